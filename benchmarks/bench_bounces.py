@@ -18,7 +18,7 @@ import numpy as np
 
 from mitsonar import ChannelSimulator, ChannelSonar
 from mitsonar.instruments.hydrophones import FieldOfView, Hydrophone
-from mitsonar.simulation.variant import ensure_variant, use_threads
+from mitsonar.simulation.device import ensure_variant, use_threads
 from mitsonar.worlds.sea import SeaSurface
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ from mitsonar import MitsonarWarning, Simulator, Sonar, SonarFrames, Trajectory,
 from mitsonar.instruments.sonar import frame_period_s, scans
 from mitsonar.instruments.sounder import named_sonars, preset
 from mitsonar.plotting.fans import fan_figure
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.device import ensure_variant
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -152,7 +152,7 @@ def bare(case: Case) -> Callable[[int], object]:
     import mitsuba as mi
 
     from mitsonar.motion.pose import to_world_matrices
-    from mitsonar.simulation.beam_former import CommonFan
+    from mitsonar.simulation.beams import CommonFan
     from mitsonar.simulation.coherent_tracing import FanRays
 
     sonar, fan = case.sonar, CommonFan.of(case.sonar)

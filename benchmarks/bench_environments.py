@@ -19,9 +19,9 @@ from mitsonar.environments.sonar_env import SonarEnv
 from mitsonar.environments.sonar_vector_env import SonarVectorEnv
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.device import ensure_variant
 from mitsonar.simulation.scene import load_scene
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.simulator import Simulator
 
 WARM = 2
 """Rounds that are not counted: Dr.Jit records a launch anew once or twice."""

@@ -24,7 +24,7 @@ from bench_render import machine
 
 from mitsonar import Simulator, Sonar, load_scene
 from mitsonar.instruments.sounder import preset
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.device import ensure_variant
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar import ChannelSimulator, ChannelSonar, load_scene
-from mitsonar.simulation.variant import ensure_variant, use_threads
+from mitsonar.simulation.device import ensure_variant, use_threads
 from mitsonar.worlds.families import create_family
 
 if TYPE_CHECKING:

@@ -100,8 +100,8 @@ def benchmark(out: Path, square: Square, noises: list[str], seeds: int, *, coars
 
 def rendered(path: Trajectory, *, coarse: bool) -> SonarFrames:
     """Render the frames of a path over the rocky field, in 256 grey values."""
-    from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
+    from mitsonar.simulation.simulator import Simulator
     from mitsonar.worlds.families import RockyField
 
     sonar = load_recipe(RECIPES["physical"]).instrument.replace(**(COARSE if coarse else {}))

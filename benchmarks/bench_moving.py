@@ -22,8 +22,8 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.bodies import Deforming
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.device import ensure_variant
+from mitsonar.simulation.simulator import Simulator
 
 WARM = 4
 """Pings that are not counted: Dr.Jit records a launch anew once or twice."""

@@ -30,7 +30,7 @@ import mitsonar
 from mitsonar.instruments.sonar import FAR_GRAZING_RAD, QUALITIES, one_beam, scans
 from mitsonar.instruments.sounder import named_sonars, preset
 from mitsonar.io.files import write_whole
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.device import ensure_variant
 
 if TYPE_CHECKING:
     import mitsuba as mi

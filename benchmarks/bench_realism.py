@@ -29,8 +29,8 @@ from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.sonar_fit import SonarFit, fit_sonar
 from mitsonar.geometry.fan import to_cartesian
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.device import ensure_variant
+from mitsonar.simulation.simulator import Simulator
 
 SHOWN_DB = 50.0
 """Span of the pictures below the 99.9th percentile [dB]."""

@@ -26,7 +26,7 @@ import numpy as np
 from rocky_seabed import Seabed, mitsuba_scene, poses_over, rocky_seabed
 
 import mitsonar
-from mitsonar.simulation.variant import backend, ensure_variant
+from mitsonar.simulation.device import backend, ensure_variant
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -300,7 +300,7 @@ def render_for_memory(frames: int, rays: int) -> None:
     """Render frames over the seabed into a folder and print the peak memory of this process."""
     from mitsonar.acoustics.noise import NoiseModel
     from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.simulation.render_run import Outputs, run
+    from mitsonar.simulation.runs import Outputs, run
 
     ensure_variant()
     sonar = instrument(96, rays, "physical").replace(range_bins=128)

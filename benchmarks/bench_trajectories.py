@@ -316,8 +316,8 @@ def driven(run: str, rate_hz: float, frames: int = 0) -> Trajectory:
 
 def rendered(job: Job) -> SonarFrames:
     """Render the frames of a run as a sonar would store them: noisy, in 256 grey values."""
-    from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
+    from mitsonar.simulation.simulator import Simulator
     from mitsonar.worlds.families import Pattern, RockyField
 
     recipe, speckle = (RECIPES["physical"], SONARS["speckle"]) if job.model == SPECKLE else (RECIPES[job.model], {})

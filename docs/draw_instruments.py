@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 import mitsonar
-from mitsonar.mapping.sounding_run import run_sounder
 from mitsonar.motion.pose import Pose
 from mitsonar.plotting.fans import save_fan, write_fan_video
+from mitsonar.simulation.runs import run_sounder
 
 SOUNDED = {
     "sidescan": ("waterfall.png", Pose(-6, -3, 2.5, heading=math.pi / 2), Pose(6, -3, 2.5, heading=math.pi / 2), 240),

@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitsonar
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.device import ensure_variant
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -22,7 +22,7 @@ import mitsonar
 from mitsonar.instruments.hydrophones import FieldOfView, Hydrophone
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.channel import ChannelSimulator, impulse_response
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.device import ensure_variant
 from mitsonar.worlds.sea import SeaSurface
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from PIL import Image
 import mitsonar
 from mitsonar.geometry.fan import to_cartesian
 from mitsonar.motion.pose import Pose
+from mitsonar.simulation.device import ensure_variant
 from mitsonar.simulation.scene import sonar_in
-from mitsonar.simulation.variant import ensure_variant
 from mitsonar.worlds.families import create_family
 
 if TYPE_CHECKING:

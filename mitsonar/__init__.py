@@ -55,9 +55,8 @@ if TYPE_CHECKING:
     from mitsonar.records.responses import ImpulseResponses
     from mitsonar.records.soundings import Echogram, Soundings, range_rates
     from mitsonar.simulation.channel import ChannelSimulator
-    from mitsonar.simulation.imaging import Simulator
-    from mitsonar.simulation.moving_files import load_meshes, load_motions
-    from mitsonar.simulation.scene import load_scene, shipped_trajectory, sonar_in
+    from mitsonar.simulation.scene import load_meshes, load_motions, load_scene, shipped_trajectory, sonar_in
+    from mitsonar.simulation.simulator import Simulator
     from mitsonar.simulation.sounding import SounderSimulator
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle
     from mitsonar.training.document_tables import load_tables
@@ -150,7 +149,7 @@ _MODULES = {
     "RenderedPairs": "datasets.rendered_pairs",
     "SeaSurface": "worlds.sea",
     "SensorNoise": "mapping.simulated_sensors",
-    "Simulator": "simulation.imaging",
+    "Simulator": "simulation.simulator",
     "Sonar": "instruments.sonar",
     "SonarEnv": "environments.sonar_env",
     "SonarFrames": "records.frames",
@@ -170,8 +169,8 @@ _MODULES = {
     "illumination": "mapping.illumination",
     "load_checkpoint": "estimation.named_estimators",
     "load_frames": "mapping.open_frames",
-    "load_meshes": "simulation.moving_files",
-    "load_motions": "simulation.moving_files",
+    "load_meshes": "simulation.scene",
+    "load_motions": "simulation.scene",
     "load_noise": "acoustics.noise",
     "load_recipe": "config.data",
     "load_scene": "simulation.scene",

@@ -74,7 +74,7 @@ def _has_cuda() -> bool:
 @pytest.fixture(scope="session")
 def variant() -> str:
     """A Mitsuba variant is set."""
-    from mitsonar.simulation.variant import ensure_variant
+    from mitsonar.simulation.device import ensure_variant
 
     return ensure_variant()
 
@@ -123,6 +123,6 @@ def mitsonar(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str])
 def scenes_of_before_are_gone() -> None:
     """Free the scenes of other files: each kernel with virtual calls holds the code of all plugins that are alive."""
     if "drjit" in sys.modules:
-        from mitsonar.simulation.variant import release_memory
+        from mitsonar.simulation.device import release_memory
 
         release_memory()

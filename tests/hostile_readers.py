@@ -28,7 +28,7 @@ from mitsonar.motion.sensors import load_sensors, save_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 from mitsonar.records.responses import ImpulseResponses
-from mitsonar.simulation.render_run import RENDERING, progress_of
+from mitsonar.simulation.runs import RENDERING, progress_of
 
 
 @dataclass(frozen=True)

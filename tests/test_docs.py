@@ -120,7 +120,7 @@ def run_python(text: str, page: str, folder: Path) -> None:
 def run_xml(text: str) -> None:
     """Load a scene."""
     import mitsonar  # noqa: F401  registers the plugins
-    from mitsonar.simulation.variant import ensure_variant
+    from mitsonar.simulation.device import ensure_variant
 
     ensure_variant()
     import mitsuba as mi

@@ -196,7 +196,7 @@ def test_import_sets_no_variant_and_loads_no_renderer() -> None:
 def test_public_names_are_all_there() -> None:
     run_python("""
         import mitsonar
-        from mitsonar.simulation.variant import ensure_variant
+        from mitsonar.simulation.device import ensure_variant
         for name in mitsonar.__all__:
             assert getattr(mitsonar, name) is not None, name
     """)
@@ -227,7 +227,7 @@ def test_rendering_works_without_torch() -> None:
     script = """
         import warnings
         import mitsonar
-        from mitsonar.simulation.variant import ensure_variant
+        from mitsonar.simulation.device import ensure_variant
         ensure_variant()
         import mitsuba as mi
         warnings.simplefilter("ignore", mitsonar.MitsonarWarning)

@@ -17,7 +17,7 @@ PACKAGES = ("mitsonar", "mitsuba", "drjit", "numpy", "scipy", "OpenEXR", "trimes
 @answered
 def doctor() -> None:
     """Check variant, libraries and versions, render a small scene against its closed form, and time it."""
-    from mitsonar.simulation.variant import backend
+    from mitsonar.simulation.device import backend
 
     say(f"python {platform.python_version()}, {platform.system()} {platform.machine()}")
     for package in PACKAGES:
@@ -41,7 +41,7 @@ def _check_sphere() -> None:
 
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.plugins.native_plugins import load_dict
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     scene = load_dict({"type": "scene", "sphere": {"type": "sphere", "radius": 10.0}})
     echoes = Simulator(scene, Sonar(range_max=12.0)).film_echoes(np.zeros(6), 0)
@@ -60,7 +60,7 @@ def _check_floor() -> None:
 
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.plugins.native_plugins import load_dict
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100.0)}
     scene = load_dict({"type": "scene", "floor": floor | {"bsdf": {"type": "diffuse", "reflectance": 0.5}}})

@@ -30,7 +30,7 @@ def image(
     """Bin the stored echoes of a run into new frames, with other bins, another window or other noise."""
     from mitsonar.acoustics.noise import load_noise
     from mitsonar.motion.trajectory import convention_named
-    from mitsonar.simulation.render_run import Outputs, StoredEchoes, run
+    from mitsonar.simulation.runs import Outputs, StoredEchoes, run
 
     outputs = Outputs(load_noise(noise), cartesian=cartesian, frame=convention_named(frame).name)
     ends = numbers(window, 2, "--range")

@@ -67,7 +67,7 @@ def impulse(
     """Simulate channels, and write responses.npz, responses.zarr, response.png and waterfall.png into the folder OUT."""
     from mitsonar.io.runs import file_digest
     from mitsonar.simulation.channel import ChannelSimulator
-    from mitsonar.simulation.impulse_run import iteration_error, run_impulse
+    from mitsonar.simulation.runs import iteration_error, run_impulse
     from mitsonar.simulation.scene import channel_sonar_in, find_scene, load_scene
 
     parameters = scene_parameters(parameter or [])

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.simulation.imaging import Simulator
-    from mitsonar.simulation.moving_files import Said
+    from mitsonar.simulation.scene import Said
+    from mitsonar.simulation.simulator import Simulator
 
 __all__ = ["NOISE", "check_above_ground", "instrument_for", "moving_said", "render", "scene_parameters", "sonar_changes"]
 
@@ -84,10 +84,9 @@ def render(
     from mitsonar.io.runs import file_digest
     from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.trajectory import convention_named
-    from mitsonar.simulation.imaging import Simulator
-    from mitsonar.simulation.moving_files import digests_of, read_said
-    from mitsonar.simulation.render_run import Outputs, run
-    from mitsonar.simulation.scene import find_scene, load_scene
+    from mitsonar.simulation.runs import Outputs, run
+    from mitsonar.simulation.scene import digests_of, find_scene, load_scene, read_said
+    from mitsonar.simulation.simulator import Simulator
 
     if label_floor and not labels:
         raise MitsonarError(f"--label-floor {label_floor:g} needs --labels: without labels nothing is labelled")
@@ -149,7 +148,7 @@ def check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: Si
         moving: whether bodies move, which is not judged.
         simulator: of the sonar, tells whether it sees anything; None: only warn.
     """
-    from mitsonar.simulation.clearance import buried_in
+    from mitsonar.simulation.tracing import buried_in
 
     found = None if moving else buried_in(scene, path.poses)
     if found is None:
@@ -166,7 +165,7 @@ def check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: Si
 def moving_said(scene: Any, options: list[str], frame: str, also: Sequence[Said] = ()) -> list[Said]:
     """Return what the scene says of its bodies' motion, and in its place what --moving and a vehicle's file say."""
     from mitsonar.motion.bodies import BodyMotion
-    from mitsonar.simulation.moving_files import Said, said_by, said_in
+    from mitsonar.simulation.scene import Said, said_by, said_in
 
     given: list[Said] = []
     for option in options:

@@ -49,8 +49,8 @@ def serve(
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.live.live_loop import live_pings
     from mitsonar.live.pose_mailbox import PoseMailbox
-    from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
+    from mitsonar.simulation.simulator import Simulator
 
     drawn = load_noise(noise)
     loaded = load_scene(scene, **scene_parameters(parameter or []))

@@ -50,12 +50,11 @@ def sound(
     """Simulate an instrument of beams on a vehicle: waterfall, ranges, points or velocities in the folder OUT."""
     from mitsonar.instruments.sounder import load_sounder
     from mitsonar.io.runs import file_digest
-    from mitsonar.mapping.sounding_run import run_sounder
     from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import convention_named
-    from mitsonar.simulation.moving_files import digests_of, read_said
-    from mitsonar.simulation.scene import find_scene, load_scene
+    from mitsonar.simulation.runs import run_sounder
+    from mitsonar.simulation.scene import digests_of, find_scene, load_scene, read_said
     from mitsonar.simulation.sounding import SounderSimulator
 
     named = convention_named(frame).name

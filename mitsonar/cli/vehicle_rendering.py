@@ -12,8 +12,8 @@ from mitsonar.errors import MitsonarError, counted
 if TYPE_CHECKING:
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.simulation.moving_files import Said
-    from mitsonar.simulation.render_run import Outputs
+    from mitsonar.simulation.runs import Outputs
+    from mitsonar.simulation.scene import Said
     from mitsonar.simulation.vehicle import VehicleFile
 
 __all__ = ["VehicleOptions", "first_pose", "render_vehicle", "vehicle_file"]
@@ -59,9 +59,9 @@ def render_vehicle(
     """Run all sensors of a vehicle along a path, and say where they lie."""
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.instruments.sounder import Sounder
-    from mitsonar.mapping.vehicle_run import run_vehicle
     from mitsonar.motion.pose import Pose
-    from mitsonar.simulation.moving_files import digests_of, read_said
+    from mitsonar.simulation.runs import run_vehicle
+    from mitsonar.simulation.scene import digests_of, read_said
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, sensors_in
 
     sensors = sensors_in(scene, Pose.from_row(path.poses[0])) if vehicle is None else vehicle.sensors

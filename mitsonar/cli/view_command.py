@@ -104,8 +104,7 @@ def _loaded(scene: str, parameters: dict[str, str]) -> tuple[Any, Any, Any]:
     import numpy as np
 
     from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.simulation.scene import find_scene, load_scene, sonar_in
-    from mitsonar.simulation.scene_triangles import triangles_in
+    from mitsonar.simulation.scene import find_scene, load_scene, sonar_in, triangles_in
 
     loaded = load_scene(scene, **parameters)
     found = sonar_in(loaded)

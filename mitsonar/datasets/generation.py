@@ -18,7 +18,7 @@ from mitsonar.datasets.workers import made_by
 from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import refuse_other, versions
 from mitsonar.io.storage import Storage
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.device import ensure_variant
 
 __all__ = ["Made", "make_dataset"]
 

@@ -169,7 +169,7 @@ class ImageModality:
 
     def warnings(self, read: Read) -> list[str]:
         """Warn of motions far below a bin, of returns outside the window, and of a gain that is too high."""
-        from mitsonar.simulation.tally import NEGLIGIBLE  # a stored set is read without a simulator
+        from mitsonar.simulation.pings import NEGLIGIBLE  # a stored set is read without a simulator
 
         sentences = []
         flight, bin_mm = self.recipe.flight, 1e3 * self.sonar.bin_m

@@ -12,7 +12,7 @@ from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.variant import release_memory
+from mitsonar.simulation.device import release_memory
 
 __all__ = ["re_rendered"]
 

@@ -22,7 +22,7 @@ from mitsonar.datasets.torch_pairs import ArrangementOptions, Samples
 from mitsonar.errors import MitsonarError, refuse_unknown
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import mounted
-from mitsonar.simulation.variant import ensure_variant, release_memory, use_threads
+from mitsonar.simulation.device import ensure_variant, release_memory, use_threads
 
 __all__ = ["RawStream", "RenderedPairs"]
 

@@ -19,16 +19,15 @@ from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import mounted
 from mitsonar.records.frames import to_uint8
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.labels import labels_above
-from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain, to_image
+from mitsonar.simulation.device import release_memory
+from mitsonar.simulation.pings import CALIBRATION_FRAMES, RenderedPings, constant_gain, labels_above, to_image
 from mitsonar.simulation.scene import load_scene, shape_names_in
-from mitsonar.simulation.variant import release_memory
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.moving_scene import SceneMotion
+    from mitsonar.simulation.moving import SceneMotion
 
 __all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world", "refuse_worlds"]
 
@@ -199,8 +198,8 @@ def refuse_worlds(recipe: Recipe) -> None:
     Raises:
         MitsonarError: one is smaller than its ``size_m``, lacks a mirror or a body that moves, or cannot be loaded.
     """
-    from mitsonar.simulation.mirror_parts import mirror_of
-    from mitsonar.simulation.moving_scene import motion_in
+    from mitsonar.simulation.mirrors import mirror_of
+    from mitsonar.simulation.moving import motion_in
 
     families = [recipe.family(group) for group in range(len(recipe.scenes))]
     every = bool(recipe.mirrors or recipe.bodies)

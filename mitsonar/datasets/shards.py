@@ -9,7 +9,7 @@ import numpy as np
 from mitsonar.datasets.modality import Renderer, Values, renderer_of
 from mitsonar.datasets.plan import Scene
 from mitsonar.datasets.store import DataStore
-from mitsonar.simulation.variant import ensure_variant, release_memory
+from mitsonar.simulation.device import ensure_variant, release_memory
 
 __all__ = ["forget", "make_shard"]
 

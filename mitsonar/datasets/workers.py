@@ -15,7 +15,7 @@ import numpy as np
 from mitsonar.datasets.shards import forget, make_shard
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.simulation.variant import use_threads
+from mitsonar.simulation.device import use_threads
 
 __all__ = ["Queue", "made_by"]
 

@@ -17,14 +17,14 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.motion.bodies import Moving
 from mitsonar.motion.composition import steered
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.rendered_pings import constant_gain, to_image
+from mitsonar.simulation.pings import constant_gain, to_image
 from mitsonar.simulation.scene import load_scene, sonar_in
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.clearance import Clearance
+    from mitsonar.simulation.tracing import Clearance
 
 __all__ = ["SonarFleet", "SonarSource"]
 
@@ -77,7 +77,7 @@ class SonarFleet:
         self.sonar, self.task = self.simulator.sonar, task
         refuse_noise(task.noise, self.sonar)
         self.step_s = 1 / self.sonar.frame_rate_hz if task.step_s is None else task.step_s
-        from mitsonar.simulation.clearance import Clearance  # now that the simulator has set a variant
+        from mitsonar.simulation.tracing import Clearance  # now that the simulator has set a variant
 
         self._clearance = Clearance(self.simulator.tracer)
         self._span = self._start_of(task)

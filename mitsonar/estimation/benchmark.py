@@ -24,7 +24,7 @@ from mitsonar.estimation.estimator import AnyEstimator, PlainTable, Record
 from mitsonar.motion.errors import MotionErrors, in_units, motion_errors
 from mitsonar.records.frames import SonarFrames
 from mitsonar.records.responses import ImpulseResponses
-from mitsonar.simulation.variant import release_memory
+from mitsonar.simulation.device import release_memory
 
 __all__ = [
     "VARIATIONS",

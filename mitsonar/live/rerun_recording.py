@@ -19,7 +19,7 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames, to_uint8
-from mitsonar.simulation.scene_triangles import Triangles
+from mitsonar.simulation.scene import Triangles
 
 __all__ = ["Shown", "first_eye", "lit_corners", "wedge_lines", "write_recording"]
 

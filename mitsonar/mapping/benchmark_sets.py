@@ -26,14 +26,14 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.open_frames import open_frames
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.simulation.render_run import RENDERING, Outputs, run
+from mitsonar.simulation.device import release_memory
+from mitsonar.simulation.runs import RENDERING, Outputs, run
 from mitsonar.simulation.scene import load_scene
-from mitsonar.simulation.variant import release_memory
 from mitsonar.worlds.families import RockyField, ShipHull
 from mitsonar.worlds.world import Family, sloped
 
 if TYPE_CHECKING:
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
 __all__ = [
     "DIVE",
@@ -273,7 +273,7 @@ class RenderedSet:
         return (self.folder / "run.json").exists() and RunDirectory.open(self.folder, RENDERING).finished
 
     def _simulator(self, sonar: Sonar) -> Simulator:
-        from mitsonar.simulation.imaging import Simulator
+        from mitsonar.simulation.simulator import Simulator
 
         world = self.name if self.simulated.flight is None else f"{DIVE}-{self.simulated.seed}"
         return Simulator(load_scene(self.simulated.world(self.out / "worlds" / world)), sonar)

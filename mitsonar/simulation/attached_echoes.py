@@ -14,7 +14,7 @@ import mitsuba as mi
 from mitsonar.acoustics.levels import level
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.device import DeviceArray
 from mitsonar.simulation.tracing import Rays, Tracer
 
 __all__ = ["AttachedEchoes", "attached_echoes"]

@@ -11,21 +11,45 @@ with the other sign. One running sum over the bins then gives the image.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.acoustics.levels import level
-from mitsonar.instruments.sonar import Sonar
-from mitsonar.instruments.views import View
+from mitsonar.acoustics.levels import largest_level, level
+from mitsonar.instruments.sonar import RAYS, Sonar
+from mitsonar.instruments.views import Receiver, Segment, View, Whole
+from mitsonar.motion.pose import mounted, to_world_matrices
 from mitsonar.records.echoes import Echoes
-from mitsonar.simulation.device_arrays import DeviceArray
-from mitsonar.simulation.view_echoes import NARROWEST, ViewEchoes, ViewTracer
+from mitsonar.simulation.device import DeviceArray, LaunchTables
 
-__all__ = ["Counts", "accumulate", "develop", "fetch", "strongest"]
+if TYPE_CHECKING:
+    from mitsonar.plugins.imaging_sonar_sensor import Fan
+    from mitsonar.simulation.tracing import Rays
+
+__all__ = [
+    "NARROWEST",
+    "Counts",
+    "ReceiverTracer",
+    "SegmentTracer",
+    "ViewEchoes",
+    "ViewTracer",
+    "WholeTracer",
+    "accumulate",
+    "develop",
+    "fetch",
+    "fraction_bits",
+    "half_path_rate",
+    "strongest",
+    "view_tracers",
+]
+
 
 ADD = dr.ReduceMode.Local
 """Mode of the additions: Dr.Jit's default assumes that the number of threads is the same when a launch is replayed."""
@@ -191,3 +215,232 @@ def _clip(place: DeviceArray, bins: int) -> DeviceArray:
 
 def _whole(place: DeviceArray) -> mi.UInt32:
     return mi.UInt32(dr.select(place > 0, place, 0))
+
+
+# ---------------- Echoes of a view: all echoes of a ping, or those of a portion of the field of view
+
+
+NARROWEST = 2.0**-6
+"""Shortest footprint [bins]: a surface at normal incidence has none, and a density needs one."""
+
+
+@dataclass(frozen=True)
+class ViewEchoes:
+    """The echoes of a launch in one view, one value for each ray, not evaluated yet.
+
+    Attributes:
+        echoes: with ranges and levels of this view.
+        beam: index of the view's beam.
+        active: whether the ray belongs to the view; other rays are not counted.
+        elevation: of each ray in the view's own frame [rad].
+    """
+
+    echoes: Echoes
+    beam: DeviceArray
+    active: DeviceArray
+    elevation: DeviceArray
+
+
+class ViewTracer(Protocol):
+    """Turn the echoes of a launch into those of one view.
+
+    Attributes:
+        bits: fraction bits of the fixed-point sums.
+    """
+
+    bits: int
+
+    @property
+    def view(self) -> View:
+        """Return the view."""
+
+    def tables(self, poses: ArrayLike) -> LaunchTables:
+        """Return the view's inputs of a launch, given the sonar's poses ``(pings, 6)`` [m, rad]."""
+
+    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
+        """Return the echoes of a launch in this view; joins the kernel that traces them."""
+
+
+class WholeTracer:
+    """All echoes, each in the beam of its ray."""
+
+    def __init__(self, view: Whole) -> None:
+        self.view = view
+        self.bits = fraction_bits(view.sonar, view.sonar.rays // view.sonar.beams)
+
+    def tables(self, poses: ArrayLike) -> LaunchTables:
+        """Return an empty table: the view needs no inputs."""
+        return {}
+
+    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
+        """Return all echoes, each in the beam of its ray."""
+        return ViewEchoes(echoes, rays.beam, True, fan.elevation)
+
+
+class SegmentTracer:
+    """The echoes of a portion of the field of view."""
+
+    def __init__(self, view: Segment) -> None:
+        self.view = view
+        self.bits = fraction_bits(view.sonar, view.sonar.rays // view.sonar.beams)
+
+    @cached_property
+    def _on_device(self) -> LaunchTables:
+        import drjit as dr
+        import mitsuba as mi
+
+        table = mi.Bool(self.view.member)
+        dr.make_opaque(table)
+        return {"member": table}
+
+    def tables(self, poses: ArrayLike) -> LaunchTables:
+        """Return the pixels of the film that belong to the portion."""
+        return self._on_device
+
+    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
+        """Return the echoes of the portion; beams count from its first."""
+        import drjit as dr
+        import mitsuba as mi
+
+        active = dr.gather(mi.Bool, tables["member"], rays.film)
+        return ViewEchoes(echoes, dr.select(active, rays.beam - self.view.first_beam, 0), active, fan.elevation)
+
+
+def fraction_bits(sonar: Sonar, rays: int, gain: float = 1.0) -> int:
+    """Return the fraction bits of the fixed-point sums: ``rays`` of the largest level in one bin stay below 2^62.
+
+    Args:
+        sonar: the instrument.
+        rays: largest number of rays in one bin.
+        gain: largest factor by which a view multiplies a ray's level.
+    """
+    cell = sonar.beam_width_rad / sonar.across * math.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
+    largest = largest_level(sonar, cell) * rays * gain
+    return 62 - math.ceil(math.log2(largest if sonar.model == "thesis" else largest / NARROWEST))
+
+
+# ---------------- Echoes at a receiver beside the transmitter (Almanza-Medina, 3.6): the transmitter's rays, seen
+# from the receiver
+
+
+class ReceiverTracer:
+    """The transmitter's echoes at a receiver beside it; see :class:`~mitsonar.instruments.views.Receiver`."""
+
+    def __init__(self, view: Receiver) -> None:
+        self.view = view
+        sonar, apart = view.sonar, math.dist(view.offset[:3], (0, 0, 0))
+        # r = (R_A + R_B) / 2 <= R_B + apart / 2, and r is at least the window's begin where it counts
+        nearest = max(sonar.range_min, sonar.bin_m)
+        gain = (nearest / (nearest - apart / 2)) ** 2 if sonar.model == "physical" else 1.0
+        traced = {name: getattr(view.transmitter, name) for name in RAYS}  # another window would want others
+        self.bits = fraction_bits(view.transmitter.replace(**_window(sonar), **traced), view.transmitter.rays, gain)
+
+    def tables(self, poses: ArrayLike) -> LaunchTables:
+        """Return the receiver's poses: three rows of ``to_world`` for each ping."""
+        import mitsuba as mi
+
+        rows = to_world_matrices(mounted(poses, self.view.offset))[:, :3].astype(np.float32)
+        return {"rows": mi.Float(rows.ravel().tolist())}
+
+    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
+        """Return the echoes that the receiver measures."""
+        import drjit as dr
+        import mitsuba as mi
+
+        from mitsonar.simulation.beams import beam_of
+        from mitsonar.simulation.tracing import hidden
+
+        lines = [dr.gather(mi.Vector4f, tables["rows"], rays.ping * 3 + axis) for axis in range(3)]
+        u: DeviceArray
+        normal: DeviceArray = mi.Normal3f(echoes.nx, echoes.ny, echoes.nz)
+        point = mi.Point3f(echoes.x, echoes.y, echoes.z)
+        way = mi.Vector3f(*(p - line.w for p, line in zip(point, lines, strict=True)))
+        distance = dr.norm(way)
+        u = way / distance
+        port, up, forward = (sum(line[axis] * u[row] for row, line in enumerate(lines)) for axis in range(3))
+        beam, inside, elevation = beam_of(self.view.sonar, -port, forward, up)
+        toward = dr.dot(normal, u)
+        lit = (echoes.hit > 0) & inside & (toward * dr.dot(normal, fan.d) > 0)
+        active = lit & ~hidden(scene, point, normal, u, distance, lit)
+        return ViewEchoes(self._received(echoes, fan, way, distance, normal), dr.select(active, beam, 0), active, elevation)
+
+    def _received(self, echoes: Echoes, fan: Fan, way: DeviceArray, distance: DeviceArray, normal: DeviceArray) -> Echoes:
+        """Compute range, footprint, cosine and weight of the echoes between transmitter and receiver; ``way`` from it."""
+        import drjit as dr
+
+        half = (echoes.range_m + distance) * 0.5
+        received = replace(echoes, **{field.name: getattr(echoes, field.name) for field in fields(Echoes)})
+        received.range_m = half
+        if self.view.sonar.model == "thesis":
+            received.near_m = received.far_m = half
+            return received
+        u = way / distance
+        lift = half_path_rate(echoes.range_m, fan.d, fan.lift, u, normal)
+        side = half_path_rate(echoes.range_m, fan.d, fan.side, u, normal)
+        middle = half + side * fan.aside
+        rises = dr.dot(normal, fan.lift) * dr.dot(normal, fan.d) < 0
+        ends = (dr.select(rises, echoes.near_m, echoes.far_m), dr.select(rises, echoes.far_m, echoes.near_m))
+        low, high = (
+            self._edge(echoes, fan, angle, end, way, normal, middle + lift * angle)
+            for angle, end in zip((fan.below, fan.above), ends, strict=True)
+        )
+        received.near_m, received.far_m = dr.select(low < high, low, high), dr.select(low < high, high, low)
+        cosine = dr.abs(dr.dot(normal, u))
+        received.cosine = dr.select(cosine < 1, cosine, 1)
+        # spreading is 1/R_B^2, and the sonar equation divides by half the path squared
+        received.solid_angle_sr = echoes.solid_angle_sr * (half / distance) ** 2
+        return received
+
+    @staticmethod
+    def _edge(
+        echoes: Echoes,
+        fan: Fan,
+        angle: DeviceArray,
+        end: DeviceArray,
+        way: DeviceArray,
+        normal: DeviceArray,
+        otherwise: DeviceArray,
+    ) -> DeviceArray:
+        """Return half the path by way of a flat edge, ``end`` from the transmitter [m]; elsewhere ``otherwise``."""
+        import drjit as dr
+
+        from mitsonar.plugins.echo_integrator import edge_direction, flatter
+
+        toward = edge_direction(fan, angle)
+        back = dr.norm(way + toward * end - fan.d * echoes.range_m)
+        return dr.select(flatter(normal, fan.d, toward), (end + back) * 0.5, otherwise)
+
+
+def half_path_rate(
+    range_m: DeviceArray, d: DeviceArray, turn: DeviceArray, u: DeviceArray, normal: DeviceArray
+) -> DeviceArray:
+    """Return the change of half a path by an angle of its ray, on the tangent plane [m/rad].
+
+    Args:
+        range_m: along the ray [m].
+        d: direction of the ray.
+        turn: its derivative by the angle.
+        u: unit direction from the other end of the path to the point hit.
+        normal: of the surface there.
+    """
+    import drjit as dr
+
+    from mitsonar.plugins.echo_integrator import steep
+
+    along = -range_m * dr.dot(normal, turn) / steep(dr.dot(normal, d))
+    return (along + dr.dot(u, d * along + turn * range_m)) * 0.5
+
+
+def _window(sonar: Sonar) -> dict[str, float]:
+    return {name: getattr(sonar, name) for name in ("range_min", "range_max", "range_bins")}
+
+
+# ---------------- The tracer of each kind of view
+
+
+TRACERS = {Whole: WholeTracer, Segment: SegmentTracer, Receiver: ReceiverTracer}
+
+
+def view_tracers(views: Iterable[View]) -> list[ViewTracer]:
+    """Return the tracer of each view, in their order."""
+    return [TRACERS[type(view)](view) for view in views]

@@ -17,15 +17,15 @@ from mitsonar.instruments.hydrophones import PADDING, ChannelSonar
 from mitsonar.motion.pose import refuse_beyond_reach
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.responses import ImpulseResponses
-from mitsonar.simulation.nonuniform_fft import phasor_sums, phasors
-from mitsonar.simulation.variant import thread_count
+from mitsonar.simulation.beams import phasor_sums, phasors
+from mitsonar.simulation.device import thread_count
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.channel_tracing import ChannelTracer, EchoValues
-    from mitsonar.simulation.mirror_parts import Mirroring
     from mitsonar.simulation.mirror_paths import MirrorPaths
+    from mitsonar.simulation.mirrors import Mirroring
+    from mitsonar.simulation.scatterers import ChannelTracer, EchoValues
 
 __all__ = ["ChannelSimulator", "Channels", "Paths", "frequency_response", "impulse_response"]
 
@@ -136,8 +136,8 @@ class ChannelSimulator:
         self, scene: mi.Scene, sonar: ChannelSonar, *, like: ChannelSimulator | None = None, mirrors: Mirroring = None
     ) -> None:
         self.sonar = sonar
-        from mitsonar.simulation.moving_files import refuse_motion
-        from mitsonar.simulation.scene_watch import SceneWatch
+        from mitsonar.simulation.moving import SceneWatch
+        from mitsonar.simulation.scene import refuse_motion
 
         refuse_motion(scene, "impulse responses")
         self._given = scene, mirrors
@@ -155,9 +155,9 @@ class ChannelSimulator:
         """Make all that follows from the scene as it is now: scatterers or tables of its surfaces, and mirrors."""
         scene, mirrors = self._given
         sonar = self.sonar
-        from mitsonar.simulation.channel_tracing import ChannelTracer
-        from mitsonar.simulation.mirror_parts import mirror_of
         from mitsonar.simulation.mirror_paths import MirrorPaths
+        from mitsonar.simulation.mirrors import mirror_of
+        from mitsonar.simulation.scatterers import ChannelTracer
 
         parts = mirror_of(scene, mirrors) if mirrors else None
         check_channel_mirrors(sonar, parts is not None, LACKING)

@@ -1,6 +1,6 @@
 """One ping's complex field over (sine of the bearing, range), summed over hash-anchored scatterers in one launch.
 
-Each ray looks through the lattice cells (:mod:`mitsonar.simulation.hashed_points`) of its own cell of the surface. A point
+Each ray looks through the lattice cells (:mod:`mitsonar.simulation.points`) of its own cell of the surface. A point
 counts where its own direction lies in that ray's cell, so on a plane each point counts exactly once, whatever the rays.
 Its echo is zeta sqrt(C cos^2 dA) / R^2 times the elevation's pattern and exp(-2 j k R). Sums are 64-bit fixed point.
 """
@@ -21,14 +21,12 @@ from mitsonar.acoustics.speckle import BLENDED, patch_amplitudes
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit
-from mitsonar.simulation.beam_former import BeamFormer, CommonFan
-from mitsonar.simulation.device_arrays import DeviceArray
-from mitsonar.simulation.elevation_pattern import elevation_gain
-from mitsonar.simulation.hashed_points import LEAST_COSINE, HashedPoints, Point, pick
-from mitsonar.simulation.mirror_parts import Mirrors, without_mirror_part
-from mitsonar.simulation.moving_scene import SceneMotion, scene_at
-from mitsonar.simulation.moving_tracing import MovingSurfaces, surfaces_of
-from mitsonar.simulation.variant import Frozen, replayed
+from mitsonar.simulation.beams import BeamFormer, CommonFan, elevation_gain
+from mitsonar.simulation.device import DeviceArray, Frozen, replayed
+from mitsonar.simulation.mirrors import Mirrors, without_mirror_part
+from mitsonar.simulation.moving import SceneMotion, scene_at
+from mitsonar.simulation.points import LEAST_COSINE, HashedPoints, Point, pick
+from mitsonar.simulation.tracing import MovingSurfaces, surfaces_of
 
 __all__ = ["STRIP", "CoherentTracer", "FanRays", "FieldCounts", "add_waves", "elevation_gain"]
 

@@ -23,7 +23,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 __all__ = ["FIRST_PING", "PINGS", "Derivative", "differentiate", "evenly", "jittered", "step_for"]
 

@@ -13,13 +13,11 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import View
 from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.records.echoes import Echoes
-from mitsonar.simulation.binning import accumulate, develop, strongest
-from mitsonar.simulation.bounce_sums import BounceSums
-from mitsonar.simulation.device_arrays import DeviceArray
-from mitsonar.simulation.elevation_pattern import elevation_gain
+from mitsonar.simulation.beams import elevation_gain
+from mitsonar.simulation.binning import ViewEchoes, ViewTracer, accumulate, develop, strongest
+from mitsonar.simulation.device import DeviceArray, Frozen
+from mitsonar.simulation.multipath_rough import BounceSums
 from mitsonar.simulation.tracing import Rays, Tracer
-from mitsonar.simulation.variant import Frozen
-from mitsonar.simulation.view_echoes import ViewEchoes, ViewTracer
 
 __all__ = ["ImageLaunch"]
 

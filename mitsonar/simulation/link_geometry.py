@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mitsonar.instruments.hydrophones import PADDING, ChannelSonar, FieldOfView, Maths
 from mitsonar.motion.pose import vehicle_rotation
-from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.device import DeviceArray
 from mitsonar.simulation.tracing import hidden
 
 __all__ = ["LINK", "EchoBatch", "Leg", "LinkGeometry", "ScatteringPoints", "link_table"]

@@ -12,16 +12,18 @@ from mitsonar.acoustics.levels import Detected, first_echoes, strongest_echoes
 from mitsonar.acoustics.water import gain_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import Sounder
-from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.soundings import Echogram, Soundings
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.motion.sensors import Readings, VehicleSensors
+from mitsonar.motion.trajectory import Trajectory, velocities
+from mitsonar.records.soundings import DvlReadings, Echogram, Soundings
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsonar.motion.bodies import Moving, MovingBodies
 
-__all__ = ["SoundedPings", "SounderSimulator"]
+__all__ = ["SoundedPings", "SounderSimulator", "dvl_readings", "dvl_sensors", "true_rates"]
+
 
 FEW = 8
 """Pings of a batch of the model coherent, which renders fan by fan: so many are lost when a run is killed."""
@@ -129,3 +131,68 @@ class SounderSimulator:
         if fan.noise_level_db is None:
             return np.zeros(fan.range_bins)
         return np.asarray(10 ** ((fan.noise_level_db - fan.source_level_db) / 10) * gain_of(fan), dtype=np.float64)
+
+
+# ---------------- A DVL in a scene: ranges from its echoes, range rates from its motion and noise
+
+
+Array = NDArray[np.float64]
+
+RATES, SCALE = 0x64766C, 0x7363616C
+"""Keep the draws of noise and of the scale apart."""
+
+
+def dvl_readings(soundings: Soundings, seed: int = 0) -> DvlReadings:
+    """Make a DVL's readings of its soundings.
+
+    A rate is that of the beam's axis, times one constant scale, plus Gaussian noise of the beam's standard deviation. Beams
+    without an echo have no rate. Fewer than three rates are no bottom lock.
+
+    Args:
+        soundings: of a dvl along its path.
+        seed: of noise and scale; the noise is a function of (seed, ping, beam).
+
+    Raises:
+        MitsonarError: soundings of another kind of instrument.
+    """
+    sounder = soundings.sounder
+    if sounder.kind != "dvl":
+        raise MitsonarError(f"readings of a DVL need soundings of one: got a {sounder.kind}")
+    true = true_rates(sounder, Trajectory(soundings.poses, soundings.time_s))
+    scale = 1 + sounder.scale_std * np.random.default_rng([seed, SCALE]).normal()
+    drawn = np.stack([np.random.default_rng([seed, RATES, ping]).normal(size=true.shape[1]) for ping in range(len(true))])
+    return DvlReadings.of(soundings, scale * true + sounder.beam_std_m_s * drawn)
+
+
+def true_rates(sounder: Sounder, flown: Trajectory) -> Array:
+    """Compute the range rates of the beams over ground at rest ``(pings, beams)`` [m/s]: minus the velocity along them.
+
+    A mount beside the vehicle's middle moves with its turn as well. The velocity at a pose is the mean of those of the
+    steps before and after it.
+    """
+    step = velocities(flown)
+    at_pose = np.concatenate([step[:1], (step[:-2] + step[1:-1]) / 2, step[-1:]]) if len(step) > 2 else step
+    starboard, forward = sounder.mount_poses[:, :2].T
+    turn = at_pose[:, 3:]
+    lever = np.stack([turn * forward, -turn * starboard, np.zeros((len(at_pose), len(forward)))], axis=-1)
+    return np.asarray(-np.einsum("pbi,bi->pb", at_pose[:, None, :3] + lever, sounder.axes))
+
+
+# ---------------- Velocities of a DVL as the readings that odometry takes
+
+
+def dvl_sensors(readings: DvlReadings) -> VehicleSensors:
+    """Return velocities sideways and forward in level axes, with their standard deviations, of the pings with bottom lock.
+
+    The correlation of both is left out; it is 0 while all beams of a symmetric DVL have an echo.
+
+    Raises:
+        MitsonarError: no bottom lock in any ping.
+    """
+    locked = readings.locked
+    if not locked.any():
+        raise MitsonarError("the DVL has no bottom lock in any ping: come nearer to the ground, or raise range_max")
+    velocity, covariance = readings.level()
+    time_s, std = readings.soundings.time_s[locked], np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[locked]
+    sideways, forward = (Readings(time_s, velocity[locked, axis], std[:, axis]) for axis in (0, 1))
+    return VehicleSensors(sideways=sideways, forward=forward, name="the DVL")

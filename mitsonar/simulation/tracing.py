@@ -2,23 +2,48 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins import echo_integrator, imaging_sonar_sensor, surfaces
+from mitsonar.plugins.hashed_texture import ROUNDS
+from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.plugins.native_plugins import load_dict
+from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.records.echoes import Echoes
-from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables
+from mitsonar.simulation.device import DeviceArray, Frozen, LaunchTables, replayed
+from mitsonar.simulation.moving import MovingScene, SceneMotion, carried_back
 
-__all__ = ["Rays", "Tracer", "free_way", "height_below", "hidden"]
+__all__ = [
+    "Buried",
+    "Clearance",
+    "MovingSurfaces",
+    "MovingTracer",
+    "Rays",
+    "Tracer",
+    "buried_in",
+    "free_way",
+    "going_on",
+    "height_below",
+    "hidden",
+    "lambert_direction",
+    "mirrored_lines",
+    "overlap",
+    "reflected",
+    "surfaces_of",
+    "tracer_of",
+]
+
 
 OFF_SURFACE = 1e-5
 """Distance off a surface at which a shadow ray begins, as a part of the coordinates' size: ten times their rounding."""
@@ -182,3 +207,302 @@ def hidden(
     if moment is not None:
         ray.time = moment
     return scene.ray_test(ray, True, active)  # type: ignore[call-overload]  # the stubs want mi.Bool for coherent
+
+
+# ---------------- Echoes of a scene whose bodies move: hits are read in the axes of the body and told in those of the
+# world
+
+
+@dataclass
+class MovingSurfaces(Surfaces):
+    """Tables of a scene's shapes, read where bodies have moved.
+
+    Attributes:
+        first_object: number below that of the first body's object.
+        shape_count: shapes of the scene.
+        motion: of the scene.
+        versions: of the meshes that deform, when their normals were read.
+    """
+
+    first_object: int = 0
+    shape_count: int = 0
+    motion: SceneMotion | None = None
+    versions: tuple[int, ...] = ()
+
+    @classmethod
+    def of_motion(cls, motion: SceneMotion, sonar: Sonar) -> MovingSurfaces:
+        """Return the tables of the scene that a motion belongs to, for one sonar."""
+        tables = cls.of(motion.scene, motion.shapes).heard_by(sonar)
+        assert isinstance(tables, MovingSurfaces)
+        return replace(tables, first_object=motion.first_objects, shape_count=len(motion.shapes), motion=motion)
+
+    def arrays(self) -> dict[str, DeviceArray]:
+        """Return the tables by name, with the normals that meshes have now."""
+        deformed = () if self.motion is None else self.motion.deformed
+        now = tuple(one.version for one in deformed)
+        if now != self.versions:
+            for one in deformed:
+                self.turn_facets(one.mesh)
+            self.versions = now
+        return super().arrays()
+
+    def hit(self, scene: mi.Scene | MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
+        """Trace rays to the nearest surface; directions are of the world."""
+        assert isinstance(scene, MovingScene)
+        return self.hit_and_body(scene, ray, active)[0]
+
+    def hit_and_body(self, scene: MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[Hit, DeviceArray]:
+        """Trace rays to the nearest surface; return the hit in the axes of the world, and the number of the body."""
+        hit, body = self.hit_in_body(scene, ray, active)
+        return replace(hit, n=carried_back(scene.lines(mi.UInt32(ray.time), body), hit.n)), body
+
+    def hit_in_body(self, scene: MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[Hit, DeviceArray]:
+        """Trace rays to the nearest surface; return the hit in the axes of its body, and the number of the body."""
+        found, body = scene.find(ray, active)
+        hit = self.read(found, scene.carried(ray, body), active)
+        numbered = (body > 0) & (hit.object_id == 0)
+        object_id = dr.select(numbered, mi.Float(body) + float(self.first_object), hit.object_id)
+        return replace(hit, object_id=object_id), body
+
+    def own_lattice(self, scene: MovingScene, hit: Hit, body: DeviceArray) -> DeviceArray:
+        """Return the number of the lattice of points on each hit: the shape's, of further bodies of one shape their own."""
+        number, first = hit.shape_id, 1
+        for copies in scene.copies:
+            number = dr.select((body > first) & (body < first + copies), self.shape_count + mi.Int32(body), number)
+            first += copies
+        return number
+
+
+class MovingTracer(Tracer):
+    """Trace the echoes of a scene whose bodies move.
+
+    Args:
+        motion: of the scene.
+        sonar: the instrument.
+    """
+
+    def __init__(self, motion: SceneMotion, sonar: Sonar) -> None:
+        super().__init__(motion.scene, sonar)
+        self.motion, self.deforms = motion, bool(motion.deformed)
+        self.surfaces = MovingSurfaces.of_motion(motion, sonar)
+
+    def scene_at(self, time_s: ArrayLike) -> MovingScene:
+        """Return the scene at the moments of a launch's pings [s]."""
+        return self.motion.at(np.ravel(time_s))
+
+    def rays_of(self, rays: Rays, rows: mi.Float, keys: mi.UInt32) -> tuple[mi.Ray3f, Fan]:
+        """Return the rays in the world, each with the number of its moment, and their fan."""
+        ray, fan = super().rays_of(rays, rows, keys)
+        moment: DeviceArray = mi.Float(rays.moment)
+        ray.time = moment
+        return ray, fan
+
+    def height_m(self, scene: DeviceArray, rows: mi.Float) -> DeviceArray:
+        """Return the height of each pose over the still shapes straight below it [m]; nan where there is nothing."""
+        assert isinstance(scene, MovingScene)
+        return super().height_m(scene.still, rows)
+
+
+def tracer_of(scene: mi.Scene, sonar: Sonar, motion: SceneMotion | None) -> Tracer:
+    """Return what traces a scene for a sonar, with bodies that move or without."""
+    return Tracer(scene, sonar) if motion is None else MovingTracer(motion, sonar)
+
+
+def surfaces_of(scene: mi.Scene, sonar: Sonar, motion: SceneMotion | None) -> Surfaces:
+    """Return the tables of a scene's shapes for a sonar, with bodies that move or without."""
+    return Surfaces.of(scene).heard_by(sonar) if motion is None else MovingSurfaces.of_motion(motion, sonar)
+
+
+# ---------------- Rays that go on from a surface: as from a mirror, or drawn from Lambert's law; and both ends of a
+# path in one beam
+
+
+FLATTEST = 0.02
+"""Cosine to the normal below which the next ray begins no farther along its direction."""
+
+HALF_LOG_2 = math.log(2) / 2
+
+
+def reflected(v: DeviceArray, normal: DeviceArray) -> DeviceArray:
+    """Return vectors as a mirror of that unit normal turns them."""
+    return v - normal * (2 * dr.dot(normal, v))
+
+
+def going_on(place: DeviceArray, direction: DeviceArray, normal: DeviceArray) -> DeviceArray:
+    """Return the distance along a direction at which the next ray begins, clear of the surface that it leaves [m]."""
+    size = dr.select(dr.abs(place.x) > dr.abs(place.y), dr.abs(place.x), dr.abs(place.y)) + dr.abs(place.z)
+    along: DeviceArray = dr.abs(dr.dot(normal, direction))
+    return (1 + size) * OFF_SURFACE / dr.select(along > FLATTEST, along, FLATTEST)
+
+
+def lambert_direction(normal: DeviceArray, d: DeviceArray, ray: DeviceArray, key: DeviceArray) -> mi.Vector3f:
+    """Draw directions by Lambert's law around the side of a surface that rays meet, from a hash.
+
+    Args:
+        normal: unit normal of the surface; its sign does not matter.
+        d: of the rays that meet it.
+        ray: number of each ray.
+        key: of the draw, 32 bits.
+    """
+    first, second = mi.sample_tea_32(ray, key, ROUNDS)
+    place = mi.Point2f((mi.Float(first >> 8) + 0.5) * 2.0**-24, (mi.Float(second >> 8) + 0.5) * 2.0**-24)
+    facing: DeviceArray = mi.Vector3f(normal * dr.select(dr.dot(normal, d) > 0, -1.0, 1.0))
+    drawn: DeviceArray = mi.warp.square_to_cosine_hemisphere(place)
+    return mi.Vector3f(mi.Frame3f(facing).to_world(drawn))
+
+
+def mirrored_lines(lines: list[list[Any]], normal: DeviceArray, place: DeviceArray) -> list[list[Any]]:
+    """Return the rows of a sonar's ``to_world`` as a plane mirror shows it, in double precision.
+
+    Args:
+        lines: three rows of four numbers.
+        normal: of the mirror.
+        place: a point on it [m].
+    """
+    n: DeviceArray = mi.Vector3d(normal)
+    n = n * dr.rsqrt(dr.squared_norm(n))
+    columns: list[DeviceArray] = [mi.Vector3d(*(line[column] for line in lines)) for column in range(4)]
+    turned = [reflected(column, n) for column in columns[:3]]
+    turned.append(columns[3] - n * (2 * dr.dot(n, columns[3] - mi.Vector3d(place))))
+    return [[column[row] for column in turned] for row in range(3)]
+
+
+def overlap(sonar: Sonar, apart: DeviceArray) -> DeviceArray:
+    """Return the amplitude that a beam has for a path whose ends are ``apart``, relative to a path in the middle of both.
+
+    Two beams of Gaussian main lobes, one steered to each end, make one in the middle times this. ``apart`` is a difference
+    of sines of the bearing.
+    """
+    ways = 1 if sonar.beam_pattern == "two_way" else 2
+    return dr.exp(dr.square(apart * (1 / sonar.beam_width_rad)) * (-HALF_LOG_2 * ways))
+
+
+# ---------------- Free water around vehicles: how near the nearest surface is, by a few rays from each, and who lies
+# below the ground
+
+
+AROUND = np.array([way for way in itertools.product((-1, 0, 1), repeat=3) if any(way)], dtype=float)
+"""Directions in which surfaces are sought: the faces, edges and corners of a cube."""
+
+
+class Clearance:
+    """Measures the clearance of vehicles, all in one launch.
+
+    Args:
+        tracer: of the scene.
+    """
+
+    def __init__(self, tracer: Tracer) -> None:
+        self.tracer = tracer
+        self._ways = AROUND / np.linalg.norm(AROUND, axis=1, keepdims=True)
+        self._launches: dict[int, Callable[..., Any]] = {}
+
+    def of(
+        self, before: NDArray[np.float64], after: NDArray[np.float64], time_s: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the distance of each place to the nearest surface in 26 directions and along the way there ``(n,)`` [m].
+
+        A surface that was passed on the way counts as a negative distance. Thin things between the directions are missed.
+
+        Args:
+            before: places that vehicles came from ``(n, 3)`` [m].
+            after: places where they are.
+            time_s: of each, for bodies that move ``(n,)`` [s].
+        """
+        count = len(after)
+        if self.tracer.deforms and count > 1:  # a launch has one shape of each body
+            each = (slice(number, number + 1) for number in range(count))
+            return np.concatenate([self.of(before[one], after[one], time_s[one]) for one in each])
+        way = after - before
+        gone = np.linalg.norm(way, axis=1)
+        ahead = np.where(gone[:, None] > 0, way / np.maximum(gone, 1e-12)[:, None], (0.0, 0.0, -1.0))
+        ways = np.concatenate([np.broadcast_to(self._ways, (count, *self._ways.shape)), ahead[:, None]], axis=1)
+        begin = np.concatenate([np.repeat(after[:, None], len(self._ways), axis=1), before[:, None]], axis=1)
+        if count not in self._launches:
+            self._launches[count] = Frozen(self._traced)
+        number = mi.Float(np.repeat(np.arange(count), ways.shape[1]).astype(np.float32).tolist())
+        rays = [mi.Float(part.ravel().astype(np.float32).tolist()) for part in (begin, ways)]
+        free = replayed(self._launches[count], self.tracer.scene_at(time_s), number, *rays)
+        distance = np.array(free, dtype=float).reshape(ways.shape[:2])
+        distance[:, -1] -= gone
+        return np.asarray(distance.min(axis=1))
+
+    def straight(self, places: NDArray[np.float64], way: tuple[float, float, float]) -> NDArray[np.float64]:
+        """Return the distance from each place ``(n, 3)`` to the surface in one direction ``(n,)`` [m], at time 0; or inf."""
+        begin = mi.Point3f(*(mi.Float(column.astype(np.float32).tolist()) for column in places.T))
+        found = free_way(self.tracer.scene_at(np.zeros(len(places))), mi.Ray3f(begin, mi.Vector3f(*way)))
+        return np.array(found, dtype=float)
+
+    @staticmethod
+    def _traced(scene: DeviceArray, number: mi.Float, begin: mi.Float, ways: mi.Float) -> DeviceArray:
+        """Trace the rays of all vehicles; a ray carries the number of its vehicle as its time."""
+        at = dr.arange(mi.UInt32, dr.width(number))
+        ray = mi.Ray3f(dr.gather(mi.Point3f, begin, at), dr.gather(mi.Vector3f, ways, at))
+        time: DeviceArray = number
+        ray.time = time
+        return free_way(scene, ray)
+
+
+SEA_SURFACE = "surface"
+"""Id of the shape that worlds give the sea above them: what lies below it is in the water."""
+
+
+class Buried(NamedTuple):
+    """A pose below the ground or inside an object.
+
+    Attributes:
+        frame: its number.
+        frames: number of all such poses.
+        text: what is wrong, in a sentence without its subject.
+        inside: whether it is inside an object.
+    """
+
+    frame: int
+    frames: int
+    text: str
+    inside: bool
+
+
+def buried_in(scene: mi.Scene, poses: NDArray[np.float64]) -> Buried | None:
+    """Find poses below the ground or inside an object: straight up a ray meets the back of a surface.
+
+    Below the ground there is nothing straight below; inside an object there is the back of the same shape. Surfaces whose
+    normals point down, and scenes that move, are not judged.
+
+    Args:
+        scene: that stands still.
+        poses: of the sonar or vehicle ``(n, 6)`` [m, rad].
+
+    Returns:
+        The first of them; None where all poses are in the water, or nothing shows that they are not.
+    """
+    places = np.asarray(poses, dtype=float)[:, :3]
+    begin = mi.Point3f(*(mi.Float(column.astype(np.float32).tolist()) for column in places.T))
+    above, below = (scene.ray_intersect(mi.Ray3f(begin, mi.Vector3f(0, 0, way))) for way in (1, -1))
+    roofed = np.array(above.is_valid()) & (np.array(above.n)[2] > 0)
+    open_below = ~np.array(below.is_valid())
+    if not roofed.any():
+        return None
+    shapes = [dr.reinterpret_array(mi.UInt32, found.shape) for found in (above, below)]
+    names = {
+        number: shape.id()
+        for shape in scene.shapes()
+        for number in np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))
+    }
+    up, down = (np.array(number) for number in shapes)
+    wet = np.array([names.get(int(number), "") == SEA_SURFACE for number in up])
+    inside = (up == down) & ~open_below & (np.array(below.n)[2] < 0)
+    wrong = np.flatnonzero(roofed & ~wet & (open_below | inside))
+    if not len(wrong):
+        return None
+    first = int(wrong[0])
+    x, y, z = places[first]
+    where, name = f"at ({x:g}, {y:g}, {z:g}) m", names.get(int(up[first]), "")
+    if inside[first]:
+        return Buried(
+            first, len(wrong), inside=True, text=f"{where} is inside {f'the shape {name}' if name else 'an object'}"
+        )
+    depth = float(np.array(above.t)[first])
+    ground = f"the ground, the shape {name}," if name else "the ground"
+    text = f"{where} is {depth:.3g} m below {ground} at z = {z + depth:.3g} m (z points up)"
+    return Buried(first, len(wrong), text, inside=False)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
+from typing import Any, NamedTuple, TypeAlias, Union
 
+import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
 from mitsonar.errors import MitsonarError
@@ -18,21 +19,32 @@ from mitsonar.instruments.sonar import Sonar, timed_path
 from mitsonar.instruments.sounder import Sounder, load_sonar, load_sounder, sonar_from
 from mitsonar.instruments.vehicle import SensorKeys, check_sensor_name, load_vehicle_recipe
 from mitsonar.motion.bodies import Moving, MovingBodies
-from mitsonar.motion.pose import Pose, mount_between, mounted, pose_from_to_world
+from mitsonar.motion.pose import Pose, mount_between, mounted, pose_from_to_world, to_world_matrices, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
+from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.records.frames import SonarFrames
 from mitsonar.records.responses import ImpulseResponses
 from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.channel import ChannelSimulator
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.moving_files import Said, motions_of
+from mitsonar.simulation.device import ensure_variant
+from mitsonar.simulation.moving import SceneMotion, SceneWatch, motion_in
+from mitsonar.simulation.scene import Said, motions_of
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.simulation.sounding import SounderSimulator
-from mitsonar.simulation.variant import ensure_variant
 
-if TYPE_CHECKING:
-    import mitsuba as mi
+__all__ = [
+    "CameraSimulator",
+    "Mounted",
+    "Record",
+    "VehicleFile",
+    "VehicleSimulator",
+    "camera_of",
+    "load_vehicle",
+    "refuse_path",
+    "sensors_in",
+    "told_of",
+]
 
-__all__ = ["Mounted", "Record", "VehicleFile", "VehicleSimulator", "load_vehicle", "refuse_path", "sensors_in"]
 
 Instrument: TypeAlias = Union[Sonar, Sounder, ChannelSonar, "mi.Sensor"]
 """What is mounted; a sensor of Mitsuba is a camera."""
@@ -129,7 +141,6 @@ class VehicleSimulator:
             return sounder.echogram(path) if instrument.kind == "sidescan" else sounder.soundings(path)
         if isinstance(instrument, ChannelSonar):
             return ChannelSimulator(self.scene, instrument).responses(path)
-        from mitsonar.simulation.camera import CameraSimulator
 
         return np.stack(list(CameraSimulator(self.scene, instrument, moving=bodies).pictures(path.poses, path.time_s)))
 
@@ -210,7 +221,6 @@ def _instrument(keys: SensorKeys, folder: Path, name: str) -> Instrument:
         return ChannelSonar.create(**{"name": name, **keys.hydrophones})
     assert keys.camera is not None
     ensure_variant()
-    from mitsonar.simulation.camera import camera_of
 
     return camera_of(keys.camera.fov_deg, keys.camera.width, keys.camera.height, keys.camera.samples)
 
@@ -218,3 +228,140 @@ def _instrument(keys: SensorKeys, folder: Path, name: str) -> Instrument:
 def _file(name: str, folder: Path) -> str:
     """Return the path of a YAML file beside the vehicle's, or a name as it is."""
     return str(folder / name) if name.lower().endswith((".yaml", ".yml")) else name
+
+
+# ---------------- Pictures of a camera on a vehicle: Mitsuba renders them, with the bodies of the scene where they
+# are at the time
+
+
+PATH_DEPTH = 8
+"""Bounces of light in a scene without an integrator of its own for cameras."""
+
+
+def camera_of(fov_deg: float, width: int, height: int, samples: int) -> mi.Sensor:
+    """Return a pinhole camera of Mitsuba; ``fov_deg`` is across the picture."""
+    pixel = "luminance" if "mono" in str(mi.variant()) else "rgb"
+    made = load_dict(
+        {
+            "type": "perspective",
+            "fov": fov_deg,
+            "fov_axis": "x",
+            "near_clip": 0.01,
+            "film": {"type": "hdrfilm", "width": width, "height": height, "pixel_format": pixel},
+            "sampler": {"type": "independent", "sample_count": samples},
+        }
+    )
+    assert isinstance(made, mi.Sensor)
+    return made
+
+
+class CameraSimulator:
+    """Renders what a camera of Mitsuba sees from poses in a scene.
+
+    The scene's integrator is used; without one, paths of light of at most 8 bounces. The samples a pixel are those of the
+    camera's sampler.
+
+    Args:
+        scene: with emitters.
+        camera: of Mitsuba, perspective or another.
+        moving: trajectories of bodies, as of :class:`mitsonar.Simulator`.
+
+    Raises:
+        MitsonarError: a scene without light.
+    """
+
+    def __init__(self, scene: mi.Scene, camera: mi.Sensor, *, moving: Moving | MovingBodies | None = None) -> None:
+        if not scene.emitters():
+            raise MitsonarError('a camera needs light: add an emitter to the scene, such as <emitter type="constant"/>')
+        self.camera, self._given = camera, (scene, moving)
+        self._watch = SceneWatch(scene)
+        self._build()
+        own = scene.integrator()
+        sees = own is not None and not type(own).__module__.startswith("mitsonar")
+        self.integrator = own if sees else load_dict({"type": "path", "max_depth": PATH_DEPTH})
+        self.samples = int(camera.sampler().sample_count())
+
+    def _build(self) -> None:
+        """Make the scene that is rendered: that given, or one with the bodies that move."""
+        scene, moving = self._given
+        self.motion = motion_in(scene, moving)
+        self.scene = scene if self.motion is None else _with_instances(scene, self.motion)
+
+    def pictures(self, poses: ArrayLike, time_s: ArrayLike, *, first: int = 0) -> Iterator[NDArray[np.uint8]]:
+        """Render pictures, one a pose: ``(height, width)`` or ``(height, width, 3)``, sRGB.
+
+        Args:
+            poses: of the camera ``(pictures, 6)`` [m, rad]; it looks ahead.
+            time_s: of the pictures ``(pictures,)`` [s].
+            first: number of the first, of which the noise of rendering is a function.
+        """
+        if self._watch.changed() is not None and self.motion is not None:
+            self._build()
+        table, time = np.atleast_2d(np.asarray(poses, dtype=float)), np.atleast_1d(np.asarray(time_s, dtype=float))
+        grey = "mono" in str(mi.variant())
+        place = mi.Transform4f(self.camera.world_transform().matrix)
+        try:
+            for number, (pose, now) in enumerate(zip(table, time, strict=True), first):
+                if self.motion is not None:
+                    _place(self.scene, self.motion, float(now))
+                _turn(self.camera, mi.Transform4f(to_world_matrices(pose)[0].tolist()))
+                picture = self._picture(number)
+                yield picture[..., 0] if grey and picture.ndim == 3 else picture
+        finally:
+            _turn(self.camera, place)  # a scene's camera stays where the scene has it
+
+    def _picture(self, number: int) -> NDArray[np.uint8]:
+        """Render the scene as it is now; ``number`` seeds the noise of rendering."""
+        module: Any = mi  # its types lack conversions of seeds and films
+        film = module.render(self.scene, sensor=self.camera, integrator=self.integrator, spp=self.samples, seed=number)
+        return np.array(module.util.convert_to_bitmap(film))
+
+
+def told_of(camera: mi.Sensor) -> dict[str, str]:
+    """Return what tells a camera again, but for its place."""
+    values: Any = mi.traverse(camera)
+    told = {name: str(values[name]) for name in values.keys() if not name.endswith("to_world")}  # noqa: SIM118  no dict
+    return told | {"type": type(camera).__name__}
+
+
+def _turn(camera: mi.Sensor, to_world: mi.Transform4f) -> None:
+    """Put a camera at a place."""
+    values = mi.traverse(camera)
+    values["to_world"] = to_world
+    values.update()
+
+
+def _with_instances(scene: mi.Scene, motion: SceneMotion) -> mi.Scene:
+    """Return the scene with an instance for each body that moves."""
+    parts: dict[str, Any] = {"type": "scene"}
+    for number, emitter in enumerate(scene.emitters()):
+        if emitter.get_shape() is None:
+            parts[f"emitter{number}"] = emitter
+    for number, shape in enumerate(motion.shapes):
+        if shape.id() in motion.numbers:
+            parts[f"group{number}"] = {"type": "shapegroup", "shape": shape}
+        else:
+            parts[f"shape{number}"] = shape
+    for body, name in enumerate(motion.bodies.shapes):
+        group = {"type": "ref", "id": f"group{motion.numbers[name]}"}
+        parts[f"body{body}"] = {"type": "instance", "group": group}
+    names = [shape.id() for shape in motion.shapes]
+    made = load_dict(parts, optimize=False)
+    for shape, name in zip(motion.shapes, names, strict=True):
+        shape.set_id(name)  # the loader has changed it
+    assert isinstance(made, mi.Scene)
+    return made
+
+
+def _place(scene: mi.Scene, motion: SceneMotion, time_s: float) -> None:
+    """Move the instances, and the vertices of what deforms, to where they are at a time [s]."""
+    values: Any = mi.traverse(scene)
+    for one in motion.deformed:
+        group = f"group{motion.numbers[one.mesh.id()]}."
+        (key,) = [key for key in values.keys() if key.startswith(group) and key.endswith("vertex_positions")]  # noqa: SIM118
+        values[key] = mi.Float(one.vertices(time_s).ravel().tolist())
+    for body, pose in enumerate(motion.bodies.poses(time_s)[0]):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = vehicle_rotation(pose).as_matrix()[0], pose[:3]
+        values[f"body{body}.to_world"] = mi.Transform4f(matrix.tolist())
+    values.update()

@@ -23,7 +23,7 @@ from mitsonar.datasets.scene_rendering import calibrate
 from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import digest
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.device import ensure_variant
 from mitsonar.training.training_types import Array, Batch, JsonObject, RawSample
 
 if TYPE_CHECKING:

@@ -263,16 +263,16 @@ def test_two_arrays_differ_by_their_rms_part() -> None:
 
 
 def test_cufinufft_that_does_not_load_is_done_without(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from mitsonar.simulation import nonuniform_fft
+    from mitsonar.simulation import beams
 
     (tmp_path / "cufinufft.py").write_text("raise ImportError('Could not find cufinufft library in system path')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "cufinufft", raising=False)
-    nonuniform_fft._has_cufinufft.cache_clear()
+    beams._has_cufinufft.cache_clear()
     try:
-        assert not nonuniform_fft._has_cufinufft()
+        assert not beams._has_cufinufft()
     finally:
-        nonuniform_fft._has_cufinufft.cache_clear()
+        beams._has_cufinufft.cache_clear()
 
 
 def test_rows_are_those_of_the_tables() -> None:

@@ -35,7 +35,7 @@ DRIVEN = np.tile([0.012, 0.009, np.radians(0.3)], (11, 1))
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
     """A run's folder: twelve frames over a floor of noise, rendered, 15 mm and 0.3 deg a frame."""
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     texture = {"type": "cell_noise", "cells": 1000, "seed": 3}
     path = path_of(DRIVEN, Pose.from_degrees([0.3, -1.0, 2.5, 35, 0, 20]), np.arange(12) / 10)

@@ -21,9 +21,9 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames, to_uint8
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.render_run import Outputs, StoredEchoes, run
+from mitsonar.simulation.runs import Outputs, StoredEchoes, run
 from mitsonar.simulation.scene import load_scene, shipped_scenes, shipped_trajectory, sonar_in
+from mitsonar.simulation.simulator import Simulator
 
 SENSOR = """<sensor type="imaging_sonar">
   <integer name="beams" value="16"/><integer name="rays_per_beam" value="60"/><integer name="rays_across" value="2"/>
@@ -253,7 +253,7 @@ def test_a_killed_run_leaves_whole_frames_and_resumes_to_the_same_bits(
 
 
 def test_a_long_run_stays_zarr(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import mitsonar.simulation.render_run as runs
+    import mitsonar.simulation.runs as runs
 
     simulator = Simulator(load_scene(scene))
     path = Trajectory(np.tile([0, 0, 2.5, np.radians(35), 0, 0], (5, 1)), np.arange(5.0))

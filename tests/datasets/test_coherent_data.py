@@ -14,7 +14,7 @@ from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.scene_rendering import instrument_in
 from mitsonar.datasets.store import DataStore
-from mitsonar.simulation.rendered_pings import to_image
+from mitsonar.simulation.pings import to_image
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside|.*too few for")]
 

@@ -34,8 +34,8 @@ from mitsonar.io.storage import Storage
 from mitsonar.motion.pose import mounted
 from mitsonar.plotting.figures import info, sheet_figure
 from mitsonar.records.frames import to_uint8
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -25,9 +25,9 @@ from mitsonar.estimation.crlb.crlb_subject import subject_of_data
 from mitsonar.estimation.crlb.image_crlb import bounds_at
 from mitsonar.records.frames import to_uint8
 from mitsonar.simulation.channel import ChannelSimulator
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.rendered_pings import to_image
+from mitsonar.simulation.pings import to_image
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside|.*too few for|.*holds")]
 

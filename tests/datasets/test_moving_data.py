@@ -15,9 +15,9 @@ from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.records.frames import to_uint8
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.rendered_pings import to_image
+from mitsonar.simulation.pings import to_image
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside")]
 

@@ -16,8 +16,8 @@ from mitsonar.environments.sonar_task import SonarTask, TaskFields
 from mitsonar.environments.sonar_vector_env import SonarVectorEnv
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 
 SONAR = Sonar(model="physical", beams=16, range_bins=32, range_min=1, range_max=8, quality="draft")
 START = [[-4, -6, 2, 0.4, 0, -0.5], [4, -4, 3, 0.5, 0, 0.5]]

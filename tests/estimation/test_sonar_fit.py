@@ -31,7 +31,7 @@ class Made(dict[str, SonarFrames]):
         import warnings
 
         from mitsonar.errors import MitsonarWarning
-        from mitsonar.simulation.imaging import Simulator
+        from mitsonar.simulation.simulator import Simulator
 
         loaded = scene(floor=floor(diffuse(0.3)), buoy=sphere((0.15, 1.75, 1.27), 0.06, diffuse(1.0)))
         poses = np.array([0, 0, 2.5, math.radians(35), 0, 0]) + np.arange(6)[:, None] * np.array([0.06, 0.02, 0, 0, 0, 0])

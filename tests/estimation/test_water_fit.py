@@ -31,7 +31,7 @@ def deep(variant: str) -> mi.Scene:
 
 def recorded(deep: mi.Scene, height: float, step: tuple[float, float] = (0, 0), **fields: Any) -> SonarFrames:
     """Six frames above the floor, whose sonar says nothing of the water."""
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     poses = np.array([0, 0, height, math.radians(35), 0, 0]) + np.arange(6)[:, None] * np.array([*step, 0, 0, 0, 0])
     with warnings.catch_warnings():

@@ -589,8 +589,8 @@ def test_visible_labels_reach_beyond_the_half_power_beam(variant: str) -> None:
     """A sphere 9 deg above the axis of a beam that is 12 deg wide: pictures show it, and so do these labels."""
     from helpers import floor, scene, sphere
 
-    from mitsonar.simulation.imaging import Simulator
-    from mitsonar.simulation.labels import labels_above
+    from mitsonar.simulation.pings import labels_above
+    from mitsonar.simulation.simulator import Simulator
 
     words: dict[str, Any] = {"azimuth_fov_deg": 30, "elevation_fov_deg": 12, "range_min": 1, "range_max": 5}
     sonar = Sonar(beams=32, range_bins=100, model="physical", pattern="two_way", frequency_hz=9e5, quality="draft", **words)

@@ -11,7 +11,7 @@ from helpers import diffuse, floor, floor_levels, scene
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import RAYS, Sonar
 from mitsonar.instruments.sounder import load_sonar, named_sonars, preset, sonar_from
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 
 @pytest.mark.parametrize("name", named_sonars())

@@ -23,7 +23,7 @@ from mitsonar.instruments.sonar import (
     rays_over_elevation,
 )
 from mitsonar.instruments.sounder import load_sonar, named_sonars, preset, sonar_from
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 PINGS = 4
 BEAMS = 12

@@ -35,8 +35,8 @@ from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fans import FanPictures
 from mitsonar.records.frames import SonarFrames, to_uint8
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 
 START = Pose(-3.4, -4.6, 2.2, float(np.radians(25)))
 TOPICS = ("/sonar/fan", "/sonar/image", "/sonar/timing")

@@ -20,7 +20,7 @@ from mitsonar.live.sonar_messages import FanEncoder
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.scene_triangles import Triangles, triangles_in
+from mitsonar.simulation.scene import Triangles, triangles_in
 
 FRAMES = 20
 SONAR = Sonar(beams=12, range_bins=30)

@@ -106,8 +106,8 @@ def test_a_resumed_run_has_the_same_profile(source: FrameSource, tmp_path: Path)
 def test_a_slope_shows_at_constant_depth(tmp_path: Path, variant: str) -> None:
     """Ground that rises forward by 10 deg: where first echoes put it is within their standard deviation of it."""
     from mitsonar.instruments.sounder import load_sonar
-    from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
+    from mitsonar.simulation.simulator import Simulator
     from mitsonar.worlds.families import Pattern
     from mitsonar.worlds.world import sloped
 

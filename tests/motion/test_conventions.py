@@ -151,8 +151,8 @@ def test_mitsonars_own_files_keep_their_bytes(tmp_path: Path) -> None:
 
 
 def test_all_conventions_and_files_give_the_same_picture(variant: str, tmp_path: Path) -> None:
-    from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene, sonar_in
+    from mitsonar.simulation.simulator import Simulator
 
     loaded = load_scene("flat_floor")
     found = sonar_in(loaded)

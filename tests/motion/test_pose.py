@@ -15,7 +15,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.pose import Pose, mounted, pose_from_to_world, to_world_matrices
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.simulation.ping_moments import moments_of
+from mitsonar.simulation.pings import moments_of
 
 RIGHT_ANGLE = np.pi / 2
 

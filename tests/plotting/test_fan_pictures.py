@@ -57,7 +57,7 @@ def test_labels_are_never_mixed() -> None:
 
 @pytest.mark.usefixtures("variant")
 def test_labels_name_shapes_and_leave_out_faint_pixels() -> None:
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     world = scene(far=sphere([0, 5, 0], 0.8), near=sphere([0.2, 3, 0], 0.2))
     simulator = Simulator(world, SONAR)

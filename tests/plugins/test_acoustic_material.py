@@ -15,8 +15,8 @@ from helpers import MitsubaDict, diffuse, essence, floor, scene
 from mitsonar.acoustics.materials import GRAZING_DEG, material, mu_at, mu_table, sigma_at, sigma_table, single_mu
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -14,7 +14,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Receiver
 from mitsonar.motion.pose import Pose
 from mitsonar.records.echoes import CHANNELS
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -45,7 +45,7 @@ def simulator(sonar: ChannelSonar, **shapes: Any) -> ChannelSimulator:
 
 
 def scatterers_of(made: ChannelSimulator) -> Scatterers:
-    from mitsonar.simulation.channel_tracing import _WorldScatterers
+    from mitsonar.simulation.scatterers import _WorldScatterers
 
     assert isinstance(made.tracer.source, _WorldScatterers)
     return made.tracer.source.scatterers

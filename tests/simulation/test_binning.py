@@ -17,8 +17,8 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.rendered_pings import RenderedPings
+from mitsonar.simulation.pings import RenderedPings
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -165,7 +165,7 @@ def test_threads_may_change_between_launches() -> None:
     """A launch recorded on one thread is replayed on two; in its own interpreter, lest it overruns memory."""
     run_python("""
         import drjit as dr, mitsonar, numpy as np
-        from mitsonar.simulation.variant import ensure_variant
+        from mitsonar.simulation.device import ensure_variant
         ensure_variant("llvm_ad_mono")
         import mitsuba as mi
         floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100), "bsdf": {"type": "diffuse"}}

@@ -12,7 +12,7 @@ from helpers import Array, diffuse, essence, floor, plate, scene, sphere
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Segment
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -10,7 +10,7 @@ import pytest
 from helpers import Array, diffuse, essence, floor, plate, scene, sphere
 
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi

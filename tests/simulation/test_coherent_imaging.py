@@ -20,15 +20,15 @@ from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.beams import Pulse, series, shaded_sinc
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose, to_world_matrices
-from mitsonar.simulation import beam_former
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation import beams
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.families import RockyField
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.coherent_imaging import CoherentImager
+    from mitsonar.simulation.coherent import CoherentImager
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
 
@@ -131,7 +131,7 @@ def test_rocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     )
     assert np.corrcoef(one.ravel(), other.ravel())[0, 1] > 0.97
     with monkeypatch.context() as patch:
-        patch.setattr(beam_former, "COLUMNS_A_BEAM", {"standard": 8})
+        patch.setattr(beams, "COLUMNS_A_BEAM", {"standard": 8})
         twice = np.abs(imager(loaded).image(POSE, 0)[0]) ** 2
     assert np.corrcoef(one.ravel(), twice.ravel())[0, 1] > 0.98
     places = POSE + np.arange(8)[:, None] * np.array([0.2, 0.15, 0, 0, 0, 0])

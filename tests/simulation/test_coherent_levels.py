@@ -15,7 +15,7 @@ from scipy.ndimage import uniform_filter
 from mitsonar.acoustics.water import gain_of, sonar_absorption
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import named_sonars, preset
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -16,7 +16,7 @@ from mitsonar.instruments.views import Segment, View
 from mitsonar.motion.pose import Pose, mounted
 
 if TYPE_CHECKING:
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -34,7 +34,7 @@ def pose_at(x: float = 0.0) -> Array:
 
 
 def simulator(loaded: object, names: Sequence[str], sonar: Sonar = SONAR) -> Simulator:
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     views: list[View] = [Segment(sonar, name) for name in names]
     return Simulator(loaded, sonar, views=views)  # type: ignore[arg-type]
@@ -48,7 +48,7 @@ def levels(source: Simulator, poses: Array) -> list[NDArray[np.float32]]:
 
 def test_both_sides_add_up_to_the_whole() -> None:
     """Every point is on one side, so the fields add up, up to the rounding of single precision."""
-    from mitsonar.simulation.coherent_imaging import CoherentImager
+    from mitsonar.simulation.coherent import CoherentImager
 
     loaded = scene(floor=floor(), box=box([0.3, 0.2, 0.1], [0.1, 0.2, 0.1]))
     whole, rays = CoherentImager(loaded, SONAR).image(pose_at(), 0)
@@ -110,7 +110,7 @@ def test_what_has_no_portions_is_refused() -> None:
         simulator(loaded, ["q1", "c1"])
     with pytest.raises(MitsonarError, match="portions have no labels"):
         list(simulator(loaded, ["q1"]).render_views(pose_at()[None], labels=True))
-    from mitsonar.simulation.coherent_imaging import CoherentImager
+    from mitsonar.simulation.coherent import CoherentImager
 
     with pytest.raises(MitsonarError, match="mirrors are of whole views: got q1"):
         CoherentImager(loaded, SONAR, {"floor": (0.5, 0.001)}, [Segment(SONAR, "q1")])

@@ -12,8 +12,8 @@ from helpers import diffuse, floor, scene, sphere
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import FrameStore, SonarFrames
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.render_run import Outputs, run
+from mitsonar.simulation.runs import Outputs, run
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -14,9 +14,9 @@ from mitsonar.errors import MitsonarError
 from mitsonar.motion.bodies import Deforming
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.simulation.camera import CameraSimulator, camera_of
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.moving_files import load_meshes
+from mitsonar.simulation.scene import load_meshes
+from mitsonar.simulation.simulator import Simulator
+from mitsonar.simulation.vehicle import CameraSimulator, camera_of
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
 
@@ -41,7 +41,7 @@ def first_range(image: Array, range_m: Array) -> float:
 
 
 def test_clearances_are_of_the_shape_at_the_time_of_each_vehicle(balls: list[Path]) -> None:
-    from mitsonar.simulation.clearance import Clearance
+    from mitsonar.simulation.tracing import Clearance
 
     growing = Deforming(fixed(Pose(0, AWAY_M, 0)), load_meshes(balls, 1.0, loop=False))
     scene = separate(ball={"type": "ply", "filename": str(balls[0])})

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from helpers import run_python
 
-from mitsonar.simulation.device_arrays import padded
+from mitsonar.simulation.device import padded
 
 AT_THE_END = """
 import ctypes, sys
 import numpy as np
 import mitsuba as mi
-from mitsonar.simulation.device_arrays import padded
+from mitsonar.simulation.device import padded
 
 mi.set_variant("llvm_ad_mono")
 import drjit as dr

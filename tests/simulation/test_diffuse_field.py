@@ -10,7 +10,7 @@ import pytest
 from helpers import diffuse, essence, floor, plate, scene
 
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -32,7 +32,7 @@ def basin(variant: str) -> mi.Scene:
 @pytest.mark.thorough
 def test_the_mean_is_that_of_the_model_physical(basin: mi.Scene, pattern: str, bounces: int) -> None:
     """Sums over all beams in six parts of the range: 12 % each, 4 % of all."""
-    from mitsonar.simulation.coherent_imaging import CoherentImager
+    from mitsonar.simulation.coherent import CoherentImager
 
     sonar = SONAR.replace(pattern=pattern, bounces=bounces)
     expected = sonar.replace(model="physical", coding="linear")

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from mitsonar.errors import MitsonarWarning
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
-from mitsonar.simulation.empty_frames import angle_hint, empty_frames, view_of
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.pings import angle_hint, empty_frames, view_of
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -89,7 +89,7 @@ def test_the_command_line_warns_of_a_black_picture(mitsonar: Command, tmp_path: 
 @pytest.mark.usefixtures("variant")
 def test_poses_below_the_ground_and_inside_objects_are_found() -> None:
     """A hull seen from below, and the water below a sea surface, are no ground above."""
-    from mitsonar.simulation.clearance import buried_in
+    from mitsonar.simulation.tracing import buried_in
 
     bed = separate(floor=floor(), ball=sphere((0, 3, 1), 0.5), surface=plate((0, 0, 9), (0, 0, 1)))
     poses = np.array([Pose(0, 0, 2.5), Pose(1, 2, -2.5), Pose(0, 3, 1.1)])

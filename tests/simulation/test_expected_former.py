@@ -13,7 +13,7 @@ from mitsonar.acoustics.water import sonar_absorption
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import named_sonars, preset
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi

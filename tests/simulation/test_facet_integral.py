@@ -11,7 +11,7 @@ from helpers import essence
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from mitsonar.simulation.facet_integral import FacetEchoes
+    from mitsonar.simulation.mirror_paths import FacetEchoes
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -31,8 +31,8 @@ def facets(half: float, cells: int) -> NDArray[np.float64]:
 
 def echo(corners: NDArray[np.float64], height: float = 0.0, carrier: float = CARRIER) -> tuple[complex, FacetEchoes]:
     """Sum of all facets at the carrier, and the echoes."""
-    from mitsonar.simulation.facet_integral import facet_echoes
-    from mitsonar.simulation.mirror_planes import MirrorFacets
+    from mitsonar.simulation.mirror_paths import facet_echoes
+    from mitsonar.simulation.mirrors import MirrorFacets
 
     found = facet_echoes(MirrorFacets("waves", corners, -1.0, height), SENT_FROM, HEARD_AT, STILL, carrier, C)
     return complex((found.amplitude * np.exp(-2j * np.pi * carrier * found.delay)).sum()), found
@@ -40,7 +40,7 @@ def echo(corners: NDArray[np.float64], height: float = 0.0, carrier: float = CAR
 
 def test_the_mean_phase_of_a_triangle_is_that_of_a_fine_sum() -> None:
     """Slow, fast, degenerate and constant phases; 1e-3 is the sum's own error, 1e-9 that of the series."""
-    from mitsonar.simulation.facet_integral import phase_mean
+    from mitsonar.simulation.mirror_paths import phase_mean
 
     grid = (np.arange(900) + 0.5) / 900
     u, v = (axis.ravel() for axis in np.meshgrid(grid, grid))

@@ -30,14 +30,14 @@ def test_frequency_response_is_the_direct_sum(carrier: float) -> None:
 
 @pytest.mark.gpu
 def test_sums_on_the_device_are_those_of_the_host() -> None:
-    from mitsonar.simulation import nonuniform_fft
+    from mitsonar.simulation import beams
 
     pytest.importorskip("cufinufft")
     rng = np.random.default_rng(0)
     turn, strength = rng.uniform(-np.pi, np.pi, 5000), rng.normal(size=(5000, 2)) @ np.array([1, 1j])
     k = np.arange(-360, 361)
     direct = np.exp(-1j * np.outer(k, turn)) @ strength
-    assert np.abs(nonuniform_fft._on_the_device(turn, strength, 721) - direct).max() < 1e-7 * np.abs(direct).max()
+    assert np.abs(beams._on_the_device(turn, strength, 721) - direct).max() < 1e-7 * np.abs(direct).max()
 
 
 def test_response_is_the_sum_of_pulses_and_nothing_wraps() -> None:

@@ -10,7 +10,7 @@ from coherent_scenes import one_point
 from helpers import Array, diffuse, essence, plate, separate
 
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
 
@@ -25,7 +25,7 @@ SURFACE = 0.8
 
 def fields(mirror: tuple[float, float], sonar: Sonar) -> tuple[complex, complex, complex, Array]:
     """The sums of the waves of one point: seen straight, by way of the surface, and by it both ways; the point's place."""
-    from mitsonar.simulation.coherent_imaging import CoherentImager
+    from mitsonar.simulation.coherent import CoherentImager
 
     _, fields, at = one_point()
     own = sonar.replace(**fields)
@@ -37,7 +37,7 @@ def fields(mirror: tuple[float, float], sonar: Sonar) -> tuple[complex, complex,
     direct = complex(imager.tracer.field(np.zeros(6))[0].astype(complex).sum())
     found = []
     for bounces in (2, 3):
-        from mitsonar.simulation.ghost_tracing import GhostTracer
+        from mitsonar.simulation.multipath_coherent import GhostTracer
 
         tracer = imager.tracer
         tracer.sonar = own.replace(bounces=bounces)
@@ -95,7 +95,7 @@ def test_mirrored_rays_see_the_image() -> None:
     """The rows of a sonar mirrored at z = 1: the image of the origin lies at z = 2, up is down."""
     import mitsuba as mi
 
-    from mitsonar.simulation.reflections import mirrored_lines
+    from mitsonar.simulation.tracing import mirrored_lines
 
     lines = [[mi.Float64(float(i == j)) for j in range(4)] for i in range(3)]
     found = mirrored_lines(lines, mi.Normal3f(0, 0, -1), mi.Point3f(7, 8, 1))

@@ -11,7 +11,7 @@ from helpers import box, diffuse, floor, place_of, scene
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -18,8 +18,8 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.tally import Tally
+from mitsonar.simulation.pings import Tally
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -351,7 +351,7 @@ def test_python_may_collect_garbage_at_any_time() -> None:
     process, for Dr.Jit cannot record it."""
     run_python("""
         import gc, mitsonar
-        from mitsonar.simulation.variant import ensure_variant
+        from mitsonar.simulation.device import ensure_variant
         ensure_variant("llvm_ad_mono")
         import mitsuba as mi
         gc.set_threshold(10**9)  # only where this test collects

@@ -18,7 +18,7 @@ from mitsonar.motion.pose import Pose, to_world_matrices
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.lattice_points import SurfacePoints
+    from mitsonar.simulation.points import SurfacePoints
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -44,7 +44,7 @@ POSE = Pose(0.3, -0.2, 2.0, pitch=np.radians(30), heading=np.radians(20))
 
 
 def points_of(shape: mi.Shape, number: int = 0, seed: int = 0) -> SurfacePoints:
-    from mitsonar.simulation.lattice_points import lattice_points
+    from mitsonar.simulation.points import lattice_points
 
     return lattice_points(shape, number, PITCH, seed)
 
@@ -107,7 +107,7 @@ def spread_over_grid(points: SurfacePoints, tracer: Any) -> NDArray[np.complex12
     cosine = np.abs((points.normal * way).sum(axis=1)) / range_m
     import mitsuba as mi
 
-    from mitsonar.simulation.elevation_pattern import elevation_gain
+    from mitsonar.simulation.beams import elevation_gain
 
     gain = np.array(elevation_gain(sonar, mi.Float(tangent.astype(np.float32))), dtype=float)
     size = np.sqrt(points.strength.astype(float)) * cosine / range_m**2 * gain
@@ -127,8 +127,8 @@ def spread_over_grid(points: SurfacePoints, tracer: Any) -> NDArray[np.complex12
 def test_images_and_impulse_responses_have_one_field(scenery: str) -> None:
     """The points that a channel sonar stores, summed here in NumPy, give the field that the imaging sonar's rays find."""
     from mitsonar.simulation.channel import ChannelSimulator
-    from mitsonar.simulation.imaging import Simulator
-    from mitsonar.simulation.lattice_points import SurfacePoints
+    from mitsonar.simulation.points import SurfacePoints
+    from mitsonar.simulation.simulator import Simulator
 
     shapes = {"floor": {"floor": floor(diffuse(0.4), 8.0)}}
     shapes["corner"] = {"ground": shapes["floor"]["floor"], "wall": plate((1, 5.5, 0), (-0.2, -1, 0.1), 6.0, diffuse(0.3))}
@@ -152,7 +152,7 @@ def test_images_and_impulse_responses_have_one_field(scenery: str) -> None:
 def test_patches_vary_by_a_gamma_law() -> None:
     """The same points and phases; factors of mean 1 whose variance is that of the patches, 9 / 4 nu."""
     plain = found(plate((0, 0, 0), (0, 0, 1), 4.0))
-    from mitsonar.simulation.lattice_points import Patches, lattice_points
+    from mitsonar.simulation.points import Patches, lattice_points
 
     nu = 2.0
     body = scene(body=plate((0, 0, 0), (0, 0, 1), 4.0)).shapes()[0]

@@ -13,13 +13,13 @@ from helpers import Array, box, diffuse, essence, floor, plate, scene, sphere
 from mitsonar.acoustics.materials import Material, material, mirror_amplitude
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.coherent_imaging import CoherentImager
-    from mitsonar.simulation.mirror_tracing import MirrorTracer
+    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.multipath_coherent import MirrorTracer
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
 
@@ -33,7 +33,7 @@ STILL = np.zeros(6)
 
 
 def imager(loaded: mi.Scene, sonar: Sonar = SONAR, **mirrors: tuple[float, float] | Material) -> CoherentImager:
-    from mitsonar.simulation.coherent_imaging import CoherentImager
+    from mitsonar.simulation.coherent import CoherentImager
 
     return CoherentImager(loaded, sonar, mirrors)
 
@@ -143,13 +143,13 @@ def test_target_strength_is_read_from_an_image(words: dict[str, float | str]) ->
 
 def test_coarse_cells_are_warned_of() -> None:
     """The sonar's cells are 6.5 mm, half the Fresnel radius of a sphere of 5 cm is 2.3 mm; divided, none is too large."""
-    from mitsonar.simulation.mirror_tracing import MirrorTracer
+    from mitsonar.simulation.multipath_coherent import MirrorTracer
 
     source = tracer(scene(ball=sphere([0, 5.05, 0], 0.05)), ball=(1.0, 0.0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         source.field(STILL)
-    from mitsonar.simulation.mirror_parts import mirror_of
+    from mitsonar.simulation.mirrors import mirror_of
 
     mirrors = mirror_of(source.scene, {"ball": (1.0, 0.0)})
     assert mirrors is not None
@@ -243,7 +243,7 @@ def test_mistakes_are_one_sentence() -> None:
 
 def test_materials_bring_their_mirror_parts(variant: str) -> None:
     """Steel named in the scene is the mirror that its numbers make, and scatters the rest once."""
-    from mitsonar.simulation.mirror_parts import mirror_of
+    from mitsonar.simulation.mirrors import mirror_of
 
     steel = {"type": "acoustic_material", "material": "steel"}
     loaded = scene(plate=plate((0, 5, 0), (0, -1, 0), half=0.05, bsdf=steel))

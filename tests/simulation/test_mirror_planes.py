@@ -20,7 +20,7 @@ from mitsonar.worlds.world import Mesh
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.mirror_planes import FlatMirrors
+    from mitsonar.simulation.mirrors import FlatMirrors
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -44,8 +44,7 @@ def instrument(**words: object) -> ChannelSonar:
 
 
 def mirrors_of(scene: mi.Scene, reflection: float = -1.0, height: float = 0.0) -> FlatMirrors:
-    from mitsonar.simulation.mirror_parts import mirror_of
-    from mitsonar.simulation.mirror_planes import flat_mirrors
+    from mitsonar.simulation.mirrors import flat_mirrors, mirror_of
 
     return flat_mirrors(scene, mirror_of(scene, {"surface": (reflection, height)}))
 
@@ -117,7 +116,7 @@ def strongest(paths: Any) -> tuple[float, complex]:
 
 def test_single_echoes_of_waves_are_kirchhoffs_integral(tmp_path: Path) -> None:
     """Where no crest is in the way, the sum of all facets at every frequency; over a sea it differs from the flat one."""
-    from mitsonar.simulation.facet_integral import facet_echoes
+    from mitsonar.simulation.mirror_paths import facet_echoes
 
     scene = unmerged(surface=loaded(SEA.surface(5), tmp_path))
     roughness = SEA.state.roughness_m

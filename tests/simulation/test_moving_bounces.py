@@ -14,7 +14,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside|.*send on more")]
 
@@ -81,9 +81,9 @@ def test_a_moved_body_is_one_built_there(changes: dict[str, Any]) -> None:
 
 def test_a_moving_point_has_the_ghosts_of_image_sources() -> None:
     """Amplitudes and phases in closed form where the body has gone to: 1 % and 0.03 rad; the point goes with the body."""
-    from mitsonar.simulation.coherent_imaging import CoherentImager
-    from mitsonar.simulation.ghost_tracing import GhostTracer
-    from mitsonar.simulation.moving_scene import motion_in
+    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.moving import motion_in
+    from mitsonar.simulation.multipath_coherent import GhostTracer
 
     height, speed = 0.8, np.array([0.02, 0.3, -0.1])
     _, changes, at = one_point()

@@ -12,8 +12,8 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     pass

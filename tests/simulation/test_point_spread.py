@@ -13,7 +13,7 @@ from helpers import Array, essence
 
 from mitsonar.instruments.beams import Pattern
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.beam_former import elevation_end
+from mitsonar.simulation.beams import elevation_end
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
 
@@ -116,7 +116,7 @@ def test_law_over_elevation_to_the_second_side_lobe(pattern: Pattern, ways: int)
     """The law itself, beyond the fan: tops of both side lobes, -13.26 and -17.83 dB one way, within 0.02 dB."""
     import mitsuba as mi
 
-    from mitsonar.simulation.elevation_pattern import elevation_gain
+    from mitsonar.simulation.beams import elevation_gain
 
     sonar = SONAR.replace(elevation_pattern=pattern, elevation_fov_deg=6.0)
     angle = np.radians(np.linspace(-30, 30, 3001))

@@ -91,7 +91,7 @@ def test_energy_is_that_of_the_imaging_sonar() -> None:
     The mean over 12 headings, since the power |zeta|^2 of each of the 40,000 points in view is drawn.
     """
     from mitsonar.instruments.sonar import Sonar
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     field = FieldOfView(tilt_deg=40.0, across_deg=20.0, along_deg=30.0, taper=0.0)
     sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=field),), points_per_m2=2000.0)

@@ -11,8 +11,15 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar, named_sonars
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.simulation.moving_files import said_by
-from mitsonar.simulation.scene import find_scene, load_scene, scale_notes, shipped_scenes, shipped_trajectory, sonar_in
+from mitsonar.simulation.scene import (
+    find_scene,
+    load_scene,
+    said_by,
+    scale_notes,
+    shipped_scenes,
+    shipped_trajectory,
+    sonar_in,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 

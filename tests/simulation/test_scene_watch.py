@@ -16,7 +16,7 @@ from mitsonar.instruments.sounder import load_sounder
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.channel import ChannelSimulator
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.simulation.sounding import SounderSimulator
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from helpers import diffuse, plate, separate, sphere
 from test_bounce_sums import ball
 
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
 
@@ -65,9 +65,9 @@ def test_one_point_has_the_ghost_of_two_image_sources(pattern: str, second: tupl
 
     An array that sends too hears mirrors above and below; others a wall aside as well.
     """
-    from mitsonar.simulation.coherent_imaging import CoherentImager
-    from mitsonar.simulation.ghost_tracing import GhostTracer
-    from mitsonar.simulation.mirror_parts import mirror_of
+    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.mirrors import mirror_of
+    from mitsonar.simulation.multipath_coherent import GhostTracer
 
     _, changes, at = one_point()
     foot, height = np.array(second, dtype=float), np.array([0, 0, 0.8])
@@ -94,8 +94,7 @@ def test_one_point_has_the_ghost_of_two_image_sources(pattern: str, second: tupl
 
 
 def test_one_mirror_has_no_second() -> None:
-    from mitsonar.simulation.mirror_parts import mirror_of
-    from mitsonar.simulation.second_mirrors import SecondMirrors, second_notes
+    from mitsonar.simulation.mirrors import SecondMirrors, mirror_of, second_notes
 
     loaded = separate(
         **{f"wall{k}": plate((k + 1, 0, 0), (-1, 0, 0)) for k in range(9)}, ball=sphere((0, 3, 0), 0.1, diffuse(0.3))

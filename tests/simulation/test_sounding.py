@@ -12,8 +12,7 @@ from mitsonar.instruments.sounder import Sounder, load_sounder
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.soundings import velocity_of
-from mitsonar.simulation.dvl import dvl_readings
-from mitsonar.simulation.sounding import SounderSimulator
+from mitsonar.simulation.sounding import SounderSimulator, dvl_readings
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
 

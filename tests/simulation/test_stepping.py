@@ -19,7 +19,7 @@ from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.channel import ChannelSimulator
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi

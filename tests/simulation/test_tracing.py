@@ -25,8 +25,8 @@ from helpers import (
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose, to_world_matrices
 from mitsonar.records.echoes import CHANNELS, Echoes
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import sonar_in
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -10,7 +10,7 @@ import pytest
 from helpers import run_python
 
 from mitsonar.errors import MitsonarError
-from mitsonar.simulation.variant import VARIANTS, backend, ensure_variant, replayed
+from mitsonar.simulation.device import VARIANTS, backend, ensure_variant, replayed
 
 
 def test_a_usable_variant_is_kept(variant: str) -> None:
@@ -39,7 +39,7 @@ def test_cuda_that_is_absent_is_said() -> None:
 
 def test_environment_forces_a_variant_and_a_missing_llvm_is_named() -> None:
     script = """
-        from mitsonar.simulation.variant import ensure_variant
+        from mitsonar.simulation.device import ensure_variant
         try:
             print(ensure_variant())
         except ValueError as error:
@@ -57,7 +57,7 @@ def test_cuda_and_llvm_see_the_same() -> None:
     """Ranges to 1e-4 m and total levels to 1e-4: ray tracers differ in the last bits only."""
     script = """
         import mitsonar, numpy as np
-        from mitsonar.simulation.variant import ensure_variant
+        from mitsonar.simulation.device import ensure_variant
         ensure_variant()
         import mitsuba as mi
         floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100), "bsdf": {"type": "diffuse"}}

@@ -11,14 +11,13 @@ import pytest
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.vehicle_run import run_vehicle
 from mitsonar.motion.pose import Pose, mount_between, mounted
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 from mitsonar.records.soundings import Soundings, range_rates
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.moving_files import load_motions, motions_of
-from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.runs import run_vehicle
+from mitsonar.simulation.scene import load_motions, load_scene, motions_of
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle, sensors_in
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
@@ -85,7 +84,7 @@ def test_hydrophones_and_bodies_that_move_are_refused(tank: Path) -> None:
 @pytest.mark.thorough
 def test_a_run_goes_on_with_the_same_bits(tank: Path, tmp_path: Path) -> None:
     from mitsonar.acoustics.noise import NOISE_MODELS
-    from mitsonar.simulation.render_run import Outputs
+    from mitsonar.simulation.runs import Outputs
 
     class KilledError(Exception):
         pass
@@ -152,7 +151,7 @@ def test_range_rates_are_those_of_body_and_sonar(tank: Path) -> None:
 
 def test_a_sensor_that_cannot_follow_is_named_before_any_is_rendered(tank: Path, tmp_path: Path) -> None:
     from mitsonar.acoustics.noise import NOISE_MODELS
-    from mitsonar.simulation.render_run import Outputs
+    from mitsonar.simulation.runs import Outputs
 
     (tmp_path / "auv.yaml").write_text(
         "sensors:\n  ahead: {sonar: {beams: 12, range_max: 9, quality: draft}}\n  head: {sonar: ping360}\n"

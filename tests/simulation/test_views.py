@@ -11,7 +11,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import SEGMENTS, Receiver, Segment
 from mitsonar.motion.pose import Pose, mounted
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -70,9 +70,9 @@ def test_a_sea_goes_on_in_time() -> None:
 def test_the_scene_has_the_surface_as_a_mirror(wind: float, tmp_path: Path) -> None:
     """The shapes' ids, the mirror part of its material, and a sonar below: a flat mirror sends nothing back to it."""
     from mitsonar.instruments.sonar import Sonar
-    from mitsonar.simulation.imaging import Simulator
-    from mitsonar.simulation.mirror_parts import mirror_of
+    from mitsonar.simulation.mirrors import mirror_of
     from mitsonar.simulation.scene import load_scene, sonar_in
+    from mitsonar.simulation.simulator import Simulator
 
     sea = SeaSurface(**{**SMALL, "wind_m_s": wind})
     path = sea.build(2).write(tmp_path / "sea")
@@ -120,7 +120,7 @@ def test_images_have_ghosts_where_the_flat_surface_says_and_waves_take_a_part(tm
     from helpers import diffuse
 
     from mitsonar.instruments.sonar import Sonar
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     straight, image = 4.4 - 0.05, math.hypot(4.4, 1.6) - 0.05
     ranges_m = straight, (straight + image) / 2, image

@@ -14,8 +14,8 @@ from PIL import Image
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene, sonar_in
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.meshes import mesh_world
 
 

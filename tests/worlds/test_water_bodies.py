@@ -10,7 +10,7 @@ from helpers import scene, sphere
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.sea import fishing_net_mesh, particle_mesh
 
 

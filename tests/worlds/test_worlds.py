@@ -15,8 +15,8 @@ from scipy import stats
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene, sonar_in
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.families import FAMILIES, FlatObjects, Pattern, RockyField, ShipHull, create_family, perlin_reflectivity
 from mitsonar.worlds.world import BuiltFamily, Mesh, stream, whole
 

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.hydrophones import ChannelSonar, Hydrophone
-from mitsonar.simulation.propagation_delay import delay_exact
+from mitsonar.simulation.links import delay_exact
 
 __all__ = ["LinkResponse", "ResponseCovariance", "block_toeplitz", "link_response"]
 

@@ -14,8 +14,8 @@ from mitsonar.estimation.crlb.fisher_bound import Bound, overall
 from mitsonar.estimation.crlb.image_crlb import bounds_at, laws_of, varied
 from mitsonar.estimation.estimator import PlainTable
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain
+from mitsonar.simulation.pings import CALIBRATION_FRAMES, RenderedPings, constant_gain
+from mitsonar.simulation.simulator import Simulator
 
 __all__ = ["Table", "Value", "bounds_of_subject", "report_lines", "report_of"]
 

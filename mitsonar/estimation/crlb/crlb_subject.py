@@ -16,8 +16,8 @@ from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Segment, View, Whole
-from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.variant import release_memory
+from mitsonar.simulation.device import release_memory
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     import mitsuba as mi

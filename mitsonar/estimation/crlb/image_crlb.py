@@ -24,7 +24,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Segment, directions
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.simulation.derivatives import FIRST_PING, PINGS, Derivative, differentiate, jittered
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 __all__ = [
     *("ALL", "KINDS", "LAWS", "VARIABLES", "bound", "bounds_at", "bounds_of_views", "cramer_rao_bound", "floor_ranges"),

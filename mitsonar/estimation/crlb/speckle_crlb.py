@@ -30,10 +30,10 @@ from mitsonar.instruments.sonar import Quality, Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.derivatives import FIRST_PING, PINGS, differentiate, evenly, step_for
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
-    from mitsonar.simulation.coherent_imaging import CoherentImager
+    from mitsonar.simulation.coherent import CoherentImager
 
 __all__ = ["SPECKLE_LAWS", "CellScores", "SpeckleBounds", "expected_sonar", "grain_law"]
 

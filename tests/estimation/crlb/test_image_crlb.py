@@ -32,7 +32,7 @@ from mitsonar.motion.pose import Pose
 from mitsonar.records.frames import to_uint8
 
 if TYPE_CHECKING:
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
 LOW, HIGH = NOISE_MODELS["low"], NOISE_MODELS["high"]
 POSE = Pose.from_degrees([0.3, -0.2, 2.5, 35, 0, 20])
@@ -147,7 +147,7 @@ SONAR = Sonar(beams=16, range_bins=64, rays_per_beam=200, rays_across=4, range_m
 
 
 def simulator(sonar: Sonar = SONAR, **shapes: dict[str, Any]) -> Simulator:
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     return Simulator(scene(**shapes), sonar)
 
@@ -469,7 +469,7 @@ def test_segments_and_their_sums() -> None:
     """Four quadrants of a looking-down sonar: information adds up, and pixels tell no less than their sums."""
     from mitsonar.instruments.views import Segment
     from mitsonar.simulation.derivatives import differentiate
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     sonar = Sonar(
         azimuth_fov_deg=100, elevation_fov_deg=100, beams=40, rays_per_beam=80, range_bins=64, range_min=2, range_max=4.5

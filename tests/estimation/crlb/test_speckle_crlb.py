@@ -23,7 +23,7 @@ from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 
 if TYPE_CHECKING:
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
 SONAR = Sonar.create(model="coherent", frequency_hz=1.8e6, beams=24, azimuth_fov_deg=7.25, beam_width_deg=0.3, range_min=4.0,
                      range_max=4.45, range_bins=96, bearing="cone", absorption_db_per_m=0.0)  # fmt: skip
@@ -102,7 +102,7 @@ def source(noise_db: float, even: bool = False) -> Simulator:
     """Even ground, or soft blotches of 10 cm; a noise of -90 dB lies 16 dB below the median echo."""
     import mitsuba as mi
 
-    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.simulator import Simulator
 
     grain = ndimage.gaussian_filter(np.random.default_rng(5).random((400, 400)), 1.5, mode="wrap")
     picture = mi.Bitmap(np.clip(0.5 + (grain - 0.5) * 3, 0.02, 1).astype(np.float32)[..., None])
@@ -163,7 +163,7 @@ def test_an_oracle_of_the_scatterers_reaches_the_grain_bound(noise_db: float) ->
 
 def ground_oracle(bounds: SpeckleBounds, draws: int) -> float:
     """e' F e / 3 of one step of scoring on frames whose scatterers are drawn anew; level and motion are known before."""
-    from mitsonar.simulation.coherent_imaging import CoherentImager
+    from mitsonar.simulation.coherent import CoherentImager
 
     pose = np.array(POSE)
     told = bounds.ground(pose, 12)

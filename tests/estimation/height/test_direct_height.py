@@ -29,7 +29,7 @@ from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.mapping.view_source import open_views
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames, ViewFrames
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.simulator import Simulator
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
 

@@ -21,8 +21,8 @@ from mitsonar.motion.composition import Motion, MotionPrior, compose, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene, shipped_trajectory, sonar_in
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.families import RockyField
 
 pytestmark = pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")

@@ -19,8 +19,8 @@ from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.families import FlatObjects
 
 UNITS = np.array([1e3, 1e3, 180 / np.pi])

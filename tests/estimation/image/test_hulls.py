@@ -11,8 +11,8 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.families import ShipHull
 
 pytestmark = [

@@ -24,8 +24,8 @@ from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.networks.shipped import SHIPPED
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.families import FlatObjects, RockyField
 
 pytestmark = [

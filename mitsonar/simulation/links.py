@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.device import DeviceArray
 
 __all__ = ["delay_exact", "delay_iterated", "delay_static", "dot", "length"]
 

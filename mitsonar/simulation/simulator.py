@@ -18,20 +18,29 @@ from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.variant import ensure_variant, replayed
+from mitsonar.simulation.device import ensure_variant, replayed
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsonar.instruments.views import View
     from mitsonar.motion.bodies import Moving, MovingBodies
-    from mitsonar.simulation.expected_former import ExpectedFormer
-    from mitsonar.simulation.mirror_parts import Mirroring
+    from mitsonar.simulation.expected import ExpectedFormer
+    from mitsonar.simulation.mirrors import Mirroring
     from mitsonar.simulation.tracing import Tracer
-from mitsonar.simulation.labels import labels_above, labels_of
-from mitsonar.simulation.ping_moments import FirstPing, GroupedPings, check_timed, moments_of, sonar_of_one_ping
-from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
-from mitsonar.simulation.tally import Tally
+from mitsonar.simulation.pings import (
+    FirstPing,
+    GroupedPings,
+    RenderedPings,
+    Tally,
+    check_timed,
+    constant_gain,
+    labels_above,
+    labels_of,
+    moments_of,
+    sonar_of_one_ping,
+    to_image,
+)
 
 __all__ = ["Simulator"]
 
@@ -69,8 +78,8 @@ class Simulator:
         rays_per_launch: int = 2**23,
     ) -> None:
         self.variant = ensure_variant()
+        from mitsonar.simulation.moving import SceneWatch
         from mitsonar.simulation.scene import sonar_in
-        from mitsonar.simulation.scene_watch import SceneWatch
 
         if sonar is None:
             found = sonar_in(scene)
@@ -96,17 +105,15 @@ class Simulator:
         scene, views, moving, rays_per_launch = self._given
         sonar, mirrors = self.sonar, self.mirrors
         from mitsonar.instruments.views import Whole
-        from mitsonar.simulation.bounce_sums import bounce_sums
-        from mitsonar.simulation.bright_surfaces import bright_notes
-        from mitsonar.simulation.coherent_imaging import coherent_imager
-        from mitsonar.simulation.expected_former import expected_former
+        from mitsonar.simulation.binning import view_tracers
+        from mitsonar.simulation.coherent import coherent_imager
+        from mitsonar.simulation.expected import expected_former
         from mitsonar.simulation.image_launch import ImageLaunch
-        from mitsonar.simulation.mirror_parts import refuse_moving_mirrors
-        from mitsonar.simulation.moving_scene import motion_in
-        from mitsonar.simulation.moving_tracing import tracer_of
+        from mitsonar.simulation.mirrors import bright_notes, refuse_moving_mirrors, second_notes
+        from mitsonar.simulation.moving import motion_in
+        from mitsonar.simulation.multipath_rough import bounce_sums
         from mitsonar.simulation.scene import scale_notes
-        from mitsonar.simulation.second_mirrors import second_notes
-        from mitsonar.simulation.view_tracers import view_tracers
+        from mitsonar.simulation.tracing import tracer_of
 
         self.motion = motion_in(scene, moving)
         check_timed(sonar, self.motion, views, mirrors)
@@ -150,7 +157,7 @@ class Simulator:
             return
         import mitsuba as mi
 
-        from mitsonar.simulation.moving_tracing import surfaces_of
+        from mitsonar.simulation.tracing import surfaces_of
 
         scene = self._given[0]
         tracers = [self.tracer, *(self.coherent.tracers.values() if self.coherent else ())]
@@ -247,7 +254,7 @@ class Simulator:
     @cached_property
     def _own_tracer(self) -> Tracer:
         """Return the tracer of the sonar's own rays: those of the launch may reach beyond the field of view."""
-        from mitsonar.simulation.moving_tracing import tracer_of
+        from mitsonar.simulation.tracing import tracer_of
 
         known = self.former is None and self.grouped is None
         return self.tracer if known else tracer_of(self.tracer.scene, self.sonar, self.motion)
@@ -258,7 +265,7 @@ class Simulator:
 
     def buried(self, pose: ArrayLike) -> str:
         """Describe where a pose lies below the ground or inside an object; empty where it does not, or bodies move."""
-        from mitsonar.simulation.clearance import buried_in
+        from mitsonar.simulation.tracing import buried_in
 
         found = (
             None if self.motion is not None else buried_in(self.tracer.scene, np.atleast_2d(np.asarray(pose, dtype=float)))

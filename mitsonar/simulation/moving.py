@@ -6,8 +6,10 @@ triangles that move cost what a million that stand still do. A ray carries the n
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,14 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.motion.bodies import Moving, MovingBodies
+from mitsonar.motion.bodies import Moving, MovingBodies, VertexLaw
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.native_plugins import load_dict
-from mitsonar.simulation.deforming_mesh import DeformingMesh
-from mitsonar.simulation.device_arrays import DeviceArray
-from mitsonar.simulation.moving_files import motions_of
+from mitsonar.simulation.device import DeviceArray
+from mitsonar.simulation.scene import motions_of
 
-__all__ = ["MovingScene", "SceneMotion", "carried_back", "motion_in", "scene_at", "scene_of"]
+__all__ = ["DeformingMesh", "MovingScene", "SceneMotion", "SceneWatch", "carried_back", "motion_in", "scene_at", "scene_of"]
 
 
 @dataclass
@@ -249,3 +250,164 @@ def _sphere(shape: mi.Shape) -> mi.Vector4f:
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     margin = 1e-4 * (1 + float(np.abs(np.stack([low, high])).max()))
     return mi.Vector4f(*middle.tolist(), radius + margin)
+
+
+# ---------------- A mesh whose vertices move between pings: its search tree is built anew, those of all other shapes stay
+
+
+class DeformingMesh:
+    """A copy of a mesh with vertices of its own.
+
+    Args:
+        shape: to copy.
+        law: vertices at a time, as many as the mesh has.
+
+    Attributes:
+        mesh: the copy.
+        scene: that holds it alone.
+        version: number of changes so far.
+
+    Raises:
+        MitsonarError: a shape that is no mesh.
+    """
+
+    def __init__(self, shape: mi.Shape, law: VertexLaw) -> None:
+        if not isinstance(shape, mi.Mesh):
+            raise MitsonarError(f"moving: only meshes deform: {shape.id()} is another shape; give a PLY file")
+        self.mesh, self.law = _copied(shape), law
+        self.scene: mi.Scene | None = None
+        self.version, self._time_s = 0, float("nan")
+
+    def vertices(self, time_s: float) -> NDArray[np.float32]:
+        """Return the vertices ``(vertices, 3)`` at a time [s].
+
+        Raises:
+            MitsonarError: another number of them, or some that are not finite.
+        """
+        found = np.asarray(self.law(time_s), dtype=np.float32)
+        count = self.mesh.vertex_count()
+        if found.shape != (count, 3) or not np.isfinite(found).all():
+            raise MitsonarError(
+                f"moving: {self.mesh.id()} has {count} vertices, finite ({count}, 3): got {found.shape} at {time_s:g} s"
+            )
+        return found
+
+    def deform(self, time_s: float) -> None:
+        """Move the vertices to where they are at a time [s].
+
+        Raises:
+            MitsonarError: as :meth:`vertices`.
+        """
+        if time_s == self._time_s:
+            return
+        vertices = self.vertices(time_s)
+        assert self.scene is not None
+        values: Any = mi.traverse(self.scene)  # its types lack the keys
+        (name,) = [key for key in values.keys() if key.endswith("vertex_positions")]  # noqa: SIM118  no dict
+        values[name] = mi.Float(vertices.ravel().tolist())
+        values.update()
+        self.version, self._time_s = self.version + 1, time_s
+
+
+def _copied(mesh: mi.Mesh) -> mi.Mesh:
+    """Return a mesh of the same triangles, uv and numbers of objects, without normals at vertices."""
+    props = mi.Properties()
+    props["bsdf"] = mesh.bsdf()
+    uv = mesh.has_vertex_texcoords()
+    made = mi.Mesh(mesh.id(), mesh.vertex_count(), mesh.face_count(), props, False, uv)
+    old, new = mi.traverse(mesh), mi.traverse(made)
+    for name in ("vertex_positions", "faces", *(("vertex_texcoords",) if uv else ())):
+        new[name] = type(new[name])(old[name])
+    new.update()
+    if mesh.has_attribute("face_id")[0]:
+        numbers = mesh.attribute_buffer("face_id")
+        made.add_attribute("face_id", dr.width(numbers) // mesh.face_count(), np.array(numbers).tolist())
+    made.set_id(mesh.id())
+    return made
+
+
+# ---------------- Notice that parameters of a scene have changed since something was made of it, such as a table of
+# its normals
+
+
+WITHOUT_ECHO = ("silhouette_sampling_weight", "vertex_normals")
+"""Ends of the names of parameters that no echo depends on: facets are flat."""
+
+
+class SceneWatch:
+    """Watches the parameters of a scene's shapes, materials and textures that ``mi.traverse`` reaches.
+
+    Dr.Jit numbers its arrays, and a changed one has another number: a look costs about 0.1 us an array, whatever its size.
+    Copies that share the memory keep numbers from being given again.
+
+    Args:
+        scene: any.
+        places: whether the places of instances, spheres, cylinders and disks count, which Mitsuba looks up when it traces.
+    """
+
+    def __init__(self, scene: mi.Scene, *, places: bool = True) -> None:
+        self._scene, self._places = scene, places
+        self._begin()
+
+    def _begin(self) -> None:
+        """Take hold of the parameters, and remember them as they are."""
+        found: Any = mi.traverse(self._scene)  # its types lack the keys
+        self._arrays: dict[str, Any] = {}  # references: they show what the scene holds now
+        self._others: dict[str, Any] = {}
+        self._owners: dict[str, mi.Object] = {}
+        for name, (place, kind, owner, _) in found.properties.items():
+            if not isinstance(owner, mi.Shape | mi.BSDF | mi.Texture) or name.endswith(WITHOUT_ECHO):
+                continue
+            looked_up = name.endswith("to_world") and isinstance(owner, mi.Shape) and not isinstance(owner, mi.Mesh)
+            if looked_up and not self._places:
+                continue
+            self._owners[name] = owner
+            value = place if kind is None else mi.get_property(place, kind, owner)
+            if isinstance(value, mi.Float | mi.UInt32 | mi.Int32):
+                self._arrays[name] = value
+            else:
+                self._others[name] = place, kind
+        self._live = list(self._arrays.values())
+        self._keep()
+
+    def changed(self) -> dict[str, mi.Object] | None:
+        """Return the parameters that changed since the last call, by name with what they belong to; None where none did."""
+        materials = self._materials()
+        if materials != self._kept_materials:  # another BSDF of a shape, with parameters of its own
+            found: dict[str, mi.Object] = {"bsdf": self._scene}
+            self._begin()
+            return found
+        others = self._fingerprints()
+        if [one.index for one in self._live] == self._numbers and others == self._kept_others:
+            return None
+        numbered = zip(self._arrays.items(), self._numbers, strict=True)
+        names = [name for (name, value), number in numbered if value.index != number]
+        names += [name for name, before in self._kept_others.items() if others[name] != before]
+        self._keep()
+        return {name: self._owners[name] for name in names}
+
+    def _materials(self) -> list[mi.BSDF | None]:
+        return [shape.bsdf() for shape in self._scene.shapes()]
+
+    def _values(self) -> dict[str, Any]:
+        """Return the parameters that are no plain arrays, such as transforms and tensors, as they are now."""
+        read: Any = mi.get_property
+        return {
+            name: place if kind is None else read(place, kind, self._owners[name])
+            for name, (place, kind) in self._others.items()
+        }
+
+    def _fingerprints(self) -> dict[str, Hashable]:
+        """Return what tells these parameters from others."""
+        return {name: tuple(dr.detail.collect_indices([value])) or str(value) for name, value in self._values().items()}
+
+    def _keep(self) -> None:
+        """Remember the parameters as they are."""
+        self._kept = [[dr.copy(value) for value in self._live], [_shared(value) for value in self._values().values()]]
+        self._numbers, self._kept_others = [one.index for one in self._live], self._fingerprints()
+        self._kept_materials = self._materials()
+
+
+def _shared(value: Any) -> Any:
+    """Return a copy that holds the same arrays."""
+    return dr.copy(value) if dr.detail.collect_indices([value]) else None

@@ -20,7 +20,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.beams import Pulse
 from mitsonar.instruments.sonar import RAYS, Sonar
 from mitsonar.instruments.views import View, Whole
-from mitsonar.simulation.beam_former import PULSE_LENGTHS, elevation_end, side_lobes
+from mitsonar.simulation.beams import PULSE_LENGTHS, elevation_end, side_lobes
 
 __all__ = ["ExpectedFormer", "expected_former"]
 

@@ -8,17 +8,36 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
+import drjit as dr
+import finufft
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from mitsonar.instruments.beams import Aperture, Pulse
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar, rays_over_elevation
+from mitsonar.simulation.device import DeviceArray, current_variant
 
-__all__ = ["BeamFormer", "CommonFan", "elevation_end", "side_lobes"]
+__all__ = [
+    "TOLERANCE",
+    "BeamFormer",
+    "CommonFan",
+    "angles_of",
+    "beam_at",
+    "beam_of",
+    "elevation_end",
+    "elevation_gain",
+    "elevation_gain_of_ends",
+    "phasor_sums",
+    "phasors",
+    "side_lobes",
+]
+
 
 SINES_A_LOBE, RANGES_A_PULSE = 8, 4
 """Lines of the grid a wavelength over the aperture, and a resolution."""
@@ -181,3 +200,141 @@ def _kept_power(shape: Any, step: float, reach: float) -> float:
     places = (np.arange(32) + 0.5) / 32
     power = [np.trapezoid(((1 - part) * shape(x) + part * shape(x - step)) ** 2, x) for part in places]
     return float(np.mean(power) / np.trapezoid(shape(x) ** 2, x))
+
+
+# ---------------- The beam that a direction lies in: bearing, elevation and index, for echoes that come another way
+# than their ray
+
+
+def beam_of(
+    sonar: Sonar, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray
+) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+    """Return beam, whether the direction lies in the field of view, and elevation [rad]."""
+    bearing, elevation = angles_of(sonar, starboard, forward, up)
+    beam, inside = beam_at(sonar, bearing)
+    lift: DeviceArray = dr.abs(elevation)
+    inside &= lift <= math.radians(sonar.elevation_fov_deg) / 2
+    return beam, inside, elevation
+
+
+def angles_of(
+    sonar: Sonar, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray
+) -> tuple[DeviceArray, DeviceArray]:
+    """Return bearing and elevation of unit directions [rad]."""
+    if sonar.bearing == "azimuth":
+        return dr.atan2(starboard, forward), _asin(up)
+    return _asin(starboard), dr.atan2(up, forward)
+
+
+def beam_at(sonar: Sonar, bearing: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
+    """Return the beam at bearings [rad], and whether they lie in one."""
+    place: DeviceArray
+    half = math.radians(sonar.azimuth_fov_deg) / 2
+    if sonar.beam_layout == "even":
+        place = bearing * (sonar.beams / (2 * half)) + sonar.beams / 2
+    else:
+        place = dr.sin(bearing) * (sonar.beams / (2 * math.sin(half))) + sonar.beams / 2
+    aside: DeviceArray = dr.abs(bearing)
+    inside = (place >= 0) & (place < sonar.beams) & (aside <= half)
+    beam = mi.UInt32(dr.select(inside, place, 0))
+    if sonar.beam_width_deg is not None and sonar.model == "physical":
+        part = (mi.Float(beam) + (0.5 - sonar.beams / 2)) * (2 / sonar.beams)  # a table would be no input of the launch
+        axis = part * half if sonar.beam_layout == "even" else dr.asin(part * math.sin(half))
+        away: DeviceArray = dr.abs(bearing - axis)
+        inside &= away <= sonar.beam_width_rad / 2
+    return beam, inside
+
+
+def _asin(value: DeviceArray) -> DeviceArray:
+    return dr.asin(dr.select(value < 1, dr.select(value > -1, value, -1), 1))
+
+
+# ---------------- The sum over echoes, a non-uniform FFT of type 1: finufft, or cufinufft where the renderer runs on CUDA
+
+
+TOLERANCE = 1e-9
+"""Relative error of the sums."""
+
+
+def phasor_sums(turn: NDArray[np.float64], strength: NDArray[np.complex128], modes: int) -> NDArray[np.complex128]:
+    """Sum strength exp(-i k turn) over the echoes, for an odd number of k around 0.
+
+    Args:
+        turn: phase step of each echo, -pi..pi ``(n,)`` [rad].
+        strength: complex amplitude of each echo ``(n,)``.
+        modes: number of k.
+
+    Returns:
+        The sums ``(modes,)``.
+    """
+    if not len(turn):
+        return np.zeros(modes, np.complex128)
+    if current_variant().startswith("cuda") and _has_cufinufft():
+        return _on_the_device(turn, strength, modes)
+    return np.asarray(finufft.nufft1d1(turn, strength, modes, eps=TOLERANCE, isign=-1, nthreads=1))
+
+
+@cache
+def _has_cufinufft() -> bool:
+    """Test whether cufinufft is installed and loads; it finds CUDA's libraries in torch's, if their versions agree."""
+    try:
+        import torch  # noqa: F401, I001  # first: its libraries are found then
+
+        import cufinufft  # noqa: F401
+    except (ImportError, OSError):
+        return False
+    return True
+
+
+def _on_the_device(turn: NDArray[np.float64], strength: NDArray[np.complex128], modes: int) -> NDArray[np.complex128]:
+    import cufinufft
+    import torch
+
+    there = [torch.from_numpy(np.ascontiguousarray(values)).cuda() for values in (turn, strength)]
+    return np.asarray(cufinufft.nufft1d1(*there, modes, eps=TOLERANCE, isign=-1).cpu().numpy())
+
+
+def phasors(
+    delay: NDArray[np.float64], amplitude: NDArray[np.inexact], sonar: ChannelSonar, padding: int
+) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+    """Compute phase step and complex amplitude of echoes in NumPy, as a launch does on the device.
+
+    Args:
+        delay: of each echo ``(n,)`` [s].
+        amplitude: of each echo ``(n,)``, before the carrier's phase.
+        sonar: carrier and frequency step.
+        padding: factor by which the frequency response is sampled finer.
+    """
+    turn, phase = delay * (sonar.frequency_step_hz / padding), delay * sonar.carrier_hz
+    strength = amplitude * np.exp(-2j * np.pi * (phase - np.rint(phase)))
+    return 2 * np.pi * (turn - np.rint(turn)), np.asarray(strength, np.complex128)
+
+
+# ---------------- Pattern over elevation: a uniform aperture whose power is one half at the edges of the field of view
+
+
+def elevation_gain(sonar: Sonar, tangent: DeviceArray) -> DeviceArray:
+    """Return the amplitude at a tangent of the elevation, of a ``mi.Float``: a uniform aperture's, or 1."""
+    pattern = sonar.vertical_pattern
+    if pattern == "box":
+        return mi.Float(1)
+    one_way = _one_way(sonar, tangent)
+    return one_way * one_way if pattern == "two_way" else one_way
+
+
+def elevation_gain_of_ends(sonar: Sonar, arrival: DeviceArray, departure: DeviceArray) -> DeviceArray:
+    """Return the amplitude of a path that comes back at another tangent of the elevation than it left at.
+
+    An array that only receives hears the arrival; one that sends as well counts at both ends.
+    """
+    pattern = sonar.vertical_pattern
+    if pattern == "box":
+        return mi.Float(1)
+    gain = _one_way(sonar, arrival)
+    return gain * _one_way(sonar, departure) if pattern == "two_way" else gain
+
+
+def _one_way(sonar: Sonar, tangent: DeviceArray) -> DeviceArray:
+    half = math.sin(math.radians(sonar.elevation_fov_deg) / 2)
+    x = tangent * dr.rsqrt(1 + tangent * tangent) * (ELEVATION_HALF[sonar.vertical_pattern] * math.pi / half)
+    return dr.select(dr.abs(x) > 1e-4, dr.sin(x) / x, 1)

@@ -18,17 +18,15 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.beams import series, shaded_sinc
 from mitsonar.instruments.sonar import Quality, Sonar
 from mitsonar.instruments.views import CONES, Segment, View, Whole
-from mitsonar.simulation.beam_former import BeamFormer
+from mitsonar.simulation.beams import BeamFormer
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
-from mitsonar.simulation.corner_tracing import CornerTracer
-from mitsonar.simulation.diffuse_field import DiffuseField
-from mitsonar.simulation.ghost_tracing import GhostTracer
-from mitsonar.simulation.hashed_points import MOST_CANDIDATES
-from mitsonar.simulation.mirror_parts import Mirroring, mirror_of
-from mitsonar.simulation.mirror_tracing import MirrorTracer
-from mitsonar.simulation.moving_scene import SceneMotion
-from mitsonar.simulation.rendered_pings import CutRays, RenderedPings
+from mitsonar.simulation.mirrors import Mirroring, mirror_of
+from mitsonar.simulation.moving import SceneMotion
+from mitsonar.simulation.multipath_coherent import CornerTracer, GhostTracer, MirrorTracer
+from mitsonar.simulation.multipath_rough import DiffuseField
+from mitsonar.simulation.pings import CutRays, RenderedPings
+from mitsonar.simulation.points import MOST_CANDIDATES
 
 if TYPE_CHECKING:
     import mitsuba as mi

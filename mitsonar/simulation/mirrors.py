@@ -1,0 +1,769 @@
+"""The mirror part of smooth surfaces: which shapes have one, how much of an echo it is, and what is left to scatter.
+
+A shape of reflection coefficient V and rms height h reflects the amplitude ``V exp(-2 k^2 h^2 cos^2)`` as a mirror: its
+energy is ``V^2 exp(-4 k^2 h^2 cos^2)``. What it scatters is multiplied by ``1 - exp(-4 k^2 h^2 cos^2)``. Both are the laws
+of :mod:`mitsonar.acoustics.materials`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple, TypeAlias
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.materials import Material
+from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.plugins.material_laws import material_of
+from mitsonar.plugins.surfaces import Hit, Surfaces, registry_index
+from mitsonar.simulation.device import DeviceArray
+from mitsonar.simulation.link_geometry import LINK, Leg, LinkGeometry, ScatteringPoints
+from mitsonar.simulation.links import dot, length
+from mitsonar.simulation.tracing import OFF_SURFACE, hidden
+
+__all__ = [
+    "MOST_FACETS",
+    "MOST_PLANES",
+    "ROW",
+    "FlatMirrors",
+    "MirrorFacets",
+    "MirrorPart",
+    "MirrorPlane",
+    "MirrorWay",
+    "MirroredLink",
+    "Mirroring",
+    "Mirrors",
+    "PlaneRow",
+    "SecondMirror",
+    "SecondMirrors",
+    "WayBack",
+    "bright_notes",
+    "flat_mirrors",
+    "mirror_of",
+    "mirror_ways",
+    "mirrored_table",
+    "second_notes",
+    "unfolded",
+]
+
+
+MirrorPart: TypeAlias = tuple[float, float] | Material
+"""Reflection coefficient of pressures, -1 to 1, and rms height of the roughness [m]; or a material that has both."""
+
+Mirroring: TypeAlias = Mapping[str, MirrorPart] | Literal["materials"] | None
+"""Mirror parts by the ids of the shapes, those of the shapes' materials, or none."""
+
+ROUGHEST_M = 1.0
+"""Largest rms height [m]."""
+
+
+@dataclass(frozen=True)
+class Mirrors:
+    """Mirror parts of the shapes of a scene, by their place in ``scene.shapes()``.
+
+    Attributes:
+        reflection: coefficient V of pressures ``(shapes,)``, 0: no mirror part.
+        roughness_m: rms height ``(shapes,)`` [m].
+    """
+
+    reflection: NDArray[np.float64]
+    roughness_m: NDArray[np.float64]
+
+    def table(self) -> mi.Float:
+        """Return V and rms height in turn, and zeros for one shape more: the input of a launch."""
+        rows = np.append(np.stack([self.reflection, self.roughness_m], axis=1), np.zeros((1, 2)), axis=0)
+        return mi.Float(rows.ravel().astype(np.float32))
+
+
+def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
+    """Collect the mirror parts of a scene's shapes; None where there are none.
+
+    Args:
+        scene: any.
+        mirrors: parts by the ids of the shapes, or ``materials``: those of each shape's ``acoustic_material``. A material
+            without a mirror part gives none.
+
+    Raises:
+        MitsonarError: a shape that the scene does not have, or a number out of limits.
+    """
+    if isinstance(mirrors, str):
+        mirrors = _of_materials(scene, mirrors)
+    if not isinstance(mirrors, Mapping | None):
+        raise MitsonarError(f"mirrors are parts by the ids of the shapes, or `materials`: got {shortened(mirrors)}")
+    names = [shape.id() for shape in scene.shapes()]
+    found = Mirrors(np.zeros(len(names)), np.zeros(len(names)))
+    for name, part in (mirrors or {}).items():
+        if name not in names:
+            raise MitsonarError(f"mirrors: the scene has no shape {name}: {nearest_names(name, names)}")
+        reflection, roughness_m = _numbers_of(name, part)
+        if not (-1 <= reflection <= 1 and 0 <= roughness_m <= ROUGHEST_M):
+            raise MitsonarError(
+                f"mirrors: the reflection of {name} lies in -1..1 and its rms height in 0..{ROUGHEST_M:g} m: "
+                f"got {reflection:g} and {roughness_m:g}"
+            )
+        for place in (place for place, own in enumerate(names) if own == name):
+            found.reflection[place], found.roughness_m[place] = reflection, roughness_m
+    return found if found.reflection.any() else None
+
+
+def _numbers_of(name: str, part: MirrorPart) -> tuple[float, float]:
+    """Return reflection and rms height [m] of a mirror part; without either 0."""
+    if isinstance(part, Material):
+        return part.reflection or 0.0, part.roughness_m or 0.0
+    try:
+        reflection, roughness_m = (float(number) for number in part)
+    except (TypeError, ValueError):
+        raise MitsonarError(
+            f"mirrors: {name} takes a pair, reflection and rms height in m, such as (-1.0, 0.0): got {shortened(part)}"
+        ) from None
+    return reflection, roughness_m
+
+
+def _of_materials(scene: mi.Scene, asked: str) -> dict[str, MirrorPart]:
+    """Return the materials of a scene's shapes by the shapes' ids."""
+    if asked != "materials":
+        raise MitsonarError(f"mirrors are parts by the ids of the shapes, or `materials`: got {asked!r}")
+    found: dict[str, MirrorPart] = {}
+    for shape in scene.shapes():
+        own = material_of(shape) if shape.bsdf() is not None else None
+        if own is not None:
+            found[shape.id()] = own.material
+    return found
+
+
+def refuse_moving_mirrors(scene: mi.Scene, mirrors: Mirroring, moving: Collection[str]) -> None:
+    """Refuse mirrors that move: images of the sonar are of planes that stand still.
+
+    Args:
+        scene: any.
+        mirrors: as of :func:`mirror_of`.
+        moving: ids of the shapes that move.
+
+    Raises:
+        MitsonarError: a mirror moves.
+    """
+    found = mirror_of(scene, mirrors)
+    for shape, reflection in zip(scene.shapes(), [] if found is None else found.reflection, strict=found is not None):
+        if reflection != 0 and shape.id() in moving:
+            raise MitsonarError(
+                f"mirrors stand still: got {shape.id()}, which moves; name the mirrors by the ids of still shapes, or leave "
+                "its trajectory out"
+            )
+
+
+def parts_at(table: mi.Float, hit: Hit) -> tuple[DeviceArray, DeviceArray]:
+    """Return V and rms height [m] where rays hit, 0 where there is no mirror part."""
+    known = hit.valid & (hit.shape_id >= 0)
+    pair = dr.gather(mi.Vector2f, table, mi.UInt32(dr.select(known, hit.shape_id, 0)), known)
+    return pair.x, pair.y
+
+
+def smooth_share(roughness_m: DeviceArray, cosine: DeviceArray, wavenumber: float) -> DeviceArray:
+    """Return the amplitude that roughness leaves of a mirror's, ``exp(-2 k^2 h^2 cos^2)``."""
+    return dr.exp(-2 * dr.square(roughness_m * cosine * wavenumber))
+
+
+def without_mirror_part(table: mi.Float, hit: Hit, d: DeviceArray, wavenumber: float) -> Hit:
+    """Return hits whose reflectivity is what roughness takes from the mirror part; others stay as they are.
+
+    The law of a material holds that share already.
+    """
+    reflection, roughness_m = parts_at(table, hit)
+    taken = 1 - dr.square(smooth_share(roughness_m, dr.dot(hit.n, d), wavenumber))
+    return replace(
+        hit, reflectivity=dr.select((reflection == 0) | (hit.material >= 0), hit.reflectivity, hit.reflectivity * taken)
+    )
+
+
+# ---------------- The flat mirrors of a scene as planes, and the others as facets, in double precision
+
+
+MOST_PLANES = 16
+"""Planes of a mesh, at most; one of more is a curved surface."""
+
+MOST_FACETS = 2_000_000
+"""Triangles of a curved mirror, at most: 1 ms of processor time a thousand and ping."""
+
+STEEPEST, HIGHEST = 0.5, 0.1
+"""A mesh is a plane with waves where no facet leans by more than 60 deg, and rms heights stay below a part of its size."""
+
+FLAT = ("Rectangle", "Disk")
+"""Mitsuba's shapes that are flat."""
+
+SAME_PLANE = 2e-6
+"""Facets are on one plane where normals and offsets (as a part of the mesh's size) differ by less."""
+
+
+@dataclass(frozen=True)
+class MirrorPlane:
+    """One plane of a mirror, ``normal . x = offset``; both sides reflect.
+
+    Attributes:
+        name: of the shape.
+        shape: its place in ``scene.shapes()``.
+        normal: unit vector ``(3,)``.
+        offset: [m].
+        reflection: coefficient V of pressures, -1 to 1.
+        roughness_m: rms height [m].
+        slab_m: how far the shape's points lie off the plane, at most [m]; 0 where it is flat.
+    """
+
+    name: str
+    shape: int
+    normal: NDArray[np.float64]
+    offset: float
+    reflection: float
+    roughness_m: float
+    slab_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class MirrorFacets:
+    """The triangles of a mirror that is no plane.
+
+    Attributes:
+        name: of the shape.
+        corners: ``(facets, 3, 3)`` [m].
+        reflection, roughness_m: see :class:`MirrorPlane`.
+    """
+
+    name: str
+    corners: NDArray[np.float64]
+    reflection: float
+    roughness_m: float
+
+
+@dataclass(frozen=True)
+class FlatMirrors:
+    """Mirrors of a scene.
+
+    Attributes:
+        planes: of what is flat.
+        facets: of what is not flat.
+        means: mean planes of the latter, for ways of several reflections; their roughness is that of all waves.
+        notes: on shapes that mirror nothing.
+    """
+
+    planes: list[MirrorPlane] = field(default_factory=list)
+    facets: list[MirrorFacets] = field(default_factory=list)
+    means: list[MirrorPlane] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def reflecting(self, reflections: int) -> list[MirrorPlane]:
+        """Return the planes of ways of several reflections; of ways of one, which the facets have, the flat ones."""
+        return self.planes if reflections < 2 else self.planes + self.means
+
+    def notes_on(self, bounces: int) -> list[str]:
+        """Return what a user should know, given the largest number of reflections."""
+        found = list(self.notes)
+        for mirror in self.facets if bounces > 1 else []:
+            mean = next((plane for plane in self.means if plane.name == mirror.name), None)
+            if mean is None:
+                found.append(f"the mirror {mirror.name} is no plane with waves: it reflects once and makes no ghosts")
+            else:
+                found.append(
+                    f"the mirror {mirror.name} is not flat: ways of several reflections have the coherent part of its "
+                    f"mean plane, with the loss of its waves' rms height, {mean.roughness_m:.2g} m; "
+                    "what waves scatter is left out"
+                )
+        return found
+
+
+def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
+    """Find the planes of a scene's mirrors: rectangles, disks, and meshes of up to :data:`MOST_PLANES` planes.
+
+    Args:
+        scene: any.
+        mirrors: parts of its shapes.
+
+    Raises:
+        MitsonarError: a curved mirror of more than :data:`MOST_FACETS` triangles.
+    """
+    found = FlatMirrors()
+    for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
+        assert mirrors is not None
+        part = float(mirrors.reflection[place]), float(mirrors.roughness_m[place])
+        if part[0] == 0:
+            continue
+        name = shape.id()
+        kind = shape.class_name()
+        if not isinstance(shape, mi.Mesh) and kind not in FLAT:
+            found.notes.append(
+                f"shape {name} ({kind.lower()}) is curved and mirrors nothing in impulse responses: give it as a mesh"
+            )
+            continue
+        corners = _triangles(shape)
+        planes = _planes(corners)
+        if planes is not None:
+            found.planes.extend(MirrorPlane(name, place, normal, offset, *part) for normal, offset in planes)
+        elif len(corners) > MOST_FACETS:
+            raise MitsonarError(
+                f"the mirror {name} has {len(corners):,} triangles: at most {MOST_FACETS:,} are possible; give it fewer, or "
+                "make it flat"
+            )
+        else:
+            found.facets.append(MirrorFacets(name, corners, *part))
+            mean = _mean_plane(name, place, corners, *part)
+            found.means.extend([] if mean is None else [mean])
+    return found
+
+
+def mirror_planes(scene: mi.Scene, mirrors: Mirrors | None) -> list[MirrorPlane]:
+    """Return the planes of a scene's flat mirrors; mirrors that are not flat have none."""
+    found = []
+    for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
+        assert mirrors is not None
+        part = float(mirrors.reflection[place]), float(mirrors.roughness_m[place])
+        if part[0] != 0 and (isinstance(shape, mi.Mesh) or shape.class_name() in FLAT):
+            planes = _planes(_triangles(shape)) or []
+            found += [MirrorPlane(shape.id(), place, normal, offset, *part) for normal, offset in planes]
+    return found
+
+
+def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
+    """Return the triangles of a mesh ``(n, 3, 3)`` [m]; one triangle in the plane of a rectangle or disk."""
+    if isinstance(shape, mi.Mesh):
+        vertices = np.array(shape.vertex_positions_buffer(), dtype=float).reshape(-1, 3)
+        return np.asarray(vertices[np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)])
+    matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=float).reshape(4, 4, -1)[..., 0]
+    middle, across, along = matrix[:3, 3], matrix[:3, 0], matrix[:3, 1]
+    return np.stack([middle, middle + across, middle + along])[None]
+
+
+def _mean_plane(
+    name: str, place: int, corners: NDArray[np.float64], reflection: float, roughness_m: float
+) -> MirrorPlane | None:
+    """Return the plane through the middle of a mesh of waves; None where heights or slopes are too large for waves."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    weight = np.repeat(np.linalg.norm(normal, axis=1), 3)
+    points = corners.reshape(-1, 3)
+    middle = np.average(points, axis=0, weights=weight)
+    variances, axes = np.linalg.eigh(np.cov(points.T, aweights=weight, bias=True))
+    up = axes[:, 0]
+    steep = np.abs(normal @ up) < STEEPEST * np.linalg.norm(normal, axis=1)
+    height = float(np.sqrt(max(variances[0], 0.0)))
+    if steep.any() or height > HIGHEST * np.sqrt(variances[1]):
+        return None
+    slab = float(np.abs((points - middle) @ up).max())
+    return MirrorPlane(name, place, up, float(up @ middle), reflection, float(np.hypot(height, roughness_m)), slab)
+
+
+def _planes(corners: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]] | None:
+    """Return normal and offset of each plane that triangles lie in; None where there are more than :data:`MOST_PLANES`."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    keep = area > 0
+    normal, corners, area = normal[keep] / area[keep, None], corners[keep], area[keep]
+    size = max(1.0, float(np.abs(corners).max(initial=0)))
+    left = np.ones(len(normal), dtype=bool)
+    planes: list[tuple[NDArray[np.float64], float]] = []
+    while left.any():
+        if len(planes) == MOST_PLANES:
+            return None
+        largest = int(np.argmax(np.where(left, area, 0)))
+        chosen, offset = normal[largest], float(normal[largest] @ corners[largest].mean(axis=0))
+        flat = np.abs(corners @ chosen - offset).max(axis=1) < SAME_PLANE * size
+        along = np.abs(normal @ chosen) > 1 - 1e-4
+        planes.append((chosen, offset))
+        left &= ~(flat & along)
+        left[largest] = False
+    return planes
+
+
+# ---------------- Image sources: a transmitter or receiver behind mirrors, for each sequence of planes that sound meets
+
+
+ROW = 10
+"""Numbers of a plane in :meth:`MirrorWay.rows`; the registry index of its shape is one more."""
+
+
+MOST_WAYS = 20_000
+"""Ways of one number of planes, at most: some 1 ms each, ping and receiver."""
+
+
+@dataclass(frozen=True)
+class MirrorWay:
+    """Planes that sound meets one after another on its way from (or, backwards, to) a transducer; none: the direct way."""
+
+    planes: tuple[MirrorPlane, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Return the names of the mirrors from the transducer on, as ``surface-seabed``."""
+        return "-".join(plane.name for plane in self.planes)
+
+    def images(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the transducer and its images, one more mirror each ``(planes + 1, 3)`` [m]."""
+        places = [np.asarray(place, dtype=float)]
+        for plane in self.planes:
+            last = places[-1]
+            places.append(last - 2 * (plane.normal @ last - plane.offset) * plane.normal)
+        return np.stack(places)
+
+    @property
+    def turn(self) -> NDArray[np.float64]:
+        """Return the matrix that mirrors vectors of the transducer, such as its velocity ``(3, 3)``."""
+        turn = np.eye(3)
+        for plane in self.planes:
+            turn = turn - 2 * np.outer(plane.normal, plane.normal @ turn)
+        return turn
+
+    def rows(self, place: NDArray[np.float64], registry: dict[int, int]) -> NDArray[np.float64]:
+        """Return what tests of the way need ``(planes, 11)``.
+
+        A row holds the image before the plane, normal, offset, reflection, roughness, slab and registry index of the shape.
+
+        Args:
+            place: of the transducer [m].
+            registry: index of each mirror by its place in the scene.
+        """
+        images = self.images(place)
+        return np.array(
+            [
+                [
+                    *(*image, *plane.normal, plane.offset),
+                    *(plane.reflection, plane.roughness_m, plane.slab_m, registry[plane.shape]),
+                ]
+                for image, plane in zip(images[:-1], self.planes, strict=True)
+            ]
+        ).reshape(-1, ROW + 1)
+
+
+def mirror_ways(planes: Sequence[MirrorPlane], length: int) -> list[MirrorWay]:
+    """Return all sequences of ``length`` planes in which none follows itself.
+
+    Raises:
+        MitsonarError: more than :data:`MOST_WAYS`.
+    """
+    count = len(planes) * (len(planes) - 1) ** (length - 1) if length else 1
+    if count > MOST_WAYS:
+        raise MitsonarError(
+            f"sound may meet the {len(planes)} planes of the mirrors in {count:,} orders of {length}: at most {MOST_WAYS:,} "
+            "are traced; give fewer mirrors, or fewer bounces"
+        )
+    ways: list[tuple[MirrorPlane, ...]] = [()]
+    for _ in range(length):
+        ways = [(*way, plane) for way in ways for plane in planes if not way or way[-1] is not plane]
+    return [MirrorWay(way) for way in ways]
+
+
+def mirrored_table(
+    table: NDArray[np.float64], out: MirrorWay, back: MirrorWay, registry: dict[int, int]
+) -> NDArray[np.float64]:
+    """Return the geometry of a link by way of mirrors: :func:`~mitsonar.simulation.link_geometry.link_table` of the images.
+
+    Places, velocities and fields of view are those of the images; the rows of both ways follow.
+
+    Args:
+        table: of the link itself ``(30,)``.
+        out: from the transmitter to the points.
+        back: from the receiver to the points, backwards in time.
+        registry: see :meth:`MirrorWay.rows`.
+    """
+    places = out.images(table[0:3])[-1], back.images(table[3:6])[-1]
+    velocities = out.turn @ table[6:9], back.turn @ table[9:12]
+    axes = table[12:21].reshape(3, 3) @ back.turn.T, table[21:30].reshape(3, 3) @ out.turn.T
+    rows = out.rows(table[0:3], registry), back.rows(table[3:6], registry)
+    return np.concatenate([*places, *velocities, *(part.ravel() for part in (*axes, *rows))])
+
+
+# ---------------- Ways by mirrors, unfolded: where each leg meets its mirror, whether nothing is in between, what the
+# mirrors leave
+
+
+class PlaneRow(NamedTuple):
+    """One mirror of a way on the device; see :meth:`~mitsonar.simulation.mirrors.MirrorWay.rows`.
+
+    Attributes:
+        image: of the transducer by the mirrors before this one, three arrays [m].
+        normal: three arrays.
+        offset: of the plane [m].
+        reflection: coefficient of pressures.
+        roughness_m: rms height [m].
+        slab_m: how far the mirror's points lie off the plane, at most [m].
+        registry: index of the shape.
+    """
+
+    image: list[DeviceArray]
+    normal: list[DeviceArray]
+    offset: DeviceArray
+    reflection: DeviceArray
+    roughness_m: DeviceArray
+    slab_m: DeviceArray
+    registry: DeviceArray
+
+    @classmethod
+    def of(cls, numbers: list[DeviceArray]) -> PlaneRow:
+        """Take the eleven numbers of a row."""
+        return cls(numbers[:3], numbers[3:6], *numbers[6:])
+
+
+def unfolded(
+    scene: mi.Scene,
+    point: ScatteringPoints,
+    image: list[DeviceArray],
+    rows: list[PlaneRow],
+    wavenumber: float,
+    active: DeviceArray,
+    moment: DeviceArray = None,
+) -> tuple[DeviceArray, DeviceArray]:
+    """Follow ways from points back to a transducer by its mirrors.
+
+    Args:
+        scene: to trace.
+        point: where the ways begin; a normal of 0 where that is no surface.
+        image: of the transducer by all mirrors [m].
+        rows: the mirrors in the order from the transducer on.
+        wavenumber: [rad/m].
+        active: ways to follow.
+        moment: number of the moment of each way in a scene that moves; default: 0, or a still scene.
+
+    Returns:
+        Which ways are open: each leg meets its mirror first, and the last one the transducer. And the product of the
+        mirrors' reflection coefficients.
+    """
+    at, normal, far, factor = point.exact, point.normal, image, mi.Float(1)
+    slab: DeviceArray = mi.Float(0)  # of the mirror that a leg leaves; waves in it hide nothing
+    for row in reversed(rows):
+        above, below = (dot(row.normal, place) - row.offset for place in (at, far))
+        size = dr.abs(at[0]) + dr.abs(at[1]) + dr.abs(at[2]) + 1
+        # a point on the mirror itself has no way by it
+        active = active & (above * below < 0) & (dr.abs(above) > size * OFF_SURFACE + row.slab_m)
+        active = active & (dr.abs(below) > row.slab_m)
+        part = above / (above - below)
+        foot = [a + (b - a) * part for a, b in zip(at, far, strict=True)]
+        way = [b - a for a, b in zip(at, foot, strict=True)]
+        u = mi.Vector3f(*(axis / length(way) for axis in way))
+        active = active & _meets(scene, mi.Point3f(*at) + u * slab, normal, u, row, active, moment)
+        normal = mi.Normal3f(*row.normal)
+        facing: DeviceArray = mi.Vector3f(*row.normal)
+        cosine = dr.abs(dr.dot(facing, u))
+        factor = factor * mi.Float(row.reflection) * smooth_share(mi.Float(row.roughness_m), cosine, wavenumber)
+        at, far = foot, row.image
+        slab = mi.Float(row.slab_m) / cosine
+    last = [a - b for a, b in zip(at, far, strict=True)]
+    distance = length(last)
+    u = mi.Vector3f(*(axis / distance for axis in last))
+    start = mi.Point3f(*at) - u * slab
+    return active & ~hidden(scene, start, normal, u, mi.Float(distance) - slab, active, moment), factor
+
+
+def _meets(
+    scene: mi.Scene,
+    at: DeviceArray,
+    normal: DeviceArray,
+    u: DeviceArray,
+    row: PlaneRow,
+    active: DeviceArray,
+    moment: DeviceArray = None,
+) -> DeviceArray:
+    """Test whether rays from points meet a mirror's plane before anything else."""
+    off = (1 + dr.abs(at.x) + dr.abs(at.y) + dr.abs(at.z)) * OFF_SURFACE
+    ray = mi.Ray3f(at + normal * dr.select(dr.dot(normal, u) > 0, off, -off), u)
+    if moment is not None:
+        ray.time = moment
+    found = scene.ray_intersect_preliminary(ray, coherent=True, active=active)  # type: ignore[call-overload]
+    index: DeviceArray = dr.reinterpret_array(mi.UInt32, found.shape)
+    met = ray.o + u * found.t
+    size = 1 + dr.abs(met.x) + dr.abs(met.y) + dr.abs(met.z)
+    # a mesh may have several planes
+    aside = dr.abs(dr.dot(mi.Vector3f(*row.normal), met) - mi.Float(row.offset))
+    near = 4 * size * OFF_SURFACE + mi.Float(row.slab_m)
+    return found.is_valid() & (index == mi.UInt32(row.registry)) & (aside < near)
+
+
+class MirroredLink(LinkGeometry):
+    """Geometry between the images of transmitter and receiver.
+
+    Args:
+        sonar: the instrument.
+        receiver: its index.
+        table: of :func:`~mitsonar.simulation.mirrors.mirrored_table`.
+        out: number of mirrors between transmitter and points.
+        back: number of mirrors between points and receiver.
+    """
+
+    def __init__(self, sonar: ChannelSonar, receiver: int, table: mi.Float64, out: int, back: int) -> None:
+        self.out, self.back = out, back
+        super().__init__(sonar, receiver, table)
+        self.wavenumber = 2 * math.pi / sonar.wavelength_m
+
+    @property
+    def size(self) -> int:
+        """Return how many numbers the table has."""
+        return LINK + (ROW + 1) * (self.out + self.back)
+
+    def reached(
+        self, scene: mi.Scene, point: ScatteringPoints, sent: Leg, received: Leg, active: DeviceArray
+    ) -> tuple[DeviceArray, DeviceArray]:
+        """Return which points sound reaches by the mirrors, there and back, and the mirrors' factor."""
+        starts = [LINK + (ROW + 1) * k for k in range(self.out + self.back)]
+        rows = [PlaneRow.of(self.numbers[start : start + ROW + 1]) for start in starts]
+        active, there = unfolded(scene, point, self.vector(0), rows[: self.out], self.wavenumber, active)
+        active, back = unfolded(scene, point, self.vector(3), rows[self.out :], self.wavenumber, active)
+        return active, there * back
+
+
+# ---------------- The way back by another mirror than the way out: image sources of the sonar behind the planes of a
+# scene
+
+
+MOST_SECOND = 8
+"""Planes that are looked through for the way back, at most: each costs two rays for every ray."""
+
+ON_PLANE = 1e-4
+"""Part of its distance from the origin by which a point may lie off a plane that it is on."""
+
+
+@dataclass(frozen=True)
+class SecondMirror:
+    """A plane of a mirror, and the index of its shape by which kernels know it."""
+
+    plane: MirrorPlane
+    registry: int
+
+    @property
+    def normal(self) -> mi.Vector3d:
+        """Return the unit normal."""
+        return mi.Vector3d(*self.plane.normal.tolist())
+
+    @property
+    def place(self) -> mi.Vector3d:
+        """Return a point on the plane [m]."""
+        return mi.Vector3d(*(self.plane.normal * self.plane.offset).tolist())
+
+
+@dataclass(frozen=True)
+class WayBack:
+    """The way from points back to the sonar by one plane.
+
+    Attributes:
+        mirror: the plane.
+        u: direction from the image of the sonar to the points.
+        distance: from that image [m].
+        factor: amplitude that the mirror leaves.
+        is_open: whether nothing is in between, and the plane is not that of the way out.
+    """
+
+    mirror: SecondMirror
+    u: DeviceArray
+    distance: DeviceArray
+    factor: DeviceArray
+    is_open: DeviceArray
+
+
+@dataclass(frozen=True)
+class SecondMirrors:
+    """Planes for the way back.
+
+    Attributes:
+        mirrors: the planes.
+        wavenumber: of the carrier [1/m].
+    """
+
+    mirrors: tuple[SecondMirror, ...]
+    wavenumber: float
+
+    @classmethod
+    def of(cls, scene: mi.Scene, mirrors: Mirrors | None, wavenumber: float) -> SecondMirrors | None:
+        """Find the planes of a scene's mirrors; None where there are not two, or more than :data:`MOST_SECOND`."""
+        planes = mirror_planes(scene, mirrors)
+        if not 2 <= len(planes) <= MOST_SECOND:
+            return None
+        shapes = scene.shapes()
+        return cls(tuple(SecondMirror(plane, registry_index(shapes[plane.shape])) for plane in planes), wavenumber)
+
+    def ways(
+        self,
+        scene: DeviceArray,
+        origin: DeviceArray,
+        point: tuple[DeviceArray, DeviceArray],
+        first: tuple[DeviceArray, DeviceArray],
+        active: DeviceArray,
+        moment: DeviceArray = None,
+    ) -> Iterator[WayBack]:
+        """Yield the way back by each plane.
+
+        Args:
+            scene: to trace.
+            origin: place of the sonar [m].
+            point: place and normal where rays meet a rough surface.
+            first: place and normal where they met their mirror.
+            active: rays to follow.
+            moment: number of the moment of each ray in a scene that moves.
+        """
+        place, normal = point
+        exact = [mi.Float64(value) for value in place]
+        sonar: DeviceArray = mi.Vector3d(origin)
+        scattering = ScatteringPoints(mi.Point3f(place), exact, normal)
+        for mirror in self.mirrors:
+            plane, facing = mirror.plane, mirror.normal
+            image = sonar - facing * (2 * (dr.dot(facing, sonar) - plane.offset))
+            way: DeviceArray = mi.Vector3d(*exact) - image
+            distance = dr.norm(way)
+            row = PlaneRow(
+                image=list(sonar),
+                normal=[mi.Float64(value) for value in plane.normal.tolist()],
+                offset=mi.Float64(plane.offset),
+                reflection=mi.Float64(plane.reflection),
+                roughness_m=mi.Float64(plane.roughness_m),
+                slab_m=mi.Float64(0),
+                registry=mi.UInt32(mirror.registry),
+            )
+            other = active & ~_on(plane, *first)
+            is_open, factor = unfolded(scene, scattering, list(image), [row], self.wavenumber, other, moment)
+            yield WayBack(mirror, mi.Vector3f(way / distance), mi.Float(distance), factor, is_open)
+
+
+def _on(plane: MirrorPlane, place: DeviceArray, normal: DeviceArray) -> DeviceArray:
+    """Test whether mirrors that rays met lie in a plane."""
+    facing: DeviceArray = mi.Vector3f(*plane.normal.tolist())
+    along: DeviceArray = dr.abs(dr.dot(facing, normal))
+    off: DeviceArray = dr.abs(dr.dot(facing, place) - plane.offset)
+    size = float(1 + np.abs(plane.offset))
+    return (along > 1 - ON_PLANE) & (off < ON_PLANE * (size + dr.norm(place)))
+
+
+def second_notes(scene: mi.Scene, mirrors: Mirroring) -> list[str]:
+    """Return a sentence where mirrors have too many planes for ways by one there and another back."""
+    count = len(mirror_planes(scene, mirror_of(scene, mirrors)))
+    if count <= MOST_SECOND:
+        return []
+    return [
+        f"the mirrors have {count} planes: ghosts by way of one there and another back are for {MOST_SECOND} at most, and "
+        "are left out"
+    ]
+
+
+# ---------------- Surfaces that send on more than arrives: harmless in one reflection, too loud in several
+
+
+def bright_notes(scene: mi.Scene, surfaces: Surfaces) -> list[str]:
+    """Return a sentence where meshes without a material have a Lambert's mu above 1 / pi.
+
+    Args:
+        scene: any.
+        surfaces: its tables.
+    """
+    rows = np.array(surfaces.facets).reshape(-1, 4)[:, 3]
+    found, largest = [], 1 / math.pi + 1e-3
+    for first, _, number, material in np.array(surfaces.shapes).reshape(-1, 4):
+        if first < 0 or number < 0 or material >= 0:
+            continue
+        shape = scene.shapes()[number]
+        assert isinstance(shape, mi.Mesh)
+        if (rows[first : first + shape.face_count()] > largest).any():
+            found.append(shape.id() or f"shape number {number}")  # Mitsuba merges meshes into one without a name
+    if not found:
+        return []
+    names = ", ".join(sorted(found)[:3]) + (" ..." if len(found) > 3 else "")
+    return [
+        f"reflectivities above 1/pi = 0.318 send on more than arrives: paths of several reflections by way of {names} are "
+        "too loud; give a reflectance of 0.318 at most, or a material"
+    ]

@@ -1,0 +1,758 @@
+"""The field of mirrors: Kirchhoff's integral over the surfaces that rays meet, a plane for each ray's cell.
+
+    s = sum j k / 2 pi V exp(-2 k^2 h^2 cos^2) cos dA sinc(g_u / 2) sinc(g_t / 2) exp(-2 j k R) / R^2
+
+with g = 2 k d . dX, where dX is the step of the hit on its tangent plane by one column (u) or row (t), and
+sinc x = sin x / x. So the echo of a mirror plane is 1 / 2R, that of a rigid sphere a / 2 R^2 (target strength a^2 / 4).
+
+A plane's cells join exactly. On curved bodies and at edges the cells of the common fan are too coarse, so a first launch
+finds where: a cell is divided until it is at most a quarter of the Fresnel radius sqrt(lambda a R / (2 (a + R))), a being
+the radius of curvature from the normals of neighbouring hits; at edges that face the sonar it is divided most. A second
+launch traces these finer rays. Bodies between the rays of the fan are not found.
+
+Facets of meshes are planes here. A mesh that stands for a curved body needs facets below half the Fresnel radius: larger
+ones glint as the polyhedron that they are. Vertex normals count for nothing.
+
+Beyond 30 deg from the normal the integral fades and ends at 45 deg: a mirror sends nothing back there, and what is left of
+the sum is the edge of the fan. So bodies of less than some five wavelengths' radius (k a < 30) are too weak.
+
+An image's levels are those of a box as wide as the beam and as long as a bin, so its peak is no target strength. Their sum
+is: 10 log10(sum of the levels over bins and beams around the echo, without gain, times spacing over width of the beams)
++ 40 log10(R) is the target strength in dB, and absorption comes on top.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarWarning
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.motion.pose import to_world_matrices
+from mitsonar.plugins.surfaces import Hit, Surfaces
+from mitsonar.simulation.beams import BeamFormer, CommonFan, elevation_gain_of_ends
+from mitsonar.simulation.coherent_tracing import STRIP, CoherentTracer, FanRays, add_waves, elevation_gain
+from mitsonar.simulation.device import DeviceArray, Frozen, padded, replayed
+from mitsonar.simulation.mirrors import Mirrors, SecondMirrors, parts_at, smooth_share, without_mirror_part
+from mitsonar.simulation.moving import SceneMotion, scene_at
+from mitsonar.simulation.points import HashedPoints, Point
+from mitsonar.simulation.tracing import MovingSurfaces, going_on, hidden, mirrored_lines, overlap, reflected, surfaces_of
+
+__all__ = [
+    "LEVEL_PART",
+    "NEIGHBOURS",
+    "CornerTracer",
+    "FinerRays",
+    "GhostTracer",
+    "MirrorTracer",
+    "MirroredRays",
+    "facing_share",
+    "mirrored_on",
+    "rows_of",
+    "sinc",
+]
+
+
+FADING, LAST = 0.866, 0.707
+"""Cosines between normal and ray where the integral begins to fade, and where it ends."""
+
+FACING = 0.985
+"""Cosine above which an edge counts as facing the sonar: beyond 10 deg its echo is far below the mirror's."""
+
+FINEST = 16
+"""Parts that a ray's cell is divided into each way, at most and at edges."""
+
+FRESNEL_PARTS = 4
+"""Cells a Fresnel radius that are wanted; two are needed."""
+
+NEIGHBOURS = [(over, down) for over in (-1, 0, 1) for down in (-1, 0, 1) if (over, down) != (0, 0)]
+
+TURN_PART = 1.5
+"""A mirror may face the sonar between hits where this times the turn of the normal to the next exceeds its slope."""
+
+LEVEL_PART = 0.3
+"""Neighbouring hits are on one surface where they leave the tangent plane by less than this part of their distance."""
+
+MOST_RAYS = 2**20
+"""Rays of the second launch, at most."""
+
+
+class MirrorTracer:
+    """Sum the echoes of mirrors.
+
+    Args:
+        scene: to trace.
+        sonar: of the model ``coherent``.
+        former: gives the grid.
+        mirrors: of the scene's shapes.
+        finest: parts that a ray's cell is divided into each way, at most.
+        motion: of bodies of the scene, which may hide mirrors; default: all stands still.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sonar: Sonar,
+        former: BeamFormer,
+        mirrors: Mirrors,
+        *,
+        finest: int = FINEST,
+        motion: SceneMotion | None = None,
+    ) -> None:
+        assert sonar.frequency_hz is not None
+        self.scene, self.sonar, self.former, self.finest = scene, sonar, former, finest
+        self.motion, self.fan, self.table = motion, CommonFan.of(sonar), mirrors.table()
+        self.surfaces = Surfaces.of(scene) if motion is None else surfaces_of(scene, sonar, motion)
+        self.wavelength = sonar.sound_speed / sonar.frequency_hz
+        self.wavenumber = 2 * math.pi / self.wavelength
+        self.last = former.first_range + (former.ranges - 1) * former.range_step
+        # the sum of all amplitudes in a cell of the grid is below k / pi times its solid angle, at most twice this
+        loudest = 16 / self.wavelength * former.sine_step * self.fan.tangent
+        self.bits = 61 - math.ceil(math.log2(max(loudest, 1.0)))
+        self.index = dr.arange(mi.UInt32, self.fan.rays)
+        dr.make_opaque(self.index)
+        dr.eval(self.table)
+        self.survey, self.launch = self._compile_survey(), self._compile_sum()
+        self.told = False
+
+    def field(self, pose: NDArray[np.float64]) -> NDArray[np.complex64]:
+        """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad]; see :meth:`add`."""
+        field = np.zeros((self.former.sines, self.former.ranges), np.complex64)
+        self.add(pose, field)
+        return field
+
+    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64], time_s: float = 0.0) -> None:
+        """Add the mirrors' echoes of one ping to its field, in place.
+
+        Args:
+            pose: of the sonar ``(6,)`` [m, rad].
+            field: on the grid ``(sines, ranges)``.
+            time_s: when bodies that move are where they are [s].
+
+        Warns:
+            MitsonarWarning: once, where cells exceed half the Fresnel radius and no finer ones were traced.
+        """
+        rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
+        scene = scene_at(self.scene, self.motion, time_s)
+        wanted = np.array(replayed(self.survey, self.index, scene, rows, self.surfaces.arrays(), self.table))
+        cell = np.flatnonzero(wanted)
+        if not len(cell):
+            return
+        parts = self._parts(np.abs(wanted[cell]))
+        self._tell(wanted[cell], parts)
+        inputs = tuple(mi.UInt32(padded(part)) for part in _expanded(cell, parts))
+        real, imag = replayed(self.launch, inputs, scene, rows, self.surfaces.arrays(), self.table)
+        field.real += np.array(real, copy=False).reshape(field.shape)
+        field.imag += np.array(imag, copy=False).reshape(field.shape)
+
+    def _parts(self, wanted: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return into how many parts each way cells are divided: powers of two, fewer where rays are too many."""
+        parts = 2 ** np.ceil(np.log2(np.clip(wanted, 1, self.finest)) - 1e-6).astype(np.int64)
+        parts = np.minimum(parts, self.finest)
+        while (parts * parts).sum() > MOST_RAYS and parts.max() > 1:
+            parts = np.minimum(parts, parts.max() // 2)
+        return parts
+
+    def _tell(self, wanted: NDArray[np.float32], parts: NDArray[np.int64]) -> None:
+        """Warn where the cells of a curved mirror stay larger than half the Fresnel radius."""
+        excess = np.where(wanted > 0, wanted, 0) / parts * (2 / FRESNEL_PARTS)
+        if self.told or not (excess > 1).any():
+            return
+        self.told = True
+        rays = self.fan.rays * float(excess.max()) ** 2
+        warnings.warn(
+            f"cells of rays on mirrors are up to {excess.max():.2g} times half the Fresnel radius: their echoes are "
+            f"wrong by decibels; {rays:,.0f} rays would do, of {self.fan.rays:,} now: choose a finer quality or a lower "
+            "frequency",
+            MitsonarWarning,
+            stacklevel=2,
+        )
+
+    # ---------------------------------------------------------------- first launch
+
+    def _compile_survey(self) -> Callable[..., Any]:
+        @Frozen
+        def survey(index: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
+            rays = FanRays(self.fan, self.sonar, index, rows_of(rows))
+            hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
+            mirror = hit.valid & (parts_at(table, hit)[0] != 0)
+            mirror &= rays.may_reach(hit, self.former.first_range, self.last)
+            kind = dr.select(mirror, mi.Int32(hit.shape_id), -1)
+            place: DeviceArray = rays.d * hit.t
+            seen = kind, place, mi.Vector3f(hit.n), dr.dot(hit.n, rays.d)
+            dr.eval(*seen, hit.t)
+            facing, needed, mixed = self._around(rays, hit, seen)
+            dr.eval(facing)
+            near = facing
+            for over, down in NEIGHBOURS:
+                near |= dr.gather(mi.Bool, facing, self._beside(rays, over, down))
+            smooth = dr.select(mirror & (dr.abs(seen[-1]) > LAST), dr.select(needed > 1, needed, 1), 0)
+            return dr.select(mixed & near & (smooth <= self.finest), -float(self.finest), smooth)
+
+        return survey
+
+    def _around(self, rays: FanRays, hit: Hit, seen: tuple[Any, ...]) -> tuple[DeviceArray, ...]:
+        """Compare each hit with those around it.
+
+        Returns:
+            Whether a mirror there may face the sonar, how many parts each way its curvature needs, whether an edge is near.
+        """
+        kind, place, normal, along = seen
+        steps = [dr.norm(step) for step in rays.steps_on(hit)]
+        mixed, turned, needed = mi.Bool(False), mi.Float(0), mi.Float(0)
+        same: dict[tuple[int, int], DeviceArray] = {}
+        for beside in NEIGHBOURS:
+            other = self._beside(rays, *beside)
+            chord: DeviceArray = dr.gather(mi.Vector3f, place, other) - place
+            length = dr.norm(chord)
+            alike = dr.gather(mi.Int32, kind, other) == kind
+            same[beside] = alike & ((kind < 0) | (dr.abs(dr.dot(normal, chord)) <= LEVEL_PART * length))
+            mixed |= ~same[beside]
+            turn = dr.select(alike, dr.norm(dr.gather(mi.Vector3f, normal, other) - normal), 0)
+            turned = dr.select(turn > turned, turn, turned)
+            if 0 in beside:
+                bent = dr.select(same[beside] & (length > 0), turn / length, 0)
+                wanted = self._cells(steps[beside.index(0) ^ 1], bent, hit.t)
+                needed = dr.select(wanted > needed, wanted, needed)
+        thin = ~(same[1, 0] | same[-1, 0]) | ~(same[0, 1] | same[0, -1])
+        least = dr.select(steps[0] < steps[1], steps[0], steps[1])
+        unresolved = dr.select(thin, self._cells(least, 1 / least, hit.t), 0)
+        steep = dr.sqrt(dr.select(along * along < 1, 1 - along * along, 0))
+        facing = (kind >= 0) & ((dr.abs(along) > FACING) | thin | (turned * TURN_PART > steep))
+        return facing, dr.select(unresolved > needed, unresolved, needed), mixed
+
+    def _cells(self, step: DeviceArray, bent: DeviceArray, range_m: DeviceArray) -> DeviceArray:
+        """Return a step over the wanted size of a cell, where the surface has that curvature [1/m]."""
+        return step * FRESNEL_PARTS * dr.sqrt((bent + 1 / range_m) * (2 / self.wavelength))
+
+    def _beside(self, rays: FanRays, over: int, down: int) -> mi.UInt32:
+        """Return the index of the neighbour of each ray, itself at the border of the fan."""
+        column, row = rays.column + over, rays.row + down
+        column = dr.select((column >= 0) & (column < self.fan.columns), column, rays.column)
+        row = dr.select((row >= 0) & (row < self.fan.rows), row, rays.row)
+        return mi.UInt32(column // STRIP * (STRIP * self.fan.rows) + row * STRIP + column % STRIP)
+
+    # ---------------------------------------------------------------- second launch
+
+    def _compile_sum(self) -> Callable[..., Any]:
+        @Frozen
+        def launch(inputs: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
+            rays = FinerRays(self.fan, self.sonar, inputs, rows_of(rows))
+            sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))
+            self._sum(scene, tables, rays, table, (sums[0], sums[1]))
+            dr.eval(sums)
+            return tuple(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in sums)
+
+        return launch
+
+    def _sum(
+        self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]
+    ) -> None:
+        """Add the echo of each ray's cell to the grid."""
+        hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
+        wavenumber = self.wavenumber
+        reflection, roughness_m = parts_at(table, hit)
+        cosine = dr.abs(dr.dot(hit.n, rays.d))
+        across, down = rays.steps_on(hit)
+        level = reflection * smooth_share(roughness_m, cosine, wavenumber) * _fading(cosine)
+        level *= (wavenumber / (2 * math.pi)) * cosine * dr.norm(dr.cross(across, down)) / dr.square(hit.t)
+        level *= sinc(dr.dot(rays.d, across) * wavenumber) * sinc(dr.dot(rays.d, down) * wavenumber)
+        level *= elevation_gain(self.sonar, rays.tangent)
+        range_m = mi.Float64(hit.t)
+        turns = range_m * (2 / self.wavelength)
+        sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + 0.25) * (2 * math.pi))
+        wave = rays.sine, range_m, level, cos, sin
+        add_waves(self.former, self.bits, sums, wave, hit.valid & (reflection != 0) & (cosine > LAST))
+
+
+class FinerRays(FanRays):
+    """Rays of parts of a fan's cells.
+
+    Args:
+        fan: of the sonar.
+        sonar: tells the bearing.
+        inputs: index of the cell, parts of it each way, the part's column and row, of each ray.
+        lines: first three rows of ``to_world`` in double precision.
+
+    Attributes:
+        sine, tangent: of the bearing and of the elevation of each ray.
+    """
+
+    def __init__(self, fan: CommonFan, sonar: Sonar, inputs: tuple[mi.UInt32, ...], lines: list[list[Any]]) -> None:
+        cell, parts, over, down = inputs
+        super().__init__(fan, sonar, cell, lines)
+        self.inputs = inputs
+        self.sine_step: DeviceArray = self.sine_step / mi.Float(parts)
+        self.tangent_step: DeviceArray = self.tangent_step / mi.Float(parts)
+        column = mi.Float(self.column * mi.Int32(parts) + mi.Int32(over)) + 0.5
+        row = mi.Float(self.row * mi.Int32(parts) + mi.Int32(down)) + 0.5
+        self.sine, self.tangent = column * self.sine_step - fan.sine, fan.tangent - row * self.tangent_step
+        self._aim(self.sine, self.tangent)
+
+    def from_lines(self, lines: list[list[Any]]) -> FinerRays:
+        """Return the same rays of a sonar elsewhere."""
+        return FinerRays(self.fan, self.sonar, self.inputs, lines)
+
+
+def _expanded(cell: NDArray[np.intp], parts: NDArray[np.int64]) -> tuple[NDArray[np.uint32], ...]:
+    """Return cell, parts each way, the part's column and row of each ray, for cells and their parts ``(n,)``.
+
+    Divided on the host: the processor ends the process where idle lanes of a kernel divide integers by 0.
+    """
+    count = parts * parts
+    number = np.arange(count.sum(), dtype=np.uint32) - np.repeat((np.cumsum(count) - count).astype(np.uint32), count)
+    cells, each = (np.repeat(part.astype(np.uint32), count) for part in (cell, parts))
+    return cells, each, number % each, number // each
+
+
+def rows_of(rows: mi.Float64) -> list[list[Any]]:
+    """Return three rows of four numbers of an array of twelve."""
+    return [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
+
+
+def _fading(cosine: DeviceArray) -> DeviceArray:
+    """Return a factor that falls smoothly from 1 at :data:`FADING` to 0 at :data:`LAST`."""
+    x = (cosine - LAST) * (1 / (FADING - LAST))
+    inner: DeviceArray = dr.select(x > 0, x * x * (3 - 2 * x), 0)
+    return dr.select(x < 1, inner, 1)
+
+
+def facing_share(cosine: DeviceArray) -> DeviceArray:
+    """Return what counts of a mirror's cell, by the cosine between its mirrored ray and the line to the sonar.
+
+    A ray that meets one mirror at an angle from its normal leaves at twice this angle from the line back.
+    """
+    return _fading(dr.sqrt((1 + dr.select(cosine > -1, cosine, -1)) * 0.5))
+
+
+def sinc(x: DeviceArray) -> DeviceArray:
+    """Return sin(x) / x."""
+    size: DeviceArray = dr.abs(x)
+    return dr.select(size > 1e-3, dr.sin(x) / x, 1 - x * x / 6)
+
+
+# ---------------- Ghosts of the model ``coherent``: hash-anchored scatterers seen by way of mirrors, in one launch
+# A ray that meets a mirror goes on, and looks at the surface behind it from the image of the sonar: the sonar mirrored
+# at the plane that the ray met. So :class:`~mitsonar.simulation.coherent_tracing.FanRays` of mirrored axes see each
+# point of the lattice at the range R' of the image. A point at the range R that the sonar sees straight as well gives
+# two paths of length R + R', there and back the other way round, of amplitude
+#
+#     V exp(-2 k^2 h^2 cos^2) zeta sqrt(C cos cos' dA) / (R R')
+#
+# By the same mirror both ways it gives one of length 2 R', of three reflections, and by another mirror back one of R' +
+# R''. Points, weights and grid are those of one reflection, so ghosts carry the speckle of what they are ghosts of.
+# Whether the sonar sees a point straight is tested once a ray, at the point that the ray meets.
+
+
+PATHS = 4
+"""Waves of a point in one cell of the grid, at most, in waves of one reflection."""
+
+
+@dataclass
+class MirroredRays:
+    """Rays of a fan behind mirrors.
+
+    Attributes:
+        rays: as they are seen from the image of the sonar.
+        hit: where they end now, ``t`` from that image [m].
+        gain: amplitude that the mirrors have left.
+        body: number of the body that they meet; 0: what stands still.
+    """
+
+    rays: FanRays
+    hit: Hit
+    gain: DeviceArray
+    body: DeviceArray
+
+
+class GhostTracer:
+    """Sum the echoes of scatterers that are seen by way of mirrors.
+
+    Args:
+        tracer: of one reflection, with mirrors.
+        mirrors: of the scene, for ways by one of them there and another back; default: no such ways.
+    """
+
+    def __init__(self, tracer: CoherentTracer, mirrors: Mirrors | None = None) -> None:
+        self.direct, self.sonar, self.former = tracer, tracer.sonar, tracer.former
+        self.wavenumber = 2 * math.pi / tracer.wavelength
+        self.nearest = max(tracer.former.first_range, tracer.sonar.bin_m)
+        self.last = self.former.first_range + (self.former.ranges - 1) * self.former.range_step
+        self.second = SecondMirrors.of(tracer.scene, mirrors, self.wavenumber) if self.sonar.bounces > 2 else None
+        more = 0 if self.second is None else len(self.second.mirrors)
+        self.bits = tracer.bits - math.ceil(math.log2(PATHS + more))
+        self.launch = self._compile()
+
+    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64], time_s: float = 0.0) -> None:
+        """Add the ghosts of one ping to its field ``(sines, ranges)``, in place, at a pose ``(6,)`` and a time [s]."""
+        direct = self.direct
+        rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
+        scene = scene_at(direct.scene, direct.motion, time_s)
+        bodies = None if direct.motion is None else mi.Float64(direct.motion.body_lines(time_s).ravel().tolist())
+        inputs = direct.index, scene, rows, direct.surfaces.arrays(), direct.patches, direct.mirrors, bodies
+        real, imag = replayed(self.launch, *inputs)
+        field.real += np.array(real, copy=False).reshape(field.shape)
+        field.imag += np.array(imag, copy=False).reshape(field.shape)
+
+    def _compile(self) -> Callable[..., Any]:
+        @Frozen
+        def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any, bodies: Any) -> Any:
+            lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
+            rays = FanRays(self.direct.fan, self.sonar, index, lines)
+            surfaces = replace(self.direct.surfaces, **tables)
+            hit = surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d))
+            now = MirroredRays(rays, hit, mi.Float(1), mi.UInt32(0))
+            sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))
+            for number in range(2, self.sonar.bounces + 1):
+                first = rays.origin + rays.d * now.hit.t, now.hit.n
+                now = mirrored_on(scene, surfaces, now, mirrors, self.wavenumber)
+                retro = number == 2 and self.sonar.bounces > 2
+                own = first if retro else None
+                self._sum(scene, rays, now, mirrors, patches, (sums[0], sums[1]), first=own, bodies=bodies)
+            dr.eval(sums)
+            return tuple(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in sums)
+
+        return launch
+
+    def _sum(
+        self,
+        scene: DeviceArray,
+        rays: FanRays,
+        now: MirroredRays,
+        mirrors: mi.Float,
+        patches: mi.Float,
+        sums: tuple[mi.UInt64, mi.UInt64],
+        *,
+        first: tuple[DeviceArray, DeviceArray] | None,
+        bodies: mi.Float64 | None,
+    ) -> None:
+        """Sum the points that rays behind mirrors look through.
+
+        ``first`` is place and normal of the only mirror so far, where the way back may be by mirrors as well.
+        """
+        hit = without_mirror_part(mirrors, now.hit, now.rays.d, self.wavenumber)
+        place: DeviceArray = now.rays.origin + now.rays.d * hit.t
+        way: DeviceArray = place - rays.origin
+        distance = dr.norm(way)
+        u = way / distance
+        matt = hit.valid & (hit.reflectivity > 0)
+        straight = matt & (dr.dot(hit.n, u) * dr.dot(hit.n, now.rays.d) > 0)
+        straight &= self._within((hit.t + distance) * 0.5, now)
+        straight &= ~hidden(scene, mi.Point3f(place), hit.n, u, distance, straight)
+        back = matt & self._within(hit.t, now) if first is not None else mi.Bool(False)
+        ways: list[tuple[FanRays, DeviceArray, DeviceArray]] = []
+        if first is not None and self.second is not None:
+            for way in self.second.ways(scene, rays.origin, (place, hit.n), first, matt):
+                beyond = rays.from_lines(mirrored_lines(rays.lines, way.mirror.normal, way.mirror.place))
+                facing = dr.dot(hit.n, way.u) * dr.dot(hit.n, now.rays.d) > 0
+                ways.append((beyond, way.factor, way.is_open & facing & self._within((hit.t + way.distance) * 0.5, now)))
+        if bodies is not None:  # all that follows is in the axes of the body that is hit
+            assert isinstance(self.direct.surfaces, MovingSurfaces)
+            turn = [[dr.gather(mi.Float64, bodies, now.body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
+            rays, now = in_body(turn, rays), replace(now, rays=in_body(turn, now.rays))
+            ways = [(in_body(turn, beyond), factor, is_open) for beyond, factor, is_open in ways]
+            normal = [mi.Float(row[0]) * hit.n.x + mi.Float(row[1]) * hit.n.y + mi.Float(row[2]) * hit.n.z for row in turn]
+            lattice = self.direct.surfaces.own_lattice(scene, hit, now.body)
+            hit, place = replace(hit, n=mi.Normal3f(*normal), shape_id=lattice), now.rays.origin + now.rays.d * hit.t
+        points = HashedPoints(
+            replace(hit, valid=straight | back | _any_of(ways)),
+            place,
+            *now.rays.steps_on(hit),
+            pitch=self.direct.pitch,
+            patch=self.sonar.speckle_patch_m,
+            seed=self.sonar.seed,
+        )
+
+        def step(number: mi.Int32) -> tuple[mi.Int32]:
+            point = points.point(number, patches, self.direct.patch_entries)
+            held = number < points.count
+            self._deposit((rays, now), points, point, sums, (held & straight, held & back if first is not None else None))
+            for beyond, factor, is_open in ways:
+                self._deposit_by((now, beyond, factor), points, point, sums, held & is_open)
+            return (number + 1,)
+
+        begin = mi.Int32(0) + dr.zeros(mi.Int32, self.direct.fan.rays)
+        dr.while_loop((begin,), lambda number: number < points.count, step)
+
+    def _within(self, range_m: DeviceArray, now: MirroredRays) -> DeviceArray:
+        """Test whether paths by way of a ray's cell may lie in the window."""
+        across, down = now.rays.steps_on(now.hit)
+        wide = dr.norm(across) + dr.norm(down)
+        return (range_m + wide > self.former.first_range) & (range_m - wide < self.last)
+
+    def _deposit(
+        self,
+        ways: tuple[FanRays, MirroredRays],
+        points: HashedPoints,
+        point: Point,
+        sums: tuple[mi.UInt64, mi.UInt64],
+        active: tuple[DeviceArray, DeviceArray | None],
+    ) -> None:
+        """Add the paths of one point of each ray to the grid."""
+        rays, now = ways
+        there, here = now.rays.seen(points, point), rays.seen(points, point)
+        far, near = (self._clear(seen.range_m) for seen in (there, here))
+        level = points.strength * point.amplitude * now.gain
+        both = level * dr.sqrt(there.cosine * here.cosine) / (far * near)
+        half = (there.range_m + here.range_m) * 0.5
+        wave = (half, *self._turned(half, point))
+        seen = active[0] & there.mine & here.ahead
+        if self.sonar.beam_pattern == "two_way":
+            gain = elevation_gain_of_ends(self.sonar, there.tangent, here.tangent) * overlap(
+                self.sonar, there.sine - here.sine
+            )
+            self._add(sums, (there.sine + here.sine) * 0.5, both * gain * 2, wave, seen)
+        else:
+            for one, other in ((there, here), (here, there)):
+                gain = elevation_gain_of_ends(self.sonar, one.tangent, other.tangent)
+                self._add(sums, one.sine, both * gain, wave, seen)
+        if active[1] is not None:
+            gain = (
+                now.gain * there.cosine / dr.square(far) * elevation_gain_of_ends(self.sonar, there.tangent, there.tangent)
+            )
+            wave = (there.range_m, *self._turned(there.range_m, point))
+            self._add(sums, there.sine, level * gain, wave, active[1] & there.mine)
+
+    def _deposit_by(
+        self,
+        way: tuple[MirroredRays, FanRays, DeviceArray],
+        points: HashedPoints,
+        point: Point,
+        sums: tuple[mi.UInt64, mi.UInt64],
+        active: DeviceArray,
+    ) -> None:
+        """Add the path of one point of each ray that leaves by another mirror; its reverse is another ray's."""
+        now, beyond, factor = way
+        there, other = now.rays.seen(points, point), beyond.seen(points, point)
+        half = (there.range_m + other.range_m) * 0.5
+        level = points.strength * point.amplitude * now.gain * factor * dr.sqrt(there.cosine * other.cosine)
+        level /= self._clear(there.range_m) * self._clear(other.range_m)
+        level *= elevation_gain_of_ends(self.sonar, there.tangent, other.tangent)
+        sine = there.sine
+        if self.sonar.beam_pattern == "two_way":
+            level *= overlap(self.sonar, there.sine - other.sine)
+            sine = (there.sine + other.sine) * 0.5
+        self._add(sums, sine, level, (half, *self._turned(half, point)), active & there.mine & other.ahead)
+
+    def _clear(self, range_m: DeviceArray) -> DeviceArray:
+        """Return ranges for spreading, which is held constant nearer than the window or one bin."""
+        near = mi.Float(range_m)
+        return dr.select(near > self.nearest, near, self.nearest)
+
+    def _turned(self, half: DeviceArray, point: Point) -> tuple[DeviceArray, DeviceArray]:
+        """Return cosine and sine of the phase of paths of half a length."""
+        turns = half * (self.wavenumber / math.pi)
+        sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + point.turn) * (2 * math.pi))
+        return cos, sin
+
+    def _add(
+        self,
+        sums: tuple[mi.UInt64, mi.UInt64],
+        sine: DeviceArray,
+        level: DeviceArray,
+        wave: tuple[DeviceArray, ...],
+        active: DeviceArray,
+    ) -> None:
+        """Add waves of a half path, cosine and sine of the phase to the grid."""
+        half, cos, sin = wave
+        add_waves(self.former, self.bits, sums, (sine, half, level, cos, sin), active)
+
+
+def _any_of(ways: list[tuple[FanRays, DeviceArray, DeviceArray]]) -> DeviceArray:
+    """Return which rays have an open way by another mirror."""
+    found = mi.Bool(False)
+    for _, _, is_open in ways:
+        found |= is_open
+    return found
+
+
+def mirrored_on(
+    scene: DeviceArray, surfaces: Surfaces, now: MirroredRays, mirrors: mi.Float, wavenumber: float
+) -> MirroredRays:
+    """Follow rays that meet mirrors to the next surface; others end.
+
+    Args:
+        scene: to trace.
+        surfaces: its tables.
+        now: rays and where they end.
+        mirrors: table of mirror parts.
+        wavenumber: of the carrier [1/m].
+    """
+    rays, hit = now.rays, now.hit
+    reflection, roughness_m = parts_at(mirrors, hit)
+    active = hit.valid & (reflection != 0)
+    place: DeviceArray = rays.origin + rays.d * hit.t
+    beyond = rays.from_lines(mirrored_lines(rays.lines, hit.n, place))
+    begin = going_on(place, beyond.d, hit.n)
+    onward, body = mi.Ray3f(mi.Point3f(place + beyond.d * begin), beyond.d), mi.UInt32(0)
+    if isinstance(surfaces, MovingSurfaces):
+        found, body = surfaces.hit_and_body(scene, onward, active)
+    else:
+        found = surfaces.hit(scene, onward, active)
+    length = dr.norm(place - beyond.origin) + begin + found.t
+    gain = now.gain * reflection * smooth_share(roughness_m, dr.dot(hit.n, rays.d), wavenumber)
+    return MirroredRays(beyond, replace(found, t=length, valid=found.valid & active), gain, body)
+
+
+def in_body(turn: list[list[DeviceArray]], rays: FanRays) -> FanRays:
+    """Return rays in the axes of bodies.
+
+    Args:
+        turn: three rows of what turns the world's axes to those of each ray's body, in double precision.
+        rays: in the world.
+    """
+    lines = rays.lines
+    carried = [[sum(row[k] * lines[k][column] for k in range(3)) for column in range(4)] for row in turn]
+    for row, line in zip(turn, carried, strict=True):
+        line[3] += row[3]
+    return rays.from_lines(carried)
+
+
+# ---------------- The field of corners: Kirchhoff's integral over the last of two or three mirrors, a plane for each
+# ray's cell
+# A ray goes from mirror to mirror. At the last one, at P, its cell sends back to the sonar what Kirchhoff's integral says,
+#
+#     s = sum j k / 2 pi V1 V2 .. (cos + cos') / 2 dA sinc(g_u / 2) sinc(g_t / 2) exp(-j k (L + R)) / (L R)
+#
+# L is the distance of P from the image of the sonar, R that from the sonar itself, cos and cos' those of both lines, dA
+# the area of the cell on the last mirror, dX its steps by one column (u) and row (t), g = k (d + (P - O) / R) . dX.
+# This is "shooting and bouncing rays" (Ling, Chou, Lee 1989). The ray tells how the path leaves; the line to P tells
+# how it arrives. Its reverse is another ray's.
+#
+# As for one mirror a first launch finds what to divide: cells whose neighbours meet other mirrors are divided most. What
+# leaves the last mirror farther than 60 deg from the line to the sonar fades, and ends at 90 deg.
+
+
+ONE_PLANE = 1e-4
+"""Images of the sonar that are nearer than this part of their distance are those of one chain of planes."""
+
+MOST_STRETCH = 16.0
+"""Largest part by which range or slant at the last mirror may exceed those of the line straight to it."""
+
+
+@dataclass
+class LastMirror:
+    """The last mirror of rays.
+
+    Attributes:
+        way: from the sonar to the point there, in double precision [m].
+        distance: its length [m]; ``length``: from the image of the sonar [m]; both in double precision.
+        u: its direction.
+        reflection: amplitude that all mirrors leave.
+        share: of Kirchhoff's integral, by what leaves the mirror.
+        heard: whether it sends anything back.
+    """
+
+    way: DeviceArray
+    distance: DeviceArray
+    length: DeviceArray
+    u: DeviceArray
+    reflection: DeviceArray
+    share: DeviceArray
+    heard: DeviceArray
+
+
+class CornerTracer(MirrorTracer):
+    """Sum the echoes of two and more mirrors one after the other; arguments as of :class:`MirrorTracer`."""
+
+    def _chains(
+        self, scene: mi.Scene, tables: Any, rays: FanRays, table: mi.Float
+    ) -> Iterator[tuple[MirroredRays, LastMirror]]:
+        """Yield rays at their second mirror, at their third, and what these send back."""
+        surfaces = replace(self.surfaces, **tables)
+        now = MirroredRays(rays, surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d)), mi.Float(1), mi.UInt32(0))
+        for _ in range(2, self.sonar.bounces + 1):
+            now = mirrored_on(scene, surfaces, now, table, self.wavenumber)
+            yield now, self._last(scene, rays, now, table)
+
+    def _last(self, scene: mi.Scene, rays: FanRays, now: MirroredRays, table: mi.Float) -> LastMirror:
+        """Return what the surface that rays meet sends back as a mirror."""
+        hit, d = now.hit, now.rays.d
+        reflection, roughness_m = parts_at(table, hit)
+        image, origin = (mi.Point3d(*(line[3] for line in one.lines)) for one in (now.rays, rays))
+        ray: DeviceArray = mi.Vector3d(d)
+        place: DeviceArray = image + ray * mi.Float64(hit.t)
+        way = place - origin
+        distance, length = dr.norm(way), dr.norm(place - image)
+        u: DeviceArray = mi.Vector3f(way / distance)
+        share = facing_share(dr.dot(reflected(d, hit.n), -u))
+        heard = hit.valid & (reflection != 0) & (share > 0) & (length < distance * MOST_STRETCH)
+        heard &= dr.dot(hit.n, u) * dr.dot(hit.n, d) > 0
+        half = mi.Float(length + distance) * 0.5
+        heard &= (half > self.former.first_range) & (half < self.last)
+        heard &= ~hidden(scene, mi.Point3f(place), hit.n, u, mi.Float(distance), heard)
+        left = smooth_share(roughness_m, dr.dot(hit.n, d), self.wavenumber)
+        return LastMirror(way, distance, length, u, now.gain * reflection * left, share, heard)
+
+    # ---------------------------------------------------------------- first launch
+
+    def _compile_survey(self) -> Callable[..., Any]:
+        @Frozen
+        def survey(index: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
+            rays = FanRays(self.fan, self.sonar, index, rows_of(rows))
+            wanted: DeviceArray = mi.Float(0)
+            for now, last in self._chains(scene, tables, rays, table):
+                own: DeviceArray = self._parts_of(rays, now, last)
+                wanted = dr.select(dr.square(own) > dr.square(wanted), own, wanted)
+            return wanted
+
+        return survey
+
+    def _parts_of(self, rays: FanRays, now: MirroredRays, last: LastMirror) -> DeviceArray:
+        """Return into how many parts each way cells are to be divided: 0 not at all heard, negative at edges."""
+        heard, image, normal = last.heard, mi.Vector3f(now.rays.origin), mi.Vector3f(now.hit.n)
+        place: DeviceArray = mi.Vector3f(image + now.rays.d * now.hit.t)
+        dr.eval(heard, image, normal, place)
+        near, mixed = heard, mi.Bool(False)
+        for beside in NEIGHBOURS:
+            other = self._beside(rays, *beside)
+            also = dr.gather(mi.Bool, heard, other)
+            chord: DeviceArray = dr.gather(mi.Vector3f, place, other) - place
+            apart: DeviceArray = dr.norm(dr.gather(mi.Vector3f, image, other) - image)
+            alike = (apart <= ONE_PLANE * (1 + now.hit.t)) & (dr.abs(dr.dot(normal, chord)) <= LEVEL_PART * dr.norm(chord))
+            mixed |= (also != heard) | (also & heard & ~alike)
+            near |= also
+        d = now.rays.d
+        steps = [dr.norm(step - d * dr.dot(d, step)) for step in now.rays.steps_on(now.hit)]
+        longest = dr.select(steps[0] > steps[1], steps[0], steps[1])
+        needed = self._cells(longest, mi.Float(0), mi.Float(last.distance))
+        smooth = dr.select(heard, dr.select(needed > 1, needed, 1), 0)
+        return dr.select(mixed & near, -float(self.finest), smooth)
+
+    # ---------------------------------------------------------------- second launch
+
+    def _sum(
+        self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]
+    ) -> None:
+        """Add the echo of each ray's cell to the grid."""
+        for now, last in self._chains(scene, tables, rays, table):
+            self._add_last(rays, now, last, sums)
+
+    def _add_last(self, rays: FinerRays, now: MirroredRays, last: LastMirror, sums: tuple[mi.UInt64, mi.UInt64]) -> None:
+        """Add what the last mirror sends back."""
+        hit, d = now.hit, now.rays.d
+        across, down = now.rays.steps_on(hit)
+        steep, back = dr.abs(dr.dot(hit.n, d)), dr.abs(dr.dot(hit.n, last.u))
+        length, distance = mi.Float(last.length), mi.Float(last.distance)
+        level = last.reflection * last.share * (self.wavenumber / (4 * math.pi)) * (steep + back)
+        level *= dr.norm(dr.cross(across, down)) / (length * distance)
+        turn: DeviceArray = (d + last.u) * (self.wavenumber / 2)
+        level *= sinc(dr.dot(turn, across)) * sinc(dr.dot(turn, down))
+        sine, tangent, ahead = rays.direction(last.u)
+        level *= elevation_gain_of_ends(self.sonar, tangent, rays.tangent)
+        if self.sonar.beam_pattern == "two_way":
+            level *= overlap(self.sonar, sine - rays.sine)
+            sine = (sine + rays.sine) * 0.5
+        half = (last.length + last.distance) * 0.5
+        turns = half * (2 / self.wavelength)
+        sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + 0.25) * (2 * math.pi))
+        kept = last.heard & ahead & (steep + back < 2 * MOST_STRETCH * steep)
+        add_waves(self.former, self.bits, sums, (sine, half, level, cos, sin), kept)
