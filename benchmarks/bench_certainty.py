@@ -26,7 +26,7 @@ from bench_recordings import CHAIN, RESTING, opened, pairs
 from numpy.typing import NDArray
 from real_recordings import recordings_folder
 
-from mitsonar.datasets.torch_pairs import SonarPairs
+from mitsonar.datasets.samples import SonarPairs
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.mapping.benchmark_sets import RenderedSet

@@ -52,10 +52,9 @@ from mitsonar import (
     load_sonar,
 )
 from mitsonar.config.data import Recipe, Split
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.plan import scenes_of, sequences_of
-from mitsonar.datasets.response_packing import with_noise
-from mitsonar.datasets.response_pairs import ImpulsePairs
+from mitsonar.datasets.responses import ImpulsePairs, with_noise
 from mitsonar.estimation.crlb.channel_crlb import channel_crlb
 from mitsonar.estimation.learned.regressors import REGRESSORS, flattened, score_all
 from mitsonar.estimation.named_estimators import create_estimator

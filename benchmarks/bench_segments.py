@@ -32,7 +32,7 @@ from bench_impulse import cpu
 from mitsonar import load_recipe
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.config.training import TrainingRecipe, load_training_recipe
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.estimation.height.direct_height import DirectHeight
 from mitsonar.estimation.learned.view_network import ViewNetwork

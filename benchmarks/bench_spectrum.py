@@ -27,11 +27,10 @@ from scipy.ndimage import uniform_filter
 
 from mitsonar.acoustics.noise import NoiseModel, information, load_noise
 from mitsonar.config.data import load_recipe
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import SceneRenderer, make_dataset
 from mitsonar.datasets.plan import scenes_of
-from mitsonar.datasets.scene_rendering import SceneRenderer
+from mitsonar.datasets.samples import SonarPairs
 from mitsonar.datasets.store import DataStore
-from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.estimation.crlb.fisher_bound import overall
 from mitsonar.estimation.crlb.image_crlb import bound
 from mitsonar.geometry.ground import GroundGeometry

@@ -207,7 +207,7 @@ def make_pattern_runs(out: Path, model: str, coarse: bool) -> None:
 
 def run_table21(job: Job, out: Path) -> Result:
     """Estimate consecutive pairs of a run: all, one of ``every``, or ``frames`` evenly spaced."""
-    from mitsonar.datasets.torch_pairs import SonarPairs
+    from mitsonar.datasets.samples import SonarPairs
 
     pairs = SonarPairs(pattern_runs(out, job.model), part="all", split="sequence", noise=job.noise)
     number = TEXTURES.index(job.texture) * len(RUNS) + RUNS.index(job.run)

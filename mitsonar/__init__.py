@@ -20,11 +20,11 @@ from mitsonar.errors import explain_missing
 if TYPE_CHECKING:
     from mitsonar.acoustics.noise import load_noise
     from mitsonar.config.data import load_recipe
-    from mitsonar.datasets.generation import make_dataset
-    from mitsonar.datasets.rendered_pairs import RenderedPairs
-    from mitsonar.datasets.response_pairs import ImpulsePairs
+    from mitsonar.datasets.make import make_dataset
+    from mitsonar.datasets.rendered import RenderedPairs
+    from mitsonar.datasets.responses import ImpulsePairs
+    from mitsonar.datasets.samples import SonarPairs
     from mitsonar.datasets.store import DataStore
-    from mitsonar.datasets.torch_pairs import SonarPairs
     from mitsonar.environments.sonar_env import SonarEnv
     from mitsonar.environments.sonar_vector_env import SonarVectorEnv
     from mitsonar.errors import MitsonarError, MitsonarWarning
@@ -139,21 +139,21 @@ _MODULES = {
     "Echogram": "records.soundings",
     "Effort": "training.reproduce",
     "Estimate": "estimation.estimator",
-    "ImpulsePairs": "datasets.response_pairs",
+    "ImpulsePairs": "datasets.responses",
     "ImpulseResponses": "records.responses",
     "MitsonarError": "errors",
     "MitsonarWarning": "errors",
     "Motion": "motion.composition",
     "Mounted": "simulation.vehicle",
     "Pose": "motion.pose",
-    "RenderedPairs": "datasets.rendered_pairs",
+    "RenderedPairs": "datasets.rendered",
     "SeaSurface": "worlds.sea",
     "SensorNoise": "mapping.simulated_sensors",
     "Simulator": "simulation.simulator",
     "Sonar": "instruments.sonar",
     "SonarEnv": "environments.sonar_env",
     "SonarFrames": "records.frames",
-    "SonarPairs": "datasets.torch_pairs",
+    "SonarPairs": "datasets.samples",
     "SonarVectorEnv": "environments.sonar_vector_env",
     "Sounder": "instruments.sounder",
     "SounderSimulator": "simulation.sounding",
@@ -179,7 +179,7 @@ _MODULES = {
     "load_sounder": "instruments.sounder",
     "load_tables": "training.document_tables",
     "load_vehicle": "simulation.vehicle",
-    "make_dataset": "datasets.generation",
+    "make_dataset": "datasets.make",
     "mosaic_figure": "plotting.figures",
     "odometry": "mapping.odometry",
     "open_recording": "recordings.open",

@@ -82,7 +82,7 @@ def variant() -> str:
 @pytest.fixture(scope="session")
 def tiny_data(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
     """The data set of the tiny recipe, made once for all modules of a worker: to read, and to copy before any harm."""
-    from mitsonar.datasets.generation import make_dataset
+    from mitsonar.datasets.make import make_dataset
 
     url = tmp_path_factory.mktemp("made") / "tiny.zarr"
     make_dataset(tiny_recipe(), str(url))

@@ -307,7 +307,7 @@ def tiny_network(seed: int = 0, **options: Any) -> Any:
 
 def tiny_samples(**words: Any) -> Any:
     """The samples that the tiny recipe would give; there are none."""
-    from mitsonar.datasets.torch_pairs import Samples
+    from mitsonar.datasets.samples import Samples
 
     return Samples(tiny_recipe(), **{"labels": "normx10", "noise": "low", **words})
 

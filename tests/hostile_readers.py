@@ -184,7 +184,7 @@ def read_store(folder: Path) -> None:
 
 
 def check_store(folder: Path) -> None:
-    from mitsonar.datasets.data_check import check
+    from mitsonar.datasets.make import check
     from mitsonar.datasets.store import DataStore
 
     check(DataStore.open(folder / "data.zarr"))

@@ -300,8 +300,8 @@ def test_data_sets_are_made_without_torch(tmp_path: Path) -> None:
         import sys
         sys.path.insert(0, {str(ROOT / "tests")!r})
         from helpers import tiny_recipe
-        from mitsonar.datasets.data_check import check
-        from mitsonar.datasets.generation import make_dataset
+        from mitsonar.datasets.make import check
+        from mitsonar.datasets.make import make_dataset
         from mitsonar.datasets.store import DataStore
         make_dataset(tiny_recipe(), {str(tmp_path / "tiny.zarr")!r}, sequences=2)
         assert check(DataStore.open({str(tmp_path / "tiny.zarr")!r})) == []

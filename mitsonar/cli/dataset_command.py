@@ -32,7 +32,7 @@ from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from mitsonar.config.data import Recipe
-    from mitsonar.datasets.generation import Made
+    from mitsonar.datasets.make import Made
 
 __all__ = ["datasets"]
 
@@ -90,7 +90,7 @@ def make(
 
 def _made(recipe: Recipe, out: str, **words: object) -> Made:
     """Make a data set with a bar; Ctrl-C ends the process at once."""
-    from mitsonar.datasets.generation import make_dataset
+    from mitsonar.datasets.make import make_dataset
 
     bar = LaterBar("rendering", "frames")
     try:
@@ -236,7 +236,7 @@ def show(
 @answered
 def check(data: Data) -> None:
     """Verify checksums, counts, ranges, and that labels agree with poses. All data are read and none changed."""
-    from mitsonar.datasets.data_check import check as find_faults
+    from mitsonar.datasets.make import check as find_faults
     from mitsonar.datasets.store import DataStore
 
     store = DataStore.open(data, unfinished=True)

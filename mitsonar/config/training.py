@@ -34,10 +34,10 @@ Noise = Annotated[str, AfterValidator(_known_noise)]
 
 
 class Input(_Part):
-    """How frames become inputs of the network: arguments of :class:`~mitsonar.datasets.torch_pairs.SonarPairs`.
+    """How frames become inputs of the network: arguments of :class:`~mitsonar.datasets.samples.SonarPairs`.
 
     Of impulse responses only ``frames`` and ``leak`` apply, the arguments of
-    :class:`~mitsonar.datasets.response_pairs.ImpulsePairs`.
+    :class:`~mitsonar.datasets.responses.ImpulsePairs`.
     """
 
     frames: int = Field(2, ge=1, le=16, description="of a sample; 1: heights are learnt")

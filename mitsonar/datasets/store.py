@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import warnings
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import EllipsisType
@@ -12,20 +14,36 @@ from typing import Any, TypeAlias
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from mitsonar.config.data import Recipe, recipe_from
-from mitsonar.datasets.modalities import modality_of
-from mitsonar.datasets.modality import Fields, Modality, Values
-from mitsonar.datasets.plan import Plan, Scene
-from mitsonar.datasets.store_arrays import SEAL, ShardLayout, create_arrays, planned_arrays, write_planned
-from mitsonar.datasets.store_attributes import check_attributes
-from mitsonar.errors import MitsonarError, shortened
-from mitsonar.io.files import check_plain
+from mitsonar.config.data import Recipe, Split, recipe_from
+from mitsonar.datasets.modality import Fields, Modality, StoredArray, Values
+from mitsonar.datasets.plan import Plan, Scene, modality_of
+from mitsonar.errors import MitsonarError, meant, shortened
+from mitsonar.io.files import check_plain, finite_number, whole_number
 from mitsonar.io.runs import other_versions
 from mitsonar.io.storage import Storage, refuse_codecs
 from mitsonar.records.frames import FEW_ROWS, rows_that_fit
+from mitsonar.worlds.world import Family
 
-__all__ = ["DECIDING", "FORMAT", "PACKAGES", "DataStore"]
+__all__ = [
+    "DECIDING",
+    "FORMAT",
+    "PACKAGES",
+    "PARTS",
+    "SEAL",
+    "DataStore",
+    "ShardLayout",
+    "check_attributes",
+    "create_arrays",
+    "deal",
+    "deal_samples",
+    "names_of_scenes",
+    "planned_arrays",
+    "world_of",
+    "write_planned",
+]
+
 
 FORMAT = 1
 """Version of what docs/guides/data-sets.md describes."""
@@ -395,3 +413,303 @@ class DataStore:
 def digest(content: bytes) -> int:
     """Compute 64 bits of BLAKE2b."""
     return int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "little")
+
+
+# ---------------- The arrays of a data set's store: how frames are cut into files, how the arrays are created, what
+# each one holds
+
+
+SHARD_BYTES = 32 * 2**20
+"""Approximate size of what is recorded in a shard. A worker holds so much, and a kill may cost so much."""
+
+SEAL = "seal"
+"""Name of the array with the sizes and digests of all files."""
+
+ABOUT = {
+    "pose": "sonar: x, y, z [m], pitch, roll, heading [rad]",
+    "vehicle_pose": "vehicle: x, y, z [m], pitch, roll, heading [rad]; motion is the vehicle's",
+    "motion": "to the next frame of the sequence: sideways, forward [m], yaw [rad]; nan for its last",
+    "velocity": "of the vehicle in its own axes: starboard, forward, up [m/s], turn to starboard [rad/s]",
+    "time_s": "since the sequence began [s]",
+    "scene": "number of the scene",
+    "sequence": "number of the sequence",
+    SEAL: "bytes and BLAKE2b-64 of each file of a shard, written when the shard is done",
+}
+
+
+@dataclass(frozen=True)
+class ShardLayout:
+    """How frames are cut into files.
+
+    Attributes:
+        chunk: frames that are compressed together: a sequence, where sequences are short.
+        shard: frames of one file, the unit of work.
+    """
+
+    chunk: int
+    shard: int
+
+    @classmethod
+    def of(cls, recipe: Recipe, plan: Plan) -> ShardLayout:
+        """Choose chunks that hold whole short sequences, and shards of about 32 MiB, of one scene if possible."""
+        pings = recipe.flight.pings if recipe.flight.kind == "random" else 10
+        chunk = pings if pings <= 10 else 10
+        each = modality_of(recipe).ping_bytes
+        scenes = np.bincount(plan.scene)
+        wanted = max(1, min(SHARD_BYTES // each, int(scenes.max())) // chunk)
+        # where scenes allow it, shards end with them: a shard of two scenes loads both
+        whole = int(np.gcd.reduce(scenes[scenes > 0])) // chunk
+        aligned = max((n for n in range(1, wanted + 1) if whole % n == 0), default=1) if whole else 1
+        return cls(chunk, chunk * (aligned if 3 * aligned >= wanted else wanted))
+
+
+def create_arrays(group: zarr.Group, plan: Plan, modality: Modality, layout: ShardLayout) -> None:
+    """Create every array of a store, and write those whose values are known before rendering.
+
+    Args:
+        group: of the store.
+        plan: all frames of the data set.
+        modality: what its instrument records.
+        layout: how frames are cut into files.
+    """
+    for name, stored in modality.stored.items():
+        # numbers of a shard's pings are small: one chunk
+        _create_recorded(group, name, len(plan), stored, layout if len(stored.shape) > 0 else ShardLayout(layout.shard, 0))
+    for name, axis in modality.axes.items():
+        _write_known(group, name, axis.values, (axis.dim,), axis.about)
+    for name, values in planned_arrays(plan, modality).items():
+        write_planned(group, name, values)
+    recorded = list(modality.stored)
+    shape = (-(-len(plan) // layout.shard), len(recorded), 2)
+    seal = group.create_array(
+        SEAL,
+        shape=shape,
+        chunks=(1, *shape[1:]),
+        dtype="uint64",
+        compressors=None,
+        fill_value=0,
+        overwrite=True,
+        dimension_names=("shard", "stored", "two"),
+    )
+    seal.attrs.put({"about": ABOUT[SEAL], "arrays": recorded})
+
+
+def planned_arrays(plan: Plan, modality: Modality) -> dict[str, Values]:
+    """Return the arrays that the plan decides, by name, each ``(frames, ...)``.
+
+    The vehicle's poses are among them where x, y, z or heading of the sonar differ from the vehicle's.
+    """
+    known: dict[str, Values] = {"pose": plan.poses, "motion": plan.motion, "time_s": plan.time_s}
+    known |= {"scene": plan.scene, "sequence": plan.sequence}
+    if not np.array_equal(plan.poses[:, [0, 1, 2, 5]], plan.vehicle[:, [0, 1, 2, 5]]):
+        known["vehicle_pose"] = plan.vehicle
+    return known | {name: getattr(plan, name) for name in modality.planned}
+
+
+def write_planned(group: zarr.Group, name: str, values: Values) -> None:
+    """Write an array of :func:`planned_arrays`, in one piece."""
+    inner = {"pose": ("six",), "vehicle_pose": ("six",), "motion": ("three",), "velocity": ("four",)}
+    _write_known(group, name, values, ("frame", *inner.get(name, ())), ABOUT[name])
+
+
+def _create_recorded(group: zarr.Group, name: str, frames: int, stored: StoredArray, layout: ShardLayout) -> None:
+    """Create an array that rendering fills: shards of compressed chunks with checksums, or plain chunks if a shard is 0."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # checksums of v3 are not in every reader
+        group.create_array(
+            name,
+            shape=(frames, *stored.shape),
+            chunks=(layout.chunk, *stored.shape),
+            shards=(layout.shard, *stored.shape) if layout.shard else None,
+            dtype=stored.kind,
+            fill_value=0,
+            compressors=[ZstdCodec(level=1), Crc32cCodec()],
+            dimension_names=("frame", *stored.dims),
+            attributes={"about": stored.about},
+            overwrite=True,
+        )
+
+
+def _write_known(group: zarr.Group, name: str, values: Values, dims: tuple[str, ...], about: str) -> None:
+    """Write an array whose values are known from the start, in one piece."""
+    array = group.create_array(
+        name,
+        shape=values.shape,
+        chunks=values.shape,
+        dtype=values.dtype,
+        fill_value=0,
+        dimension_names=dims,
+        attributes={"about": about},
+        overwrite=True,
+    )
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        array[...] = values
+
+
+# ---------------- The attributes of a data set's store, checked before anything is allocated for the frames that they
+# promise
+
+
+MOST_FRAMES = 10**9
+"""Largest number of frames of a data set."""
+
+
+def check_attributes(about: Fields, recipe: Recipe, modality: Modality) -> None:
+    """Check the numbers of a store against each other and against its recipe.
+
+    Args:
+        about: attributes of the Zarr group.
+        recipe: of the data set.
+        modality: what its instrument records.
+
+    Raises:
+        MitsonarError, KeyError, ValueError: a number that cannot be, or one that is missing.
+    """
+    sequences = whole_number(about["sequences"], "sequences", 1, recipe.sequences)
+    most = MOST_FRAMES
+    if recipe.flight.kind == "random":
+        most = sequences * recipe.flight.pings
+        whole_number(about["frames"], "frames", most, most)
+    frames = whole_number(about["frames"], "frames", 1, min(most, MOST_FRAMES))
+    shard = whole_number(about["shard_frames"], "shard_frames", 1, MOST_FRAMES)
+    if shard % whole_number(about["chunk_frames"], "chunk_frames", 1, shard):
+        raise ValueError("shard_frames is no multiple of chunk_frames")
+    total, numbers = 0, set()
+    for scene in about["scenes"]:
+        numbers.add(whole_number(scene["number"], "number of a scene", 0, 2**31))
+        whole_number(scene["group"], "group of a scene", 0, len(recipe.scenes) - 1)
+        whole_number(scene["seed"], "seed of a scene", 0, 2**64)
+        total += whole_number(scene["sequences"], "sequences of a scene", 1, sequences)
+    if total != sequences or len(numbers) != len(about["scenes"]):
+        raise ValueError(f"scenes have {total:,} sequences, {sequences:,} are promised for {frames:,} frames")
+    for name in modality.settled:
+        finite_number(about[name], name, above=0)
+    versions = about["versions"]
+    if not (isinstance(versions, dict) and isinstance(about["variant"], str)):
+        raise ValueError("versions or variant is something else")
+    if not all(type(about[name]) is bool for name in ("ready", "finished")):
+        raise ValueError("ready and finished must be true or false")
+
+
+# ---------------- Which frames are for training, validation and test: sequences, whole worlds, or samples, assigned
+# at random
+
+
+PARTS = ("train", "validation", "test")
+
+
+def world_of(recipe: Recipe, scenes: dict[int, Scene]) -> NDArray[np.int64]:
+    """Find the first scene with the same world, by number of the scene. Some worlds do not depend on their seed."""
+    if recipe.recorded is not None:  # nobody knows whether two recordings are of one place
+        return np.arange(max(scenes) + 1)
+    known: dict[tuple[type[Family], str, int], int] = {}
+    worlds = np.zeros(max(scenes) + 1, dtype=np.int64)
+    for number, scene in sorted(scenes.items()):
+        family = recipe.family(scene.group)
+        world = (type(family), family.model_dump_json(), scene.seed if family.seeded else 0)
+        worlds[number] = known.setdefault(world, number)
+    return worlds
+
+
+def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
+    """Mark the frames ``(frames,)`` of a part. Sequences, or worlds with all their frames, are assigned at random.
+
+    Args:
+        world: of each frame ``(frames,)``.
+        sequence: of each frame ``(frames,)``.
+        split: shares of the parts, and the seed.
+        part: ``train``, ``validation``, ``test`` or ``all``.
+
+    Raises:
+        MitsonarError: unknown part, a part that the split lacks, fewer worlds or sequences than parts.
+    """
+    if part == "all":
+        return np.ones(len(world), dtype=bool)
+    if part not in PARTS:
+        raise MitsonarError(f"part must be {', '.join(PARTS)} or all: got {part!r}{meant(part, (*PARTS, 'all'))}")
+    shares = np.array([getattr(split, name) for name in PARTS])
+    if shares[PARTS.index(part)] == 0:
+        raise MitsonarError(f"the split by {split.by} has no {part} part: {_shares(split)}; give another split")
+    owner = world if split.by == "scene" else sequence
+    numbers = np.unique(owner)
+    counts = _counts(len(numbers), shares)
+    if (counts[shares > 0] == 0).any():
+        raise MitsonarError(
+            f"the data set has {len(numbers)} different {split.by}{'s' * (len(numbers) > 1)}, too few for {_shares(split)}: "
+            "make more, give another split, or read part 'all'"
+        )
+    dealt = numbers[np.random.default_rng([split.seed, 6]).permutation(len(numbers))]
+    ends = np.cumsum(counts)
+    index = PARTS.index(part)
+    return np.isin(owner, dealt[ends[index] - counts[index] : ends[index]])
+
+
+def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
+    """Mark the samples ``(samples,)`` of a part. Training and validation share sequences, whose samples are assigned one by
+    one: these have the same motion and a frame in common. The test part, if there is one, is whole sequences.
+
+    Args:
+        sequence: of each sample ``(samples,)``.
+        split: shares of the parts, and the seed.
+        part: ``train``, ``validation``, ``test`` or ``all``.
+
+    Raises:
+        MitsonarError: as of :func:`deal`.
+    """
+    number = np.arange(len(sequence), dtype=np.int32)
+    if part not in PARTS or not split.test:
+        return deal(number.astype(np.int64), number, split, part)
+    whole = Split(by="sequence", train=1 - split.test, validation=0.0, test=split.test, seed=split.seed)
+    if part == "test":
+        return deal(sequence.astype(np.int64), sequence, whole, part)
+    marked = deal(sequence.astype(np.int64), sequence, whole, "train")
+    rest = 1 - split.test
+    shared = split.model_copy(update={"train": split.train / rest, "validation": split.validation / rest, "test": 0.0})
+    marked[marked] = deal(number[marked].astype(np.int64), number[marked], shared, part)
+    return marked
+
+
+def _counts(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Divide ``total`` among the parts by their shares; a part with a share gets at least one."""
+    counts = np.maximum(np.rint(shares * total).astype(np.int64), (shares > 0).astype(np.int64))
+    largest = int(shares.argmax())
+    counts[largest] = total - (counts.sum() - counts[largest])
+    return np.maximum(counts, 0)
+
+
+def _shares(split: Split) -> str:
+    """Write the shares of all parts."""
+    return ", ".join(f"{name} {getattr(split, name):.0%}" for name in PARTS)
+
+
+# ---------------- Names of the shapes of a data set's scenes, which its labels number
+
+
+def names_of_scenes(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArray[np.int32]]]:
+    """Return the names of all shapes of a data set, and the places among them of each scene's shapes.
+
+    Names of a scene file are in the store; worlds that depend on a seed are built once more. The second part gives by the
+    number of the scene the place of each ``shape_id``, and -1 for -1 ``(shapes + 1,)``. Both are empty where nothing is
+    known: of frames that were recorded, and of scene files in stores of earlier versions.
+    """
+    if store.recipe.recorded is not None:
+        return (), {}
+    stored = store.about.get("shape_names")
+    found: dict[int, tuple[str, ...]] = {}
+    built: dict[tuple[str, int], tuple[str, ...]] = {}
+    for number, scene in sorted(store.scenes.items()):
+        family = store.recipe.family(scene.group)
+        if family.called == "scene":
+            if not isinstance(stored, list) or scene.group >= len(stored):
+                return (), {}
+            found[number] = tuple(map(str, stored[scene.group]))
+        else:
+            key = repr(family), scene.seed if family.seeded else 0
+            if key not in built:
+                built[key] = family.build(scene.seed).shape_names
+            found[number] = built[key]
+    names = tuple(dict.fromkeys(name for own in found.values() for name in own))
+    if len(set(map(len, found.values()))) == 1 and len(set(found.values())) == 1:  # as the scenes number them
+        return next(iter(found.values())), {}
+    place = {name: at for at, name in enumerate(names)}
+    return names, {number: np.array([*map(place.get, own), -1], dtype=np.int32) for number, own in found.items()}

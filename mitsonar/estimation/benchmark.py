@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.datasets.make import SceneRenderer
 from mitsonar.datasets.plan import scenes_of
-from mitsonar.datasets.re_render import re_rendered
-from mitsonar.datasets.response_samples import ImpulseSamples
-from mitsonar.datasets.scene_rendering import SceneRenderer
-from mitsonar.datasets.torch_pairs import SonarPairs
+from mitsonar.datasets.rendered import re_rendered
+from mitsonar.datasets.responses import ImpulseSamples
+from mitsonar.datasets.samples import SonarPairs
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.fisher_bound import overall
 from mitsonar.estimation.crlb.image_crlb import bounds_at

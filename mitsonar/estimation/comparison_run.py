@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.config.data import Recipe, Split
-from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import samples_of
-from mitsonar.datasets.response_samples import ImpulseSamples
-from mitsonar.datasets.sample_index import split_for
+from mitsonar.datasets.plan import modality_of
+from mitsonar.datasets.responses import ImpulseSamples
+from mitsonar.datasets.samples import split_for
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, argument, counted, meant
 from mitsonar.estimation.benchmark import (

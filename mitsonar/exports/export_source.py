@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.config.data import Split
-from mitsonar.datasets.scene_names import names_of_scenes
-from mitsonar.datasets.split import PARTS, deal, world_of
-from mitsonar.datasets.store import DataStore
+from mitsonar.datasets.store import PARTS, DataStore, deal, names_of_scenes, world_of
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.mapping.open_frames import is_data_set, open_frames, view_in
 from mitsonar.records.frames import COLUMNS, LABELS, SonarFrames, open_group

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import snr_of, snr_said
-from mitsonar.datasets.response_packing import with_noise
+from mitsonar.datasets.responses import with_noise
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.responses import ImpulseResponses

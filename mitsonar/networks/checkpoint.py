@@ -17,9 +17,8 @@ from torch import Tensor, nn
 
 from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.arrangement import Labels
-from mitsonar.datasets.batches import Batches
 from mitsonar.datasets.modality import Fields
-from mitsonar.datasets.sample_index import Part, split_for
+from mitsonar.datasets.samples import Batches, Part, split_for
 from mitsonar.errors import MitsonarError, meant, shortened
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
@@ -31,8 +30,8 @@ from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.shipped import SHIPPED, shipped_path
 
 if TYPE_CHECKING:
-    from mitsonar.datasets.response_samples import ImpulseSamples
-    from mitsonar.datasets.torch_pairs import SonarPairs
+    from mitsonar.datasets.responses import ImpulseSamples
+    from mitsonar.datasets.samples import SonarPairs
 
 __all__ = ["FILE", "FORMAT", "WORDS", "Checkpoint"]
 

@@ -35,7 +35,7 @@ WORDS = {
     "cartesian_rows": int,
     "ground": bool,
 }
-"""The options of :class:`~mitsonar.datasets.torch_pairs.SonarPairs` that define the input of a network, with their types."""
+"""The options of :class:`~mitsonar.datasets.samples.SonarPairs` that define the input of a network, with their types."""
 
 LATER: dict[str, type | tuple[type, ...]] = {"range_levels": (int, type(None)), "halves": bool}
 """Options that files of earlier versions lack. They then have the defaults of SonarPairs."""

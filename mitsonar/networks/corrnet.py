@@ -94,7 +94,7 @@ class CorrNet(nn.Module):
 
         Args:
             images: ``(batch, 2, bins, beams)`` in 0..1.
-            ground: a batch of :func:`mitsonar.datasets.ground_nodes.ground_at`.
+            ground: a batch of :func:`mitsonar.datasets.samples.ground_at`.
             start: the motion with which the iterations begin ``(batch, 3)`` [m, m, rad]; default: none.
 
         Returns:

@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 
 from torch import Tensor, nn
 
-from mitsonar.datasets.batches import Inputs
 from mitsonar.datasets.modality import Fields
+from mitsonar.datasets.samples import Inputs
 from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.networks.cnn1b import Cnn1b
 from mitsonar.networks.cnn4b import Cnn4b
@@ -82,7 +82,7 @@ def options_for(name: str, inputs: Inputs, labels: Tensor, receivers: int = 1) -
 
     Args:
         name: of :data:`NETWORKS`.
-        inputs: of a batch, as :class:`~mitsonar.datasets.torch_pairs.SonarPairs` makes them: one tensor or a tuple.
+        inputs: of a batch, as :class:`~mitsonar.datasets.samples.SonarPairs` makes them: one tensor or a tuple.
         labels: ``(batch, outputs)``.
         receivers: number of receivers whose impulse responses the input holds.
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
-from mitsonar.datasets.ground_nodes import ground_at
+from mitsonar.datasets.samples import ground_at
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import sonar_from
 from mitsonar.networks.checkpoint import Checkpoint
@@ -27,7 +27,7 @@ def onnx_of(checkpoint: Checkpoint, batch: int | None = None) -> bytes:
     """Write a checkpoint as ONNX, and return the file's content.
 
     Inputs: ``image`` in the checkpoint's arrangement, grey values 0..1, and ``cartesian`` for ``both`` coordinates;
-    for networks that know the geometry also the tables of :func:`~mitsonar.datasets.ground_nodes.ground_at`, by name.
+    for networks that know the geometry also the tables of :func:`~mitsonar.datasets.samples.ground_at`, by name.
     Outputs: ``labels``, or ``motion`` and its ``covariance``.
 
     Args:

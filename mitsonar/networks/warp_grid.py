@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mitsonar.datasets.ground_nodes import NODES
+from mitsonar.datasets.samples import NODES
 from mitsonar.geometry.ground import moved
 
 __all__ = ["Ground", "WarpGrid", "displacement"]
 
 Ground = dict[str, Tensor]
-"""A batch of the tables of :func:`mitsonar.datasets.ground_nodes.ground_at`, by name."""
+"""A batch of the tables of :func:`mitsonar.datasets.samples.ground_at`, by name."""
 
 PRIOR = 0.01
 """Information of a weak prior of no step, with a standard deviation of ten units, for frames without detail."""
@@ -24,7 +24,7 @@ class WarpGrid:
     """Cells of one size: their positions, and how they move with the sonar.
 
     Args:
-        ground: a batch of :func:`mitsonar.datasets.ground_nodes.ground_at`.
+        ground: a batch of :func:`mitsonar.datasets.samples.ground_at`.
         unit: of motions ``(batch, 3)`` [m, m, rad].
         step: bins and beams of a cell.
         size: bins and beams of the image.
@@ -105,7 +105,7 @@ def displacement(ground: Ground, motion: Tensor) -> Tensor:
     """Compute how far a motion moves the ground of each node ``(batch, 2, R, C)``, in bins and beams.
 
     Args:
-        ground: a batch of :func:`mitsonar.datasets.ground_nodes.ground_at`.
+        ground: a batch of :func:`mitsonar.datasets.samples.ground_at`.
         motion: ``(batch, 3)`` [m, m, rad].
     """
     points = moved(ground["points"], motion[:, None, None])

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
 from mitsonar.config.data import Recipe, Split
-from mitsonar.datasets.modalities import modality_of
-from mitsonar.datasets.response_pairs import ImpulsePairs
-from mitsonar.datasets.sample_index import split_for
+from mitsonar.datasets.plan import modality_of
+from mitsonar.datasets.responses import ImpulsePairs
+from mitsonar.datasets.samples import SonarPairs, split_for
 from mitsonar.datasets.store import DataStore
-from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.errors import MitsonarError, counted
 from mitsonar.estimation.benchmark import Answers, chosen, rows_of
 from mitsonar.estimation.learned.trained_network import (

@@ -16,11 +16,10 @@ from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
 from mitsonar.config.data import Recipe, load_recipe
 from mitsonar.config.training import TrainingRecipe
-from mitsonar.datasets.joined_pairs import JoinedPairs
-from mitsonar.datasets.rendered_pairs import RawStream, RenderedPairs
-from mitsonar.datasets.response_pairs import ImpulsePairs
-from mitsonar.datasets.scene_rendering import calibrate
-from mitsonar.datasets.torch_pairs import SonarPairs
+from mitsonar.datasets.make import calibrate
+from mitsonar.datasets.rendered import RawStream, RenderedPairs
+from mitsonar.datasets.responses import ImpulsePairs
+from mitsonar.datasets.samples import JoinedPairs, SonarPairs
 from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import digest
 from mitsonar.simulation.device import ensure_variant
@@ -28,7 +27,7 @@ from mitsonar.training.training_types import Array, Batch, JsonObject, RawSample
 
 if TYPE_CHECKING:
     from mitsonar.datasets.arrangement import Arrangement
-    from mitsonar.datasets.response_packing import Packing
+    from mitsonar.datasets.responses import Packing
     from mitsonar.training.training_types import NetworkInput
 
 __all__ = ["STEP", "Material", "Validation", "batches", "finished", "material_of", "seed_of"]

@@ -10,9 +10,8 @@ from helpers import files_of, tiny_recipe
 
 from mitsonar.acoustics.levels import coded
 from mitsonar.config.data import Recipe
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import instrument_in, make_dataset
 from mitsonar.datasets.plan import scenes_of
-from mitsonar.datasets.scene_rendering import instrument_in
 from mitsonar.datasets.store import DataStore
 from mitsonar.simulation.pings import to_image
 

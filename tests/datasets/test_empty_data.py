@@ -10,11 +10,8 @@ import yaml
 from helpers import HEARD, TINY, Command, essence, refused, tiny_recipe
 
 from mitsonar.config.data import Recipe, load_recipe, recipe_from
-from mitsonar.datasets.data_check import check
-from mitsonar.datasets.generation import make_dataset
-from mitsonar.datasets.image_modality import ImageModality
-from mitsonar.datasets.plan import Scene
-from mitsonar.datasets.scene_rendering import loaded_world
+from mitsonar.datasets.make import check, loaded_world, make_dataset
+from mitsonar.datasets.plan import ImageModality, Scene
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 

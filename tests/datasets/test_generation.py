@@ -21,13 +21,9 @@ import yaml
 from helpers import PROGRAM, TINY, Command, by_itself, files_of, refused, tiny_recipe
 
 from mitsonar.config.data import array_names
-from mitsonar.datasets.data_check import check
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import FRAMES_A_SCENE, Queue, SceneRenderer, calibrate, check, forget, make_dataset, make_shard
 from mitsonar.datasets.plan import Plan, sequences_of
-from mitsonar.datasets.scene_rendering import FRAMES_A_SCENE, SceneRenderer, calibrate
-from mitsonar.datasets.shards import forget, make_shard
 from mitsonar.datasets.store import PACKAGES, DataStore
-from mitsonar.datasets.workers import Queue
 from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import versions
 from mitsonar.io.storage import Storage
@@ -456,7 +452,7 @@ def _wait(until: Callable[[], bool], seconds: float) -> None:
 
 
 def test_no_scheduler_there(mitsonar: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsonar.datasets.workers.ANSWERS_WITHIN", "1s")
+    monkeypatch.setattr("mitsonar.datasets.make.ANSWERS_WITHIN", "1s")
     done = mitsonar(*command(tmp_path, "--scheduler", "tcp://127.0.0.1:9"))
     refused(done, "no dask scheduler", "tcp://127.0.0.1:9")
 
@@ -652,8 +648,8 @@ def test_a_full_disk_is_said_and_loses_nothing(made: Path, tmp_path: Path) -> No
 def test_a_worker_that_dies_again_and_again_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = f"""
 import os, sys
-import mitsonar.datasets.workers as workers
-from mitsonar.datasets.generation import make_dataset
+import mitsonar.datasets.make as workers
+from mitsonar.datasets.make import make_dataset
 from mitsonar.config.data import array_names
 from helpers import tiny_recipe
 from mitsonar.errors import MitsonarError

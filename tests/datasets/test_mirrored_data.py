@@ -12,13 +12,10 @@ from helpers import impulse_recipe, tiny_recipe
 
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.config.data import Recipe
-from mitsonar.datasets.data_check import check
-from mitsonar.datasets.generation import make_dataset
-from mitsonar.datasets.re_render import re_rendered
-from mitsonar.datasets.rendered_pairs import RenderedPairs
-from mitsonar.datasets.scene_rendering import instrument_in
+from mitsonar.datasets.make import check, instrument_in, make_dataset
+from mitsonar.datasets.rendered import RenderedPairs, re_rendered
+from mitsonar.datasets.samples import SonarPairs
 from mitsonar.datasets.store import DataStore
-from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.crlb_report import bounds_of_subject
 from mitsonar.estimation.crlb.crlb_subject import subject_of_data

@@ -10,8 +10,7 @@ import pytest
 from helpers import place_of, tiny_recipe
 
 from mitsonar.config.data import Recipe
-from mitsonar.datasets.data_check import check
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import check, make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.records.frames import to_uint8

@@ -11,8 +11,7 @@ from helpers import essence, tiny_recipe, world_directions
 from scipy import stats
 
 from mitsonar.config.data import Recipe, load_recipe
-from mitsonar.datasets.image_modality import footprint
-from mitsonar.datasets.plan import Plan, run_poses, scenes_of, sequences_of
+from mitsonar.datasets.plan import Plan, footprint, run_poses, scenes_of, sequences_of
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose, mounted

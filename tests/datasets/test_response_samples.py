@@ -14,12 +14,9 @@ from helpers import Command, files_of, impulse_recipe, refused, run_python, tiny
 
 from mitsonar.acoustics.noise import snr_of
 from mitsonar.config.data import load_recipe, shipped_recipes
-from mitsonar.datasets.data_check import check
-from mitsonar.datasets.generation import make_dataset
-from mitsonar.datasets.modalities import modality_of
-from mitsonar.datasets.plan import Plan, footprints_at
-from mitsonar.datasets.response_packing import Packing, noise_power, packed, with_noise
-from mitsonar.datasets.response_samples import ImpulseSamples, displacement_labels
+from mitsonar.datasets.make import check, make_dataset
+from mitsonar.datasets.plan import Plan, footprints_at, modality_of
+from mitsonar.datasets.responses import ImpulseSamples, Packing, displacement_labels, noise_power, packed, with_noise
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.learned.regressors import REGRESSORS, Turned, flattened, score_all
@@ -363,7 +360,7 @@ def test_leaks_show_no_motion(made: Path) -> None:
 
 def test_responses_are_read_without_torch_and_without_a_renderer(made: Path) -> None:
     script = f"""
-        from mitsonar.datasets.response_samples import ImpulseSamples
+        from mitsonar.datasets.responses import ImpulseSamples
         print(ImpulseSamples({str(made)!r}, noise="20 dB").responses(0).response.shape)
     """
     assert "(3, 4, 200)" in run_python(script, block=("torch", "mitsuba", "drjit", "finufft"))
@@ -375,7 +372,7 @@ def test_the_wrong_kind_of_data_set_is_one_sentence(made: Path) -> None:
     with pytest.raises(MitsonarError, match="two pings or more, first and last: got frames 1"):
         ImpulseSamples(made, frames=1)
     pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
-    from mitsonar.datasets.torch_pairs import SonarPairs
+    from mitsonar.datasets.samples import SonarPairs
 
     with pytest.raises(MitsonarError, match="the data set received is of impulse responses, this needs one of images"):
         SonarPairs(made)

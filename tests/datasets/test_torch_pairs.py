@@ -14,7 +14,7 @@ from helpers import DOWN, run_python, tiny_recipe
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.config.data import Split, load_recipe
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import make_dataset
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.fan import to_cartesian
 from mitsonar.motion.pose import Pose
@@ -25,8 +25,8 @@ pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant")]
 from torch.utils.data import DataLoader  # noqa: E402
 
 from mitsonar.datasets.arrangement import Labels, arrangement_of  # noqa: E402
-from mitsonar.datasets.rendered_pairs import RenderedPairs  # noqa: E402
-from mitsonar.datasets.torch_pairs import SampleOptions, Samples, SonarPairs  # noqa: E402
+from mitsonar.datasets.rendered import RenderedPairs  # noqa: E402
+from mitsonar.datasets.samples import SampleOptions, Samples, SonarPairs  # noqa: E402
 
 HIGH = NOISE_MODELS["high"]
 

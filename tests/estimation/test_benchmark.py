@@ -14,7 +14,7 @@ import pytest
 from helpers import Command, refused, tiny_recipe
 
 from mitsonar.acoustics.noise import NOISE_MODELS
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import make_dataset
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.errors import cluster_resamples, in_units
 
@@ -25,8 +25,8 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
 ]
 
-from mitsonar.datasets.re_render import re_rendered  # noqa: E402
-from mitsonar.datasets.torch_pairs import SonarPairs  # noqa: E402
+from mitsonar.datasets.rendered import re_rendered  # noqa: E402
+from mitsonar.datasets.samples import SonarPairs  # noqa: E402
 from mitsonar.estimation.benchmark import (  # noqa: E402
     VARIATIONS,
     Answers,

@@ -272,7 +272,7 @@ def test_points_of_neusis_lie_where_ours_do(mitsonar: Command, run: Path, frames
 
 @pytest.mark.e2e
 def test_a_data_set_is_exported_by_its_split(mitsonar: Command, tmp_path: Path, variant: str) -> None:
-    from mitsonar.datasets.generation import make_dataset
+    from mitsonar.datasets.make import make_dataset
     from mitsonar.datasets.store import DataStore
 
     recipe = tiny_recipe(labels=["shape_id"], split={"by": "sequence", "train": 0.5, "validation": 0.5})
@@ -433,7 +433,7 @@ def test_stretches_of_a_run_are_disjoint_and_cover_it(run: Path, tmp_path: Path)
 def test_a_data_set_of_ones_own_scene_has_the_names_of_its_shapes(mitsonar: Command, tmp_path: Path, variant: str) -> None:
     import yaml
 
-    from mitsonar.datasets.generation import make_dataset
+    from mitsonar.datasets.make import make_dataset
 
     (tmp_path / "scene.xml").write_text(SCENE)
     recipe = tiny_recipe(
@@ -460,7 +460,7 @@ def test_a_data_set_of_ones_own_scene_has_the_names_of_its_shapes(mitsonar: Comm
 
 def test_worlds_that_lack_a_kind_are_numbered_by_names(tmp_path: Path, variant: str) -> None:
     """Two groups of scenes whose shapes have other numbers: a name is the same class in both."""
-    from mitsonar.datasets.generation import make_dataset
+    from mitsonar.datasets.make import make_dataset
     from mitsonar.datasets.store import DataStore
 
     pattern = {"family": "pattern"}

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from mitsonar import SonarFrames, Trajectory
 from mitsonar.config.data import load_recipe, recipe_from
-from mitsonar.datasets.data_check import check
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import check, make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.comparison_run import compare

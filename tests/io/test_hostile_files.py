@@ -719,8 +719,7 @@ def test_a_run_without_frames_has_none_to_read(tmp_path: Path) -> None:
 
 def test_a_shard_without_a_seal_is_sealed_by_its_writer_only(spoilt: Path) -> None:
     """Who only reads was asked to write the seal, a traceback."""
-    from mitsonar.datasets.store import DataStore
-    from mitsonar.datasets.store_arrays import SEAL
+    from mitsonar.datasets.store import SEAL, DataStore
 
     store = DataStore.open(spoilt, write=True)
     store.array(SEAL)[0] = 0

@@ -500,8 +500,8 @@ def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> Non
 @pytest.mark.learn
 def test_a_data_set_s_sequences_are_runs(tmp_path: Path) -> None:
     """The longest unless told; pixels and noise as the reader of pairs gives them."""
-    from mitsonar.datasets.generation import make_dataset
-    from mitsonar.datasets.torch_pairs import SonarPairs
+    from mitsonar.datasets.make import make_dataset
+    from mitsonar.datasets.samples import SonarPairs
 
     url = str(tmp_path / "tiny.zarr")
     make_dataset(tiny_recipe(), url, sequences=3)

@@ -21,7 +21,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: install mit
 pytestmark = pytest.mark.learn
 
 
-from mitsonar.datasets.torch_pairs import Samples  # noqa: E402
+from mitsonar.datasets.samples import Samples  # noqa: E402
 from mitsonar.networks.checkpoint import FILE, Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network  # noqa: E402
 from mitsonar.networks.gaussian_head import GaussianHead  # noqa: E402

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mitsonar.datasets.ground_nodes import NODES, ground_at
+from mitsonar.datasets.samples import NODES, ground_at
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.sonar import Bearing

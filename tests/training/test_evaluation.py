@@ -16,7 +16,7 @@ import pytest
 from drawn_frames import over_ground, sway
 from helpers import Command, refused, run_python, tiny_recipe
 
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import make_dataset
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, motions
@@ -30,7 +30,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
 ]
 
-from mitsonar.datasets.torch_pairs import Samples, SonarPairs  # noqa: E402
+from mitsonar.datasets.samples import Samples, SonarPairs  # noqa: E402
 from mitsonar.estimation.comparison_run import compare  # noqa: E402
 from mitsonar.estimation.learned.height_ensemble import HeightEnsemble  # noqa: E402
 from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402

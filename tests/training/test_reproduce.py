@@ -43,7 +43,7 @@ pytestmark = [
 ]
 
 from mitsonar.config.training import TrainingRecipe, load_training_recipe, shipped_training_recipes  # noqa: E402
-from mitsonar.datasets.torch_pairs import Samples  # noqa: E402
+from mitsonar.datasets.samples import Samples  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
 from mitsonar.training.reproduce import Effort, reproduce, unseen_recipe  # noqa: E402
@@ -406,7 +406,7 @@ def test_unseen_scenes_are_evaluated_as_the_network_says(whole: Path) -> None:
     """RMSE in the table against the network asked by hand."""
     (url,) = (path for path in (whole / "data").iterdir() if "unseen" in path.name)
     (seen,) = (path for path in (whole / "data").iterdir() if "unseen" not in path.name)
-    from mitsonar.datasets.torch_pairs import SonarPairs
+    from mitsonar.datasets.samples import SonarPairs
 
     pairs, before = SonarPairs(url, part="all", one_a_sequence=True, labels="normx10"), SonarPairs(seen, part="all")
     assert pairs.recipe.seed != before.recipe.seed

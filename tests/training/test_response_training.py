@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import Command, impulse_recipe, refused
 
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import make_dataset
 from mitsonar.errors import MitsonarError
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves
 
 from mitsonar.config.training import Optimiser, load_training_recipe, shipped_training_recipes  # noqa: E402
 from mitsonar.config.training import training_recipe_from as recipe_of  # noqa: E402
-from mitsonar.datasets.response_pairs import ImpulsePairs  # noqa: E402
+from mitsonar.datasets.responses import ImpulsePairs  # noqa: E402
 from mitsonar.estimation.learned.response_network import ResponseNetwork  # noqa: E402
 from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
 from mitsonar.networks.blocks import SameAverage  # noqa: E402

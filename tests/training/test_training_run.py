@@ -23,7 +23,7 @@ from helpers import TINY, tiny_recipe
 from scipy.stats import multivariate_normal
 from typer.testing import CliRunner
 
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import make_dataset
 from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import differences
 
@@ -39,10 +39,12 @@ from mitsonar.config.training import (  # noqa: E402
     training_recipe_from,
 )
 from mitsonar.datasets.arrangement import Labels  # noqa: E402
-from mitsonar.datasets.joined_pairs import JoinedPairs  # noqa: E402
-from mitsonar.datasets.rendered_pairs import RawStream, RenderedPairs  # noqa: E402
-from mitsonar.datasets.scene_rendering import SceneRenderer  # noqa: E402
-from mitsonar.datasets.torch_pairs import SonarPairs  # noqa: E402
+from mitsonar.datasets.make import SceneRenderer  # noqa: E402
+from mitsonar.datasets.rendered import RawStream, RenderedPairs  # noqa: E402
+from mitsonar.datasets.samples import (  # noqa: E402
+    JoinedPairs,
+    SonarPairs,
+)
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.gaussian_head import GaussianHead  # noqa: E402
 from mitsonar.training.evaluation import evaluate  # noqa: E402

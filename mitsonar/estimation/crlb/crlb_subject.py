@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.config.data import MirrorKeys
-from mitsonar.datasets.scene_rendering import SceneRenderer
-from mitsonar.datasets.split import deal, world_of
-from mitsonar.datasets.store import DataStore
+from mitsonar.datasets.make import SceneRenderer
+from mitsonar.datasets.store import DataStore, deal, world_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Segment, View, Whole

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mitsonar.datasets.arrangement import Arrangement
-from mitsonar.datasets.ground_nodes import ground_of, light_of
+from mitsonar.datasets.samples import ground_of, light_of
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import (
     LEAST_AT_BEST,

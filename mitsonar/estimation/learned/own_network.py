@@ -18,7 +18,7 @@ from mitsonar.motion.composition import Motion
 from mitsonar.records.frames import SonarFrames, to_float32
 
 if TYPE_CHECKING:
-    from mitsonar.datasets.torch_pairs import Samples
+    from mitsonar.datasets.samples import Samples
 
 __all__ = ["OwnNetwork"]
 
@@ -29,7 +29,7 @@ class OwnNetwork:
     Args:
         network: takes images ``(batch, 2, bins, beams)`` float32 in 0..1, or what ``samples`` make of them. It is copied and
             set to evaluation; what is learnt later does not count.
-        samples: on which it was trained, such as :class:`~mitsonar.datasets.torch_pairs.SonarPairs`. They say how frames
+        samples: on which it was trained, such as :class:`~mitsonar.datasets.samples.SonarPairs`. They say how frames
             become its input, and decode its labels. Without them the labels are raw: sideways, forward [m], yaw [rad].
 
     Raises:

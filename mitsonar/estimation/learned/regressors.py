@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError, nearest_names
 
 if TYPE_CHECKING:
-    from mitsonar.datasets.response_samples import ImpulseSamples
+    from mitsonar.datasets.responses import ImpulseSamples
 
 __all__ = ["NORMAL_IQR", "REGRESSORS", "Regression", "RegressionScore", "flattened", "score_all"]
 

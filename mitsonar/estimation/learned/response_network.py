@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mitsonar.datasets.response_packing import packed
+from mitsonar.datasets.responses import packed
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.channel.pings import pings_of
 from mitsonar.estimation.estimator import Estimate, rejected

@@ -551,8 +551,7 @@ def test_the_command_answers_the_buyer(tmp_path: Path) -> None:
 def test_the_command_reads_data_sets(tmp_path: Path) -> None:
     from helpers import tiny_recipe
 
-    from mitsonar.datasets.generation import make_dataset
-    from mitsonar.datasets.scene_rendering import SceneRenderer
+    from mitsonar.datasets.make import SceneRenderer, make_dataset
     from mitsonar.datasets.store import DataStore
 
     url = tmp_path / "tiny.zarr"

@@ -208,7 +208,7 @@ def test_grain_tells_far_more_than_ground_and_noise_hides_both() -> None:
 @pytest.mark.usefixtures("variant")
 def test_commands_answer_coherent_data_sets(tmp_path: Path, mitsonar: Command) -> None:
     """`crlb` says which laws it used, and `compare` divides by the last of them."""
-    from mitsonar.datasets.generation import make_dataset
+    from mitsonar.datasets.make import make_dataset
 
     url = tmp_path / "coherent.zarr"
     changes = {"model": "coherent", "beams": 12, "range_bins": 48}

@@ -14,7 +14,7 @@ from helpers import DOWN, Command, essence, floor, floor_levels, refused, scene,
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
@@ -256,7 +256,7 @@ class TestNetworks:
 
     @pytest.mark.thorough
     def test_a_network_tells_the_height(self, heights: Path, tmp_path: Path, mitsonar: Command) -> None:
-        from mitsonar.datasets.torch_pairs import SonarPairs
+        from mitsonar.datasets.samples import SonarPairs
         from mitsonar.estimation.height.height_network import HeightNetwork
         from mitsonar.training.evaluation import predictions
 

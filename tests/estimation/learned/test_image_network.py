@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import lit_plane
 
-from mitsonar.datasets.ground_nodes import ground_at
+from mitsonar.datasets.samples import ground_at
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.geometry.ground import STD_MEASURED, Attitude
 from mitsonar.instruments.sonar import Sonar

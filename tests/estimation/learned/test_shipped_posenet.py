@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from mitsonar.config.data import load_recipe
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import make_dataset
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.errors import in_units
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant")]
 
-from mitsonar.datasets.torch_pairs import SonarPairs  # noqa: E402
+from mitsonar.datasets.samples import SonarPairs  # noqa: E402
 from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 

@@ -14,9 +14,8 @@ from helpers import DOWN, Command, essence, tiny_recipe
 
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.config.data import load_recipe
-from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.make import SceneRenderer, make_dataset
 from mitsonar.datasets.plan import scenes_of
-from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import motions
 
@@ -29,7 +28,7 @@ pytestmark = [
 ]
 
 from mitsonar.config.training import Optimiser, load_training_recipe, training_recipe_from  # noqa: E402
-from mitsonar.datasets.torch_pairs import Samples, SonarPairs  # noqa: E402
+from mitsonar.datasets.samples import Samples, SonarPairs  # noqa: E402
 from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402
 from mitsonar.estimation.learned.view_network import ViewNetwork, _rejection_of_profiles  # noqa: E402
 from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
@@ -121,7 +120,7 @@ def test_vectors_are_read_once(portions: Path, monkeypatch: pytest.MonkeyPatch) 
     once = pairs[4][0]
     assert set(pairs._whole) == {"vector_c3", "nonzero_c3"}
     assert pickle.loads(pickle.dumps(pairs))._whole == {}
-    monkeypatch.setattr("mitsonar.datasets.torch_pairs.KEPT_BYTES", 0)
+    monkeypatch.setattr("mitsonar.datasets.samples.KEPT_BYTES", 0)
     torch.testing.assert_close(SonarPairs(portions, part="all", views=["c3"])[4][0], once, rtol=0, atol=0)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Unpack
 
@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
 from mitsonar.config.data import Recipe, load_recipe, recipe_from
-from mitsonar.datasets.batches import Batch, Device, RawSample
+from mitsonar.datasets.make import SceneRenderer, calibrate
 from mitsonar.datasets.modality import Values
-from mitsonar.datasets.plan import Scene, sequences_of, world_seed
-from mitsonar.datasets.scene_rendering import SceneRenderer, calibrate
-from mitsonar.datasets.torch_pairs import ArrangementOptions, Samples
+from mitsonar.datasets.plan import Scene, scenes_of, sequences_of, world_seed
+from mitsonar.datasets.samples import ArrangementOptions, Batch, Device, RawSample, Samples, SonarPairs
 from mitsonar.errors import MitsonarError, refuse_unknown
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import mounted
+from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.device import ensure_variant, release_memory, use_threads
 
-__all__ = ["RawStream", "RenderedPairs"]
+__all__ = ["RawStream", "RenderedPairs", "re_rendered"]
 
 
 class RenderedPairs(IterableDataset[Batch], Samples):
@@ -32,7 +32,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
 
     A world that does not depend on its seed, such as a scene file, is the same in both.
 
-    Iteration yields ``(input, label)`` as :class:`~mitsonar.datasets.torch_pairs.SonarPairs` does. :meth:`loader` yields
+    Iteration yields ``(input, label)`` as :class:`~mitsonar.datasets.samples.SonarPairs` does. :meth:`loader` yields
     batches, with noise and layout computed on their device. Each worker of a ``DataLoader`` renders worlds of its own.
     Workers must be started by spawn, since the ray tracer does not survive a fork: ``DataLoader(pairs, num_workers=2,
     multiprocessing_context="spawn")``.
@@ -85,7 +85,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             yield self.one(sample)
 
     def raw(self, skip: int = 0, share: tuple[int, int] | None = None) -> Iterator[RawSample]:
-        """Yield raw samples of this worker; :meth:`~mitsonar.datasets.torch_pairs.Samples.finished` makes a batch of them.
+        """Yield raw samples of this worker; :meth:`~mitsonar.datasets.samples.Samples.finished` makes a batch of them.
 
         Args:
             skip: number of samples to skip. They are not rendered, except those that lie between samples that are needed.
@@ -256,3 +256,46 @@ class RawStream(IterableDataset[RawSample]):
         had = len(range(worker, self.skip, workers))  # batches come from the workers in turn
         loader, loaders = self.share
         return self.pairs.raw(self.batch_size * had, (loader * workers + worker, loaders * workers))
+
+
+# ---------------- Pairs of a data set re-rendered with a change: heave between the pings, or rays that move within
+# their cells
+
+
+def re_rendered(
+    pairs: SonarPairs,
+    numbers: Sequence[int],
+    *,
+    shift: Callable[[int, NDArray[np.float64]], NDArray[np.float64]] | None = None,
+    jitter: bool | None = None,
+) -> Iterator[tuple[int, SonarFrames]]:
+    """Re-render samples of a data set. Yield (number, frames) scene by scene, with the stored gain and noise.
+
+    Args:
+        pairs: samples of a store of images of one view. Its worlds are rebuilt.
+        numbers: of the samples.
+        shift: from a sample's number and its poses ``(frames, 6)`` to the poses that are rendered. The frames
+            keep the stored poses, heights and times.
+        jitter: whether rays move at random within their cells in each ping; default: as in the data set.
+
+    Raises:
+        MitsonarError: a store of vectors, or of several views.
+    """
+    fields = pairs.recipe.model_dump()
+    recipe = pairs.recipe if jitter is None else recipe_from({**fields, "sonar": {**fields["sonar"], "jitter": jitter}})
+    gain = float(pairs.store.about["gain"])
+    wanted = np.asarray(numbers, dtype=np.int64)
+    scene_of = pairs.scene[pairs.first[wanted]]
+    for scene in scenes_of(pairs.recipe, pairs.recipe.sequences):
+        mine = wanted[scene_of == scene.number]
+        if not len(mine):
+            continue
+        renderer = SceneRenderer(recipe, scene)
+        start = int(np.argmax(pairs.scene == scene.number))
+        for index in mine.tolist():
+            here = pairs.frame_numbers(index)
+            poses = pairs.pose[here] if shift is None else shift(index, pairs.pose[here])
+            values = renderer.frames(poses, here.start - start, gain)
+            yield index, pairs.sonar_frames(index, next(array for name, array in values.items() if name.startswith("image")))
+        del renderer
+        release_memory()

@@ -1,0 +1,955 @@
+"""Making a data set: shard by shard, by one process or many. A whole shard is never made twice, whatever was killed."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.water import noise_of
+from mitsonar.config.data import Recipe
+from mitsonar.datasets.modality import Fields, Renderer, Values, empty_sentence, renderer_of
+from mitsonar.datasets.plan import (
+    ImageModality,
+    Plan,
+    Scene,
+    footprints_at,
+    modality_of,
+    scenes_of,
+    sequences_of,
+    world_seed,
+)
+from mitsonar.datasets.store import PACKAGES, PARTS, DataStore, deal, world_of
+from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.io.runs import refuse_other, versions
+from mitsonar.io.storage import Storage
+from mitsonar.motion.composition import motions
+from mitsonar.motion.pose import mounted
+from mitsonar.records.frames import to_uint8
+from mitsonar.simulation.channel import ChannelSimulator
+from mitsonar.simulation.device import ensure_variant, release_memory, use_threads
+from mitsonar.simulation.pings import CALIBRATION_FRAMES, RenderedPings, constant_gain, labels_above, to_image
+from mitsonar.simulation.scene import load_scene, shape_names_in
+from mitsonar.simulation.simulator import Simulator
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitsonar.simulation.moving import SceneMotion
+
+__all__ = [
+    "FRAMES_A_SCENE",
+    "Made",
+    "Queue",
+    "ResponseRenderer",
+    "SceneRenderer",
+    "calibrate",
+    "check",
+    "forget",
+    "loaded_world",
+    "made_by",
+    "make_dataset",
+    "make_shard",
+    "refuse_worlds",
+]
+
+
+HALF_A_GROUP = re.compile(r"zarr\.[0-9a-f]{32}\.partial")
+"""What a kill leaves before anything else is there. Any other file belongs to the user."""
+
+ROUNDS = 3
+"""How often shards that are missing at the end are made."""
+
+SHARDS_TO_CHECK = 32
+"""Shards of a large data set that are searched for empty frames. `mitsonar dataset check` reads all of them."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What making a data set did.
+
+    Attributes:
+        url: of the store.
+        frames: of the data set.
+        made: shards that this call wrote.
+        shards: of the data set.
+        warnings: a sentence each.
+    """
+
+    url: str
+    frames: int
+    made: int
+    shards: int
+    warnings: list[str]
+
+
+def make_dataset(
+    recipe: Recipe,
+    url: str,
+    *,
+    sequences: int | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    verify: bool = False,
+    begun: Callable[[int, int], None] = lambda frames, done: None,
+    progress: Callable[[int], None] = lambda frames: None,
+) -> Made:
+    """Make a data set, or continue one that was interrupted. The result is the same bit for bit.
+
+    Args:
+        recipe: of the data set.
+        url: folder or URL of the store.
+        sequences: only so many of the recipe's sequences.
+        workers: processes on this machine; with 1 this process renders, with all its threads.
+        scheduler: address of a running dask scheduler, whose workers render instead.
+        verify: whether existing shards are compared with their digests, too, and remade where these differ.
+        begun: called with the number of frames of the data set and the number of those that exist already.
+        progress: called with the number of frames that were added.
+
+    Raises:
+        MitsonarError: the store is another data set, another process writes it, or it was begun with other versions.
+    """
+    if recipe.recorded is not None:
+        raise MitsonarError(f"the recipe {recipe.name} is of recorded frames: `mitsonar dataset from-frames` copies them")
+    storage = Storage(url)
+    _refuse_other_files(storage)
+    with storage.locked() as still_ours:
+        variant = ensure_variant()
+        store = _open_or_create(storage, recipe, sequences, variant, verify)
+        _clear_parts(storage)
+        todo = store.missing(verify=verify)
+        begun(len(store), len(store) - _frames(store, todo))
+        written = 0
+        for _ in range(ROUNDS):  # what was damaged meanwhile is remade
+            if not todo:
+                break
+            _check_versions(store)
+            store.unfinish()
+            for shard in made_by(store, todo, workers=workers, scheduler=scheduler):
+                still_ours()
+                progress(_frames(store, [shard]))
+            written += len(todo)
+            todo = store.missing()
+        if todo:
+            raise MitsonarError(f"{url}: shards vanish while others are written; does another program write there?")
+        store.finish()
+        return Made(storage.url, len(store), written, store.shards, _warnings(store))
+
+
+def _refuse_other_files(storage: Storage) -> None:
+    """Refuse a folder with other files: creating an array removes what has its name.
+
+    Raises:
+        MitsonarError: there are other files.
+    """
+    there = [name for name in storage.sizes() if not HALF_A_GROUP.fullmatch(name)]
+    if there and "zarr.json" not in there:
+        raise MitsonarError(f"{storage.url} holds other things ({min(there)}) and is kept as it is: choose another -o")
+
+
+def _open_or_create(storage: Storage, recipe: Recipe, sequences: int | None, variant: str, verify: bool) -> DataStore:
+    """Open the existing store if it is the same data set, or create a new one."""
+    count = recipe.sequences if sequences is None else sequences
+    scenes_of(recipe, count)  # refuses a wrong number before anything is rendered
+    if "zarr.json" in storage.sizes():
+        store = DataStore.open(storage, write=True, unfinished=True)
+        _check_same(store, recipe, count, variant)
+        if store.ready:
+            if verify:
+                store.mend_known(Plan.of(recipe, count))
+            return store
+    about = {**renderer_of(modality_of(recipe)).settled(recipe), "variant": variant, "versions": versions(PACKAGES)}
+    return DataStore.create(storage, recipe, Plan.of(recipe, count), about)
+
+
+def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) -> None:
+    """Check that the store was begun with this recipe, number of sequences and variant.
+
+    Raises:
+        MitsonarError: it was not; the message names what differs.
+    """
+    about = store.about
+    asked = {**recipe.model_dump(mode="json"), "sequences": sequences}
+    had = {**about["recipe"], "sequences": about["sequences"]}
+    refuse_other(store.place.url, had, asked, " (`mitsonar dataset info --recipe` prints the recipe)")
+    if about["variant"] != variant:
+        raise MitsonarError(
+            f"{store.place.url} was begun with {about['variant']}, this is {variant}, which differs in the last bits: set "
+            f"MITSONAR_VARIANT={about['variant']}, or choose another -o"
+        )
+
+
+def _check_versions(store: DataStore) -> None:
+    """Check that the missing shards would fit the existing ones.
+
+    Raises:
+        MitsonarError: the store was begun with other versions.
+    """
+    changed = store.other_versions()
+    if changed:
+        raise MitsonarError(
+            f"{store.place.url} was begun with {', '.join(changed)}: the rest would differ from it; finish it with these "
+            "versions, or choose another -o"
+        )
+
+
+def _clear_parts(storage: Storage) -> None:
+    """Remove the partial files of a killed writer. A file gets its name only when it is whole."""
+    if storage.local:
+        for name in storage.sizes():
+            if name.endswith(".partial"):
+                storage.remove(name)
+
+
+def _too_few(store: DataStore) -> list[str]:
+    """Return a sentence if the recipe's own split has too few scenes or sequences."""
+    split = store.recipe.split
+    worlds = world_of(store.recipe, store.scenes)[store.read("scene")]
+    try:
+        deal(worlds, store.read("sequence"), split, max(PARTS, key=lambda part: getattr(split, part)))
+    except MitsonarError as error:
+        return [str(error)]
+    return []
+
+
+def _frames(store: DataStore, shards: list[int]) -> int:
+    return sum(store.frames_of(shard).stop - store.frames_of(shard).start for shard in shards)
+
+
+def _warnings(store: DataStore) -> list[str]:
+    """List what the user should know of a finished data set, a sentence each."""
+    sentences = [*_too_few(store)]
+    over_nothing = int(np.isnan(store.read("height_m")).sum())
+    if over_nothing:
+        sentences.append(
+            f"nothing is below the sonar in {over_nothing:,} of {len(store):,} frames: world.size_m is larger than what the "
+            "scene holds"
+        )
+    return [*sentences, *_empty(store), *store.modality.warnings(store.read)]
+
+
+def _empty(store: DataStore) -> list[str]:
+    """Return a sentence if frames hold no echo, in shards spread evenly over the data set."""
+    shards = np.unique(np.linspace(0, store.shards - 1, min(SHARDS_TO_CHECK, store.shards)).round().astype(int))
+    empty, frames = [], 0
+    for shard in shards:
+        here = store.frames_of(int(shard))
+        try:
+            empty += (here.start + np.flatnonzero(store.modality.empty(store.read, here))).tolist()
+        except MitsonarError:  # damaged: `mitsonar dataset check` says which
+            continue
+        frames += here.stop - here.start
+    checked = "" if frames == len(store) else f" that were checked (of {len(store):,})"
+    return [empty_sentence(empty, frames, checked)] if empty else []
+
+
+# ---------------- Who makes the shards: this process, processes beside it, or the workers of a dask scheduler anywhere
+
+
+AHEAD = 2
+"""Shards that a worker holds at a time: one that it makes, one that waits."""
+
+ASK_S = 1.0
+"""Seconds between two requests for the list of workers."""
+
+LOSSES = 3
+"""Number of workers that may be lost with the same shard."""
+
+SILENCE_S = 90.0
+"""Seconds for which there may be no worker at all."""
+
+ANSWERS_WITHIN = "10s"
+"""Time for the scheduler's first answer, in dask's notation."""
+
+
+class Future(Protocol):
+    """A task of dask, which has no types of its own."""
+
+    status: str
+
+    def done(self) -> bool:
+        """Return whether the task has ended."""
+
+    def exception(self) -> BaseException:
+        """Return the error of a task that failed."""
+
+    def cancel(self) -> None:
+        """Withdraw the task."""
+
+
+class Client(Protocol):
+    """A client of a dask scheduler."""
+
+    def ncores(self) -> dict[str, int]:
+        """Return the threads of each worker, by address."""
+
+    def submit(self, task: Callable[[str, int], int], /, *args: object, workers: list[str], pure: bool) -> Future:
+        """Hand a task to one of the workers."""
+
+    def cancel(self, futures: list[Future]) -> None:
+        """Withdraw tasks."""
+
+
+def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: str | None = None) -> Iterator[int]:
+    """Make shards. Yield the number of each when it is done.
+
+    Args:
+        store: to which they belong.
+        todo: their numbers.
+        workers: processes on this machine, one thread each; with 1 this process renders, with all its threads.
+        scheduler: address of a running dask scheduler, whose workers render instead.
+
+    Raises:
+        MitsonarError: no scheduler there, no worker left, too many workers lost at one shard, or a worker's error.
+    """
+    if scheduler is None and workers <= 1:
+        try:
+            for shard in todo:
+                yield make_shard(store, shard)
+        finally:
+            forget()
+    else:
+        with _client(workers, scheduler) as client:
+            yield from _hand_out(client, store, Queue(todo))
+
+
+@contextlib.contextmanager
+def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
+    """Open a client of the scheduler. Local workers are started by spawn, with one thread each."""
+    import logging
+
+    import dask
+    import distributed
+
+    connect: Callable[..., AbstractContextManager[Client]] = distributed.Client
+    start: Callable[..., AbstractContextManager[object]] = distributed.LocalCluster
+
+    if scheduler is not None:
+        try:
+            connected = connect(scheduler, timeout=ANSWERS_WITHIN, set_as_default=False)
+        except (OSError, ValueError) as error:
+            reason = " ".join(str(error).split())[:160]
+            raise MitsonarError(
+                f"no dask scheduler at {scheduler}: {reason}; start one with `dask scheduler` and give the address it prints"
+            ) from None
+        with connected as client:
+            yield client
+        return
+    settings = {
+        "distributed.worker.multiprocessing-method": "spawn",
+        "distributed.comm.timeouts.connect": "60s",
+        # by default dask makes workers return memory at each release, which doubles NumPy's time, and samples their stacks
+        "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": "1"},
+        "distributed.worker.profile.enabled": False,
+        # Ctrl-C reaches all processes of a terminal: this process stops the others
+        "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
+    }
+    quiet = logging.CRITICAL  # mitsonar itself reports a lost worker
+    with (
+        dask.config.set(settings),
+        start(
+            n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address=None, silence_logs=quiet
+        ) as cluster,
+        connect(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+class Queue:
+    """Shards that wait. A worker continues after its last shard, whose scene it has loaded, or begins a stretch of its own.
+
+    Args:
+        todo: numbers of the shards.
+    """
+
+    def __init__(self, todo: list[int]) -> None:
+        self.waiting = set(todo)
+        self.at: dict[str, int] = {}
+        self.lost: Counter[int] = Counter()
+
+    def __bool__(self) -> bool:
+        return bool(self.waiting)
+
+    def next(self, worker: str) -> int:
+        """Choose the next shard for a worker."""
+        shard = self.at.get(worker, -2) + 1
+        if shard not in self.waiting:
+            first, end = self._longest()
+            taken = first - 1 in self.at.values()  # another worker will continue there
+            shard = (first + end) // 2 if taken else first
+        self.waiting.remove(shard)
+        self.at[worker] = shard
+        return shard
+
+    def _longest(self) -> tuple[int, int]:
+        """Find the longest stretch of shards that wait: its first, and the one after its last."""
+        waiting = np.sort(np.fromiter(self.waiting, dtype=int))
+        ends = np.flatnonzero(np.append(np.diff(waiting) > 1, True)) + 1
+        lengths = np.diff(ends, prepend=0)
+        longest = int(lengths.argmax())
+        first = int(waiting[ends[longest] - lengths[longest]])
+        return first, first + int(lengths[longest])
+
+    def give_back(self, shard: int) -> None:
+        """Return a shard whose worker was lost, so that another worker makes it.
+
+        Raises:
+            MitsonarError: too many workers were lost with it.
+        """
+        self.lost[shard] += 1
+        if self.lost[shard] > LOSSES:
+            raise MitsonarError(
+                f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; whole shards "
+                "stay, the same command continues"
+            )
+        self.waiting.add(shard)
+
+    def forget(self, alive: list[str]) -> None:
+        """Forget the workers that are gone."""
+        self.at = {worker: shard for worker, shard in self.at.items() if worker in alive}
+
+
+def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
+    """Supply every worker with shards until all are made. Yield the number of each when it is done."""
+    url = store.place.root if store.place.local else store.place.url
+    given: dict[Future, tuple[str, int]] = {}
+    asked, received, alive = 0.0, time.monotonic(), list[str]()
+    try:
+        while queue or given:
+            if time.monotonic() - asked > ASK_S:
+                alive, asked = list(client.ncores()), time.monotonic()
+                queue.forget(alive)
+                # dask would keep a task waiting for ever whose worker is gone
+                for future in [future for future, (worker, _) in given.items() if worker not in alive]:
+                    queue.give_back(given.pop(future)[1])
+                    future.cancel()
+            if alive:
+                received = time.monotonic()
+            elif time.monotonic() - received > SILENCE_S:
+                raise _no_worker(queue)
+            for worker in alive:
+                while queue and sum(owner == worker for owner, _ in given.values()) < AHEAD:
+                    shard = queue.next(worker)
+                    given[client.submit(_work, url, shard, workers=[worker], pure=False)] = worker, shard
+            done = [future for future in given if future.done()]
+            for future in done:
+                shard = given.pop(future)[1]
+                if future.status == "finished":
+                    yield shard
+                elif future.status == "error" and not _is_lost(future):
+                    raise future.exception()
+                else:
+                    queue.give_back(shard)
+            if not done:
+                time.sleep(0.1)
+    finally:
+        with contextlib.suppress(Exception):
+            client.cancel(list(given))
+
+
+def _no_worker(queue: Queue) -> MitsonarError:
+    """Write the error of a scheduler without workers."""
+    lost = ", ".join(map(str, queue.lost))
+    cause = (
+        f"workers were lost at shards {lost} and none has come back for {SILENCE_S:.0f} s "
+        "(out of memory?): use fewer workers"
+        if lost
+        else f"the scheduler has had no worker for {SILENCE_S:.0f} s: start some with `dask worker ADDRESS`"
+    )
+    return MitsonarError(f"{cause}; whole shards stay, the same command continues")
+
+
+def _is_lost(future: Future) -> bool:
+    """Return whether the worker died, rather than its task failed."""
+    from distributed import KilledWorker
+
+    return isinstance(future.exception(), KilledWorker)
+
+
+def _work(url: str, shard: int) -> int:
+    """Make one shard in a dask worker, with as many threads of the ray tracer as the worker has.
+
+    Raises:
+        MitsonarError: this worker cannot open the store, or has other versions.
+    """
+    from distributed import get_worker
+
+    use_threads(get_worker().state.nthreads)
+    store = DataStore.open(url, write=True, unfinished=True)
+    other = store.other_versions()
+    if other:
+        raise MitsonarError(
+            f"the store was begun with {', '.join(other)} on {socket.gethostname()}: install the same everywhere"
+        )
+    return make_shard(store, shard)
+
+
+# ---------------- One shard of a data set: rendered, written and sealed, in any process
+
+
+_RENDERER: dict[tuple[str, Scene], Renderer] = {}
+"""The last scene, by all that it depends on: the recipe, and the scene's plan."""
+
+_ONE_AT_A_TIME = threading.Lock()
+"""A process renders one shard at a time, since the threads of a dask worker share one ray tracer."""
+
+
+def make_shard(store: DataStore, shard: int) -> int:
+    """Render and write one shard, and return its number. The last scene stays loaded for the next call."""
+    with _ONE_AT_A_TIME:
+        ensure_variant(store.about["variant"])
+        store.write_shard(shard, _shard_values(store, shard))
+    return shard
+
+
+def forget() -> None:
+    """Close the scene that :func:`make_shard` keeps loaded."""
+    _RENDERER.clear()
+    release_memory()
+
+
+def _shard_values(store: DataStore, shard: int) -> dict[str, Values]:
+    """Render all arrays of a shard, by name; frames of several scenes follow each other."""
+    here = store.frames_of(shard)
+    scene_of = store.read("scene")[here]
+    planned = {name: store.read(name, here) for name in ("pose", *store.modality.planned)}
+    firsts = _first_frames(store)
+    parts: dict[str, list[Values]] = {}
+    for number in np.unique(scene_of):
+        mine = np.flatnonzero(scene_of == number)
+        first = here.start + int(mine[0]) - firsts[int(number)]
+        known = {name: values[mine] for name, values in planned.items()}
+        for name, values in _renderer(store, int(number)).recorded(known, first, store.about).items():
+            parts.setdefault(name, []).append(values)
+    return {name: values[0] if len(values) == 1 else np.concatenate(values) for name, values in parts.items()}
+
+
+def _first_frames(store: DataStore) -> dict[int, int]:
+    """Find the first frame of each scene. Frames of a scene are consecutive."""
+    numbers, first = np.unique(store.read("scene"), return_index=True)
+    return dict(zip(numbers.tolist(), first.tolist(), strict=True))
+
+
+def _renderer(store: DataStore, number: int) -> Renderer:
+    """Return the renderer of a scene; the last one is kept."""
+    scene = store.scenes[number]
+    key = (store.recipe.model_dump_json(), scene)
+    if key not in _RENDERER:
+        forget()  # before the next is loaded: two scenes would need twice the memory
+        _RENDERER[key] = renderer_of(store.modality)(store.recipe, scene)
+    return _RENDERER[key]
+
+
+# ---------------- Checks of a data set: checksums, counts, ranges, and labels that follow from poses
+
+
+LABEL_TOLERANCE = 1e-9
+"""Largest difference of labels and limits [m, rad]."""
+
+
+def check(store: DataStore, progress: Callable[[int], None] = lambda frames: None) -> list[str]:
+    """Check a data set. Everything is read.
+
+    Args:
+        store: of the data set.
+        progress: called with the number of frames that were checked.
+
+    Returns:
+        A sentence for each fault.
+    """
+    wrong = _files(store, progress)
+    for check_part in (_plan, _counts, _labels, _flight):
+        try:
+            wrong += check_part(store)
+        except MitsonarError as error:
+            wrong.append(str(error))
+    return wrong
+
+
+def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
+    """Check every file against its seal, and its values against their limits."""
+    wrong: list[str] = []
+    unwritten: list[int] = []
+    empty: list[int] = []
+    sizes, seals = store.place.sizes(), store.seals()
+    for shard in range(store.shards):
+        here = store.frames_of(shard)
+        keys = [store.key(name, shard) for name in store.rendered]
+        lacking = [key for key in keys if key not in sizes]
+        if lacking or not seals[shard].any():
+            unwritten.append(shard)
+        else:
+            damaged = store.damaged(shard, seals[shard])
+            for key in damaged:
+                size = int(seals[shard][keys.index(key), 0])
+                wrong.append(
+                    f"{key} is damaged (frames {here.start}..{here.stop - 1}): "
+                    + (f"{sizes[key]} bytes, sealed with {size}" if sizes[key] != size else "other bytes than were sealed")
+                )
+            if not damaged:
+                wrong += store.modality.faults(store.read, here)
+                empty += (here.start + np.flatnonzero(store.modality.empty(store.read, here))).tolist()
+        progress(here.stop - here.start)
+    if empty:
+        wrong.append(empty_sentence(empty, len(store)))
+    if unwritten:
+        which = ", ".join(map(str, unwritten[:10])) + (" ..." if len(unwritten) > 10 else "")
+        state = "is damaged" if store.finished else "is not finished"
+        wrong.append(
+            f"{store.place.url} {state}: {len(unwritten)} of {store.shards} shards are not written ({which}); the same "
+            "`mitsonar dataset make` makes them"
+        )
+    return wrong
+
+
+def _plan(store: DataStore) -> list[str]:
+    """Check the planned arrays against a plan that is made anew from recipe and seed."""
+    if store.recipe.recorded is not None:  # its poses were given
+        return []
+    plan = Plan.of(store.recipe, int(store.about["sequences"]))
+    return [f"{name} is not what recipe and seed give" for name in store.unplanned(plan)]
+
+
+def _counts(store: DataStore) -> list[str]:
+    """Check the numbers of frames, sequences and scenes."""
+    about, wrong = store.about, []
+    scene, sequence = store.read("scene"), store.read("sequence")
+    lengths = np.bincount(sequence)
+    if len(scene) != about["frames"] or len(lengths) != about["sequences"]:
+        wrong.append(f"{len(scene)} frames in {len(lengths)} sequences, {about['frames']} in {about['sequences']} promised")
+    if (np.diff(sequence) < 0).any() or (np.diff(sequence) > 1).any():
+        wrong.append("sequences are not numbered one after the other")
+    if store.recipe.flight.kind == "random" and (lengths != store.recipe.flight.pings).any():
+        wrong.append(f"sequences of {sorted(set(lengths.tolist()))} frames, the recipe says {store.recipe.flight.pings}")
+    _, first = np.unique(sequence, return_index=True)
+    for number, wanted in store.scenes.items():
+        found = int((scene[first] == number).sum())
+        if found != wanted.sequences:
+            wrong.append(f"scene {number} has {found} sequences, {wanted.sequences} promised")
+    for name, axis in store.modality.axes.items():
+        if not np.array_equal(store.read(name), axis.values):
+            wrong.append(f"{name} is not what the recipe's sonar has")
+    return wrong
+
+
+def _vehicle(store: DataStore) -> NDArray[np.float64]:
+    return store.read("vehicle_pose" if "vehicle_pose" in store.group else "pose")
+
+
+def _labels(store: DataStore) -> list[str]:
+    """Check the motions against the poses."""
+    sequence, motion, vehicle = store.read("sequence"), store.read("motion"), _vehicle(store)
+    inner = np.append(sequence[1:] == sequence[:-1], False)
+    wrong = []
+    if not np.isnan(motion[~inner]).all():
+        wrong.append("the last frame of a sequence has a motion")
+    error = np.abs(motions(vehicle) - motion[:-1])[inner[:-1]]
+    if error.size and not error.max() <= LABEL_TOLERANCE:
+        wrong.append(f"labels differ from poses by up to {error.max():.1e} (m, rad), allowed {LABEL_TOLERANCE:g}")
+    return wrong
+
+
+def _flight(store: DataStore) -> list[str]:
+    """Check the limits of motions and jumps, and that footprints lie inside their scenes."""
+    recipe = store.recipe
+    flight = recipe.flight
+    if flight.kind != "random":
+        return []
+    wrong = []
+    sequence, motion, scene = (store.read(name) for name in ("sequence", "motion", "scene"))
+    vehicle = _vehicle(store)
+    limit = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
+    if motion.size and np.nanmax(np.abs(np.nan_to_num(motion)) - limit) > LABEL_TOLERANCE:
+        wrong.append("motions exceed the recipe's limits")
+    border = np.flatnonzero((sequence[1:] != sequence[:-1]) & (scene[1:] == scene[:-1]))
+    if flight.jump_m is not None and border.size:
+        jump = np.abs(vehicle[border + 1, :2] - vehicle[border, :2])
+        low, high = flight.jump_m
+        if jump.min() < low - LABEL_TOLERANCE or jump.max() > high + LABEL_TOLERANCE:
+            wrong.append(f"jumps of {jump.min():.4f}..{jump.max():.4f} m, the recipe says {low:g}..{high:g}")
+    outside = _outside(store, vehicle, scene)
+    if outside > LABEL_TOLERANCE:
+        wrong.append(f"a footprint leaves its scene by {outside:.3g} m")
+    return wrong
+
+
+def _outside(store: DataStore, vehicle: NDArray[np.float64], scene: NDArray[np.int32]) -> float:
+    """Return how far footprints leave their scenes at most [m]."""
+    recipe = store.recipe
+    half = {number: recipe.family(one.group).half_m for number, one in store.scenes.items()}
+    limit = np.array([half[int(number)] for number in scene])
+    farthest = -np.inf
+    # where no pose of the vehicle is stored, it differs from the sonar's by the mount's pitch alone
+    lean = 0.0 if "vehicle_pose" in store.group else recipe.mount.pose.pitch
+    flown = np.column_stack([vehicle[:, 2], np.round(vehicle[:, 3] - lean, 9)])
+    for height, pitch in np.unique(flown, axis=0):
+        mine = (flown == (height, pitch)).all(axis=1)
+        corners = np.abs(footprints_at(vehicle[mine], store.modality.reach(float(height), float(pitch))))
+        farthest = max(farthest, float((corners.max(axis=(1, 2)) - limit[mine]).max()))
+    return farthest
+
+
+# ---------------- A scene of a recipe becomes pixels, for stores and for training with rendered frames
+
+
+VISIBLE = 1e-4
+"""Expected level of a cell with a visible label, at least, as a part of full scale; it must exceed the noise too."""
+
+FRAMES_A_SCENE = 10_000_000
+"""A ping's number is its scene's number times this, plus its position in the scene: jitter does not depend on the size of
+the data set."""
+
+
+class SceneRenderer:
+    """One scene, built, loaded, and ready to render.
+
+    Args:
+        recipe: of the data set.
+        scene: which of its scenes.
+    """
+
+    def __init__(self, recipe: Recipe, scene: Scene) -> None:
+        self.recipe, self.scene = recipe, scene
+        world, sonar = loaded_world(recipe, scene), instrument_in(recipe, scene)
+        self.simulator = Simulator(world, sonar, views=recipe.views, mirrors=recipe.mirrors)
+        self.bodies = body_places(recipe, self.simulator.motion)
+        self._labeller: Simulator | None = None
+        if recipe.labels and recipe.visible_labels:  # the expected levels, over all that the patterns receive
+            patterns = {"pattern": sonar.beam_pattern, "elevation_pattern": sonar.vertical_pattern}
+            self._labeller = Simulator(world, sonar.replace(model="physical", **patterns))
+
+    @staticmethod
+    def settled(recipe: Recipe) -> Fields:
+        """Compute the gain of the data set and its inverse, and with labels of shapes the names of those of scene files.
+
+        See :func:`calibrate`. The names are a list for each group of scenes; it is empty for worlds that are built.
+        """
+        refuse_worlds(recipe)
+        gain = calibrate(recipe)
+        found: Fields = {"gain": gain, "level_scale": 1 / gain}
+        groups = range(len(recipe.scenes))
+        if "shape_id" in recipe.labels and any(recipe.family(group).called == "scene" for group in groups):
+            known: dict[str, list[str]] = {}
+            for group in groups:
+                family = recipe.family(group)
+                if repr(family) not in known:
+                    world = Scene(0, group, world_seed(recipe.seed, 0), 1)
+                    named = family.called == "scene"
+                    known[repr(family)] = list(shape_names_in(loaded_world(recipe, world))) if named else []
+            found["shape_names"] = [known[repr(recipe.family(group))] for group in groups]
+        return found
+
+    def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[RenderedPings]]:
+        """Render levels of frames ``first``, ``first + 1`` ... of the scene, in batches with a part for each view.
+
+        Bodies that the scene's file moves are where they are at frame / ``frame_rate_hz``.
+        """
+        time_s = self._time_s(first, len(poses))
+        number = self.scene.number * FRAMES_A_SCENE + first
+        return self.simulator.render_views(poses, first=number, labels=labels, time_s=time_s)
+
+    def frames(self, poses: NDArray[np.float64], first: int, gain: float) -> dict[str, Values]:
+        """Render frames of the scene. Return what is stored of them, ``(frames, ...)`` by array name.
+
+        Args:
+            poses: of the sonar ``(frames, 6)``.
+            first: number of the first in the scene.
+            gain: of the data set.
+        """
+        values = self._empty(len(poses))
+        for batch in self.render_views(poses, first, labels=bool(self.recipe.labels) and self._labeller is None):
+            start = batch[0].first - (self.scene.number * FRAMES_A_SCENE + first)
+            self._fill({name: array[start : start + len(batch[0])] for name, array in values.items()}, batch, gain)
+        if self._labeller is not None:
+            number = self.scene.number * FRAMES_A_SCENE + first
+            for pings in self._labeller.pings(poses, first=number, labels=True, time_s=self._time_s(first, len(poses))):
+                here = slice(pings.first - number, pings.first - number + len(pings))
+                floor = np.maximum(VISIBLE, gain * noise_of(self.simulator.sonar))[:, None]
+                for label, shown in labels_above(pings, gain, floor).items():
+                    if label in self.recipe.labels:
+                        values[label][here] = shown
+        if self.bodies:
+            states = self.simulator.bodies(self._time_s(first, len(poses)))
+            assert states.poses is not None
+            assert states.velocities is not None
+            values["body_pose"][:] = states.poses[:, self.bodies]
+            values["body_velocity"][:] = states.velocities[:, self.bodies]
+        return values
+
+    def _time_s(self, first: int, frames: int) -> NDArray[np.float64]:
+        """Return the times of frames of the scene, of which its moving bodies are functions ``(frames,)`` [s]."""
+        return np.asarray((first + np.arange(frames)) / self.simulator.sonar.frame_rate_hz, dtype=np.float64)
+
+    def recorded(self, planned: dict[str, Values], first: int, about: Fields) -> dict[str, Values]:
+        """Render frames at the poses of the plan; see :class:`~mitsonar.datasets.modality.Renderer`."""
+        return self.frames(planned["pose"], first, float(about["gain"]))
+
+    def _empty(self, frames: int) -> dict[str, Values]:
+        """Allocate the arrays to fill; counts begin at 0."""
+        stored = ImageModality(self.recipe).stored
+        return {name: np.zeros((frames, *one.shape), dtype=one.kind) for name, one in stored.items()}
+
+    def _fill(self, values: dict[str, Values], batch: list[RenderedPings], gain: float) -> None:
+        """Write what is stored of one batch into the arrays."""
+        values["height_m"][:] = batch[0].height_m
+        for view, pings in zip(self.simulator.views, batch, strict=True):
+            suffix = self.recipe.suffix(view.name)
+            outside = (pings.counts.nearer + pings.counts.farther).sum(axis=1).astype(np.uint32)
+            np.maximum(values["dropped"], outside, out=values["dropped"])  # portions overlap
+            for number, levels in enumerate(pings.levels):  # one by one: a frame fits the cache, a batch does not
+                image = to_image(levels, gain, view.sonar)
+                values["saturated"][number] += np.count_nonzero(image >= 1)
+                if f"image{suffix}" in values:
+                    values[f"image{suffix}"][number] = to_uint8(image) if self.recipe.pixel == "uint8" else image
+                if f"vector{suffix}" in values:
+                    values[f"vector{suffix}"][number] = image.sum(axis=1, dtype=np.float64)
+                    values[f"nonzero{suffix}"][number] = np.count_nonzero(image, axis=1)
+            for label in pings.labels and self.recipe.labels:
+                values[f"{label}{suffix}"][:] = pings.labels[label]
+
+
+def instrument_in(recipe: Recipe, scene: Scene) -> Sonar:
+    """Return the sonar of a scene: that of speckle has a seed of each scene, since its scatterers are hashed by it.
+
+    Where the recipe has ``noise_db``, the noise of a scene is raised.
+    """
+    sonar = recipe.instrument
+    if sonar.model != "coherent":
+        return sonar
+    seed = int(np.random.SeedSequence([recipe.seed, scene.number]).generate_state(1)[0])
+    if sonar.noise_level_db is None or not recipe.noise_db:
+        return sonar.replace(seed=seed)
+    return sonar.replace(seed=seed, noise_level_db=sonar.noise_level_db + float(recipe.noise_raised_db(scene.number)))
+
+
+def body_places(recipe: Recipe, motion: SceneMotion | None) -> list[int]:
+    """Return the places of the recipe's bodies among those that move in a scene.
+
+    Raises:
+        MitsonarError: a body that does not move there.
+    """
+    known = () if motion is None else motion.bodies.names
+    for name in recipe.bodies:
+        if name not in known:
+            there = nearest_names(name, known) if known else "nothing moves there"
+            raise MitsonarError(f"bodies: no body {shortened(name)} moves in the scene: {there}")
+    return [known.index(name) for name in recipe.bodies]
+
+
+def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
+    """Build a scene's world in a temporary folder, and load it.
+
+    Raises:
+        MitsonarError: a scene of the user's own that is smaller than the recipe says.
+    """
+    with tempfile.TemporaryDirectory(prefix="mitsonar-world-") as folder:
+        family = recipe.family(scene.group)
+        path, parameters = family.prepare(scene.seed, Path(folder) / "world")
+        loaded = load_scene(path, **parameters)
+        extent = loaded.bbox()
+        family.refuse_smaller(np.array(extent.min, dtype=float).ravel(), np.array(extent.max, dtype=float).ravel())
+        return loaded
+
+
+def refuse_worlds(recipe: Recipe) -> None:
+    """Refuse scenes of the user's own that are smaller than the recipe says, and worlds without the mirrors that it names.
+
+    Nothing is rendered yet. Of each group of scenes one world is looked at.
+
+    Raises:
+        MitsonarError: one is smaller than its ``size_m``, lacks a mirror or a body that moves, or cannot be loaded.
+    """
+    from mitsonar.simulation.mirrors import mirror_of
+    from mitsonar.simulation.moving import motion_in
+
+    families = [recipe.family(group) for group in range(len(recipe.scenes))]
+    every = bool(recipe.mirrors or recipe.bodies)
+    looked_at = {repr(family): group for group, family in enumerate(families) if every or not family.seeded}
+    for group in looked_at.values():
+        world = loaded_world(recipe, Scene(0, group, world_seed(recipe.seed, 0), 1))
+        body_places(recipe, motion_in(world, None) if recipe.bodies else None)
+        if mirror_of(world, recipe.mirrors) is None and recipe.mirrors:
+            raise MitsonarError(
+                f"mirrors: no shape of the worlds of scenes.{group} reflects: got {recipe.mirrors}; give [reflection, rms "
+                "height in m] by the ids of shapes, or shapes of materials that have both"
+            )
+    release_memory()
+
+
+def calibrate(recipe: Recipe) -> float:
+    """Compute the gain: the 99.9th percentile of all pixels of the first 20 frames of the first scene becomes 0.9.
+
+    The frames are those of the recipe, however few of them are made. A recipe may also give the gain, such as that of
+    another data set of the same sonar.
+
+    Raises:
+        MitsonarError: these frames are empty.
+    """
+    if recipe.gain is not None:
+        return recipe.gain
+    scene = scenes_of(recipe, recipe.sequences)[0]
+    poses = []
+    for sequence in sequences_of(recipe, scene):
+        poses.append(mounted(sequence.vehicle, recipe.mount.pose))
+        if sum(map(len, poses)) >= CALIBRATION_FRAMES:
+            break
+    table = np.concatenate(poses)[:CALIBRATION_FRAMES]
+    renderer = SceneRenderer(recipe, scene)
+    batches = list(renderer.render_views(table, 0))
+    del renderer
+    release_memory()
+    if not any(pings.levels.any() for batch in batches for pings in batch):
+        raise MitsonarError(
+            "the first frames are empty: no ray met anything within the window; check height_m, mount, range_min and "
+            "range_max"
+        )
+    return constant_gain([_joined(batches)])[0]
+
+
+def _joined(batches: list[list[RenderedPings]]) -> RenderedPings:
+    """Join all views of all frames as frames of one column, since the gain is one constant for all."""
+    first = batches[0][0]
+    frames = []
+    for batch in batches:
+        frames += [np.concatenate([pings.levels[k].ravel() for pings in batch]) for k in range(len(batch[0]))]
+    return RenderedPings(first.first, np.stack(frames)[:, :, None], first.counts, first.height_m)
+
+
+# ---------------- A scene of a recipe becomes impulse responses
+
+
+class ResponseRenderer:
+    """One scene, built, loaded, and ready to record.
+
+    Args:
+        recipe: of the data set.
+        scene: which of its scenes.
+    """
+
+    def __init__(self, recipe: Recipe, scene: Scene) -> None:
+        self.simulator = ChannelSimulator(loaded_world(recipe, scene), recipe.channel_sonar, mirrors=recipe.mirrors)
+
+    @staticmethod
+    def settled(recipe: Recipe) -> Fields:
+        """Return no numbers: responses have no gain. Mirrors are looked for in the worlds."""
+        refuse_worlds(recipe)
+        return {}
+
+    def recorded(self, planned: dict[str, Values], first: int, about: Fields) -> dict[str, Values]:
+        """Simulate responses at the poses and velocities of the plan; see :class:`~mitsonar.datasets.modality.Renderer`."""
+        parts = list(self.simulator.pings(planned["pose"], planned["velocity"], first=first))
+        names = ("response", "height_m", "echoes", "dropped")
+        return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}

@@ -1,0 +1,311 @@
+"""Impulse responses as input of networks (Almanza-Medina, 5.2.5), with noise at a signal-to-noise ratio; NumPy only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from mitsonar.acoustics.noise import snr_of, snr_said
+from mitsonar.config.data import Recipe
+from mitsonar.datasets.arrangement import WHICH_LEVEL, Labels
+from mitsonar.datasets.modality import Fields
+from mitsonar.datasets.samples import AnySplit, Batch, Device, Part, RawSample, StoredBatches
+from mitsonar.datasets.store import DataStore
+from mitsonar.errors import MitsonarError
+from mitsonar.motion.composition import motions
+from mitsonar.records.responses import ImpulseResponses
+
+__all__ = ["ImpulsePairs", "ImpulseSamples", "Leak", "Packing", "displacement_labels", "noise_power", "packed", "with_noise"]
+
+
+SIGNAL_ENERGY = (0.01, 0.99)
+"""Parts of the energy between whose delays the signal lies."""
+
+
+def packed(response: NDArray[np.complexfloating]) -> NDArray[np.float32]:
+    """Pack responses ``(..., Q, M, taps)`` into matrices ``(..., taps, 2 M Q)`` (Almanza-Medina, 5.2.5).
+
+    The columns are, for each of M receivers, the real parts of its Q responses, then their imaginary parts. They are divided
+    by the largest magnitude of the sample. A sample without signal stays 0.
+    """
+    pings, receivers, taps = response.shape[-3:]
+    largest = np.abs(response).max(axis=(-3, -2, -1), keepdims=True)
+    unit = np.moveaxis(response / np.where(largest > 0, largest, 1), -1, -3)  # (..., taps, Q, M)
+    parts = np.stack([unit.real, unit.imag], axis=-1)  # (..., taps, Q, M, 2)
+    columns = np.moveaxis(parts, -3, -1)  # (..., taps, M, 2, Q)
+    return np.ascontiguousarray(columns.reshape(*response.shape[:-3], taps, 2 * pings * receivers), dtype=np.float32)
+
+
+def noise_power(response: NDArray[np.complexfloating], snr_db: float) -> float:
+    """Compute the variance of the complex noise of each tap at a signal-to-noise ratio [dB].
+
+    The signal is the mean power of the taps, over pings and receivers ``(Q, M, taps)``, from the tap where 1 % of the energy
+    has arrived to the tap where 99 % has. Silence before and after does not count.
+    """
+    energy = (np.abs(response.astype(np.complex128)) ** 2).mean(axis=(0, 1))
+    total = np.cumsum(energy)
+    if total[-1] == 0:
+        return 0.0
+    first, last = np.searchsorted(total, np.array(SIGNAL_ENERGY) * total[-1])
+    return float(energy[first : last + 1].mean() * 10 ** (-snr_db / 10))
+
+
+def with_noise(
+    response: NDArray[np.complexfloating], numbers: ArrayLike, snr_db: float | None, seed: int
+) -> NDArray[np.complexfloating]:
+    """Add white complex noise, drawn from (seed, ping), to the responses ``(Q, M, taps)`` of one sample.
+
+    Args:
+        response: without noise.
+        numbers: of the pings ``(Q,)``.
+        snr_db: signal-to-noise ratio [dB], see :func:`noise_power`; None: no noise.
+        seed: of the noise.
+    """
+    if snr_db is None:
+        return response
+    each = np.sqrt(noise_power(response, snr_db) / 2)
+    draws = [np.random.default_rng([seed, int(number)]) for number in np.asarray(numbers)]
+    parts = np.stack([rng.standard_normal((*response.shape[1:], 2)) for rng in draws])
+    noisy = response + each * (parts[..., 0] + 1j * parts[..., 1])
+    return np.asarray(noisy, dtype=response.dtype)
+
+
+@dataclass(frozen=True)
+class Packing:
+    """Turns the responses of a batch into the input of a network.
+
+    Attributes:
+        receivers: their names, in order.
+        levels: signal-to-noise ratios [dB], None for no noise; of several, each sample draws one by (seed, first ping).
+    """
+
+    receivers: tuple[str, ...]
+    levels: Sequence[float | None] = (None,)
+
+    def received(self, response: NDArray[np.complexfloating], numbers: ArrayLike, seed: int) -> NDArray[np.complexfloating]:
+        """Add its noise to one sample ``(Q, M, taps)``."""
+        level = 0
+        if len(self.levels) > 1:
+            level = int(np.random.default_rng([seed, WHICH_LEVEL, int(np.asarray(numbers)[0])]).integers(len(self.levels)))
+        return with_noise(response, numbers, self.levels[level], seed)
+
+    def __call__(self, response: NDArray[np.complexfloating], numbers: ArrayLike, seed: int) -> NDArray[np.float32]:
+        """Pack responses ``(batch, Q, M, taps)`` into matrices ``(batch, 1, taps, 2 M Q)``, with noise.
+
+        Args:
+            response: without noise.
+            numbers: of the pings ``(batch, Q)``.
+            seed: of the noise.
+        """
+        rows = zip(response, np.asarray(numbers), strict=True)
+        return packed(np.stack([self.received(one, mine, seed) for one, mine in rows]))[:, None]
+
+
+# ---------------- Impulse responses of a data set, sample by sample, for estimators and regressors; NumPy only
+
+
+Leak = Literal["none", "one_ping", "strangers"]
+"""What a sample keeps of the motion; see :class:`ImpulseSamples`."""
+
+LEAKS = ("none", "one_ping", "strangers")
+
+
+def displacement_labels(kind: str, recipe: Recipe, pings: int) -> Labels:
+    """Return the labels of displacements from the first of ``pings`` pings to the last; yaw only where the recipe turns."""
+    step = Labels.of(kind, recipe, 2)
+    count = 3 if recipe.flight.yaw_deg > 0 else 2
+    return Labels(kind, (pings - 1) * step.low[:count], (pings - 1) * step.high[:count], step.names[:count])
+
+
+class ImpulseSamples:
+    """Samples of a data set of impulse responses: Q consecutive pings and the displacement from the first to the last.
+
+    Args:
+        url: path or URL of the store.
+        part: ``train``, ``validation``, ``test``, or ``all``.
+        split: ``scene``, ``sequence``, keys, or a :class:`~mitsonar.config.data.Split`; default: the recipe's own.
+        frames: Q, pings of a sample; default: the recipe's.
+        noise: ``none``, a signal-to-noise ratio such as ``20 dB`` (see
+            :func:`~mitsonar.datasets.responses.noise_power`), or a list of them, of which each sample draws one.
+        labels: ``raw`` (m, m, rad), ``quantised`` or ``normx10``.
+        seed: of the noise.
+        leak: for tests of where an estimator finds the motion. ``one_ping`` repeats the first response, ``strangers`` takes
+            all but the first response from a sample of another scene. Neither holds the motion.
+        one_a_sequence: whether only one sample of each sequence is taken.
+
+    Attributes:
+        sonar: the instrument.
+        arrange: packing and noise.
+
+    Raises:
+        MitsonarError: no finished data set of responses there, an unknown option, a part without samples.
+    """
+
+    def __init__(
+        self,
+        url: str | Path,
+        *,
+        part: str = "train",
+        split: AnySplit = None,
+        frames: int | None = None,
+        noise: str | Sequence[str] = "none",
+        labels: str = "normx10",
+        seed: int = 0,
+        leak: Leak = "none",
+        one_a_sequence: bool = False,
+    ) -> None:
+        self.store, self._part = DataStore.open(url), part
+        self.recipe = self.store.recipe
+        self.sonar = self.recipe.channel_sonar
+        self.frames = self.recipe.frames if frames is None else frames
+        if self.frames < 2:
+            raise MitsonarError(f"a sample has two pings or more, first and last: got frames {self.frames}")
+        if leak not in LEAKS:
+            raise MitsonarError(f"leak must be one of {', '.join(LEAKS)}: got {leak!r}")
+        levels = [noise] if isinstance(noise, str) else list(noise)
+        if not levels:
+            raise MitsonarError("noise is a ratio or a list of them: got an empty list; give none for no noise")
+        self.arrange = Packing(tuple(one.name for one in self.sonar.receivers), tuple(map(snr_of, levels)))
+        self.labels = displacement_labels(labels, self.recipe, self.frames)
+        self.seed, self.epoch, self.leak = seed, 0, leak
+        self.chosen = Part.of(self.store, part, split, self.frames, seed=seed, one_a_sequence=one_a_sequence)
+        self.split, self.first = self.chosen.split, self.chosen.first
+        self.scene, self.sequence = self.chosen.scene, self.chosen.sequence
+        if leak == "strangers" and len(np.unique(self.scene[self.first])) < 2:
+            raise MitsonarError(f"strangers are of two scenes, part {part!r} has one: read another part, or make more")
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def __repr__(self) -> str:
+        receivers = len(self.arrange.receivers)
+        return (
+            f"{type(self).__name__}({len(self):,} samples of {self.frames} pings at {receivers} receivers, "
+            f"part {self._part}, {self.recipe.name}: {self.store.place.url})"
+        )
+
+    def frame_numbers(self, index: int) -> slice:
+        """Return the pings of a sample, as numbered in the store."""
+        return self.chosen.frame_numbers(index)
+
+    def target(self, index: int) -> NDArray[np.float64]:
+        """Return the displacement from the first ping to the last (Almanza-Medina, eq. 3.4).
+
+        It is sideways, forward [m] and, if the recipe turns, yaw [rad].
+        """
+        here = self.frame_numbers(index)
+        ends = self.chosen.pose[[here.start, here.stop - 1]]
+        return np.asarray(motions(ends)[0, : len(self.labels.names)])
+
+    def targets(self) -> NDArray[np.float64]:
+        """Return the displacements of all samples ``(samples, 2 or 3)``."""
+        return np.array([self.target(index) for index in range(len(self))])
+
+    def response(self, index: int) -> NDArray[np.complex64]:
+        """Read the responses of a sample ``(Q, M, taps)``, without noise, changed as ``leak`` says."""
+        mine = self.store.read("response", self.frame_numbers(index))
+        if self.leak == "one_ping":
+            return np.repeat(mine[:1], self.frames, axis=0)
+        if self.leak == "strangers":
+            others = np.flatnonzero(self.scene[self.first] != self.scene[self.first[index]])
+            other = int(np.random.default_rng([self.seed, 11, int(self.first[index])]).choice(others))
+            return np.concatenate([mine[:1], self.store.read("response", self.frame_numbers(other))[1:]])
+        return mine
+
+    @property
+    def noise_seed(self) -> int:
+        """Return the seed of the noise."""
+        return self.seed
+
+    def received(self, index: int) -> NDArray[np.complexfloating]:
+        """Read the responses of a sample ``(Q, M, taps)``, with its noise."""
+        here = self.frame_numbers(index)
+        return self.arrange.received(self.response(index), np.arange(here.start, here.stop), self.noise_seed)
+
+    def matrix(self, index: int) -> NDArray[np.float32]:
+        """Read the packed matrix ``(taps, 2 M Q)`` of a sample, with its noise."""
+        return packed(self.received(index))
+
+    def responses(self, index: int) -> ImpulseResponses:
+        """Read a sample with its noise, as estimators take it."""
+        here = self.frame_numbers(index)
+        known = self._per_ping
+        return ImpulseResponses(
+            response=self.received(index),
+            sonar=self.sonar,
+            poses=self.chosen.pose[here],
+            time_s=known["time_s"][here],
+            velocity=known["velocity"][here],
+            height_m=known["height_m"][here],
+        )
+
+    @cached_property
+    def _per_ping(self) -> dict[str, NDArray[np.float64]]:
+        """Read the small arrays of the whole store, one chunk each."""
+        return {name: self.store.read(name) for name in ("time_s", "velocity", "height_m")}
+
+
+# ---------------- Samples of impulse responses for torch: packed matrices with the displacement between the pings
+
+
+class ImpulsePairs(ImpulseSamples, StoredBatches, Dataset[Batch]):
+    """Samples of impulse responses; ``pairs[i]`` is ``(input, label)``, float32 tensors.
+
+    The input is ``(1, taps, 2 M Q)``: for each of M receivers the real parts of its Q responses, then their imaginary parts,
+    one column each, divided by the largest magnitude of the sample (Almanza-Medina, 5.2.5). The label is the displacement
+    from the first ping to the last: sideways, forward, and yaw where the recipe turns. Arguments and errors:
+    :class:`~mitsonar.datasets.responses.ImpulseSamples`.
+    """
+
+    @property
+    def noise_seed(self) -> int:
+        """Return the seed of the noise, which changes with the epoch."""
+        return self.epoch_seed
+
+    def raw(self, index: int) -> RawSample:
+        """Read a sample as it is stored: responses ``(Q, M, taps)``, numbers of the pings, and the label."""
+        here = self.frame_numbers(index)
+        label = self.labels.encode(self.target(index))
+        return {"frames": np.arange(here.start, here.stop), "response": self.response(index), "label": label}
+
+    def finished(self, batch: dict[str, Tensor], device: Device = None) -> Batch:
+        """Make matrices and labels of a batch of raw samples, on a device."""
+        response, numbers = (torch.as_tensor(batch[name]).cpu().numpy() for name in ("response", "frames"))
+        inputs = torch.from_numpy(self.arrange(response, numbers, self.noise_seed))
+        return inputs.to(device, non_blocking=True), torch.as_tensor(batch["label"]).to(device, non_blocking=True)
+
+    def at_noise(self, level: str) -> Packing:
+        """Return the packing with one level of noise.
+
+        Raises:
+            MitsonarError: an unknown level.
+        """
+        return replace(self.arrange, levels=(snr_of(level),))
+
+    def described(self) -> Fields:
+        """Describe the samples, as a checkpoint keeps it; see :meth:`~mitsonar.datasets.samples.Batches.described`."""
+        low, high = self.recipe.flight.heights
+        return {
+            "arrangement": {
+                "frames": self.frames,
+                "views": list(self.arrange.receivers),
+                "kind": "response",
+                "layout": "columns",
+                "coordinates": "delay",
+                "cartesian_rows": self.sonar.taps,
+                "ground": False,
+            },
+            "sonar": {"channel": self.sonar.model_dump(mode="json")},
+            "trained_at": {"height_m": [low, high], "pitch_deg": 0.0, "roll_deg": 0.0},
+            "model": self.sonar.model,
+            "noise": "; ".join(map(snr_said, self.arrange.levels)),
+        }
