@@ -41,7 +41,7 @@ def export(
         write_whole(half, content)
         say(f"{network}, {len(content):,} bytes: {half}")
     if onnx is not None:
-        from mitsonar.networks.onnx_export import onnx_of
+        from mitsonar.networks.checkpoint import onnx_of
 
         content = onnx_of(checkpoint, None if batch == "dynamic" else int(batch))
         write_whole(onnx, content)

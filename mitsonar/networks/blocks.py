@@ -46,7 +46,7 @@ class Network(nn.Module):
         options: of the network, defaults included; plain values.
         needs: options of the input's arrangement that it requires.
         any_sonar: whether it works with sonars that it was not trained on.
-        has_covariance: whether it returns a :class:`~mitsonar.networks.gaussian_head.GaussianHead` rather than labels.
+        has_covariance: whether it returns a :class:`~mitsonar.networks.corrnet.GaussianHead` rather than labels.
     """
 
     needs: ClassVar[Fields] = {}

@@ -10,21 +10,14 @@ from torch import Tensor, nn
 from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.samples import Inputs
 from mitsonar.errors import MitsonarError, nearest_names, shortened
-from mitsonar.networks.cnn1b import Cnn1b
-from mitsonar.networks.cnn4b import Cnn4b
-from mitsonar.networks.cnn4posenet import Cnn4PoseNet
 from mitsonar.networks.corrnet import CorrNet
-from mitsonar.networks.impulse_posenet import ImpulsePoseNet
-from mitsonar.networks.posenet import PoseNet
-from mitsonar.networks.posenet_dual import PoseNetDual
-from mitsonar.networks.posenetvec import PoseNetVec
 from mitsonar.networks.profilenet import ProfileNet
-from mitsonar.networks.sfmnet import SfMNet
+from mitsonar.networks.thesis import Cnn1b, Cnn4b, Cnn4PoseNet, ImpulsePoseNet, PoseNet, PoseNetDual, PoseNetVec, SfMNet
 
 __all__ = ["NETWORKS", "called", "create_network", "options_for", "options_of"]
 
 Output: TypeAlias = Any
-"""The output of a network: labels ``(batch, outputs)``, or a :class:`~mitsonar.networks.gaussian_head.GaussianHead`."""
+"""The output of a network: labels ``(batch, outputs)``, or a :class:`~mitsonar.networks.corrnet.GaussianHead`."""
 
 NETWORKS: dict[str, Any] = {
     "posenet": PoseNet,

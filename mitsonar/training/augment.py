@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mitsonar.motion.composition import inverse
-from mitsonar.networks.warp_grid import Ground
+from mitsonar.networks.corrnet import Ground
 
 __all__ = ["AUGMENTATIONS", "augmented"]
 

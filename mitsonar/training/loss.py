@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mitsonar.config.training import Loss
 from mitsonar.datasets.arrangement import Labels
-from mitsonar.networks.gaussian_head import GaussianHead, likelihood
+from mitsonar.networks.corrnet import GaussianHead, likelihood
 
 if TYPE_CHECKING:
     from mitsonar.training.training_types import NetworkOutput

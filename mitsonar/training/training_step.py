@@ -16,8 +16,8 @@ from mitsonar.datasets.arrangement import Labels
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.errors import AXES, Axis
 from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.networks.corrnet import GaussianHead
 from mitsonar.networks.create import NETWORKS, called, create_network, options_for
-from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.training.augment import augmented
 from mitsonar.training.loss import create_loss
 from mitsonar.training.training_data import STEP, Material, Validation, batches, finished, seed_of
@@ -26,7 +26,7 @@ from mitsonar.training.training_types import Array, Batch
 if TYPE_CHECKING:
     from torch.utils.data import DataLoader
 
-    from mitsonar.networks.warp_grid import Ground
+    from mitsonar.networks.corrnet import Ground
     from mitsonar.training.training_types import NetworkInput, NetworkOutput
 
 __all__ = ["NetworkTraining", "axes_of", "estimates", "network_for", "rmse_by_level"]

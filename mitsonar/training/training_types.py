@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from mitsonar.networks.gaussian_head import GaussianHead
-    from mitsonar.networks.warp_grid import Ground
+    from mitsonar.networks.corrnet import GaussianHead, Ground
 
     NetworkInput = Tensor | tuple[Tensor | Ground, ...]
     """One input of a network, or several, which are passed as separate arguments."""

@@ -23,8 +23,8 @@ pytestmark = pytest.mark.learn
 
 from mitsonar.datasets.samples import Samples  # noqa: E402
 from mitsonar.networks.checkpoint import FILE, Checkpoint  # noqa: E402
+from mitsonar.networks.corrnet import GaussianHead  # noqa: E402
 from mitsonar.networks.create import create_network  # noqa: E402
-from mitsonar.networks.gaussian_head import GaussianHead  # noqa: E402
 
 
 @pytest.fixture(scope="module")

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 torch = pytest.importorskip("torch")
 corrnet = pytest.importorskip("mitsonar.networks.corrnet")
-warp_grid = pytest.importorskip("mitsonar.networks.warp_grid")
-matching = pytest.importorskip("mitsonar.networks.matching")
-slopes = pytest.importorskip("mitsonar.networks.slopes")
-head = pytest.importorskip("mitsonar.networks.gaussian_head")
+warp_grid = pytest.importorskip("mitsonar.networks.corrnet")
+matching = pytest.importorskip("mitsonar.networks.corrnet")
+slopes = pytest.importorskip("mitsonar.networks.corrnet")
+head = pytest.importorskip("mitsonar.networks.corrnet")
 augment = pytest.importorskip("mitsonar.training.augment")
 
 pytestmark = pytest.mark.learn
@@ -213,7 +213,7 @@ def test_it_learns() -> None:
 
 def test_it_learns_after_it_was_asked() -> None:
     """In one process: what an evaluation leaves behind for sizes of its own serves a training."""
-    from mitsonar.networks.warp_grid import _from_nodes
+    from mitsonar.networks.corrnet import _from_nodes
 
     _from_nodes.cache_clear()
     network, image, ground = create_network("corrnet", finer=1), seen_pair(np.array([0.01, 0.0, 0.0])), batch()

@@ -35,9 +35,11 @@ from mitsonar.estimation.comparison_run import compare  # noqa: E402
 from mitsonar.estimation.learned.height_ensemble import HeightEnsemble  # noqa: E402
 from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402
 from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
-from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
+from mitsonar.networks.checkpoint import (  # noqa: E402
+    Checkpoint,
+    onnx_of,
+)
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
-from mitsonar.networks.onnx_export import onnx_of  # noqa: E402
 from mitsonar.training.evaluation import evaluate, predictions, samples_for  # noqa: E402
 from mitsonar.training.training_types import JsonObject  # noqa: E402
 
@@ -648,6 +650,6 @@ def test_export_writes_a_file_once(mitsonar: Command, tmp_path: Path, monkeypatc
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "onnxscript" else find_spec(name))
     refused(mitsonar(*words, path, "--overwrite"), "writing ONNX needs onnxscript", "mitsonar[learn]")
     assert path.read_bytes() == before
-    monkeypatch.setattr("mitsonar.networks.onnx_export.onnx_of", lambda checkpoint, batch: b"new")
+    monkeypatch.setattr("mitsonar.networks.checkpoint.onnx_of", lambda checkpoint, batch: b"new")
     assert mitsonar(*words, path, "--overwrite").returncode == 0
     assert path.read_bytes() == b"new"

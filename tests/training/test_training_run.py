@@ -46,7 +46,7 @@ from mitsonar.datasets.samples import (  # noqa: E402
     SonarPairs,
 )
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
-from mitsonar.networks.gaussian_head import GaussianHead  # noqa: E402
+from mitsonar.networks.corrnet import GaussianHead  # noqa: E402
 from mitsonar.training.evaluation import evaluate  # noqa: E402
 from mitsonar.training.loss import create_loss, squared_error  # noqa: E402
 from mitsonar.training.training_data import Order, Validation, _Together, finished, material_of  # noqa: E402

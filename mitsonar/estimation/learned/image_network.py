@@ -35,8 +35,7 @@ from mitsonar.geometry.ground import STD_MEASURED, Attitude, attitude_of
 from mitsonar.instruments.sounder import sonar_from
 from mitsonar.motion.composition import Motion, MotionPrior, inverse
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.networks.gaussian_head import GaussianHead
-from mitsonar.networks.warp_grid import Ground, WarpGrid
+from mitsonar.networks.corrnet import GaussianHead, Ground, WarpGrid
 from mitsonar.records.frames import SonarFrames
 
 __all__ = ["ImageNetwork"]

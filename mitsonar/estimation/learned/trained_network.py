@@ -22,9 +22,8 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.errors import AXES
 from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.networks.corrnet import GaussianHead, Ground
 from mitsonar.networks.create import called
-from mitsonar.networks.gaussian_head import GaussianHead
-from mitsonar.networks.warp_grid import Ground
 from mitsonar.records.frames import SonarFrames, ViewFrames
 
 __all__ = [

@@ -1,0 +1,513 @@
+"""PoseNet, the best network on images of Almanza-Medina (3.3.2 and Table 4.1), after GeoNet (Yin and Shi, 2018)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from mitsonar.datasets.modality import Fields
+from mitsonar.errors import MitsonarError, shortened
+from mitsonar.networks.blocks import (
+    ConvolutionNetwork,
+    Network,
+    Quadrants,
+    SameAverage,
+    SameConv2d,
+    Size,
+    Table,
+    cells_after,
+    column_convolutions,
+    convolutions,
+    fully_connected,
+    glorot,
+    scaled,
+    values_after,
+)
+
+__all__ = [
+    "IMPULSE_CHANNELS",
+    "IMPULSE_KERNELS",
+    "IMPULSE_LAYERS",
+    "POSENETVEC_CHANNELS",
+    "POSENETVEC_KERNELS",
+    "POSENET_LAYERS",
+    "SFMNET_LAYERS",
+    "SIZES",
+    "Cnn1b",
+    "Cnn4PoseNet",
+    "Cnn4b",
+    "CoarseFeatures",
+    "ImpulsePoseNet",
+    "PoseNet",
+    "PoseNetDual",
+    "PoseNetVec",
+    "QuadPoseNet",
+    "SfMNet",
+]
+
+
+POSENET_KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3)
+POSENET_CHANNELS = (32, 64, 128, 256, 512, 512, 512, 1024, 1024)
+POSENET_LAYERS: Table = tuple(
+    (kernel, channels, 2) for kernel, channels in zip(POSENET_KERNELS, POSENET_CHANNELS, strict=True)
+)
+"""Table 4.1."""
+
+
+class PoseNet(ConvolutionNetwork):
+    """Nine convolutions of stride 2, a mean over 4 x 4 cells, and a fully connected layer to the estimates.
+
+    It reads any size: two frames side by side (512 x 192), three (512 x 288), two sensors (512 x 384), wide frames side by
+    side (512 x 1024) or stacked (1024 x 512). The text has 3 (Q - 1) outputs. Here three frames have 3, too, since their
+    motion is constant. Options and errors: :class:`~mitsonar.networks.blocks.ConvolutionNetwork`.
+    """
+
+    table: ClassVar[Table] = POSENET_LAYERS
+
+
+# ---------------- PoseNet on polar and Cartesian images together (Almanza-Medina, 3.4.7)
+
+
+DUAL_VALUES = 1024
+"""Values of the fully connected layer that reads both branches (ours: as many as a branch has)."""
+
+
+class PoseNetDual(Network):
+    """Two PoseNets whose averages are joined by a fully connected layer with a ReLU (ours) before the estimates.
+
+    Dropout lies before that layer (ours).
+
+    Args:
+        outputs: estimates.
+        width: factor on the channels and on the fully connected layer.
+        dropout: rate in training.
+        size: rows and columns of the polar input.
+        cartesian_size: rows and columns of the Cartesian input.
+        channels: of each input; with Almanza-Medina's 1 the frames are side by side.
+
+    Raises:
+        MitsonarError: a value out of its range.
+    """
+
+    needs: ClassVar[Fields] = {"coordinates": "both"}
+
+    def __init__(
+        self,
+        *,
+        outputs: int = 3,
+        width: float = 1.0,
+        dropout: float = 0.5,
+        size: Size = (512, 192),
+        cartesian_size: Size = (512, 512),
+        channels: int = 1,
+    ) -> None:
+        sizes = {"size": size, "cartesian_size": cartesian_size}
+        super().__init__(outputs=outputs, width=width, dropout=dropout, channels=channels, **sizes)
+        self.polar = nn.Sequential(convolutions(POSENET_LAYERS, channels, width) | {"average": SameAverage()})
+        self.cartesian = nn.Sequential(convolutions(POSENET_LAYERS, channels, width) | {"average": SameAverage()})
+        values = sum(values_after(POSENET_LAYERS, each, width) for each in sizes.values())
+        self.dropout = nn.Dropout(dropout)
+        self.layers = fully_connected([values, scaled(DUAL_VALUES, width)])
+        self.regression = nn.Linear(scaled(DUAL_VALUES, width), outputs)
+        glorot(self)
+
+    def forward(self, polar: Tensor, cartesian: Tensor) -> Tensor:
+        """Estimate labels ``(batch, outputs)`` of the same frames as polar and as Cartesian images, grey values 0..1.
+
+        Args:
+            polar: ``(batch, channels, rows, columns)`` of ``size``.
+            cartesian: ``(batch, channels, rows, columns)`` of ``cartesian_size``.
+
+        Raises:
+            MitsonarError: frames of another size.
+        """
+        self.expect(polar)
+        self.expect(cartesian, "cartesian_size")
+        features = torch.cat((self.polar(polar).flatten(1), self.cartesian(cartesian).flatten(1)), dim=1)
+        return self.regression(self.layers(self.dropout(features)))  # type: ignore[no-any-return]
+
+
+# ---------------- PoseNetVec: a PoseNet for vectors that keeps the number of columns (Almanza-Medina, 4.3.1 and Table
+# 4.2)
+
+
+POSENETVEC_KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3)
+"""Rows of the kernels, along the range."""
+
+POSENETVEC_CHANNELS = (32, 64, 128, 256, 512, 512, 512, 1024, 1024)
+
+POSENETVEC_COLUMNS = 2
+"""Columns of a kernel."""
+
+
+class PoseNetVec(Network):
+    """Nine convolutions of stride 2 along the range and 1 across, a mean over 4 x 4 cells, a fully connected layer.
+
+    It reads vectors side by side, two of each portion of the field of view: 512 x 2 of the whole, 512 x 8 of four quadrants.
+    From one vector it estimates the height (Table 4.4). Dropout lies before the fully connected layer (ours, as in PoseNet;
+    the text gives no position).
+
+    Args:
+        outputs: estimates.
+        width: factor on the channels.
+        dropout: rate in training.
+        size: range levels and columns of the input.
+        channels: of the input.
+
+    Raises:
+        MitsonarError: a value out of its range.
+    """
+
+    needs: ClassVar[Fields] = {"kind": "vector"}
+
+    def __init__(
+        self, *, outputs: int = 3, width: float = 1.0, dropout: float = 0.5, size: Size = (512, 8), channels: int = 1
+    ) -> None:
+        super().__init__(outputs=outputs, width=width, dropout=dropout, channels=channels, size=size)
+        layers = column_convolutions(POSENETVEC_KERNELS, POSENETVEC_CHANNELS, POSENETVEC_COLUMNS, width, channels)
+        self.layers = nn.Sequential(*layers, SameAverage())
+        self.dropout = nn.Dropout(dropout)
+        rows, columns = size
+        for _ in POSENETVEC_KERNELS:
+            rows = -(-rows // 2)
+        self.regression = nn.Linear(scaled(POSENETVEC_CHANNELS[-1], width) * rows * columns, outputs)
+        glorot(self)
+
+    def forward(self, vectors: Tensor) -> Tensor:
+        """Estimate labels ``(batch, outputs)`` of vectors ``(batch, channels, levels, columns)``.
+
+        Raises:
+            MitsonarError: vectors of another size.
+        """
+        self.expect(vectors)
+        return self.regression(self.dropout(self.layers(vectors).flatten(1)))  # type: ignore[no-any-return]
+
+
+# ---------------- SfMNet: the part of SfM-Net that estimates the camera's motion (Almanza-Medina, 3.3.1;
+# Vijayanarasimhan et al., 2017)
+
+
+SFMNET_KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3, 3)
+SFMNET_CHANNELS = (32, 64, 128, 128, 256, 256, 512, 512, 1024, 1024)
+SFMNET_STRIDES = (4, 3, 3, 2, 1, 2, 1, 2, 1, 2)
+SFMNET_LAYERS: Table = tuple(zip(SFMNET_KERNELS, SFMNET_CHANNELS, SFMNET_STRIDES, strict=True))
+"""The channels are those of SfM-Net without its second layer of 64: 32, then twice 64 to 1024, as in the text."""
+
+
+class SfMNet(ConvolutionNetwork):
+    """Ten convolutions, a mean over 4 x 4 cells, and a fully connected layer to the estimates.
+
+    The text gives neither padding nor the extent of the average: they are PoseNet's (ours).
+    Options and errors: :class:`~mitsonar.networks.blocks.ConvolutionNetwork`.
+    """
+
+    table: ClassVar[Table] = SFMNET_LAYERS
+
+
+# ---------------- CNN-1b: two convolutions on a coarse image (Almanza-Medina, 3.3.3; Costante et al., 2016)
+
+
+CNN1B_CHANNELS = (64, 20)
+"""Channels of the two convolutions (ours, after Costante et al.; the text gives only their kernels)."""
+
+SIZES = (2400, 1200, 600, 300)
+"""Values of the fully connected layers. The text gives them for CNN-4b, and four layers for both networks."""
+
+
+class CoarseFeatures(nn.Module):
+    """Features of CNN-1b and of each quarter of CNN-4b: a coarse image after one convolution, and after two.
+
+    ``coarse``, a mean over cells; ``conv1``, 9 x 9; ``pool1``, the maximum over 4 x 4; ``conv2``, 2 x 2; ``pool2``, 2 x 2.
+    The text is silent on the following, which is ours. The convolutions have ReLU, "same" padding and stride 1. Pools do not
+    overlap, and cells that do not fill one are left out, as in MATLAB. The text's layer that joins the outputs of both pools
+    has no weights.
+
+    Args:
+        cells: rows and columns of cells of a mean.
+        size: rows and columns of the input.
+        width: factor on the channels.
+        channels: of the input.
+    """
+
+    def __init__(self, *, cells: int, size: Size, width: float, channels: int = 1) -> None:
+        super().__init__()
+        first, second = (scaled(full, width) for full in CNN1B_CHANNELS)
+        self.coarse = nn.AvgPool2d(cells)
+        self.conv1 = nn.Sequential(SameConv2d(channels, first, 9), nn.ReLU(inplace=True))
+        self.pool1 = nn.MaxPool2d(4)
+        self.conv2 = nn.Sequential(SameConv2d(first, second, 2), nn.ReLU(inplace=True))
+        self.pool2 = nn.MaxPool2d(2)
+        rows, columns = (length // cells // 4 for length in size)
+        if min(rows, columns) < 2:
+            raise MitsonarError(
+                f"images must have at least {8 * cells} x {8 * cells} cells where the network first takes means over "
+                f"{cells} x {cells}: got {size[0]} x {size[1]}"
+            )
+        self.values = first * rows * columns + second * (rows // 2) * (columns // 2)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Compute features ``(batch, values)`` of images ``(batch, channels, rows, columns)``."""
+        fine = self.pool1(self.conv1(self.coarse(image)))
+        return torch.cat((fine.flatten(1), self.pool2(self.conv2(fine)).flatten(1)), dim=1)
+
+
+class Cnn1b(Network):
+    """Means over 8 x 8 cells, two convolutions, and a fully connected network of four layers.
+
+    Dropout lies before the fully connected network (ours; the text gives a rate, but no position).
+
+    Args:
+        outputs: estimates.
+        width: factor on the channels and on the sizes of the fully connected layers.
+        dropout: rate in training.
+        size: rows and columns of the input, at least 64 each.
+        channels: of the input; with Almanza-Medina's 1 the frames are side by side.
+
+    Raises:
+        MitsonarError: a value out of its range.
+    """
+
+    def __init__(
+        self,
+        *,
+        outputs: int = 3,
+        width: float = 1.0,
+        dropout: float = 0.5,
+        size: Size = (512, 192),
+        channels: int = 1,
+    ) -> None:
+        super().__init__(outputs=outputs, width=width, dropout=dropout, channels=channels, size=size)
+        self.features = CoarseFeatures(cells=8, size=size, width=width, channels=channels)
+        self.dropout = nn.Dropout(dropout)
+        self.layers = fully_connected([self.features.values, *(scaled(full, width) for full in SIZES)])
+        self.regression = nn.Linear(scaled(SIZES[-1], width), outputs)
+        glorot(self)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Estimate labels ``(batch, outputs)`` of frames ``(batch, channels, rows, columns)``, grey values 0..1.
+
+        Raises:
+            MitsonarError: frames of another size.
+        """
+        self.expect(image)
+        return self.regression(self.layers(self.dropout(self.features(image))))  # type: ignore[no-any-return]
+
+
+# ---------------- CNN-4b: CNN-1b on each quadrant of the two images (Almanza-Medina, 3.3.3; Costante et al., 2016)
+
+
+class Cnn4b(Network):
+    """Four pairs of quadrants, each with CNN-1b's convolutions on means over 4 x 4 cells, and one fully connected network.
+
+    The four share no weights. Dropout lies before the fully connected network. Both are ours.
+
+    Args:
+        outputs: estimates.
+        width: factor on the channels and on the sizes of the fully connected layers.
+        dropout: rate in training.
+        size: rows and columns of the input, two images side by side; at least 64 each, rows even, columns divisible by 4.
+
+    Raises:
+        MitsonarError: a value out of its range, or images that cannot be cut into quadrants.
+    """
+
+    def __init__(
+        self,
+        *,
+        outputs: int = 3,
+        width: float = 1.0,
+        dropout: float = 0.5,
+        size: Size = (512, 192),
+    ) -> None:
+        super().__init__(outputs=outputs, width=width, dropout=dropout, size=size)
+        quadrant = Quadrants.size(size)
+        quarters = [CoarseFeatures(cells=4, size=quadrant, width=width) for _ in range(4)]
+        values = sum(quarter.values for quarter in quarters)
+        self.split = Quadrants()
+        self.quarters = nn.ModuleList(quarters)
+        self.dropout = nn.Dropout(dropout)
+        self.layers = fully_connected([values, *(scaled(full, width) for full in SIZES)])
+        self.regression = nn.Linear(scaled(SIZES[-1], width), outputs)
+        glorot(self)
+
+    def forward(self, pair: Tensor) -> Tensor:
+        """Estimate labels ``(batch, outputs)`` of two images side by side ``(batch, 1, rows, columns)``, grey values 0..1.
+
+        Raises:
+            MitsonarError: images of another size.
+        """
+        self.expect(pair)
+        features = [quarter(image) for quarter, image in zip(self.quarters, self.split(pair), strict=True)]
+        return self.regression(self.layers(self.dropout(torch.cat(features, dim=1))))  # type: ignore[no-any-return]
+
+
+# ---------------- CNN-4PoseNet: a PoseNet on each quadrant of the two images (Almanza-Medina, 3.3.4)
+
+
+CNN4POSENET_LAYERS = POSENET_LAYERS[:8]
+"""Convolutions of a QuadPoseNet. The text gives their number and kernels; channels and strides are PoseNet's (ours)."""
+
+CNN4POSENET_VALUES = 1024
+"""Values of each of its two fully connected layers."""
+
+
+class QuadPoseNet(nn.Module):
+    """Eight convolutions, with a fully connected layer on the last one and another on the first: coarse and fine features.
+
+    The 5 x 5 average after the first convolution does not overlap (ours: MATLAB's stride of 1 would need 200 million weights
+    after it). Cells that do not fill it are left out. The fully connected layers have a ReLU (ours). We read the text's
+    layers of 2 x 1024 and 8 x 1024 values as these outputs side by side, without weights.
+
+    Args:
+        size: rows and columns of the input.
+        width: factor on the channels and on the fully connected layers.
+    """
+
+    def __init__(self, *, size: Size, width: float) -> None:
+        super().__init__()
+        layers = convolutions(CNN4POSENET_LAYERS, 1, width, bare_end=False)
+        self.first = layers.pop("conv1")
+        self.others = nn.Sequential(layers | {"average": SameAverage()})
+        self.early = nn.AvgPool2d(5)
+        rows, columns = (length // 5 for length in cells_after(size, [2]))
+        if min(rows, columns) < 1:
+            raise MitsonarError(f"quadrants side by side must have at least 9 x 9 cells: got {size[0]} x {size[1]}")
+        values = scaled(CNN4POSENET_VALUES, width)
+        self.from_last = fully_connected([values_after(CNN4POSENET_LAYERS, size, width), values])
+        self.from_first = fully_connected([scaled(CNN4POSENET_LAYERS[0][1], width) * rows * columns, values])
+        self.values = 2 * values
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Compute features ``(batch, values)`` of images ``(batch, 1, rows, columns)``."""
+        first = self.first(image)
+        last = self.from_last(self.others(first).flatten(1))
+        return torch.cat((last, self.from_first(self.early(first).flatten(1))), dim=1)
+
+
+class Cnn4PoseNet(Network):
+    """Four pairs of quadrants, each with its own QuadPoseNet; a fully connected layer reads them all.
+
+    Dropout lies before that layer (ours).
+
+    Args:
+        outputs: estimates.
+        width: factor on the channels and on the sizes of the fully connected layers.
+        dropout: rate in training.
+        size: rows and columns of the input, two images side by side; rows even, columns divisible by 4.
+
+    Raises:
+        MitsonarError: a value out of its range, or images that cannot be cut into quadrants.
+    """
+
+    def __init__(
+        self,
+        *,
+        outputs: int = 3,
+        width: float = 1.0,
+        dropout: float = 0.5,
+        size: Size = (512, 192),
+    ) -> None:
+        super().__init__(outputs=outputs, width=width, dropout=dropout, size=size)
+        quadrant = Quadrants.size(size)
+        quarters = [QuadPoseNet(size=quadrant, width=width) for _ in range(4)]
+        self.split = Quadrants()
+        self.quarters = nn.ModuleList(quarters)
+        self.dropout = nn.Dropout(dropout)
+        self.regression = nn.Linear(sum(quarter.values for quarter in quarters), outputs)
+        glorot(self)
+
+    def forward(self, pair: Tensor) -> Tensor:
+        """Estimate labels ``(batch, outputs)`` of two images side by side ``(batch, 1, rows, columns)``, grey values 0..1.
+
+        Raises:
+            MitsonarError: images of another size.
+        """
+        self.expect(pair)
+        features = [quarter(image) for quarter, image in zip(self.quarters, self.split(pair), strict=True)]
+        return self.regression(self.dropout(torch.cat(features, dim=1)))  # type: ignore[no-any-return]
+
+
+# ---------------- The PoseNets that read impulse responses side by side (Almanza-Medina, 5.3, fig. 5.5 and Table 5.1)
+
+
+IMPULSE_KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3)
+"""Rows of the kernels, along the delay (Table 5.1)."""
+
+IMPULSE_CHANNELS = (32, 64, 128, 256, 512, 512, 512, 512, 512)
+
+IMPULSE_COLUMNS = 4
+"""Columns of a kernel."""
+
+IMPULSE_LAYERS = (6, 9)
+"""Fewest and most convolutions of Table 5.2."""
+
+
+class ImpulsePoseNet(Network):
+    """A PoseNet for each receiver's block of columns, all joined in one fully connected layer to the estimates.
+
+    Convolutions have stride 2 along the delay and 1 across. All but the last have batch normalisation and ReLU. A mean over
+    4 x 4 cells follows. Dropout lies after the first ReLU and after the mean. A block keeps its 2 Q columns: "4 x 8" of
+    Conv8 in Table 5.1 is a slip.
+
+    Args:
+        outputs: estimates.
+        width: factor on the channels.
+        dropout: rate in training.
+        layers: convolutions, 6 to 9: those of Table 5.1 from the first on.
+        receivers: M, blocks of columns.
+        size: taps and columns of the input, 2 M Q.
+
+    Raises:
+        MitsonarError: a value out of its range, a number of columns that cannot be divided among the receivers.
+    """
+
+    needs: ClassVar[Fields] = {"kind": "response"}
+
+    def __init__(
+        self,
+        *,
+        outputs: int = 2,
+        width: float = 1.0,
+        dropout: float = 0.5,
+        layers: int = 7,
+        receivers: int = 4,
+        size: Size = (800, 16),
+    ) -> None:
+        super().__init__(outputs=outputs, width=width, dropout=dropout, size=size)
+        if not isinstance(layers, int) or not IMPULSE_LAYERS[0] <= layers <= IMPULSE_LAYERS[1]:
+            raise MitsonarError(
+                f"layers must be {IMPULSE_LAYERS[0]} to {IMPULSE_LAYERS[1]}, as in table 5.2: got {shortened(layers)}"
+            )
+        if not isinstance(receivers, int) or receivers < 1 or size[1] % (2 * receivers):
+            raise MitsonarError(
+                f"size {list(size)} must have real and imaginary columns for each receiver: got receivers "
+                f"{shortened(receivers)}; leave out receivers and size, which the data define"
+            )
+        self.options |= {"layers": layers, "receivers": receivers}
+        self.nets = nn.ModuleList(_pose_net(layers, width, dropout) for _ in range(receivers))
+        rows = size[0]
+        for _ in range(layers):
+            rows = -(-rows // 2)
+        values = receivers * scaled(IMPULSE_CHANNELS[layers - 1], width) * rows * (size[1] // receivers)
+        self.regression = nn.Linear(values, outputs)
+        glorot(self)
+
+    def forward(self, matrix: Tensor) -> Tensor:
+        """Estimate labels ``(batch, outputs)`` of packed matrices ``(batch, 1, taps, 2 M Q)``.
+
+        Raises:
+            MitsonarError: matrices of another size.
+        """
+        self.expect(matrix)
+        blocks = matrix.chunk(len(self.nets), dim=-1)
+        joined = torch.cat([net(block).flatten(1) for net, block in zip(self.nets, blocks, strict=True)], dim=1)
+        return self.regression(joined)  # type: ignore[no-any-return]
+
+
+def _pose_net(layers: int, width: float, dropout: float) -> nn.Sequential:
+    """Build the convolutions of Table 5.1, the mean, and dropout, also after the first ReLU."""
+    parts = column_convolutions(IMPULSE_KERNELS[:layers], IMPULSE_CHANNELS[:layers], IMPULSE_COLUMNS, width)
+    parts.insert(3, nn.Dropout(dropout))
+    return nn.Sequential(*parts, SameAverage(), nn.Dropout(dropout))
