@@ -28,7 +28,7 @@ from real_recordings import recordings_folder
 
 from mitsonar.datasets.samples import SonarPairs
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.named import create_estimator
 from mitsonar.mapping.benchmark_sets import RenderedSet
 from mitsonar.mapping.closure import closure_of
 from mitsonar.mapping.open_source import LOOP

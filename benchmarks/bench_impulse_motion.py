@@ -55,9 +55,9 @@ from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.plan import scenes_of, sequences_of
 from mitsonar.datasets.responses import ImpulsePairs, with_noise
-from mitsonar.estimation.crlb.channel_crlb import channel_crlb
-from mitsonar.estimation.learned.regressors import REGRESSORS, flattened, score_all
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.crlb.channel import channel_crlb
+from mitsonar.estimation.named import create_estimator
+from mitsonar.estimation.regressors import REGRESSORS, flattened, score_all
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.response_source import ResponseSource

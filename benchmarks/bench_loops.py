@@ -31,7 +31,7 @@ from mitsonar.acoustics.noise import load_noise
 from mitsonar.config.data import load_recipe
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.named import create_estimator
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import normalised_errors
 from mitsonar.mapping.motion_series import path_of

@@ -23,7 +23,7 @@ from real_recordings import FOLDER, recordings_folder
 from scipy import ndimage
 
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.named import create_estimator
 from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.frame_source import FrameSource

@@ -34,9 +34,9 @@ from mitsonar.acoustics.noise import load_noise
 from mitsonar.config.training import TrainingRecipe, load_training_recipe
 from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.store import DataStore
-from mitsonar.estimation.height.direct_height import DirectHeight
-from mitsonar.estimation.learned.view_network import ViewNetwork
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.height import DirectHeight
+from mitsonar.estimation.learned import ViewNetwork
+from mitsonar.estimation.named import create_estimator
 from mitsonar.mapping.measured_heights import measured
 from mitsonar.mapping.odometry_run import run_odometry
 from mitsonar.mapping.view_source import open_views

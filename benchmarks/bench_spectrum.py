@@ -31,8 +31,7 @@ from mitsonar.datasets.make import SceneRenderer, make_dataset
 from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.samples import SonarPairs
 from mitsonar.datasets.store import DataStore
-from mitsonar.estimation.crlb.fisher_bound import overall
-from mitsonar.estimation.crlb.image_crlb import bound
+from mitsonar.estimation.crlb.image import bound, overall
 from mitsonar.geometry.ground import GroundGeometry
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.errors import in_units

@@ -66,7 +66,7 @@ from mitsonar.config.data import load_recipe, shipped_recipes
 from mitsonar.datasets.plan import run_poses
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.named import create_estimator
 from mitsonar.mapping.benchmark_sets import TEXTURES as SONARS
 from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.odometry import odometry

@@ -28,11 +28,10 @@ if TYPE_CHECKING:
     from mitsonar.environments.sonar_env import SonarEnv
     from mitsonar.environments.sonar_vector_env import SonarVectorEnv
     from mitsonar.errors import MitsonarError, MitsonarWarning
-    from mitsonar.estimation.benchmark_tables import Comparison
-    from mitsonar.estimation.comparison_run import compare
-    from mitsonar.estimation.crlb.image_crlb import cramer_rao_bound
+    from mitsonar.estimation.compare import Comparison, compare
+    from mitsonar.estimation.crlb.image import cramer_rao_bound
     from mitsonar.estimation.estimator import Estimate
-    from mitsonar.estimation.named_estimators import create_estimator, load_checkpoint
+    from mitsonar.estimation.named import create_estimator, load_checkpoint
     from mitsonar.geometry.fan import to_cartesian
     from mitsonar.instruments.hydrophones import ChannelSonar
     from mitsonar.instruments.sonar import Sonar
@@ -133,7 +132,7 @@ __all__ = [
 _MODULES = {
     "ChannelSimulator": "simulation.channel",
     "ChannelSonar": "instruments.hydrophones",
-    "Comparison": "estimation.benchmark_tables",
+    "Comparison": "estimation.compare",
     "DataStore": "datasets.store",
     "Deforming": "motion.bodies",
     "Echogram": "records.soundings",
@@ -162,12 +161,12 @@ _MODULES = {
     "VehicleSensors": "motion.sensors",
     "VehicleSimulator": "simulation.vehicle",
     "build_mosaic": "mapping.mosaic",
-    "compare": "estimation.comparison_run",
-    "cramer_rao_bound": "estimation.crlb.image_crlb",
-    "create_estimator": "estimation.named_estimators",
+    "compare": "estimation.compare",
+    "cramer_rao_bound": "estimation.crlb.image",
+    "create_estimator": "estimation.named",
     "fishing_net_mesh": "worlds.sea",
     "illumination": "mapping.illumination",
-    "load_checkpoint": "estimation.named_estimators",
+    "load_checkpoint": "estimation.named",
     "load_frames": "mapping.open_frames",
     "load_meshes": "simulation.scene",
     "load_motions": "simulation.scene",

@@ -371,7 +371,7 @@ def spoil_checkpoint(rng: Rng, folder: Path) -> None:
 def read_checkpoint(folder: Path) -> None:
     import torch
 
-    from mitsonar.estimation.learned.trained_network import answer_of
+    from mitsonar.estimation.learned import answer_of
     from mitsonar.networks.checkpoint import Checkpoint
 
     found = Checkpoint.load(folder / "network.ckpt")

@@ -56,7 +56,7 @@ def compare(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Compare estimators on the same pairs. Failures count as zero motion. Bootstrap by scene, then sequence."""
-    from mitsonar.estimation.comparison_run import compare as compared
+    from mitsonar.estimation.compare import compare as compared
 
     found = compared(
         data,

@@ -14,8 +14,7 @@ from mitsonar.cli.render_command import NOISE, instrument_for, scene_parameters
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
-    from mitsonar.estimation.crlb.crlb_report import Table, Value
-    from mitsonar.estimation.crlb.crlb_subject import Subject
+    from mitsonar.estimation.crlb.report import Subject, Table, Value
 
 __all__ = ["crlb"]
 
@@ -82,8 +81,7 @@ def crlb(
     window follow the nearest and farthest range of the floor. The number of bins stays.
     """
     from mitsonar.acoustics.noise import load_noise, refuse_noise
-    from mitsonar.estimation.crlb.crlb_report import bounds_of_subject, report_lines, report_of
-    from mitsonar.estimation.crlb.crlb_subject import subject_of_data
+    from mitsonar.estimation.crlb.report import bounds_of_subject, report_lines, report_of, subject_of_data
     from mitsonar.motion.trajectory import convention_named
 
     given, (name, values) = None if noise is None else load_noise(noise), _variable(vary)
@@ -135,7 +133,7 @@ def crlb(
 def _variable(text: str | None) -> tuple[str | None, list[Value]]:
     """Parse ``NAME=V1,V2,...``; of ``window`` the values are intervals."""
     from mitsonar.errors import nearest_names
-    from mitsonar.estimation.crlb.image_crlb import VARIABLES
+    from mitsonar.estimation.crlb.image import VARIABLES
 
     if text is None:
         return None, []
@@ -166,7 +164,7 @@ def _of_scene(
     poses: _PosesAsked,
 ) -> Subject:
     """Load a scene and the poses that the options define."""
-    from mitsonar.estimation.crlb.crlb_subject import subject_of_scene
+    from mitsonar.estimation.crlb.report import subject_of_scene
     from mitsonar.simulation.scene import load_scene
 
     loaded = load_scene(source, **parameters)

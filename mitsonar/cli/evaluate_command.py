@@ -47,7 +47,7 @@ def evaluate(
     deg/100.
     """
     checkpoint = checkpoint_from(run)
-    from mitsonar.estimation.benchmark_tables import FEWEST_SCENES
+    from mitsonar.estimation.compare import FEWEST_SCENES
     from mitsonar.training.evaluation import evaluate as evaluated
     from mitsonar.training.evaluation_tables import refuse_tables, report_lines, save_tables
 

@@ -17,7 +17,7 @@ from mitsonar.io.files import write_whole
 from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
-    from mitsonar.estimation.height.direct_height import HeightEstimate
+    from mitsonar.estimation.height import HeightEstimate
     from mitsonar.mapping.frame_source import FrameSource
     from mitsonar.mapping.view_source import ViewSource
 
@@ -45,7 +45,7 @@ def height(
 
     `mitsonar odometry --height-by` passes such heights to the estimators of motion.
     """
-    from mitsonar.estimation.height.named_height_estimators import height_estimator_from
+    from mitsonar.estimation.height import height_estimator_from
     from mitsonar.mapping.height_tables import heights_csv, heights_lines
     from mitsonar.mapping.measured_heights import measured
     from mitsonar.mapping.open_source import Reading, frames_for, views_for

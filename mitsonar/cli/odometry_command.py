@@ -116,7 +116,7 @@ def odometry(
     measured, table.md, table.json, path.png, run.json, and estimates.jsonl, from which --resume continues. With --loops
     also loops.csv.
     """
-    from mitsonar.estimation.named_estimators import create_estimator
+    from mitsonar.estimation.named import create_estimator
     from mitsonar.mapping.bag_sensors import open_sensors
     from mitsonar.mapping.closure import loop_starts
     from mitsonar.mapping.odometry_run import run_odometry, table_lines

@@ -85,7 +85,7 @@ def from_recording(
     `mitsonar render` and recipes of data sets take it by --sonar. With --noise the files are laid over one another:
     --sonar sonar.yaml,noise.yaml.
     """
-    from mitsonar.estimation.recorded_sonar import as_instrument
+    from mitsonar.estimation.sonar_fit import as_instrument
     from mitsonar.mapping.open_frames import open_frames
 
     for path in (out, noise):
@@ -122,8 +122,7 @@ def _fit_and_write(
     measure_coding: bool,
 ) -> None:
     """Fit a sonar to frames, write it to OUT, or its noise to another file, and say what was found."""
-    from mitsonar.estimation.recorded_sonar import NOISE_FIELDS
-    from mitsonar.estimation.sonar_fit import fit_sonar
+    from mitsonar.estimation.sonar_fit import NOISE_FIELDS, fit_sonar
 
     found = fit_sonar(frames, told.sonar, measure_coding=measure_coding, **told.fields)
     if noise is None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import Motion, MotionPrior
+from mitsonar.motion.errors import in_units
 from mitsonar.records.frames import SonarFrames, ViewFrames
 from mitsonar.records.responses import ImpulseResponses
 
@@ -33,12 +34,14 @@ __all__ = [
     "correlation_of",
     "correlation_rejection",
     "matching_rejection",
+    "prior_rejection",
     "rejected",
     "spread_of",
     "stands_out",
     "two_frames",
     "without_slow",
 ]
+
 
 INPUTS = "pitch; height where no first echoes show"
 """Inputs of methods that know the geometry, beside the images; see :mod:`mitsonar.geometry.ground`."""
@@ -318,3 +321,35 @@ def matching_rejection(
     if spread_of(np.add.reduceat(np.add.reduceat(product, rows, axis=0), columns, axis=1)) < FEWEST_BLOCKS:
         return "too small a part of the frames holds anything to match"
     return ""
+
+
+# ---------------- Estimates are held against what was expected: a motion that a prior all but excludes is rejected
+
+
+LARGEST_SQUARE = 21.1
+"""Chi-square of three numbers that one right estimate in ten thousand exceeds."""
+
+
+def prior_rejection(motion: Motion, covariance: NDArray[np.float64] | None, prior: MotionPrior | None) -> str:
+    """Return why a motion contradicts its prior; empty where it does not, or where there is no prior.
+
+    The squared distance is measured by the sum of both covariances, and compared with chi-square of three numbers at 0.9999.
+
+    Args:
+        motion: estimated from the frames alone.
+        covariance: of it ``(3, 3)`` [m, m, rad]; None: unknown, and not counted.
+        prior: what was expected.
+    """
+    if prior is None:
+        return ""
+    apart = np.array(motion) - np.array(prior.motion)
+    together = prior.covariance if covariance is None else prior.covariance + covariance
+    std = np.sqrt(np.diag(together))
+    std[std == 0] = 1
+    scaled = apart / std  # else a component of large variance makes the solver drop the others
+    square = float(scaled @ np.linalg.lstsq(together / np.outer(std, std), scaled, rcond=None)[0])
+    if square <= LARGEST_SQUARE:
+        return ""
+    sideways, forward, yaw = in_units(apart)
+    off = np.sqrt(square)
+    return f"the motion is {sideways:.0f}, {forward:.0f} mm, {yaw:.2f} deg from the prior: {off:.1f} standard deviations"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.recorded_sonar import NOISE_FIELDS, as_instrument
+from mitsonar.estimation.sonar_fit import NOISE_FIELDS, as_instrument
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.runs import shown
 from mitsonar.mapping.any_recording import recording_at

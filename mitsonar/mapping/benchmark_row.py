@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.benchmark import Answers
+from mitsonar.estimation.compare import Answers
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, PlainTable
 from mitsonar.io.runs import RunDirectory
 from mitsonar.mapping.benchmark_sets import PRESET

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.crlb.fisher_bound import overall
-from mitsonar.estimation.crlb.image_crlb import bounds_at, laws_of
+from mitsonar.estimation.crlb.image import bounds_at, laws_of, overall
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.io.runs import RunDirectory

@@ -7,7 +7,7 @@ from itertools import groupby
 
 import numpy as np
 
-from mitsonar.estimation.benchmark_tables import Cells, markdown
+from mitsonar.estimation.compare import Cells, markdown
 from mitsonar.estimation.estimator import PlainTable
 from mitsonar.mapping.benchmark_sets import DIVE
 from mitsonar.motion.errors import AXES

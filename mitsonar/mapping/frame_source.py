@@ -21,7 +21,7 @@ from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels
 from mitsonar.records.frames import LABELS, SonarFrames, to_float32
 
 if TYPE_CHECKING:
-    from mitsonar.estimation.height.direct_height import HeightEstimator
+    from mitsonar.estimation.height import HeightEstimator
 
 __all__ = ["FrameSource"]
 

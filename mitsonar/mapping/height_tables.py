@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from mitsonar.estimation.height.direct_height import HeightEstimate
+    from mitsonar.estimation.height import HeightEstimate
 
 __all__ = ["heights_csv", "heights_lines"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.image.ground_view import GroundView, fan_places
+from mitsonar.estimation.image.phase import GroundView, fan_places
 from mitsonar.geometry.ground import attitude_of
 from mitsonar.motion.composition import Motion
 from mitsonar.records.frames import SonarFrames

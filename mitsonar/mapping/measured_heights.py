@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from mitsonar.estimation.estimator import Record
-    from mitsonar.estimation.height.direct_height import HeightEstimate, HeightEstimator
+    from mitsonar.estimation.height import HeightEstimate, HeightEstimator
     from mitsonar.records.frames import SonarFrames, ViewFrames
 
 __all__ = ["measured", "without_height"]

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, counted, nearest_names
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.named_estimators import EstimatorLike, create_estimator
+from mitsonar.estimation.named import EstimatorLike, create_estimator
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, errors_along, graph_path
@@ -190,7 +190,7 @@ def odometry(
     Args:
         frames: of one run.
         estimator: estimates the motion between two frames; any that
-            :func:`~mitsonar.estimation.named_estimators.create_estimator` takes: a name, a checkpoint, one of your own.
+            :func:`~mitsonar.estimation.named.create_estimator` takes: a name, a checkpoint, one of your own.
         smooth: see above.
         scale: factors for sideways, forward, yaw ``(3,)``; ``fit``: by least squares of valid against true motions.
         start: the first pose; default: the true one, or the origin with the height of the first frame. Along the path

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable
-from mitsonar.estimation.named_estimators import EXTERNAL, create_estimator
+from mitsonar.estimation.named import EXTERNAL, create_estimator
 from mitsonar.io.files import parse_json, read_json, whole_lines, write_json, write_whole
 from mitsonar.io.runs import RunDirectory, RunKind, digest, versions
 from mitsonar.mapping.benchmark_row import LENGTHS_M, Case, measured_row
@@ -55,7 +55,7 @@ class Wanted:
             of a name up to a hyphen means all of these sets: ``dive``, ``dive-aris3000``.
         textures: of :data:`~mitsonar.mapping.benchmark_sets.TEXTURES`, for simulated sets.
         noises: of :data:`~mitsonar.mapping.benchmark_sets.NOISES`, for simulated sets; dives have their preset's.
-        methods: as :func:`~mitsonar.estimation.named_estimators.create_estimator` takes them; none: :data:`METHODS`, without
+        methods: as :func:`~mitsonar.estimation.named.create_estimator` takes them; none: :data:`METHODS`, without
             those whose packages are not installed.
         frames: of each set at most; None: 40 of a dive, 260 of another simulated set, all of a recording.
         geometry: file that tells how the pictures of recordings are laid out.

@@ -13,7 +13,7 @@ import numpy as np
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator
-from mitsonar.estimation.height.named_height_estimators import height_estimator_from
+from mitsonar.estimation.height import height_estimator_from
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.open_frames import is_recording, open_frames
 from mitsonar.mapping.response_source import ResponseSource, holds_responses, open_responses

@@ -19,7 +19,7 @@ from mitsonar.records.frames import ViewFrames
 
 if TYPE_CHECKING:
     from mitsonar.datasets.store import DataStore
-    from mitsonar.estimation.height.direct_height import HeightEstimator
+    from mitsonar.estimation.height import HeightEstimator
 
 __all__ = ["ViewSource", "open_views"]
 

@@ -796,7 +796,7 @@ def info(store: DataStore) -> Table:
 
 
 Report: TypeAlias = Mapping[str, Any]
-"""A report of :mod:`mitsonar.estimation.crlb.crlb_report`: its keys, with rows of bounds under ``rows``."""
+"""A report of :mod:`mitsonar.estimation.crlb.report`: its keys, with rows of bounds under ``rows``."""
 
 
 def crlb_png(report: Report) -> bytes:

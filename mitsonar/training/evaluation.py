@@ -19,15 +19,8 @@ from mitsonar.datasets.responses import ImpulsePairs
 from mitsonar.datasets.samples import SonarPairs, split_for
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, counted
-from mitsonar.estimation.benchmark import Answers, chosen, rows_of
-from mitsonar.estimation.learned.trained_network import (
-    ANGLE_OFF_DEG,
-    HEIGHT_OFF,
-    TrainedInstrument,
-    answer_of,
-    inputs_of,
-    one_thread,
-)
+from mitsonar.estimation.compare import Answers, chosen, rows_of
+from mitsonar.estimation.learned import ANGLE_OFF_DEG, HEIGHT_OFF, TrainedInstrument, answer_of, inputs_of, one_thread
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.motion.errors import AXES, cluster_resamples
 from mitsonar.networks.checkpoint import Checkpoint
@@ -170,7 +163,7 @@ def _report(
 
     ``notes`` are sentences that a reader of the tables needs. ``tables`` has one table for each level of noise. The rows of
     a table are of the network and of ``zero``, and hold the fields of
-    :class:`~mitsonar.estimation.benchmark.BenchmarkRow` in mm, mm, deg (heights: mm), and ``thesis``, the RMSE in mm, mm,
+    :class:`~mitsonar.estimation.compare.BenchmarkRow` in mm, mm, deg (heights: mm), and ``thesis``, the RMSE in mm, mm,
     1/100 deg. ``beyond`` holds the shares of true motions and of estimates outside the range of training, ``correlations``
     those of the network's errors between any two axes.
     """

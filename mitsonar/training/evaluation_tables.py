@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.benchmark_tables import markdown
+from mitsonar.estimation.compare import markdown
 from mitsonar.io.files import write_json, write_whole
 from mitsonar.io.runs import refuse_to_replace
 from mitsonar.training.training_types import JsonObject

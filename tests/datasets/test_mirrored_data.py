@@ -17,9 +17,8 @@ from mitsonar.datasets.rendered import RenderedPairs, re_rendered
 from mitsonar.datasets.samples import SonarPairs
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.crlb.crlb_report import bounds_of_subject
-from mitsonar.estimation.crlb.crlb_subject import subject_of_data
-from mitsonar.estimation.crlb.image_crlb import bounds_at
+from mitsonar.estimation.crlb.image import bounds_at
+from mitsonar.estimation.crlb.report import bounds_of_subject, subject_of_data
 from mitsonar.records.frames import to_uint8
 from mitsonar.simulation.channel import ChannelSimulator
 from mitsonar.simulation.pings import to_image

@@ -19,8 +19,8 @@ from mitsonar.datasets.plan import Plan, footprints_at, modality_of
 from mitsonar.datasets.responses import ImpulseSamples, Packing, displacement_labels, noise_power, packed, with_noise
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.learned.regressors import REGRESSORS, Turned, flattened, score_all
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.named import create_estimator
+from mitsonar.estimation.regressors import REGRESSORS, Turned, flattened, score_all
 from mitsonar.motion.composition import Motion, compose, motions, steady
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory, velocities

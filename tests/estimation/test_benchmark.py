@@ -27,21 +27,24 @@ pytestmark = [
 
 from mitsonar.datasets.rendered import re_rendered  # noqa: E402
 from mitsonar.datasets.samples import SonarPairs  # noqa: E402
-from mitsonar.estimation.benchmark import (  # noqa: E402
+from mitsonar.estimation.compare import (  # noqa: E402  # noqa: E402
     VARIATIONS,
     Answers,
     _heaved,
+    _methods,
     answers_of,
     bounds_of_pairs,
+    compare,
     frames_of,
     rows_of,
     with_prior,
 )
-from mitsonar.estimation.comparison_run import _methods, compare  # noqa: E402
 from mitsonar.estimation.estimator import Estimate  # noqa: E402
 from mitsonar.estimation.image.direct import Direct  # noqa: E402
-from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
-from mitsonar.estimation.zero import Zero  # noqa: E402
+from mitsonar.estimation.named import (  # noqa: E402
+    Zero,
+    create_estimator,
+)
 from mitsonar.motion.composition import (  # noqa: E402
     Motion,
     MotionPrior,

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mitsonar.estimation.estimator import Excess, ambiguity, correlation_excess, correlation_of, correlation_rejection
-from mitsonar.estimation.image.direct_cells import DirectLevel
-from mitsonar.estimation.image.direct_registration import Held
+from mitsonar.estimation.image.registration import DirectLevel, Held
 
 SIZE = (200, 96)
 

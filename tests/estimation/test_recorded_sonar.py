@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import Command
 
-from mitsonar.estimation.recorded_sonar import NOISE_FIELDS, as_instrument
+from mitsonar.estimation.sonar_fit import NOISE_FIELDS, as_instrument
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.records.frames import SonarFrames

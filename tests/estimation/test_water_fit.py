@@ -68,7 +68,7 @@ def test_an_even_new_glow_has_no_structure(deep: mi.Scene) -> None:
 
 
 def test_a_glow_of_few_bins_tells_no_beams() -> None:
-    from mitsonar.estimation.water_fit import glow_by_beam
+    from mitsonar.estimation.sonar_fit import glow_by_beam
 
     at: Array = np.linspace(1, 4.99, 400)
     flat = np.ones((2, 400, 8))
@@ -77,7 +77,7 @@ def test_a_glow_of_few_bins_tells_no_beams() -> None:
 
 def test_a_glow_far_out_keeps_its_height_where_it_is_seen() -> None:
     """A line of more than 120 dB at range 0 is laid through the middle of what is seen."""
-    from mitsonar.estimation.water_fit import near_glow
+    from mitsonar.estimation.sonar_fit import near_glow
 
     at: Array = np.linspace(2, 5.99, 400)
     excess: Array = np.maximum(0, 60 - 200 * (at - 2))
@@ -89,7 +89,7 @@ def test_a_glow_far_out_keeps_its_height_where_it_is_seen() -> None:
 
 def test_a_glow_may_begin_behind_the_first_bins() -> None:
     """Some windows begin with darker bins."""
-    from mitsonar.estimation.water_fit import near_glow
+    from mitsonar.estimation.sonar_fit import near_glow
 
     at: Array = np.linspace(1, 4.99, 400)
     excess: Array = np.where(np.arange(400) < 8, 10.0, np.maximum(0, 60 * (1 - at / 1.5)))

@@ -18,8 +18,8 @@ from mitsonar.config.data import load_recipe, recipe_from
 from mitsonar.datasets.make import check, make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.comparison_run import compare
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.compare import compare
+from mitsonar.estimation.named import create_estimator
 from mitsonar.exports.recorded_data_set import write_recorded
 from mitsonar.exports.recorded_frames import as_pixels, axes_of, frames_with_poses
 from mitsonar.mapping.known_poses import poses_at, stretches

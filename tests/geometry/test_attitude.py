@@ -10,7 +10,7 @@ from drawn_frames import SONAR as FLOOR_SONAR
 from drawn_frames import over_ground
 from helpers import lit_plane
 
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.named import create_estimator
 from mitsonar.geometry.ground import STD_GIVEN, STD_MEASURED, UNKNOWN_MOST, UNKNOWN_PER_S, GroundGeometry, attitude_of
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar

@@ -979,8 +979,7 @@ def test_a_journal_that_never_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_answers_that_promise_more_than_is_there(tmp_path: Path) -> None:
     """A comparison is gone on with: its tables of answers are a stranger's too."""
-    from mitsonar.estimation.benchmark import Answers
-    from mitsonar.estimation.kept_answers import kept_answers
+    from mitsonar.estimation.compare import Answers, kept_answers
 
     folder, methods = kept_answers(tmp_path / "out", {"a": 1}), {"flow": None}
     folder.keep("high", "none", {"flow": Answers.unasked(4)})
@@ -1039,7 +1038,7 @@ def test_checkpoints_that_ask_for_too_much(how: str, tmp_path: Path) -> None:
 def test_an_answer_of_another_arity(tmp_path: Path) -> None:
     import torch
 
-    from mitsonar.estimation.learned.trained_network import answer_of
+    from mitsonar.estimation.learned import answer_of
     from mitsonar.networks.checkpoint import Checkpoint
 
     make_checkpoint(tmp_path)

@@ -12,7 +12,7 @@ from drawn_frames import over_ground, sway
 from numpy.typing import NDArray
 
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.named import create_estimator
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.height_profile import ALTIMETER, FIRST_ECHOES, HeightProfile, height_profile
 from mitsonar.mapping.odometry import odometry

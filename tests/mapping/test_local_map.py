@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.zero import Zero
+from mitsonar.estimation.named import Zero
 from mitsonar.geometry.fan import Views, polar_of
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping import local_map

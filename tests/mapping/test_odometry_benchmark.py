@@ -15,8 +15,7 @@ from helpers import Command
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.named_estimators import create_estimator
-from mitsonar.estimation.zero import Zero
+from mitsonar.estimation.named import Zero, create_estimator
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.mapping import benchmark_row, benchmark_sets, odometry_benchmark, odometry_run
 from mitsonar.mapping.benchmark_row import Case, measured_row

@@ -31,10 +31,12 @@ pytestmark = [
 ]
 
 from mitsonar.datasets.samples import Samples, SonarPairs  # noqa: E402
-from mitsonar.estimation.comparison_run import compare  # noqa: E402
-from mitsonar.estimation.learned.height_ensemble import HeightEnsemble  # noqa: E402
-from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402
-from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
+from mitsonar.estimation.compare import compare  # noqa: E402
+from mitsonar.estimation.learned import (  # noqa: E402
+    HeightEnsemble,
+    ImageNetwork,
+)
+from mitsonar.estimation.named import create_estimator  # noqa: E402
 from mitsonar.networks.checkpoint import (  # noqa: E402
     Checkpoint,
     onnx_of,
@@ -320,7 +322,7 @@ def test_without_torch_the_extra_is_named(run: Path) -> None:
     said = run_python(
         f"""
         from mitsonar.errors import MitsonarError
-        from mitsonar.estimation.named_estimators import create_estimator
+        from mitsonar.estimation.named import create_estimator
         create_estimator("direct")
         try:
             create_estimator({str(run)!r})

@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
+from mitsonar.errors import MitsonarError, argument
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.responses import ImpulseResponses
 
-__all__ = ["Correlation"]
+__all__ = ["BAND_HZ", "Band", "Correlation", "Pings", "assumed_height", "bands_of", "pings_of", "reach_of"]
+
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -84,7 +85,7 @@ class Correlation:
         """Estimate the motion; a prior is ignored: the search covers all motions up to ``speed``.
 
         Raises:
-            MitsonarError: records of :func:`mitsonar.estimation.channel.pings.pings_of`, or no height.
+            MitsonarError: records of :func:`mitsonar.estimation.channel.correlation.pings_of`, or no height.
         """
         pings = pings_of(responses)
         height = assumed_height(responses, "correlation", self.height_m)
@@ -168,3 +169,134 @@ def _windows(taps: NDArray[np.inexact]) -> NDArray[np.inexact]:
     """Sum over neighbouring taps."""
     whole = len(taps) // WINDOW * WINDOW
     return np.asarray(taps[:whole].reshape(-1, WINDOW).sum(axis=1))
+
+
+# ---------------- Checks that all estimators of impulse responses share: of pings, reach and height
+
+
+UNEVEN = 0.01
+"""Part of an interval by which the time of a ping may deviate."""
+
+
+class Pings(NamedTuple):
+    """Checked responses.
+
+    Attributes:
+        response: ``(pings, receivers, taps)`` complex128.
+        interval_s: from ping to ping [s].
+        silent: receivers without any echo in one ping or more.
+    """
+
+    response: NDArray[np.complex128]
+    interval_s: float
+    silent: tuple[str, ...]
+
+
+def pings_of(responses: ImpulseResponses) -> Pings:
+    """Check responses and convert them to complex128.
+
+    Raises:
+        MitsonarError: fewer than two pings, times that do not rise evenly, values that are not finite.
+    """
+    if len(responses) < 2:
+        raise MitsonarError(f"an estimator of motion takes two pings or more: got {len(responses)}; give a longer run")
+    if not np.isfinite(responses.response).all():
+        raise MitsonarError("the responses hold nan or inf: leave such pings out")
+    steps = np.diff(responses.time_s)
+    interval = float(steps.mean())
+    if not (np.isfinite(interval) and interval > 0 and (np.abs(steps - interval) <= UNEVEN * interval).all()):
+        raise MitsonarError(
+            f"pings must come at equal times that rise: got steps of {steps.min():g} to {steps.max():g} s; select such pings"
+        )
+    quiet = np.asarray(~responses.response.any(axis=2).all(axis=0), dtype=bool)
+    names = tuple(one.name for number, one in enumerate(responses.sonar.receivers) if quiet[number])
+    return Pings(responses.response.astype(np.complex128), interval, names)
+
+
+def reach_of(interval_s: float, speed: float, wavelength_m: float, most_waves: float) -> float:
+    """Return the longest motion between pings [m].
+
+    Raises:
+        MitsonarError: more wavelengths than can be searched.
+    """
+    reach = speed * interval_s
+    if reach > most_waves * wavelength_m:
+        raise MitsonarError(
+            f"pings {interval_s:g} s apart at up to {speed:g} m/s leave motions of up to {reach:.3g} m open, "
+            f"{reach / wavelength_m:.3g} wavelengths, of which at most {most_waves:g} can be searched: measure more often, "
+            f"or give the estimator a lower speed (NAME:speed={most_waves * wavelength_m / interval_s:.2g})"
+        )
+    return reach
+
+
+def assumed_height(responses: ImpulseResponses, name: str, height_m: float | None) -> float:
+    """Return the height of the transmitter over the ground [m]: as given, or the mean of the responses' heights.
+
+    Raises:
+        MitsonarError: neither is there, or it is not positive or beyond the instrument's range.
+    """
+    if height_m is not None:
+        height = height_m
+    elif responses.height_m is not None:
+        height = float(np.mean(responses.height_m))
+    else:
+        raise MitsonarError(f"{name} needs the height over the ground: the responses hold none; give {argument('height_m')}")
+    if not 0 < height < responses.sonar.range_max:
+        raise MitsonarError(
+            f"{name}: {argument('height_m')} must be above 0 and below range_max {responses.sonar.range_max:g} m: got "
+            f"{height:g} m"
+        )
+    return height
+
+
+# ---------------- A wide band is divided into narrow ones
+# For unknown scatterers, frequencies farther apart than one over the spread of delays (some 100 Hz) are independent.
+# Parts of a band that do not overlap therefore hold independent information on the motion; each is a channel sonar of
+# its own carrier. The cost of a part grows with the cube of its taps: n parts cost n squared times less than the whole
+# band. Only the correlation across their edges is lost.
+
+
+BAND_HZ = 4800.0
+"""Least bandwidth of a part [Hz]."""
+
+FAINT = 1e-3
+"""Frequencies at which the whole band has a smaller amplitude are left out."""
+
+
+class Band(NamedTuple):
+    """A part of a band.
+
+    Attributes:
+        sonar: an instrument of this part alone.
+        place: indices of its frequencies among those of the whole's measurement ``(taps,)``.
+        gain: from the whole's spectrum to the part's ``(taps,)``.
+    """
+
+    sonar: ChannelSonar
+    place: NDArray[np.int64]
+    gain: NDArray[np.float64]
+
+    def of(self, response: Complex) -> Complex:
+        """Return the response of this part ``(..., taps)`` from the response of the whole band."""
+        return np.asarray(np.fft.ifft(np.fft.fft(response, axis=-1)[..., self.place] * self.gain, axis=-1))
+
+
+def bands_of(sonar: ChannelSonar, width_hz: float = BAND_HZ) -> list[Band]:
+    """Return the parts of an instrument's band: as many as are at least ``width_hz`` wide and sampled alike."""
+    count = max(1, int(sonar.bandwidth_hz / width_hz))
+    while sonar.taps % count:
+        count -= 1
+    step, spacing = sonar.frequency_step_hz, (1 + sonar.rolloff) * sonar.bandwidth_hz / count
+    found = []
+    for number in range(count):
+        offset = step * round((number - (count - 1) / 2) * spacing / step)
+        part = sonar.replace(
+            carrier_hz=sonar.carrier_hz + offset,
+            bandwidth_hz=sonar.bandwidth_hz / count,
+            sampling_hz=sonar.sampling_hz / count,
+        )
+        frequency = np.asarray(np.fft.fftfreq(part.taps, 1 / part.sampling_hz), dtype=np.float64)
+        whole = sonar.raised_cosine(frequency + offset)
+        gain = np.where(whole > FAINT, part.raised_cosine(frequency) / np.maximum(whole, FAINT), 0) / count
+        found.append(Band(part, np.rint((frequency + offset) / step).astype(np.int64) % sonar.taps, gain))
+    return found

@@ -22,7 +22,8 @@ Almanza-Medina gives no further details. Chosen here:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Literal, NamedTuple
 
 import cv2
@@ -31,16 +32,142 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS, Estimate, two_frames
-from mitsonar.estimation.image.displacement_map import FlowLevel, WindowGrid, window_grid
-from mitsonar.estimation.image.displacement_match import STILL, TINY, WindowFlow, in_blocks, match_map, match_vector
-from mitsonar.geometry.ground import attitude_of, moved
+from mitsonar.geometry.ground import GroundGeometry, attitude_of, moved
+from mitsonar.instruments.sonar import Bearing
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
 
-__all__ = ["Flow"]
+__all__ = [
+    "STILL",
+    "TINY",
+    "Flow",
+    "FlowLevel",
+    "WindowFlow",
+    "WindowGrid",
+    "in_blocks",
+    "match_map",
+    "match_vector",
+    "window_grid",
+]
+
+
+# ---------------- The windows of a level of optical flow, and the displacements that a motion gives them over level
+# ground
+
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
+
+
+class FlowLevel(NamedTuple):
+    """One step from coarse to fine: every so many bins of frames smoothed over bins and beams (standard deviations); windows
+    of so many bins and beams; at most so many rounds of flow and match."""
+
+    step: int
+    bins: float
+    beams: float
+    window: tuple[int, int]
+    rounds: int
+
+
+HIGHER = 0.02
+"""The step in height that the map's change is taken from, as a part of it."""
+
+
+@dataclass(frozen=True)
+class WindowGrid:
+    """The cells of a level's frames over the ground, and the windows over them.
+
+    Attributes:
+        ground: of the first frame.
+        other: of the second frame.
+        level: of the windows.
+    """
+
+    ground: GroundGeometry
+    other: GroundGeometry
+    level: FlowLevel
+
+    @cached_property
+    def cells(self) -> Floats:
+        """Ground points of all cells ``(bins, beams, 2)``."""
+        return self.ground.points.astype(np.float32)
+
+    @cached_property
+    def window(self) -> tuple[int, int]:
+        """Size of the windows in this level's rows and columns."""
+        bins, beams = self.level.window
+        return max(3, bins // self.level.step), beams
+
+    @cached_property
+    def centres(self) -> tuple[slice, slice]:
+        """The cells in the middle of the windows; these overlap by half."""
+        rows, columns = (max(1, size // 2) for size in self.window)
+        return slice(rows // 2, None, rows), slice(columns // 2, None, columns)
+
+    @cached_property
+    def home(self) -> Doubles:
+        """Range [m] and bearing [rad] of the windows' centres ``(n, m, 2)``."""
+        return np.stack(np.meshgrid(self.ground.range_m, self.ground.bearing_rad, indexing="ij"), axis=-1)[self.centres]
+
+    @cached_property
+    def spacing(self) -> Doubles:
+        """Metres of a row and radians of a column at the centres ``(n, m, 2)``."""
+        steps = [np.gradient(axis) for axis in (self.ground.range_m, self.ground.bearing_rad)]
+        return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1)[self.centres]
+
+    @cached_property
+    def points(self) -> Doubles:
+        """Ground points of the centres ``(n, m, 2)``."""
+        return self.ground.points[self.centres]
+
+    @cached_property
+    def derivative(self) -> Doubles:
+        """Of the centres' displacement by the motion ``(n, m, 2, 3)``; zero where they show no ground."""
+        return np.nan_to_num(self.ground.derivative[self.centres])
+
+    @cached_property
+    def _higher(self) -> tuple[GroundGeometry, GroundGeometry]:
+        """The sonar of both frames :data:`HIGHER` times the height of the first further up."""
+        ground, other = (replace(one, height_m=one.height_m + HIGHER * self.ground.height_m) for one in self._both)
+        return ground, other
+
+    @property
+    def _both(self) -> tuple[GroundGeometry, GroundGeometry]:
+        return self.ground, self.other
+
+    @cached_property
+    def _higher_points(self) -> Doubles:
+        """Ground points of the centres, seen from there ``(n, m, 2)``."""
+        return self._higher[0].points[self.centres]
+
+    def map(self, v: Doubles) -> Doubles:
+        """Return the modelled displacement map of a motion [m, rad] ``(n, m, 2)``; zero where no ground is shown."""
+        return np.nan_to_num(np.stack(self.other.to_polar(moved(self.points, v)), axis=-1) - self.home)
+
+    def by_height(self, v: Doubles) -> Doubles:
+        """How that map changes with the height, in parts of it ``(n, m, 2, 1)``."""
+        map_there = np.stack(self._higher[1].to_polar(moved(self._higher_points, v)), axis=-1) - self.home
+        return (np.nan_to_num(map_there - self.map(v)) / HIGHER)[..., None]
+
+
+@lru_cache(maxsize=16)
+def window_grid(
+    range_m: tuple[float, ...],
+    bearing_rad: tuple[float, ...],
+    bearing: Bearing,
+    first: tuple[float, float, float],
+    second: tuple[float, float, float],
+    level: FlowLevel,
+) -> WindowGrid:
+    """Return the windows of a level over level ground; of each frame height [m], pitch and roll [rad]."""
+    ranges = np.array(range_m)[level.step // 2 :: level.step]
+    ground, other = (GroundGeometry(ranges, np.array(bearing_rad), bearing, *pose) for pose in (first, second))
+    return WindowGrid(ground, other, level)
+
+
+# ---------------- flow
+
 
 LEVELS = (
     FlowLevel(8, 16.0, 3.0, (136, 33), 6),
@@ -275,3 +402,139 @@ def _rejection(fit: _Fit, blocks: float, unseen: float) -> str:
     if (std > LARGEST_STD).any():
         return f"standard deviations of {1e3 * std[0]:.1f}, {1e3 * std[1]:.1f} mm, {np.degrees(std[2]):.2f} deg"
     return ""
+
+
+# ---------------- The motion whose modelled displacement map fits a measured one best
+
+
+TINY = 1e-20
+"""Keeps a division by zero finite."""
+
+STILL = np.array([1e-4, 1e-4, 3e-5])
+"""Steps below which a level ends [m, m, rad]."""
+
+CAUCHY = 8.0
+"""Windows whose squared misfit is so many times the usual have half the weight."""
+
+SIZE = np.array([0.01, 0.01, 0.003])
+"""Motions of like size [m, m, rad]."""
+
+BLOCK = 4
+"""Windows that overlap, and that show one rock, err alike: blocks of so many by so many count once."""
+
+
+class WindowFlow(NamedTuple):
+    """In each window: displacement left over [m, rad] ``(n, m, 2)``; its information, and the same without what noise adds
+    to slopes ``(n, m, 2, 2)``."""
+
+    displacement: Doubles
+    information: Doubles
+    shared: Doubles
+
+
+class MapMatch(NamedTuple):
+    """Motion, and its covariance, or None where the match is not a maximum."""
+
+    motion: Doubles
+    covariance: Doubles | None
+
+
+def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float) -> MapMatch | None:
+    """Weighted robust least squares between the displacement map and the exact map of a motion; None where that is singular.
+
+    The unknowns are the motion and, unless ``height_std`` is 0, the height in parts of it.
+    """
+    found = grid.map(v) + flow.displacement
+    unknowns = grid.derivative if not height_std else np.concatenate([grid.derivative, grid.by_height(v)], axis=-1)
+    used = flow.information.any(axis=(2, 3))
+    if used.sum() < BLOCK * BLOCK:
+        return None
+    p = np.append(v, 0.0)[: unknowns.shape[-1]]
+    prior = np.zeros(len(p))
+    for _ in range(10):
+        misfit = found - grid.map(p[:3]) - (unknowns[..., 3:] @ p[3:])
+        pull = (flow.information @ misfit[..., None])[..., 0]
+        squared = np.maximum((misfit * pull).sum(axis=-1), 0)
+        usual = float(np.median(squared[used])) / 1.39 + TINY  # the median of chi-square with 2 degrees of freedom
+        prior[3:] = usual * BLOCK**2 / height_std**2 if height_std else 0.0
+        weight = 1 / (1 + squared / (CAUCHY * usual))
+        scores = _apply(unknowns, pull) * weight[..., None]
+        normal = _normal(unknowns, flow.information * weight[..., None, None]).sum(axis=(0, 1)) + np.diag(prior)
+        if not _regular(normal):
+            return None
+        step = np.linalg.solve(normal, scores.sum(axis=(0, 1)) - prior * p)
+        p = p + step
+        if (np.abs(step[:3]) < STILL / 10).all():
+            break
+    # robust scores rise by the weight's square, over both directions; noise is in either frame's slopes, not in the shared
+    normals = _normal(unknowns, flow.shared * (weight * weight)[..., None, None])
+    if not _regular(normals.sum(axis=(0, 1)) + np.diag(prior)):
+        return MapMatch(p[:3], None)
+    return MapMatch(p[:3], _covariance(normals, scores, prior, height_std))
+
+
+def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | None:
+    """Fit the motion whose modelled map has the same three numbers as the measured one; None where that is singular.
+
+    They are the mean displacements in range and in bearing, and the slope of the displacement in range over bearing.
+    """
+    found = grid.map(v) + flow.displacement
+    used = flow.information.any(axis=(2, 3))
+    count = int(used.sum())
+    if count < BLOCK * BLOCK:
+        return None
+    aside = np.where(used, grid.home[..., 1] - grid.home[..., 1][used].mean(), 0.0)
+    one, none = used.astype(float), np.zeros(used.shape)
+    # what each window adds to the vector: (n, m, 2, 3)
+    summary = np.stack([np.stack([one, none, aside], axis=-1), np.stack([none, one, none], axis=-1)], axis=-2) / count
+    slope = (np.swapaxes(summary, -1, -2) @ grid.derivative).sum(axis=(0, 1))
+    if np.linalg.matrix_rank(slope * SIZE) < 3:
+        return None
+    for _ in range(10):
+        scores = _apply(summary, found - grid.map(v))
+        step = np.linalg.solve(slope, scores.sum(axis=(0, 1)))
+        v = v + step
+        if (np.abs(step) < STILL / 10).all():
+            break
+    # noise in the slopes holds the flow back by this much
+    gain = np.linalg.pinv(flow.information, hermitian=True) @ flow.shared
+    normals = np.swapaxes(summary, -1, -2) @ gain @ grid.derivative
+    return MapMatch(v, _covariance(normals, scores, np.zeros(3), 0.0))
+
+
+def _apply(unknowns: Doubles, pull: Doubles) -> Doubles:
+    """Return the gradient by each unknown, of each window ``(n, m, unknowns)``."""
+    return (np.swapaxes(unknowns, -1, -2) @ pull[..., None])[..., 0]
+
+
+def _normal(unknowns: Doubles, information: Doubles) -> Doubles:
+    """Unknowns' information from each window ``(n, m, unknowns, unknowns)``."""
+    return np.asarray(np.swapaxes(unknowns, -1, -2) @ (information @ unknowns))
+
+
+def _regular(normal: Doubles) -> bool:
+    """Whether normal equations can be solved and have a maximum."""
+    size = np.sqrt(np.maximum(np.diag(normal), TINY))
+    eigenvalues = np.linalg.eigvalsh(normal / np.outer(size, size))
+    return bool(eigenvalues[0] > 1e-8 * eigenvalues[-1])
+
+
+def _covariance(normals: Doubles, scores: Doubles, prior: Doubles, height_std: float) -> Doubles | None:
+    """Of the motion ``(3, 3)``, from how it changes when one block of windows is left out (jackknife), and from what was
+    assumed of the height; None where one block alone decides."""
+    each, said = in_blocks(normals), in_blocks(scores)
+    whole = each.sum(axis=0) + np.diag(prior)
+    try:
+        change = np.linalg.solve(whole - each, said[..., None])[..., 0]
+        assumed = np.linalg.solve(whole, np.diag(prior * height_std))
+    except np.linalg.LinAlgError:
+        return None
+    blocks = len(each)
+    return np.asarray((change.T @ change * (blocks - 1) / blocks + assumed @ assumed.T)[:3, :3])
+
+
+def in_blocks(values: Doubles) -> Doubles:
+    """Sum over blocks of windows ``(blocks, ...)``."""
+    for axis in (0, 1):
+        values = np.add.reduceat(values, np.arange(0, values.shape[axis], BLOCK), axis=axis)
+    return values.reshape(-1, *values.shape[2:])

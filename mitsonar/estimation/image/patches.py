@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.estimation.image.image_slopes import blurred, central_differences
+from mitsonar.estimation.image.registration import blurred, central_differences
 
 __all__ = ["COLUMNS", "ROWS", "Alignment", "PatchImage", "Patches", "align", "corners", "cut", "patch_image"]
 

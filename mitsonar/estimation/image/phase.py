@@ -6,19 +6,22 @@ with the image and do not see its translation; what remains after the rotation i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_rejection, rejected, two_frames
-from mitsonar.estimation.image.ground_view import GroundView
-from mitsonar.geometry.ground import attitude_of
+from mitsonar.geometry.ground import Attitude, GroundGeometry, attitude_of, moved
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
 
-__all__ = ["Phase"]
+__all__ = ["Ecc", "GroundView", "Phase", "fan_places"]
+
 
 Floats = NDArray[np.float32]
 
@@ -162,3 +165,212 @@ def _shifted(motion: Motion, shift: tuple[float, float], view: GroundView) -> Mo
     warp = view.warp(motion).astype(float)
     warp[:, 2] += warp[:, :2] @ shift
     return view.motion(warp)
+
+
+# ---------------- The estimator ``ecc``: OpenCV's enhanced correlation coefficient (Evangelidis and Psarakis, 2008)
+# on the ground plane
+
+
+LEVELS = ((4, 9), (1, 5))
+"""Edge of a pixel in fine ones, and size of OpenCV's Gaussian filter, coarse to fine."""
+
+FINE = 0.43
+"""Edge of a fine pixel in distances of neighbouring beams at the middle of the window: 0.01 m with a DIDSON at 4.4 m."""
+
+SETTLED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-5)
+
+
+@dataclass(frozen=True)
+class Ecc:
+    """Rigid registration of the frames as seen from above.
+
+    Args:
+        height_m: over the ground, where the window shows no first echoes; default: that of the frames.
+        pitch_rad: default: that of the frames.
+        pixel_m: edge of a fine pixel [m]; default: 0.43 times the distance of beams at the middle of the window.
+
+    Raises:
+        MitsonarError: a pixel that is not positive.
+    """
+
+    height_m: float | None = None
+    pitch_rad: float | None = None
+    pixel_m: float | None = None
+
+    consumes = SonarFrames
+    inputs = INPUTS
+    digest = ""
+
+    def __post_init__(self) -> None:
+        if self.pixel_m is not None and not self.pixel_m > 0:
+            raise MitsonarError(f"ecc takes a pixel above 0 m: got {self.pixel_m:g}")
+
+    def _pixel_m(self, frames: SonarFrames) -> float:
+        """Return the edge of a fine pixel [m], to two digits."""
+        if self.pixel_m is not None:
+            return self.pixel_m
+        spacing = float(np.ptp(frames.bearing_rad)) / (len(frames.bearing_rad) - 1)
+        return float(f"{FINE * spacing * float(frames.range_m[0] + frames.range_m[-1]) / 2:.1e}")
+
+    def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion; reject frames for which OpenCV finds none. A prior is ignored.
+
+        Raises:
+            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+        """
+        images = two_frames(frames)
+        attitude = attitude_of(frames, "ecc", self.height_m, self.pitch_rad)
+        if attitude.reason or any(blank(image) for image in images):
+            return rejected(attitude.reason or "nothing in the frames to match")
+        motion = Motion(0.0, 0.0, 0.0)
+        pixel_m = self._pixel_m(frames)
+        for pixels, size in LEVELS:
+            view = GroundView(frames, attitude, pixels * pixel_m)
+            first, second = (view.draw(image, number) for number, image in enumerate(images))
+            warp = view.warp(motion)
+            mask = (view.inside * np.uint8(255)).astype(np.uint8)
+            if min(first.shape) < 4 * size:
+                return rejected("the fan meets too little ground")
+            try:
+                words = (warp, cv2.MOTION_EUCLIDEAN, SETTLED, size)
+                warp = np.asarray(cv2.findTransformECCWithMask(first, second, mask, mask, *words)[1], dtype=np.float32)
+            except cv2.error:
+                return rejected("the correlation has no maximum nearby")
+            motion = view.motion(warp)
+        reason = self._rejection(first, second, warp, view.inside, size)
+        return Estimate(motion, None, not reason, reason, attitude.about)
+
+    @staticmethod
+    def _rejection(
+        first: NDArray[np.float32],
+        second: NDArray[np.float32],
+        warp: NDArray[np.float32],
+        inside: NDArray[np.bool_],
+        size: int,
+    ) -> str:
+        """Return the reason of a rejection, from images smoothed as in OpenCV; empty for a valid match."""
+        smooth = [cv2.GaussianBlur(image, (size, size), 0) for image in (first, second)]
+        back = cv2.warpAffine(smooth[1], warp, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        seen = cv2.warpAffine(
+            inside.astype(np.float32), warp, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
+        edge = cv2.erode((inside & (seen > 0.99)).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+        return matching_rejection(smooth[0], back, edge, alike=4 * np.pi * (0.3 * ((size - 1) / 2 - 1) + 0.8) ** 2)
+
+
+# ---------------- Frames as seen from above: projected to the level ground, for methods that register maps
+
+
+MOST_VIEW_CELLS = 2**20
+"""Of a view: a window of many metres gets larger cells."""
+
+
+@dataclass(frozen=True)
+class GroundView:
+    """The part of the ground that a fan shows, as an image: row 0 farthest forward, column 0 most to port.
+
+    Args:
+        frames: whose cells are projected.
+        attitude: height over what is seen, pitch, roll.
+        cell_m: edge of a pixel; larger where the view would have more than a million.
+        most_along: pixels along the longer side; they are larger where it would have more.
+    """
+
+    frames: SonarFrames
+    attitude: Attitude
+    cell_m: float
+    most_along: int = MOST_VIEW_CELLS
+
+    @cached_property
+    def _geometry(self) -> GroundGeometry:
+        return self.attitude.ground(self.frames)
+
+    @cached_property
+    def edge(self) -> float:
+        """Edge of a pixel [m]."""
+        left, right, near, far = self.reach
+        whole = float(np.sqrt((right - left) * (far - near) / MOST_VIEW_CELLS))
+        return max(self.cell_m, whole, max(right - left, far - near) / self.most_along)
+
+    @cached_property
+    def reach(self) -> tuple[float, float, float, float]:
+        """Ground seen: starboard from, to, forward from, to [m]; all 0 where the fan meets no ground."""
+        f = self.frames
+        few = (f.range_m[::8], f.bearing_rad[::4]), (f.range_m[[0, -1]], f.bearing_rad)
+        geometries = [replace(self._geometry, range_m=ranges, bearing_rad=bearings) for ranges, bearings in few]
+        points = np.concatenate([geometry.points.reshape(-1, 2) for geometry in geometries])
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            return 0.0, 0.0, 0.0, 0.0
+        (left, near), (right, far) = points.min(axis=0), points.max(axis=0)
+        return float(left), float(right), float(near), float(far)
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Ground of each pixel: starboard, forward [m] ``(rows, columns, 2)``."""
+        left, right, near, far = self.reach
+        x = np.arange(left, right, self.edge) + self.edge / 2
+        y = np.arange(far, near, -self.edge) - self.edge / 2
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+    @cached_property
+    def _pixel_positions(self) -> list[tuple[Floats, Floats, NDArray[np.bool_]]]:
+        """Row and column in each frame of each pixel, and whether it is inside and lit ``(rows, columns)``."""
+        numbers = range(len(self.attitude.apart)) if self.attitude.apart else (None,)
+        return [fan_places(self.attitude.ground(self.frames, k), self.frames.sonar, self.points) for k in numbers]
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Pixels within the fans that the sonar can light, were the ground level ``(rows, columns)``.
+
+        What lies around them is dark in every frame: an outline that moves with the sonar.
+        """
+        return np.asarray(np.all([lit for _, _, lit in self._pixel_positions], axis=0))
+
+    def draw(self, image: Floats, number: int = 0) -> Floats:
+        """Draw the image ``(bins, beams)`` of a frame as seen from above ``(rows, columns)``; 0 outside the fan."""
+        row, column, _ = self._pixel_positions[number if self.attitude.apart else 0]
+        if not row.size:
+            return np.zeros((0, 0), dtype=np.float32)
+        finer = self.edge / float(np.median(np.diff(self.frames.range_m)))
+        if finer > 1:  # bins are finer than pixels
+            border = cv2.BORDER_REPLICATE
+            image = np.asarray(
+                cv2.GaussianBlur(image, (1, 0), sigmaX=1e-3, sigmaY=0.4 * finer, borderType=border), np.float32
+            )
+        return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), np.float32)
+
+    def warp(self, motion: Motion) -> NDArray[np.float32]:
+        """Where a motion takes a pixel (column, row) of the first frame, as a matrix ``(2, 3)``."""
+        corner = np.array([self.reach[0], self.reach[3]]) + self.edge / 2 * np.array([1, -1])
+        pixels = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        there = moved(corner + pixels * [self.edge, -self.edge], motion)
+        there = (there - corner) / [self.edge, -self.edge]
+        return np.column_stack([there[1] - there[0], there[2] - there[0], there[0]]).astype(np.float32)
+
+    def motion(self, warp: NDArray[np.floating]) -> Motion:
+        """Return the motion of a warp, the inverse of :meth:`warp`."""
+        yaw = float(np.arctan2(warp[0, 1], warp[0, 0]))
+        still = self.warp(Motion(0.0, 0.0, yaw)).astype(float)
+        step = (warp[:, 2] - still[:, 2]) * self.edge
+        return Motion(float(-step[0]), float(step[1]), yaw)
+
+
+def fan_places(
+    ground: GroundGeometry, sonar: Sonar, points: NDArray[np.float64]
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Find the cells of a frame that show points of the ground.
+
+    Args:
+        ground: under the frame, with its ranges and bearings.
+        sonar: that received it: it lights what is within the opening of its beams.
+        points: starboard, forward [m] ``(..., 2)``.
+
+    Returns:
+        Row and column in the frame, -1 beyond its cells; and whether a point is within them and lit; each ``(...)``.
+    """
+    radius, bearing = ground.to_polar(points)
+    row = np.interp(radius, ground.range_m, np.arange(len(ground.range_m)), left=-1, right=-1)
+    column = np.interp(bearing, ground.bearing_rad, np.arange(len(ground.bearing_rad)), left=-1, right=-1)
+    lit = np.abs(ground.elevation(points)) <= np.radians(sonar.elevation_fov_deg) / 2
+    return row.astype(np.float32), column.astype(np.float32), (row >= 0) & (column >= 0) & lit

@@ -13,14 +13,11 @@ from points import PointGround, run
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.channel.likelihood import Likelihood
-from mitsonar.estimation.channel.motion_score import judged
-from mitsonar.estimation.channel.motion_search import receiver_bands_of
-from mitsonar.estimation.channel.pings import Pings, pings_of
-from mitsonar.estimation.channel.response_covariance import ResponseCovariance, block_toeplitz, link_response
-from mitsonar.estimation.channel.sub_bands import bands_of
-from mitsonar.estimation.crlb.channel_crlb import channel_crlb, impulse_information
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.channel.correlation import Pings, bands_of, pings_of
+from mitsonar.estimation.channel.covariance import ResponseCovariance, block_toeplitz, link_response
+from mitsonar.estimation.channel.likelihood import Likelihood, judged, receiver_bands_of
+from mitsonar.estimation.crlb.channel import channel_crlb, impulse_information
+from mitsonar.estimation.named import create_estimator
 from mitsonar.instruments.hydrophones import ChannelSonar, four_receivers
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose

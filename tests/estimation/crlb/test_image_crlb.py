@@ -17,12 +17,14 @@ from typer.testing import CliRunner
 
 from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, information, information_of_sums
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.crlb.fisher_bound import Bound, fisher, overall
-from mitsonar.estimation.crlb.image_crlb import (
+from mitsonar.estimation.crlb.image import (
+    Bound,
     bound,
     bounds_of_views,
     cramer_rao_bound,
+    fisher,
     floor_ranges,
+    overall,
     varied,
 )
 from mitsonar.geometry.ground import GroundGeometry

@@ -15,9 +15,14 @@ from scipy.sparse import csr_array
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.crlb.image_crlb import cramer_rao_bound
-from mitsonar.estimation.crlb.score_covariance import CellCorrelation, ScoreCovariance
-from mitsonar.estimation.crlb.speckle_crlb import CellScores, SpeckleBounds, grain_law
+from mitsonar.estimation.crlb.image import (
+    CellCorrelation,
+    CellScores,
+    ScoreCovariance,
+    SpeckleBounds,
+    cramer_rao_bound,
+    grain_law,
+)
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose

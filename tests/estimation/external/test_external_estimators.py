@@ -17,9 +17,8 @@ from scipy import ndimage
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.external.cfar_gicp import CfarGicp
-from mitsonar.estimation.external.ground_pair import ground_pair
-from mitsonar.estimation.named_estimators import EXTERNAL, create_estimator
+from mitsonar.estimation.external import CfarGicp, ground_pair
+from mitsonar.estimation.named import EXTERNAL, create_estimator
 from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.mapping.odometry import odometry
 from mitsonar.motion.composition import Motion, MotionPrior, compose

@@ -18,9 +18,7 @@ from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.height.direct_height import DirectHeight
-from mitsonar.estimation.height.floor_profile import FloorProfile
-from mitsonar.estimation.height.named_height_estimators import height_estimator_from
+from mitsonar.estimation.height import DirectHeight, FloorProfile, height_estimator_from
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.mapping.frame_source import FrameSource
@@ -257,7 +255,7 @@ class TestNetworks:
     @pytest.mark.thorough
     def test_a_network_tells_the_height(self, heights: Path, tmp_path: Path, mitsonar: Command) -> None:
         from mitsonar.datasets.samples import SonarPairs
-        from mitsonar.estimation.height.height_network import HeightNetwork
+        from mitsonar.estimation.height import HeightNetwork
         from mitsonar.training.evaluation import predictions
 
         words = {"kind": "vector", "frames": 1, "views": ["whole", "c2"]}
@@ -294,7 +292,7 @@ class TestNetworks:
     def test_the_network_trained_nearest_to_the_height_answers(
         self, heights: Path, tmp_path: Path, mitsonar: Command
     ) -> None:
-        from mitsonar.estimation.named_estimators import create_estimator
+        from mitsonar.estimation.named import create_estimator
 
         runs = []
         for name, seed in (("low", 0), ("high", 1)):

@@ -9,12 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS
-from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.estimator import Estimate, prior_rejection
 from mitsonar.estimation.image import direct
 from mitsonar.estimation.image.direct import Direct, is_far
-from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, on_cells
-from mitsonar.estimation.named_estimators import create_estimator
-from mitsonar.estimation.prior_gate import prior_rejection
+from mitsonar.estimation.image.registration import by_block, cell_blocks, on_cells
+from mitsonar.estimation.named import create_estimator
 from mitsonar.geometry.ground import FirstEchoes, attitude_of
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, MotionPrior, compose, motions

@@ -8,15 +8,21 @@ import numpy as np
 import pytest
 
 from mitsonar.estimation.estimator import two_frames
-from mitsonar.estimation.image.direct import LEVELS, _resolved
-from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, products_by_block
-from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
-from mitsonar.estimation.image.direct_nodes import GroundNodes
-from mitsonar.estimation.image.direct_registration import _inner, is_resolved, smoothed
-from mitsonar.estimation.image.direct_relief import registered_over_relief
-from mitsonar.estimation.image.ground_view import GroundView
-from mitsonar.estimation.image.image_slopes import blurred
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.image.direct import LEVELS, _resolved, registered_over_relief
+from mitsonar.estimation.image.phase import GroundView
+from mitsonar.estimation.image.registration import (
+    Cells,
+    DirectLevel,
+    GroundNodes,
+    _inner,
+    blurred,
+    by_block,
+    cell_blocks,
+    is_resolved,
+    products_by_block,
+    smoothed,
+)
+from mitsonar.estimation.named import create_estimator
 from mitsonar.geometry.ground import Attitude
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar

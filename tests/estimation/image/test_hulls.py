@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsonar.acoustics.noise import NOISE_MODELS
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.named import create_estimator
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose

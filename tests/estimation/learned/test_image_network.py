@@ -10,13 +10,13 @@ import pytest
 from helpers import lit_plane
 
 from mitsonar.datasets.samples import ground_at
-from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.named import create_estimator
 from mitsonar.geometry.ground import STD_MEASURED, Attitude
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion
 
 pytest.importorskip("torch")
-image_network = pytest.importorskip("mitsonar.estimation.learned.image_network")
+image_network = pytest.importorskip("mitsonar.estimation.learned")
 
 pytestmark = [pytest.mark.learn, pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
 

@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: install mit
 pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant")]
 
 from mitsonar.datasets.samples import SonarPairs  # noqa: E402
-from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
+from mitsonar.estimation.named import create_estimator  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 
 UNSEEN, GAIN = 730_022, 0.0462

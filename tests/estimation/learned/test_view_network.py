@@ -29,9 +29,12 @@ pytestmark = [
 
 from mitsonar.config.training import Optimiser, load_training_recipe, training_recipe_from  # noqa: E402
 from mitsonar.datasets.samples import Samples, SonarPairs  # noqa: E402
-from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402
-from mitsonar.estimation.learned.view_network import ViewNetwork, _rejection_of_profiles  # noqa: E402
-from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
+from mitsonar.estimation.learned import (  # noqa: E402
+    ImageNetwork,
+    ViewNetwork,
+    _rejection_of_profiles,
+)
+from mitsonar.estimation.named import create_estimator  # noqa: E402
 from mitsonar.mapping.view_source import open_views  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402

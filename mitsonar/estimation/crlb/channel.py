@@ -1,6 +1,6 @@
 """The Cramer-Rao lower bound of motion from impulse responses of unknown ground.
 
-Pings of unknown ground are Gaussian with the covariance R of :mod:`mitsonar.estimation.channel.response_covariance`. The
+Pings of unknown ground are Gaussian with the covariance R of :mod:`mitsonar.estimation.channel.covariance`. The
 Fisher information of the motion is tr(R^-1 R_a R^-1 R_b), added over receivers, whose fields of view hardly overlap. The
 bound is *local*: it does not include that another motion may fit as well.
 """
@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.channel.motion_search import ReceiverBand, receiver_bands_of
-from mitsonar.estimation.channel.response_covariance import ResponseCovariance, block_toeplitz
-from mitsonar.estimation.channel.sub_bands import bands_of
+from mitsonar.estimation.channel.correlation import bands_of
+from mitsonar.estimation.channel.covariance import ResponseCovariance, block_toeplitz
+from mitsonar.estimation.channel.likelihood import ReceiverBand, receiver_bands_of
 from mitsonar.instruments.hydrophones import ChannelSonar
 
 __all__ = ["NOISELESS_DB", "channel_crlb", "impulse_information"]

@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from functools import cached_property, partial
+from typing import ClassVar, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from mitsonar.errors import MitsonarError, argument
-from mitsonar.estimation.height.floor_profile import FloorProfile
+from mitsonar.errors import MitsonarError, argument, meant
+from mitsonar.estimation.learned import NetworkInput, Trained, TrainedInstrument, answer_of, one_thread
+from mitsonar.estimation.named import load_checkpoint, names_checkpoint, options_from
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.instruments.views import SEGMENTS, Segment, Whole
+from mitsonar.instruments.views import SEGMENTS, Segment, Whole, directions
+from mitsonar.motion.pose import Pose, vehicle_rotation
+from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.frames import SonarFrames, ViewFrames
 
-__all__ = ["Above", "DirectHeight", "HeightEstimate", "HeightEstimator", "profile_of", "rejection_of_profile"]
+__all__ = [
+    "Above",
+    "DirectHeight",
+    "FloorProfile",
+    "HeightEstimate",
+    "HeightEstimator",
+    "HeightNetwork",
+    "height_estimator_from",
+    "profile_of",
+    "rejection_of_profile",
+]
+
 
 Above = SonarFrames | ViewFrames
 """One frame, or one ping of several views."""
@@ -221,3 +237,172 @@ def _nearest_alike(profile: Array, floor: FloorProfile, edges: Array) -> float |
         return None
     alike = (ground[lit] / size[lit, None]) @ (profile - profile.mean())
     return float(heights[lit][int(alike.argmax())])
+
+
+# ---------------- The range profile of level ground at any height: first return and fall-off of levels
+
+
+MANY = 256
+"""Most beams, and rays of a beam, that are used."""
+
+FARTHEST = 40.0
+"""Largest range over height of the ground."""
+
+
+class FloorProfile:
+    """The range profile of level ground of constant reflectivity, as a curve over range / height.
+
+    Levels are those of :func:`mitsonar.acoustics.levels.level`: a ray's cosine in the ``thesis`` model; cosine, solid
+    angle, spreading and gain in ``physical``.
+
+    Args:
+        sonar: the instrument.
+        pitch_rad: of it, > 0 looks down.
+        roll_rad: of it.
+        weight: of its rays in the profile ``(rays_per_beam, beams)``, rows from the highest elevation down; None: all alike.
+
+    Raises:
+        MitsonarError: no ray meets the ground.
+    """
+
+    def __init__(self, sonar: Sonar, pitch_rad: float, roll_rad: float = 0.0, weight: Array | None = None) -> None:
+        self.sonar, self.pitch_rad, self.roll_rad = sonar, pitch_rad, roll_rad
+        rows, beams = (np.unique(np.linspace(0, n - 1, min(n, MANY)).astype(int)) for n in (self._rows, sonar.beams))
+        elevation = (0.5 - (rows + 0.5) / self._rows) * np.radians(sonar.elevation_fov_deg)
+        bearing = sonar.bearing_rad[beams]
+        rays = directions(sonar.bearing, bearing[None, :], elevation[:, None])
+        down = -(vehicle_rotation(Pose(0, 0, 0, pitch_rad, roll_rad, 0)).apply(rays.reshape(-1, 3))[:, 2])
+        part = np.ones(rays.shape[:2]) if weight is None else weight[np.ix_(rows, beams)]
+        angle = elevation[:, None] if sonar.bearing == "azimuth" else bearing[None, :]
+        part = part * (1.0 if sonar.model == "thesis" else np.cos(angle))
+        meets = (down > 1 / FARTHEST) & (part.ravel() > 0)
+        if not meets.any():
+            raise MitsonarError(f"at a pitch of {np.degrees(pitch_rad):g} deg the sonar sees no level ground")
+        order = np.argsort(-down[meets])
+        self._down, self._part = down[meets][order], part.ravel()[meets][order]
+
+    @property
+    def _rows(self) -> int:
+        return max(1, self.sonar.rays_per_beam)
+
+    @cached_property
+    def _along(self) -> tuple[Array, Array]:
+        """Return the ranges of rays over the height, rising, and the sum of levels up to each."""
+        away = 1 / self._down
+        gain = 1.0 if self.sonar.model == "thesis" else away ** (self.sonar.gain_exponent - 2)
+        return away, np.cumsum(self._part * self._down * gain)
+
+    @property
+    def nearest(self) -> float:
+        """Return the range of the first return over the height."""
+        return float(self._along[0][0])
+
+    @property
+    def farthest(self) -> float:
+        """Return the range of the last return over the height."""
+        return float(self._along[0][-1])
+
+    def at(self, height_m: float | Array, edges_m: Array) -> Array:
+        """Return the levels of the bins between edges ``(..., bins)`` at heights ``(...)`` [m]; their sum is 1 at most."""
+        away, total = self._along
+        ends = np.asarray(edges_m) / np.asarray(height_m, dtype=float)[..., None]
+        return np.asarray(np.diff(np.interp(ends, away, total, left=0.0), axis=-1) / total[-1])
+
+
+# ---------------- The height estimator of a checkpoint: a network of one frame, or of one vector (Almanza-Medina, 4.5)
+
+
+BEYOND = 0.1
+"""Part of the interval of the heights of training by which a valid height may exceed it."""
+
+
+@dataclass(init=False, eq=False)
+class HeightNetwork(Trained):
+    """A trained network that estimates heights.
+
+    Args:
+        checkpoint: of it; it must take one frame.
+        force: go on with another sonar than that of training.
+
+    Raises:
+        MitsonarError: a checkpoint of motions.
+    """
+
+    instead: ClassVar[str] = "direct"
+
+    def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
+        if checkpoint.arrangement["frames"] != 1:
+            raise MitsonarError(
+                f"this {checkpoint.network} estimates motions of {checkpoint.arrangement['frames']} frames, not heights: "
+                "give one that was trained with input.frames: 1, or direct"
+            )
+        self.force = force
+        self._take(checkpoint)
+
+    @property
+    def views(self) -> tuple[str, ...] | None:
+        """Return the names of the views that it reads; None: a single image."""
+        views = tuple(self._checkpoint.arrangement["views"])
+        return None if views == (Whole.name,) else views
+
+    def height(self, frame: Above) -> HeightEstimate:
+        """Estimate the height; its standard deviation is that of validation.
+
+        Raises:
+            MitsonarError: not one frame, other views or another sonar than those of training.
+        """
+        profile, _ = profile_of(frame)
+        reason = rejection_of_profile(profile) or self._rejection_of_attitude(frame)
+        if reason:
+            return HeightEstimate(np.nan, np.nan, False, reason)
+        with torch.inference_mode(), one_thread():
+            targets, _ = self._checkpoint.decode(answer_of(self._network, self._input(frame)))
+        height, coder = float(targets[0, 0]), self._checkpoint.coder
+        if not np.isfinite(height):
+            return HeightEstimate(np.nan, np.nan, False, "the network's answer is not finite")
+        low, high = float(coder.low[0]), float(coder.high[0])
+        rmse = self._checkpoint.rmse
+        std = np.nan if rmse is None else float(rmse[0]) / 1e3
+        if not low - BEYOND * (high - low) <= height <= high + BEYOND * (high - low):
+            return HeightEstimate(
+                height, std, False, f"{height:.2f} m is beyond the heights of training, {low:g}..{high:g} m"
+            )
+        return HeightEstimate(height, std)
+
+    def _input(self, frame: Above) -> NetworkInput:
+        """Return the input of the network, a batch of one."""
+        if isinstance(frame, ViewFrames):
+            return self._input_of_views(frame)
+        names = self._checkpoint.arrangement["views"]
+        if len(names) > 1:
+            raise MitsonarError(
+                f"this {self._checkpoint.network} is given {', '.join(names)}: use a data set that holds them"
+            )
+        self._check_instrument(names[0], TrainedInstrument.in_frames(frame.sonar, frame.range_m, frame.bearing_rad))
+        values = {names[0]: torch.from_numpy(np.asarray(frame.image)[None])}
+        arranged = self._arranged({names[0]: (frame.range_m, frame.bearing_rad)})
+        inputs: NetworkInput = arranged(values, torch.arange(1)[None], 0)
+        return inputs
+
+
+# ---------------- Height estimators by name
+
+
+def height_estimator_from(text: str) -> HeightEstimator:
+    """Create a height estimator from a text: ``direct``, a checkpoint or the folder of a training run, with options or not.
+
+    Raises:
+        MitsonarError: no such checkpoint, one of motions, an unknown option.
+    """
+    name, *words = text.split(":")
+    if name == "direct":
+        return DirectHeight(**options_from(name, words, DirectHeight))
+    if not names_checkpoint(name):
+        raise MitsonarError(
+            "heights are told by direct, or by the checkpoint or folder of a training: got "
+            f"{name!r}{meant(name, ['direct'])}"
+        )
+    checkpoint = load_checkpoint(name)
+
+    made = partial(HeightNetwork, checkpoint)
+    return made(**options_from(name, words, made))

@@ -1,4 +1,4 @@
-"""All estimators by name."""
+"""The estimator ``zero``: always "no motion", the row that every table needs."""
 
 from __future__ import annotations
 
@@ -13,19 +13,26 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 import numpy as np
 
 from mitsonar.errors import MitsonarError, explain_missing, meant, nearest_names
-from mitsonar.estimation.channel.correlation import Correlation
+from mitsonar.estimation.channel.correlation import Correlation, pings_of
 from mitsonar.estimation.channel.likelihood import Likelihood
-from mitsonar.estimation.estimator import AnyEstimator, Options
-from mitsonar.estimation.external.cfar_gicp import CfarGicp
-from mitsonar.estimation.external.fourier_mellin import FourierMellin
-from mitsonar.estimation.external.own_estimator import HasEstimate, checked_options, created, own_class, own_estimator
-from mitsonar.estimation.external.stackreg import StackReg
+from mitsonar.estimation.estimator import AnyEstimator, Estimate, Options, Record, two_frames
+from mitsonar.estimation.external import (
+    CfarGicp,
+    FourierMellin,
+    HasEstimate,
+    StackReg,
+    checked_options,
+    created,
+    own_class,
+    own_estimator,
+)
 from mitsonar.estimation.image.direct import Direct
-from mitsonar.estimation.image.ecc import Ecc
 from mitsonar.estimation.image.flow import Flow
-from mitsonar.estimation.image.phase import Phase
-from mitsonar.estimation.zero import Zero
+from mitsonar.estimation.image.phase import Ecc, Phase
+from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.networks.shipped import SHIPPED, shipped_path
+from mitsonar.records.frames import SonarFrames
+from mitsonar.records.responses import ImpulseResponses
 
 if TYPE_CHECKING:
     from torch import nn
@@ -37,12 +44,38 @@ __all__ = [
     "EXTERNAL",
     "NAMES",
     "EstimatorLike",
+    "Zero",
     "create_estimator",
     "estimators_for",
     "load_checkpoint",
     "names_checkpoint",
     "options_from",
 ]
+
+
+CHECKS: dict[type, Callable[..., object]] = {SonarFrames: two_frames, ImpulseResponses: pings_of}
+"""The checks of the other estimators: what they reject, this one rejects."""
+
+
+class Zero:
+    """Estimates no motion, whatever the records hold."""
+
+    consumes = object
+    inputs = "nothing"
+    digest = ""
+
+    def estimate(self, records: Record, /, prior: MotionPrior | None = None) -> Estimate:
+        """Return no motion; a prior is ignored.
+
+        Raises:
+            MitsonarError: records that no other estimator takes.
+        """
+        CHECKS.get(type(records), len)(records)
+        return Estimate(Motion(0.0, 0.0, 0.0))
+
+
+# ---------------- All estimators by name
+
 
 ESTIMATORS: dict[str, type[AnyEstimator]] = {
     "zero": Zero,
@@ -157,7 +190,7 @@ def _nearest(texts: list[str], options: Options) -> AnyEstimator:
     if plain or len(made) < 2:
         fault = f"{plain[0]} was not trained at a height" if plain else f"got {len(made)}"
         raise MitsonarError(f"commas stand between two or more checkpoints, of which the height chooses one: {fault}")
-    from mitsonar.estimation.learned.height_ensemble import HeightEnsemble
+    from mitsonar.estimation.learned import HeightEnsemble
 
     return HeightEnsemble(made)
 
@@ -174,9 +207,7 @@ def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
         MitsonarError: no torch, no such checkpoint or one that cannot be used.
     """
     checkpoint = load_checkpoint(path)
-    from mitsonar.estimation.learned.image_network import ImageNetwork
-    from mitsonar.estimation.learned.response_network import ResponseNetwork
-    from mitsonar.estimation.learned.view_network import ViewNetwork, reads_views
+    from mitsonar.estimation.learned import ImageNetwork, ResponseNetwork, ViewNetwork, reads_views
 
     if checkpoint.channel is not None:
         return partial(ResponseNetwork, checkpoint)

@@ -1,0 +1,726 @@
+"""The Cramer-Rao lower bound of motion estimation for a known scene, sonar and noise.
+
+No unbiased estimator of the motion (sideways, forward, yaw) has a covariance below the inverse of the Fisher information
+F = J' W J: J how pixels change with the motion, W the information of a noisy pixel (:mod:`mitsonar.acoustics.noise`).
+The bound is that of an oracle, which owns the renderer and knows the scene, its height and the frames without noise.
+
+*One frame* is registered with that oracle: covariance 1 / F. *Two frames*, both noisy, of a known relief: twice that. It is
+optimistic, since a real estimator has to find the relief and the reflectivity of every cell in the same two frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+
+from mitsonar.acoustics.levels import coding_slope
+from mitsonar.acoustics.noise import Information, NoiseModel, information, information_of_sums, refuse_noise
+from mitsonar.acoustics.speckle import rician_information, score_shares
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.instruments.sonar import Quality, Sonar
+from mitsonar.instruments.views import Segment, directions
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose, vehicle_rotation
+from mitsonar.simulation.derivatives import FIRST_PING, PINGS, Derivative, differentiate, evenly, jittered, step_for
+from mitsonar.simulation.simulator import Simulator
+
+if TYPE_CHECKING:
+    from mitsonar.simulation.coherent import CoherentImager
+
+__all__ = [
+    "ALL",
+    "KINDS",
+    "LAWS",
+    "SPECKLE_LAWS",
+    "VARIABLES",
+    "Bound",
+    "CellCorrelation",
+    "CellScores",
+    "ScoreCovariance",
+    "SpeckleBounds",
+    "bound",
+    "bounds_at",
+    "bounds_of_views",
+    "cramer_rao_bound",
+    "expected_sonar",
+    "fisher",
+    "fisher_by",
+    "floor_ranges",
+    "grain_law",
+    "laws_of",
+    "overall",
+    "together",
+    "varied",
+]
+
+
+KINDS: dict[str, str] = {"image": "all pixels", "vector": "sums over the beams"}
+LAWS: dict[str, str] = {
+    "pixel": "the exact law of the noisy pixel: clipped, rounded to grey values",
+    "gaussian": "a Gaussian of the same mean and variance: the limit of least squares",
+    "rays": "the same, with the noise of the rays of a single ping as further variance",
+}
+
+ALL = "all views"
+
+VARIABLES = {
+    "height_m": "of the sonar over the ground",
+    "pitch_deg": "of the sonar",
+    "azimuth_fov_deg": "beams stay as many, and as wide as their spacing",
+    "elevation_fov_deg": "rays over it stay as many",
+    "beams": "the field of view stays, beams are as wide as their spacing",
+    "range_bins": "the window stays",
+    "window": "both ends [m], 3.2..5.6; bins stay as many",
+}
+"""Numbers that a bound may be asked for many values of, and what stays the same."""
+
+MOVING = ("height_m", "pitch_deg", "azimuth_fov_deg", "elevation_fov_deg")
+"""Those that move the floor out of the window."""
+
+
+class InformationTerms(NamedTuple):
+    """What values that change with the motion tell.
+
+    Attributes:
+        information: of each ``(n, ...)``.
+        jacobian: two estimates of what they depend on ``(2, n, 2, 3)``.
+        rays: variance of each by the rays of a ping, beyond what its law holds ``(n,)``.
+    """
+
+    information: Information
+    jacobian: NDArray[np.float64]
+    rays: NDArray[np.float64]
+
+    def bound(self, law: str) -> Bound | None:
+        """By one of :data:`LAWS`."""
+        if law == "pixel":
+            weight = self.information.law
+        else:
+            more = self.rays if law == "rays" else np.zeros_like(self.rays)
+            weight = self.information.matched(more) if (self.information.variance + more > 0).all() else None
+        return None if weight is None else fisher(self.jacobian, weight)
+
+
+def bound(
+    derivative: Derivative, noise: NoiseModel, *, kind: str = "image", law: str = "pixel", greys: int = 255
+) -> Bound | None:
+    """Compute the bound of one view.
+
+    Without noise nothing but rounding stands between a pixel and its level. The exact law then tells the motion without
+    limit, and the answer is None; ``gaussian`` counts rounding as a variance of 1 / (12 255^2), as for pixels that noise of
+    their own dithers; ``rays`` adds the noise of the rays, from which no single ping is free. Vectors are not rounded, and
+    have no ``gaussian`` bound without noise either.
+
+    Args:
+        derivative: of the view at a pose.
+        noise: of its pixels.
+        kind: of :data:`KINDS`.
+        law: of :data:`LAWS`.
+        greys: the largest grey value that pixels are stored with.
+
+    Raises:
+        MitsonarError: unknown words.
+    """
+    _check(kind, law)
+    return _terms(derivative, noise, kind, greys).bound(law)
+
+
+def laws_of(sonar: Sonar) -> dict[str, str]:
+    """Return the laws that a sonar's pixels may have, by name, with what they mean; the last counts in comparisons."""
+    return SPECKLE_LAWS if sonar.model == "coherent" else LAWS
+
+
+def _check(kind: str, law: str, kinds: Sequence[str] = tuple(KINDS), laws: Sequence[str] = tuple(LAWS)) -> None:
+    for what, word, known in (("kind", kind, kinds), ("law", law, laws)):
+        if word not in known:
+            raise MitsonarError(f"unknown {what} {word!r}: {nearest_names(word, known)}")
+
+
+def _terms(derivative: Derivative, noise: NoiseModel, kind: str, greys: int = 255) -> InformationTerms:
+    return _by_pixels(derivative, noise, greys) if kind == "image" else _by_sums(derivative, noise)
+
+
+def _by_pixels(derivative: Derivative, noise: NoiseModel, greys: int) -> InformationTerms:
+    """Return the information of pixels."""
+    changing = derivative.jacobian.any(axis=(0, 3, 4))
+    level, filled = derivative.level[changing], derivative.filled[changing]
+    told = information(noise, level, filled, greys=greys)
+    switching = level**2 * (1 / filled - 1)  # of echoes that are there or not: the law holds it
+    rays = np.maximum(derivative.variance[changing] - switching, 0.0) * told.slope[:, 0] ** 2
+    return InformationTerms(told, derivative.jacobian[:, changing].astype(float), rays)
+
+
+def _by_sums(derivative: Derivative, noise: NoiseModel) -> InformationTerms:
+    """Return the information of sums over the beams."""
+    jacobian = derivative.jacobian.sum(axis=2, dtype=float)
+    changing = jacobian.any(axis=(0, 2, 3))
+    level, filled = derivative.level[changing], derivative.filled[changing]
+    told = information_of_sums(noise, filled.sum(axis=1), filled.shape[1])
+    by_filled = told.slope[:, 1:]
+    # no ray falls into two beams: variances of a row's pixels add up
+    rays = derivative.variance[changing] + (2 * by_filled * level + by_filled**2 * filled) * (1 - filled)
+    return InformationTerms(told, jacobian[:, changing], np.maximum(rays.sum(axis=1), 0.0))
+
+
+def bounds_of_views(
+    names: Sequence[str], views: Sequence[Derivative], noise: NoiseModel, *, apart: bool = True
+) -> dict[tuple[str, str, str], Bound | None]:
+    """All bounds at one pose: (portion, kind, law) -> bound; of several views their sum too, as ``all views``.
+
+    Args:
+        names: of the views.
+        views: their derivatives.
+        noise: of their pixels.
+        apart: whether no two views hear the same rays; those that do have no sum.
+    """
+    found: dict[tuple[str, str, str], Bound | None] = {}
+    for kind in KINDS:
+        told = [_terms(view, noise, kind) for view in views]
+        for law in LAWS:
+            parts = [one.bound(law) for one in told]
+            if len(parts) > 1 and apart:
+                found[ALL, kind, law] = together(parts)
+            found |= {(name, kind, law): part for name, part in zip(names, parts, strict=True)}
+    return found
+
+
+def bounds_at(
+    simulator: Simulator, poses: ArrayLike, noise: NoiseModel, gain: float, *, pings: int | None = None
+) -> Iterator[dict[tuple[str, str, str], Bound | None]]:
+    """:func:`bounds_of_views` at each pose.
+
+    Args:
+        simulator: of the scene that the poses are in (of a data set: ``SceneRenderer(recipe, scene).simulator``).
+        poses: of the sonar ``(n, 6)``.
+        noise: of the pixels.
+        gain: that of the frames.
+        pings: of each half of the derivatives; default: 8, and four times as many, twice, where images leave it open whether
+            an axis can be observed.
+    """
+    if simulator.coherent is not None:
+        refuse_noise(noise, simulator.sonar)
+        for laws in SpeckleBounds(simulator, gain).at(poses, pings=pings):
+            yield {(simulator.views[0].name, "image", law): found for law, found in laws.items()}
+        return
+    source, names = jittered(simulator), [view.name for view in simulator.views]
+    portions = [view.member for view in simulator.views if isinstance(view, Segment)]
+    apart = not portions or bool(np.sum(portions, axis=0).max() <= 1)
+    for number, pose in enumerate(np.atleast_2d(np.asarray(poses, dtype=float))):
+        for count in (PINGS, 4 * PINGS, 16 * PINGS) if pings is None else (pings,):
+            first = FIRST_PING + 32 * PINGS * number
+            views = next(differentiate(source, pose, gain, pings=count, first=first))
+            found = bounds_of_views(names, views, noise, apart=apart)
+            images = [one for (_, kind, _), one in found.items() if kind == "image" and one is not None]
+            if all(np.isfinite(one.std()).all() for one in images):
+                break
+        yield found
+
+
+def cramer_rao_bound(
+    simulator: Simulator,
+    poses: ArrayLike,
+    noise: NoiseModel,
+    gain: float,
+    *,
+    view: str | None = None,
+    kind: str = "image",
+    law: str | None = None,
+    frames: int = 2,
+    pings: int | None = None,
+) -> NDArray[np.float64]:
+    """Compute the least standard deviations of a motion at each pose (Cramer and Rao).
+
+    Args:
+        simulator: of the scene that the poses are in.
+        poses: of the sonar ``(n, 6)`` [m, rad].
+        noise: of the pixels; without noise ask for the law ``rays``. The model ``coherent`` has its own: none.
+        gain: that of the frames.
+        view: which one; default: the only one, or all together where no two hear the same rays.
+        kind: ``image``, all pixels, or ``vector``, sums over the beams; the model ``coherent`` has images only.
+        law: ``pixel``: the exact law of the noisy pixel, clipped and rounded to grey values; ``gaussian``: a Gaussian of the
+            same mean and variance; ``rays``: the same, with the noise of the rays of a single ping as further variance. Of
+            the model ``coherent`` ``ground``: the expected level is known, and the grain is new in each frame; ``grain``:
+            the scatterers are known as well. Default: ``pixel``, of the model ``coherent`` ``ground``.
+        frames: noisy ones, 1 or 2.
+        pings: of each half of the derivatives; default: 8, and four times as many, twice, where images leave it open whether
+            an axis can be observed.
+
+    Returns:
+        Sideways, forward [m] and yaw [rad] ``(n, 3)``; 0 where nothing but rounding stands between a pixel and its level,
+        inf where an axis cannot be observed.
+
+    Raises:
+        MitsonarError: unknown words; several portions that overlap, and none named; noise of pixels with speckle.
+    """
+    speckle = simulator.coherent is not None
+    law = law or ("ground" if speckle else "pixel")
+    _check(kind, law, ["image"] if speckle else list(KINDS), list(laws_of(simulator.sonar)))
+    portion = view or (ALL if len(simulator.views) > 1 else simulator.views[0].name)
+    found = []
+    for one in bounds_at(simulator, poses, noise, gain, pings=pings):
+        if (portion, kind, law) not in one:
+            names = ", ".join(known.name for known in simulator.views)
+            raise MitsonarError(f"portions that overlap have no bound together: got view {view!r}; name one of {names}")
+        found.append(one[portion, kind, law])
+    return np.array([np.zeros(3) if one is None else one.std(frames) for one in found]).reshape(-1, 3)
+
+
+# ---------------------------------------------------------------- what if
+
+
+def varied(
+    sonar: Sonar, poses: NDArray[np.float64], heights: NDArray[np.float64], name: str, value: float | tuple[float, float]
+) -> tuple[Sonar, NDArray[np.float64]]:
+    """Sonar and poses with one number of :data:`VARIABLES` changed.
+
+    The floor stays in the window: where height, pitch or a field of view change, both ends of the window move in the
+    proportion in which the nearest and the farthest range of the level floor in view do, and its bins become longer or
+    shorter with it. A window that is given itself stays as it is.
+
+    Args:
+        sonar: the instrument.
+        poses: of the sonar ``(n, 6)``.
+        heights: over the ground ``(n,)`` [m].
+        name: of the number.
+        value: in the unit that its name says; of ``window`` both ends [m].
+
+    Raises:
+        MitsonarError: unknown name, a value outside its limits, a sonar that looks past the floor to the horizon.
+    """
+    if name not in VARIABLES:
+        raise MitsonarError(f"unknown variable {name!r}: {nearest_names(name, VARIABLES)}")
+    if name == "window":
+        near, far = value  # type: ignore[misc]
+        return sonar.replace(range_min=near, range_max=far), poses
+    changed, number = poses.copy(), float(value)  # type: ignore[arg-type]
+    before = floor_ranges(sonar, float(heights.mean()), float(poses[:, 3].mean())) if name in MOVING else None
+    height, other = heights, sonar
+    if name == "height_m":
+        if not number > 0:
+            raise MitsonarError(f"height_m must be above 0: got {number:g}")
+        changed[:, 2] += number - heights
+        height = np.full_like(heights, number)
+    elif name == "pitch_deg":
+        changed[:, 3] = np.radians(number)
+    else:
+        whole = name in ("beams", "range_bins", "rays_per_beam")
+        if whole and number != round(number):
+            raise MitsonarError(f"{name} must be a whole number: got {number:g}")
+        width = {"beam_width_deg": None} if name in ("azimuth_fov_deg", "beams") else {}
+        other = sonar.replace(**{name: round(number) if whole else number}, **width)
+    if before is None:
+        return other, changed
+    after = floor_ranges(other, float(height.mean()), float(changed[:, 3].mean()))
+    near, far = (end * new / old for end, new, old in zip((sonar.range_min, sonar.range_max), after, before, strict=True))
+    return other.replace(range_min=near, range_max=far), changed
+
+
+def floor_ranges(sonar: Sonar, height_m: float, pitch_rad: float) -> tuple[float, float]:
+    """Nearest and farthest range of a level floor in the field of view [m].
+
+    Raises:
+        MitsonarError: part of it looks to the horizon.
+    """
+    half = sonar.bearing_rad[-1] + sonar.beam_width_rad / 2
+    elevation = np.radians(sonar.elevation_fov_deg) / 2
+    b, e = np.meshgrid(np.linspace(-half, half, 181), np.linspace(-elevation, elevation, 181))
+    turn = vehicle_rotation(Pose(0, 0, 0, pitch_rad, 0, 0))
+    down = -turn.apply(directions(sonar.bearing, b.ravel(), e.ravel()))[:, 2]
+    if down.min() < 1e-3:
+        raise MitsonarError(
+            f"at pitch {np.degrees(pitch_rad):.3g} deg the field of view of {sonar.elevation_fov_deg:g} deg reaches the "
+            "horizon, no window holds that floor: raise pitch_deg or lower elevation_fov_deg"
+        )
+    return height_m / float(down.max()), height_m / float(down.min())
+
+
+# ---------------- Fisher information of a motion, and the least covariance that follows from it
+
+
+SURE = 3.0
+"""A direction is observable in which the information exceeds so many of its standard errors."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Fisher information of the motion in one frame.
+
+    Attributes:
+        information: F ``(3, 3)`` of sideways, forward [1/m^2] and yaw [1/rad^2].
+        reason: covariance of the elements of F, from the noise of the rays that it was computed with ``(3, 3, 3, 3)``.
+    """
+
+    information: NDArray[np.float64]
+    reason: NDArray[np.float64]
+
+    def __add__(self, other: Bound) -> Bound:
+        """Of two independent images."""
+        return Bound(self.information + other.information, self.reason + other.reason)
+
+    def covariance(self, frames: int = 1) -> NDArray[np.float64]:
+        """Return the least covariance ``(3, 3)`` [m, m, rad]: of one frame against an oracle, or of two noisy frames.
+
+        The pseudo-inverse where not all can be observed: the variance of an axis with a part in what cannot be is inf.
+        """
+        if frames not in (1, 2):
+            raise MitsonarError(f"a bound is that of 1 or 2 noisy frames: got {frames}")
+        diagonal = np.diag(self.information)
+        scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
+        size, axes = np.linalg.eigh(self.information * np.outer(scale, scale))
+        known = size > np.maximum(SURE * self._error(axes * scale[:, None]), 1e-9)
+        inverse = (axes[:, known] / size[known]) @ axes[:, known].T * np.outer(scale, scale)
+        lost = (axes[:, ~known] ** 2).sum(axis=1) > 1e-3
+        inverse[lost, :] = inverse[:, lost] = 0
+        inverse[lost, lost] = np.inf
+        return np.asarray(frames * inverse)
+
+    def std(self, frames: int = 1) -> NDArray[np.float64]:
+        """Return the least standard deviations ``(3,)`` [m, m, rad]; inf where an axis cannot be observed."""
+        return np.asarray(np.sqrt(np.diag(self.covariance(frames))))
+
+    @property
+    def relative_error(self) -> NDArray[np.float64]:
+        """Standard error of :meth:`std` as a part of it ``(3,)``; nan where an axis cannot be observed."""
+        covariance = self.covariance()
+        variance = np.diag(covariance)
+        finite = np.where(np.isfinite(covariance), covariance, 0)
+        return np.asarray(np.where(np.isfinite(variance), self._error(finite) / (2 * variance), np.nan))
+
+    def _error(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the standard error of v' F v for each column v ``(3, n)``."""
+        v = directions
+        variance: NDArray[np.float64] = np.einsum("ijkl,in,jn,kn,ln->n", self.reason, v, v, v, v)
+        return np.sqrt(np.maximum(variance, 0))
+
+
+def fisher(jacobian: NDArray[np.float64], weight: NDArray[np.float64]) -> Bound:
+    """Compute F = J1' W J2, made symmetric, and the covariance of its elements.
+
+    Args:
+        jacobian: two independent estimates of how k numbers of n independent values change with the motion ``(2, n, k, 3)``.
+        weight: information of each value about its numbers ``(n, k, k)``.
+    """
+    return fisher_by(jacobian, lambda values: weight @ values)
+
+
+def fisher_by(jacobian: NDArray[np.float64], weigh: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Bound:
+    """Compute F = J1' W J2 of values that need not be independent; see :func:`fisher`.
+
+    Args:
+        jacobian: two independent estimates ``(2, n, k, 3)``.
+        weigh: multiplies derivatives ``(n, k, 3)`` by the information of all values, W.
+
+    With M the mean and D half the difference of both it is M' W M - D' W D, and the noise of M is as large as D.
+    """
+    mean, half = jacobian.mean(axis=0), (jacobian[0] - jacobian[1]) / 2
+    weighted = weigh(half)
+    own = mean.transpose(0, 2, 1) @ weigh(mean)
+    own = (own + own.transpose(0, 2, 1)) / 2
+    noise = half.transpose(0, 2, 1) @ weighted
+    noise = (noise + noise.transpose(0, 2, 1)) / 2
+    mixed = mean.transpose(0, 2, 1) @ weighted
+    parts = np.concatenate([mixed + mixed.transpose(0, 2, 1), np.sqrt(2) * noise]).reshape(-1, 9)
+    return Bound((own - noise).sum(axis=0), (parts.T @ parts).reshape(3, 3, 3, 3))
+
+
+def together(parts: Sequence[Bound | None]) -> Bound | None:
+    """Add the information of several views, whose noise is independent; None where one view alone has no bound."""
+    known = [part for part in parts if part is not None]
+    return sum(known[1:], known[0]) if len(known) == len(parts) else None
+
+
+def overall(stds: Iterable[ArrayLike]) -> NDArray[np.float64]:
+    """One number an axis for many poses ``(3,)``: the root of the mean variance, which an RMSE is to be compared with."""
+    return np.asarray(np.sqrt(np.mean(np.square(np.array(list(stds), dtype=float)), axis=0)))
+
+
+# ---------------- How scores of neighbouring cells covary, since array and pulse spread echoes and noise over some of
+# them
+# The information of n correlated values about a motion is J' W^1/2 C^-1 W^1/2 J: J how they change with it, W what each
+# tells, C the covariance of their standardised scores. It is what the best weighted sum of the scores can use. Parts of
+# C are products of a correlation over bins and one over beams.
+
+
+Complex = NDArray[np.complex128]
+Floats = NDArray[np.float64]
+
+TOLERANCE, MOST_STEPS = 1e-5, 2000
+"""Relative residual at which the conjugate gradients end, and their steps at most."""
+
+
+@dataclass(frozen=True)
+class CellCorrelation:
+    """The correlation of two cells: that of their bins times that of their beams.
+
+    Attributes:
+        over_bins: ``(bins, bins)``.
+        over_beams: ``(beams, beams)``.
+    """
+
+    over_bins: csr_array[Any, Any]
+    over_beams: Floats
+
+    def __mul__(self, other: CellCorrelation) -> CellCorrelation:
+        """Multiply cell by cell."""
+        return CellCorrelation(csr_array(self.over_bins.multiply(other.over_bins)), self.over_beams * other.over_beams)
+
+    def __matmul__(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Apply to an image ``(bins, beams)``."""
+        return np.asarray((self.over_bins @ image) @ self.over_beams.T)
+
+
+@dataclass(frozen=True)
+class ScoreCovariance:
+    """Covariance of the standardised scores of all cells: sums of Re(w_i* R_ij w_j), and a part that no two cells share.
+
+    Attributes:
+        parts: weights w ``(bins, beams)`` with the correlation R.
+        own: variance that no two cells share ``(bins, beams)``, so that all have variance 1.
+    """
+
+    parts: list[tuple[NDArray[Any], CellCorrelation]]
+    own: Floats
+
+    @classmethod
+    def of(cls, parts: list[tuple[NDArray[Any], CellCorrelation]], shape: tuple[int, int]) -> ScoreCovariance:
+        """Add the part that makes all variances 1.
+
+        Args:
+            parts: see the attribute.
+            shape: bins and beams.
+        """
+        shared = sum((np.abs(weight) ** 2 for weight, _ in parts), np.zeros(shape))
+        return cls(parts, np.maximum(1 - shared, 1e-6))
+
+    def __matmul__(self, values: Floats) -> Floats:
+        """Apply to maps ``(k, bins, beams)``."""
+        found = self.own * values
+        for weight, correlation in self.parts:
+            for total, one in zip(found, values, strict=True):
+                total += (np.conj(weight) * (correlation @ (weight * one))).real
+        return found
+
+    def solve(self, values: Floats) -> Floats:
+        """Return C^-1 of maps ``(k, bins, beams)``, by conjugate gradients.
+
+        Raises:
+            MitsonarError: they do not converge.
+        """
+        found, rest = np.zeros_like(values), values.copy()
+        way, size = rest.copy(), np.einsum("kij,kij->k", rest, rest)
+        goal = TOLERANCE**2 * size
+        for _ in range(MOST_STEPS):
+            if (size <= goal).all():
+                return found
+            spread = self @ way
+            along = np.einsum("kij,kij->k", way, spread)
+            step = np.divide(size, along, out=np.zeros_like(size), where=along > 0)[:, None, None]
+            found += step * way
+            rest -= step * spread
+            before, size = size, np.einsum("kij,kij->k", rest, rest)
+            way = rest + np.divide(size, before, out=np.zeros_like(size), where=before > 0)[:, None, None] * way
+        raise MitsonarError("the covariance of the cells cannot be inverted: give beams nearer to the width of the spacing")
+
+
+# ---------------- The Cramer-Rao lower bound of motion in the model ``coherent``, whose pixels are |s + n|: speckle
+# s, receiver's noise n
+# *Grain known*: an oracle owns the scatterers, so s is a function of the pose. A pixel has the Rice law
+# (:mod:`mitsonar.acoustics.speckle`), and what changes with the motion is |s|^2. Only amplitudes are observed: the
+# phase of s, which turns once in a quarter of a millimetre, tells nothing. Neighbouring cells share noise.
+#
+# *Ground known*: an oracle knows the expected level of every cell, as that of the other models does, but no scatterers:
+# each frame has grain of its own, as after a motion of more than the grain's size. An intensity is exponential; its
+# score is the intensity over its mean, and scores of two cells covary as the squared coherence of their fields.
+#
+# Both are what the best weighted sum of the scores of single pixels can use. `ground` is optimistic in two ways:
+# speckle correlates as on even ground, though a dark cell beside a bright one shows that one's grain; and patches of
+# ``speckle_nu``, which belong to the grain, are not in it.
+
+
+SPECKLE_LAWS: dict[str, str] = {
+    "grain": "scatterers and ground are known: amplitudes in the receiver's noise, rounded to grey values",
+    "ground": "the expected level is known, the grain is new in each frame: intensities of speckle and noise",
+}
+
+GRAIN_PINGS, GROUND_PINGS = 2, 4
+"""Places at which each half of the derivatives is taken: bounds vary by 1 to 3 %."""
+
+GRAIN_STEP = 1 / 8
+"""Step of the grain's derivatives, as a part of a bin (forward) and of a beam (sideways, yaw): a tenth of the grain."""
+
+OTHER_RAYS: dict[str, Quality] = {"draft": "standard", "standard": "fine", "fine": "standard"}
+"""Quality of the rays of the other half."""
+
+AGREEING = 0.5
+"""Echoes on which two sets of rays disagree by a larger part are left out: sharp edges, thin tops of rocks. So are expected
+levels that vary by a larger part from ping to ping of moving rays."""
+
+GREYS = 255
+
+
+class SpeckleBounds:
+    """Bounds of one coherent sonar in one scene.
+
+    Args:
+        simulator: of the model ``coherent``.
+        gain: that of the frames.
+
+    Raises:
+        MitsonarError: another model.
+    """
+
+    def __init__(self, simulator: Simulator, gain: float) -> None:
+        if simulator.coherent is None:
+            raise MitsonarError(f"bounds of speckle are for the model coherent: got {simulator.sonar.model}")
+        self.sonar, self.gain = simulator.sonar, gain
+        self.imager = simulator.coherent
+        self.halves = self.imager, self.imager.of_quality(OTHER_RAYS[self.sonar.quality])
+        mirrors = simulator.mirrors if self.sonar.bounces > 1 else None  # one reflection has no expected level of a mirror
+        self.expected = Simulator(simulator.tracer.scene, expected_sonar(self.sonar), mirrors=mirrors)
+        noise, volume = self.imager.noise_powers()
+        self.noise = np.broadcast_to((noise + volume)[:, None], (self.sonar.range_bins, self.sonar.beams))
+        beams = self.imager.beam_correlations()
+        share = float(volume.sum()) / max(float((noise + volume).sum()), 1e-300)
+        bins = self.imager.bin_correlation().astype(float)
+        self.of_noise = CellCorrelation(bins, (1 - share) * beams[0] + share * beams[1])
+        self.of_speckle = CellCorrelation(bins, beams[2])
+
+    def at(self, poses: ArrayLike, *, pings: int | None = None) -> Iterator[dict[str, Bound]]:
+        """Bounds by law of :data:`SPECKLE_LAWS`, at each pose.
+
+        Args:
+            poses: of the sonar ``(n, 6)``.
+            pings: of each half of the derivatives; default: 2 for the grain, 4 for the ground.
+        """
+        for number, pose in enumerate(np.atleast_2d(np.asarray(poses, dtype=float))):
+            first = FIRST_PING + 32 * PINGS * number
+            yield {"grain": self.grain(pose, pings).bound(), "ground": self.ground(pose, pings, first).bound()}
+
+    def grain(self, pose: Floats, pings: int | None = None) -> CellScores:
+        """Return what cells tell of the motion where the scatterers are known.
+
+        Differences are those of the power of echoes, by two sets of rays.
+
+        Args:
+            pose: of the sonar ``(6,)``.
+            pings: see :meth:`at`.
+        """
+        step = np.array(step_for(self.sonar, GRAIN_STEP))
+        jacobian = np.stack([_power_slopes(imager, pose, step, pings or GRAIN_PINGS) for imager in self.halves])
+        echo, other = (imager.echoes(pose)[0].astype(np.complex128) for imager in self.halves)
+        level = np.abs(echo) ** 2 + self.noise
+        scale = self.gain * self.imager.gain.astype(float)[:, None]
+        slope = coding_slope(level * scale, self.sonar) * scale
+        use = (slope > 0) & (np.abs(echo - other) < AGREEING * np.abs(echo + other) / 2)
+        rounding = np.divide(1 / (12 * GREYS**2), slope**2, out=np.full_like(slope, np.inf), where=use)
+        return CellScores(jacobian, *grain_law(echo, self.noise, self.of_noise, rounding))
+
+    def ground(self, pose: Floats, pings: int | None = None, first: int = FIRST_PING) -> CellScores:
+        """Return what cells tell of the motion where the expected level is known.
+
+        Differences are those of the expected level, over level and noise.
+
+        Args:
+            pose: of the sonar ``(6,)``.
+            pings: see :meth:`at`.
+            first: number of the first ping, of which the rays' jitter is a function.
+        """
+        gain = 0.01 / float(next(self.expected.pings(pose[None], first=first)).levels.max())
+        (derivative,) = next(differentiate(self.expected, pose, gain, pings=pings or GROUND_PINGS, first=first))
+        level = derivative.level + self.noise * self.imager.gain[:, None] * gain
+        known = (level > 0) & (derivative.variance < (AGREEING * level) ** 2)
+        safe = np.where(known, level, 1)
+        echo = np.where(known, derivative.level, 0) / safe
+        other = np.where(known, 1 - echo, 0.0)
+        parts = [
+            (echo, self.of_speckle * self.of_speckle),
+            (np.sqrt(2 * echo * other), self.of_speckle * self.of_noise),
+            (other, self.of_noise * self.of_noise),
+        ]
+        jacobian = derivative.jacobian[..., 0, :] / safe[..., None]
+        return CellScores(jacobian, known.astype(float), ScoreCovariance.of(parts, level.shape))
+
+
+class CellScores(NamedTuple):
+    """What the cells of a frame tell of the motion.
+
+    Attributes:
+        jacobian: two independent estimates of how the cells' numbers change with the motion ``(2, bins, beams, 3)``.
+        weight: Fisher information of each cell about its number ``(bins, beams)``.
+        covariance: of the standardised scores.
+    """
+
+    jacobian: Floats
+    weight: Floats
+    covariance: ScoreCovariance
+
+    def bound(self) -> Bound:
+        """Compute the bound J1' W^1/2 C^-1 W^1/2 J2."""
+        return fisher_by(np.asarray(self.jacobian, dtype=float).reshape(2, -1, 1, 3), self._weigh)
+
+    def _weigh(self, values: Floats) -> Floats:
+        """Return W^1/2 C^-1 W^1/2 of values ``(cells, 1, 3)``."""
+        root = np.sqrt(self.weight)
+        maps = np.moveaxis(values.reshape(*root.shape, 3), 2, 0)
+        return np.moveaxis(root * self.covariance.solve(root * maps), 0, 2).reshape(-1, 1, 3)
+
+
+def grain_law(
+    echo: Complex, noise: Floats, shared: CellCorrelation, rounding: ArrayLike = 0.0
+) -> tuple[Floats, ScoreCovariance]:
+    """Compute what amplitudes tell about the power of an echo whose noiseless field is known.
+
+    Args:
+        echo: the noiseless field ``(bins, beams)``.
+        noise: mean power of the noise ``(bins, beams)``; all 0: only rounding is left.
+        shared: correlation of the noise of two cells.
+        rounding: variance of the power by rounding ``(bins, beams)``; inf where a pixel is not to be used.
+
+    Returns:
+        The information of each cell ``(bins, beams)`` and the covariance of their scores.
+
+    Raises:
+        MitsonarError: neither noise nor rounding.
+    """
+    power = np.abs(echo) ** 2
+    rounding = np.broadcast_to(np.asarray(rounding, dtype=float), power.shape)
+    if not (noise > 0).all():
+        if not (rounding > 0).all():
+            raise MitsonarError("without noise amplitudes tell the motion without limit: give the sonar noise_level_db")
+        return 1 / rounding, ScoreCovariance([], np.ones(power.shape))
+    variance = 1 / rician_information(power, noise)
+    total = variance + rounding
+    kept = np.sqrt(variance / total)  # part of the score's standard deviation that is not rounding
+    shares = score_shares(power, noise)
+    turn = np.exp(1j * np.angle(echo))
+    parts = [
+        (kept * shares.linear * turn, shared),
+        (kept * shares.power, shared * shared),
+        (kept * shares.double * turn**2, shared * shared),
+    ]
+    return 1 / total, ScoreCovariance.of(parts, power.shape)
+
+
+def expected_sonar(sonar: Sonar) -> Sonar:
+    """Return the sonar whose levels are the means of many coherent pings."""
+    patterns = {"pattern": sonar.beam_pattern, "elevation_pattern": sonar.vertical_pattern}
+    return sonar.replace(model="physical", quality="fine", **patterns)
+
+
+def _power_slopes(imager: CoherentImager, pose: Floats, step: Floats, pings: int) -> Floats:
+    """Return the derivative of the power of echoes by the motion ``(bins, beams, 3)``: mean over places within the step."""
+    within = evenly(pings) * step
+    slopes = np.zeros((imager.sonar.range_bins, imager.sonar.beams, 3))
+    for axis in range(3):
+        for motion in within:
+            for side in (1, -1):
+                moved = motion.copy()
+                moved[axis] = side * step[axis]
+                echo = imager.echoes(np.array(compose(Pose.from_row(pose), Motion(*moved))))[0]
+                slopes[..., axis] += side * (echo.real.astype(float) ** 2 + echo.imag.astype(float) ** 2)
+    return slopes / (2 * step * pings)

@@ -1,0 +1,584 @@
+"""The estimator ``cfar-gicp``: points by cell-averaging CFAR on the ground plane, registered by small_gicp."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import pickle
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError, explain_missing, meant
+from mitsonar.estimation.estimator import INPUTS, Estimate, Options, rejected, two_frames
+from mitsonar.estimation.image.phase import GroundView
+from mitsonar.geometry.ground import Attitude, attitude_of
+from mitsonar.motion.composition import Motion, MotionPrior
+from mitsonar.records.frames import SonarFrames
+
+__all__ = [
+    "CfarGicp",
+    "FourierMellin",
+    "GroundPair",
+    "HasEstimate",
+    "OwnEstimator",
+    "StackReg",
+    "checked_options",
+    "created",
+    "ground_pair",
+    "own_class",
+    "own_estimator",
+    "package",
+]
+
+
+GUARD, TRAINING = 4, 20
+"""Bins on either side of a cell that are left out, and to which the mean of its surroundings reaches beyond them."""
+
+SMOOTH = (3, 5)
+"""Beams and bins over which levels are averaged before detection, so that a point is an echo and no grain."""
+
+NEIGHBOURS_M, VOXEL_M = (0.3, 0.1), 0.01
+"""Largest distance of points that correspond, far then near, and edge of the cells in which points are joined [m]."""
+
+FEWEST = 30
+"""Fewest points of a frame that are registered."""
+
+
+@dataclass(frozen=True)
+class CfarGicp:
+    """Detections above the mean of their surroundings in range, as points of level ground.
+
+    Args:
+        threshold: level over the mean of the surroundings at which a cell is a detection.
+
+    Raises:
+        MitsonarError: small_gicp is not installed.
+    """
+
+    threshold: float = 1.5
+
+    consumes = SonarFrames
+    inputs = INPUTS
+    digest = ""
+
+    def __post_init__(self) -> None:
+        package("small_gicp")
+
+    def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion; a prior is where the registration begins.
+
+        Raises:
+            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+        """
+        images = two_frames(frames)
+        attitude = attitude_of(frames, "cfar-gicp", None, None)
+        clouds = [self._points(image, frames, attitude) for image in images]
+        if attitude.reason or min(len(cloud) for cloud in clouds) < FEWEST:
+            return rejected(attitude.reason or f"fewer than {FEWEST} detections")
+        to_first, settled = _to_first(Motion(0.0, 0.0, 0.0) if prior is None else prior.motion), False
+        for distance in NEIGHBOURS_M:
+            found = package("small_gicp").align(
+                *clouds,
+                init_T_target_source=to_first,
+                downsampling_resolution=VOXEL_M,
+                max_correspondence_distance=distance,
+                max_iterations=50,
+                rotation_epsilon=1e-5,
+                translation_epsilon=1e-5,
+            )
+            to_first, settled = found.T_target_source, bool(found.converged)
+        return Estimate(_motion_of(to_first)) if settled else rejected("the registration does not converge")
+
+    def _points(self, image: NDArray[np.float32], frames: SonarFrames, attitude: Attitude) -> NDArray[np.float64]:
+        """Return detections as points ``(n, 3)`` [m]: starboard, forward, 0."""
+        level = cv2.blur(image, SMOOTH)
+        wide, narrow = (2 * (GUARD + TRAINING) + 1, 2 * GUARD + 1)
+        sums = [count * cv2.blur(image, (1, count)) for count in (wide, narrow)]
+        around = (sums[0] - sums[1]) / (wide - narrow)
+        summit = level >= cv2.dilate(level, np.ones((3, 3), np.uint8))
+        points = attitude.ground(frames).points[summit & (level > self.threshold * around)]
+        points = points[np.isfinite(points).all(axis=1)]
+        return np.column_stack([points, np.zeros(len(points))])
+
+
+def _to_first(motion: Motion) -> NDArray[np.float64]:
+    """Return the matrix ``(4, 4)`` that takes points of the second frame to the first, after a motion (eq. 3.4)."""
+    cos, sin = np.cos(motion.yaw), np.sin(motion.yaw)
+    matrix = np.eye(4)
+    matrix[:2, :2] = [[cos, sin], [-sin, cos]]
+    matrix[:2, 3] = matrix[:2, :2] @ [motion.sideways, motion.forward]
+    return matrix
+
+
+def _motion_of(to_first: NDArray[np.float64]) -> Motion:
+    """Return the motion of a matrix, the inverse of :func:`_to_first`."""
+    yaw = float(np.arctan2(to_first[0, 1], to_first[0, 0]))
+    sideways, forward = to_first[:2, :2].T @ to_first[:2, 3]
+    return Motion(float(sideways), float(forward), yaw)
+
+
+# ---------------- The estimator ``fourier-mellin``: log-polar spectra and phase correlation by the package fourier-mellin
+
+
+INSTALL = "pip install --no-deps fourier-mellin (its dependency opencv-python would replace opencv-python-headless)"
+
+
+@dataclass(frozen=True)
+class FourierMellin:
+    """Rotation, scale and translation of the frames as seen from above; the scale is dropped.
+
+    The package takes squares, and is misled by borders: the pictures fall to 0 there, within a square of twice their edge.
+
+    Raises:
+        MitsonarError: fourier-mellin is not installed.
+    """
+
+    consumes = SonarFrames
+    inputs = INPUTS
+    digest = ""
+
+    def __post_init__(self) -> None:
+        package("fourier_mellin", INSTALL)
+
+    def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion; the prior is not used.
+
+        Raises:
+            MitsonarError: as :func:`mitsonar.estimation.external.ground_pair` does.
+        """
+        pair = ground_pair(frames, "fourier-mellin")
+        if pair.reason:
+            return rejected(pair.reason)
+        square, corner = _square(pair.first.shape)
+        images = [np.pad(_tapered(image), square) for image in (pair.first, pair.second)]
+        found = package("fourier_mellin", INSTALL).FourierMellin(images[0]).register_image(images[1])
+        middle = (len(images[0]) - 1) / 2
+        warp = np.array(cv2.getRotationMatrix2D((middle, middle), found.rotation, 1.0), dtype=float)
+        warp[:, 2] += found.x, -found.y  # it counts rows upwards
+        warp[:, 2] += warp[:, :2] @ np.array(corner) - np.array(corner)
+        return pair.estimate(warp)
+
+
+def _square(shape: tuple[int, ...]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+    """Return by how much a picture is padded before and after, rows then columns, and the column and row of its corner."""
+    edge = 2 * max(shape)
+    before = [(edge - size) // 2 for size in shape]
+    around = [(first, edge - size - first) for first, size in zip(before, shape, strict=True)]
+    return around, (before[1], before[0])
+
+
+def _tapered(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a picture less its mean, that falls to 0 at its border."""
+    window = cv2.createHanningWindow(image.shape[::-1], cv2.CV_32F)
+    return np.asarray((image - image.mean()) * window, dtype=np.float32)
+
+
+# ---------------- Two frames as pictures of the ground without a border, for packages that register pictures and know
+# no mask
+
+
+Picture = NDArray[np.float32]
+
+PIXEL = 0.5
+"""Edge of a pixel, in distances of neighbouring beams at the middle of the window."""
+
+SMALLEST = 32
+"""Rows and columns that a picture must have to be registered."""
+
+
+@dataclass(frozen=True)
+class GroundPair:
+    """Two frames seen from above, cut to a rectangle that the fan fills.
+
+    Attributes:
+        first: picture of the first frame ``(rows, columns)``, row 0 farthest forward; empty where nothing is left.
+        second: of the second.
+        view: the pictures are a part of it.
+        corner: column and row in the view of pixel (0, 0).
+        reason: why the pair cannot be registered; empty where it can.
+    """
+
+    first: Picture
+    second: Picture
+    view: GroundView
+    corner: tuple[int, int]
+    reason: str
+
+    def motion(self, warp: NDArray[np.floating]) -> Motion:
+        """Return the motion of the warp ``(2, 3)`` that takes pixels (column, row) of the first picture to the second."""
+        whole = np.array(warp, dtype=float)
+        whole[:, 2] += np.array(self.corner) - whole[:, :2] @ np.array(self.corner)
+        return self.view.motion(whole)
+
+    def estimate(self, warp: NDArray[np.floating]) -> Estimate:
+        """Return the estimate of such a warp; reject one that takes the pictures half apart."""
+        rows, columns = self.first.shape
+        corners = np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]], dtype=float)
+        moved = np.abs(corners @ warp[:, :2].T + warp[:, 2] - corners)
+        if not (moved < np.array([columns, rows]) / 2).all():
+            return rejected("the pictures as registered do not overlap by half")
+        return Estimate(self.motion(warp))
+
+
+def ground_pair(frames: SonarFrames, name: str) -> GroundPair:
+    """Draw two frames as pictures of level ground.
+
+    Args:
+        frames: two of them.
+        name: of the estimator, for errors.
+
+    Raises:
+        MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+    """
+    images = two_frames(frames)
+    attitude = attitude_of(frames, name, None, None)
+    spacing = float(np.ptp(frames.bearing_rad)) / (len(frames.bearing_rad) - 1)
+    view = GroundView(frames, attitude, PIXEL * spacing * float(frames.range_m[0] + frames.range_m[-1]) / 2)
+    rows, columns = _filled_rectangle(view.inside)
+    first, second = (np.ascontiguousarray(view.draw(image, k)[rows, columns]) for k, image in enumerate(images))
+    small = "" if min(first.shape) >= SMALLEST else "the fan meets too little ground"
+    blank = "" if small or (np.ptp(first) > 0 and np.ptp(second) > 0) else "nothing in the frames to match"
+    return GroundPair(first, second, view, (columns.start, rows.start), attitude.reason or small or blank)
+
+
+def _filled_rectangle(inside: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return rows and columns of the largest rectangle about the middle column that lies inside; empty where none does."""
+    best, area = (slice(0, 0), slice(0, 0)), 0
+    middle = inside.shape[1] // 2
+    for half in range(1, middle + 1):
+        columns = slice(middle - half, middle + half)
+        whole = np.concatenate([[False], inside[:, columns].all(axis=1), [False]])
+        edges = np.flatnonzero(np.diff(whole.astype(np.int8)))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            if (stop - start) * 2 * half > area:
+                best, area = (slice(int(start), int(stop)), columns), (stop - start) * 2 * half
+    return best
+
+
+def package(name: str, install: str = "") -> ModuleType:
+    """Import a package that mitsonar does not need.
+
+    Args:
+        name: of the module.
+        install: how to install it, where no extra of mitsonar does.
+
+    Raises:
+        MitsonarError: it is not installed; the sentence says what to do.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if install and error.name == name:
+            raise MitsonarError(f"this estimator needs {name}, which is not installed: {install}") from None
+        raise explain_missing(error) from None
+
+
+# ---------------- Anybody's method as an estimator: an object with ``estimate(frames)``, a class of such objects, or
+# a network of torch
+
+
+AnyObject = Any
+"""An instance of somebody's class, or the class."""
+
+PATH = re.compile(r"([A-Za-z_][\w.]*:[A-Za-z_]\w*)((?::.*)?)", flags=re.DOTALL)
+
+
+class HasEstimate(Protocol):
+    """An object with the method ``estimate(frames)``, or ``estimate(frames, prior)``."""
+
+    @property
+    def estimate(self) -> Callable[..., Estimate]:
+        """Return the method."""
+
+
+@dataclass(init=False, eq=False)
+class OwnEstimator:
+    """An estimator that is an object of the user's own.
+
+    Args:
+        path: its name in messages and files: ``my_module:MyEstimator``, or that of its class.
+        made: the object. ``estimate`` takes records, and a ``prior`` if it has an argument of that name. Attributes
+            ``consumes``, ``inputs`` and ``digest`` count where it has them, as in
+            :class:`~mitsonar.estimation.estimator.Estimator`; otherwise it consumes ``SonarFrames``.
+        again: makes the object in another process, where it need not be picklable.
+
+    Raises:
+        MitsonarError: an object without a method ``estimate`` that takes records only, or records and a prior.
+    """
+
+    path: str
+
+    def __init__(self, path: str, made: AnyObject, again: _FromText | None = None) -> None:
+        self.path, self._made, self._again = path, made, again
+        consumes = getattr(made, "consumes", SonarFrames)
+        if not isinstance(consumes, type):
+            raise MitsonarError(f"{path}: consumes must be a class such as mitsonar.SonarFrames: got {consumes!r}")
+        self.consumes: type = consumes
+        self.inputs = str(getattr(made, "inputs", "its own"))
+        self.digest = str(getattr(made, "digest", ""))
+        try:
+            estimate = made.estimate
+        except AttributeError:
+            raise MitsonarError(f"{path} has no method estimate(frames), which returns an Estimate") from None
+        if not callable(estimate):
+            raise MitsonarError(f"{path}: estimate must be a method that takes two frames")
+        self._takes_prior = _takes_prior(path, estimate)
+
+    def __reduce__(self) -> tuple[Callable[..., OwnEstimator], tuple[object, ...]]:
+        """Return what another process makes it of."""
+        if self._again is not None:
+            return self._again, ()
+        try:
+            return _unpickled, (self.path, pickle.dumps(self._made))
+        except Exception as error:
+            raise MitsonarError(
+                f"{self.path} cannot be sent to another process ({_words_of(error)}): use one worker, or name it as "
+                "my_module:MyEstimator"
+            ) from error
+
+    def estimate(self, records: AnyObject, /, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion by the object, which gets the prior where it takes one.
+
+        Raises:
+            MitsonarError: it raises an error, or returns no :class:`~mitsonar.estimation.estimator.Estimate`.
+        """
+        try:
+            found = self._made.estimate(records, **({"prior": prior} if self._takes_prior else {}))
+        except MitsonarError:
+            raise
+        except Exception as error:
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{os.path.basename(last.filename)}, line {last.lineno}"
+            raise MitsonarError(f"{self.path}: estimate raises {_words_of(error)} at {where}") from error
+        try:
+            motion = Motion(*(float(value) for value in found.motion))
+            covariance = None if found.covariance is None else self._covariance(found.covariance)
+            return Estimate(motion, covariance, bool(found.valid), str(found.reason), found.about)
+        except (AttributeError, TypeError):
+            raise MitsonarError(f"{self.path}: estimate must return an Estimate: got {type(found).__name__}") from None
+
+    def _covariance(self, given: AnyObject) -> NDArray[np.float64]:
+        """Return a covariance as an array of 3 x 3."""
+        covariance = np.asarray(given, dtype=np.float64)
+        if covariance.shape != (3, 3):
+            raise MitsonarError(f"{self.path}: the covariance of an Estimate must be 3 x 3 or None: got {covariance.shape}")
+        return covariance
+
+
+def own_estimator(made: AnyObject, options: Options, again: _FromText | None = None, name: str = "") -> OwnEstimator:
+    """Return an object of the user's own, or a network of torch, as an estimator.
+
+    Args:
+        made: the object.
+        options: only a network takes one: see :class:`~mitsonar.estimation.learned.OwnNetwork`.
+        again: makes it in another process.
+        name: in messages; default: that of its class.
+
+    Raises:
+        MitsonarError: an object that is none of both, or options that it does not take.
+    """
+    name = name or type(made).__name__
+    if not hasattr(made, "estimate") and _is_network(made):
+        from mitsonar.estimation.learned import OwnNetwork
+
+        return OwnEstimator(name, OwnNetwork(made, **checked_options(name, options, OwnNetwork, but=1)), again)
+    if options:
+        raise MitsonarError(f"{name} is made already and takes no options: got {', '.join(options)}; give its class")
+    return OwnEstimator(name, made, again)
+
+
+def own_class(text: str, options: Options) -> OwnEstimator | None:
+    """Return the estimator that a text names: ``my_module:MyEstimator``, with ``:key=value`` or not.
+
+    The module lies in the current folder or is installed. Values are numbers, true, false, or texts.
+
+    Returns:
+        The estimator; None where the text is not of that form.
+
+    Raises:
+        MitsonarError: no such module or class, one without ``estimate``, one that cannot be imported or created, an option
+            that it does not take.
+    """
+    found = PATH.fullmatch(text)
+    if found is None:
+        return None
+    values = dict(options)
+    for word in found[2].split(":")[1:]:
+        key, equals, value = word.partition("=")
+        if not (key and equals):
+            raise MitsonarError(f"a class is my_module:MyEstimator or my_module:MyEstimator:key=value: got {text!r}")
+        values[key] = _value(value)
+    return _FromText(found[1], os.getcwd(), values)()
+
+
+def checked_options(name: str, options: Options, made: Callable[..., object], but: int = 0) -> Options:
+    """Return the options after a check of their names.
+
+    Args:
+        name: of the estimator, for the message.
+        options: by name.
+        made: what takes them.
+        but: how many of its first arguments are no options.
+
+    Raises:
+        MitsonarError: an option that it does not take.
+    """
+    try:
+        parameters = list(inspect.signature(made).parameters.values())[but:]
+    except (TypeError, ValueError):  # made in C, without a signature
+        return options
+    if any(one.kind is one.VAR_KEYWORD for one in parameters):
+        return options
+    known = [one.name for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
+    for key in options:
+        if key not in known:
+            raise MitsonarError(f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}{meant(key, known)}")
+    return options
+
+
+@dataclass(frozen=True)
+class _FromText:
+    """Makes the estimator that a text names, here and in other processes.
+
+    Attributes:
+        path: ``my_module:MyEstimator``.
+        folder: where its module may lie.
+        options: of the class.
+    """
+
+    path: str
+    folder: str
+    options: Options
+
+    def __call__(self) -> OwnEstimator:
+        module, _, name = self.path.partition(":")
+        with _importable(self.folder):
+            found = vars(self._imported(module)).get(name)
+            if found is None:
+                raise MitsonarError(f"{self.path}: {module} has no {name}: give the name of a class in it")
+            made = created(found, self.options, self.path) if callable(found) and not _is_network(found) else found
+        words = [self.path, *(f"{key}={value}" for key, value in self.options.items())]
+        return own_estimator(made, {}, self, ":".join(words))
+
+    def _imported(self, module: str) -> ModuleType:
+        """Return the module of that name."""
+        try:
+            return importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            where = f"needs {error.name}, which is not installed" if error.name != module else "is no module here"
+            raise MitsonarError(f"{self.path}: {module} {where}: start in its folder, or install it") from None
+        except Exception as error:
+            raise MitsonarError(f"{self.path}: {module} raises {_words_of(error)} when it is imported") from error
+
+
+def created(found: Callable[..., object], options: Options, name: str) -> AnyObject:
+    """Return an instance of a class of the user's own.
+
+    Raises:
+        MitsonarError: it cannot be created of these options.
+    """
+    checked_options(name, options, found)
+    words = ", ".join(f"{key}={value!r}" for key, value in options.items())
+    try:
+        return found(**options)
+    except Exception as error:
+        needs = "" if options else ": it must need no arguments, or give them as options"
+        raise MitsonarError(f"{name}: {name.rpartition(':')[2]}({words}) raises {_words_of(error)}{needs}") from error
+
+
+def _unpickled(path: str, content: bytes) -> OwnEstimator:
+    return OwnEstimator(path, pickle.loads(content))
+
+
+def _is_network(made: AnyObject) -> bool:
+    """Return whether it is a network of torch, which is not loaded for that: whoever has a network has loaded it."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(made, torch.nn.Module)
+
+
+def _takes_prior(path: str, estimate: Callable[..., object]) -> bool:
+    """Return whether a method ``estimate`` has an argument ``prior``.
+
+    Raises:
+        MitsonarError: it needs others.
+    """
+    try:
+        signature = inspect.signature(estimate)
+    except (TypeError, ValueError):
+        return False
+    takes = "prior" in signature.parameters
+    try:
+        signature.bind(None, **({"prior": None} if takes else {}))
+    except TypeError:
+        raise MitsonarError(
+            f"{path}: estimate{signature} must take the frames alone, or the frames and an argument prior"
+        ) from None
+    return takes
+
+
+def _value(text: str) -> bool | int | float | str:
+    """Return the value that a word of the command line stands for."""
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
+@contextmanager
+def _importable(folder: str) -> Iterator[None]:
+    """Let modules of a folder be imported."""
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        with suppress(ValueError):  # a module may have changed the search path itself
+            sys.path.remove(folder)
+
+
+def _words_of(error: Exception) -> str:
+    return f"{type(error).__name__} ({error})"
+
+
+# ---------------- The estimator ``stackreg``: rigid registration of pictures by pystackreg (Thevenaz, Ruttimann and
+# Unser, 1998)
+
+
+@dataclass(frozen=True)
+class StackReg:
+    """Least squares over a pyramid of the frames as seen from above.
+
+    Raises:
+        MitsonarError: pystackreg is not installed.
+    """
+
+    consumes = SonarFrames
+    inputs = INPUTS
+    digest = ""
+
+    def __post_init__(self) -> None:
+        package("pystackreg")
+
+    def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion; the prior is not used.
+
+        Raises:
+            MitsonarError: as :func:`mitsonar.estimation.external.ground_pair` does.
+        """
+        pair = ground_pair(frames, "stackreg")
+        if pair.reason:
+            return rejected(pair.reason)
+        registration = package("pystackreg").StackReg(package("pystackreg").StackReg.RIGID_BODY)
+        return pair.estimate(registration.register(pair.first, pair.second)[:2])

@@ -1,1 +1,0 @@
-"""Methods of other packages, and of anybody, as estimators."""

@@ -1,1 +1,0 @@
-"""Estimators of the height over the ground."""

@@ -1,0 +1,805 @@
+"""Gauss-Newton between two frames in polar coordinates: the steps of ``direct``, coarse to fine, and what they are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property, lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+
+from mitsonar.estimation.estimator import UNMEASURED, Excess, ambiguity, correlation_excess, correlation_of, spread_of
+from mitsonar.geometry.ground import Attitude, GroundGeometry, margin_of_light, moved, nearest_known
+from mitsonar.motion.composition import Motion, inverse
+from mitsonar.records.frames import SonarFrames
+
+__all__ = [
+    "FAINTEST",
+    "FEWEST_CELLS",
+    "NODES",
+    "Cells",
+    "DirectLevel",
+    "Fit",
+    "GroundNodes",
+    "Held",
+    "alike_cells",
+    "blurred",
+    "by_block",
+    "cauchy",
+    "cell_blocks",
+    "central_differences",
+    "is_resolved",
+    "node_axes",
+    "noise_of",
+    "on_cells",
+    "products_by_block",
+    "register",
+    "sampled",
+    "slopes_of",
+    "smoothed",
+]
+
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+
+STILL = np.array([3e-5, 3e-5, 6e-6])
+"""Steps below which an iteration ends [m, m, rad]."""
+
+CAUCHY = 3.0
+"""Residuals of so many standard deviations have half the weight."""
+
+TOGETHER = (3, 2)
+"""Patches within which residuals belong together: rocks and their shadows."""
+
+AROUND = (3, 3)
+"""Patches along beams and bins around each that are looked at as a block."""
+
+BLOCK_CAUCHY = 4.0
+"""Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
+
+NEGLIGIBLE = 0.1
+"""Standard deviations of the estimate below which a step left over is lost in the noise."""
+
+ASIDE = 8
+"""Beams by which one frame is displaced to see how much the match stands out."""
+
+COARSE = 10.0
+"""How many times larger steps end the iteration of a level that another follows."""
+
+REMEMBERED = 4
+LEVER_M = 4.0
+LONGEST = 4.0
+NEAR_M = 0.002
+"""Steps that are remembered for the next; metres that a turn is worth; how many times longer a step may get; how short it
+must be before."""
+
+FEWEST_CELLS = 500
+"""Fewest cells that are registered."""
+
+FEWEST_ROWS = 24
+"""Fewest rows of a level that is not the last."""
+
+SAMPLED = (5, 3)
+"""The noise is measured in every so manieth bin and beam."""
+
+
+class Fit(NamedTuple):
+    """The quality of a motion: covariance from the residuals, derivatives, correlation, sizes.
+
+    ``by_height`` is the derivative by the height ``(3,)``, ``by_lean`` that by how far height, pitch and roll of the second
+    frame exceed those of the first ``(3, 3)``; their signs do not matter to a covariance. ``excess`` is how much the
+    correlation exceeds that of displaced frames.
+    """
+
+    converged: bool
+    covariance: Doubles
+    by_height: Doubles
+    by_lean: Doubles
+    correlation: float
+    independent: float
+    blocks: float
+    excess: Excess = UNMEASURED
+
+
+class Held(NamedTuple):
+    """What is known of the unknowns before: mean and standard deviation of each [m, m, rad, m]; infinite: nothing."""
+
+    mean: Doubles
+    std: Doubles
+
+    def weight(self, scale: float, level: DirectLevel) -> Doubles:
+        """Return the prior weight of each unknown in units of the residuals' noise."""
+        return np.asarray(alike_cells(level) * scale**2 / self.std**2)
+
+
+def register(
+    pair: tuple[Floats, Floats],
+    cells: Cells,
+    start: Doubles,
+    level: DirectLevel,
+    *,
+    last: bool,
+    held: Held,
+) -> tuple[Doubles, Fit | None] | None:
+    """Run Gauss-Newton from a start; None where there is nothing to match.
+
+    Args:
+        pair: both frames at this level, smoothed.
+        cells: of this level.
+        start: sideways, forward [m], yaw [rad], and heave [m] where it is unknown ``(3,)`` or ``(4,)``.
+        level: smoothing and iterations.
+        last: whether it is the finest level: both ways are drawn, and the fit is assessed.
+        held: what is known of the unknowns before.
+
+    Returns:
+        The motion, and its fit at the finest level.
+    """
+    v, accelerate, converged = start.copy(), _AndersonAcceleration(), False
+    still = STILL if last else COARSE * STILL
+    at, margins = None, np.zeros((2, 2))
+    for _ in range(level.iterations):
+        at = _linearised(*pair, cells, v, level, margins, last=last)
+        if at is None:
+            return None
+        weight = held.weight(at.scale, level)
+        pull = at.pull + weight * (v - held.mean)
+        step = np.asarray(-np.linalg.solve(at.normal + np.diag(weight), pull), dtype=np.float64)
+        v = np.add(v, accelerate(v, step))
+        converged = bool((np.abs(step[:3]) < still).all())
+        if converged:
+            break
+    if not last or at is None:
+        return v, None
+    fit = _fit(at, cells, v, level, held.weight(at.scale, level), converged)
+    return v, fit if converged else fit._replace(converged=_is_small(step[:3], fit.covariance[:3, :3]))
+
+
+def _is_small(step: Doubles, covariance: Doubles) -> bool:
+    """Return whether a step is lost in the noise of the estimate ``(3, 3)``, however long it is."""
+    return bool(step @ np.linalg.lstsq(covariance, step, rcond=None)[0] < NEGLIGIBLE**2)
+
+
+class _Side(NamedTuple):
+    """One frame drawn at the cells of the other: residual, weights, and sums over patches.
+
+    ``weight`` is that of single cells, 0 where they do not count ``(bins, beams)``; ``along`` and ``across`` are it times
+    the slopes along bins and beams; ``patches`` is that of each patch ``(patches,)``; ``slopes`` and ``pull`` are sums of
+    both weights times slope by slope, and times slope by residual: along bins, of both, along beams ``(3, patches)``; along
+    bins, beams ``(2, patches)``.
+    """
+
+    before: Floats
+    after: Floats
+    inner: tuple[slice, slice]
+    weight: Floats
+    along: Floats
+    across: Floats
+    patches: Doubles
+    slopes: Doubles
+    pull: Doubles
+
+
+class _Linearisation(NamedTuple):
+    """Both sides at one motion, the noise of their differences, and the normal equations."""
+
+    sides: list[_Side]
+    scale: float
+    normal: Doubles
+    pull: Doubles
+
+
+def _linearised(
+    first: Floats, second: Floats, cells: Cells, v: Doubles, level: DirectLevel, margins: Doubles, *, last: bool
+) -> _Linearisation | None:
+    """Draw the second frame at the cells of the first, at the last level also the reverse; None where too little remains.
+
+    ``margins`` of both ways ``(2, 2)`` grow in place.
+    """
+    pairs = []
+    for back in (False, True) if last else (False,):
+        there = cells.shift(v, back=back)
+        inner = _inner(there, cells.usable, margins[int(back)])
+        if inner is None:
+            return None
+        drawn = sampled(first if back else second, cells.row + there[0], cells.column + there[1])
+        pairs.append((drawn, second, inner) if back else (first, drawn, inner))
+    residuals = [after - before for before, after, _ in pairs]
+    counted = residuals[0][pairs[0][2]]
+    if counted.size < FEWEST_CELLS:
+        return None
+    scale = noise_of(counted[:: SAMPLED[0], :: SAMPLED[1]].ravel())
+    sides = [_side(*pair, residual, cells, level, scale, last=last) for pair, residual in zip(pairs, residuals, strict=True)]
+    normal = np.sum([_by_motion(cells.derivative, side.slopes) for side in sides], axis=0)
+    pull = np.sum([_flat(cells.derivative) @ side.pull.ravel() for side in sides], axis=0)
+    return None if _singular(normal) else _Linearisation(sides, scale, normal, pull)
+
+
+def noise_of(residual: Floats) -> float:
+    """Return the standard deviation of most residuals ``(cells,)``, by their median."""
+    return max(1.4826 * median_of(np.abs(residual)), FAINTEST)
+
+
+def median_of(values: NDArray[np.floating]) -> float:
+    """Return the median ``(n,)``, of an even number the upper one: without the checks of ``np.median``."""
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
+
+
+def _side(
+    before: Floats,
+    after: Floats,
+    inner: tuple[slice, slice],
+    residual: Floats,
+    cells: Cells,
+    level: DirectLevel,
+    scale: float,
+    *,
+    last: bool,
+) -> _Side:
+    """Weigh cells, and at the last level blocks; sum over patches."""
+    along, across = slopes_of((before + after) * np.float32(0.5), level, scale)
+    weight = np.zeros_like(residual)
+    weight[inner] = cauchy(residual[inner], scale)
+    if cells.seen is not None:
+        weight *= cells.seen
+    bins, beams = weight * along, weight * across
+    products = (bins, along), (bins, across), (beams, across), (bins, residual), (beams, residual)
+    sums = products_by_block(products, cells.patch)
+    patches = _patch_weight(sums.reshape(5, *cells.patches)) if last else np.ones(sums.shape[1])
+    sums *= patches
+    return _Side(before, after, inner, weight, bins, beams, patches, sums[:3], sums[3:])
+
+
+def cauchy(residual: Floats, scale: float) -> Floats:
+    """Return weights of residuals whose noise has this standard deviation."""
+    ratio = residual * np.float32(1 / (CAUCHY * scale))
+    ratio *= ratio
+    ratio += 1
+    return np.asarray(np.reciprocal(ratio, out=ratio))
+
+
+def alike_cells(level: DirectLevel) -> float:
+    """Return how many cells count once: smoothed noise is alike in neighbours, as far as a smoothing kernel covers."""
+    return float(4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28))
+
+
+def _by_motion(derivative: Doubles, slopes: Doubles) -> Doubles:
+    """Return how the pull changes with the motion ``(unknowns, unknowns)``, from sums of slopes by slopes."""
+    return np.asarray(_flat(_information(derivative, slopes)) @ _flat(derivative).T)
+
+
+def _flat(values: Doubles) -> Doubles:
+    """Return values ``(n, 2 * patches)`` of ``(n, 2, patches)``."""
+    return np.reshape(values, (len(values), -1))
+
+
+def _information(derivative: Doubles, slopes: Doubles) -> Doubles:
+    """Return derivatives ``(n, 2, patches)`` times sums of slopes by slopes: along bins, of both, along beams."""
+    return np.asarray(derivative * slopes[::2] + derivative[:, ::-1] * slopes[1])
+
+
+def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held: Doubles, converged: bool) -> Fit:
+    """Assess the motion from slopes of one frame times those of the other, and from the pulls of blocks.
+
+    These hold whatever errs together within a block: noise, speckle, relief, in both ways of drawing at once.
+    """
+    informed = _information(cells.derivative, np.sum([_cross(side, cells, level) for side in at.sides], axis=0))
+    true = _flat(informed) @ _flat(cells.derivative).T
+    # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
+    sound = true if np.linalg.eigvalsh(true)[0] > 0 else (at.normal + at.normal.T) / 2
+    undone = np.linalg.inv(sound + np.diag(held))
+    each = _without_each(sound + np.diag(held), informed, at, cells)
+    # what is known before errs, too: where the frames tell nothing it is all that is known
+    known = undone * (alike_cells(level) * at.scale**2 * held) @ undone.T
+    side = at.sides[0]
+    both = [_information(cells.derivative, one.slopes) for one in at.sides]
+    shares = _together((np.tensordot(undone, both[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
+    by_height, by_lean = (
+        undone @ np.sum([_flat(one) @ _flat(shift).T for one in both], axis=0)
+        for shift in (cells.lifted_shift(v)[None], cells.leaning_shift(v))
+    )
+    before, after = side.before[side.inner], side.after[side.inner]
+    independent, excess = before.size / alike_cells(level), _excess(side, cells)
+    return Fit(
+        converged=converged,
+        covariance=ambiguity(excess.mean, independent) * (each @ each.T + (known + known.T) / 2),
+        by_height=by_height[:, 0],
+        by_lean=by_lean,
+        correlation=correlation_of(before, after),
+        independent=independent,
+        blocks=spread_of(shares),
+        excess=excess,
+    )
+
+
+def _without_each(whole: Doubles, informed: Doubles, at: _Linearisation, cells: Cells) -> Doubles:
+    """Return by how much the motion would change without each of the blocks ``(n, blocks)``: the jackknife.
+
+    Blocks that hold much of the information pull little, since the motion follows them.
+    """
+    pulls = np.sum([(cells.derivative * side.pull).sum(axis=1) for side in at.sides], axis=0)
+    parts = np.einsum("ikp,jkp->ijp", informed, cells.derivative)
+    left = whole - np.moveaxis(_together((parts + np.swapaxes(parts, 0, 1)) / 2, cells), -1, 0)
+    change = np.linalg.solve(left, np.moveaxis(_together(pulls, cells), -1, 0)[..., None])
+    return np.asarray(change[..., 0].T)
+
+
+def _excess(side: _Side, cells: Cells) -> Excess:
+    """Return by how much the frames correlate more than displaced across the beams."""
+    before, after = side.before[side.inner], side.after[side.inner]
+    inside = np.ones(before.shape, dtype=bool) if cells.seen is None else cells.seen[side.inner] > 0
+    return correlation_excess(before, after, inside, ASIDE)
+
+
+def is_resolved(bins: int, level: DirectLevel) -> bool:
+    """Return whether frames of so many bins leave a level enough rows."""
+    return bins >= FEWEST_ROWS * level.step
+
+
+def smoothed(image: Floats, level: DirectLevel) -> Floats:
+    """Every so many bins of the smoothed image."""
+    bins, beams = level.smoothing
+    if level.step == 1:
+        return blurred(image, bins, beams)
+    return blurred(_smoothed_rows(len(image), bins, level.step) @ image, 0, beams)
+
+
+@lru_cache(maxsize=16)
+def _smoothed_rows(bins: int, sigma: float, step: int) -> Floats:
+    """Return the weights of bins in every so manieth bin, smoothed ``(rows, bins)``: only those are computed."""
+    return np.ascontiguousarray(blurred(np.eye(bins, dtype=np.float32), sigma, 0)[step // 2 :: step])
+
+
+class _AndersonAcceleration:
+    """Anderson acceleration (1965): noise in the slopes shortens steps; the last steps show by how much."""
+
+    def __init__(self) -> None:
+        self.places: list[Doubles] = []
+        self.steps: list[Doubles] = []
+
+    def __call__(self, place: Doubles, step: Doubles) -> Doubles:
+        """Return an accelerated step; the given one where the last steps do not suffice."""
+        lever = np.array([1, 1, LEVER_M, 1])[: len(step), None]
+        if np.linalg.norm(lever[:, 0] * step) > NEAR_M:  # too far for the last steps to tell much
+            return step
+        self.places.append(place)
+        self.steps.append(step)
+        if len(self.steps) < 2:
+            return step
+        places, steps = (np.diff(np.array(values[-REMEMBERED:]), axis=0).T for values in (self.places, self.steps))
+        past, *_ = np.linalg.lstsq(lever * steps, lever[:, 0] * step, rcond=1e-3)
+        accelerated = np.asarray(step - (places + steps) @ past)
+        lengths = [float(np.linalg.norm(lever[:, 0] * one)) for one in (accelerated, step)]
+        return accelerated if lengths[0] < LONGEST * lengths[1] else step
+
+
+def _inner(there: Floats, usable: slice, least: Doubles) -> tuple[slice, slice] | None:
+    """Return the cells that meet the ground and stay within both images; None where none does.
+
+    ``least`` are the margins so far ``(2,)``, which grow in place: cells that came and went would keep it from settling.
+    """
+    _, bins, beams = there.shape
+    reach = np.array([max(one.max(), -one.min()) for one in there])
+    if not np.isfinite(reach).all():
+        return None
+    least[:] = np.maximum(least, np.ceil(reach) + 1)
+    margin = [int(far) for far in least]
+    start = max(margin[0], usable.start)
+    if not (start + margin[0] < bins and 2 * margin[1] < beams):
+        return None
+    return slice(start, bins - margin[0]), slice(margin[1], beams - margin[1])
+
+
+def _singular(normal: Doubles) -> bool:
+    """Return whether some motion changes nothing."""
+    size = np.sqrt(np.diag(normal))
+    if not (size > 0).all():
+        return True
+    stretch = np.linalg.eigvalsh(normal / np.outer(size, size))
+    return bool(stretch[-1] > 1e8 * stretch[0])
+
+
+def _cross(side: _Side, cells: Cells, level: DirectLevel) -> Doubles:
+    """Return how the pull changes with the slopes ``(3, patches)``, from slopes of one frame times slopes of the other,
+    whose noise is independent.
+
+    Outliers, whose weight falls as they grow, count with the derivative of weight times residual, which is negative: a
+    motion that the weights hold is known less well than the sum of the weights says.
+    """
+    curvature = side.weight * (2 * side.weight - 1)
+    (along, across), others = (central_differences(blurred(image, *level.slopes)) for image in (side.before, side.after))
+    bins, beams = along * curvature, across * curvature
+    products = (bins, others[0]), (bins, others[1]), (beams, others[0]), (beams, others[1])
+    along_both, one, other, across_both = products_by_block(products, cells.patch)
+    return np.stack([along_both, (one + other) / 2, across_both]) * side.patches
+
+
+def _patch_weight(sums: Doubles) -> Doubles:
+    """Return weights of patches ``(patches,)``: one whose surroundings move on their own shows relief, or a shadow.
+
+    The measure is the decrease of their squared differences by their own best shift (Lucas and Kanade, 1981). ``sums``: of
+    slopes by slopes and by residuals ``(5, rows, columns)``.
+    """
+    around = np.array([cv2.boxFilter(one, -1, AROUND, normalize=False, borderType=cv2.BORDER_CONSTANT) for one in sums])
+    aa, ab, bb, pull_a, pull_b = around.reshape(5, -1)
+    holds = aa + bb > 0
+    if not holds.any():
+        return np.ones(aa.shape)
+    aa, bb = (one + 1e-3 * one[holds].mean() + 1e-12 for one in (aa, bb))
+    decrease = (bb * pull_a**2 - 2 * ab * pull_a * pull_b + aa * pull_b**2) / (aa * bb - ab * ab)
+    return np.asarray(1 / (1 + decrease / (BLOCK_CAUCHY**2 * median_of(decrease[holds]) + 1e-12)))
+
+
+def _together(values: Doubles, cells: Cells) -> Doubles:
+    """Sum values of patches ``(..., patches)`` over the blocks whose errors are alike ``(..., blocks)``."""
+    return by_block(values.reshape(*values.shape[:-1], *cells.patches), TOGETHER)
+
+
+# ---------------- The cells of a frame over level ground, and how a motion shifts them
+
+
+class DirectLevel(NamedTuple):
+    """One step from coarse to fine.
+
+    Attributes:
+        step: every so many bins are used.
+        smoothing: of the frames, in bins and beams.
+        slopes: further smoothing of their mean, before its slopes are taken.
+        iterations: at most.
+    """
+
+    step: int
+    smoothing: tuple[float, float]
+    slopes: tuple[float, float]
+    iterations: int
+
+
+PATCH = (8, 4)
+"""Bins and beams that are summed first: the geometry is constant there."""
+
+FEWEST_PATCH_ROWS = 2
+"""Fewest rows of a patch of a coarse level."""
+
+
+class Cells:
+    """The cells of one level: where they are, and how they move with the sonar, in bins and beams.
+
+    Attributes:
+        patch: rows and columns of the patches over which cells are summed.
+        patches: number of them along rows and columns.
+        derivative: of the displacement of the patches' middles by motion (and heave) ``(3 or 4, 2, patches)``.
+        usable: rows that meet the ground.
+        seen: 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do.
+    """
+
+    def __init__(self, nodes: GroundNodes, level: DirectLevel) -> None:
+        self.nodes, self.grid = nodes, cell_grid(*nodes.key, level.step)
+        self.row, self.column, self.patch, self.patches = self.grid.row, self.grid.column, self.grid.patch, self.grid.patches
+        self.derivative = self._on_patches(nodes.derivative)
+        known = nodes.known
+        first = float(nodes.axes[0][int(known.any(axis=1).argmax())]) if known.any() else np.inf
+        self.usable = slice(int(np.searchsorted(self.grid.range_m, first)), None)
+        self.seen = self._seen(level)
+
+    def _seen(self, level: DirectLevel) -> Floats | None:
+        """Return 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do."""
+        shown, masked = self.nodes.shown
+        if shown[self.nodes.from_node[0].min() :].all():
+            return None
+        row, column = (
+            np.abs(values[:, None] - nodes).argmin(axis=1)
+            for values, nodes in zip((self.grid.range_m, self.grid.bearing_rad), self.nodes.axes, strict=True)
+        )
+        on_all = shown[row][:, column].astype(np.uint8)
+        reach = [2 * int(np.ceil(2 * s / k)) + 1 for s, k in zip(level.smoothing, (level.step, 1), strict=True)]
+        return np.asarray(cv2.erode(on_all, np.ones(reach, np.uint8)) if masked else on_all, dtype=np.float32)
+
+    def _on_all(self, nodes: Doubles) -> Floats:
+        """Interpolate from the nodes to all cells ``(2, bins, beams)``, in bins and beams."""
+        return np.asarray(self.grid.over_bins @ nodes.astype(np.float32) @ self.grid.over_beams)
+
+    def _on_patches(self, nodes: Doubles) -> Doubles:
+        """Interpolate from the nodes to the middles of the patches ``(..., 2, patches)``, in bins and beams."""
+        middles = self.grid.over_rows @ nodes @ self.grid.over_columns
+        return np.asarray(middles.reshape(*nodes.shape[:-2], -1))
+
+    def shift(self, v: Doubles, *, back: bool = False, lift_m: float = 0.0) -> Floats:
+        """Return the displacement of the ground of each cell ``(2, bins, beams)`` from the first frame to the second.
+
+        It is in bins and beams; ``back``: from the second frame to the first; ``lift_m``: of ground so much higher.
+        """
+        return self._on_all(self.nodes.shift(v, back=back, lift_m=lift_m))
+
+    def lifted_shift(self, v: Doubles) -> Doubles:
+        """Return the derivative of :meth:`shift` by the height at the middles of the patches ``(2, patches)`` [1/m]."""
+        return self._on_patches(self.nodes.lifted_shift(v))
+
+    def leaning_shift_of_cells(self, v: Doubles) -> list[Floats]:
+        """Return the derivatives of :meth:`shift` by how frames lean, each ``(2, bins, beams)``."""
+        return [self._on_all(nodes) for nodes in self.nodes.leaning_shift(v)]
+
+    def leaning_shift(self, v: Doubles) -> Doubles:
+        """Return the derivatives of :meth:`shift` by how frames lean, in the middles of the patches ``(3, 2, patches)``."""
+        return self._on_patches(self.nodes.leaning_shift(v))
+
+
+class CellGrid(NamedTuple):
+    """Cells of every so many bins and their patches; splines from the nodes, in bins ``[0]`` and beams ``[1]``.
+
+    ``over_bins`` and ``over_beams`` lead to all cells, ``over_rows`` and ``over_columns`` to the middles of the patches.
+    """
+
+    range_m: Doubles
+    bearing_rad: Doubles
+    row: Floats
+    column: Floats
+    over_bins: Floats
+    over_beams: Floats
+    patch: tuple[int, int]
+    patches: tuple[int, int]
+    over_rows: Doubles
+    over_columns: Doubles
+
+
+@lru_cache(maxsize=16)
+def cell_grid(range_m: tuple[float, ...], bearing_rad: tuple[float, ...], step: int) -> CellGrid:
+    ranges, axes = np.array(range_m)[step // 2 :: step], np.array(bearing_rad)
+    splines = [
+        np.asarray(make_interp_spline(node, np.eye(len(node)), 3)(values))
+        for node, values in zip(node_axes(np.array(range_m), axes), (ranges, axes), strict=True)
+    ]
+    bin_m, beam_rad = (np.gradient(values)[:, None] for values in (ranges, axes))
+    over_bins = np.stack([splines[0] / bin_m, splines[0]])
+    over_beams = np.stack([splines[1].T, (splines[1] / beam_rad).T])
+    patch = max(FEWEST_PATCH_ROWS, PATCH[0] // step), PATCH[1]
+    patches = cell_blocks((len(ranges), len(axes)), patch)
+    rows, columns = (
+        np.minimum(np.arange(count) * edge + edge // 2, size - 1)
+        for count, edge, size in zip(patches, patch, (len(ranges), len(axes)), strict=True)
+    )
+    return CellGrid(
+        ranges,
+        axes,
+        row=np.arange(len(ranges), dtype=np.float32)[:, None],
+        column=np.arange(len(axes), dtype=np.float32)[None, :],
+        over_bins=over_bins.astype(np.float32),
+        over_beams=over_beams.astype(np.float32),
+        patch=patch,
+        patches=patches,
+        over_rows=over_bins[:, rows],
+        over_columns=np.ascontiguousarray(over_beams[:, :, columns]),
+    )
+
+
+# ---------------- Level ground at a few nodes of a frame, and how it moves with the sonar: what lies between them is
+# smooth
+
+
+NODES = (33, 17)
+"""Nodes along range and bearing."""
+
+LEAN_STEP = 1e-4
+"""Step of heights [m], pitch and roll [rad] of a frame for numerical derivatives."""
+
+HEIGHT_STEP = 0.05
+"""Step of the height for numerical derivatives, as a part of it."""
+
+
+def node_axes(range_m: Doubles, bearing_rad: Doubles) -> tuple[Doubles, Doubles]:
+    """Return ranges [m] and bearings [rad] of the nodes: from the first to the last cell."""
+    return np.linspace(range_m[0], range_m[-1], NODES[0]), np.linspace(bearing_rad[0], bearing_rad[-1], NODES[1])
+
+
+class GroundNodes:
+    """The nodes of a pair of frames, which all levels share.
+
+    Args:
+        frames: whose axes they span.
+        attitude: of the sonar.
+        heave: whether the derivative has a fourth component, by the sonar's height.
+
+    Attributes:
+        known: whether a node meets the ground ``(nodes, nodes)``.
+        derivative: of range [m] and bearing [rad] by motion (and heave) ``(3 or 4, 2, nodes, nodes)``.
+    """
+
+    def __init__(self, frames: SonarFrames, attitude: Attitude, *, heave: bool) -> None:
+        self.frames, self.attitude, self.heave = frames, attitude, heave
+        self.axes = node_axes(frames.range_m, frames.bearing_rad)
+        self.ground = self._ground(None)
+        self.known = np.asarray(np.isfinite(self.ground.points).all(axis=-1), dtype=bool)
+        self.from_node = nearest_known(self.known)
+        self.derivative = self._derivative(self.ground)
+
+    def _ground(self, number: int | None, lift_m: float = 0.0) -> GroundGeometry:
+        """Return the geometry of the nodes, of the frames' mean or of one frame, over ground raised by ``lift_m``."""
+        attitude = self.attitude
+        mean = attitude.height_m - lift_m, attitude.pitch_rad, attitude.roll_rad
+        pose = mean if number is None else attitude.of_frame(number, lift_m)
+        return GroundGeometry(*self.axes, self.frames.sonar.bearing, *pose)
+
+    @cached_property
+    def _of_frames(self) -> tuple[GroundGeometry, GroundGeometry]:
+        """Return the geometry of the nodes in each frame."""
+        return (self._ground(0), self._ground(1)) if self.attitude.apart else (self.ground, self.ground)
+
+    @cached_property
+    def _from_nodes_of_frames(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """Return the nodes of each frame whose values its nodes take."""
+        if not self.attitude.apart:
+            return [self.from_node, self.from_node]
+        return [nearest_known(np.asarray(np.isfinite(one.points).all(axis=-1))) for one in self._of_frames]
+
+    def _derivative(self, ground: GroundGeometry) -> Doubles:
+        """Return the derivative by motion (and heave), that of the nearest node where a node meets no ground."""
+        nodes = np.moveaxis(ground.derivative, (3, 2), (0, 1))
+        if self.heave:
+            nodes = np.concatenate([nodes, np.moveaxis(ground.derivative_by_height, 2, 0)[None]])
+        return np.nan_to_num(nodes[:, :, self.from_node[0], self.from_node[1]])
+
+    @cached_property
+    def shown(self) -> tuple[NDArray[np.bool_], bool]:
+        """Return which nodes show ground to be matched ``(nodes, nodes)``, and whether the outline of the light is masked.
+
+        See :func:`mitsonar.geometry.ground.margin_of_light`.
+        """
+        margin = margin_of_light(self.ground, self.attitude, self.frames.sonar.elevation_fov_deg)
+        return (self.known, False) if margin is None else (self.known & (margin >= 0), True)
+
+    @cached_property
+    def key(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return ranges and bearings of the frames' cells, to be looked up by."""
+        return tuple(self.frames.range_m.tolist()), tuple(self.frames.bearing_rad.tolist())
+
+    def shift(self, v: Doubles, *, back: bool, lift_m: float) -> Doubles:
+        """Return the displacement of the nodes in range [m] and bearing [rad]; see :meth:`Cells.shift`."""
+        ground, other = self._of_frames[:: -1 if back else 1]
+        if lift_m:
+            ground, other = (replace(one, height_m=one.height_m - lift_m) for one in (ground, other))
+        if self.heave:
+            half = float(v[3]) / (2 if back else -2)
+            ground, other = replace(ground, height_m=ground.height_m + half), replace(other, height_m=other.height_m - half)
+        nodes = self._between(ground, other, inverse(v[:3]) if back else v[:3])
+        # a cell that meets level ground may not meet ground that lies lower
+        known = self._from_nodes_of_frames[int(back)]
+        row, column = nearest_known(np.asarray(np.isfinite(nodes).all(axis=0), dtype=bool)) if lift_m else known
+        return np.asarray(nodes[:, row, column], dtype=np.float64)
+
+    def _between(self, ground: GroundGeometry, other: GroundGeometry, motion: Doubles | Motion) -> Doubles:
+        """Return the displacement of the ground of the nodes of one frame in another ``(2, nodes, nodes)``; nan off it."""
+        radius, bearing = other.to_polar(moved(ground.points, motion))
+        return np.stack([radius - self.axes[0][:, None], bearing - self.axes[1]])
+
+    def leaning_shift(self, v: Doubles) -> Doubles:
+        """Return the derivative of :meth:`shift` by what the second frame's height, pitch and roll exceed the first's.
+
+        Returns:
+            Ranges [m] and bearings [rad] a metre of height, a radian of pitch and of roll ``(3, 2, nodes, nodes)``; 0 where
+            nothing is unknown.
+        """
+        if not any(self.attitude.unsure):
+            return np.zeros((3, *self.derivative.shape[1:]))
+        row, column = self._from_nodes_of_frames[0]
+        changes = []
+        for name in ("height_m", "pitch_rad", "roll_rad"):
+            ends = []
+            for sign in (-1, 1):
+                ground, other = (
+                    replace(one, **{name: getattr(one, name) + way * sign * LEAN_STEP / 2})
+                    for one, way in zip(self._of_frames, (-1, 1), strict=True)
+                )
+                ends.append(self._between(ground, other, v[:3]))
+            changes.append((ends[1] - ends[0]) / (2 * LEAN_STEP))
+        return np.nan_to_num(np.stack(changes)[:, :, row, column])
+
+    def lifted_shift(self, v: Doubles) -> Doubles:
+        """Return the derivative of :meth:`shift` by the height [m/m, rad/m]."""
+        change = HEIGHT_STEP * self.attitude.height_m
+        higher, lower = (self.shift(v, back=False, lift_m=lift_m) for lift_m in (-change, change))
+        return (higher - lower) / (2 * change)
+
+
+# ---------------- Blocks of cells: whole groups of bins and beams, over which maps are summed
+
+
+def cell_blocks(shape: tuple[int, ...], block: tuple[int, int]) -> tuple[int, int]:
+    """Return the number of blocks along bins and beams; cells beyond the last whole block belong to it."""
+    return max(shape[-2] // block[0], 1), max(shape[-1] // block[1], 1)
+
+
+def by_block(maps: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.float64]:
+    """Sum maps ``(..., bins, beams)`` over blocks ``(..., blocks)``."""
+    means = [_means(one, block) for one in maps.reshape(-1, *maps.shape[-2:])]
+    return _sums(means, cell_blocks(maps.shape, block), block).reshape(*maps.shape[:-2], -1)
+
+
+def products_by_block(pairs: Sequence[tuple[Floats, Floats]], block: tuple[int, int]) -> NDArray[np.float64]:
+    """Sum products of two maps ``(bins, beams)`` over blocks ``(pairs, blocks)``."""
+    shape = pairs[0][0].shape
+    product = np.empty(shape, dtype=np.float32)  # one for all: it stays in the processor's cache
+    return _sums([_means(np.multiply(*pair, out=product), block) for pair in pairs], cell_blocks(shape, block), block)
+
+
+def _means(values: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.floating]:
+    """Average a map ``(bins, beams)`` over blocks; one that is not whole is filled with zeros ``(rows, columns)``."""
+    over = [-(-size // edge) for size, edge in zip(values.shape, block, strict=True)]
+    missing = [(0, count * edge - size) for count, edge, size in zip(over, block, values.shape, strict=True)]
+    if any(after for _, after in missing):
+        values = np.pad(values, missing)
+    # OpenCV takes a third of the time of np.add.reduceat
+    return np.asarray(cv2.resize(values, over[::-1], interpolation=cv2.INTER_AREA), dtype=values.dtype)
+
+
+def _sums(means: list[NDArray[np.floating]], blocks: tuple[int, int], block: tuple[int, int]) -> NDArray[np.float64]:
+    """Sum over blocks from their means ``(maps, blocks)``; cells beyond the last whole block belong to it."""
+    sums = np.multiply(means, block[0] * block[1], dtype=np.float64)
+    rows, columns = blocks
+    if sums.shape[1:] != blocks:
+        sums[:, rows - 1] += sums[:, rows:].sum(axis=1)
+        sums[:, :, columns - 1] += sums[:, :, columns:].sum(axis=2)
+    return np.asarray(sums[:, :rows, :columns].reshape(len(means), -1), dtype=np.float64)
+
+
+def on_cells(table: NDArray[np.float64], shape: tuple[int, ...], block: tuple[int, int]) -> Floats:
+    """Interpolate values of blocks ``(rows, columns)`` linearly to cells of this shape ``(bins, beams)``."""
+    row, column = (
+        ((np.arange(size) + 0.5) / edge - 0.5).astype(np.float32) for size, edge in zip(shape, block, strict=True)
+    )
+    column, row = (np.ascontiguousarray(axis) for axis in np.broadcast_arrays(column[None], row[:, None]))
+    drawn = cv2.remap(table.astype(np.float32), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(drawn, dtype=np.float32)
+
+
+# ---------------- Smoothed images, values between pixels, and slopes over bins and beams
+
+
+FAINTEST = 0.02
+"""Residuals of this size are never outliers: patterns of rays and interpolation reach it without any noise."""
+
+NEIGHBOURS = (3, 7)
+"""Beams and bins within which the slopes' variance is compared with the noise (Wiener's filter)."""
+
+
+def blurred(image: Floats, bins: float, beams: float) -> Floats:
+    """Smooth an image ``(bins, beams)`` by a Gaussian of these standard deviations [bins, beams]; 0, 0: not at all."""
+    if not bins and not beams:
+        return image
+    size = tuple(2 * int(np.ceil(3 * sigma)) + 1 for sigma in (beams, bins))
+    least = 1e-3  # OpenCV takes 0 for the other one
+    return np.asarray(
+        cv2.GaussianBlur(image, size, sigmaX=max(beams, least), sigmaY=max(bins, least), borderType=cv2.BORDER_REPLICATE)
+    )
+
+
+def sampled(image: Floats, row: Floats, column: Floats) -> Floats:
+    """Interpolate an image between pixels, bilinear."""
+    return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def slopes_of(image: Floats, level: DirectLevel, scale: float) -> tuple[Floats, Floats]:
+    """Return central differences over bins and beams of the denoised image (Wiener's filter).
+
+    ``scale`` is the standard deviation of a difference of two frames; their mean has half of it.
+    """
+    smooth = blurred(image, *level.slopes)
+    if scale > FAINTEST:
+        mean = cv2.blur(smooth, NEIGHBOURS)
+        variance = cv2.blur(smooth * smooth, NEIGHBOURS) - mean * mean
+        kept = np.maximum(0, 1 - np.float32(2 * (scale / 2) ** 2) / np.maximum(variance, np.float32(1e-9)))
+        smooth = mean + (smooth - mean) * kept
+    return central_differences(smooth)
+
+
+HALVES = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
+ONE = np.ones(1, dtype=np.float32)
+
+
+def central_differences(image: Floats) -> tuple[Floats, Floats]:
+    """Return central differences over bins and over beams."""
+    by_bin = cv2.sepFilter2D(image, -1, ONE, HALVES, borderType=cv2.BORDER_REPLICATE)
+    by_beam = cv2.sepFilter2D(image, -1, HALVES, ONE, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(by_bin, dtype=np.float32), np.asarray(by_beam, dtype=np.float32)

@@ -1,0 +1,982 @@
+"""Several networks, each trained at a height of its own: the one that was trained nearest to the measured height answers."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, cast
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor, nn
+
+from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.datasets.arrangement import Arrangement
+from mitsonar.datasets.responses import packed
+from mitsonar.datasets.samples import ground_of, light_of
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.channel.correlation import pings_of
+from mitsonar.estimation.estimator import (
+    INPUTS,
+    LEAST_AT_BEST,
+    AnyEstimator,
+    Estimate,
+    Record,
+    ambiguity,
+    blank,
+    correlation_excess,
+    correlation_of,
+    matching_rejection,
+    prior_rejection,
+    rejected,
+    two_frames,
+    without_slow,
+)
+from mitsonar.estimation.image.phase import Phase
+from mitsonar.geometry.fan import cartesian_map
+from mitsonar.geometry.ground import STD_MEASURED, Attitude, attitude_of
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import sonar_from
+from mitsonar.instruments.views import SEGMENTS
+from mitsonar.motion.composition import Motion, MotionPrior, inverse
+from mitsonar.motion.errors import AXES
+from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.networks.corrnet import GaussianHead, Ground, WarpGrid
+from mitsonar.networks.create import called
+from mitsonar.records.frames import SonarFrames, ViewFrames, to_float32
+from mitsonar.records.responses import ImpulseResponses
+
+if TYPE_CHECKING:
+    from mitsonar.datasets.samples import Samples
+
+__all__ = [
+    "ANGLE_OFF_DEG",
+    "BEYOND",
+    "HEIGHT_OFF",
+    "HeightEnsemble",
+    "ImageNetwork",
+    "NetworkInput",
+    "OwnNetwork",
+    "ResponseNetwork",
+    "Trained",
+    "TrainedInstrument",
+    "ViewNetwork",
+    "answer_of",
+    "inputs_of",
+    "one_thread",
+    "reads_views",
+]
+
+
+@dataclass(eq=False)
+class HeightEnsemble:
+    """The network trained nearest to the height of the frames.
+
+    Args:
+        networks: two or more, all of one image or all of the same views.
+
+    Attributes:
+        inputs: what it is given beside the images.
+        views: that all of them read; None: a single image.
+        kind: ``image`` or ``vector``.
+
+    Raises:
+        MitsonarError: networks that read different things.
+    """
+
+    networks: Sequence[AnyEstimator]
+    inputs: str = field(default="height, which chooses the network", init=False)
+
+    def __post_init__(self) -> None:
+        reads = {(type(one), getattr(one, "views", None), one.kind) for one in self._members}
+        if len(reads) != 1 or len(self._members) != len(self.networks):
+            said = "; ".join(sorted(f"{kind}s of {', '.join(views or ('one view',))}" for _, views, kind in reads))
+            raise MitsonarError(f"networks that stand in for each other must read the same views: got {said}")
+        ((_, self.views, self.kind),) = reads
+
+    @property
+    def _members(self) -> list[ImageNetwork | ViewNetwork]:
+        return [one for one in self.networks if isinstance(one, ImageNetwork | ViewNetwork)]
+
+    @property
+    def checkpoints(self) -> tuple[Checkpoint, ...]:
+        """Return the checkpoints of all networks."""
+        return tuple(checkpoint for one in self._members for checkpoint in one.checkpoints)
+
+    @property
+    def consumes(self) -> type:
+        """Return the class of records that its networks read."""
+        return ViewFrames if self.views else SonarFrames
+
+    @property
+    def digest(self) -> str:
+        """Return the digests of all networks."""
+        return " ".join(one.digest for one in self.networks)
+
+    def estimate(self, frames: SonarFrames | ViewFrames, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion with the chosen network.
+
+        Raises:
+            MitsonarError: frames without a height; as the network does.
+        """
+        known = None if frames.height_m is None else frames.height_m[np.isfinite(frames.height_m)]
+        if known is None or not len(known):
+            raise MitsonarError(
+                "the height chooses the network, and the frames tell none: measure it with --height-by direct"
+            )
+        height = float(known.mean())
+        network: AnyEstimator = self.chosen(height)
+        return network.estimate(frames, prior)
+
+    def chosen(self, height_m: float) -> ImageNetwork | ViewNetwork:
+        """Return the network whose heights of training are nearest in ratio; of several, that whose middle is nearest."""
+
+        def away(network: ImageNetwork | ViewNetwork) -> tuple[float, float]:
+            low, high = network.heights
+            outside = max(np.log(low / height_m), np.log(height_m / high), 0.0)
+            return float(outside), float(abs(np.log(height_m / np.sqrt(low * high))))
+
+        return min(self._members, key=away)
+
+
+# ---------------- A network of torch of the user's own as an estimator: frames become its input as they did in training
+
+
+class OwnNetwork:
+    """Estimates motions by any module whose output is labels of motions ``(batch, 3)``.
+
+    Args:
+        network: takes images ``(batch, 2, bins, beams)`` float32 in 0..1, or what ``samples`` make of them. It is copied and
+            set to evaluation; what is learnt later does not count.
+        samples: on which it was trained, such as :class:`~mitsonar.datasets.samples.SonarPairs`. They say how frames
+            become its input, and decode its labels. Without them the labels are raw: sideways, forward [m], yaw [rad].
+
+    Raises:
+        MitsonarError: samples of other than two images of one view, or with the geometry of the ground.
+    """
+
+    consumes = SonarFrames
+    inputs = "its own"
+    digest = ""
+
+    def __init__(self, network: nn.Module, samples: Samples | None = None) -> None:
+        if samples is not None and (
+            samples.frames != 2 or len(samples.arrange.views) != 1 or samples.arrange.kind != "image" or samples.ground
+        ):
+            raise MitsonarError(
+                "a network of your own estimates from two images of one view: give samples with frames=2, kind='image', one "
+                "view, and no ground"
+            )
+        self._network = copy.deepcopy(network).eval()
+        self._arrange = None if samples is None else replace(samples.arrange, noise=NoiseModel(), levels=())
+        self._labels = None if samples is None else samples.labels
+        self._shape: tuple[int, ...] | None = None
+        if samples is not None and samples.arrange.coordinates != "polar":
+            view = next(view for view in samples.recipe.views if view.name == samples.arrange.views[0])
+            self._shape = (len(view.sonar.range_m), len(view.bearing_rad))
+
+    def estimate(self, frames: SonarFrames) -> Estimate:
+        """Estimate the motion; its covariance is not known.
+
+        Raises:
+            MitsonarError: not two frames, frames of a size that the network does not take, an output that is no motion.
+        """
+        two_frames(frames)
+        if self._shape is not None and frames.image.shape[1:] != self._shape:
+            raise MitsonarError(f"the network was trained on images of {self._shape}: got {frames.image.shape[1:]}")
+        like = next(self._network.parameters(), torch.empty(0))
+        images = torch.from_numpy(np.ascontiguousarray(to_float32(frames.image)))[None].to(like.device)
+        inputs: NetworkInput = images
+        if self._arrange is not None:
+            inputs = self._arrange({self._arrange.views[0]: images}, torch.arange(2, device=like.device)[None], 0)
+        with torch.inference_mode(), one_thread():
+            answer = answer_of(self._network, inputs)
+        if not isinstance(answer, torch.Tensor) or answer.shape != (1, 3):
+            got = f"a tensor of {tuple(answer.shape)}" if isinstance(answer, torch.Tensor) else type(answer).__name__
+            raise MitsonarError(f"a network of motions must return labels (batch, 3): got {got} for a batch of one")
+        labels = answer[0].double().cpu().numpy()
+        if not np.isfinite(labels).all():
+            return rejected("the network's answer is not finite")
+        motion = labels if self._labels is None else self._labels.decode(labels)
+        return Estimate(Motion(*motion.tolist()))
+
+
+# ---------------- What all estimators that a checkpoint makes have in common: the network, its sonar, and rejections
+# that need no images
+
+
+Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Ranges of the bins ``(bins,)`` [m] and bearings of the beams ``(beams,)`` [rad]."""
+
+NetworkInput = Tensor | tuple[Tensor | Ground, ...]
+"""What a network reads: a tensor, or a tuple of tensors and of the geometry of the ground."""
+
+BEYOND = 1.2
+"""Factor by which a valid motion may exceed those of training."""
+
+HEIGHT_OFF, ANGLE_OFF_DEG = 0.1, 2.0
+"""How far height, as part of it, and pitch and roll may be from those that training has fixed."""
+
+WINDOW_OFF = 0.02
+"""How far window and field of view may be from those of training, as part of them."""
+
+
+class TrainedInstrument(NamedTuple):
+    """The numbers of a sonar that a network knows from training."""
+
+    name: str
+    bins: int
+    beams: int
+    window_m: tuple[float, float]
+    azimuth_fov_deg: float
+    elevation_fov_deg: float
+    bearing: str
+
+    @classmethod
+    def of(cls, sonar: Sonar) -> TrainedInstrument:
+        """As the sonar says."""
+        return cls.in_frames(sonar, sonar.range_m, sonar.bearing_rad)
+
+    @classmethod
+    def in_frames(cls, sonar: Sonar, range_m: NDArray[np.float64], bearing_rad: NDArray[np.float64]) -> TrainedInstrument:
+        """Of a sonar whose frames have these bins and beams."""
+        half = (range_m[-1] - range_m[0]) / max(1, len(range_m) - 1) / 2
+        span = (bearing_rad[-1] - bearing_rad[0]) * len(bearing_rad) / max(1, len(bearing_rad) - 1)
+        window = (float(range_m[0] - half), float(range_m[-1] + half))
+        size = (len(range_m), len(bearing_rad))
+        return cls(sonar.name, *size, window, math.degrees(span), sonar.elevation_fov_deg, sonar.bearing)
+
+    def unlike(self, other: TrainedInstrument) -> str:
+        """Return the numbers in which another differs: ``beams 128, not 96; ...``; empty where none does."""
+        found = []
+        for what in ("bins", "beams", "bearing"):
+            if getattr(self, what) != getattr(other, what):
+                found.append(f"{what} {getattr(other, what)}, not {getattr(self, what)}")
+        for what in ("azimuth_fov_deg", "elevation_fov_deg"):
+            mine, its = getattr(self, what), getattr(other, what)
+            if abs(its - mine) > WINDOW_OFF * mine:
+                found.append(f"{what} {its:.4g}, not {mine:.4g}")
+        ends = zip(self.window_m, other.window_m, strict=True)
+        if any(abs(its - mine) > WINDOW_OFF * self.window_m[1] for mine, its in ends):
+            mine, its = (f"{near:.3g}..{far:.3g} m" for near, far in (self.window_m, other.window_m))
+            found.append(f"window {its}, not {mine}")
+        return "; ".join(found)
+
+
+@dataclass(init=False, eq=False)
+class Trained:
+    """A network with its weights.
+
+    Attributes:
+        digest: of the network.
+        force: go on with another sonar than that of training.
+        inputs: what it is given beside the images.
+    """
+
+    digest: str
+    force: bool
+    instead: ClassVar[str] = "corrnet or direct"
+    """What serves other sonars."""
+
+    @property
+    def checkpoints(self) -> tuple[Checkpoint, ...]:
+        """Return the checkpoint."""
+        return (self._checkpoint,)
+
+    @property
+    def heights(self) -> tuple[float, float]:
+        """Lowest and highest of training [m]."""
+        low, high = self._checkpoint.trained_at["height_m"]
+        return float(low), float(high)
+
+    def _take(self, checkpoint: Checkpoint) -> None:
+        """Keep the network out of the fields: files and comparisons of options need the digest only."""
+        self.digest, self.inputs = checkpoint.digest, inputs_of(checkpoint)
+        self._checkpoint, self._network = checkpoint, checkpoint.build()
+        self._trained = {view: TrainedInstrument.of(sonar) for view, sonar in checkpoint.sonars.items()}
+        self._last: tuple[bytes, Arrangement] | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        """For other processes: torch would share its tensors through file descriptors."""
+        return {**asdict(self), "content": self._checkpoint.to_bytes()}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        content = state.pop("content")
+        assert isinstance(content, bytes)
+        vars(self).update(state)
+        self._take(Checkpoint.from_bytes(content))
+
+    @property
+    def kind(self) -> str:
+        """``image`` or ``vector``, that it reads."""
+        return str(self._checkpoint.arrangement["kind"])
+
+    def _input_of_views(self, frames: ViewFrames) -> NetworkInput:
+        """Return the input of the network from the pings of its views, a batch of one.
+
+        Raises:
+            MitsonarError: views that are not there, or of another sonar than that of training.
+        """
+        names = self._checkpoint.arrangement["views"]
+        lacking = [view for view in names if view not in frames.values]
+        if lacking:
+            raise MitsonarError(
+                f"this {self._checkpoint.network} is given {', '.join(names)}: got {', '.join(frames.values)}; read them "
+                "from a data set that holds them"
+            )
+        for view in names:
+            self._check_instrument(view, TrainedInstrument.of(frames.sonars[view]))
+        values = {view: torch.from_numpy(np.asarray(frames.values[view])[None]) for view in names}
+        if frames.kind == "vector":  # noise has been drawn before
+            values |= {f"nonzero_{view}": torch.zeros_like(one, dtype=torch.int32) for view, one in values.items()}
+        axes = {view: (frames.sonars[view].range_m, frames.bearing_rad[view]) for view in names}
+        inputs: NetworkInput = self._arranged(axes)(values, torch.arange(len(frames))[None], 0)
+        return inputs
+
+    def _check_instrument(self, view: str, has: TrainedInstrument) -> None:
+        """Refuse another sonar than that of training, unless it is forced."""
+        unlike = self._trained[view].unlike(has) if view in self._trained and not self.force else ""
+        if unlike:
+            raise MitsonarError(
+                f"this {self._checkpoint.network} was trained on the sonar {self._trained[view].name}, the frames are of "
+                f"{has.name}: {unlike}; train on that sonar, use {self.instead}, or force it with RUN:force=1"
+            )
+
+    def _arranged(self, axes: dict[str, Axes]) -> Arrangement:
+        """From frames of these views to the network's input; kept, since it is that of the frames before."""
+        key = b"".join(axis.tobytes() for both in axes.values() for axis in both)
+        if self._last is None or self._last[0] != key:
+            words = self._checkpoint.arrangement
+            maps = {}
+            if words["coordinates"] != "polar":
+                maps = {view: cartesian_map(*both, words["cartesian_rows"]) for view, both in axes.items()}
+            beams = {view: len(bearing_rad) for view, (_, bearing_rad) in axes.items()}
+            made = Arrangement(tuple(axes), words["kind"], words["layout"], words["coordinates"], NoiseModel(), beams, maps)
+            made = replace(made, range_levels=words.get("range_levels"), halves=words.get("halves", False))
+            self._last = key, made
+        return self._last[1]
+
+    # ---------------------------------------------------------------- rejections
+
+    def _rejection_of_geometry(self, frames: SonarFrames | ViewFrames) -> str:
+        """Whether the sonar stood as in training, as far as the frames tell; networks that are given it need not."""
+        if self._checkpoint.arrangement["ground"]:
+            return ""
+        trained_at = self._checkpoint.trained_at
+        low, high = trained_at["height_m"]
+        heights = [np.nanmean(frames.height_m)] if frames.height_m is not None and np.isfinite(frames.height_m).any() else []
+        if (
+            heights and frames.poses is not None and np.isfinite(frames.poses[:, 2]).all()
+        ):  # over z = 0: straight below there may be a rock
+            heights.append(frames.poses[:, 2].mean())
+        if heights and not any(low * (1 - HEIGHT_OFF) <= height <= high * (1 + HEIGHT_OFF) for height in heights):
+            return f"the sonar stood at {heights[0]:.2f} m: {self._checkpoint.fixed} are fixed by training"
+        return self._rejection_of_attitude(frames)
+
+    def _rejection_of_attitude(self, frames: SonarFrames | ViewFrames) -> str:
+        """Whether pitch and roll were those of training, as far as the frames tell."""
+        trained_at = self._checkpoint.trained_at
+        if frames.poses is not None:
+            for name, column in (("pitch", 3), ("roll", 4)):
+                angle = math.degrees(frames.poses[:, column].mean())
+                if abs(angle - trained_at[f"{name}_deg"]) > ANGLE_OFF_DEG:
+                    return f"the sonar had a {name} of {angle:.1f} deg: {self._checkpoint.fixed} are fixed by training"
+        return ""
+
+    def _rejection_of_size(self, motion: Motion, start: Motion | None = None) -> str:
+        """Whether the answer, counted from the start of the iterations, is of the size that training had."""
+        coder = self._checkpoint.coder
+        middle, half = (coder.low + coder.high) / 2, (coder.high - coder.low) / 2
+        off = (np.array(motion) - (np.zeros(3) if start is None else np.array(start)))[: len(half)]
+        beyond = np.abs(off - middle) > BEYOND * half
+        if not beyond.any():
+            return ""
+        axis = int(beyond.argmax())
+        name, unit, scale = AXES[axis]
+        value, low, high = scale * np.array([off, coder.low, coder.high])[:, axis]
+        since = "" if start is None else ", counted from the start,"
+        return f"{name} {value:.3g} {unit}{since} is beyond the motions of training, {low:.3g}..{high:.3g} {unit}"
+
+
+def inputs_of(checkpoint: Checkpoint) -> str:
+    """Return what a network needs beside the images, for tables."""
+    return INPUTS if checkpoint.arrangement["ground"] else f"nothing; {checkpoint.fixed} fixed by training"
+
+
+def answer_of(network: nn.Module, inputs: NetworkInput) -> Tensor | GaussianHead:
+    """Run a network; several inputs come as a tuple.
+
+    Raises:
+        MitsonarError: inputs of a size that it cannot take.
+    """
+    try:
+        answer: Tensor | GaussianHead = called(network, inputs)
+        return answer
+    except MitsonarError:
+        raise
+    except (RuntimeError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise MitsonarError(f"the network cannot take these frames: {error}") from None
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch computes with one thread: a pair is too small for more, and pairs are for the processes to share."""
+    had = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(had)
+
+
+# ---------------- The estimator that a checkpoint is: a trained network between two frames and a motion, with checks
+# of the result
+
+
+Pair = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+SMOOTH = (2.0, 0.8)
+"""Standard deviations of the filter before frames are matched [bins, beams]."""
+
+
+class Comparison(NamedTuple):
+    """How frames are compared that an answer has brought together: bins of a cell, smoothing [bins, beams]."""
+
+    cell: int
+    smoothing: tuple[float, float]
+
+    @property
+    def alike(self) -> float:
+        """Return how many neighbouring cells count as one."""
+        return 4 * math.pi * math.hypot(self.smoothing[0] / self.cell, 12**-0.5) * self.smoothing[1]
+
+
+COMPARISONS = (Comparison(4, SMOOTH), Comparison(1, (0.7, 0.5)))
+"""The second only where the first finds nothing: fine texture shows in noise that hides what is coarse."""
+
+BLOCK = 16
+"""Such cells and beams of the blocks over which what is matched must be spread."""
+
+NOISY = 0.83
+"""Correlation of matched frames below which noise shortens the network's steps, so that it goes on from its answer.
+
+Without noise hulls have 0.84 and more, rocky fields 0.95; in high noise they have 0.82 and less, and 0.75 to 0.91. With 0.75
+six of 200 pairs of hulls in high noise stopped short: squared errors of 8 to 44 times the covariance.
+"""
+
+OTHER_FAN = 1.5
+"""Fans so many times wider or narrower than that of training are reported."""
+
+FAR_MODEL = 4.0
+"""Squared errors over the network's covariance for motions far beyond training, measured on rocky fields."""
+
+
+@dataclass(init=False, eq=False)
+class ImageNetwork(Trained):
+    """A trained network.
+
+    Args:
+        checkpoint: of it; it must take two frames of one view.
+        force: go on with another sonar than that of training.
+        height_m: over the ground, where the window shows no first echoes; only for networks that know the geometry, as
+        pitch_rad: is, and
+        relief_m: mean height over the ground of what is seen.
+
+    Raises:
+        MitsonarError: a checkpoint that needs something else than two frames of one view, that does not fit its network, or
+            whose geometry is fixed by training but given here.
+    """
+
+    height_m: float | None
+    pitch_rad: float | None
+    relief_m: float | None
+
+    @property
+    def consumes(self) -> type:
+        """Return the class of records that it reads."""
+        return SonarFrames
+
+    def __init__(
+        self,
+        checkpoint: Checkpoint,
+        *,
+        force: bool = False,
+        height_m: float | None = None,
+        pitch_rad: float | None = None,
+        relief_m: float | None = None,
+    ) -> None:
+        self._check_input(checkpoint)
+        if not checkpoint.arrangement["ground"] and any(value is not None for value in (height_m, pitch_rad, relief_m)):
+            raise MitsonarError(f"this {checkpoint.network} is given no geometry: {checkpoint.fixed} are fixed by training")
+        self.force, self.height_m, self.pitch_rad, self.relief_m = force, height_m, pitch_rad, relief_m
+        self._take(checkpoint)
+
+    def _check_input(self, checkpoint: Checkpoint) -> None:
+        """Whether the network reads what an estimator has."""
+        words = checkpoint.arrangement
+        if words["frames"] != 2 or len(words["views"]) != 1:
+            raise MitsonarError(
+                f"an estimator has two frames of one view: this {checkpoint.network} is given {words['frames']} frames of "
+                f"{', '.join(words['views'])} as {words['kind']}s; use `mitsonar odometry` on a data set that holds them, "
+                "`mitsonar evaluate`, or another checkpoint"
+            )
+
+    def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion and its covariance.
+
+        A network that is given the geometry begins at a prior, and else at no motion. Where that fails, and nothing tells
+        that the motion is near, :class:`~mitsonar.estimation.image.phase.Phase` finds the start. Other networks ignore a
+        prior.
+
+        Args:
+            frames: two.
+            prior: where to start; a motion that contradicts it is rejected.
+
+        Returns:
+            The estimate; ``start`` of ``about`` is ``zero``, ``prior`` or ``phase``.
+
+        Raises:
+            MitsonarError: not two frames, another sonar than that of training, frames without what the network needs.
+        """
+        images = two_frames(frames)
+        for view in self._trained:
+            self._check_instrument(view, TrainedInstrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad))
+        if any(blank(image) for image in images):
+            return rejected("nothing in the frames to match")
+        attitude = self._attitude_of(frames)
+        if attitude is not None and attitude.reason:
+            return rejected(attitude.reason)
+        if attitude is None:
+            return self._from(frames, images, {}, None)
+        ground = _batch({**ground_of(frames, attitude), **light_of(frames, attitude)})
+        found = self._from(frames, images, ground, None if prior is None else prior.motion)
+        if found.covariance is not None and _correlation_of_answer(images, ground, found.motion) < NOISY:
+            found = self._again(frames, images, ground, found)
+        found = self._judged(frames, found, prior, "zero" if prior is None else "prior", attitude, ground)
+        doubtful = found.valid and _correlation_of_answer(images, ground, found.motion) < LEAST_AT_BEST
+        is_near = prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))
+        if is_near or (found.valid and not doubtful):
+            return found
+        elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
+        if not elsewhere.valid or not self._rejection_of_size(elsewhere.motion):
+            return found  # a motion nearby has been looked for
+        second = self._from(frames, images, ground, elsewhere.motion)
+        if self._rejection_of_size(second.motion, elsewhere.motion):  # phase errs by more than training's motions
+            second = self._from(frames, images, ground, second.motion)
+        second = self._judged(frames, second, prior, "phase", attitude, ground)
+        if doubtful and (not second.valid or _correlation_of_answer(images, ground, second.motion) < LEAST_AT_BEST):
+            return found
+        return second
+
+    def _judged(
+        self,
+        frames: SonarFrames,
+        found: Estimate,
+        prior: MotionPrior | None,
+        named: str,
+        attitude: Attitude,
+        ground: Ground,
+    ) -> Estimate:
+        """Return an estimate that names its start, with the covariance of motions beyond training where it is one.
+
+        Heights less certain than those of training join it, and unknown heave, pitch and roll. It is rejected where it
+        contradicts a prior.
+        """
+        covariance = found.covariance
+        if covariance is not None:
+            covariance = FAR_MODEL * covariance if self._rejection_of_size(found.motion) else covariance
+            unsure = (attitude.height_std_m / attitude.height_m) ** 2 - STD_MEASURED**2
+            if unsure > 0:
+                by_height = _by_height(ground, found.motion)
+                covariance = covariance + unsure * np.outer(by_height, by_height)
+            covariance = attitude.widened(covariance, frames)
+        reason = found.reason or prior_rejection(found.motion, covariance, prior)
+        return replace(
+            found,
+            covariance=covariance,
+            valid=not reason,
+            reason=reason,
+            about={**found.about, **attitude.about, **self._untrained(frames), "start": named},
+        )
+
+    @cached_property
+    def _fan_deg(self) -> float:
+        """Return the field of view in azimuth of the data that trained the network [deg]."""
+        trained = sonar_from(dict(self._checkpoint.data_recipe["sonar"]))
+        return TrainedInstrument.of(trained).azimuth_fov_deg
+
+    def _untrained(self, frames: SonarFrames) -> dict[str, str]:
+        """Return what an estimate must report of frames unlike those of training, of a network that takes any sonar."""
+        found = []
+        if frames.sonar.model == "coherent" and "coherent" not in self._checkpoint.model:
+            found.append("speckle")
+        has = TrainedInstrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad)
+        if abs(math.log(has.azimuth_fov_deg / self._fan_deg)) > math.log(OTHER_FAN):
+            found.append(f"a fan of {has.azimuth_fov_deg:.3g} deg (but {self._fan_deg:.3g})")
+        return {"untrained": f"{self._checkpoint.network} was not trained for {' or '.join(found)}"} if found else {}
+
+    def _from(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Estimate:
+        """Estimate the motion from a start of the network's iterations; None: no motion."""
+        with torch.inference_mode(), one_thread():
+            targets, covariances = self._checkpoint.decode(self._answer(frames, images, ground, start))
+        if not np.isfinite(targets).all():
+            return rejected("the network's answer is not finite")
+        if targets.shape[1] != 3:
+            raise MitsonarError(f"a motion has three numbers: this {self._checkpoint.network} says {targets.shape[1]}")
+        if covariances is not None and not _is_covariance(covariances[0]):
+            return rejected("the network's covariance is not positive: images unlike those of its training")
+        motion = Motion(*targets[0].tolist())
+        covariance = self._checkpoint.covariance if covariances is None else covariances[0]
+        reason = self._rejection_of_geometry(frames) or self._rejection_of_size(motion, start)
+        if not reason:
+            reason = _rejection_of_answer(images, ground, motion) if ground else self._rejection_of_match(frames, images)
+        return Estimate(motion, covariance, not reason, reason)
+
+    def _again(self, frames: SonarFrames, images: Pair, ground: Ground, first: Estimate) -> Estimate:
+        """Estimate once more, from an answer that noise may have held back, and back from the second frame.
+
+        The mean of both ways counts. How far the answers go and how far they lie apart is not known better.
+        """
+        found = self._from(frames, images, ground, first.motion)
+        if found.covariance is None:
+            return found
+        motion, apart = self._both_ways(frames, images, found.motion)
+        went = np.array(found.motion) - np.array(first.motion)
+        fine = COMPARISONS[-1]
+        one, other, inside = _brought_together(images, ground, motion, fine)
+        excess = correlation_excess(one, other, inside, BLOCK // 2).mean
+        unsure = ambiguity(excess, inside.sum() / fine.alike)
+        reason = found.reason or self._rejection_of_size(motion)
+        covariance = unsure * found.covariance + np.outer(went, went) + np.outer(apart, apart) / 2
+        return Estimate(motion, covariance, not reason, reason, found.about)
+
+    def _both_ways(self, frames: SonarFrames, images: Pair, there: Motion) -> tuple[Motion, NDArray[np.float64]]:
+        """Return the mean of a motion and of that from the second frame to the first, and how far they lie apart."""
+        swapped = frames.select(np.array([1, 0]))
+        attitude = self._attitude_of(swapped)
+        if attitude is None or attitude.reason:
+            return there, np.zeros(3)
+        ground = _batch({**ground_of(swapped, attitude), **light_of(swapped, attitude)})
+        back = self._from(swapped, images[::-1], ground, Motion(*inverse(np.array(there)).tolist()))
+        if back.covariance is None:
+            return there, np.zeros(3)
+        apart = inverse(np.array(back.motion)) - np.array(there)
+        return Motion(*(np.array(there) + apart / 2).tolist()), apart
+
+    def _attitude_of(self, frames: SonarFrames) -> Attitude | None:
+        """Height and pitch, for a network that is given them."""
+        if not self._checkpoint.arrangement["ground"]:
+            return None
+        return attitude_of(frames, self._checkpoint.network, self.height_m, self.pitch_rad, self.relief_m)
+
+    def _answer(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Tensor | GaussianHead:
+        """Return the answer of the network, a batch of one."""
+        (view,) = self._checkpoint.arrangement["views"]
+        inputs = self._arrangement(frames)({view: torch.from_numpy(np.stack(images)[None])}, torch.arange(2)[None], 0)
+        if not ground:
+            return answer_of(self._network, inputs)
+        image = cast(Tensor, inputs)  # networks that are given the ground read one image
+        if start is None:
+            return answer_of(self._network, (image, ground))
+        return answer_of(self._network, (image, ground, torch.tensor([start], dtype=torch.float32)))
+
+    def _arrangement(self, frames: SonarFrames) -> Arrangement:
+        """From the frames to the network's input."""
+        (view,) = self._checkpoint.arrangement["views"]
+        return self._arranged({view: (frames.range_m, frames.bearing_rad)})
+
+    # ---------------------------------------------------------------- rejections
+
+    def _rejection_of_match(self, frames: SonarFrames, images: Pair) -> str:
+        """Whether the frames show one place at all: they must be alike once shifted, as far as training's motions go."""
+        first, second = (smooth(image, Comparison(1, SMOOTH)) for image in images)
+        size = first.shape
+        rows, columns = (min(reach, length // 3) for reach, length in zip(self._reach(frames), size, strict=True))
+        middle = second[rows : size[0] - rows, columns : size[1] - columns]
+        found = cv2.matchTemplate(without_slow(first, 32), without_slow(middle, 32), cv2.TM_CCOEFF_NORMED)
+        row, column = np.unravel_index(int(found.argmax()), found.shape)
+        there = first[row : row + middle.shape[0], column : column + middle.shape[1]]
+        inside = np.ones(middle.shape, dtype=bool)
+        return matching_rejection(there, middle, inside, alike=4 * math.pi * SMOOTH[0] * SMOOTH[1])
+
+    def _reach(self, frames: SonarFrames) -> tuple[int, int]:
+        """How far an echo can move between frames in bins and in beams, by the motions of training."""
+        coder = self._checkpoint.coder
+        sideways, forward, yaw = BEYOND * np.maximum(np.abs(coder.low), np.abs(coder.high))
+        bin_m, beam_rad = (float(np.median(np.diff(axis))) for axis in (frames.range_m, frames.bearing_rad))
+        outward = forward + sideways * math.sin(min(math.pi / 2, np.abs(frames.bearing_rad).max()))
+        across = yaw + sideways / frames.range_m[0]
+        return 2 + int(outward / bin_m), 2 + int(across / beam_rad)
+
+
+def _batch(table: dict[str, NDArray[np.float32]]) -> Ground:
+    """Return tensors of a batch of one."""
+    return {name: torch.from_numpy(values)[None] for name, values in table.items()}
+
+
+def _by_height(ground: Ground, motion: Motion) -> NDArray[np.float64]:
+    """Return the derivative of an estimated motion by the height, as a part of it: other motions explain the same shifts."""
+    lit = ground["lit"][0].numpy() >= 0 if "lit" in ground else np.ones(ground["derivative"].shape[-2:], dtype=bool)
+    here, lower = (ground[name][0].numpy()[..., lit] for name in ("derivative", "by_relief"))
+    change = np.tensordot(np.array(motion), lower, axes=(0, 1))
+    return np.asarray(np.linalg.lstsq(np.moveaxis(here, 1, -1).reshape(-1, 3), change.ravel(), rcond=None)[0])
+
+
+def _rejection_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
+    """Whether the frames are alike once the second is drawn where the answer takes what the first shows."""
+    coarse, fine = COMPARISONS
+    reason = _mismatch(images, ground, motion, coarse)
+    if reason and _correlation_of_answer(images, ground, motion) < LEAST_AT_BEST:
+        return reason if _mismatch(images, ground, motion, fine) else ""
+    return reason
+
+
+def _mismatch(images: Pair, ground: Ground, motion: Motion, comparison: Comparison) -> str:
+    """Return why the frames that an answer has brought together do not match; empty where they do."""
+    first, second, inside = _brought_together(images, ground, motion, comparison)
+    return matching_rejection(first, second, inside, alike=comparison.alike, block=BLOCK, aside=BLOCK // 2)
+
+
+def _correlation_of_answer(images: Pair, ground: Ground, motion: Motion) -> float:
+    """Return the correlation of the frames that an answer has brought together."""
+    first, second, inside = _brought_together(images, ground, motion, COMPARISONS[0])
+    return correlation_of(without_slow(first, BLOCK)[inside], without_slow(second, BLOCK)[inside])
+
+
+def _brought_together(
+    images: Pair, ground: Ground, motion: Motion, comparison: Comparison
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the first frame, the second one drawn at its cells, and which cells both show."""
+    rows, beams = images[0].shape[0] // comparison.cell, images[0].shape[1]
+    means = (image[: rows * comparison.cell].reshape(rows, comparison.cell, beams).mean(axis=1) for image in images)
+    first, second = (smooth(mean, comparison) for mean in means)
+    warp_grid = WarpGrid(ground, torch.ones(1, 3), (comparison.cell, 1), images[0].shape, first.shape, None)
+    back, inside = warp_grid.draw(torch.from_numpy(second)[None, None], torch.tensor([motion]))
+    return first, back[0, 0].numpy(), inside[0].numpy() > 0
+
+
+def smooth(image: NDArray[np.float32], comparison: Comparison) -> NDArray[np.float32]:
+    """With less noise."""
+    bins, beams = comparison.smoothing
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=beams, sigmaY=bins / comparison.cell), dtype=np.float32)
+
+
+def _is_covariance(matrix: NDArray[np.float64]) -> bool:
+    """Return whether a matrix ``(3, 3)`` is finite, symmetric and not negative, as a series of motions asks."""
+    if not np.isfinite(matrix).all() or np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
+        return False
+    least, _, largest = np.linalg.eigvalsh(matrix)
+    return bool(least >= -1e-9 * largest)
+
+
+# ---------------- The estimator that a checkpoint of impulse responses is: its measured taps in, the motion over all
+# its pings out
+
+
+UNREAD = ("name", "frame_rate_hz", "seed")
+"""Fields of a channel sonar that do not change what a network reads; and ``rays`` of the model scatterers."""
+
+
+@dataclass(init=False, eq=False)
+class ResponseNetwork(Trained):
+    """A trained network that reads impulse responses.
+
+    Args:
+        checkpoint: of it.
+        force: go on with another instrument or model than that of training.
+
+    Raises:
+        MitsonarError: a checkpoint that does not fit its network.
+    """
+
+    instead: ClassVar[str] = "likelihood or correlation"
+
+    @property
+    def consumes(self) -> type:
+        """Return the class of records that it reads."""
+        return ImpulseResponses
+
+    def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
+        self.force = force
+        self._take(checkpoint)
+
+    def estimate(self, responses: ImpulseResponses, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion from the first to the last ping, with the covariance of validation.
+
+        A network that was trained without turns answers that there is none, and with no variance, as ``likelihood`` does.
+
+        Args:
+            responses: as many pings as in training.
+            prior: ignored: the network answers in the range of its training.
+
+        Raises:
+            MitsonarError: another number of pings, or another instrument or model than that of training.
+        """
+        count = self._checkpoint.arrangement["frames"]
+        if len(responses) != count:
+            raise MitsonarError(f"this {self._checkpoint.network} is given {count} pings: got {len(responses)}")
+        pings = pings_of(responses)
+        self._check_channel(responses.sonar)
+        if len(pings.silent) == len(responses.sonar.receivers):
+            return rejected("no receiver heard anything")
+        inputs = torch.from_numpy(packed(pings.response)[None, None])
+        with torch.inference_mode(), one_thread():
+            targets, _ = self._checkpoint.decode(answer_of(self._network, inputs))
+        if not np.isfinite(targets).all():
+            return rejected("the network's answer is not finite")
+        answer = np.zeros(3)
+        answer[: targets.shape[1]] = targets[0]
+        motion = Motion(*answer.tolist())
+        reason = self._rejection_of_height(responses) or self._rejection_of_size(motion)
+        return Estimate(motion, self._covariance, not reason, reason)
+
+    @property
+    def _covariance(self) -> NDArray[np.float64] | None:
+        """Return the covariance of validation [m, m, rad] ``(3, 3)``; 0 of a turn that the network does not estimate."""
+        rmse = self._checkpoint.rmse
+        if rmse is None:
+            return None
+        variances = np.zeros(3)
+        variances[: len(rmse)] = (rmse / [axis.scale for axis in AXES[: len(rmse)]]) ** 2
+        return np.diag(variances)
+
+    def _check_channel(self, has: ChannelSonar) -> None:
+        """Refuse another instrument or model of echoes than that of training, unless it is forced."""
+        trained = self._checkpoint.channel
+        if trained is None or self.force:
+            return
+        left_out = {*UNREAD, *(() if trained.model == has.model == "rays" else ("rays",))}
+        mine, its = (one.model_dump(exclude=left_out) for one in (trained, has))
+        receivers = mine.pop("receivers") != its.pop("receivers")
+        unlike = [f"{name} {its[name]}, not {value}" for name, value in mine.items() if value != its[name]]
+        unlike += ["other receivers"] if receivers else []
+        if unlike:
+            raise MitsonarError(
+                f"this {self._checkpoint.network} was trained on the channel sonar {trained.name}, the responses are of "
+                f"{has.name}: {'; '.join(unlike)}; train on that one, use {self.instead}, or force it with RUN:force=1"
+            )
+
+    def _rejection_of_height(self, responses: ImpulseResponses) -> str:
+        """Return why the height is not that of training; empty where it is, or where the responses do not hold it."""
+        low, high = self.heights
+        if responses.height_m is None or not np.isfinite(responses.height_m).all():
+            return ""
+        height = float(np.mean(responses.height_m))
+        if low * (1 - HEIGHT_OFF) <= height <= high * (1 + HEIGHT_OFF):
+            return ""
+        return f"the transmitter stood at {height:.2f} m: {self._checkpoint.fixed} are fixed by training"
+
+
+# ---------------- The estimator that a checkpoint of several views, or of vectors, is: portions of a looking-down
+# view, say
+
+
+ALIKE = 0.4
+"""Least correlation of two pings' profiles without what is slow in them, the median over the views: pairs of 20 mm from 10 m
+have 0.8 to 0.97 at 512 and 1024 levels, pings of different places less than 0.4 but for the vector of a whole view."""
+
+SLOW = 4.0
+"""Standard deviation of the filter that tells what is slow [bins]."""
+
+FEW = 256
+"""Levels below which profiles of any two places are alike, and tell nothing."""
+
+
+def reads_views(checkpoint: Checkpoint) -> bool:
+    """Whether a network is given several views, a portion of one, or vectors as a data set stores them."""
+    words = checkpoint.arrangement
+    vectors = words["kind"] == "vector" and not words.get("halves", False)
+    return vectors or len(words["views"]) > 1 or words["views"][0] in SEGMENTS
+
+
+@dataclass(init=False, eq=False)
+class ViewNetwork(Trained):
+    """A trained network that reads several views or their vectors.
+
+    Args:
+        checkpoint: of it; it must take two frames.
+        force: go on with another sonar than that of training.
+
+    Raises:
+        MitsonarError: a checkpoint that needs something else than two frames, or that does not fit its network.
+    """
+
+    instead: ClassVar[str] = "a network of that sonar's views"
+
+    @property
+    def consumes(self) -> type:
+        """Return the class of records that it reads."""
+        return ViewFrames
+
+    def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
+        if checkpoint.arrangement["frames"] != 2:
+            raise MitsonarError(
+                f"an estimator has two frames: this {checkpoint.network} is given {checkpoint.arrangement['frames']}; use "
+                "`mitsonar evaluate`, or another checkpoint"
+            )
+        self.force = force
+        self._take(checkpoint)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Return the names of the views that it reads."""
+        return tuple(self._checkpoint.arrangement["views"])
+
+    def estimate(self, records: Record, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion between two pings, with the covariance of validation.
+
+        Args:
+            records: two :class:`~mitsonar.records.frames.ViewFrames`.
+            prior: ignored: the network answers in the range of its training.
+
+        Raises:
+            MitsonarError: not two pings of these views, another sonar than that of training.
+        """
+        frames = self._checked_views(records)
+        inputs = self._input_of_views(frames)
+        profiles = frames.profiles()
+        if not np.isfinite(profiles).all():
+            raise MitsonarError("the frames hold nan or inf: set pixels without echo to 0")
+        if (np.ptp(profiles, axis=2) == 0).any():
+            return rejected("nothing in the frames to match")
+        with torch.inference_mode(), one_thread():
+            targets, covariances = self._checkpoint.decode(answer_of(self._network, inputs))
+        if not np.isfinite(targets).all():
+            return rejected("the network's answer is not finite")
+        motion = Motion(*targets[0].tolist())
+        reason = self._rejection_of_geometry(frames) or self._rejection_of_size(motion) or _rejection_of_profiles(profiles)
+        covariance = self._checkpoint.covariance if covariances is None else covariances[0]
+        return Estimate(motion, covariance, not reason, reason)
+
+    def _checked_views(self, frames: Record) -> ViewFrames:
+        """Check that there are two pings of the views that it reads."""
+        views = ", ".join(self.views)
+        if not isinstance(frames, ViewFrames):
+            raise MitsonarError(
+                f"this {self._checkpoint.network} is given {self.kind}s of {views}: use `mitsonar odometry` or `mitsonar "
+                "evaluate` on a data set that holds them"
+            )
+        if len(frames) != 2 or any(view not in frames.values for view in self.views):
+            raise MitsonarError(f"two pings of {views} are needed: got {len(frames)} of {', '.join(frames.values)}")
+        return frames
+
+
+def _rejection_of_profiles(profiles: NDArray[np.float32]) -> str:
+    """Whether two pings ``(views, 2, bins)`` show one place: what varies quickly along range must be alike."""
+    if profiles.shape[2] < FEW:
+        return ""
+    quick = profiles - gaussian_filter1d(profiles, SLOW, axis=2)
+    found = []
+    for first, second in quick:
+        shifted = [(first[3 : len(first) - 3], second[3 + lag : len(second) - 3 + lag]) for lag in range(-3, 4)]
+        found.append(max(np.vdot(a, b) / np.sqrt(np.vdot(a, a) * np.vdot(b, b) + 1e-12) for a, b in shifted))
+    alike = float(np.median(found))
+    return "" if alike >= ALIKE else f"the profiles of both pings correlate by {alike:.2f} only"

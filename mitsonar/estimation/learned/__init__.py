@@ -1,1 +1,0 @@
-"""Estimators that a training made."""
