@@ -29,8 +29,8 @@ from real_recordings import recordings_folder
 from mitsonar.datasets.samples import SonarPairs
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.named import create_estimator
-from mitsonar.mapping.benchmark_sets import RenderedSet
-from mitsonar.mapping.closure import closure_of
+from mitsonar.mapping.odometry import closure_of
+from mitsonar.mapping.odometry_benchmark import RenderedSet
 from mitsonar.mapping.open_source import LOOP
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import cluster_resamples, in_units, motion_errors

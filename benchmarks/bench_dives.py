@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 import mitsonar
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.image.direct import Direct
-from mitsonar.mapping.benchmark_sets import DIVE_HZ, DIVE_SONARS, FLIGHTS, SETS, TEXTURES, SimulatedSet, dive_course
+from mitsonar.mapping.odometry_benchmark import DIVE_HZ, DIVE_SONARS, FLIGHTS, SETS, TEXTURES, SimulatedSet, dive_course
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import MotionErrors, motion_errors
 from mitsonar.motion.pose import Pose, mounted

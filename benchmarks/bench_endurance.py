@@ -35,7 +35,7 @@ from bench_trajectories import GYRO, machine, rendered
 from numpy.typing import NDArray
 from trajectory_jobs import trajectory_job
 
-from mitsonar.mapping.simulated_sensors import simulated_sensors
+from mitsonar.mapping.sensors import simulated_sensors
 from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import FrameStore, SonarFrames

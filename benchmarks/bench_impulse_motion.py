@@ -58,9 +58,9 @@ from mitsonar.datasets.responses import ImpulsePairs, with_noise
 from mitsonar.estimation.crlb.channel import channel_crlb
 from mitsonar.estimation.named import create_estimator
 from mitsonar.estimation.regressors import REGRESSORS, flattened, score_all
-from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry import odometry
-from mitsonar.mapping.response_source import ResponseSource
+from mitsonar.mapping.open_source import ResponseSource
+from mitsonar.mapping.series import path_of
 from mitsonar.motion.composition import motions
 from mitsonar.motion.courses import COURSES, course
 from mitsonar.motion.errors import in_units

@@ -32,11 +32,11 @@ from mitsonar.config.data import load_recipe
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named import create_estimator
-from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import normalised_errors
-from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry import Odometry, odometry
-from mitsonar.mapping.simulated_sensors import simulated_sensors
+from mitsonar.mapping.sensors import simulated_sensors
+from mitsonar.mapping.series import path_of
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.sensors import VehicleSensors
 from mitsonar.motion.trajectory import Trajectory

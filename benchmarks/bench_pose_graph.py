@@ -22,8 +22,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from mitsonar.mapping.graph_odometry import graph_path
-from mitsonar.mapping.motion_series import MotionSeries, path_of
-from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.series import MotionSeries, path_of
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.sensors import VehicleSensors
 

@@ -26,10 +26,9 @@ from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named import create_estimator
 from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import odometry
-from mitsonar.mapping.open_frames import open_frames
 from mitsonar.mapping.open_source import LOOP, with_assumed_plane
+from mitsonar.mapping.sources import FrameSource, open_frames
 from mitsonar.recordings.write_aris import write_aris
 from mitsonar.records.frames import SonarFrames
 

@@ -37,9 +37,9 @@ from mitsonar.datasets.store import DataStore
 from mitsonar.estimation.height import DirectHeight
 from mitsonar.estimation.learned import ViewNetwork
 from mitsonar.estimation.named import create_estimator
-from mitsonar.mapping.measured_heights import measured
 from mitsonar.mapping.odometry_run import run_odometry
-from mitsonar.mapping.view_source import open_views
+from mitsonar.mapping.open_source import open_views
+from mitsonar.mapping.sources import measured
 from mitsonar.motion.errors import in_units
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.frames import SonarFrames

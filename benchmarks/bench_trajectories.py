@@ -67,12 +67,10 @@ from mitsonar.datasets.plan import run_poses
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named import create_estimator
-from mitsonar.mapping.benchmark_sets import TEXTURES as SONARS
-from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.odometry import odometry
-from mitsonar.mapping.pose_covariance import pose_covariances
-from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
-from mitsonar.mapping.trajectory_smoothing import kalman_smoothed, spline_smoothed
+from mitsonar.mapping.odometry_benchmark import TEXTURES as SONARS
+from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.series import MotionSeries, kalman_smoothed, path_of, pose_covariances, spline_smoothed
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import assess, motion_errors
 from mitsonar.motion.pose import Pose, mounted

@@ -10,8 +10,7 @@ import numpy as np
 from trajectory_jobs import NOISE_OF, RECIPES, Job, trajectory_job
 
 from mitsonar.io.files import write_whole
-from mitsonar.mapping.illumination import ILLUMINATION_FRAMES, illumination
-from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic
+from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Blend, Mosaic, build_mosaic, illumination
 from mitsonar.motion.errors import AXES, in_units
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fans import GAMMA

@@ -36,12 +36,11 @@ if TYPE_CHECKING:
     from mitsonar.instruments.hydrophones import ChannelSonar
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.instruments.sounder import Sounder, load_sonar, load_sounder
-    from mitsonar.mapping.illumination import illumination
-    from mitsonar.mapping.mosaic import build_mosaic
-    from mitsonar.mapping.motion_series import path_of
+    from mitsonar.mapping.mosaic import build_mosaic, illumination
     from mitsonar.mapping.odometry import odometry
-    from mitsonar.mapping.open_frames import load_frames
-    from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+    from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
+    from mitsonar.mapping.series import path_of
+    from mitsonar.mapping.sources import load_frames
     from mitsonar.motion.bodies import Deforming
     from mitsonar.motion.composition import Motion
     from mitsonar.motion.pose import Pose
@@ -147,7 +146,7 @@ _MODULES = {
     "Pose": "motion.pose",
     "RenderedPairs": "datasets.rendered",
     "SeaSurface": "worlds.sea",
-    "SensorNoise": "mapping.simulated_sensors",
+    "SensorNoise": "mapping.sensors",
     "Simulator": "simulation.simulator",
     "Sonar": "instruments.sonar",
     "SonarEnv": "environments.sonar_env",
@@ -165,9 +164,9 @@ _MODULES = {
     "cramer_rao_bound": "estimation.crlb.image",
     "create_estimator": "estimation.named",
     "fishing_net_mesh": "worlds.sea",
-    "illumination": "mapping.illumination",
+    "illumination": "mapping.mosaic",
     "load_checkpoint": "estimation.named",
-    "load_frames": "mapping.open_frames",
+    "load_frames": "mapping.sources",
     "load_meshes": "simulation.scene",
     "load_motions": "simulation.scene",
     "load_noise": "acoustics.noise",
@@ -184,13 +183,13 @@ _MODULES = {
     "open_recording": "recordings.open",
     "particle_mesh": "worlds.sea",
     "path_figure": "plotting.figures",
-    "path_of": "mapping.motion_series",
+    "path_of": "mapping.series",
     "range_rates": "records.soundings",
     "reproduce": "training.reproduce",
     "save_sensors": "motion.sensors",
     "sheet_figure": "plotting.figures",
     "shipped_trajectory": "simulation.scene",
-    "simulated_sensors": "mapping.simulated_sensors",
+    "simulated_sensors": "mapping.sensors",
     "sonar_in": "simulation.scene",
     "to_cartesian": "geometry.fan",
     "write_mcap": "recordings.write_mcap",

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.motion_series import path_of
+from mitsonar.mapping.series import path_of
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import FrameStore, SonarFrames

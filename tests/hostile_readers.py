@@ -23,7 +23,7 @@ from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.runs import RunDirectory, RunKind
 from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder
-from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
 from mitsonar.motion.sensors import load_sensors, save_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
@@ -138,7 +138,7 @@ def make_frames_zarr(folder: Path) -> None:
 
 
 def read_frames_zarr(folder: Path) -> None:
-    from mitsonar.mapping.open_frames import open_frames
+    from mitsonar.mapping.sources import open_frames
 
     SonarFrames.load(folder / "frames.zarr")
     with warnings.catch_warnings():
@@ -300,7 +300,7 @@ class Nearby:
 
 def make_odometry(folder: Path) -> None:
     from mitsonar.estimation.estimator import Estimate
-    from mitsonar.mapping.estimate_journal import add_to_journal
+    from mitsonar.mapping.odometry_run import add_to_journal
     from mitsonar.motion.composition import Motion
 
     begun(folder, ODOMETRY, {"a": 1}, source="s", scale=None, seconds=1.5)

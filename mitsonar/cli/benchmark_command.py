@@ -61,8 +61,7 @@ def odometry_benchmark(
 
     Simulated sets are rendered once into OUT and kept. Each row is written when it is made. The table holds all rows of OUT.
     """
-    from mitsonar.mapping.benchmark_table import benchmark_lines
-    from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_odometry
+    from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_lines, benchmark_odometry
 
     asked = {"sets": set_, "textures": texture, "noises": noise, "methods": method}
     wanted = Wanted(

@@ -284,7 +284,7 @@ def export(
     view: Annotated[str | None, typer.Option(help="Name of the view (default: the first).")] = None,
 ) -> None:
     """Write a data set in the layout of another tool, whole or absent."""
-    from mitsonar.mapping.open_frames import is_data_set
+    from mitsonar.mapping.sources import is_data_set
 
     if not is_data_set(data):
         raise MitsonarError(f"no data set at {data}: {command_line('frames', 'export')} exports runs and recordings")

@@ -75,7 +75,7 @@ def export(
     polygons: Polygons = False,
 ) -> None:
     """Write frames in the layout of another tool, whole or absent. COCO and YOLO need labels, KITTI and neusis poses."""
-    from mitsonar.mapping.open_frames import is_data_set
+    from mitsonar.mapping.sources import is_data_set
 
     if is_data_set(run):
         raise MitsonarError(f"{run} is a data set: {command_line('dataset', 'export', run)} exports it")

@@ -18,8 +18,8 @@ from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
     from mitsonar.estimation.height import HeightEstimate
-    from mitsonar.mapping.frame_source import FrameSource
-    from mitsonar.mapping.view_source import ViewSource
+    from mitsonar.mapping.open_source import ViewSource
+    from mitsonar.mapping.sources import FrameSource
 
 __all__ = ["height"]
 
@@ -46,9 +46,9 @@ def height(
     `mitsonar odometry --height-by` passes such heights to the estimators of motion.
     """
     from mitsonar.estimation.height import height_estimator_from
-    from mitsonar.mapping.height_tables import heights_csv, heights_lines
-    from mitsonar.mapping.measured_heights import measured
+    from mitsonar.mapping.odometry_benchmark import heights_csv, heights_lines
     from mitsonar.mapping.open_source import Reading, frames_for, views_for
+    from mitsonar.mapping.sources import measured
 
     if out is not None:
         refuse_to_replace(out, overwrite=overwrite)
@@ -98,7 +98,7 @@ def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | Non
     """Return views and their kind, of a data set of vectors alone or of portions of a view; else None."""
     from mitsonar.config.data import array_names
     from mitsonar.datasets.store import DataStore
-    from mitsonar.mapping.open_frames import is_data_set
+    from mitsonar.mapping.sources import is_data_set
 
     if not is_data_set(where):
         return None

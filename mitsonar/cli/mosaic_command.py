@@ -20,8 +20,8 @@ from mitsonar.io.runs import kind_of_run, refuse_to_replace
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mitsonar.mapping.frame_source import FrameSource
     from mitsonar.mapping.mosaic import Mosaic
+    from mitsonar.mapping.sources import FrameSource
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.records.frames import SonarFrames
 
@@ -63,12 +63,10 @@ def mosaic(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
     """Lay frames on the ground plane along a path: mean level, standard deviation and count of each cell."""
-    from mitsonar.mapping.geotiff import save_geotiff
-    from mitsonar.mapping.illumination import illumination
-    from mitsonar.mapping.mosaic import Mosaic, build_mosaic
+    from mitsonar.mapping.mosaic import Mosaic, build_mosaic, illumination, save_geotiff
     from mitsonar.mapping.odometry_run import ODOMETRY
-    from mitsonar.mapping.open_frames import is_recording
     from mitsonar.mapping.open_source import Reading, frames_for, with_assumed_plane
+    from mitsonar.mapping.sources import is_recording
 
     if kind_of_run(frames) == ODOMETRY.name:
         raise MitsonarError(
@@ -172,7 +170,7 @@ def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Tr
 
 def _spread(count: int) -> NDArray[np.intp]:
     """Choose the frames that the illumination is estimated from."""
-    from mitsonar.mapping.illumination import ILLUMINATION_FRAMES
+    from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES
 
     return np.unique(np.linspace(0, count - 1, min(ILLUMINATION_FRAMES, count)).astype(np.intp))
 

@@ -117,10 +117,10 @@ def odometry(
     also loops.csv.
     """
     from mitsonar.estimation.named import create_estimator
-    from mitsonar.mapping.bag_sensors import open_sensors
-    from mitsonar.mapping.closure import loop_starts
+    from mitsonar.mapping.odometry import loop_starts
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
     from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at, usual_loop
+    from mitsonar.mapping.sensors import open_sensors
     from mitsonar.motion.pose import Pose
     from mitsonar.records.frames import SonarFrames
 

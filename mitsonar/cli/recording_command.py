@@ -198,7 +198,7 @@ def _span(text: str, what: str) -> tuple[int, int]:
 
 
 def _opened(file: str, topic: str | None, geometry: Path | None) -> Recording:
-    from mitsonar.mapping.any_recording import recording_at
+    from mitsonar.mapping.sources import recording_at
 
     return recording_at(file, view=topic, geometry=geometry)
 

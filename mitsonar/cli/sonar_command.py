@@ -86,7 +86,7 @@ def from_recording(
     --sonar sonar.yaml,noise.yaml.
     """
     from mitsonar.estimation.sonar_fit import as_instrument
-    from mitsonar.mapping.open_frames import open_frames
+    from mitsonar.mapping.sources import open_frames
 
     for path in (out, noise):
         if path is not None:

@@ -84,7 +84,7 @@ def _shown(
 ) -> Shown:
     """Return what to show: frames with the scene they were made of, or a scene with its sonar and its shipped path."""
     from mitsonar.live.rerun_recording import Shown
-    from mitsonar.mapping.open_frames import is_data_set, is_recording, open_frames
+    from mitsonar.mapping.sources import is_data_set, is_recording, open_frames
 
     place = Path(what)
     frames_there = is_data_set(what) or is_recording(what) or place.is_dir() or place.suffix in (".npz", ".zarr")

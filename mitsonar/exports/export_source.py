@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mitsonar.config.data import Split
 from mitsonar.datasets.store import PARTS, DataStore, deal, names_of_scenes, world_of
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.mapping.open_frames import is_data_set, open_frames, view_in
+from mitsonar.mapping.sources import is_data_set, open_frames, view_in
 from mitsonar.records.frames import COLUMNS, LABELS, SonarFrames, open_group
 
 __all__ = ["ExportSource", "open_export"]

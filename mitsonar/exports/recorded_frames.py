@@ -13,9 +13,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.sonar_fit import NOISE_FIELDS, as_instrument
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.runs import shown
-from mitsonar.mapping.any_recording import recording_at
-from mitsonar.mapping.known_poses import poses_at, stretches
-from mitsonar.mapping.open_frames import is_data_set
+from mitsonar.mapping.sources import is_data_set, poses_at, recording_at, stretches
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.recording import Part
 from mitsonar.records.frames import SonarFrames, to_float32

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.live.sonar_messages import FanEncoder
-from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames, to_uint8

@@ -10,14 +10,10 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import AnyEstimator
-from mitsonar.mapping.error_correlation import ErrorCorrelation
-from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.graph_solver import GraphSolution, solved
-from mitsonar.mapping.loop_appearance import Canvas
-from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops, LoopSearch, canvas_of, search_loops
-from mitsonar.mapping.motion_series import MotionSeries, path_of
-from mitsonar.mapping.pose_graph import CorrelatedErrors, PoseEdges, PoseGraph, relative_motions
-from mitsonar.mapping.trajectory_smoothing import fit_noise
+from mitsonar.mapping.loops import Canvas, KeepLoop, KnownLoops, LoopSearch, canvas_of, search_loops
+from mitsonar.mapping.pose_graph import CorrelatedErrors, GraphSolution, PoseEdges, PoseGraph, relative_motions, solved
+from mitsonar.mapping.series import ErrorCorrelation, MotionSeries, fit_noise, path_of
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.sensors import UNKNOWN_STD, Headings, VehicleSensors, wrapped
 from mitsonar.motion.trajectory import Trajectory

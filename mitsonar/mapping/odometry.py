@@ -7,10 +7,12 @@ the place of the composition.
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Literal, get_args
 
@@ -18,21 +20,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, counted, nearest_names
-from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.named import EstimatorLike, create_estimator
-from mitsonar.mapping.closure import Closure, closure_of
-from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, errors_along, graph_path
-from mitsonar.mapping.height_profile import HeightProfile, height_profile
 from mitsonar.mapping.local_map import USED, map_attitudes, mapped
-from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops, canvas_of
-from mitsonar.mapping.mode_continuity import continued
-from mitsonar.mapping.motion_series import MotionSeries, fit_scale, path_of, scaled
+from mitsonar.mapping.loops import KeepLoop, KnownLoops, canvas_of
 from mitsonar.mapping.open_source import Source
-from mitsonar.mapping.pair_estimation import estimate_motions
-from mitsonar.mapping.pose_covariance import pose_covariances
+from mitsonar.mapping.pairs import continued, estimate_motions
 from mitsonar.mapping.pose_graph import CorrelatedErrors
-from mitsonar.mapping.trajectory_smoothing import kalman_smoothed, spline_smoothed
+from mitsonar.mapping.series import (
+    MotionSeries,
+    fit_scale,
+    kalman_smoothed,
+    path_of,
+    pose_covariances,
+    scaled,
+    spline_smoothed,
+)
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import AXES, assess, in_units, motion_errors, path_length
 from mitsonar.motion.pose import Pose
@@ -40,10 +45,250 @@ from mitsonar.motion.sensors import VehicleSensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 
-__all__ = ["Odometry", "Row", "Smoothing", "bridged", "odometry", "series_of"]
+__all__ = [
+    "ALTIMETER",
+    "FIRST_ECHOES",
+    "Closure",
+    "HeightProfile",
+    "Odometry",
+    "Row",
+    "Smoothing",
+    "bridged",
+    "closure_of",
+    "height_profile",
+    "loop_starts",
+    "odometry",
+    "series_of",
+]
+
+
+# ---------------- Closure, a quality without truth: single motions composed, less the motion over all of them
+# estimated at once
+
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+FEWEST = 2
+"""Loops from which errors are judged."""
+
+
+@dataclass(frozen=True)
+class Closure:
+    """Loops over ``steps`` motions: composed, less estimated at once.
+
+    Attributes:
+        steps: motions of a loop.
+        residuals: sideways, forward [m], yaw [rad] that each loop leaves over ``(loops, 3)``.
+        factor: by which the covariances of single motions must be multiplied, so that they explain the residuals; at
+            least 1. nan where they are not known.
+    """
+
+    steps: int
+    residuals: Array
+    factor: float
+
+    @property
+    def rms(self) -> Array:
+        """Return the root of the mean square of the residuals ``(3,)`` [m, m, rad]."""
+        return np.asarray(np.sqrt((self.residuals**2).mean(axis=0)))
+
+    @property
+    def mean(self) -> Array:
+        """Return the mean of the residuals ``(3,)`` [m, m, rad]: single steps are too long or too short by it."""
+        return np.asarray(self.residuals.mean(axis=0))
+
+    def honest(self, estimates: Sequence[Estimate]) -> list[Estimate]:
+        """Return the estimates with covariances that explain the residuals.
+
+        Covariances are multiplied by the factor. Estimates without one get the mean square of the residuals, of which each
+        of the motions of a loop and the one over all of them hold an equal part.
+        """
+        share = np.diag((self.residuals**2).mean(axis=0) / (self.steps + 1))
+        factor = self.factor if np.isfinite(self.factor) else 1.0
+        known = [np.asarray(one.covariance) * factor if one.covariance is not None else share for one in estimates]
+        return [replace(one, covariance=covariance) for one, covariance in zip(estimates, known, strict=True)]
+
+
+def closure_of(
+    source: Source,
+    estimator: AnyEstimator,
+    numbers: Index,
+    estimates: Sequence[Estimate],
+    steps: int,
+    progress: Callable[[int], None] = lambda pairs: None,
+) -> Closure | None:
+    """Estimate motions over several steps at once, and compare them with the single steps composed.
+
+    Loops follow one another without overlap, so that their errors are independent. Of a short run they overlap, so that
+    there are 16 of them, or as many as fit.
+
+    Args:
+        source: of the records.
+        estimator: the one of the single steps.
+        numbers: of the frames used ``(frames,)``.
+        estimates: of the single steps ``(frames - 1,)``.
+        steps: motions of a loop.
+        progress: called with the number of loops that were added, also of those left out.
+
+    Returns:
+        The closure; None where fewer than two loops have valid motions throughout.
+    """
+    valid = np.array([one.valid for one in estimates], dtype=bool)
+    residuals, explained = [], []
+    for start in (int(one) for one in loop_starts(len(estimates), steps)):
+        if not valid[start : start + steps].all():
+            progress(1)
+            continue
+        ends = np.array([numbers[start], numbers[start + steps]])
+        whole = estimate_motions(source, estimator, ends)[0]
+        progress(1)
+        if not whole.valid:
+            continue
+        parts = list(estimates[start : start + steps])
+        residual = _composed(np.array([one.motion for one in parts])) - np.asarray(whole.motion)
+        residuals.append(residual)
+        covariances = [one.covariance for one in (*parts, whole) if one.covariance is not None]
+        if len(covariances) == steps + 1:
+            total = np.sum(np.array(covariances), axis=0)
+            explained.append(float(residual @ np.linalg.solve(total, residual)) / 3)
+    if len(residuals) < FEWEST:
+        return None
+    factor = max(1.0, float(np.mean(explained))) if len(explained) == len(residuals) else float("nan")
+    return Closure(steps, np.array(residuals), factor)
+
+
+def loop_starts(motions: int, steps: int) -> Index:
+    """Return the first motion of each loop over ``steps`` of so many motions."""
+    stride = max(1, min(steps, (motions - steps) // 15 if motions > steps else 1))
+    return np.arange(0, motions - steps + 1, stride, dtype=np.intp)
+
+
+def _composed(motions: Array) -> Array:
+    """Return the motion ``(3,)`` of consecutive motions ``(steps, 3)``, in axes of the last heading (eq. 3.4)."""
+    heading = np.cumsum(motions[:, 2])
+    turn = heading[-1] - heading
+    sideways = motions[:, 0] * np.cos(turn) - motions[:, 1] * np.sin(turn)
+    forward = motions[:, 0] * np.sin(turn) + motions[:, 1] * np.cos(turn)
+    return np.array([sideways.sum(), forward.sum(), heading[-1]])
+
+
+# ---------------- The height of the sonar over the ground along a path, by first echoes or an altimeter, and where
+# the ground lies
+
+
+FIRST_ECHOES, ALTIMETER = "first echoes", "altimeter"
+"""What measured a height."""
+
+
+@dataclass(frozen=True)
+class HeightProfile:
+    """Heights along a path; nan where nothing measured them.
+
+    Attributes:
+        frames: their numbers in the source ``(frames,)``.
+        distance_m: horizontal way along the path ``(frames,)``.
+        places: x, y of the ground that was measured ``(frames, 2)`` [m]. First echoes come from ground ahead of the sonar.
+        height_m: of the sonar over that ground ``(frames,)``.
+        std_m: standard deviation of the height ``(frames,)``; nan for an altimeter, which tells none.
+        by: :data:`FIRST_ECHOES` or :data:`ALTIMETER` ``(frames,)``; empty where nothing measured it.
+        ground_z_m: z of that ground in the coordinates of the path ``(frames,)``; nan where z is not measured.
+        ground_depth_m: depth of that ground below the surface ``(frames,)``; nan without a depth sensor.
+    """
+
+    frames: Index
+    distance_m: Array
+    places: Array
+    height_m: Array
+    std_m: Array
+    by: NDArray[np.str_]
+    ground_z_m: Array
+    ground_depth_m: Array
+
+    def csv(self) -> str:
+        """Return a table with a line a frame; cells are empty where nothing is known."""
+        text = io.StringIO()
+        table = csv.writer(text, lineterminator="\n")
+        names = ["distance_m", "x_m", "y_m", "height_m", "height_std_m", "ground_z_m", "ground_depth_m"]
+        table.writerow(["frame", *names, "measured_by"])
+        heights = self.height_m, self.std_m, self.ground_z_m, self.ground_depth_m
+        rows = np.column_stack([self.distance_m, self.places, *heights])
+        for frame, row, by in zip(self.frames, rows, self.by, strict=True):
+            table.writerow([int(frame), *("" if np.isnan(value) else f"{value:.6f}" for value in row), str(by)])
+        return text.getvalue()
+
+
+def height_profile(
+    source: Source, frames: Index, estimates: Sequence[Estimate], sensors: VehicleSensors | None, path: Trajectory
+) -> HeightProfile:
+    """Collect the heights over the ground along a path.
+
+    First echoes count, where an estimator measured the height by them; else the heights that the frames tell. A height that
+    the user gave is no measurement.
+
+    Args:
+        source: of the records.
+        frames: numbers of those used ``(n,)``.
+        estimates: of each pair of them; ``about`` may hold ``height_m`` and ``height_std_m``, of first echoes.
+        sensors: of the vehicle.
+        path: poses at the frames.
+    """
+    poses = path.poses
+    height, std = (_at_frames(np.array([_told(one, name) for one in estimates])) for name in ("height_m", "height_std_m"))
+    echoes = np.isfinite(height)
+    altimeter = _altimeter(source, frames)
+    height = np.where(echoes, height, altimeter)
+    ahead = np.where(echoes, _ahead(source, frames, height), 0.0)
+    places = poses[:, :2] + ahead[:, None] * np.column_stack([np.sin(poses[:, 5]), np.cos(poses[:, 5])])
+    places[np.isnan(height)] = np.nan
+    nothing = np.full(len(frames), np.nan)
+    depth = None if sensors is None else sensors.depths(path.time_s)
+    known = source.poses[frames, 2] if source.poses is not None else nothing if depth is None else poses[:, 2]
+    return HeightProfile(
+        frames=frames,
+        distance_m=np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))]),
+        places=places,
+        height_m=height,
+        std_m=std,
+        by=np.where(echoes, FIRST_ECHOES, np.where(np.isfinite(altimeter), ALTIMETER, "")),
+        ground_z_m=known - height,
+        ground_depth_m=nothing if depth is None else depth + height,
+    )
+
+
+def _told(estimate: Estimate, name: str) -> float:
+    """Return a height that first echoes tell; nan where they tell none."""
+    return float(estimate.about[name]) if "height_std_m" in estimate.about else np.nan
+
+
+def _at_frames(of_pairs: Array) -> Array:
+    """Return the mean of what the pairs before and after each frame tell ``(frames,)``."""
+    both = np.stack([np.append(of_pairs, np.nan), np.append(np.nan, of_pairs)])
+    known = np.isfinite(both)
+    count = known.sum(axis=0)
+    return np.where(count > 0, np.where(known, both, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
+
+
+def _altimeter(source: Source, frames: Index) -> Array:
+    """Return the heights that the frames tell ``(frames,)``; nan where they tell none, or those are given or assumed."""
+    if source.height_m is None or (isinstance(source, FrameSource) and source.assumed_height):
+        return np.full(len(frames), np.nan)
+    heights = np.asarray(source.height_m[frames], dtype=float)
+    given = np.nan if source.told_height_m is None else source.told_height_m
+    return np.where(heights == given, np.nan, heights)
+
+
+def _ahead(source: Source, frames: Index, height_m: Array) -> Array:
+    """Return how far ahead of the sonar its steepest rays meet the ground, in the mean of the beams ``(frames,)`` [m]."""
+    attitudes = source.attitudes(frames) if isinstance(source, FrameSource) else None
+    if not isinstance(source, FrameSource) or attitudes is None:
+        return np.zeros(len(frames))
+    steepest = attitudes[:, 3] + np.radians(source.like.sonar.elevation_fov_deg) / 2
+    return np.asarray(height_m / np.tan(steepest) * float(np.cos(source.like.bearing_rad).mean()))
+
+
+# ---------------- odometry
+
 Row = tuple[str, float, str]
 """Name, value, unit."""
 
@@ -99,7 +344,7 @@ class Odometry:
     def pose_covariances(self) -> Array | None:
         """Return the covariances of x, y [m] and heading [rad] along the path ``(frames, 3, 3)``.
 
-        Errors over the same ground are alike, as :class:`~mitsonar.mapping.error_correlation.ErrorCorrelation` says, but for
+        Errors over the same ground are alike, as :class:`~mitsonar.mapping.series.ErrorCorrelation` says, but for
         motions by the local map. Of smoothed motions, and of records that do not show ground, they count as independent.
         None where the covariances of the motions are not known. With sensors or loops they are the marginals of the pose
         graph.

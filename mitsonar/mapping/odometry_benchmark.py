@@ -2,30 +2,501 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, Any, cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
-from mitsonar.estimation.estimator import AnyEstimator, PlainTable
+from mitsonar.estimation.compare import Answers, Cells, markdown
+from mitsonar.estimation.crlb.image import bounds_at, laws_of, overall
+from mitsonar.estimation.estimator import AnyEstimator, Estimate, PlainTable
 from mitsonar.estimation.named import EXTERNAL, create_estimator
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.io.files import parse_json, read_json, whole_lines, write_json, write_whole
 from mitsonar.io.runs import RunDirectory, RunKind, digest, versions
-from mitsonar.mapping.benchmark_row import LENGTHS_M, Case, measured_row
-from mitsonar.mapping.benchmark_sets import DIVE, NOISES, PRESET, SEED, SETS, TEXTURES, Begin, RenderedSet
-from mitsonar.mapping.benchmark_table import benchmark_lines
-from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.odometry import Odometry
+from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder, run_odometry
 from mitsonar.mapping.open_source import LOOP, Reading, open_source, record_at
+from mitsonar.mapping.sources import FrameSource, open_frames
+from mitsonar.motion.composition import motions
+from mitsonar.motion.errors import (
+    AXES,
+    assess,
+    cluster_resamples,
+    distance_driven,
+    in_units,
+    motion_errors,
+    path_length,
+    segment_drift,
+)
+from mitsonar.motion.pose import Pose, mounted
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
+from mitsonar.simulation.device import release_memory
+from mitsonar.simulation.runs import RENDERING, Outputs, run
+from mitsonar.simulation.scene import load_scene
+from mitsonar.worlds.families import RockyField, ShipHull
+from mitsonar.worlds.world import Family, sloped
 
-__all__ = ["METHODS", "Wanted", "benchmark_odometry"]
+if TYPE_CHECKING:
+    from mitsonar.estimation.height import HeightEstimate
+    from mitsonar.simulation.simulator import Simulator
+
+__all__ = [
+    "DIVE",
+    "LENGTHS_M",
+    "METHODS",
+    "NOISES",
+    "PRESET",
+    "SEED",
+    "SETS",
+    "TEXTURES",
+    "Begin",
+    "Case",
+    "RenderedSet",
+    "SimulatedSet",
+    "Wanted",
+    "benchmark_course",
+    "benchmark_lines",
+    "benchmark_odometry",
+    "dive_course",
+    "heights_csv",
+    "heights_lines",
+    "measured_row",
+]
+
+
+# ---------------- One row of the odometry benchmark: a method on the frames of one set, its path, errors, time and
+# failures
+
+
+Array = NDArray[np.float64]
+
+LENGTHS_M = (1.0, 2.0, 5.0)
+"""Lengths of the segments of drift [m]; KITTI has 100 to 800 m."""
+
+TIMED_PAIRS = 15
+"""Pairs whose estimates are timed, evenly spaced."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a row is of.
+
+    Attributes:
+        name: of the set, or the path of a recording.
+        texture: ``still``, ``speckle``, or ``recorded``.
+        noise: level.
+        method: name of the estimator.
+        geometry: file that tells how the pictures of a recording are laid out.
+    """
+
+    name: str
+    texture: str
+    noise: str
+    method: str
+    geometry: Path | None = field(default=None, compare=False)
+
+    @property
+    def words(self) -> tuple[str, str, str, str]:
+        """Return set, texture, noise and method."""
+        return self.name, self.texture, self.noise, self.method
+
+    @property
+    def command(self) -> str:
+        """Return the words of the command line that make this row, after ``mitsonar benchmark odometry``."""
+        geometry = [] if self.geometry is None else [f"--geometry {self.geometry}"]
+        if self.texture == "recorded":
+            return " ".join([f"--set {self.name}", *geometry, f"--method {self.method}"])
+        noise = [] if self.noise == PRESET else [f"--noise {self.noise}"]
+        return " ".join([f"--set {self.name} --texture {self.texture}", *noise, f"--method {self.method}"])
+
+
+def measured_row(
+    case: Case,
+    source: FrameSource,
+    estimator: AnyEstimator,
+    folder: Path,
+    *,
+    bound: Array | None = None,
+    workers: int = 1,
+    progress: Callable[[int], None] = lambda pairs: None,
+) -> PlainTable:
+    """Estimate the path of a set, and compute what the table of the benchmark shows.
+
+    Invalid motions are failures; they are bridged from their neighbours, as :func:`mitsonar.mapping.odometry.odometry` does.
+
+    Args:
+        case: what the row is of.
+        source: of its frames.
+        estimator: the method.
+        folder: of the odometry; an interrupted one goes on.
+        bound: of a motion ``(3,)`` [m, m, rad], where it is known.
+        workers: processes beside this one.
+        progress: called with the number of pairs that were added.
+
+    Returns:
+        Numbers, lists and texts, for JSON: None where a number is not known.
+
+    Raises:
+        MitsonarError: frames that the estimator does not take.
+    """
+    pairs = len(source) - 1
+    row: PlainTable = dict(zip(("set", "texture", "noise", "method"), case.words, strict=True))
+    row |= {"command": case.command, "inputs": estimator.inputs, "frames": len(source), "pairs": pairs, "note": ""}
+    loop = LOOP if source.true is None and pairs > LOOP else 0
+    try:
+        found = run_odometry(
+            source, case.method, estimator, folder, closure=loop, workers=workers, resume=True, progress=progress
+        )
+    except MitsonarError as error:
+        estimates = _kept(folder)
+        if len(estimates) < pairs or any(one.valid for one in estimates):
+            raise
+        return row | {"failures": pairs, "note": str(error), "ms": _milliseconds(source, estimator)}
+    row |= {"failures": int((~found.believed).sum()), "ms": _milliseconds(source, estimator)}
+    row |= {"estimated_path_m": path_length(found.path)}
+    return row | (_without_truth(found) if found.true is None else _against_truth(found, found.true, bound))
+
+
+def _kept(folder: Path) -> list[Estimate]:
+    """Return the estimates of a row that failed."""
+    if not (folder / "run.json").exists():
+        return []
+    return list(OdometryFolder(RunDirectory.open(folder, ODOMETRY)).kept().values())
+
+
+def _without_truth(found: Odometry) -> PlainTable:
+    """Return what is known of a path without truth: its ends, and what loops leave over."""
+    end = found.path.poses[-1] - found.path.poses[0]
+    row: PlainTable = {"net": [float(end[0]), float(end[1]), float(np.degrees(end[5]))]}
+    row |= {"sums": in_units(found.series.motions.sum(axis=0)).tolist()}
+    if found.closure is not None:
+        row |= {"closure_steps": found.closure.steps, "closure": in_units(found.closure.rms).tolist()}
+    return row
+
+
+def _against_truth(found: Odometry, true: Trajectory, bound: Array | None) -> PlainTable:
+    """Return the errors of a path: drift over segments, at the end, and of single motions."""
+    at_frames = Trajectory(true.poses[found.frames], true.time_s[found.frames])
+    row: PlainTable = {"path_m": path_length(at_frames)}
+    drift = segment_drift(found.path, at_frames, LENGTHS_M)
+    if drift is not None:
+        percent, degrees = drift.intervals()
+        row |= {"drift_percent": [drift.percent, *percent], "drift_deg_per_100m": [drift.deg_per_100m, *degrees]}
+        row |= {"lengths_m": list(drift.lengths_m), "segments": len(drift.length_m), "blocks": len(np.unique(drift.blocks))}
+    end = 100 * assess(found.path, at_frames).end_drift
+    row |= {"end_percent": end if np.isfinite(end) else None}
+    truth, block = motions(at_frames.poses), distance_driven(at_frames)[:-1] // LENGTHS_M[0]
+    errors = motion_errors(found.series.motions, truth, np.ones(len(truth), dtype=bool), None, cluster_resamples(block))
+    row |= {name: getattr(errors, name).tolist() for name in ("rmse", "rmse_low", "rmse_high", "zero", "bias")}
+    nees = _nees(found.estimates, truth)
+    row |= {"nees": nees if np.isfinite(nees) else None}
+    if bound is not None:
+        units = in_units(bound)
+        known = (units > 0) & np.isfinite(units)
+        times = np.divide(errors.rmse, units, out=np.zeros(3), where=known)
+        row |= {"bound": units.tolist()} if np.isfinite(units).all() else {}
+        row |= {"over_bound": [float(t) if k else None for t, k in zip(times, known, strict=True)]}
+    return row
+
+
+def _nees(estimates: list[Estimate], truth: Array) -> float:
+    """Return a third of the mean normalised squared error of the valid estimates; nan where no covariance is known."""
+    unknown = np.full((3, 3), np.nan)
+    motion = np.array([one.motion for one in estimates], dtype=float)
+    covariance = np.array([unknown if one.covariance is None else one.covariance for one in estimates])
+    return motion_errors(motion, truth, np.array([one.valid for one in estimates], dtype=bool), covariance).nees
+
+
+def _milliseconds(source: FrameSource, estimator: AnyEstimator) -> float:
+    """Return the median processor time of an estimate, all threads together, after a first one that loads [ms]."""
+    first = np.unique(np.linspace(0, len(source) - 2, TIMED_PAIRS).astype(int))
+    timed, threads = Answers.unasked(len(first)), cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        estimator.estimate(source.read([first[0], first[0] + 1]))
+        for index, number in enumerate(first):
+            timed.ask(index, estimator, source.read([number, number + 1]))
+    finally:
+        cv2.setNumThreads(threads)
+    return float(np.median(timed.ms))
+
+
+# ---------------- The simulated sets of the odometry benchmark: worlds that no training saw, dives and one course,
+# still texture or speckle
+# A set is rendered once into the folder of the benchmark and kept. *Still texture*: the model ``physical``, in which a
+# cell of the ground is as bright in every frame. *Speckle*: the model ``coherent``, in which grain changes as the sonar
+# moves.
+
+
+SEED = 730_022
+"""Of the worlds, the rays and the noise. Worlds of recipes have other seeds, hashes of the data set's seed and the scene."""
+
+STEP_M = 0.02
+"""Way of the vehicle from frame to frame [m]: the largest that the shipped networks were trained for."""
+
+TURN_RAD, TURN_M = np.radians(6.0), 2.5
+"""The heading swings by this angle, over so many metres of way: 0.3 deg a frame at most."""
+
+CRAB_RAD, CRAB_M = np.radians(30.0), 1.7
+"""So does the angle between way and heading: sideways motions of 10 mm at most."""
+
+DIVE_M_PER_S, DIVE_HZ = 0.4, 10.0
+
+TEXTURES: dict[str, dict[str, Any]] = {
+    "still": {"model": "physical", "quality": "standard"},
+    "speckle": {"model": "coherent", "quality": "standard", "coding": "gamma", "coding_gamma": 0.5, "gain_exponent": 4},
+}
+"""What a texture is, as changes of the sonar."""
+
+PRESET = "preset"
+"""The noise of a dive: what the preset has in its model, which is none in ``physical``."""
+
+NOISES = ("none", "low", "high")
+"""Levels of noise. Of still texture: Almanza-Medina's. Of speckle the receiver's: none, the preset's, or one raised to 6 dB
+below the echo of the median cell."""
+
+Begin = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
+"""Called with what begins and its length; while it is open, its value is called with how much more is done."""
+
+
+@dataclass(frozen=True)
+class SimulatedSet:
+    """A world and a sonar over it.
+
+    Attributes:
+        family: of the world.
+        preset: of the sonar.
+        window: changes of the preset.
+        height_m: of the vehicle over z = 0 [m].
+        pitch_deg: of the sonar [deg].
+        raised_db: by which the preset's receiver noise is raised for ``high`` [dB].
+        slope_deg: angle at which the ground rises forward [deg].
+        flight: None for the course of :func:`benchmark_course`, or a name of :data:`FLIGHTS`: a dive, with the preset's own
+            quality, coding and noise.
+        seed: of world, rays and dive.
+        frames: how many, unasked.
+    """
+
+    family: Family
+    preset: str
+    window: dict[str, Any]
+    height_m: float
+    pitch_deg: float
+    raised_db: float
+    slope_deg: float = 0.0
+    flight: str | None = None
+    seed: int = SEED
+    frames: int = 260
+
+    def sonar(self, texture: str, noise: str) -> Sonar:
+        """Return the sonar of a texture and a level of receiver noise."""
+        if self.flight is not None:
+            changes = {**self.window, "model": TEXTURES[texture]["model"], "seed": self.seed}
+            return load_sonar(self.preset).replace(**changes)
+        made = load_sonar(self.preset).replace(**self.window, **TEXTURES[texture], seed=SEED)
+        if texture == "still" or made.noise_level_db is None:
+            return made
+        levels = {"none": None, "low": made.noise_level_db, "high": made.noise_level_db + self.raised_db}
+        return made.replace(noise_level_db=levels[noise])
+
+    def path(self, frames: int, rate_hz: float) -> Trajectory:
+        """Return the poses of the sonar on its course; a dive has ten frames a second of every sonar."""
+        if self.flight is None:
+            vehicle = benchmark_course(frames)
+        else:
+            rate_hz = DIVE_HZ
+            vehicle = dive_course(frames, rate_hz, self.seed, FLIGHTS[self.flight])
+        vehicle[:, 2] += self.height_m
+        return Trajectory(mounted(vehicle, Pose.from_degrees([0, 0, 0, self.pitch_deg, 0, 0])), np.arange(frames) / rate_hz)
+
+    def world(self, folder: Path) -> Path:
+        """Write the world into a folder, where it is not there, and return its scene."""
+        scene = folder / "scene.xml"
+        if not scene.exists():
+            built = self.family.build(self.seed)
+            (sloped(built, self.slope_deg) if self.slope_deg else built).write(folder)
+        return scene
+
+
+DIVE_FIELD = RockyField(size_m=40, a_side=(20, 60), centre_height_m=(0.0, 0.2), rock_size_m=(0.0, 0.3))
+
+DIVE_SONARS: dict[str, tuple[dict[str, Any], float, float]] = {
+    "didson300": ({}, 2.5, 35),
+    "aris3000": ({"range_bins": 600}, 1.6, 30),
+    "oculus-m1200d-2100khz": ({"beams": 160, "range_bins": 500, "range_max": 8.0}, 2.0, 20),
+    "oculus-m750d-750khz": ({"beams": 160, "range_bins": 500, "range_max": 20.0}, 4.0, 20),
+    "blueview-p900-45": ({"beams": 128, "range_bins": 500, "range_max": 15.0}, 3.0, 20),
+    "gemini-720is": ({"beams": 160, "range_bins": 500, "range_max": 20.0}, 4.0, 20),
+}
+"""The presets that dive: changes that save time, height [m], pitch [deg]."""
+
+FLIGHTS = {"level": 0.0, "gentle": 1.0}
+"""How much a vehicle moves beside its way, as a share of a calm day: see :func:`dive_course`."""
+
+DIVE_SEEDS = (3, 11, 20)
+
+DIVE = "dive"
+"""What the names of all dives begin with."""
+
+SETS: dict[str, SimulatedSet] = {
+    **{
+        f"{DIVE}-{preset}-{flight}-{seed}": SimulatedSet(
+            DIVE_FIELD, preset, window, height_m, pitch_deg, 0.0, flight=flight, seed=seed, frames=40
+        )
+        for preset, (window, height_m, pitch_deg) in DIVE_SONARS.items()
+        for flight in FLIGHTS
+        for seed in DIVE_SEEDS
+    },
+    # DIDSON over rocks
+    "rocks": SimulatedSet(RockyField(size_m=30), "didson300", {"range_min": 3.2, "range_max": 5.6}, 2.5, 35, 16),
+    # Oculus of 130 deg over rocks that rise forward
+    "slope": SimulatedSet(
+        RockyField(size_m=30),
+        "oculus-m750d-750khz",
+        {"range_min": 5.0, "range_max": 9.0, "range_bins": 400, "beams": 256},
+        2.5,
+        25,
+        35,
+        slope_deg=10,
+    ),
+    # DIDSON along a hull
+    "hull": SimulatedSet(ShipHull(), "didson300", {"range_min": 1.5, "range_max": 5.0}, 0.32, 4, 22),
+}
+"""The sets by name."""
+
+
+def benchmark_course(frames: int) -> NDArray[np.float64]:
+    """Return the course of all sets, about the origin: poses ``(frames, 6)`` [m, rad] at z = 0.
+
+    The vehicle goes forward by :data:`STEP_M` a frame along a line that swings, and crabs.
+    """
+    way = np.arange(frames) * STEP_M
+    heading = TURN_RAD * np.sin(2 * np.pi * way / TURN_M)
+    course = heading + CRAB_RAD * np.sin(2 * np.pi * way / CRAB_M)
+    poses = np.zeros((frames, 6))
+    middle = (course[1:] + course[:-1]) / 2
+    poses[1:, 0], poses[1:, 1] = np.cumsum(STEP_M * np.sin(middle)), np.cumsum(STEP_M * np.cos(middle))
+    poses[:, 5] = heading
+    poses[:, :2] -= (poses[0, :2] + poses[-1, :2]) / 2
+    return poses
+
+
+def dive_course(frames: int, rate_hz: float, seed: int, moves: float) -> NDArray[np.float64]:
+    """Return the way of a vehicle at 0.4 m/s from the origin: poses ``(frames, 6)`` [m, rad].
+
+    Args:
+        frames: how many.
+        rate_hz: of them [1/s].
+        seed: of the phases.
+        moves: 1 for a calm day: heading +-8 deg in 6 s, heave +-4 cm in 3.1 s, pitch +-2 deg in 2.3 s and roll +-2 deg in
+            2.9 s; 0 for none of these, straight ahead.
+    """
+    time_s, phase = np.arange(frames) / rate_hz, np.random.default_rng(seed).uniform(0, 2 * np.pi, 4)
+    periods, sizes = np.array([6.0, 3.1, 2.3, 2.9]), np.array([np.radians(8), 0.04, np.radians(2), np.radians(2)])
+    swing = moves * sizes * np.sin(2 * np.pi * time_s[:, None] / periods + phase)
+    poses = np.zeros((frames, 6))
+    poses[:, 5] = swing[:, 0] - swing[0, 0]
+    poses[:, 2:5] = swing[:, 1:]
+    step = DIVE_M_PER_S / rate_hz
+    poses[1:, 0], poses[1:, 1] = step * np.cumsum(np.sin(poses[:-1, 5])), step * np.cumsum(np.cos(poses[:-1, 5]))
+    return poses
+
+
+@dataclass(frozen=True)
+class RenderedSet:
+    """A simulated set with a texture and noise, in the folder of a benchmark.
+
+    Attributes:
+        name: of the set, of :data:`SETS`.
+        texture: of :data:`TEXTURES`.
+        noise: of :data:`NOISES`.
+        frames: how many.
+        out: folder of the benchmark.
+    """
+
+    name: str
+    texture: str
+    noise: str
+    frames: int
+    out: Path
+
+    @property
+    def simulated(self) -> SimulatedSet:
+        """Return the set."""
+        return SETS[self.name]
+
+    @property
+    def folder(self) -> Path:
+        """Return the folder of the frames; noise of still texture is added when they are read."""
+        return self.out / "sets" / "-".join([self.name, self.texture, *([self.noise] if self.texture == "speckle" else [])])
+
+    def source(self, begin: Begin) -> FrameSource:
+        """Return the frames; render those that are missing."""
+        sonar = self.simulated.sonar(self.texture, self.noise)
+        if not self._finished():
+            path = self.simulated.path(self.frames, sonar.frame_rate_hz)
+            origin = {"set": self.name, "seed": self.simulated.seed}
+            with begin(f"rendering {self.folder.name}", self.frames) as progress:
+                nothing = Outputs(NOISE_MODELS["none"])
+                run(self._simulator(sonar), path, self.folder, nothing, origin=origin, resume=True, progress=progress)
+            release_memory()
+        source = replace(open_frames(self.folder), name=self.folder.name)
+        return source.with_noise(self._noise, SEED) if self.texture == "still" else source
+
+    @property
+    def _noise(self) -> NoiseModel:
+        """Return the noise that is added to pixels."""
+        return NOISE_MODELS[self.noise if self.texture == "still" and self.noise != PRESET else "none"]
+
+    def _finished(self) -> bool:
+        return (self.folder / "run.json").exists() and RunDirectory.open(self.folder, RENDERING).finished
+
+    def _simulator(self, sonar: Sonar) -> Simulator:
+        from mitsonar.simulation.simulator import Simulator
+
+        world = self.name if self.simulated.flight is None else f"{DIVE}-{self.simulated.seed}"
+        return Simulator(load_scene(self.simulated.world(self.out / "worlds" / world)), sonar)
+
+    def bound(self, poses: int, begin: Begin) -> NDArray[np.float64]:
+        """Return the Cramer-Rao lower bound of a motion ``(3,)`` [m, m, rad]: root of the mean variance over some poses.
+
+        Raises:
+            MitsonarError: the frames are not rendered.
+        """
+        gain = RunDirectory.open(self.folder, RENDERING).amount("gain")
+        if gain is None:
+            raise MitsonarError(f"{self.folder} tells no gain: render it anew")
+        sonar = self.simulated.sonar(self.texture, self.noise)
+        path = self.simulated.path(self.frames, sonar.frame_rate_hz)
+        some = path.poses[np.linspace(0, self.frames - 1, poses + 2).astype(int)[1:-1]]
+        noise, law = self._noise, list(laws_of(sonar))[-1]
+        found = []
+        with begin(f"bound of {'-'.join((self.name, self.texture, self.noise))}", poses) as progress:
+            for bounds in bounds_at(self._simulator(sonar), some, noise, gain):
+                one = next(value for (_, kind, of), value in bounds.items() if (kind, of) == ("image", law))
+                found.append(np.zeros(3) if one is None else one.std(2))
+                progress(1)
+        release_memory()
+        return overall(found)
+
+
+# ---------------- odometry benchmark
+
 
 METHODS = ("zero", "ecc", "phase", "flow", "direct", "corrnet", "corrnet-coherent", *EXTERNAL)
 """Rows that are made unasked, but for :data:`OTHER_GRAIN`."""
@@ -51,10 +522,10 @@ class Wanted:
     """Rows that are asked for: every method on every set, texture and level of noise.
 
     Attributes:
-        sets: names of :data:`~mitsonar.mapping.benchmark_sets.SETS`, or paths of recordings and runs. The beginning
+        sets: names of :data:`~mitsonar.mapping.odometry_benchmark.SETS`, or paths of recordings and runs. The beginning
             of a name up to a hyphen means all of these sets: ``dive``, ``dive-aris3000``.
-        textures: of :data:`~mitsonar.mapping.benchmark_sets.TEXTURES`, for simulated sets.
-        noises: of :data:`~mitsonar.mapping.benchmark_sets.NOISES`, for simulated sets; dives have their preset's.
+        textures: of :data:`~mitsonar.mapping.odometry_benchmark.TEXTURES`, for simulated sets.
+        noises: of :data:`~mitsonar.mapping.odometry_benchmark.NOISES`, for simulated sets; dives have their preset's.
         methods: as :func:`~mitsonar.estimation.named.create_estimator` takes them; none: :data:`METHODS`, without
             those whose packages are not installed.
         frames: of each set at most; None: 40 of a dive, 260 of another simulated set, all of a recording.
@@ -290,3 +761,196 @@ def _folder_name(case: Case) -> str:
     name = case.name if case.name in SETS else f"{Path(case.name).stem}-{digest(str(Path(case.name).resolve()))[:8]}"
     plain = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in case.method)
     return "-".join((name, case.texture, case.noise, plain))
+
+
+# ---------------- The tables of the odometry benchmark as Markdown: dives, drift of the other sets, then a part for
+# each of these
+
+
+FEWEST_BLOCKS = 10
+"""Fewest blocks of a path for intervals; with fewer they are too narrow."""
+
+UNITS = " / ".join(f"{axis.name} {axis.unit}" for axis in AXES)
+
+
+def benchmark_lines(rows: Sequence[PlainTable]) -> list[str]:
+    """Return the rows, in their order, as lines of Markdown."""
+    dives = [row for row in rows if row["set"].startswith(f"{DIVE}-")]
+    parts = [list(group) for _, group in groupby([row for row in rows if row not in dives], key=_cell)]
+    return [*_dives(dives), *_overview(parts), *(line for part in parts for line in _part(part))]
+
+
+def _dives(rows: Sequence[PlainTable]) -> Iterator[str]:
+    """Yield a table a method: a line a sonar, texture and flight, over the worlds of these."""
+    for method in dict.fromkeys(row["method"] for row in rows):
+        flown: dict[tuple[str, str, str], list[PlainTable]] = {}
+        for row in rows:
+            if row["method"] == method:
+                preset, flight = _flown(row["set"])
+                flown.setdefault((preset, row["texture"], flight), []).append(row)
+        worlds = max(len(of) for of in flown.values())
+        yield from ("", f"**Dives, {method}**: RMSE and bound: {UNITS}; of {worlds} worlds, drift is the median", "")
+        yield from markdown([_dive(*key, of) for key, of in flown.items()], tuple(DIVE_CELLS), DIVE_CELLS)
+
+
+def _flown(name: str) -> tuple[str, str]:
+    """Return preset and flight of a dive's name."""
+    preset, flight, _ = name.removeprefix(f"{DIVE}-").rsplit("-", 2)
+    return preset, flight
+
+
+def _dive(preset: str, texture: str, flight: str, rows: Sequence[PlainTable]) -> PlainTable:
+    """Return the line of a dive from the rows of its worlds."""
+    known = [row for row in rows if "path_m" in row]
+    line: PlainTable = {"sonar": preset, "texture": texture, "flight": flight, "pairs": sum(row["pairs"] for row in rows)}
+    line |= {"failures": sum(row["failures"] for row in rows), "ms": float(np.median([row["ms"] for row in rows]))}
+    if not known:
+        return line
+    for name in ("rmse", "bound"):
+        if all(row.get(name) is not None for row in known):
+            line[name] = np.sqrt(np.mean([np.square(row[name]) for row in known], axis=0)).tolist()
+    tried = [(row["nees"], row["pairs"] - row["failures"]) for row in known if row.get("nees") is not None]
+    if tried:
+        line["nees"] = float(np.average([nees for nees, _ in tried], weights=[count for _, count in tried]))
+    drifts = [row["end_percent"] for row in known if row["end_percent"] is not None]
+    line["end_percent"] = float(np.median(drifts)) if drifts else None
+    return line
+
+
+def _overview(parts: list[list[PlainTable]]) -> Iterator[str]:
+    """Yield a table of drift in percent: a line a method, a column a set; nothing for a single set."""
+    measured = [part for part in parts if any("path_m" in row for row in part)]
+    drifts = {", ".join(_cell(part[0])): {row["method"]: row for row in part} for part in measured}
+    if len(drifts) < 2:
+        return
+    methods = dict.fromkeys(name for of in drifts.values() for name in of)
+    texts: Cells = {name: _drift_in(name) for name in drifts}
+    lines: list[PlainTable] = [{"method": m, **{name: of.get(m, {}) for name, of in drifts.items()}} for m in methods]
+    yield from ("", "Drift over segments, % of their length; after a comma the motions that failed, %", "")
+    yield from markdown(lines, ("method", *drifts), {"method": CELLS["method"], **texts})
+
+
+def _drift_in(name: str) -> Callable[[PlainTable], str]:
+    """Return what writes the drift and the failures of a method in a set."""
+
+    def text(line: PlainTable) -> str:
+        row = line[name]
+        if not row:
+            return ""
+        failed = f", {100 * row['failures'] / row['pairs']:.0f}" if row["failures"] else ""
+        return f"{row['drift_percent'][0]:.1f}{failed}" if row.get("drift_percent") else f"-{failed}"
+
+    return text
+
+
+def _cell(row: PlainTable) -> tuple[str, str, str]:
+    return row["set"], row["texture"], row["noise"]
+
+
+def _part(rows: list[PlainTable]) -> Iterator[str]:
+    """Yield heading, facts and table of one set."""
+    first = rows[0]
+    true = [row for row in rows if "path_m" in row]
+    noise = "" if first["texture"] == "recorded" else f", noise {first['noise']}"
+    yield from ("", f"**{first['set']}, {first['texture']}{noise}**: {'; '.join(_facts(first, true))}", "")
+    yield from markdown(rows, COLUMNS if true else CLOSURE_COLUMNS, CELLS)
+    yield from (f"- {row['method']}: {row['note']}" for row in rows if row["note"])
+
+
+def _facts(first: PlainTable, true: list[PlainTable]) -> Iterator[str]:
+    """Yield what holds for all rows."""
+    yield f"{first['frames']} frames"
+    if not true:
+        yield f"no truth; net motion and closure: {UNITS}"
+        return
+    one = true[0]
+    yield f"path {one['path_m']:.2f} m; RMSE: {UNITS}"
+    if one.get("bound") is not None:
+        yield f"bound {_three(one['bound'])}"
+    if "segments" in one:
+        lengths = ", ".join(f"{length:g}" for length in one["lengths_m"])
+        few = f", so few that intervals are too narrow (95 %, over {one['blocks']} blocks)"
+        blocks = few if one["blocks"] < FEWEST_BLOCKS else f", 95 % intervals over {one['blocks']} blocks"
+        yield f"{one['segments']} segments of {lengths} m{blocks}"
+
+
+DIGITS = (2, 2, 3)
+
+
+def _three(values: Sequence[float | None], digits: Sequence[int] = DIGITS) -> str:
+    return " / ".join("-" if value is None else f"{value:.{d}f}" for value, d in zip(values, digits, strict=True))
+
+
+def _spanned(row: PlainTable, name: str, digits: int) -> str:
+    """Return a value with its interval."""
+    if row.get(name) is None:
+        return "-"
+    value, low, high = row[name]
+    return f"{value:.{digits}f} ({low:.{digits}f}..{high:.{digits}f})"
+
+
+CELLS: Cells = {
+    "method": lambda row: str(row["method"]),
+    "drift %": lambda row: _spanned(row, "drift_percent", 1),
+    "drift deg / 100 m": lambda row: _spanned(row, "drift_deg_per_100m", 0),
+    "end %": lambda row: "-" if row.get("end_percent") is None else f"{row['end_percent']:.1f}",
+    "RMSE": lambda row: _three(row["rmse"]) if "rmse" in row else "-",
+    "/ bound": lambda row: _three(row["over_bound"], (0, 0, 0)) if "over_bound" in row else "-",
+    "nees": lambda row: "-" if row.get("nees") is None else f"{row['nees']:.1f}",
+    "net motion": lambda row: _three(row["sums"]) if "sums" in row else "-",
+    "closure": lambda row: _three(row["closure"]) if "closure" in row else "-",
+    "fail": lambda row: f"{row['failures']} of {row['pairs']}",
+    "ms": lambda row: f"{row['ms']:.0f}",
+}
+
+DIVE_CELLS: Cells = {
+    "sonar": lambda row: str(row["sonar"]),
+    "texture": lambda row: str(row["texture"]),
+    "flight": lambda row: str(row["flight"]),
+    "rejected": lambda row: f"{row['failures']} of {row['pairs']}",
+    "RMSE": CELLS["RMSE"],
+    "bound": lambda row: _three(row["bound"]) if "bound" in row else "-",
+    "NEES": lambda row: "-" if row.get("nees") is None else f"{row['nees']:.2f}",
+    "drift %": lambda row: "-" if row.get("end_percent") is None else f"{row['end_percent']:.2f}",
+    "ms": CELLS["ms"],
+}
+
+COLUMNS = ("method", "drift %", "drift deg / 100 m", "end %", "RMSE", "/ bound", "nees", "fail", "ms")
+CLOSURE_COLUMNS = ("method", "net motion", "closure", "fail", "ms")
+
+
+# ---------------- Measured heights as a table, and in sentences
+
+
+def heights_csv(time_s: Array, estimates: list[HeightEstimate], true: Array | None) -> str:
+    """Return a table with a line a frame; cells are empty where a number is not known.
+
+    Args:
+        time_s: of the frames ``(n,)`` [s].
+        estimates: of the frames.
+        true: true heights ``(n,)`` [m], where known.
+    """
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["frame", "time_s", "height_m", "std_m", "believed", "reason", "true_z_m"])
+    for k, one in enumerate(estimates):
+        numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in (one.height_m, one.std_m)]
+        z = "" if true is None else f"{true[k]:.6g}"
+        table.writerow([k, f"{time_s[k]:.9g}", *numbers, int(one.valid), one.reason, z])
+    return text.getvalue()
+
+
+def heights_lines(estimates: list[HeightEstimate], true: Array | None) -> list[str]:
+    """Return sentences on the heights of all frames; ``true`` holds the true heights ``(n,)`` [m], where known."""
+    valid = np.array([one.valid for one in estimates], dtype=bool)
+    heights = np.array([one.height_m for one in estimates])[valid]
+    lines = []
+    for reason in dict.fromkeys(one.reason for one in estimates if not one.valid):
+        lines.append(f"not believed, {sum(one.reason == reason for one in estimates):,} frames: {reason}")
+    if len(heights):
+        lines.append(f"height {heights.min():.3f} .. {heights.max():.3f} m, median {np.median(heights):.3f} m")
+    if true is not None and len(heights):
+        error = heights - true[valid]
+        rmse, middle = 100 * np.sqrt((error**2).mean()), 100 * np.median(np.abs(error))
+        lines.append(f"against the true z: RMSE {rmse:.2f} cm, median {middle:.2f} cm, bias {100 * error.mean():+.2f} cm")
+    return lines

@@ -2,36 +2,338 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, ClassVar, Protocol, Self, TypeVar, cast
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.acoustics.noise import load_noise
+from mitsonar.acoustics.noise import NoiseModel, load_noise, snr_of, snr_said
+from mitsonar.datasets.responses import with_noise
 from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator
 from mitsonar.estimation.height import height_estimator_from
-from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.open_frames import is_recording, open_frames
-from mitsonar.mapping.response_source import ResponseSource, holds_responses, open_responses
-from mitsonar.mapping.view_source import ViewSource, open_views
+from mitsonar.mapping.sources import FrameSource, is_recording, measured, open_frames, sequence_in
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames, ViewFrames
 from mitsonar.records.responses import ImpulseResponses
+
+if TYPE_CHECKING:
+    from mitsonar.datasets.store import DataStore
+    from mitsonar.estimation.height import HeightEstimator
 
 __all__ = [
     "LOOP",
     "Reading",
+    "ResponseSource",
     "Source",
+    "ViewSource",
     "frames_for",
+    "holds_responses",
+    "open_responses",
     "open_source",
+    "open_views",
     "record_at",
     "usual_loop",
     "views_for",
     "with_assumed_plane",
 ]
+
+
+# ---------------- Several views of a sequence of a data set, as images or vectors, read some pings at a time
+
+
+@dataclass(frozen=True)
+class ViewSource:
+    """The pings of one sequence.
+
+    Attributes:
+        name: of the source, for messages.
+        store: of the data set.
+        views: that are read, in this order.
+        kind: ``image`` or ``vector``.
+        first: number of the first frame of the sequence in the store.
+        time_s: of the pings ``(n,)`` [s].
+        poses: true poses of the vehicle, whose motion networks of data sets estimate ``(n, 6)`` [m, rad].
+        sonar_poses: of the sonar on it ``(n, 6)`` [m, rad].
+        height_m: over the ground ``(n,)``.
+        noise: added to the pings that are read, as to samples of the data set.
+        seed: of the noise.
+        note: which sequence this is.
+        altimeter: measures the height of each ping that is read, in place of ``height_m``.
+        contrast: none: networks of data sets are trained on levels.
+    """
+
+    name: str
+    store: DataStore
+    views: tuple[str, ...]
+    kind: str
+    first: int
+    time_s: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    sonar_poses: NDArray[np.float64]
+    height_m: NDArray[np.float64]
+    noise: NoiseModel | None = None
+    seed: int = 0
+    note: str = ""
+    told_height_m: float | None = None
+    pitch_rad: float | None = None
+    altimeter: HeightEstimator | None = None
+    contrast: ClassVar[None] = None
+
+    def __len__(self) -> int:
+        """Return the number of pings."""
+        return len(self.time_s)
+
+    def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
+        """Return the same pings with noise: a function of the seed and the number of each frame."""
+        return self if noise.is_none else replace(self, noise=noise, seed=seed)
+
+    def with_heights_by(self, estimator: HeightEstimator) -> Self:
+        """Return the same pings, whose heights an estimator measures in its views when they are read.
+
+        Raises:
+            MitsonarError: the data set lacks these views.
+        """
+        if estimator.views is not None:
+            _check_there(self.store, estimator.views, estimator.kind)
+        return replace(self, altimeter=estimator)
+
+    @property
+    def true(self) -> Trajectory:
+        """Return the true path of the vehicle."""
+        return Trajectory(self.poses, self.time_s)
+
+    def check_times(self) -> None:
+        """Check nothing: the times of a sequence increase."""
+
+    def read(self, index: ArrayLike) -> ViewFrames:
+        """Read pings of these numbers ``(n,)`` with position and heading 0, so that no truth can leak.
+
+        Raises:
+            MitsonarError: arrays that cannot be read.
+        """
+        chosen = np.asarray(index, dtype=np.intp)
+        frames = self._read(chosen, self.views, self.kind)
+        if self.altimeter is None:
+            return frames
+        views, kind = self.altimeter.views or self.views, self.altimeter.kind if self.altimeter.views else self.kind
+        same = (views, kind) == (self.views, self.kind)
+        return measured(frames, self.altimeter, frames if same else self._read(chosen, views, kind))[0]
+
+    def _read(self, chosen: NDArray[np.intp], views: tuple[str, ...], kind: str) -> ViewFrames:
+        """Read pings as they are stored, with noise."""
+        from mitsonar.config.data import array_names
+        from mitsonar.datasets.arrangement import arrangement_of
+
+        here = slice(self.first + int(chosen[0]), self.first + int(chosen[-1]) + 1)
+        kept = chosen - chosen[0]
+        values, known = {}, {view.name: view for view in self.store.recipe.views}
+        made = arrangement_of(self.store.recipe, views=views, kind=kind, noise=self.noise or "none")
+        for number, view in enumerate(views):
+            frames = {
+                (view if stored == kind else f"nonzero_{view}"): self.store.read(name, here)[kept][None]
+                for name, (stored, of) in array_names(self.store.recipe).items()
+                if of == view and (stored == kind or (stored == "nonzero" and kind == "vector"))
+            }
+            numbers = (self.first + chosen.astype(np.int64))[None]
+            values[view] = np.asarray(made.noisy(frames, view, numbers, self.seed + number))[0]
+        return ViewFrames(
+            kind=kind,
+            values=values,
+            sonars={view: known[view].sonar for view in views},
+            bearing_rad={view: known[view].bearing_rad for view in views},
+            time_s=self.time_s[chosen],
+            poses=self.sonar_poses[chosen] * [0, 0, 1, 1, 1, 0],
+            height_m=self.height_m[chosen],
+        )
+
+    def digest(self) -> str:
+        """Return the SHA-256 of all data but the views, and of the views of the first and the last ping."""
+        digest = hashlib.sha256(self.store.recipe.model_dump_json().encode())
+        for values in (self.time_s, self.poses, self.sonar_poses, self.height_m):
+            digest.update(np.ascontiguousarray(values, dtype=float).tobytes())
+        digest.update(repr((self.views, self.kind, self.noise, self.seed, self.first, self.altimeter)).encode())
+        for number in (0, len(self) - 1):
+            digest.update(self.read([number]).profiles().tobytes())
+        return digest.hexdigest()
+
+
+def open_views(url: str, views: Sequence[str], kind: str, *, sequence: int | None = None) -> ViewSource:
+    """Open views of a sequence of a data set. Default: the longest sequence; of several, the first.
+
+    Raises:
+        MitsonarError: no data set, or one without such views, kind or sequence.
+    """
+    from mitsonar.datasets.store import DataStore  # its import takes half a second
+
+    store = DataStore.open(url)
+    _check_there(store, views, kind)
+    here, number, note = sequence_in(store, sequence)
+    time_s, sonar_poses, height_m = (store.read(name, here) for name in ("time_s", "pose", "height_m"))
+    poses = store.read("vehicle_pose", here) if "vehicle_pose" in store.group else sonar_poses
+    name, which = f"{url}, sequence {number}", f"{note}, {kind}s of {', '.join(views)}"
+    return ViewSource(name, store, tuple(views), kind, here.start, time_s, poses, sonar_poses, height_m, note=which)
+
+
+def _check_there(store: DataStore, views: Sequence[str], kind: str) -> None:
+    """Check that a data set holds these views.
+
+    Raises:
+        MitsonarError: it does not.
+    """
+    from mitsonar.config.data import array_names
+
+    there = {view for kind_there, view in array_names(store.recipe).values() if kind_there == kind}
+    lacking = [view for view in views if view not in there]
+    if lacking:
+        had = nearest_names(lacking[0], sorted(there)) if there else f"it holds no {kind}s"
+        raise MitsonarError(f"{store.place.url} has no {kind}s of view {lacking[0]!r}: {had}")
+
+
+# ---------------- Impulse responses of one run, for odometry, as :class:`~mitsonar.mapping.sources.FrameSource`
+# gives frames
+
+
+@dataclass(frozen=True)
+class ResponseNoise:
+    """White complex noise at a ratio of signal to noise."""
+
+    snr_db: float
+
+    def model_dump(self) -> dict[str, str]:
+        """Return its kind and ratio, for the record of a run."""
+        return {"kind": "white", "snr": snr_said(self.snr_db)}
+
+
+@dataclass(frozen=True)
+class ResponseSource:
+    """The pings of one run.
+
+    Attributes:
+        name: of the source, for messages.
+        responses: of all pings.
+        told_height_m: the height that the user gave for responses without one.
+        noise: added to the pings that are read.
+        seed: of the noise.
+        note: empty; data sets are read by their samples.
+        contrast: none, as of all impulse responses.
+    """
+
+    name: str
+    responses: ImpulseResponses
+    told_height_m: float | None = None
+    noise: ResponseNoise | None = None
+    seed: int = 0
+    note: str = ""
+    pitch_rad: float | None = None
+    contrast: ClassVar[None] = None
+
+    def __len__(self) -> int:
+        """Return the number of pings."""
+        return len(self.responses)
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """Return the times of the pings ``(pings,)`` [s]."""
+        return self.responses.time_s
+
+    @property
+    def poses(self) -> NDArray[np.float64] | None:
+        """Return the true poses of the transmitter ``(pings, 6)`` [m, rad]; None where they are not known."""
+        return self.responses.poses
+
+    @property
+    def height_m(self) -> NDArray[np.float64] | None:
+        """Return the height over the ground ``(pings,)`` [m]; None where it is not known."""
+        return self.responses.height_m
+
+    @property
+    def true(self) -> Trajectory | None:
+        """Return the true path of the transmitter; None where it is not known."""
+        return None if self.poses is None else Trajectory(self.poses, self.time_s)
+
+    def with_noise(self, snr: str, seed: int = 0) -> Self:
+        """Return the same pings with noise at a ratio of signal to noise such as ``20 dB``.
+
+        Raises:
+            MitsonarError: not a ratio.
+        """
+        ratio = snr_of(snr)
+        return replace(self, noise=None if ratio is None else ResponseNoise(ratio), seed=seed)
+
+    def with_height(self, height_m: float | None) -> Self:
+        """Return the same pings with a height [m] where they lack it.
+
+        Raises:
+            MitsonarError: a height that is not above 0, or that would not be used.
+        """
+        if height_m is None:
+            return self
+        if not 0 < height_m < np.inf:
+            raise MitsonarError(f"the height must be above 0: got {height_m:g} m")
+        known = self.responses.height_m
+        if known is not None and np.isfinite(known).all():
+            raise MitsonarError(f"{self.name} holds heights, so that {height_m:g} m would not be used: leave it out")
+        responses = replace(self.responses, height_m=np.full(len(self), height_m))
+        return replace(self, responses=responses, told_height_m=height_m)
+
+    def check_times(self) -> None:
+        """Check that the times of the pings increase.
+
+        Raises:
+            MitsonarError: they do not, or are not finite.
+        """
+        if not (np.isfinite(self.time_s).all() and (np.diff(self.time_s) > 0).all()):
+            raise MitsonarError(f"{self.name}: times of pings must be finite and increase; write the pings in order")
+
+    def read(self, index: ArrayLike) -> ImpulseResponses:
+        """Read pings of these numbers ``(n,)`` as estimators may use them.
+
+        They have height and attitude, but neither position, heading nor velocity, so that no truth can leak.
+        """
+        chosen = np.asarray(index, dtype=np.intp)
+        picked = self.responses.select(chosen)
+        response = picked.response
+        if self.noise is not None:
+            response = with_noise(response, chosen, self.noise.snr_db, self.seed)
+        poses = None if picked.poses is None else picked.poses * [0, 0, 1, 1, 1, 0]
+        return replace(picked, response=response.astype(np.complex64), poses=poses, velocity=None)
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the responses with their times, poses, heights and noise."""
+        digest = hashlib.sha256(self.responses.sonar.model_dump_json().encode())
+        for values in (self.responses.response, self.time_s, self.poses, self.height_m):
+            digest.update(b"-" if values is None else np.ascontiguousarray(values).tobytes())
+        digest.update(repr((self.noise, self.seed)).encode())
+        return digest.hexdigest()
+
+
+def holds_responses(where: str | Path) -> bool:
+    """Return whether impulse responses are there: a folder of ``mitsonar impulse``, or its responses.npz or .zarr."""
+    path = Path(where)
+    if path.name.startswith("responses."):
+        return os.path.exists(path)
+    return os.path.isdir(path) and os.path.isfile(path / "responses.npz")
+
+
+def open_responses(where: str | Path) -> ResponseSource:
+    """Open the responses at a path.
+
+    Raises:
+        MitsonarError: no responses, or a damaged file.
+    """
+    return ResponseSource(str(where), ImpulseResponses.load(where))
+
+
+# ---------------- open source
+
 
 Source = FrameSource | ResponseSource | ViewSource
 

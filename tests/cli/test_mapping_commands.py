@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry_run import OdometryFolder
-from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.series import path_of
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.sensors import save_sensors

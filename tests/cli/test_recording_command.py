@@ -14,8 +14,8 @@ from helpers import Command, essence, refused
 from PIL import Image
 
 from mitsonar import SonarFrames
-from mitsonar.mapping.any_recording import recording_at
-from mitsonar.mapping.motion_series import path_of
+from mitsonar.mapping.series import path_of
+from mitsonar.mapping.sources import recording_at
 from mitsonar.recordings.write_mcap import write_mcap
 
 

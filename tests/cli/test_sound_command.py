@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import Command, refused
 
-from mitsonar.mapping.open_frames import load_frames
+from mitsonar.mapping.sources import load_frames
 from mitsonar.motion.sensors import load_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames

@@ -22,8 +22,7 @@ from mitsonar.estimation.compare import compare
 from mitsonar.estimation.named import create_estimator
 from mitsonar.exports.recorded_data_set import write_recorded
 from mitsonar.exports.recorded_frames import as_pixels, axes_of, frames_with_poses
-from mitsonar.mapping.known_poses import poses_at, stretches
-from mitsonar.mapping.open_frames import load_frames, open_frames
+from mitsonar.mapping.sources import load_frames, open_frames, poses_at, stretches
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import in_units
 from mitsonar.recordings.open import open_recording

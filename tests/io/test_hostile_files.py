@@ -703,7 +703,7 @@ def test_frames_done_of_a_run_that_cannot_be(done: Any, tmp_path: Path) -> None:
 
 def test_a_run_without_frames_has_none_to_read(tmp_path: Path) -> None:
     """The index of a frame that is not there was a traceback."""
-    from mitsonar.mapping.open_frames import load_frames, open_frames
+    from mitsonar.mapping.sources import load_frames, open_frames
 
     make_frames_zarr(tmp_path)
     path = tmp_path / "frames.zarr"
@@ -973,7 +973,7 @@ def test_a_journal_that_never_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     make_odometry(tmp_path)
     (tmp_path / "estimates.jsonl").unlink()
     (tmp_path / "estimates.jsonl").symlink_to("/dev/zero")
-    monkeypatch.setattr("mitsonar.mapping.estimate_journal.LARGEST_JOURNAL", 1000)
+    monkeypatch.setattr("mitsonar.mapping.odometry_run.LARGEST_JOURNAL", 1000)
     assert "larger than 1,000 bytes" in refusal(lambda: read_odometry(tmp_path))
 
 

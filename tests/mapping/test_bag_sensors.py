@@ -10,7 +10,7 @@ import pytest
 from bags import Maker, Sent, write_bag
 
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping.bag_sensors import open_sensors
+from mitsonar.mapping.sensors import open_sensors
 
 TIMES = 1_700_000_000 + np.arange(0, 2, 0.1)
 KINDS = ["one.bag", "two", "three_mcap"]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mitsonar.geometry.fan import Views, polar_of
 from mitsonar.instruments.sonar import Bearing
-from mitsonar.mapping.bundle_adjustment import Adjusted, Observations, adjusted
+from mitsonar.mapping.bundle import Adjusted, Observations, adjusted
 
 Array = NDArray[np.float64]
 

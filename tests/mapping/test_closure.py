@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from mitsonar import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.closure import Closure, closure_of
-from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.odometry import odometry
-from mitsonar.mapping.pair_estimation import estimate_motions
+from mitsonar.mapping.odometry import Closure, closure_of, odometry
+from mitsonar.mapping.pairs import estimate_motions
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.records.frames import SonarFrames
 

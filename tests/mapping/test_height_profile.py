@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named import create_estimator
-from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.height_profile import ALTIMETER, FIRST_ECHOES, HeightProfile, height_profile
-from mitsonar.mapping.odometry import odometry
+from mitsonar.mapping.odometry import ALTIMETER, FIRST_ECHOES, HeightProfile, height_profile, odometry
 from mitsonar.mapping.odometry_run import run_odometry
-from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory

@@ -16,12 +16,10 @@ from mitsonar.estimation.named import Zero
 from mitsonar.geometry.fan import Views, polar_of
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping import local_map
-from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.landmarks import ImageAxes
-from mitsonar.mapping.local_map import mapped
-from mitsonar.mapping.motion_series import MotionSeries, path_of
+from mitsonar.mapping.local_map import ImageAxes, mapped
 from mitsonar.mapping.odometry import odometry, series_of
-from mitsonar.mapping.pose_covariance import pose_covariances
+from mitsonar.mapping.series import MotionSeries, path_of, pose_covariances
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.records.frames import SonarFrames

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.loop_appearance import Canvas, likenesses
-from mitsonar.mapping.motion_series import path_of
+from mitsonar.mapping.loops import Canvas, likenesses
 from mitsonar.mapping.odometry import Odometry, odometry
 from mitsonar.mapping.odometry_run import run_odometry
 from mitsonar.mapping.pose_graph import PoseEdges
-from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.series import path_of
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.sensors import save_sensors

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsonar.estimation.estimator import Estimate, rejected
-from mitsonar.mapping.mode_continuity import continued
+from mitsonar.mapping.pairs import continued
 from mitsonar.motion.composition import Motion
 
 

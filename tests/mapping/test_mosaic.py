@@ -19,9 +19,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.geometry.ground import GroundGeometry
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import directions
-from mitsonar.mapping.geotiff import save_geotiff
-from mitsonar.mapping.illumination import illumination
-from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic
+from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic, illumination, save_geotiff
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.figures import mosaic_figure, path_figure, quality_figure, save_figure

@@ -24,16 +24,15 @@ from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping import odometry_run
-from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import errors_along
-from mitsonar.mapping.loop_appearance import Canvas
-from mitsonar.mapping.motion_series import MotionSeries, path_of
+from mitsonar.mapping.loops import Canvas
 from mitsonar.mapping.odometry import bridged, odometry
 from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
-from mitsonar.mapping.open_frames import load_frames, open_frames
 from mitsonar.mapping.open_source import usual_loop
-from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
-from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.pairs import PAIRS_A_BATCH, estimate_motions
+from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.series import MotionSeries, path_of
+from mitsonar.mapping.sources import FrameSource, load_frames, open_frames
 from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

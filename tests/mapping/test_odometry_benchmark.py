@@ -17,12 +17,20 @@ from scipy.spatial.transform import Rotation
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.named import Zero, create_estimator
 from mitsonar.instruments.sounder import load_sonar
-from mitsonar.mapping import benchmark_row, benchmark_sets, odometry_benchmark, odometry_run
-from mitsonar.mapping.benchmark_row import Case, measured_row
-from mitsonar.mapping.benchmark_sets import SETS, STEP_M, RenderedSet, benchmark_course, dive_course
-from mitsonar.mapping.benchmark_table import benchmark_lines
-from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_odometry
+from mitsonar.mapping import odometry_benchmark, odometry_run
+from mitsonar.mapping.odometry_benchmark import (
+    SETS,
+    STEP_M,
+    Case,
+    RenderedSet,
+    Wanted,
+    benchmark_course,
+    benchmark_lines,
+    benchmark_odometry,
+    dive_course,
+    measured_row,
+)
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import path_length
 from mitsonar.recordings.write_aris import write_aris
@@ -38,7 +46,7 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> None:
     """No figure of each path, which takes a second, and fewer pairs to time."""
     monkeypatch.setattr(odometry_run, "save_figure", lambda path, figure: None)
     monkeypatch.setattr(odometry_run, "path_figure", lambda *_, **__: None)
-    monkeypatch.setattr(benchmark_row, "TIMED_PAIRS", 2)
+    monkeypatch.setattr(odometry_benchmark, "TIMED_PAIRS", 2)
 
 
 @pytest.fixture(scope="module")
@@ -166,8 +174,8 @@ def test_the_ground_of_the_slope_rises_forward(tmp_path: Path, monkeypatch: pyte
         SETS["slope"], family=ShipHull(size_m=30, groups_a_side=(0, 0), anodes_a_side=(1, 1)), preset="didson300",
         window={"range_min": 4.0, "range_max": 9.0, "range_bins": 64, "beams": 16},
     )  # fmt: skip
-    monkeypatch.setitem(benchmark_sets.SETS, "slope", small)
-    monkeypatch.setitem(benchmark_sets.TEXTURES, "still", {"model": "physical", "rays_per_beam": 20, "rays_across": 1})
+    monkeypatch.setitem(odometry_benchmark.SETS, "slope", small)
+    monkeypatch.setitem(odometry_benchmark.TEXTURES, "still", {"model": "physical", "rays_per_beam": 20, "rays_across": 1})
     source = RenderedSet("slope", "still", "none", 12, tmp_path).source(lambda what, count: _Quiet())
     assert source.poses is not None
     wanted = source.poses[:, 2] - np.tan(np.radians(10)) * source.poses[:, 1]
@@ -362,7 +370,7 @@ BUILD = ShipHull.build
 @pytest.mark.usefixtures("variant")
 def test_one_command_renders_a_set_and_makes_its_row(mitsonar: Command, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(ShipHull, "build", small_hull)
-    monkeypatch.setitem(benchmark_sets.TEXTURES["speckle"], "quality", "draft")
+    monkeypatch.setitem(odometry_benchmark.TEXTURES["speckle"], "quality", "draft")
     command = ("benchmark", "odometry", "--set", "hull", "--texture", "speckle", "--frames", 3, "--bound", 0, "-o", tmp_path)
     done = mitsonar(*command, "--method", "flow", "--resume")
     assert done.returncode == 0, done.stderr

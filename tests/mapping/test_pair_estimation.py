@@ -11,8 +11,8 @@ import pytest
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
+from mitsonar.mapping.pairs import PAIRS_A_BATCH, estimate_motions
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
 

@@ -10,14 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping import graph_solver
-from mitsonar.mapping.error_correlation import ErrorCorrelation
+from mitsonar.mapping import pose_graph
 from mitsonar.mapping.graph_odometry import graph_path
-from mitsonar.mapping.graph_solver import GraphSolution, solved
-from mitsonar.mapping.motion_series import MotionSeries, path_of
-from mitsonar.mapping.pose_covariance import pose_covariances
-from mitsonar.mapping.pose_graph import PoseEdges, PoseGraph, relative_motions
-from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.pose_graph import GraphSolution, PoseEdges, PoseGraph, relative_motions, solved
+from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.series import ErrorCorrelation, MotionSeries, path_of, pose_covariances
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.sensors import Headings
@@ -199,8 +196,8 @@ def test_marginals_of_a_long_path_are_those_of_columns(monkeypatch: pytest.Monke
         graph = replace(graph, loops=loops)
     short = solved(graph)
     own, following = short.covariances()
-    monkeypatch.setattr(graph_solver, "LONG", 100)
-    monkeypatch.setattr(graph_solver, "STRETCH", stretch)
+    monkeypatch.setattr(pose_graph, "LONG", 100)
+    monkeypatch.setattr(pose_graph, "STRETCH", stretch)
     long = solved(graph)
     np.testing.assert_allclose(long.poses, short.poses, atol=1e-9)
     found, onward = long.covariances()

@@ -16,9 +16,19 @@ from scipy.stats import chi2, multivariate_normal
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.mapping.motion_series import MotionSeries, fit_scale, path_of, scaled
-from mitsonar.mapping.pose_covariance import ellipse, pose_covariances
-from mitsonar.mapping.trajectory_smoothing import fit_noise, fit_wander, kalman_smoothed, spline_period, spline_smoothed
+from mitsonar.mapping.series import (
+    MotionSeries,
+    ellipse,
+    fit_noise,
+    fit_scale,
+    fit_wander,
+    kalman_smoothed,
+    path_of,
+    pose_covariances,
+    scaled,
+    spline_period,
+    spline_smoothed,
+)
 from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

@@ -11,8 +11,7 @@ from drawn_frames import sway
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.mapping.bag_sensors import open_sensors
-from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.sensors import SensorNoise, open_sensors, simulated_sensors
 from mitsonar.motion.composition import motions
 from mitsonar.motion.sensors import ROOT_HOUR, Readings, VehicleSensors, load_sensors, save_sensors
 from mitsonar.motion.trajectory import Trajectory

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping.motion_series import path_of
+from mitsonar.mapping.series import path_of
 from mitsonar.motion.errors import segment_drift
 from mitsonar.motion.pose import Pose, to_world_matrices
 from mitsonar.motion.trajectory import Trajectory

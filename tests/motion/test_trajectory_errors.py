@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping.motion_series import path_of
+from mitsonar.mapping.series import path_of
 from mitsonar.motion.errors import Alignment, absolute_errors, aligned, assess, associated, path_length, relative_errors
 from mitsonar.motion.pose import Pose, poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from recording_files import aris_file
 
 from mitsonar import MitsonarError, open_recording
-from mitsonar.mapping.open_frames import open_frames
+from mitsonar.mapping.sources import open_frames
 from mitsonar.recordings.recording import in_time_order, runs_of
 from mitsonar.recordings.sound_metrics import in_beam_order
 

@@ -11,7 +11,7 @@ import pytest
 from drawn_frames import over_ground, sway
 
 from mitsonar import MitsonarError, SonarFrames
-from mitsonar.mapping.open_frames import load_frames
+from mitsonar.mapping.sources import load_frames
 from mitsonar.recordings import pictures
 from mitsonar.recordings.pictures import write_frames
 from mitsonar.recordings.recording import Part, Recording

@@ -10,7 +10,7 @@ import pytest
 from drawn_frames import START, over_ground, sway
 
 from mitsonar import MitsonarError, Pose, Simulator, Trajectory, load_scene, load_sonar, open_recording
-from mitsonar.mapping.motion_series import path_of
+from mitsonar.mapping.series import path_of
 from mitsonar.recordings.handedness import handedness_of
 from mitsonar.recordings.recording import Part
 from mitsonar.records.frames import SonarFrames

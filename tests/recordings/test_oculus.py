@@ -11,7 +11,7 @@ from recording_files import oculus_log, oculus_ping, other_message, some_pings
 from mitsonar import MitsonarError, open_recording
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.image.direct import Direct
-from mitsonar.mapping.open_frames import open_frames
+from mitsonar.mapping.sources import open_frames
 
 SAMPLE = Path(__file__).resolve().parents[2].parent / "shared/data/real/oculus-m1200d-three-pings/three_pings_8bit.raw"
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mitsonar import MitsonarError, open_recording
-from mitsonar.mapping.open_frames import open_frames
+from mitsonar.mapping.sources import open_frames
 from mitsonar.recordings.pictures import naturally, times_in_names
 
 POLAR = "layout: polar\nrange_min: 1\nrange_max: 9\nazimuth_fov_deg: 60\nlevel: dB\nelevation_fov_deg: 12\n"

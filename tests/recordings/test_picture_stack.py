@@ -12,7 +12,7 @@ from fans import drawn
 
 from mitsonar import MitsonarError, MitsonarWarning, SonarFrames, create_estimator, open_recording
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.open_frames import open_frames
+from mitsonar.mapping.sources import open_frames
 from mitsonar.recordings.open import format_of
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"

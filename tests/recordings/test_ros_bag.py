@@ -19,7 +19,7 @@ from PIL import Image
 from rosbags.rosbag1 import Writer
 
 from mitsonar import MitsonarError, open_recording
-from mitsonar.mapping.open_frames import open_frames
+from mitsonar.mapping.sources import open_frames
 from mitsonar.recordings.ros_messages import OCULUS, PROJECTED, ros1_types
 
 

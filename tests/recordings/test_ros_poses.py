@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsonar import open_recording
-from mitsonar.mapping.open_frames import open_frames
+from mitsonar.mapping.sources import open_frames
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import CONVENTIONS
 

@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mitsonar import MitsonarError, open_recording
-from mitsonar.mapping.open_frames import open_frames
+from mitsonar.mapping.sources import open_frames
 
 COLUMNS = {
     "FrameTime": 0, "PingMode": 6, "SamplePeriod": 10, "SampleStartDelay": 2000, "SoundSpeed": 1500.0, "SamplesPerBeam": 40,

@@ -4,7 +4,7 @@ Oceanic Engineering, 2019; Almanza-Medina, 1.2.3, 2.3, 3.4.8).
 
 1. Dense optical flow between the frames, in native (range, bearing), gives a displacement map.
 2. The best match among the displacement maps of modelled sensor motions gives sideways, forward and yaw.
-3. A weighted regularised spline joins the motions of a run: :mod:`mitsonar.mapping.trajectory_smoothing`.
+3. A weighted regularised spline joins the motions of a run: :mod:`mitsonar.mapping.series`.
 
 Almanza-Medina gives no further details. Chosen here:
 

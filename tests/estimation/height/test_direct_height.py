@@ -21,10 +21,9 @@ from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.height import DirectHeight, FloorProfile, height_estimator_from
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
-from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.measured_heights import measured
-from mitsonar.mapping.pair_estimation import estimate_motions
-from mitsonar.mapping.view_source import open_views
+from mitsonar.mapping.open_source import open_views
+from mitsonar.mapping.pairs import estimate_motions
+from mitsonar.mapping.sources import FrameSource, measured
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames, ViewFrames
 from mitsonar.simulation.simulator import Simulator

@@ -35,7 +35,7 @@ from mitsonar.estimation.learned import (  # noqa: E402
     _rejection_of_profiles,
 )
 from mitsonar.estimation.named import create_estimator  # noqa: E402
-from mitsonar.mapping.view_source import open_views  # noqa: E402
+from mitsonar.mapping.open_source import open_views  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
 from mitsonar.training.evaluation import evaluate, predictions  # noqa: E402

@@ -1,0 +1,687 @@
+"""Motions between consecutive frames with their errors: composed to a path (Almanza-Medina, eq. 3.4), and scaled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import make_smoothing_spline
+from scipy.linalg import block_diag
+from scipy.stats import chi2
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.mapping.pose_graph import CorrelatedErrors
+from mitsonar.motion.errors import AXES
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
+
+__all__ = [
+    "Ellipse",
+    "ErrorCorrelation",
+    "MotionSeries",
+    "ellipse",
+    "fit_noise",
+    "fit_scale",
+    "fit_wander",
+    "kalman_smoothed",
+    "path_of",
+    "pose_covariances",
+    "scaled",
+    "spline_period",
+    "spline_smoothed",
+]
+
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MotionSeries:
+    """Motions between consecutive frames, and what is known of their errors.
+
+    Attributes:
+        motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)`` (eq. 3.4).
+        time_s: of the frames ``(frames,)``, increasing, not necessarily evenly.
+        covariances: of the errors of the motions ``(frames - 1, 3, 3)`` [m, m, rad], where known.
+        valid: False where a motion and its covariance must not be used ``(frames - 1,)``; None: all are valid.
+        with_next: covariance of each motion's error (rows) with that of the next (columns) ``(frames - 2, 3, 3)``. Errors
+            further apart depend on each other only through those between (Markov). None: errors are independent.
+
+    Raises:
+        MitsonarError: shapes that do not fit, times that do not increase, no valid motion, or a valid motion that is not
+            finite or has no valid covariance.
+    """
+
+    motions: Array
+    time_s: Array
+    covariances: Array | None = None
+    valid: NDArray[np.bool_] | None = None
+    with_next: Array | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.time_s) - 1
+        if count < 1:
+            raise MitsonarError(f"a path needs two frames or more: got {count + 1}; give a longer run")
+        if self.motions.shape != (count, 3):
+            raise MitsonarError(f"motions must be ({count}, 3) for {count + 1} frame times: got {self.motions.shape}")
+        if not (np.isfinite(self.time_s).all() and (np.diff(self.time_s) > 0).all()):
+            raise MitsonarError("frame times must be finite and increase: sort the frames, or give their times")
+        if self.believed.shape != (count,):
+            raise MitsonarError(f"valid must be ({count},), one for each motion: got {self.believed.shape}")
+        if not self.believed.any():
+            raise MitsonarError(f"none of {count} motions is valid, so that there is no path: try another estimator")
+        self._refuse(~np.isfinite(self.motions).all(axis=1), "is not finite")
+        if self.covariances is not None:
+            self._check_covariances(self.covariances)
+        if self.with_next is not None and self.with_next.shape != (count - 1, 3, 3):
+            raise MitsonarError(f"with_next must be ({count - 1}, 3, 3): got {self.with_next.shape}")
+
+    def _check_covariances(self, covariances: Array) -> None:
+        if covariances.shape != (len(self), 3, 3):
+            raise MitsonarError(f"covariances must be ({len(self)}, 3, 3), one a motion: got {covariances.shape}")
+        self._refuse(~np.isfinite(covariances).all(axis=(1, 2)), "has a covariance that is not finite")
+        known = np.where(self.believed[:, None, None], covariances, np.eye(3))
+        crooked = np.abs(known - known.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(known).max(axis=(1, 2))
+        least = np.linalg.eigvalsh(known)
+        self._refuse(crooked | (least[:, 0] < -1e-9 * least[:, 2]), "has a covariance with a negative variance, or lopsided")
+
+    def _refuse(self, bad: ArrayLike, what: str) -> None:
+        where = np.flatnonzero(np.asarray(bad) & self.believed)
+        if where.size:
+            raise MitsonarError(
+                f"the motion from frame {where[0]} to {where[0] + 1} {what} ({where.size} of {len(self)} are so): "
+                "mark it as not valid, or leave it out"
+            )
+
+    def __len__(self) -> int:
+        """Return the number of motions: one less than frames."""
+        return len(self.time_s) - 1
+
+    @classmethod
+    def from_estimates(cls, estimates: Sequence[Estimate], time_s: ArrayLike) -> Self:
+        """Collect the estimates of consecutive frames at ``time_s`` ``(frames,)`` [s].
+
+        The series has covariances only if every valid estimate has one.
+        """
+        valid = np.array([estimate.valid for estimate in estimates], dtype=bool)
+        unknown = np.full((3, 3), np.nan)
+        covariances = [unknown if one.covariance is None else one.covariance for one in estimates]
+        known = all(one.covariance is not None for one in estimates if one.valid)
+        motions = np.array([one.motion for one in estimates], dtype=float).reshape(-1, 3)
+        return cls(motions, np.asarray(time_s, dtype=float), np.array(covariances) if known else None, valid)
+
+    @cached_property
+    def believed(self) -> NDArray[np.bool_]:
+        """Return which motions are valid ``(frames - 1,)``."""
+        return np.ones(len(self), dtype=bool) if self.valid is None else self.valid
+
+    @cached_property
+    def step_s(self) -> Array:
+        """Return the time from frame to frame ``(frames - 1,)`` [s]."""
+        return np.diff(self.time_s)
+
+    @cached_property
+    def middle_s(self) -> Array:
+        """Return the time half-way through each motion ``(frames - 1,)`` [s], at which it has its mean velocity."""
+        return (self.time_s[1:] + self.time_s[:-1]) / 2
+
+    @cached_property
+    def velocity(self) -> Array:
+        """Return the mean velocity of each motion in the vehicle's frame ``(frames - 1, 3)`` [m/s, m/s, rad/s]."""
+        return self.motions / self.step_s[:, None]
+
+
+# ---------------------------------------------------------------- composition
+
+
+def path_of(motions: ArrayLike, start: Pose, time_s: ArrayLike) -> Trajectory:
+    """Compose motions to a path from ``start`` (Almanza-Medina, eq. 3.4).
+
+    Each step is :func:`mitsonar.motion.composition.compose`; :func:`mitsonar.motion.composition.motions` is the inverse.
+    Height, pitch and roll stay those of ``start``.
+
+    Args:
+        motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)``.
+        start: the first pose.
+        time_s: of the frames ``(frames,)`` [s].
+
+    Raises:
+        MitsonarError: shapes that do not fit, a motion that is not finite, times that do not increase.
+    """
+    series = MotionSeries(np.asarray(motions, dtype=float), np.asarray(time_s, dtype=float))
+    sideways, forward, yaw = series.motions.T
+    heading = start.heading + np.cumsum(yaw)
+    sin, cos = np.sin(heading), np.cos(heading)
+    poses = np.tile(np.asarray(start, dtype=float), (len(series) + 1, 1))
+    poses[1:, 0] += np.cumsum(forward * sin + sideways * cos)
+    poses[1:, 1] += np.cumsum(forward * cos - sideways * sin)
+    poses[1:, 5] = heading
+    return Trajectory(poses, series.time_s)
+
+
+# ---------------------------------------------------------------- scale
+
+
+def scaled(measured: MotionSeries, factors: ArrayLike) -> MotionSeries:
+    """Multiply motions and their covariances by a factor for each of sideways, forward, yaw ``(3,)``.
+
+    Almanza-Medina takes 2.3 for sideways (3.5.2), and 9.0 for sideways with 4.0 for forward (3.5.3).
+
+    Raises:
+        MitsonarError: not three finite factors.
+    """
+    factor = np.asarray(factors, dtype=float)
+    if factor.shape != (3,) or not np.isfinite(factor).all():
+        raise MitsonarError(f"scale factors are three finite numbers, for sideways, forward, yaw: got {factors!r}")
+    both = np.outer(factor, factor)
+    covariances, with_next = (None if c is None else c * both for c in (measured.covariances, measured.with_next))
+    return replace(measured, motions=measured.motions * factor, covariances=covariances, with_next=with_next)
+
+
+def fit_scale(estimated: ArrayLike, true: ArrayLike) -> Array:
+    """Fit the factors ``(3,)`` from estimated to true motions, both ``(frames - 1, 3)``.
+
+    Each axis is fitted by least squares through the origin. An axis whose estimates are all zero keeps the factor 1. Noise
+    in the estimates lowers a factor by signal / (signal + noise) power.
+
+    Raises:
+        MitsonarError: motions of different shapes, or not finite.
+    """
+    e, t = np.asarray(estimated, dtype=float), np.asarray(true, dtype=float)
+    if e.shape != t.shape or e.ndim != 2 or e.shape[1] != 3 or not (np.isfinite(e).all() and np.isfinite(t).all()):
+        raise MitsonarError(
+            f"scale factors need as many true as estimated motions (motions, 3): got {e.shape} and {t.shape}"
+        )
+    power = (e * e).sum(axis=0)
+    return np.where(power > 0, (e * t).sum(axis=0) / np.where(power > 0, power, 1), 1.0)
+
+
+# ---------------- Smoothing of motions: by a weighted spline, or by a Kalman filter with RTS smoother
+# Almanza-Medina composes estimates without smoothing (3.5.1, 4.4.4, 5.4.5), and leaves splines and Kalman filters to
+# further work (6.2).
+
+
+FEWEST_FOR_SPLINE = 5
+"""Fewest motions that SciPy's smoothing spline takes; fewer are joined by straight lines."""
+
+LONGEST_PERIOD = 2000.0
+"""Longest period [motions]: beyond, the spline is a straight line, and SciPy's equations lose their digits (from 6000)."""
+
+
+# ---------------------------------------------------------------- splines
+
+
+def spline_smoothed(measured: MotionSeries, period_s: ArrayLike | None = None) -> MotionSeries:
+    """Smooth the velocities, axis by axis, by a cubic spline; bridge invalid motions.
+
+    The weights are the inverse variances of the estimates; without covariances all motions weigh the same. Henson and
+    Zakharov, whose method Almanza-Medina compares with (3.4.8, 3.5.3), integrate such splines. Before the first and after
+    the last valid motion the velocity is constant. Fewer than five valid motions are not smoothed, but joined by straight
+    lines. The smoothed motions have no covariance; those of :func:`kalman_smoothed` have one.
+
+    Args:
+        measured: the motions.
+        period_s: an oscillation of this period [s] keeps half of its amplitude, faster ones less; one number, or one an
+            axis ``(3,)``. Default: :func:`spline_period`. At most 2,000 motions: there the spline is a straight line.
+
+    Raises:
+        MitsonarError: a period that is not positive, or a variance that is not.
+    """
+    known, abscissa, weight = _spline_data(measured)
+    velocity = np.column_stack(
+        [np.interp(measured.middle_s, measured.middle_s[known], v[known]) for v in measured.velocity.T]
+    )
+    if known.size >= FEWEST_FOR_SPLINE:
+        gap = _mean_gap(measured, known)
+        period = np.asarray(spline_period(measured) if period_s is None else period_s, dtype=float)
+        if not (period > 0).all() or period.shape not in ((), (3,)):
+            raise MitsonarError(f"period_s must be a positive number of seconds, or three: got {period_s!r}")
+        strength = _strength(np.minimum(np.broadcast_to(period, 3) / gap, LONGEST_PERIOD))
+        held = np.clip(measured.middle_s, measured.middle_s[known[0]], measured.middle_s[known[-1]])
+        for axis in range(3):
+            values = measured.velocity[known, axis]
+            spline = make_smoothing_spline(abscissa, values, w=weight[:, axis], lam=strength[axis])
+            velocity[:, axis] = spline((held - measured.middle_s[known[0]]) / gap)
+    return MotionSeries(velocity * measured.step_s[:, None], measured.time_s)
+
+
+def spline_period(measured: MotionSeries) -> Array:
+    """Choose the period ``(3,)`` [s] at which :func:`spline_smoothed` halves an oscillation.
+
+    Each axis is chosen by generalised cross validation (Craven and Wahba, 1979), between two and 2,000 motions. SciPy's own
+    choice changes with the unit of time, and ignores the weights of the residuals.
+
+    Raises:
+        MitsonarError: fewer than five valid motions.
+    """
+    known, abscissa, weight = _spline_data(measured)
+    if known.size < FEWEST_FOR_SPLINE:
+        raise MitsonarError(f"a spline's period needs {FEWEST_FOR_SPLINE} valid motions: got {known.size}; give more")
+    values = measured.velocity[known]
+
+    def score(log_period: Array) -> Array:
+        return _generalised_cross_validation(abscissa, values, weight, _strength(np.exp(log_period)))
+
+    least = _least(score, np.log(np.full(3, 2.0)), np.log(np.full(3, LONGEST_PERIOD)))
+    return np.exp(least) * _mean_gap(measured, known)
+
+
+def _spline_data(measured: MotionSeries) -> tuple[NDArray[np.intp], Array, Array]:
+    """Return which motions are valid, their times (mean gap 1) and their weights for each axis (mean 1)."""
+    known = np.flatnonzero(measured.believed)
+    weight = np.broadcast_to(measured.step_s[known, None] ** 2, (known.size, 3))
+    if measured.covariances is not None:
+        weight = weight / _variances(measured)[known]
+    abscissa = (measured.middle_s[known] - measured.middle_s[known[0]]) / _mean_gap(measured, known)
+    return known, abscissa, weight / weight.mean(axis=0)
+
+
+def _mean_gap(measured: MotionSeries, known: NDArray[np.intp]) -> float:
+    span = measured.middle_s[known[-1]] - measured.middle_s[known[0]]
+    return float(span / (known.size - 1)) if known.size > 1 else 1.0
+
+
+def _strength(period: Array) -> Array:
+    """Return the factor of the integral of f''^2 that halves an oscillation of a period [mean gaps]; weights of mean 1."""
+    return (period / (2 * np.pi)) ** 4
+
+
+def _generalised_cross_validation(x: Array, y: Array, w: Array, strength: Array) -> Array:
+    """Score smoothing splines of many strengths ``(many, axes)`` through y ``(n, axes)`` with weights w.
+
+    In Reinsch's form: with B = R + strength S, S = Q'W^-1Q and B c = Q'y, the residuals are strength W^-1 Q c, and the trace
+    of (1 - hat matrix) is that of strength B^-1 S.
+    """
+    h = np.diff(x)[:, None]
+    a, c = 1 / h[:-1], 1 / h[1:]  # Q takes second differences: its columns are a, b, c
+    b = -(a + c)
+    r, s = np.zeros((3, len(a), 1)), np.zeros((3, len(a), y.shape[1]))  # diagonals: the main one, and those above
+    r[0], r[1, :-1] = (h[:-1] + h[1:]) / 3, h[1:-1] / 6
+    s[0] = a**2 / w[:-2] + b**2 / w[1:-1] + c**2 / w[2:]
+    s[1, :-1] = b[:-1] * a[1:] / w[1:-2] + c[:-1] * b[1:] / w[2:-1]
+    s[2, :-2] = c[:-2] * a[2:] / w[2:-2]
+    s = s[:, :, None]
+    curve, inverse = _five_diagonals(r[:, :, None] + strength * s, a * y[:-2] + b * y[1:-1] + c * y[2:])
+    misfit, free = (s[0] * curve * curve).sum(axis=0), (s[0] * inverse[0]).sum(axis=0)
+    for k in (1, 2):
+        misfit += 2 * (s[k, :-k] * curve[:-k] * curve[k:]).sum(axis=0)
+        free += 2 * (s[k] * inverse[k]).sum(axis=0)
+    return np.asarray(len(x) * misfit / free**2)
+
+
+def _five_diagonals(band: Array, right: Array) -> tuple[Array, Array]:
+    """Solve symmetric equations with five diagonals (Hutchinson and de Hoog, 1985).
+
+    ``band`` is the main diagonal and the two above ``(3, n, many, axes)``. Return the solution ``(n, many, axes)`` and the
+    same diagonals of the inverse.
+    """
+    _, n, *many = band.shape
+    d, z, l1, l2 = np.zeros((4, n + 2, *many))  # B = L d L', L z = right; two zeros before the first
+    for i in range(2, n + 2):
+        d[i] = band[0, i - 2] - l1[i - 1] ** 2 * d[i - 1] - l2[i - 2] ** 2 * d[i - 2]
+        z[i] = right[i - 2] - l1[i - 1] * z[i - 1] - l2[i - 2] * z[i - 2]
+        l1[i] = (band[1, i - 2] - l1[i - 1] * d[i - 1] * l2[i - 1]) / d[i]
+        l2[i] = band[2, i - 2] / d[i]
+    d, z, l1, l2 = d[2:], z[2:], l1[2:], l2[2:]
+    solution, inverse = np.zeros((n + 2, *many)), np.zeros((3, n + 2, *many))  # two zeros after the last
+    for i in range(n - 1, -1, -1):
+        solution[i] = z[i] / d[i] - l1[i] * solution[i + 1] - l2[i] * solution[i + 2]
+        inverse[2, i] = -l1[i] * inverse[1, i + 1] - l2[i] * inverse[0, i + 2]
+        inverse[1, i] = -l1[i] * inverse[0, i + 1] - l2[i] * inverse[1, i + 1]
+        inverse[0, i] = 1 / d[i] - l1[i] * inverse[1, i] - l2[i] * inverse[2, i]
+    return solution[:-2], inverse[:, :-2]
+
+
+# ---------------------------------------------------------------- Kalman filter
+
+
+def kalman_smoothed(measured: MotionSeries, wander: ArrayLike | None = None) -> MotionSeries:
+    """Estimate motions and covariances from all measurements: Kalman filter and Rauch-Tung-Striebel smoother.
+
+    The state is the velocity in the vehicle's frame (sideways, forward, yaw). From the middle of one motion to that of the
+    next it is a random walk, independent on each axis, with no prior. A measured motion is velocity times its time, with its
+    whole 3 x 3 covariance. Invalid motions are filled in. ``with_next`` of the result holds the covariances of consecutive
+    errors; without them the covariance of the pose would be too small.
+
+    Args:
+        measured: the motions; where they have no covariances, :func:`fit_noise` estimates one for all.
+        wander: standard deviation of the random walk after a second: [m/s, m/s, rad/s] per root second ``(3,)``; it grows
+            with the root of time. Default: :func:`fit_wander`.
+
+    Raises:
+        MitsonarError: a variance or wander that is not positive, or too few motions to estimate them.
+    """
+    if measured.covariances is None:
+        covariances = np.tile(np.diag(fit_noise(measured) ** 2), (len(measured), 1, 1))
+        measured = replace(measured, covariances=covariances)
+    walk = np.asarray(fit_wander(measured) if wander is None else wander, dtype=float)
+    if walk.shape != (3,) or not (np.isfinite(walk) & (walk > 0)).all():
+        raise MitsonarError(f"wander must be three positive numbers (m/s, m/s, rad/s per root second): got {wander!r}")
+    _variances(measured)
+    mean, covariance, gain = _filtered(measured, walk)
+    mean, covariance, lag = _rts(mean, covariance, gain, _walked(measured, walk))
+    step = measured.step_s
+    squared, crossed = (step**2)[:, None, None], (step[:-1] * step[1:])[:, None, None]
+    return MotionSeries(mean * step[:, None], measured.time_s, covariance * squared, with_next=lag * crossed)
+
+
+def _walked(measured: MotionSeries, wander: Array) -> Array:
+    """Return the covariance of the change of velocity from each motion to the next ``(frames - 2, 3, 3)``."""
+    return np.diff(measured.middle_s)[:, None, None] * np.diag(wander**2)
+
+
+def _filtered(measured: MotionSeries, wander: Array) -> tuple[Array, Array, Array]:
+    """Return the filtered velocity ``(n, 3)``, its covariance, and the gain of the smoother ``(n - 1, 3, 3)``.
+
+    Before the first valid motion the gain is the identity.
+    """
+    seen, noise = measured.velocity, np.asarray(measured.covariances) / (measured.step_s**2)[:, None, None]
+    walked = _walked(measured, wander)
+    first = int(np.argmax(measured.believed))
+    n, one = len(measured), np.eye(3)
+    mean, covariance = np.tile(seen[first], (n, 1)), np.zeros((n, 3, 3))
+    back = np.tile(one, (max(n - 1, 0), 1, 1))
+    covariance[first] = noise[first]
+    for k in range(first + 1, n):
+        ahead = covariance[k - 1] + walked[k - 1]
+        back[k - 1] = np.linalg.solve(ahead, covariance[k - 1]).T
+        mean[k], covariance[k] = mean[k - 1], ahead
+        if measured.believed[k]:
+            gain = np.linalg.solve(ahead + noise[k], ahead).T
+            mean[k] += gain @ (seen[k] - mean[k - 1])
+            # Joseph's form: a sum of two squares, so that rounding cannot make it negative
+            covariance[k] = _symmetric((one - gain) @ ahead @ (one - gain).T + gain @ noise[k] @ gain.T)
+    return mean, covariance, back
+
+
+def _rts(mean: Array, covariance: Array, back: Array, walked: Array) -> tuple[Array, Array, Array]:
+    """Return the smoothed velocity, its covariance, and the covariance of each with the next."""
+    mean, covariance, lag = mean.copy(), covariance.copy(), np.zeros_like(back)
+    one = np.eye(3)
+    for k in range(len(mean) - 2, -1, -1):
+        gain, rest = back[k], one - back[k]
+        lag[k] = gain @ covariance[k + 1]
+        mean[k] += gain @ (mean[k + 1] - mean[k])
+        # P - G (P + Q) G' + G P' G', written as a sum of squares
+        covariance[k] = _symmetric(rest @ covariance[k] @ rest.T + gain @ (covariance[k + 1] + walked[k]) @ gain.T)
+    return mean, covariance, lag
+
+
+def fit_wander(measured: MotionSeries) -> Array:
+    """Estimate the random walk of the velocity in a second ``(3,)`` [m/s, m/s, rad/s per root second].
+
+    It maximises the likelihood of the filter's innovations, each axis by itself, with the diagonal of the covariances.
+
+    Raises:
+        MitsonarError: no covariances, a variance that is not positive, or one valid motion among several.
+    """
+    if measured.covariances is None:
+        raise MitsonarError("fit_wander needs the motions' covariances: give them, or estimate the noise with fit_noise")
+    known = np.flatnonzero(measured.believed)
+    if known.size == 1 < len(measured):
+        raise MitsonarError(f"one valid motion of {len(measured)} shows no change of velocity: give wander")
+    gap, seen = np.diff(measured.middle_s[known])[:, None], measured.velocity[known]
+    noise = _variances(measured)[known] / measured.step_s[known, None] ** 2
+    if known.size == 1:  # nothing to walk to
+        return np.asarray(np.sqrt(noise[0]))
+
+    def misfit(log_walk: Array) -> Array:
+        log_spread, chi = _innovations(seen, noise, gap, np.exp(log_walk))
+        return np.asarray(log_spread + chi)
+
+    high = np.log(1e2 * (np.diff(seen, axis=0) ** 2 + noise[1:] + noise[:-1]).mean(axis=0) / gap.min())
+    return np.exp(_least(misfit, high - np.log(1e14), high) / 2)
+
+
+def fit_noise(measured: MotionSeries) -> Array:
+    """Estimate the standard deviation of the errors ``(3,)`` [m, m, rad], one for all motions, from their differences.
+
+    It maximises the likelihood jointly with the random walk of the velocity.
+
+    Raises:
+        MitsonarError: fewer than five valid motions, or an axis that never changes.
+    """
+    known = np.flatnonzero(measured.believed)
+    seen, step = measured.velocity[known], measured.step_s[known, None]
+    if known.size < 5:
+        raise MitsonarError(f"the noise of motions needs five of them or more: got {known.size}; give covariances")
+    still = [axis.name for axis, values in zip(AXES, measured.motions[known].T, strict=True) if not np.ptp(values)]
+    if still:
+        raise MitsonarError(
+            f"{still[0]} is the same in all motions, so that its noise cannot be estimated: give covariances"
+        )
+    noise, gap = np.broadcast_to((step.mean() / step) ** 2, seen.shape), np.diff(measured.middle_s[known])[:, None]
+
+    def power(log_walk: Array) -> tuple[Array, Array]:
+        log_spread, chi = _innovations(seen, noise, gap, np.exp(log_walk))
+        return log_spread, chi / len(gap)
+
+    def misfit(log_walk: Array) -> Array:
+        log_spread, each = power(log_walk)
+        return np.asarray(log_spread + len(gap) * np.log(each))
+
+    unit = np.full(3, -np.log(gap.mean()))  # a walk as large as the noise
+    walk = _least(misfit, unit - np.log(1e10), unit + np.log(1e6))
+    return np.asarray(np.sqrt(power(walk[None])[1][0]) * step.mean())
+
+
+def _innovations(seen: Array, noise: Array, gap: Array, walk: Array) -> tuple[Array, Array]:
+    """Sum the log variances and the normalised squares of the filter's innovations, each axis by itself.
+
+    ``walk`` holds many variances of the random walk in a second ``(many, 3)``.
+    """
+    mean, variance = seen[0] + 0 * walk, noise[0] + 0 * walk
+    log_spread, chi = 0 * walk, 0 * walk
+    for k in range(1, len(seen)):
+        ahead = variance + walk * gap[k - 1]
+        spread = ahead + noise[k]
+        innovation = seen[k] - mean
+        gain = ahead / spread
+        log_spread, chi = log_spread + np.log(spread), chi + innovation**2 / spread
+        mean, variance = mean + gain * innovation, gain * noise[k]
+    return log_spread, chi
+
+
+def _variances(measured: MotionSeries) -> Array:
+    """Return the variances of the motions ``(frames - 1, 3)``, positive where valid."""
+    variance = np.diagonal(np.asarray(measured.covariances), axis1=1, axis2=2)
+    for axis, values in zip(AXES, variance[measured.believed].T, strict=True):
+        if not (values > 0).all():
+            raise MitsonarError(f"smoothing needs variances above zero: got {values.min():g} for {axis.name}")
+    return variance
+
+
+def _least(score: Callable[[Array], Array], low: Array, high: Array, points: int = 25, rounds: int = 4) -> Array:
+    """Return where each column of ``score((points, axes))`` is least between low and high: a grid, then finer ones."""
+    columns = np.arange(low.size)
+    for _ in range(rounds):
+        grid = np.linspace(low, high, points)
+        best = np.argmin(score(grid), axis=0)
+        low, high = grid[np.maximum(best - 1, 0), columns], grid[np.minimum(best + 1, points - 1), columns]
+    return np.asarray(grid[best, columns])
+
+
+def _symmetric(matrix: Array) -> Array:
+    return (matrix + matrix.T) / 2
+
+
+# ---------------- Covariances of the poses along a path, from the covariances of its motions
+
+
+def pose_covariances(
+    series: MotionSeries,
+    start: Pose,
+    at_start: ArrayLike | None = None,
+    correlated: CorrelatedErrors | None = None,
+    alone: NDArray[np.bool_] | None = None,
+) -> Array:
+    """Return the covariances of x, y [m] and heading [rad] of every frame ``(frames, 3, 3)`` along a path, to first order.
+
+    Args:
+        series: the motions with their covariances, all valid: smooth a series with gaps first.
+        start: the first pose.
+        at_start: its covariance ``(3, 3)``; not given: known exactly.
+        correlated: how errors of consecutive motions depend on each other; not given: as ``series.with_next`` says, or not.
+        alone: motions that share no errors all the same ``(frames - 1,)``.
+
+    Raises:
+        MitsonarError: no covariances, or an invalid motion, whose error is not known.
+    """
+    if series.covariances is None:
+        raise MitsonarError("the pose's covariance needs those of the motions: give them, or use kalman_smoothed")
+    if not series.believed.all():
+        gaps = int((~series.believed).sum())
+        raise MitsonarError(f"{gaps} motions are not valid, so that their errors are not known: use kalman_smoothed first")
+    poses = path_of(series.motions, start, series.time_s).poses
+    found = np.zeros((len(poses), 3, 3))
+    found[0] = 0.0 if at_start is None else np.asarray(at_start, dtype=float)
+    if correlated is None:
+        shared, steps = np.zeros((3, 3)), _as_next_says(series.covariances, series.with_next)
+    else:
+        # one slope stays for good; what wanders begins anew with the first motion
+        shared, steps = np.diag([0.0] * 3 + [1.0] * 9), _correlated(series, correlated, alone)
+    joint = block_diag(found[0], shared)  # of the pose and of what motions share
+    for k, ((x, y), step) in enumerate(zip(np.diff(poses[:, :2], axis=0), steps, strict=True)):
+        sin, cos = np.sin(poses[k + 1, 5]), np.cos(poses[k + 1, 5])
+        pose = np.array([[1, 0, y], [0, 1, -x], [0, 0, 1]])  # derivatives of eq. 3.4: by the pose,
+        motion = np.array([[cos, sin, y], [-sin, cos, -x], [0, 0, 1]])  # and by the motion
+        by_shared = motion @ step.by_shared
+        onward = np.block([[pose, by_shared @ step.onward], [np.zeros((len(step.onward), 3)), step.onward]])
+        fresh_by = np.vstack([by_shared, np.eye(len(step.onward))])
+        joint = onward @ joint @ onward.T + fresh_by @ step.fresh @ fresh_by.T
+        joint[:3, :3] += motion @ step.own @ motion.T
+        joint = (joint + joint.T) / 2
+        found[k + 1] = joint[:3, :3]
+    return found
+
+
+class _Step(NamedTuple):
+    """The error of a motion, by what it shares with others ``(m,)``: that before it times a matrix, and a fresh part.
+
+    ``onward`` is the matrix ``(m, m)``; ``fresh`` the covariance of the fresh part ``(m, m)``; ``by_shared`` the derivative
+    of the error ``(3, m)``; ``own`` the covariance of the rest ``(3, 3)``.
+    """
+
+    onward: Array
+    fresh: Array
+    by_shared: Array
+    own: Array
+
+
+def _as_next_says(covariances: Array, with_next: Array | None) -> Iterator[_Step]:
+    """Regress each motion's error on the one before: it is itself what is shared."""
+    along, fresh = np.zeros_like(covariances), covariances.copy()
+    if with_next is not None and len(with_next):
+        along[1:] = np.linalg.solve(covariances[:-1], with_next).swapaxes(1, 2)
+        fresh[1:] -= along[1:] @ with_next
+    for matrix, rest in zip(along, fresh, strict=True):
+        yield _Step(matrix, rest, np.eye(3), np.zeros((3, 3)))
+
+
+def _correlated(series: MotionSeries, correlated: CorrelatedErrors, alone: NDArray[np.bool_] | None) -> Iterator[_Step]:
+    """Share errors that wander, in standard deviations, and slopes over the motion."""
+    assert series.covariances is not None
+    variance, axes = np.linalg.eigh(series.covariances)
+    root = axes * np.sqrt(np.maximum(variance, 0))[:, None] @ axes.swapaxes(1, 2)
+    wander = np.sqrt(correlated.share) * root
+    by_shared = np.concatenate([wander, correlated.by_slopes()], axis=2)
+    own = (1 - correlated.share) * series.covariances
+    if alone is not None:
+        by_shared[alone], own[alone] = 0.0, series.covariances[alone]
+    for along, by, rest in zip(np.append(0.0, correlated.onward), by_shared, own, strict=True):
+        onward, fresh = np.ones(12), np.zeros(12)
+        onward[:3], fresh[:3] = along, 1 - along**2
+        yield _Step(np.diag(onward), np.diag(fresh), by, rest)
+
+
+class Ellipse(NamedTuple):
+    """A confidence ellipse: half axes [m], and the bearing of the longer one [rad], clockwise from +y as a heading."""
+
+    major_m: float
+    minor_m: float
+    heading: float
+
+
+def ellipse(covariance: ArrayLike, probability: float = 0.95) -> Ellipse:
+    """Return the ellipse that holds a position with a probability, from a covariance that begins with x, y ``(2.., 2..)``.
+
+    Raises:
+        MitsonarError: a probability that is not between 0 and 1.
+    """
+    if not 0 < probability < 1:
+        raise MitsonarError(f"probability must be between 0 and 1: got {probability:g}")
+    variance, axes = np.linalg.eigh(np.asarray(covariance, dtype=float)[:2, :2])
+    minor, major = np.sqrt(np.maximum(variance, 0) * chi2.ppf(probability, 2))
+    return Ellipse(float(major), float(minor), float(np.arctan2(axes[0, 1], axes[1, 1]) % np.pi))
+
+
+# ---------------- Correlation of the errors of consecutive motions: they are estimated over the same ground
+# Relief over level ground, and the outline of the light, pull an estimate in one direction as long as the same ground
+# is seen. A covariance that tells the error of one motion rightly then tells that of a path far too small.
+
+
+@dataclass(frozen=True)
+class ErrorCorrelation:
+    """How errors of motions over the same ground depend on each other.
+
+    The defaults are measured on rocky fields with ``direct`` (``benchmarks/bench_loops.py``).
+
+    Attributes:
+        share: part of the variance that motions over the same ground have in common.
+        length: of the ground's way through the window, after which that part correlates by 1/e, as a part of the reach.
+        slope: standard deviation of a common error in proportion to the motion, as a scale by a wrong height is.
+
+    Raises:
+        MitsonarError: numbers outside their limits.
+    """
+
+    share: float = 0.9
+    length: float = 0.12
+    slope: float = 0.006
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.share < 1 and 0 < self.length < np.inf and 0 < self.slope < np.inf):
+            raise MitsonarError(
+                "share must be 0 or more and below 1, length and slope above 0: got "
+                f"{self.share:g}, {self.length:g} and {self.slope:g}"
+            )
+
+    def of(self, motions: ArrayLike, reach_m: float) -> CorrelatedErrors:
+        """Return how the errors of consecutive motions ``(n, 3)`` depend on each other.
+
+        Args:
+            motions: sideways, forward [m], yaw [rad].
+            reach_m: horizontal distance of the sonar from the middle of the ground that it sees [m].
+        """
+        moved = np.asarray(motions, dtype=float)
+        way = np.hypot(moved[:, 0] + reach_m * moved[:, 2], moved[:, 1])
+        between = (way[1:] + way[:-1]) / 2
+        # a sonar at rest sees the same ground for good: errors stay, but the graph needs some change
+        onward = np.exp(-np.maximum(between / (self.length * reach_m), 1e-6))
+        lever = np.array([1.0, 1.0, 1.0 / reach_m])
+        slope_std = self.slope * np.outer(lever, 1 / lever)
+        return CorrelatedErrors(self.share, onward, slope_std, _spread(moved, onward))
+
+
+def _spread(moved: Array, onward: Array) -> Array:
+    """Spread each motion over those that see the same ground, so that their sum stays ``(n, 3)``.
+
+    A slope over measured motions would take an error that two components share for an error in proportion.
+    """
+    total = _alike(np.ones((len(moved), 1)), onward)
+    return _alike(moved / total, onward)
+
+
+def _alike(values: Array, onward: Array) -> Array:
+    """Sum values ``(n, k)`` with weights that are the correlations of their motions."""
+    before, after = values.copy(), values.copy()
+    for k, stays in enumerate(onward):
+        before[k + 1] += stays * before[k]
+    for k in range(len(onward) - 1, -1, -1):
+        after[k] += onward[k] * after[k + 1]
+    return np.asarray(before + after - values)

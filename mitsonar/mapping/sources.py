@@ -1,0 +1,787 @@
+"""Sonar frames of one run, read some at a time: of a simulated run, a data set or a recording."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias, TypeVar
+from zipfile import is_zipfile
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Slerp
+
+from mitsonar.acoustics.levels import LocalContrast, fitted_contrast
+from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
+from mitsonar.motion.bodies import BodyStates
+from mitsonar.motion.errors import associated
+from mitsonar.motion.pose import poses_from, vehicle_rotation
+from mitsonar.motion.trajectory import Trajectory
+from mitsonar.recordings.open import format_of, known_formats, open_recording
+from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels, Recording
+from mitsonar.records.frames import COLUMNS, LABELS, PER_FRAME, SonarFrames, check_column, open_group, to_float32
+
+if TYPE_CHECKING:
+    from mitsonar.datasets.store import DataStore
+    from mitsonar.estimation.estimator import Record
+    from mitsonar.estimation.height import HeightEstimate, HeightEstimator
+    from mitsonar.records.frames import ViewFrames
+
+__all__ = [
+    "FrameSource",
+    "LabelledPart",
+    "StoredView",
+    "is_data_set",
+    "is_recording",
+    "load_frames",
+    "measured",
+    "open_frames",
+    "poses_at",
+    "recording_at",
+    "sequence_in",
+    "stretches",
+    "view_in",
+    "without_height",
+]
+
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+PATTERN_FRAMES = 64
+"""Frames of which a static pattern is the mean, at most."""
+
+FITTED, FITTED_RUNS = 3, 4
+"""Consecutive frames of a run by which the contrast is fitted, and the number of such runs."""
+
+PLANAR = 1e-6
+"""Smallest change of height, pitch or roll along a path [m, rad]: files round them."""
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """The frames of one run; pixels are read on demand.
+
+    Attributes:
+        name: of the source, for messages.
+        like: no frames, but all that is the same for each of them: sonar, bins, beams, level.
+        time_s: of the frames ``(frames,)`` [s]; where each beam has its own, their mean.
+        images: reads the frames of given numbers ``(n,)``: ``(n, bins, beams)``.
+        poses: true poses of the sonar ``(frames, 6)`` [m, rad], where known.
+        attitude_rad: pitch, roll, heading by the sonar's own sensors ``(frames, 3)`` [rad], where known; nan where not.
+        height_m: over the ground ``(frames,)``, where known; nan where nothing is below.
+        pitch_rad: of the sonar, where its poses are not known.
+        told_height_m: the height that the user gave for frames without one.
+        assumed_height: whether ``height_m`` is assumed, since nobody tells it.
+        noise: added to the frames that are read.
+        seed: of the noise.
+        first_number: number of the first frame, of which the noise is a function.
+        note: which frames these are, where the name does not say it.
+        altimeter: measures the height of each frame that is read, in place of ``height_m``.
+        contrast: turns levels into local contrast when frames are read.
+        pattern_db: static pattern ``(bins, beams)`` [dB] that moves with the sonar, taken out before the contrast.
+    """
+
+    name: str
+    like: SonarFrames
+    time_s: Array
+    images: Callable[[Index], Pixels]
+    poses: Array | None = None
+    attitude_rad: Array | None = None
+    height_m: Array | None = None
+    pitch_rad: float | None = None
+    told_height_m: float | None = None
+    assumed_height: bool = False
+    noise: NoiseModel | None = None
+    seed: int = 0
+    first_number: int = 0
+    note: str = ""
+    altimeter: HeightEstimator | None = None
+    contrast: LocalContrast | None = None
+    pattern_db: NDArray[np.float32] | None = None
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.time_s)
+
+    @classmethod
+    def of(cls, frames: SonarFrames, name: str = "the frames") -> Self:
+        """Take frames that are in memory; labels are not kept."""
+        nothing: dict[str, Any] = dict.fromkeys(LABELS)
+        frames = replace(frames, **nothing)
+        like, images = frames.select(slice(0)), frames.image.__getitem__
+        known = frames.poses, frames.height_m
+        return cls.of_arrays(like, frames.time_s, *known, images, name, attitude_rad=frames.attitude_rad)
+
+    @classmethod
+    def of_part(cls, part: Part, name: str, note: str = "") -> Self:
+        """Take a part of a recording."""
+        known, attitude = (part.poses, part.height_m), part.attitude_rad
+        return cls.of_arrays(part.like, part.time_s, *known, part.images, name, attitude_rad=attitude, note=note)
+
+    @classmethod
+    def of_arrays(
+        cls,
+        like: SonarFrames,
+        time_s: Array,
+        poses: Array | None,
+        height_m: Array | None,
+        images: Callable[[Index], Pixels],
+        name: str,
+        *,
+        attitude_rad: Array | None = None,
+        first_number: int = 0,
+        note: str = "",
+    ) -> Self:
+        """Take frames whose times, poses, attitudes and heights are in memory, and whose images are read on demand."""
+        time = np.asarray(time_s, dtype=float)
+        time = time.mean(axis=1) if time.ndim == 2 else time
+        like = replace(like, beam_poses=None, **BodyStates().fields())  # as labels: truth that is not kept
+        return cls(name, like, time, images, poses, attitude_rad, height_m, first_number=first_number, note=note)
+
+    def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
+        """Return the same frames with noise: a function of the seed and the number of each frame."""
+        return self if noise.is_none else replace(self, noise=noise, seed=seed)
+
+    def with_contrast(self, contrast: LocalContrast | None = None, *, moving: bool = False) -> Self:
+        """Return the same frames as local contrast: without the light that moves with the sonar.
+
+        Args:
+            contrast: how; default: smoothed as little as makes consecutive frames alike, by some of these frames.
+            moving: take out the mean of frames over the whole run too. A sonar at rest loses its scene by that.
+        """
+        plain = replace(self, altimeter=None)
+        pattern = None
+        if moving:
+            some = np.unique(np.linspace(0, len(self) - 1, PATTERN_FRAMES).astype(np.intp))
+            levels = np.stack([plain.read([one]).in_decibels()[0] for one in some])
+            pattern = np.asarray(levels.mean(axis=0), dtype=np.float32)
+        if contrast is None:
+            starts = np.unique(np.linspace(0, max(0, len(self) - FITTED), FITTED_RUNS).astype(np.intp))
+            runs = [plain.read(np.arange(at, min(at + FITTED, len(self)))).in_decibels() for at in starts]
+            contrast = fitted_contrast([run if pattern is None else run - pattern for run in runs])
+        return replace(self, contrast=contrast, pattern_db=pattern)
+
+    def with_heights_by(self, estimator: HeightEstimator) -> Self:
+        """Return the same frames, whose heights an estimator measures when they are read.
+
+        Raises:
+            MitsonarError: an estimator that reads views, not frames.
+        """
+        if estimator.views is not None:
+            raise MitsonarError(
+                f"{self.name}: heights are estimated from {estimator.kind}s of {', '.join(estimator.views)}, the frames are "
+                "images of one view: give direct, or a network that was trained on such images"
+            )
+        return replace(self, altimeter=estimator)
+
+    def with_geometry(self, height_m: float | None = None, pitch_rad: float | None = None) -> Self:
+        """Return the same frames with a height [m] and a pitch [rad] where they lack them.
+
+        Raises:
+            MitsonarError: they lack nothing, or a number outside its limits.
+        """
+        lacking = self.height_m is None or not np.isfinite(self.height_m).all()
+        if height_m is not None and not lacking:
+            raise MitsonarError(
+                f"{self.name}: the frames tell their heights, so that {height_m:g} m would not be used: leave it out, "
+                "or give it to the estimator, as NAME:height_m=2.5"
+            )
+        if pitch_rad is not None and self.poses is not None:
+            raise MitsonarError(
+                f"{self.name}: the frames tell their pitch, so that {np.degrees(pitch_rad):g} deg would not be used: leave "
+                "it out, or give it to the estimator, as NAME:pitch_deg=35"
+            )
+        if height_m is not None and not 0 < height_m < np.inf:
+            raise MitsonarError(f"the height must be above 0: got {height_m:g} m")
+        if height_m is not None and height_m > self.like.range_m[-1]:
+            raise MitsonarError(
+                f"{self.name}: the window ends at {self.like.range_m[-1]:g} m, and no ground is seen from a height of "
+                f"{height_m:g} m: give heights in metres, below that"
+            )
+        if pitch_rad is not None and not abs(pitch_rad) <= np.pi / 2:
+            raise MitsonarError(f"the pitch must lie in -90..90 deg: got {np.degrees(pitch_rad):g} deg")
+        heights = self.height_m
+        if height_m is not None:
+            known = np.full(len(self), np.nan) if heights is None else heights
+            heights = np.where(np.isfinite(known), known, height_m)
+        return replace(
+            self, height_m=heights, told_height_m=height_m, pitch_rad=pitch_rad if self.pitch_rad is None else self.pitch_rad
+        )
+
+    @property
+    def sonar_poses(self) -> Array | None:
+        """Return the poses of the sonar ``(frames, 6)`` [m, rad]; None where they are not known."""
+        return self.poses
+
+    @property
+    def true(self) -> Trajectory | None:
+        """Return the true path of the sonar; None where it is not known."""
+        return None if self.poses is None else Trajectory(self.poses, self.time_s)
+
+    def check_times(self) -> None:
+        """Check that the times of the frames increase.
+
+        Raises:
+            MitsonarError: they do not, or are not finite.
+        """
+        bad = np.flatnonzero(~(np.diff(self.time_s) > 0))
+        if not np.isfinite(self.time_s).all() or bad.size:
+            where = int(bad[0]) if bad.size else 0
+            times = ", ".join(f"{time:g}" for time in self.time_s[where : where + 2])
+            raise MitsonarError(
+                f"{self.name}: frame times must be finite and increase: got {times} s at frame {where}; write the frames in "
+                "order, with time_s"
+            )
+
+    def read(self, index: ArrayLike) -> SonarFrames:
+        """Read frames of these numbers ``(n,)`` as estimators may use them.
+
+        Their poses have height, pitch and roll, but position and heading 0, so that no truth can leak. Where only pitch and
+        roll are known, the height is nan.
+
+        Raises:
+            MitsonarError: frames that are not there, or pixels that cannot be read.
+        """
+        chosen = np.asarray(index, dtype=np.intp)
+        beyond = chosen[(chosen < 0) | (chosen >= len(self))]
+        if beyond.size:
+            raise MitsonarError(f"{self.name} has no frame {beyond[0]}: it holds {len(self):,}, numbered from 0")
+        try:
+            image = self.images(chosen)
+        except (OSError, ValueError, RuntimeError, KeyError) as error:
+            reason = " ".join(str(error).split())[:160]
+            raise MitsonarError(f"{self.name}: frames {chosen[0]}..{chosen[-1]} cannot be read: {reason}") from None
+        if self.noise is not None:
+            numbers = chosen.astype(np.int64) + self.first_number
+            image = self.noise.apply(to_float32(image), seed=self.seed, frames=numbers)
+        poses = self.attitudes(chosen)
+        if poses is not None and self.poses is None:
+            poses[:, 2] = np.nan
+        frames = replace(
+            self.like,
+            image=image,
+            time_s=self.time_s[chosen],
+            poses=poses,
+            attitude_rad=None,
+            height_m=None if self.height_m is None else self.height_m[chosen],
+        )
+        if self.altimeter is not None:
+            frames = measured(frames, self.altimeter)[0]
+        return frames if self.contrast is None else self._contrast_of(frames, self.contrast)
+
+    def _contrast_of(self, frames: SonarFrames, contrast: LocalContrast) -> SonarFrames:
+        level = frames.in_decibels()
+        level = level if self.pattern_db is None else level - self.pattern_db
+        return replace(frames, image=contrast.apply(level), level="contrast")
+
+    def attitudes(self, chosen: Index) -> Array | None:
+        """Return poses of frames without position and heading ``(n, 6)``; None where neither poses nor pitch are known."""
+        if self.poses is not None:
+            return self.poses[chosen] * [0, 0, 1, 1, 1, 0]
+        if self.pitch_rad is not None:
+            return np.tile([0.0, 0, 0, self.pitch_rad, 0, 0], (len(chosen), 1))
+        if self.attitude_rad is None:
+            return None
+        pitch_roll = self.attitude_rad[chosen, :2]
+        return np.column_stack([np.zeros((len(chosen), 3)), pitch_roll, np.zeros(len(chosen))])
+
+    def chunks(self, index: ArrayLike) -> Iterator[SonarFrames]:
+        """Read frames of these numbers, some at a time."""
+        chosen = np.asarray(index, dtype=np.intp)
+        count = self.frames_a_chunk
+        for start in range(0, len(chosen), count):
+            yield self.read(chosen[start : start + count])
+
+    def along(self, path: Trajectory, tolerance_s: float = 0.01) -> tuple[Index, Array]:
+        """Return the numbers ``(n,)`` of the frames for which a path has a pose, and these poses ``(n, 6)``.
+
+        A path of odometry has one height, pitch and roll throughout. Pitch and roll are then those of the frames, if known.
+
+        Raises:
+            MitsonarError: no frame is at the time of a pose, within the tolerance.
+        """
+        self.check_times()
+        try:
+            there, index = associated(path.time_s, self.time_s, tolerance_s)
+        except MitsonarError:
+            raise MitsonarError(
+                f"the path lasts from {path.time_s[0]:g} to {path.time_s[-1]:g} s, {self.name} from {self.time_s[0]:g} to "
+                f"{self.time_s[-1]:g} s, and no pose is within {tolerance_s:g} s of a frame: give the path of this run"
+            ) from None
+        poses = path.poses[there].copy()
+        attitudes = self.attitudes(index)
+        if attitudes is not None and (np.ptp(path.poses[:, 2:5], axis=0) < PLANAR).all():
+            poses[:, 3:5] = attitudes[:, 3:5]
+        return index, poses
+
+    @property
+    def frames_a_chunk(self) -> int:
+        """Return how many frames are read at a time."""
+        return max(1, CHUNK_BYTES // max(1, len(self.like.range_m) * len(self.like.bearing_rad) * 4))
+
+    def digest(self) -> str:
+        """Return the SHA-256 of all data but the images, and of the first, the middle and the last image."""
+        digest = hashlib.sha256(self.like.sonar.model_dump_json().encode())
+        for values in (self.like.range_m, self.like.bearing_rad, self.time_s, self.poses, self.height_m):
+            digest.update(b"-" if values is None else np.ascontiguousarray(values, dtype=float).tobytes())
+        digest.update(b"" if self.attitude_rad is None else np.ascontiguousarray(self.attitude_rad, dtype=float).tobytes())
+        digest.update(repr((self.pitch_rad, self.noise, self.seed, self.first_number)).encode())
+        digest.update(b"" if self.altimeter is None else repr(self.altimeter).encode())
+        digest.update(b"" if self.contrast is None else repr(self.contrast).encode())
+        if len(self):
+            some = np.unique(np.linspace(0, len(self) - 1, 3).astype(np.intp))
+            digest.update(np.ascontiguousarray(self.read(some).image).tobytes())
+        return digest.hexdigest()
+
+
+# ---------------- Sonar frames at a path or URL: ``frames.npz``, ``frames.zarr`` of a long run, a sequence of a data
+# set, a recording
+
+
+StoredArray = Any
+"""An array of Zarr, whichever form of its metadata; read by indices."""
+
+FINDING = "give frames.npz, frames.zarr, the folder of a run, a data set or a recording"
+
+
+def open_frames(
+    where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
+) -> FrameSource:
+    """Open the frames at a path or URL.
+
+    Args:
+        where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
+        sequence: of a data set, or part of a recording; default: the longest; of several, the first.
+        view: of a data set, or topic of a ROS bag; default: the first, or the only one.
+        geometry: file that tells how the pictures of a recording are laid out.
+
+    Raises:
+        MitsonarError: no frames there; a sequence or view that is not there; a geometry that is not needed.
+    """
+    path = Path(where)
+    data_set = is_data_set(where)
+    if not data_set and is_recording(where):
+        return _of_recording(path, sequence, view, geometry)
+    if geometry is not None:
+        raise MitsonarError(f"{where} is no recording of pictures: it tells its geometry itself; leave {geometry} out")
+    if data_set:
+        return _of_data_set(str(where), sequence, view)
+    if sequence is not None or view is not None:
+        raise MitsonarError(f"{where} is no data set or recording: sequence and view choose among theirs; leave them out")
+    if os.path.isdir(path) and not os.path.isfile(path / "zarr.json"):
+        found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
+        if not found:
+            raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {FINDING}")
+        path = found[0]
+    return _of_zarr(path, str(where)) if os.path.isdir(path) else _of_npz(path, str(where))
+
+
+def load_frames(
+    where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
+) -> SonarFrames:
+    """Load all frames at a path or URL into memory, with true poses where they are known.
+
+    Labels are not loaded: :meth:`mitsonar.SonarFrames.load` loads those of a run.
+
+    Args:
+        where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
+        sequence: of a data set, or part of a recording; default: the longest; of several, the first.
+        view: of a data set, or topic of a ROS bag; default: the first, or the only one.
+        geometry: file that tells how the pictures of a recording are laid out.
+
+    Raises:
+        MitsonarError: no frames there; a sequence or view that is not there; a geometry that is not needed.
+    """
+    source = open_frames(where, sequence=sequence, view=view, geometry=geometry)
+    return replace(source.read(np.arange(len(source))), poses=source.poses, attitude_rad=source.attitude_rad)
+
+
+def is_data_set(where: str | Path) -> bool:
+    """Return whether a data set is there. Every URL is one. Frames of a long run are Zarr too, with other attributes."""
+    path = Path(where)
+    if "://" in str(where):
+        return True
+    if not os.path.isfile(path / "zarr.json"):
+        return False
+    import zarr
+
+    try:
+        return bool(zarr.open_group(path, mode="r").attrs.get("kind") == "mitsonar data set")
+    except Exception:  # a damaged Zarr may raise anything
+        return False
+
+
+def is_recording(where: str | Path) -> bool:
+    """Return whether a recording of a real sonar is there."""
+    return "://" not in str(where) and format_of(where) is not None
+
+
+def _of_recording(path: Path, number: int | None, view: str | None, geometry: str | Path | None) -> FrameSource:
+    """Open a part of a recording."""
+    recording = open_recording(path, geometry, view)
+    for note in recording.notes:
+        warnings.warn(f"{path}: {note}", MitsonarWarning, stacklevel=3)
+    part, which = recording.part(number), ""
+    if len(recording.parts) > 1:
+        chosen = recording.longest if number is None else number
+        longest = ", the longest" if number is None else ""
+        which = f"part {chosen} of {len(recording.parts):,}{longest}: {counted(len(part), 'frame')}"
+    return FrameSource.of_part(part, str(path), which)
+
+
+def _of_npz(path: Path, name: str) -> FrameSource:
+    """Take the frames of ``frames.npz``.
+
+    Raises:
+        MitsonarError: nothing there, a file of another kind, or a damaged one.
+    """
+    if not os.path.exists(path):
+        raise MitsonarError(f"there are no frames at {path}: {FINDING}")
+    if os.path.isfile(path) and os.access(path, os.R_OK) and not is_zipfile(path):
+        empty = path.stat().st_size == 0
+        reason = "it is empty" if empty else "it is neither a whole frames.npz nor a recording that mitsonar reads"
+        raise MitsonarError(f"cannot read frames {path}: {reason}; {FINDING}: {known_formats()}")
+    return FrameSource.of(SonarFrames.load(path), name)
+
+
+def _of_zarr(path: Path, name: str) -> FrameSource:
+    """Open the frames of a long run, also of one that is not finished."""
+    try:
+        found, done = open_group(path, COLUMNS, "time_s", "frames_done")
+        arrays = {name: one for name, one in found.items() if not isinstance(one, np.ndarray)}
+        arrays = {name: array for name, array in arrays.items() if name not in (*LABELS, "pitch_rad")}
+        image = arrays["image"]
+        table: dict[str, Any] = {
+            name: array[:done] if name in PER_FRAME else array[...] for name, array in arrays.items() if name != "image"
+        }
+        table |= {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
+        nothing = np.zeros((0, *image.shape[1:]), dtype=image.dtype)
+        none_of = {name: values[:0] for name, values in table.items() if name in PER_FRAME}
+    except Exception as error:
+        raise MitsonarError(f"cannot read frames {path}: {' '.join(str(error).split())[:160]}; {FINDING}") from None
+    like = SonarFrames.from_arrays(table | none_of | {"image": nothing}, str(path))
+    for known in ("poses", "attitude_rad", "height_m"):
+        if known in table:
+            check_column(table[known], known, COLUMNS[known], {"frames": done, "six": 6, "three": 3}, str(path))
+    times = table["time_s"]
+    if times.ndim == 1:
+        check_column(times, "time_s", COLUMNS["time_s"], {"frames": done}, str(path))
+    if done < image.shape[0]:
+        message = f"{path} is not finished: {done:,} of {counted(image.shape[0], 'frame')} written"
+        warnings.warn(message, MitsonarWarning, stacklevel=3)
+    poses, attitude, height = table.get("poses"), table.get("attitude_rad"), table.get("height_m")
+
+    def images(index: Index) -> Pixels:
+        picked = _picked(image, index)
+        check_column(picked, "image", COLUMNS["image"], {}, str(path))
+        return picked
+
+    return FrameSource.of_arrays(like, table["time_s"], poses, height, images, name, attitude_rad=attitude)
+
+
+def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSource:
+    from mitsonar.datasets.store import DataStore  # its import takes half a second
+
+    store = DataStore.open(url)
+    chosen = view_in(store, view)
+    here, number, which = sequence_in(store, sequence)
+    image = store.array(chosen.array)
+    return FrameSource.of_arrays(
+        chosen.like,
+        store.read("time_s", here),
+        store.read("pose", here),
+        store.read("height_m", here),
+        lambda index: _picked(image, index + here.start),
+        f"{url}, sequence {number}",
+        first_number=here.start,
+        note=which + (f", view {chosen.name}" if chosen.several else ""),
+    )
+
+
+class StoredView(NamedTuple):
+    """A view of a data set: its name, its array of images, frames like them without images, and whether there are others."""
+
+    name: str
+    array: str
+    like: SonarFrames
+    several: bool
+
+
+def view_in(store: DataStore, view: str | None = None) -> StoredView:
+    """Return a view of a data set whose images are stored; default: the first.
+
+    Raises:
+        MitsonarError: no images, or no such view.
+    """
+    from mitsonar.config.data import array_names
+
+    stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}
+    if not stored:
+        raise MitsonarError(f"{store.place.url} holds vectors, no images: give a data set of images")
+    name = next(iter(stored)) if view is None else view
+    if name not in stored:
+        raise MitsonarError(f"{store.place.url} has no view {name!r}: {nearest_names(name, stored)}")
+    known = {one.name: one for one in store.recipe.views}[name]
+    image = store.array(stored[name])
+    like = SonarFrames(
+        image=np.zeros((0, *image.shape[1:]), dtype=image.dtype),
+        range_m=known.sonar.range_m,
+        bearing_rad=known.bearing_rad,
+        time_s=np.zeros(0),
+        sonar=known.sonar,
+        level=store.recipe.level_of(known),
+        level_scale=float(store.about["level_scale"]),
+    )
+    return StoredView(name, stored[name], like, len(stored) > 1)
+
+
+def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, int, str]:
+    """Return the frames of a sequence of a data set, its number, and a description. Default: the longest, or the first such.
+
+    Raises:
+        MitsonarError: no such sequence.
+    """
+    sequences = store.read("sequence")
+    lengths = np.bincount(sequences)
+    number = int(lengths.argmax()) if sequence is None else sequence
+    if not (0 <= number < len(lengths) and lengths[number]):
+        raise MitsonarError(f"{store.place.url} has no sequence {number}: it has {len(lengths):,}, numbered from 0")
+    first = int(np.argmax(sequences == number))
+    longest = ", the longest" if sequence is None else ""
+    which = f"sequence {number} of {len(lengths):,}{longest}: {counted(int(lengths[number]), 'frame')}"
+    return slice(first, first + int(lengths[number])), number, which
+
+
+def _picked(image: StoredArray, index: Index) -> Pixels:
+    """Read frames of a Zarr array; those at equal steps at once."""
+    if not len(index):
+        return np.asarray(image[:0])
+    steps = np.unique(np.diff(index))
+    if len(steps) <= 1 and (not len(steps) or steps[0] > 0):
+        return np.asarray(image[int(index[0]) : int(index[-1]) + 1 : int(steps[0]) if len(steps) else 1])
+    return np.stack([np.asarray(image[int(one)]) for one in index])
+
+
+# ---------------- Frames of any origin as a recording: files of real sonars, runs and data sets; with poses and labels
+
+
+Labels: TypeAlias = dict[str, Any]
+"""Arrays of per-pixel truth by the names of :data:`~mitsonar.records.frames.LABELS`."""
+
+
+@dataclass(frozen=True)
+class LabelledPart(Part):
+    """A part with per-pixel truth.
+
+    Attributes:
+        labels: reads the labels of frames of given numbers ``(n,)`` by name: ``(n, bins, beams)``.
+    """
+
+    labels: Callable[[Index], Labels] = lambda index: {}
+
+    def read(self, index: ArrayLike) -> SonarFrames:
+        """Read frames of these numbers ``(n,)``, with labels.
+
+        Raises:
+            MitsonarError: frames that are not there, or that cannot be read.
+        """
+        return replace(super().read(index), **self.labels(np.asarray(index, dtype=np.intp)))
+
+    def _read_within(self, rows: slice, columns: slice) -> dict[str, Any]:
+        """Return the fields that read pixels and their labels, of these bins and beams."""
+
+        def labels(index: Index) -> Labels:
+            return {name: values[:, rows, columns] for name, values in self.labels(index).items()}
+
+        return {**super()._read_within(rows, columns), "labels": labels}
+
+
+def recording_at(
+    where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
+) -> Recording:
+    """Open frames at a path or URL as a recording.
+
+    Args:
+        where: a recording of a real sonar, ``frames.npz``, ``frames.zarr``, the folder of a run, or a data set.
+        sequence: of a data set.
+        view: of a data set, or topic of a ROS bag.
+        geometry: file that tells how pictures are laid out.
+
+    Raises:
+        MitsonarError: no frames there, or choices that do not fit them.
+    """
+    data_set = is_data_set(where)
+    if not data_set and is_recording(where):
+        return open_recording(where, geometry, view)
+    source = open_frames(where, sequence=sequence if data_set else None, view=view, geometry=geometry)
+    labels = None if data_set else _labels_at(Path(where))
+    part = LabelledPart(
+        like=source.like,
+        time_s=source.time_s,
+        images=source.images,
+        poses=source.poses,
+        attitude_rad=source.attitude_rad,
+        height_m=source.height_m,
+        labels=(lambda index: {}) if labels is None else labels,
+    )
+    words = "data set of mitsonar" if data_set else "run of mitsonar"
+    return Recording(str(where), words, (part,), {}, (source.note,) if source.note else ())
+
+
+def _labels_at(path: Path) -> Callable[[Index], Labels] | None:
+    """Return what reads the labels of a run; None where it has none."""
+    if os.path.isdir(path) and path.suffix != ".zarr":
+        path = next(one for one in (path / "frames.npz", path / "frames.zarr") if os.path.exists(one))
+    if os.path.isfile(path):
+        frames = SonarFrames.load(path)
+        kept = {name: getattr(frames, name) for name in LABELS if getattr(frames, name) is not None}
+        return (lambda index: {name: values[index] for name, values in kept.items()}) if kept else None
+    try:
+        arrays = {name: one for name, one in open_group(path, COLUMNS, "time_s", "frames_done")[0].items() if name in LABELS}
+    except Exception as error:  # a damaged Zarr raises errors of many kinds
+        raise MitsonarError(f"cannot read the labels of {path}: {' '.join(str(error).split())[:160]}") from None
+
+    def stored(index: Index) -> Labels:
+        return {
+            name: np.stack([np.asarray(one[int(number)]) for number in index]) if len(index) else np.asarray(one[:0])
+            for name, one in arrays.items()
+        }
+
+    return stored if arrays else None
+
+
+# ---------------- Heights that are measured in the frames themselves, in place of recorded ones
+
+
+Framed = TypeVar("Framed", bound="SonarFrames | ViewFrames")
+
+
+def measured(
+    frames: Framed, by: HeightEstimator, like: SonarFrames | ViewFrames | None = None
+) -> tuple[Framed, list[HeightEstimate]]:
+    """Measure the height in each frame, and return the frames with these heights, and the estimates.
+
+    Heights are nan where the estimate is not valid. The poses take the same heights, so that no other can be read.
+
+    Args:
+        frames: whose heights are replaced.
+        by: measures the heights.
+        like: the same pings as the estimator reads them; None: the frames.
+
+    Raises:
+        MitsonarError: as the estimator does.
+    """
+    read = frames if like is None else like
+    estimates = [by.height(read.select(slice(k, k + 1))) for k in range(len(read))]
+    heights = np.array([one.height_m if one.valid else np.nan for one in estimates])
+    return replace(frames, height_m=heights, poses=_at(frames.poses, heights)), estimates
+
+
+def without_height(frames: Record) -> bool:
+    """Return whether heights were measured in these frames, and none was found."""
+    heights, poses = getattr(frames, "height_m", None), frames.poses
+    if heights is None or np.isfinite(heights).any():
+        return False
+    return poses is None or not np.isfinite(poses[:, 2]).any()
+
+
+def _at(poses: NDArray[np.float64] | None, heights: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return poses with these heights over the ground."""
+    if poses is None:
+        return None
+    moved = poses.copy()
+    moved[:, 2] = heights
+    return moved
+
+
+# ---------------- Poses at the times of frames, from a path that was measured or estimated, and the stretches of
+# frames that have them
+
+
+SAME_S = 0.01
+"""Distance of a frame from a pose that is taken for it [s]: times in files are rounded."""
+
+LONGEST_GAP_S = 1.0
+"""Longest step of a path within which poses are interpolated [s]."""
+
+PAUSE = 5.0
+"""Step from frame to frame, as part of the median step, that ends a stretch."""
+
+
+def poses_at(
+    path: Trajectory, time_s: Array, name: str, attitude_rad: Array | None = None
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Interpolate a path at the times of frames.
+
+    A frame has a pose where one of the path is within 10 ms of it, or where it lies between two that are at most a second
+    apart. A path of odometry has one height, pitch and roll throughout. Pitch and roll are then those of the frames, if
+    known.
+
+    Args:
+        path: its times rise.
+        time_s: of the frames ``(frames,)`` [s].
+        name: of the frames, for errors.
+        attitude_rad: pitch, roll, heading of the frames by their own sensors ``(frames, 3)``; nan where unknown.
+
+    Returns:
+        Poses ``(frames, 6)`` [m, rad], and which frames have one ``(frames,)``; the others are nan.
+
+    Raises:
+        MitsonarError: the times of the path do not rise, or no frame has a pose.
+    """
+    times = path.time_s
+    if not (np.diff(times) > 0).all():
+        raise MitsonarError("the times of the path must rise: sort its poses")
+    after = np.clip(np.searchsorted(times, time_s), 1, max(1, len(times) - 1)).astype(np.intp)
+    before = after - 1
+    after = np.minimum(after, len(times) - 1)
+    near = np.minimum(np.abs(times[before] - time_s), np.abs(times[after] - time_s)) <= SAME_S + 1e-9
+    between = (times[before] <= time_s) & (time_s <= times[after]) & (times[after] - times[before] <= LONGEST_GAP_S)
+    known = near | between
+    if not known.any():
+        raise MitsonarError(
+            f"no pose for the frames of {name}: the path lasts from {times[0]:.10g} to {times[-1]:.10g} s, the frames from "
+            f"{time_s[0]:.10g} to {time_s[-1]:.10g} s; give a path with the times of the frames"
+        )
+    poses = np.full((len(time_s), 6), np.nan)
+    poses[known] = _interpolated(path, np.clip(time_s[known], times[0], times[-1]))
+    if attitude_rad is not None and (np.ptp(path.poses[:, 2:5], axis=0) < PLANAR).all():
+        told = known[:, None] & np.isfinite(attitude_rad[:, :2])
+        poses[:, 3:5] = np.where(told, attitude_rad[:, :2], poses[:, 3:5])
+    return poses, known
+
+
+def stretches(known: NDArray[np.bool_], time_s: Array) -> list[slice]:
+    """Return the stretches of two or more consecutive frames that have poses and follow each other without a pause.
+
+    Args:
+        known: which frames have a pose ``(frames,)``.
+        time_s: of the frames ``(frames,)`` [s].
+    """
+    steps = np.diff(time_s)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    ends = np.flatnonzero(~(known[1:] & known[:-1]) | (steps > PAUSE * usual)) + 1
+    borders = [0, *ends.tolist(), len(known)]
+    return [slice(one, other) for one, other in pairwise(borders) if other - one > 1]
+
+
+def _interpolated(path: Trajectory, time_s: Array) -> Array:
+    """Return the poses of a path at times within it ``(n, 6)``: positions in straight lines, attitudes by the arc.
+
+    At a time of the path the pose is the path's own to the bit.
+    """
+    if len(path) == 1:
+        return np.repeat(path.poses, len(time_s), axis=0)
+    position = np.column_stack([np.interp(time_s, path.time_s, axis) for axis in path.poses[:, :3].T])
+    poses = poses_from(position, Slerp(path.time_s, vehicle_rotation(path.poses))(time_s))
+    place = np.minimum(np.searchsorted(path.time_s, time_s), len(path) - 1)
+    same = path.time_s[place] == time_s
+    poses[same] = path.poses[place[same]]
+    return np.asarray(poses, dtype=np.float64)
