@@ -43,8 +43,8 @@ from mitsonar.mapping.sources import measured
 from mitsonar.motion.errors import in_units
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.frames import SonarFrames
-from mitsonar.training.evaluation import evaluate
-from mitsonar.training.training_run import train
+from mitsonar.training.evaluate import evaluate
+from mitsonar.training.run import train
 
 QUADRANTS, CONES = ["q1", "q2", "q3", "q4"], ["c1", "c2", "c3", "c4"]
 

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import write_whole
-from mitsonar.training.document_tables import DocumentTable, ScriptedTable, TableRow, contents, load_tables, tables_with
-from mitsonar.training.row_results import Found
+from mitsonar.training.reproduce import DocumentTable, Found, ScriptedTable, TableRow, contents, load_tables, tables_with
 
 HERE = Path(__file__).resolve().parent
 RESULTS, PAGE = HERE / "results" / "reproduced", HERE / "REPRODUCED.md"

@@ -57,8 +57,7 @@ if TYPE_CHECKING:
     from mitsonar.simulation.simulator import Simulator
     from mitsonar.simulation.sounding import SounderSimulator
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle
-    from mitsonar.training.document_tables import load_tables
-    from mitsonar.training.reproduce import Effort, reproduce
+    from mitsonar.training.reproduce import Effort, load_tables, reproduce
     from mitsonar.worlds.sea import SeaSurface, fishing_net_mesh, particle_mesh
 
 __all__ = [
@@ -175,7 +174,7 @@ _MODULES = {
     "load_sensors": "motion.sensors",
     "load_sonar": "instruments.sounder",
     "load_sounder": "instruments.sounder",
-    "load_tables": "training.document_tables",
+    "load_tables": "training.reproduce",
     "load_vehicle": "simulation.vehicle",
     "make_dataset": "datasets.make",
     "mosaic_figure": "plotting.figures",

@@ -94,11 +94,11 @@ def bare_curves() -> Iterator[Callable[..., Any]]:
     """An empty figure in place of a training's curve, which takes half a second at each validation; gives the real one."""
     from matplotlib.figure import Figure
 
-    from mitsonar.training import training_folder
+    from mitsonar.training import journal
 
-    real = training_folder.curve_figure
+    real = journal.curve_figure
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training_folder, "curve_figure", lambda *_: Figure(figsize=(1, 1)))
+        patch.setattr(journal, "curve_figure", lambda *_: Figure(figsize=(1, 1)))
         yield real
 
 

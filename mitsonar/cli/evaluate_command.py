@@ -48,8 +48,8 @@ def evaluate(
     """
     checkpoint = checkpoint_from(run)
     from mitsonar.estimation.compare import FEWEST_SCENES
-    from mitsonar.training.evaluation import evaluate as evaluated
-    from mitsonar.training.evaluation_tables import refuse_tables, report_lines, save_tables
+    from mitsonar.training.evaluate import evaluate as evaluated
+    from mitsonar.training.evaluate import refuse_tables, report_lines, save_tables
 
     if out is not None:
         refuse_tables(out, overwrite=overwrite)

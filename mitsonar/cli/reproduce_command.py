@@ -16,7 +16,7 @@ from mitsonar.cli.train_command import TrainingBar, asked_to_stop
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
-    from mitsonar.training.training_run import TrainingReport
+    from mitsonar.training.run import TrainingReport
 
 __all__ = ["reproduce"]
 
@@ -58,7 +58,7 @@ def reproduce(
         return
     if workers is not None and workers < 1:
         raise MitsonarError(f"--workers must be at least 1: got {workers}")
-    from mitsonar.training.document_tables import rows_named, table_named
+    from mitsonar.training.reproduce import rows_named, table_named
 
     wanted = [name.strip() for name in rows.split(",") if name.strip()] if rows is not None else None
     rows_named(table_named(table), wanted)
@@ -85,7 +85,7 @@ def reproduce(
 
 def _list() -> None:
     """List all tables and figures with their rows, or with the command that makes them."""
-    from mitsonar.training.document_tables import LOUD, NOISES, ScriptedTable, contents
+    from mitsonar.training.reproduce import LOUD, NOISES, ScriptedTable, contents
 
     printed = [said for noise, said in NOISES.items() if noise != LOUD]
     say(f"RMSE in Almanza-Medina, sideways mm / forward mm / yaw deg: {', '.join(printed)}")

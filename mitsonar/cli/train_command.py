@@ -18,7 +18,7 @@ from mitsonar.cli.console import Terminated, answered, changes_of, say
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from mitsonar.training.training_run import TrainingReport
+    from mitsonar.training.run import TrainingReport
 
 __all__ = ["TrainingBar", "asked_to_stop", "train"]
 
@@ -62,8 +62,8 @@ def train(
 ) -> None:
     """Train a network. After a stop at any moment --resume continues; on a CPU the result has the same bits."""
     from mitsonar.config.training import load_training_recipe
-    from mitsonar.training.training_run import leads
-    from mitsonar.training.training_run import train as train_network
+    from mitsonar.training.run import leads
+    from mitsonar.training.run import train as train_network
 
     wanted = load_training_recipe(recipe, changes_of(change or [], None))
     with asked_to_stop() as stop, TrainingBar() as bar:

@@ -6,35 +6,68 @@ import io
 import json
 import math
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import date
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
-from typing import Protocol
+from textwrap import wrap
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
-from pydantic import ValidationError
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mitsonar.config.data import Recipe, load_recipe, recipe_from
 from mitsonar.config.training import TrainingRecipe, load_training_recipe
 from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.samples import split_for
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError, argument, complaint
+from mitsonar.errors import MitsonarError, argument, complaint, nearest_names
 from mitsonar.io.files import read_json, write_json, write_whole
 from mitsonar.io.runs import RunDirectory, RunKind, plain_json, refuse_other, versions
 from mitsonar.io.storage import Storage
+from mitsonar.motion.errors import AXES, Axis
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.training.document_tables import load_tables, rows_named, split_name, table_named, tables_with
-from mitsonar.training.evaluation import evaluate
-from mitsonar.training.reproduced_tables import plain_table, table_figure, table_lines
-from mitsonar.training.row_results import Found, Reached, RowScore
-from mitsonar.training.training_folder import TRAINING
-from mitsonar.training.training_journal import TrainingReport
-from mitsonar.training.training_run import train
-from mitsonar.training.training_types import JsonObject
+from mitsonar.training.data import JsonObject
+from mitsonar.training.evaluate import evaluate
+from mitsonar.training.journal import TRAINING, TrainingReport
+from mitsonar.training.run import train
 
-__all__ = ["Effort", "Watch", "reproduce", "unseen_recipe"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "HEIGHT",
+    "NOISES",
+    "DocumentTable",
+    "Effort",
+    "Errors",
+    "Found",
+    "Part",
+    "Reached",
+    "RowScore",
+    "ScriptedTable",
+    "Strict",
+    "TableRow",
+    "Watch",
+    "contents",
+    "errors_said",
+    "load_scripted",
+    "load_tables",
+    "plain_table",
+    "reproduce",
+    "rows_named",
+    "split_name",
+    "table_figure",
+    "table_lines",
+    "table_named",
+    "tables_with",
+    "unseen_recipe",
+]
+
 
 TABLES = RunKind(
     "tables",
@@ -379,7 +412,7 @@ def unseen_recipe(data: Recipe, learnt: int, wanted: int | None, frames: int) ->
 
 
 def _progress(watch: Watch, what: str) -> Callable[[int], Advance]:
-    """Return the argument ``begin`` of :func:`~mitsonar.training.evaluation.evaluate`."""
+    """Return the argument ``begin`` of :func:`~mitsonar.training.evaluate.evaluate`."""
     return lambda total: watch.begin(f"evaluating {what}", total, "pairs")
 
 
@@ -439,3 +472,496 @@ def _processor() -> str:
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
+
+
+# ---------------- Tables of trained networks as Almanza-Medina prints them
+
+
+LOUD: Literal["0.0274,0.0062,0.0274"] = "0.0274,0.0062,0.0274"
+"""A fifth of the high noise: what echoes of five times the gain have. The baseline of Almanza-Medina hardly feels the high
+noise (table 3.8: 8.39 and 8.16 mm), and ``ecc`` hardly feels this (0.98 and 1.02 mm; 1.89 with high noise)."""
+
+NOISES = {"none": "noiseless", "high": "high noise", LOUD: "high noise, 5 times the gain"}
+"""Noise of the validation samples, and the heading of its half of a table."""
+
+CHAPTERS = ("chapter3", "chapter4", "chapter5")
+"""Files of tables."""
+
+HEIGHT = Axis("height", "% of the interval", 1.0)
+"""Axis of figures of heights. Errors are relative: one interval of heights is 26 times the other."""
+
+Errors = Annotated[tuple[float, ...], Field(min_length=1, max_length=3)]
+"""Sideways [mm], forward [mm], and yaw [deg] where the vehicle turns; or height [mm]."""
+
+
+class Strict(BaseModel):
+    """A model that refuses unknown keys and cannot be changed."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TableRow(Strict):
+    """One network of a table.
+
+    Attributes:
+        approach: its name in Almanza-Medina.
+        recipe: name of the training recipe.
+        set: keys of the recipe that this row changes, with dots between the levels. They override those of an effort.
+        name: of the row; default: name of its recipe. The same network has the same name in all tables.
+        none: RMSE without noise, if it is printed and legible.
+        high: RMSE with high noise, if it is printed and legible.
+        ms: duration of one estimate [ms], if it is printed and legible.
+        interval: width of the interval of training heights [m]; only of networks that estimate heights.
+    """
+
+    approach: str
+    recipe: str
+    set: JsonObject = Field(default_factory=dict)
+    name: str
+    none: Errors | None = None
+    high: Errors | None = None
+    ms: float | None = None
+    interval: float | None = Field(None, gt=0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named(cls, fields: object) -> object:
+        return {"name": fields.get("recipe"), **fields} if isinstance(fields, dict) else fields
+
+    @property
+    def printed(self) -> dict[str, Errors]:
+        """Return the errors that Almanza-Medina prints, by noise."""
+        both = {"none": self.none, "high": self.high}
+        return {noise: errors for noise, errors in both.items() if errors is not None}
+
+    def drawn(self, errors: tuple[float, ...]) -> tuple[float, ...]:
+        """Return an RMSE as a figure shows it: heights in percent of their interval."""
+        return errors if self.interval is None else (errors[0] / 10 / self.interval,)
+
+    def said(self, errors: tuple[float, ...] | None) -> str:
+        """Format an RMSE for people: heights in cm and in percent of their interval."""
+        if errors is None:
+            return "-"
+        if self.interval is None:
+            return errors_said(errors)
+        return f"{errors[0] / 10:.2f} cm ({errors[0] / 10 / self.interval:.2f} %)"
+
+
+class DocumentTable(Strict):
+    """One table of Almanza-Medina.
+
+    Attributes:
+        name: its number.
+        title: what its rows differ in.
+        figure: whether Almanza-Medina draws it as a figure.
+        section: of Almanza-Medina that describes it.
+        note: remark for readers who compare.
+        differs: how validation and simulation of Almanza-Medina differ from ours.
+        largest: the largest motions of its data, which are uniform within plus and minus these; for heights half the
+            interval [%].
+        set: keys of the recipes that all rows change.
+        noises: noise of the samples that all rows are scored on.
+        unseen: number of sequences of unseen scenes, each with the pings of one sample; default: a part of the number of
+            training sequences.
+        rows: in the order of Almanza-Medina.
+    """
+
+    name: str
+    title: str
+    figure: bool = False
+    section: str
+    note: str = ""
+    differs: str = (
+        "Almanza-Medina selected and validated networks on the same pairs (8,000 in most tables). Scenes, gain and windows "
+        "there differ from ours."
+    )
+    largest: Errors = (20.0, 20.0, 0.45)
+    set: JsonObject = Field(default_factory=dict)
+    noises: list[Literal["none", "high", "0.0274,0.0062,0.0274"]] = ["none", "high", LOUD]
+    unseen: int | None = Field(None, ge=1)
+    rows: list[TableRow] = Field(min_length=1)
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """Return the axes that its rows estimate."""
+        return (HEIGHT,) if len(self.largest) == 1 else tuple(AXES[: len(self.largest)])
+
+    @property
+    def kind(self) -> str:
+        """Return ``Table``, or ``Figure``."""
+        return "Figure" if self.figure else "Table"
+
+    @property
+    def no_motion(self) -> tuple[float, ...]:
+        """Return the RMSE of always estimating no motion."""
+        return tuple(end / np.sqrt(3) for end in self.largest)
+
+
+class ScriptedTable(Strict):
+    """A table or figure of Almanza-Medina that a script of ``benchmarks/`` makes: of methods, paths, times.
+
+    Attributes:
+        name: its number, of a figure with ``figure-`` before it.
+        title: what it shows.
+        section: of Almanza-Medina that describes it.
+        command: that makes it, from the root of the sources.
+        printed: what Almanza-Medina prints, row by row, as text.
+        results: page and heading with ours.
+    """
+
+    name: str
+    title: str
+    section: str
+    command: str
+    printed: dict[str, str] = Field(default_factory=dict)
+    results: str
+
+
+@cache
+def load_tables() -> dict[str, DocumentTable]:
+    """Load all tables, by number."""
+    folder = files("mitsonar.recipes") / "tables"
+    texts = [(folder / f"{chapter}.yaml").read_text(encoding="utf-8") for chapter in CHAPTERS]
+    return {name: DocumentTable(name=name, **fields) for text in texts for name, fields in yaml.safe_load(text).items()}
+
+
+@cache
+def load_scripted() -> dict[str, ScriptedTable]:
+    """Load the tables and figures that scripts make, by number."""
+    text = (files("mitsonar.recipes") / "tables" / "scripted.yaml").read_text(encoding="utf-8")
+    return {name: ScriptedTable(name=name, **fields) for name, fields in yaml.safe_load(text).items()}
+
+
+def contents() -> list[DocumentTable | ScriptedTable]:
+    """List all tables and figures that can be reproduced, in the order of their chapters and numbers."""
+    both: list[DocumentTable | ScriptedTable] = [*load_tables().values(), *load_scripted().values()]
+    return sorted(both, key=lambda one: [int(number) for number in one.name.removeprefix("figure-").split(".")])
+
+
+def table_named(name: str) -> DocumentTable:
+    """Return the table of that number.
+
+    Raises:
+        MitsonarError: no such table, or one that a script makes.
+    """
+    tables, scripted = load_tables(), load_scripted()
+    if name in scripted:
+        raise MitsonarError(f"{name} is made by a script of mitsonar's sources: run there  {scripted[name].command}")
+    if name not in tables:
+        raise MitsonarError(f"no table {name!r}: {nearest_names(name, [one.name for one in contents()])}")
+    return tables[name]
+
+
+def rows_named(table: DocumentTable, names: list[str] | None = None) -> list[TableRow]:
+    """Return the named rows of a table, in the order of the table; all rows if none is named.
+
+    Raises:
+        MitsonarError: no such row.
+    """
+    known = [row.name for row in table.rows]
+    for name in names or []:
+        if name not in known:
+            raise MitsonarError(f"table {table.name} has no row {name!r}: {nearest_names(name, known)}")
+    return [row for row in table.rows if not names or row.name in names]
+
+
+def tables_with(name: str) -> list[str]:
+    """Return the numbers of the tables that have a row of this name."""
+    return [table.name for table in load_tables().values() if any(row.name == name for row in table.rows)]
+
+
+def errors_said(errors: tuple[float, ...]) -> str:
+    """Format the RMSE of each axis for people."""
+    named = zip(errors, AXES, strict=False)
+    return " / ".join(f"{value:.3f}" if axis.unit == "deg" else f"{value:.2f}" for value, axis in named)
+
+
+def split_name(split: str | JsonObject) -> str:
+    """Return what a split deals out: ``sample``, ``sequence`` or ``scene``."""
+    return split if isinstance(split, str) else str(split["by"])
+
+
+# ---------------- What a row of a table reached here: its errors, and the scale of its training
+
+
+Part = Literal["validation", "test", "unseen"]
+"""Samples that a row is scored on."""
+
+
+class RowScore(Strict):
+    """Errors on some samples: sideways [mm], forward [mm], and yaw [deg] if the network estimates it; or height [mm].
+
+    Attributes:
+        pairs: number of pairs.
+        scenes: number of scenes that they are of.
+        rmse: root mean square error.
+        low: lower end of its 95 % interval.
+        high: upper end of its 95 % interval.
+        slope: of the estimates over the true motions, without unit; null where nothing moved.
+        zero: RMSE of always estimating no motion.
+        ms: processor time of one estimate on one core [ms], as an evaluation measures it.
+    """
+
+    pairs: int
+    scenes: int
+    rmse: Errors
+    low: Errors
+    high: Errors
+    slope: tuple[float | None, ...]
+    zero: Errors
+    ms: float | None = None
+
+
+class Reached(Strict):
+    """The scale at which a row was reached.
+
+    Attributes:
+        training_pairs: number of training samples.
+        pairs_seen: samples seen in training; a sample counts each time that it is seen.
+        pairs_best: samples seen when the evaluated network was saved, the best by validation.
+        epochs: pairs_seen over training_pairs.
+        epochs_asked: epochs of the recipe.
+        minutes: duration of training [min].
+        device: device of training.
+        machine: processor of that machine.
+        threads: number of threads.
+        batch: samples of one step.
+        rate: initial learning rate.
+        precision: of the training.
+        split: how validation samples are separated from training: ``sample``, ``sequence`` or ``scene``.
+        date: day on which training ended.
+    """
+
+    training_pairs: int
+    pairs_seen: int
+    pairs_best: int
+    epochs: float
+    epochs_asked: float
+    minutes: float
+    device: str
+    machine: str
+    threads: int
+    batch: int
+    rate: float
+    precision: str
+    split: str
+    date: str
+
+
+class Found(Strict):
+    """Errors of one row, and the scale at which they were reached.
+
+    Attributes:
+        recipe: name of the row.
+        validation: errors by noise, on the part of the data set that is not used for training.
+        test: errors by noise, on the sequences that are kept from training and validation; empty where there are none.
+        unseen: errors by noise, on the scenes of a data set with another seed.
+        reached: scale of the training.
+    """
+
+    recipe: str
+    validation: dict[str, RowScore]
+    test: dict[str, RowScore] = Field(default_factory=dict)
+    unseen: dict[str, RowScore]
+    reached: Reached
+
+    def score(self, part: Part, noise: str) -> RowScore | None:
+        """Return the errors on one part with one noise; None where there are no such samples."""
+        scores: dict[str, RowScore] = getattr(self, part)
+        return scores.get(noise)
+
+
+# ---------------- Tables of Almanza-Medina beside what was reached here: as Markdown, for programs, and as a figure
+
+
+NOT_YET = "not trained yet"
+
+SPLITS = {
+    "sequence": "one pair a sequence of those kept from training, of the same scenes",
+    "scene": "one pair a sequence of those kept from training, of other scenes",
+    "sample": "pairs dealt out one by one, as in Almanza-Medina (3.2.1, 4.2.2), one a sequence; training used pairs of the "
+    "same sequences, with the same motion and a frame in common",
+}
+"""By the split of a recipe: how validation samples are separated from training."""
+
+PARTS: dict[Part, str] = {"validation": "validation", "test": "other sequences", "unseen": "unseen scenes"}
+
+GAIN = (
+    " *high noise*: here the mean echo is 0.44 of the scale of this noise. The gain of Almanza-Medina is not known, and "
+    "must have been several times larger: the baseline there hardly feels the noise (table 3.8: 8.39 and 8.16 mm). With 5 "
+    "times the gain ours does not either: 0.98 and 1.02 mm."
+)
+"""Note on columns with high noise."""
+
+OF_PARTS: dict[Part, str] = {
+    "validation": "the network that a training keeps is the best on them.",
+    "test": "*other sequences*: one pair a sequence of those kept from training and validation, of the same scenes.",
+    "unseen": "*unseen scenes*: one pair a sequence of a data set with another seed, whose scenes no network has seen.",
+}
+"""Note on each."""
+
+REACHED: dict[str, Callable[[Found], str]] = {
+    "pairs to learn from": lambda found: f"{found.reached.training_pairs:,}",
+    "pairs seen (best after)": lambda found: f"{found.reached.pairs_seen:,} ({found.reached.pairs_best:,})",
+    "epochs": lambda found: f"{found.reached.epochs:.2f} of {found.reached.epochs_asked:.3g}",
+    "minutes": lambda found: f"{found.reached.minutes:.1f}",
+    "batch, rate, precision": lambda found: f"{found.reached.batch}, {found.reached.rate:.3g}, {found.reached.precision}",
+    "scored pairs: validation, unseen (scenes)": lambda found: (
+        f"{found.validation['none'].pairs:,}, {found.unseen['none'].pairs:,} ({found.unseen['none'].scenes})"
+    ),
+    "scored pairs: other sequences": lambda found: f"{found.test['none'].pairs:,}" if found.test else "-",
+    "on": lambda found: f"{found.reached.device}; {found.reached.machine}, threads: {found.reached.threads}",
+    "date": lambda found: found.reached.date,
+}
+"""Columns that show the scale at which a row was reached."""
+
+
+def table_lines(table: DocumentTable, found: Mapping[str, Found]) -> list[str]:
+    """Format a table as Markdown. Rows that are not in ``found`` are shown as not trained yet."""
+    first = next((found[row.name] for row in table.rows if row.name in found), None)
+    split = first.reached.split if first else split_name(table.set.get("split", "sequence"))
+    return [
+        f"## {table.kind} {table.name}: {table.title} (Almanza-Medina, {table.section})",
+        "",
+        *_framed(_error_cells(table, found, first)),
+        "",
+        *([f"Note: {table.note}.", ""] if table.note else []),
+        f"*validation* (split: {split}): {SPLITS[split]}; {' '.join(OF_PARTS[part] for part in _parts(table, found))} "
+        f"{table.differs}{GAIN if 'high' in table.noises else ''}",
+        "",
+        "The scale at which each figure was reached:",
+        "",
+        *_framed(_reached_cells(table, found)),
+    ]
+
+
+def _parts(table: DocumentTable, found: Mapping[str, Found]) -> dict[Part, str]:
+    """Return the parts that rows are scored on, with their headings: all but other sequences where no split has any."""
+    tested = any(row.name in found and found[row.name].test for row in table.rows)
+    return {part: heading for part, heading in PARTS.items() if part != "test" or tested}
+
+
+def _noises(table: DocumentTable, found: Mapping[str, Found]) -> list[str]:
+    """Return the noises that rows are scored with: none that is not printed and that no row has."""
+    return [noise for noise in table.noises if noise != LOUD or any(noise in one.validation for one in found.values())]
+
+
+def _error_cells(table: DocumentTable, found: Mapping[str, Found], first: Found | None) -> list[list[str]]:
+    """Return the cells of errors and times: those of Almanza-Medina beside ours."""
+    units = " / ".join(f"{axis.unit} {axis.name}" for axis in table.axes)
+    parts = _parts(table, found)
+    heights, timed = table.axes == (HEIGHT,), any(row.ms for row in table.rows)
+    head, zero = ["RMSE of heights" if heights else f"RMSE, {units}"], ["*always answering no motion*"]
+    for noise in _noises(table, found):
+        printed = noise != LOUD
+        head += [f"Almanza-Medina, {NOISES[noise]}"] * printed + [f"{part}, {NOISES[noise]}" for part in parts.values()]
+        scores = [first.score(part, noise) if first else None for part in parts]
+        zero += [errors_said(table.no_motion)] * printed
+        zero += ["-" if score is None else errors_said(score.zero) for score in scores]
+    cells = [head] if heights else [head, zero]
+    for row in table.rows:
+        ours = found.get(row.name)
+        cells.append([row.approach])
+        for noise in _noises(table, found):
+            scores = [ours.score(part, noise) if ours else None for part in parts]
+            mine = [row.said(score.rmse) if score is not None else "-" if ours else NOT_YET for score in scores]
+            cells[-1] += [row.said(row.printed.get(noise))] * (noise != LOUD) + mine
+    if timed:
+        head += ["Almanza-Medina, ms", "here, ms"]
+        for row, line in zip(table.rows, cells[-len(table.rows) :], strict=True):
+            score = found[row.name].score("unseen", table.noises[0]) if row.name in found else None
+            ms = None if score is None else score.ms
+            line += ["-" if one is None else f"{one:.3g}" for one in (row.ms, ms)]
+        zero += ["0", "0"]
+    return cells
+
+
+def _reached_cells(table: DocumentTable, found: Mapping[str, Found]) -> list[list[str]]:
+    """Return the cells of the scale at which each row was reached."""
+    cells = [["row", "recipe", "also in", *REACHED]]
+    for row in table.rows:
+        ours = found.get(row.name)
+        others = ", ".join(name for name in tables_with(row.name) if name != table.name) or "-"
+        recipe = row.recipe + "".join(f", {key}: {_short(value)}" for key, value in row.set.items())
+        scale = [text(ours) for text in REACHED.values()] if ours else [NOT_YET, *["-"] * (len(REACHED) - 1)]
+        cells.append([row.approach, recipe, others, *scale])
+    return cells
+
+
+def _short(value: object) -> str:
+    return json.dumps(value).replace('"', "")
+
+
+def plain_table(table: DocumentTable, found: Mapping[str, Found]) -> JsonObject:
+    """Return a table for programs."""
+    rows = []
+    for row in table.rows:
+        ours = found.get(row.name)
+        rows.append(
+            {
+                "approach": row.approach,
+                "recipe": row.recipe,
+                "set": row.set,
+                "name": row.name,
+                "also_in": [name for name in tables_with(row.name) if name != table.name],
+                "thesis": {noise: list(errors) for noise, errors in row.printed.items()},
+                "thesis_ms": row.ms,
+                "interval_m": row.interval,
+                "status": "done" if ours else NOT_YET,
+                "ours": ours.model_dump(mode="json", exclude={"recipe"}) if ours else None,
+            }
+        )
+    about = {"title": table.title, "section": table.section, "note": table.note, "units": [axis.unit for axis in table.axes]}
+    return {**about, "no_motion": list(table.no_motion), "rows": rows}
+
+
+def _framed(rows: list[list[str]]) -> list[str]:
+    """Format cells as a Markdown table, whose head is the first row."""
+    width = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = ["| " + " | ".join(cell.ljust(size) for cell, size in zip(row, width, strict=True)) + " |" for row in rows]
+    return [lines[0], "|" + "|".join("-" * (size + 2) for size in width) + "|", *lines[1:]]
+
+
+def table_figure(table: DocumentTable, found: Mapping[str, Found], *, title: str = "") -> Figure:
+    """Draw bars of Almanza-Medina, validation, other sequences and unseen scenes.
+
+    Whiskers are 95 % intervals. The dotted line is the RMSE of always estimating no motion.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 2.6 + 1.1 * len(table.rows)), layout="constrained")
+    figure.suptitle("\n".join(wrap(title or f"{table.kind} {table.name}: {table.title}", 150)), fontsize="medium")
+    noises = _noises(table, found)
+    grid = figure.subplots(len(noises), len(table.axes), sharey=True, squeeze=False)
+    position = {row.name: k for k, row in enumerate(table.rows) if row.name in found}
+    handles: dict[str, Any] = {}
+    shown = _parts(table, found)
+    places: dict[Part, tuple[float, str]] = {"validation": (-0.08, "C0"), "test": (0.12, "C2"), "unseen": (0.32, "C1")}
+    for panels, noise in zip(grid, noises, strict=True):
+        for k, (panel, axis) in enumerate(zip(panels, table.axes, strict=True)):
+            printed = [row.drawn(row.printed[noise])[k] if noise in row.printed else np.nan for row in table.rows]
+            handles["Almanza-Medina"] = panel.barh(np.arange(len(printed)) - 0.28, printed, 0.18, color="0.6")
+            for part, said in shown.items():
+                offset, colour = places[part]
+                known = [(row, found[row.name].score(part, noise)) for row in table.rows if row.name in found]
+                scores = [(row, score) for row, score in known if score is not None]
+                ends = np.array([[row.drawn(e)[k] for e in (s.low, s.rmse, s.high)] for row, s in scores]).reshape(-1, 3)
+                low, rmse, high = ends.T
+                whiskers = {"xerr": np.maximum([rmse - low, high - rmse], 0), "error_kw": {"linewidth": 0.8}}
+                positions = [position[row.name] + offset for row, _ in scores]
+                handles[said] = panel.barh(positions, rmse, 0.18, color=colour, **(whiskers if scores else {}))
+            handles["no motion"] = panel.axvline(table.no_motion[k], color="black", linestyle=":")
+            panel.set(title=f"{NOISES[noise]}: {axis.name}", xlabel=f"RMSE ({axis.unit})")
+            panel.set_yticks(range(len(printed)), [_label(row, found.get(row.name)) for row in table.rows])
+    grid[0, 0].invert_yaxis()
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
+    return figure
+
+
+def _label(row: TableRow, ours: Found | None) -> str:
+    """Return the name of a row and the scale at which it was reached."""
+    if ours is None:
+        return f"{row.approach}\n{NOT_YET}"
+    return (
+        f"{row.approach}\n{ours.reached.training_pairs:,} pairs x {ours.reached.epochs:.2g}, {ours.reached.minutes:.3g} min"
+    )

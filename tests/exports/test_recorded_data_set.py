@@ -221,8 +221,8 @@ def test_a_network_is_trained_on_it_and_evaluated(places: dict[str, Path], tmp_p
     pytest.importorskip("torch")
     from mitsonar.config.training import training_recipe_from
     from mitsonar.networks.checkpoint import Checkpoint
-    from mitsonar.training.evaluation import evaluate
-    from mitsonar.training.training_run import train
+    from mitsonar.training.evaluate import evaluate
+    from mitsonar.training.run import train
 
     data = tmp_path / "data.zarr"
     written(data, places["aris"], cut=6)

@@ -25,7 +25,7 @@ warp_grid = pytest.importorskip("mitsonar.networks.corrnet")
 matching = pytest.importorskip("mitsonar.networks.corrnet")
 slopes = pytest.importorskip("mitsonar.networks.corrnet")
 head = pytest.importorskip("mitsonar.networks.corrnet")
-augment = pytest.importorskip("mitsonar.training.augment")
+augment = pytest.importorskip("mitsonar.training.step")
 
 pytestmark = pytest.mark.learn
 

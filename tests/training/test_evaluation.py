@@ -42,8 +42,8 @@ from mitsonar.networks.checkpoint import (  # noqa: E402
     onnx_of,
 )
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
-from mitsonar.training.evaluation import evaluate, predictions, samples_for  # noqa: E402
-from mitsonar.training.training_types import JsonObject  # noqa: E402
+from mitsonar.training.data import JsonObject  # noqa: E402
+from mitsonar.training.evaluate import evaluate, predictions, samples_for  # noqa: E402
 
 SAYS = np.array([0.004, -0.006, np.radians(0.1)])
 """What the networks here answer, whatever they see."""

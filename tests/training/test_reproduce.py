@@ -21,18 +21,21 @@ from mitsonar.config.data import Recipe, load_recipe
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.errors import in_units
-from mitsonar.training.document_tables import (
+from mitsonar.training.reproduce import (
     LOUD,
     NOISES,
+    Found,
+    Reached,
+    RowScore,
     contents,
     load_scripted,
     load_tables,
     rows_named,
+    table_figure,
+    table_lines,
     table_named,
     tables_with,
 )
-from mitsonar.training.reproduced_tables import table_figure, table_lines
-from mitsonar.training.row_results import Found, Reached, RowScore
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytest.importorskip("lightning", reason="Lightning is not installed: install mitsonar[learn]")

@@ -25,8 +25,8 @@ from mitsonar.networks.blocks import SameAverage  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network  # noqa: E402
 from mitsonar.records.responses import ImpulseResponses  # noqa: E402
-from mitsonar.training.evaluation import evaluate, predictions, samples_for  # noqa: E402
-from mitsonar.training.training_run import train  # noqa: E402
+from mitsonar.training.evaluate import evaluate, predictions, samples_for  # noqa: E402
+from mitsonar.training.run import train  # noqa: E402
 
 FIELDS: dict[str, Any] = {
     "network": {"name": "impulse_posenet", "width": 0.03, "layers": 6},

@@ -47,11 +47,11 @@ from mitsonar.datasets.samples import (  # noqa: E402
 )
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.corrnet import GaussianHead  # noqa: E402
-from mitsonar.training.evaluation import evaluate  # noqa: E402
-from mitsonar.training.loss import create_loss, squared_error  # noqa: E402
-from mitsonar.training.training_data import Order, Validation, _Together, finished, material_of  # noqa: E402
-from mitsonar.training.training_journal import TrainingReport, _score  # noqa: E402
-from mitsonar.training.training_run import train  # noqa: E402
+from mitsonar.training.data import Order, Validation, _Together, finished, material_of  # noqa: E402
+from mitsonar.training.evaluate import evaluate  # noqa: E402
+from mitsonar.training.journal import TrainingReport, _score  # noqa: E402
+from mitsonar.training.run import train  # noqa: E402
+from mitsonar.training.step import create_loss, squared_error  # noqa: E402
 
 FIELDS: dict[str, Any] = {
     "network": {"name": "posenet", "width": 0.03},
@@ -367,7 +367,7 @@ KILLED = """
     import os, sys
     from mitsonar.io import whole_files as files
     from mitsonar.config.training import load_training_recipe
-    from mitsonar.training.training_run import train
+    from mitsonar.training.run import train
 
     if __name__ == "__main__":
         _, told, data, out, when, render = sys.argv
@@ -462,7 +462,7 @@ def test_a_run_keeps_what_it_promises(
     made: Path, tmp_path: Path, bare_curves: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The best network's errors, computed again from its file; the log; the picture; a network that has learnt."""
-    monkeypatch.setattr("mitsonar.training.training_folder.curve_figure", bare_curves)
+    monkeypatch.setattr("mitsonar.training.journal.curve_figure", bare_curves)
     reports: list[TrainingReport] = []
     labels: dict[str, Any] = {"labels": "quantised", "noise": "none", "optimiser": {"rate": 3e-3}, "steps": 60}
     labels |= {"split": {"train": 0.8, "validation": 0.2}, "validate": {"every_steps": 20, "pairs": None, "noise": ["low"]}}
@@ -662,8 +662,8 @@ def test_rows_of_the_log_between_validations_tell_the_errors_in_training(
     """With a row for each line that is printed; the picture and TensorBoard show them, too."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    monkeypatch.setattr("mitsonar.training.training_folder.curve_figure", bare_curves)
-    monkeypatch.setattr("mitsonar.training.training_journal.LOG_SECONDS", 0.0)
+    monkeypatch.setattr("mitsonar.training.journal.curve_figure", bare_curves)
+    monkeypatch.setattr("mitsonar.training.journal.LOG_SECONDS", 0.0)
     told, out = tmp_path / "mine.yaml", tmp_path / "run"
     validate = {"every_steps": 4, "pairs": 4, "noise": ["none"]}
     told.write_text(yaml.safe_dump({**FIELDS, "steps": 6, "validate": validate}))
@@ -732,7 +732,7 @@ def test_two_devices_share_a_training(made: Path, tmp_path: Path) -> None:
     script.write_text(
         textwrap.dedent("""
         import sys
-        from mitsonar.training.training_run import train
+        from mitsonar.training.run import train
         if __name__ == "__main__":
             train(*sys.argv[1:], accelerator="cpu", devices=2, strategy="ddp", threads=1)
         """)

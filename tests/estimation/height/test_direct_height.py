@@ -241,7 +241,7 @@ class TestNetworks:
     @staticmethod
     def trained(data: Path, run: Path, **words: Any) -> Any:
         from mitsonar.config.training import training_recipe_from
-        from mitsonar.training.training_run import train
+        from mitsonar.training.run import train
 
         small = {
             "network": {"name": "posenetvec", "width": 1 / 16},
@@ -255,7 +255,7 @@ class TestNetworks:
     def test_a_network_tells_the_height(self, heights: Path, tmp_path: Path, mitsonar: Command) -> None:
         from mitsonar.datasets.samples import SonarPairs
         from mitsonar.estimation.height import HeightNetwork
-        from mitsonar.training.evaluation import predictions
+        from mitsonar.training.evaluate import predictions
 
         words = {"kind": "vector", "frames": 1, "views": ["whole", "c2"]}
         kept = self.trained(heights, tmp_path / "run", input=words)

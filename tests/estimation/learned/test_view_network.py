@@ -38,8 +38,8 @@ from mitsonar.estimation.named import create_estimator  # noqa: E402
 from mitsonar.mapping.open_source import open_views  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
-from mitsonar.training.evaluation import evaluate, predictions  # noqa: E402
-from mitsonar.training.training_run import train  # noqa: E402
+from mitsonar.training.evaluate import evaluate, predictions  # noqa: E402
+from mitsonar.training.run import train  # noqa: E402
 
 GAINS = {"coherent": 268.0, "physical": 343.0}
 """Of the sets that the shipped ProfileNet has learnt from."""

@@ -19,14 +19,17 @@ from mitsonar.datasets.responses import ImpulsePairs
 from mitsonar.datasets.samples import SonarPairs, split_for
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, counted
-from mitsonar.estimation.compare import Answers, chosen, rows_of
+from mitsonar.estimation.compare import Answers, chosen, markdown, rows_of
 from mitsonar.estimation.learned import ANGLE_OFF_DEG, HEIGHT_OFF, TrainedInstrument, answer_of, inputs_of, one_thread
 from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.io.files import write_json, write_whole
+from mitsonar.io.runs import refuse_to_replace
 from mitsonar.motion.errors import AXES, cluster_resamples
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.training.training_types import Array, JsonObject
+from mitsonar.training.data import Array, JsonObject
 
-__all__ = ["NOISES", "evaluate", "predictions"]
+__all__ = ["NOISES", "evaluate", "predictions", "refuse_tables", "report_lines", "save_tables"]
+
 
 NOISES = ("none", "low", "high")
 """Levels of noise, by default."""
@@ -370,3 +373,50 @@ def _notes(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
                 f"{recipe.mount.pitch_deg:g} deg, roll {recipe.mount.roll_deg:g} deg"
             )
     return found
+
+
+# ---------------- Tables of an evaluation: as Markdown, and as files in a folder
+
+
+COLUMNS = (
+    *("method", "RMSE", "RMSE, mm / mm / deg/100", "95 % interval", "median", "95 %", "slope", "bias", "large"),
+    *("skill", "nees", "ms", "inputs"),
+)
+
+
+def report_lines(report: JsonObject) -> list[str]:
+    """Format the tables of :func:`mitsonar.training.evaluate.evaluate` as Markdown."""
+    units = "height mm" if len(report["names"]) == 1 else "sideways mm / forward mm / yaw deg"
+    units = units.removesuffix(" / yaw deg") if len(report["names"]) == 2 else units
+    lines = [
+        f"{report['data']} ({report['recipe']}), part {report['part']} by {report['split']}: {report['pairs']} samples of "
+        f"{report['scenes']} scenes, {report['model']} model; {units}"
+    ]
+    for table in report["tables"]:
+        beyond = table["beyond"]
+        lines += ["", f"noise {table['noise']}", "", *markdown(table["rows"], COLUMNS), ""]
+        lines.append(
+            f"beyond the targets of training: {beyond['true']:.1%} of the samples, {beyond['answers']:.1%} of the answers  "
+        )
+        known = [f"{axes} {'-' if value is None else f'{value:.2f}'}" for axes, value in table["correlations"].items()]
+        if known:
+            lines.append(f"correlations of errors: {', '.join(known)}  ")
+    return lines
+
+
+def refuse_tables(out: Path, *, overwrite: bool) -> None:
+    """Refuse to replace the tables in a folder without ``overwrite``.
+
+    Raises:
+        MitsonarError: the folder holds tables, or the path is a file.
+    """
+    if out.exists() and not out.is_dir():
+        raise MitsonarError(f"-o is a folder: got the file {out}")
+    refuse_to_replace(out / "table.md", out / "table.json", overwrite=overwrite)
+
+
+def save_tables(out: Path, report: JsonObject) -> None:
+    """Write ``table.md`` and ``table.json``. The folder is created."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_whole(out / "table.md", ("\n".join(report_lines(report)) + "\n").encode())
+    write_json(out / "table.json", report)

@@ -24,11 +24,9 @@ from mitsonar.config.training import TrainingRecipe, load_training_recipe
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.io.runs import RunDirectory, other_versions
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.training.training_data import Material, material_of
-from mitsonar.training.training_folder import EVENTS, RunFolder, StateFile
-from mitsonar.training.training_journal import STATE_MINUTES, Journal, Pace, TrainingReport
-from mitsonar.training.training_step import NetworkTraining, network_for
-from mitsonar.training.training_types import JsonObject
+from mitsonar.training.data import JsonObject, Material, material_of
+from mitsonar.training.journal import EVENTS, STATE_MINUTES, Journal, Pace, RunFolder, StateFile, TrainingReport
+from mitsonar.training.step import NetworkTraining, network_for
 
 __all__ = ["TrainingReport", "leads", "train"]
 

@@ -6,7 +6,7 @@ import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,14 +23,50 @@ from mitsonar.datasets.samples import JoinedPairs, SonarPairs
 from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import digest
 from mitsonar.simulation.device import ensure_variant
-from mitsonar.training.training_types import Array, Batch, JsonObject, RawSample
 
 if TYPE_CHECKING:
+    from mitsonar.networks.corrnet import GaussianHead, Ground
+
+    NetworkInput = Tensor | tuple[Tensor | Ground, ...]
+    "One input of a network, or several, which are passed as separate arguments."
+    NetworkOutput = Tensor | GaussianHead
+    "Labels ``(batch, outputs)``, or motions with a covariance."
     from mitsonar.datasets.arrangement import Arrangement
     from mitsonar.datasets.responses import Packing
-    from mitsonar.training.training_types import NetworkInput
 
-__all__ = ["STEP", "Material", "Validation", "batches", "finished", "material_of", "seed_of"]
+__all__ = [
+    "STEP",
+    "Array",
+    "Batch",
+    "JsonObject",
+    "Material",
+    "RawSample",
+    "Validation",
+    "batches",
+    "finished",
+    "material_of",
+    "seed_of",
+]
+
+
+# ---------------- Names for what the training room passes on without looking inside
+
+
+Array = NDArray[np.float64]
+"""Numbers in SI units, unless the text says otherwise."""
+
+JsonObject = dict[str, Any]
+"""What a JSON file, a YAML file or a report holds: plain values by name."""
+
+RawSample = dict[str, Any]
+"""One sample as a data set stores it: arrays and numbers by name, before noise and arrangement."""
+
+Batch = dict[str, Any]
+"""Samples of one step: ``epoch``, ``frames``, and ``raw`` samples, or finished ``inputs`` and ``label``."""
+
+
+# ---------------- training data
+
 
 ORDER, STEP, CHOICE, WORLDS = 31, 32, 33, 34
 """Purposes of random numbers; see :func:`seed_of`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, cast
 
@@ -11,25 +12,32 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mitsonar.config.training import TrainingRecipe
+from mitsonar.config.training import Loss, TrainingRecipe
 from mitsonar.datasets.arrangement import Labels
 from mitsonar.errors import MitsonarError
+from mitsonar.motion.composition import inverse
 from mitsonar.motion.errors import AXES, Axis
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.networks.corrnet import GaussianHead
+from mitsonar.networks.corrnet import GaussianHead, Ground, likelihood
 from mitsonar.networks.create import NETWORKS, called, create_network, options_for
-from mitsonar.training.augment import augmented
-from mitsonar.training.loss import create_loss
-from mitsonar.training.training_data import STEP, Material, Validation, batches, finished, seed_of
-from mitsonar.training.training_types import Array, Batch
+from mitsonar.training.data import STEP, Array, Batch, Material, Validation, batches, finished, seed_of
 
 if TYPE_CHECKING:
     from torch.utils.data import DataLoader
 
-    from mitsonar.networks.corrnet import Ground
-    from mitsonar.training.training_types import NetworkInput, NetworkOutput
+    from mitsonar.training.data import NetworkInput, NetworkOutput
 
-__all__ = ["NetworkTraining", "axes_of", "estimates", "network_for", "rmse_by_level"]
+__all__ = [
+    "AUGMENTATIONS",
+    "NetworkTraining",
+    "augmented",
+    "axes_of",
+    "create_loss",
+    "estimates",
+    "network_for",
+    "rmse_by_level",
+    "squared_error",
+]
 
 
 def axes_of(labels: Labels) -> tuple[Axis, ...]:
@@ -227,3 +235,113 @@ def rmse_by_level(
         network.train(was)
     means = {level: np.sqrt(np.concatenate(parts).mean(axis=0)) for level, parts in squares.items()}
     return means, np.asarray(np.sqrt(np.concatenate(truths).mean(axis=0)))
+
+
+# ---------------- Losses of training: eq. 3.1, eq. 3.2-3.3 with the penalty (Almanza-Medina, 3.4), and the Gaussian
+# likelihood
+
+
+def squared_error(
+    estimates: Tensor, labels: Tensor, *, penalty: float = 0.0, low: Tensor | float = -10.0, high: Tensor | float = 10.0
+) -> Tensor:
+    """Return the loss of eq. 3.1, or with a penalty that of eq. 3.3: the sum of squared errors and penalties over 2 S W.
+
+    Args:
+        estimates: ``(S, W)`` in label units.
+        labels: ``(S, W)`` in label units.
+        penalty: eta of eq. 3.2.
+        low: u_1 of eq. 3.2, one value or one for each of the W labels.
+        high: u_2 of eq. 3.2, one value or one for each of the W labels.
+    """
+    square = (estimates - labels).square()
+    if penalty:
+        beyond = (low - estimates).clamp(min=0) + (estimates - high).clamp(min=0)
+        square = square + penalty * beyond.square()
+    return square.sum() / (2 * square.numel())
+
+
+def create_loss(loss: Loss, labels: Labels) -> Callable[[NetworkOutput, Tensor], Tensor]:
+    """Return the loss of a network's output ``(batch, outputs)`` against labels, as a recipe defines it."""
+    if loss.kind == "likelihood":
+        return _likelihood
+    low, high = (torch.from_numpy(labels.encode(end)) for end in (labels.low, labels.high))
+    if loss.bounds is not None:
+        low, high = (torch.full_like(low, bound) for bound in loss.bounds)
+
+    def regression(estimates: NetworkOutput, target: Tensor) -> Tensor:
+        assert isinstance(estimates, Tensor)
+        ends = {"low": low.to(estimates), "high": high.to(estimates)} if loss.penalty else {}
+        return squared_error(estimates, target, penalty=loss.penalty, **ends)
+
+    return regression
+
+
+def _likelihood(estimates: NetworkOutput, target: Tensor) -> Tensor:
+    assert isinstance(estimates, GaussianHead)
+    return likelihood(estimates, target)
+
+
+# ---------------- Data augmentation: random changes of frames and motions that leave the motion known
+
+
+STRANGERS = 0.05
+"""Part of the pairs whose second frame is another pair's. Nothing matches, and the covariance must be large."""
+
+Augmented = tuple[Tensor, Ground, Tensor]
+"""Images ``(batch, 2, bins, beams)``, geometry of the ground, and motions ``(batch, 3)`` [m, m, rad]."""
+
+
+def augmented(inputs: tuple[Tensor, Ground], labels: Tensor, kinds: Sequence[str]) -> tuple[tuple[Tensor, Ground], Tensor]:
+    """Change inputs and labels of a batch at random, by torch's generator.
+
+    Args:
+        inputs: images ``(batch, 2, bins, beams)`` and the geometry of the ground.
+        labels: motions ``(batch, 3)`` [m, m, rad].
+        kinds: keys of :data:`AUGMENTATIONS`, applied in this order.
+    """
+    images, ground = inputs
+    batch = images, ground, labels
+    for kind in kinds:
+        batch = AUGMENTATIONS[kind](batch)
+    images, ground, labels = batch
+    return (images, ground), labels
+
+
+def mirrored(batch: Augmented) -> Augmented:
+    """Exchange port and starboard in half of the pairs.
+
+    This holds for sonars without roll, whose beams are symmetric about the axis.
+    """
+    images, ground, labels = batch
+    chosen = _some(labels, 0.5)
+    images = torch.where(chosen[:, None, None, None], images.flip(-1), images)
+    return images, ground, torch.where(chosen[:, None], labels * labels.new_tensor([-1.0, 1.0, -1.0]), labels)
+
+
+def reversed_(batch: Augmented) -> Augmented:
+    """Reverse the order of the frames in half of the pairs."""
+    images, ground, labels = batch
+    chosen = _some(labels, 0.5)
+    images = torch.where(chosen[:, None, None, None], images.flip(1), images)
+    return images, ground, torch.where(chosen[:, None], inverse(labels), labels)
+
+
+def strange(batch: Augmented) -> Augmented:
+    """Replace some second frames by those of other pairs."""
+    images, ground, labels = batch
+    chosen = _some(labels, STRANGERS)
+    second = torch.where(chosen[:, None, None], images[:, 1].roll(1, dims=0), images[:, 1])
+    return torch.stack([images[:, 0], second], dim=1), ground, labels
+
+
+AUGMENTATIONS: dict[str, Callable[[Augmented], Augmented]] = {
+    "mirror": mirrored,
+    "reverse": reversed_,
+    "strangers": strange,
+}
+"""Changes of a batch, by name."""
+
+
+def _some(labels: Tensor, part: float) -> Tensor:
+    """Draw which pairs are changed ``(batch,)``."""
+    return torch.rand(len(labels), device=labels.device) < part
