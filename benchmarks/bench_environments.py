@@ -15,8 +15,7 @@ import time
 import numpy as np
 from bench_impulse import cpu
 
-from mitsonar.environments.sonar_env import SonarEnv
-from mitsonar.environments.sonar_vector_env import SonarVectorEnv
+from mitsonar.bridges.gymnasium import SonarEnv, SonarVectorEnv
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.simulation.device import ensure_variant

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from mitsonar.live.live_client import LiveClient, image_of
+from mitsonar.bridges.live_client import LiveClient, image_of
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.scene import shipped_trajectory
 

@@ -33,8 +33,8 @@ GROUPS = {
     "Environments": (
         "SonarEnv",
         "SonarVectorEnv",
-        "environments.sonar_task.SonarTask",
-        "environments.sonar_task.Transition",
+        "bridges.gymnasium.SonarTask",
+        "bridges.gymnasium.Transition",
     ),
     "Records": ("SonarFrames", "ImpulseResponses", "Echogram", "Soundings", "load_frames", "open_recording", "write_mcap"),
     "Estimation and mapping": (

@@ -19,14 +19,13 @@ from mitsonar.errors import explain_missing
 
 if TYPE_CHECKING:
     from mitsonar.acoustics.noise import load_noise
+    from mitsonar.bridges.gymnasium import SonarEnv, SonarVectorEnv
     from mitsonar.config.data import load_recipe
     from mitsonar.datasets.make import make_dataset
     from mitsonar.datasets.rendered import RenderedPairs
     from mitsonar.datasets.responses import ImpulsePairs
     from mitsonar.datasets.samples import SonarPairs
     from mitsonar.datasets.store import DataStore
-    from mitsonar.environments.sonar_env import SonarEnv
-    from mitsonar.environments.sonar_vector_env import SonarVectorEnv
     from mitsonar.errors import MitsonarError, MitsonarWarning
     from mitsonar.estimation.compare import Comparison, compare
     from mitsonar.estimation.crlb.image import cramer_rao_bound
@@ -148,10 +147,10 @@ _MODULES = {
     "SensorNoise": "mapping.sensors",
     "Simulator": "simulation.simulator",
     "Sonar": "instruments.sonar",
-    "SonarEnv": "environments.sonar_env",
+    "SonarEnv": "bridges.gymnasium",
     "SonarFrames": "records.frames",
     "SonarPairs": "datasets.samples",
-    "SonarVectorEnv": "environments.sonar_vector_env",
+    "SonarVectorEnv": "bridges.gymnasium",
     "Sounder": "instruments.sounder",
     "SounderSimulator": "simulation.sounding",
     "Soundings": "records.soundings",

@@ -447,7 +447,7 @@ def spoil_sdf(rng: Rng, folder: Path) -> None:
 
 
 def read_foreign(path: Path) -> None:
-    from mitsonar.worlds.imported_world import imported_world
+    from mitsonar.bridges.model_import import imported_world
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

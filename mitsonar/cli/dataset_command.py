@@ -137,7 +137,7 @@ def detector(
     ] = None,
 ) -> None:
     """Render random views of a scene, with boxes, in parts for training, validation and test. The same command resumes."""
-    from mitsonar.exports.detector_set import DetectorViews, detector_recipe
+    from mitsonar.bridges.export_formats import DetectorViews, detector_recipe
 
     if to not in ("coco", "yolo"):
         raise MitsonarError(f"--to is coco or yolo: got {to!r}; `mitsonar dataset export` writes other layouts")
@@ -314,8 +314,7 @@ def from_frames(
     geometry: Geometry = None,
 ) -> None:
     """Make a data set of frames with known poses, of runs and of recordings: to compare, to evaluate, to train on."""
-    from mitsonar.exports.recorded_data_set import write_recorded
-    from mitsonar.exports.recorded_frames import frames_with_poses
+    from mitsonar.bridges.export_source import frames_with_poses, write_recorded
 
     paths: list[Path | None] = list(poses) if poses else [None]
     if len(paths) not in (1, len(files)):

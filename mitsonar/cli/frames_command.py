@@ -86,7 +86,7 @@ def export(
 
 def classes_of(classes: str, without: list[str] | None) -> list[tuple[str, str]]:
     """Return the rules of classes that options give."""
-    from mitsonar.exports.labelled_pictures import class_rules
+    from mitsonar.bridges.export_source import class_rules
 
     return [*((name, "") for name in without or []), *class_rules(classes)]
 
@@ -132,9 +132,8 @@ def exported(
     every_class: bool = False,
 ) -> None:
     """Export frames and say where they are."""
-    from mitsonar.exports.export_source import open_export
-    from mitsonar.exports.labelled_pictures import PictureKind
-    from mitsonar.exports.named_exports import export_to
+    from mitsonar.bridges.export_formats import export_to
+    from mitsonar.bridges.export_source import PictureKind, open_export
 
     source = open_export(where, view=view, split=split)
     words = {"classes": classes, "least": least, "least_snr_db": least_snr_db, "polygons": polygons}

@@ -18,8 +18,7 @@ from mitsonar.cli.render_command import NOISE, instrument_for, scene_parameters,
 from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
-    from mitsonar.live.live_loop import LivePublisher
-    from mitsonar.live.pose_mailbox import PoseMailbox
+    from mitsonar.bridges.live import LivePublisher, PoseMailbox
 
 __all__ = ["serve"]
 
@@ -47,8 +46,7 @@ def serve(
 ) -> None:
     """Serve a live sonar: clients publish poses on /pose and get fan, polar image, transform and timing. Ctrl-C ends it."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
-    from mitsonar.live.live_loop import live_pings
-    from mitsonar.live.pose_mailbox import PoseMailbox
+    from mitsonar.bridges.live import PoseMailbox, live_pings
     from mitsonar.simulation.scene import load_scene
     from mitsonar.simulation.simulator import Simulator
 
@@ -94,7 +92,7 @@ def _set_by_signals() -> Iterator[Event]:
 
 def _foxglove(mailbox: PoseMailbox, host: str, port: int) -> LivePublisher:
     """Start the server and say where it is."""
-    from mitsonar.live.foxglove_server import FoxgloveServer
+    from mitsonar.bridges.foxglove import FoxgloveServer
 
     server = FoxgloveServer(mailbox, host, port)
     say(f"listening on ws://{host}:{server.port} (in Foxglove: Open connection); poses as JSON on /pose")
@@ -103,7 +101,7 @@ def _foxglove(mailbox: PoseMailbox, host: str, port: int) -> LivePublisher:
 
 def _ros_node(mailbox: PoseMailbox) -> LivePublisher:
     """Start the node and say its topics."""
-    from mitsonar.live.ros_node import RosNode
+    from mitsonar.bridges.ros_node import RosNode
 
     node = RosNode(mailbox)
     say("ROS 2 node /mitsonar: poses on /pose")

@@ -13,7 +13,7 @@ from mitsonar.cli.render_command import scene_parameters
 from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
-    from mitsonar.live.rerun_recording import Shown
+    from mitsonar.bridges.rerun import Shown
     from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["view"]
@@ -44,9 +44,9 @@ def view(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file or page.")] = False,
 ) -> None:
     """Show fan, polar image and levels of each frame; scene, wedge of the beams, true and estimated path."""
+    from mitsonar.bridges.rerun import write_recording
+    from mitsonar.bridges.viewer_page import RECORDING, VIEWER, write_page
     from mitsonar.io.runs import refuse_to_replace
-    from mitsonar.live.rerun_recording import write_recording
-    from mitsonar.live.viewer_page import RECORDING, VIEWER, write_page
 
     if save is not None and html is not None:
         raise MitsonarError("--save and --html contradict each other: the page has the recording in it")
@@ -83,7 +83,7 @@ def _shown(
     view_: str | None,
 ) -> Shown:
     """Return what to show: frames with the scene they were made of, or a scene with its sonar and its shipped path."""
-    from mitsonar.live.rerun_recording import Shown
+    from mitsonar.bridges.rerun import Shown
     from mitsonar.mapping.sources import is_data_set, is_recording, open_frames
 
     place = Path(what)

@@ -177,7 +177,7 @@ def import_scene(
     seabed_z: Annotated[float | None, typer.Option(help="Add a seabed of random cells at this height [m].")] = None,
 ) -> None:
     """Make a scene from one of another simulator: Gazebo (SDF), ROS (URDF), Isaac Sim (USD). Coordinates stay."""
-    from mitsonar.worlds.imported_world import imported_world
+    from mitsonar.bridges.model_import import imported_world
 
     world = imported_world(
         file,

@@ -48,11 +48,11 @@ from zarr.registry import register_codec
 
 import mitsonar
 from mitsonar.acoustics.materials import material
+from mitsonar.bridges.model_import import imported_world
 from mitsonar.errors import MitsonarError, MitsonarWarning, shortened
 from mitsonar.io.storage import refuse_codecs
 from mitsonar.records.frames import SonarFrames
 from mitsonar.records.responses import ImpulseResponses
-from mitsonar.worlds.imported_world import imported_world
 from mitsonar.worlds.meshes import mesh_world
 
 SLOW = {"frames.zarr", "frames.zarr, resumed", "responses.zarr", "data set", "data set, checked", "checkpoint"}

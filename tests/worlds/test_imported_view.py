@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from helpers import Command
 
+from mitsonar.bridges.model_import import REACH, imported_world
 from mitsonar.errors import MitsonarWarning
-from mitsonar.worlds.imported_view import REACH
-from mitsonar.worlds.imported_world import imported_world
 from mitsonar.worlds.world import World
 
 

@@ -9,13 +9,13 @@ import pytest
 from foreign_scenes import BUOY, SDF, URDF, make_sdf, make_urdf
 from helpers import Command, refused
 
+from mitsonar.bridges.model_import import imported_world
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.simulator import Simulator
-from mitsonar.worlds.imported_world import imported_world
 from mitsonar.worlds.world import World
 
 

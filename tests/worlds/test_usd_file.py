@@ -13,10 +13,10 @@ from helpers import run_python
 from hostile_readers import Reader, attack, spoil_file
 from mutations import changed_bytes, changed_text
 
+from mitsonar.bridges import usd
+from mitsonar.bridges.model_import import imported_world
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.simulation.scene import load_scene
-from mitsonar.worlds import usd_file
-from mitsonar.worlds.imported_world import imported_world
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="usd-core is not installed: mitsonar[usd]")
 
@@ -111,7 +111,7 @@ def test_a_layer_in_a_searched_folder_is_read(tmp_path: Path) -> None:
 
 def test_without_usd_core_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_usd(tmp_path)
-    monkeypatch.setattr(usd_file, "find_spec", lambda name: None)
+    monkeypatch.setattr(usd, "find_spec", lambda name: None)
     with pytest.raises(MitsonarError, match=r"reading USD needs pxr.*mitsonar\[usd\]"):
         imported_world(tmp_path / "stage.usda")
 

@@ -1,0 +1,681 @@
+"""The layouts by name, and an export from beginning to end."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import pickle
+import tarfile
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from mitsonar.bridges.export_source import (
+    LEAST_SNR_DB,
+    ExportSource,
+    LabelledPictures,
+    PictureKind,
+    Region,
+    Shot,
+    as_json,
+    compressed,
+    digest_of,
+    json_line,
+    new_folder,
+    png,
+    pose_of,
+    refuse_unlabelled,
+    refuse_unposed,
+    regions_of,
+    runs_of,
+    shots,
+)
+from mitsonar.config.data import Keys, Recipe, load_recipe, recipe_from, set_key, shipped_recipes
+from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar, named_sonars
+from mitsonar.io.files import PlainValue, write_whole
+from mitsonar.motion.pose import vehicle_rotation
+from mitsonar.motion.trajectory import CONVENTIONS
+from mitsonar.records.frames import to_float32
+from mitsonar.simulation.scene import covered_squares_in, find_scene, load_scene, shape_boxes_in, shape_names_in, sonar_in
+
+__all__ = [
+    "EXPORTS",
+    "DetectorViews",
+    "detector_recipe",
+    "export_coco",
+    "export_hugging_face",
+    "export_kitti",
+    "export_neusis",
+    "export_to",
+    "export_webdataset",
+    "export_yolo",
+]
+
+
+# ---------------- COCO and YOLO: pictures with boxes, masks and classes, in parts for training, validation and test
+
+
+YOLO_PARTS = {"train": "train", "validation": "val", "test": "test"}
+
+
+def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
+    """Write ``images/PART/`` and ``annotations/PART.json``, masks as compressed runs; yield after each frame.
+
+    Categories are classes, numbered from 1. Attributes of an annotation name its shape and its object.
+    """
+    refuse_unlabelled(source)
+    (folder / "annotations").mkdir()
+    columns, rows = pictures.size
+    count, like, parts = 0, source.like, _parts_of(source)
+    with ExitStack() as files:
+        tables: dict[str, tuple[IO[str], IO[str]]] = {}
+        for part in parts:
+            (folder / "images" / part).mkdir(parents=True)
+            images, annotations = (folder / f"{part}.{name}" for name in ("images", "annotations"))
+            tables[part] = files.enter_context(images.open("w")), files.enter_context(annotations.open("w"))
+        for shot in shots(source):
+            name = f"{shot.name}.png"
+            write_whole(folder / "images" / shot.part / name, png(pictures.picture(shot.frames, shot.index)))
+            size = {"width": columns, "height": rows, "file_name": name}
+            extra = {"part": shot.part, "sequence": int(source.sequence[shot.number])}
+            tables[shot.part][0].write(f"{json_line({'id': shot.number + 1, **size, **extra})}\n")
+            for region in _regions(source, pictures, shot):
+                count += 1
+                names = (
+                    like.shape_names[region.shape] if region.shape < len(like.shape_names) else f"shape {region.shape}",
+                    like.object_names[region.number] if region.number < len(like.object_names) else "",
+                )
+                found = _annotation(count, shot.number + 1, region, names, (rows, columns))
+                tables[shot.part][1].write(f"{json_line(found)}\n")
+            yield 1
+    pictures.refuse_none(source.frames)
+    table = [{"id": kind + 1, "name": name, "supercategory": "shape"} for kind, name in enumerate(pictures.classes)]
+    about = {"description": source.about or source.name, "contributor": "mitsonar", "picture": pictures.picture_kind}
+    for part in parts:
+        with (folder / "annotations" / f"{part}.json").open("w") as whole:  # piece by piece: it may exceed the memory
+            whole.write(f'{{"info":{json_line(about)},"licenses":[],"categories":{json_line(table)},"images":[')
+            _copy(folder / f"{part}.images", whole)
+            whole.write('],"annotations":[')
+            _copy(folder / f"{part}.annotations", whole)
+            whole.write("]}\n")
+
+
+def _parts_of(source: ExportSource) -> list[str]:
+    """Return the parts that have frames; a warning names what a detector needs and lacks."""
+    parts = [part for part in YOLO_PARTS if (source.part == part).any()]
+    lacking = [part for part in ("train", "validation") if part not in parts]
+    if lacking:
+        warnings.warn(f"no frames are for {' and '.join(lacking)}: give --split", MitsonarWarning, stacklevel=3)
+    return parts
+
+
+def _regions(source: ExportSource, pictures: LabelledPictures, shot: Shot) -> list[Region]:
+    """Return the regions of a frame, and count them."""
+    found = pictures.regions(shot.frames, shot.index, float(source.raised_db[shot.number]))
+    pictures.count(shot.part, found)
+    return found
+
+
+def _annotation(number: int, image: int, region: Region, names: tuple[str, str], size: tuple[int, int]) -> dict[str, object]:
+    return {
+        "id": number,
+        "image_id": image,
+        "category_id": region.kind + 1,
+        "bbox": list(region.box),
+        "area": int(np.count_nonzero(region.mask)),
+        "iscrowd": 0,
+        "segmentation": {"size": list(size), "counts": compressed(runs_of(region.mask))},
+        "attributes": {"shape": names[0], "object": region.number, "object_name": names[1]},
+    }
+
+
+def _copy(part: Path, whole: IO[str]) -> None:
+    """Append the lines of a file, with commas between them, and remove it."""
+    with part.open() as lines:
+        for place, line in enumerate(lines):
+            whole.write(("," if place else "") + line.rstrip("\n"))
+    part.unlink()
+
+
+def export_yolo(source: ExportSource, pictures: LabelledPictures, folder: Path, *, polygons: bool = False) -> Iterator[int]:
+    """Write ``images/PART/``, ``labels/PART/`` and ``data.yaml``; yield after each frame.
+
+    A line of a label file is the class and the middle and size of the box, or with ``polygons`` the outline, as parts of the
+    picture. Parts are train, val and test; ``data.yaml`` names those that have frames.
+    """
+    refuse_unlabelled(source)
+    parts = [YOLO_PARTS[part] for part in _parts_of(source)]
+    for part in parts:
+        for kind in ("images", "labels"):
+            (folder / kind / part).mkdir(parents=True)
+    for shot in shots(source):
+        part = YOLO_PARTS[shot.part]
+        lines = [line for one in _regions(source, pictures, shot) for line in _yolo_lines(one, pictures.size, polygons)]
+        write_whole(folder / "images" / part / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
+        write_whole(folder / "labels" / part / f"{shot.name}.txt", "".join(f"{line}\n" for line in lines).encode())
+        yield 1
+    pictures.refuse_none(source.frames)
+    table = {**{part: f"images/{part}" for part in parts}, "names": dict(enumerate(pictures.classes))}
+    write_whole(folder / "data.yaml", yaml.safe_dump(table, sort_keys=False, allow_unicode=True).encode())
+
+
+def _yolo_lines(region: Region, size: tuple[int, int], polygons: bool) -> list[str]:
+    columns, rows = size
+    if polygons:
+        outlines = [outline / size for outline in _outlines(region)]
+        return [" ".join([str(region.kind), *(f"{value:.6f}" for value in one.ravel())]) for one in outlines]
+    column, row, width, height = region.box
+    values = ((column + width / 2) / columns, (row + height / 2) / rows, width / columns, height / rows)
+    return [" ".join([str(region.kind), *(f"{value:.6f}" for value in values)])]
+
+
+def _outlines(region: Region) -> list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
+    """Return the outer outlines of a region ``(points, 2)`` along its pixels' middles; specks of two pixels have none."""
+    import cv2
+
+    found, _ = cv2.findContours(region.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    return [one[:, 0, :].astype(float) + 0.5 for one in found if len(one) >= 3]
+
+
+# ---------------- The data set of a detector: random views of a scene or of generated worlds, with labels, noise and
+# three parts
+
+
+CLEAR_M = 0.3
+"""Distance of the sonar from the box around an object and from the ground, at least [m]."""
+
+GROUND = 0.9
+"""A shape is ground where it covers this part of the scene's edge."""
+
+REACH = 0.6
+"""Window of the sonar, at most, as a part of the scene's edge: a fan must find places to lie inside."""
+
+SHARES = 0.7, 0.15, 0.15
+FRAMES_OF_WORLD = 10
+"""Frames of a generated world, where there are enough of them."""
+
+
+@dataclass(frozen=True)
+class DetectorViews:
+    """What the pictures of a detector are taken of.
+
+    Attributes:
+        frames: number of pictures.
+        heights: of the sonar, least and largest [m]; None: 1.5 to 3 m over a scene's ground, or as the recipe says.
+        pitch_deg: least and largest, > 0 down [deg]; None: 10 to 30, or as the recipe says.
+        noise_db: what is added to the noise of the sonar [dB]; each scene, or part of one, takes the next.
+        split: shares of training, validation and test.
+        seed: of poses, worlds and noise.
+    """
+
+    frames: int
+    heights: tuple[float, float] | None = None
+    pitch_deg: tuple[float, float] | None = None
+    noise_db: tuple[float, ...] = ()
+    split: tuple[float, float, float] = SHARES
+    seed: int = 0
+
+
+def detector_recipe(
+    scene: str | Path, views: DetectorViews, sonar: str | None = None, changes: Keys | None = None
+) -> tuple[Recipe, list[tuple[str, str]], list[str]]:
+    """Make the recipe of a detector's data set: one ping a sequence, at random places, with labels of shapes and objects.
+
+    In a scene file the sonar stays over the ground, and clear of the boxes around all other shapes. Worlds of a recipe are
+    split by scene, views of one scene file by sequence.
+
+    Args:
+        scene: a Mitsuba XML file, the name of a shipped scene, or a recipe of a data set, whose worlds are taken.
+        views: how many, from where, and in what noise.
+        sonar: preset or YAML file; default: the sonar of the scene or of the recipe.
+        changes: keys of the recipe to change, with dots between the levels.
+
+    Returns:
+        The recipe; classes that leave out the ground, as rules of
+        :class:`~mitsonar.bridges.export_source.LabelledPictures`; sentences on what was decided.
+
+    Raises:
+        MitsonarError: fewer frames than parts, no such scene, sonar or ground, a height within the ground.
+    """
+    parts = sum(share > 0 for share in views.split)
+    if views.frames < parts:
+        raise MitsonarError(f"--frames must be at least {parts}, one for each part of --split: got {views.frames}")
+    of_recipe = str(scene).lower().endswith((".yaml", ".yml")) or str(scene) in shipped_recipes()
+    chosen = "sonar.range_max" in (changes or {})
+    fields, rules, notes = _of_recipe(str(scene), views) if of_recipe else _of_scene(str(scene), views, sonar, chosen)
+    if of_recipe and sonar is not None:
+        fields["sonar"] = _sonar_fields(sonar)
+    flight = fields["flight"]
+    flight |= {"pings": 1, "jump_m": None}
+    flight |= {} if views.heights is None else {"height_m": list(views.heights)}
+    if views.pitch_deg is not None:
+        flight["pitch_deg"] = list(views.pitch_deg)
+        fields["mount"] = {**fields.get("mount", {}), "pitch_deg": 0.0}
+    train, validation, test = views.split
+    fields |= {"frames": 1, "labels": ["shape_id", "object_id"], "noise_db": list(views.noise_db), "seed": views.seed}
+    fields["split"] = {**fields["split"], "train": train, "validation": validation, "test": test}
+    for key, value in (changes or {}).items():
+        set_key(fields, key, value)
+    recipe = recipe_from(fields)
+    if recipe.sonar is not None and recipe.instrument.model == "coherent" and "visible_labels" not in (changes or {}):
+        recipe = recipe_from({**fields, "visible_labels": True})
+    return recipe, rules, notes
+
+
+def _sonar_fields(name: str) -> Keys:
+    """Return the keys of a sonar, of a preset or a file."""
+    if name in named_sonars():
+        return {"preset": name}
+    return load_sonar(name).model_dump(exclude_unset=True)
+
+
+def _scenes(frames: int, worlds: Sequence[Keys]) -> list[Keys]:
+    """Spread frames evenly over worlds, a sequence a frame."""
+    counts = np.diff(np.rint(np.linspace(0, frames, len(worlds) + 1)).astype(int))
+    return [{"count": 1, "sequences": int(count), "world": world} for count, world in zip(counts, worlds, strict=True)]
+
+
+def _of_recipe(name: str, views: DetectorViews) -> tuple[Keys, list[tuple[str, str]], list[str]]:
+    """Return the keys of a recipe whose worlds a detector shall see; several worlds a part, where they differ."""
+    recipe = load_recipe(name)
+    groups = [group for group, one in enumerate(recipe.scenes) for _ in range(one.count)]
+    wanted = max(3, len(views.noise_db), views.frames // FRAMES_OF_WORLD)
+    chosen = [groups[int(at)] for at in np.linspace(0, len(groups) - 1, min(len(groups), wanted, views.frames)).round()]
+    fields = recipe.model_dump(mode="json")
+    fields["scenes"] = _scenes(views.frames, [dict(recipe.scenes[group].world) for group in chosen])
+    seeded = all(recipe.family(group).seeded for group in chosen) and len(chosen) >= 3
+    fields["split"]["by"] = "scene" if seeded else "sequence"
+    ground = ("seabed", "plate", "surface")
+    return fields, [(shape, "") for shape in ground if shape in recipe.family(0).build(0).shape_names], []
+
+
+def _of_scene(
+    name: str, views: DetectorViews, sonar: str | None, chosen: bool
+) -> tuple[Keys, list[tuple[str, str]], list[str]]:
+    """Return the keys of a recipe of a scene file; the window is cut to the ground unless the user has chosen it."""
+    path = find_scene(name).resolve()
+    loaded = load_scene(path)
+    names, boxes = shape_names_in(loaded), shape_boxes_in(loaded)
+    size, ground = _ground(path, covered_squares_in(loaded))
+    objects = [box for box, flat in zip(boxes, ground, strict=True) if not flat]
+    if not objects:
+        raise MitsonarError(f"{path} holds its ground and no objects: a detector needs some to find")
+    top = float(boxes[ground, 1, 2].max())
+    heights = views.heights or (top + 1.5, top + 3.0)
+    if heights[0] < top + CLEAR_M:
+        raise MitsonarError(
+            f"--height must be at least {top + CLEAR_M:.3g} m, {CLEAR_M:g} m over the ground of {path}: got {heights[0]:g}"
+        )
+    found = sonar_in(loaded)
+    if sonar is not None:
+        instrument, keys = load_sonar(sonar), _sonar_fields(sonar)
+    elif found is not None:
+        instrument = found[0]
+        keys = instrument.model_dump(exclude_unset=True)
+    else:
+        raise MitsonarError(f"{path} has no sensor of type imaging_sonar: name a sonar, --sonar oculus-m750d-1200khz")
+    left_out = list(dict.fromkeys(name for name, flat in zip(names, ground, strict=True) if flat))
+    notes = [f"ground, without a class: {', '.join(left_out)}"]
+    keys, note = (keys, []) if chosen else _within(instrument, keys, size)
+    fields: Keys = {
+        "name": path.stem,
+        "about": f"views of {path.name} for a detector",
+        "world": {"family": "scene", "file": str(path), "size_m": size},
+        "scenes": _scenes(views.frames, [{}] * max(1, min(len(views.noise_db), views.frames))),
+        "sonar": keys,
+        "mount": {"pitch_deg": 0.0},
+        "flight": {
+            "height_m": list(heights),
+            "pitch_deg": [10.0, 30.0],
+            "keep_out": [[*(box[0] - CLEAR_M), *(box[1] + CLEAR_M)] for box in objects],
+        },
+        "split": {"by": "sequence"},
+    }
+    return fields, [(name, "") for name in left_out], [*notes, *note]
+
+
+def _ground(path: Path, halves: NDArray[np.float64]) -> tuple[float, NDArray[np.bool_]]:
+    """Return the edge of the square around the origin that the widest shape covers [m], and which shapes cover it.
+
+    Raises:
+        MitsonarError: no shape lies around the origin.
+    """
+    if not len(halves):
+        raise MitsonarError(f"{path} holds no shapes: give a scene with a ground and objects")
+    size = 2 * float(halves.max())
+    if size <= 0:
+        raise MitsonarError(f"no shape of {path} lies around the origin: its ground must, since views are drawn there")
+    return math.floor(size * 1000) / 1000, 2 * halves >= GROUND * size
+
+
+def _within(sonar: Sonar, keys: Keys, size: float) -> tuple[Keys, list[str]]:
+    """Return the keys of a sonar whose window is no longer than its scene allows, and a sentence where it was cut."""
+    reach = REACH * size
+    if sonar.range_max <= reach:
+        return keys, []
+    if reach <= sonar.range_min:
+        raise MitsonarError(
+            f"a scene of {size:g} m is too small for a window from {sonar.range_min:g} m: give another sonar"
+        )
+    bins = max(1, round(sonar.range_bins * (reach - sonar.range_min) / (sonar.range_max - sonar.range_min)))
+    note = f"range_max is {reach:.3g} m in place of {sonar.range_max:g}, so that fans fit into {size:g} m of ground"
+    return {**keys, "range_max": reach, "range_bins": bins}, [f"{note}; --set sonar.range_max=... changes it"]
+
+
+# ---------------- Hugging Face: an image folder with a metadata.jsonl for each part, a card, and Croissant metadata
+
+
+CONTEXT: dict[str, PlainValue] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "citeAs": "cr:citeAs",
+    "column": "cr:column",
+    "conformsTo": "dct:conformsTo",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract",
+    "field": "cr:field",
+    "fileProperty": "cr:fileProperty",
+    "fileObject": "cr:fileObject",
+    "fileSet": "cr:fileSet",
+    "format": "cr:format",
+    "includes": "cr:includes",
+    "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath",
+    "key": "cr:key",
+    "md5": "cr:md5",
+    "parentField": "cr:parentField",
+    "path": "cr:path",
+    "recordSet": "cr:recordSet",
+    "references": "cr:references",
+    "regex": "cr:regex",
+    "repeated": "cr:repeated",
+    "replace": "cr:replace",
+    "sc": "https://schema.org/",
+    "separator": "cr:separator",
+    "source": "cr:source",
+    "subField": "cr:subField",
+    "transform": "cr:transform",
+}
+"""The context that Croissant 1.0 prescribes."""
+
+
+def export_hugging_face(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
+    """Write ``data/PART/*.png`` with ``metadata.jsonl``, ``README.md`` and ``croissant.json``; yield after each frame."""
+    counts: dict[str, int] = {}
+    keys: dict[str, str] = {}
+    with contextlib.ExitStack() as ends:
+        tables: dict[str, IO[str]] = {}
+        for shot in shots(source):
+            place = folder / "data" / shot.part
+            if shot.part not in tables:
+                place.mkdir(parents=True)
+                tables[shot.part] = ends.enter_context((place / "metadata.jsonl").open("w"))
+            counts[shot.part] = counts.get(shot.part, 0) + 1
+            write_whole(place / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
+            told: dict[str, PlainValue] = {"file_name": f"{shot.name}.png", **pose_of(shot)}
+            told["sequence"] = int(source.sequence[shot.number])
+            keys = {key: "sc:Integer" if isinstance(value, int) else "sc:Float" for key, value in told.items()}
+            if "shape_id" in source.labels:
+                told["objects"] = regions_of(shot, pictures, source)
+            tables[shot.part].write(f"{json_line(told)}\n")
+            yield 1
+    keys["file_name"] = "sc:Text"
+    write_whole(folder / "README.md", _card(source, pictures, counts).encode())
+    write_whole(folder / "croissant.json", as_json(_croissant(source, folder, sorted(counts), keys)))
+
+
+def _card(source: ExportSource, pictures: LabelledPictures, counts: dict[str, int]) -> str:
+    """Return the card of the data set, whose head the hub reads."""
+    parts = [{"split": part, "path": f"data/{part}/**"} for part in counts]
+    head = {"task_categories": ["object-detection"], "tags": ["sonar", "simulation", "mitsonar"]}
+    configs = {"configs": [{"config_name": "default", "data_files": parts}]}
+    text = yaml.safe_dump({**head, **configs}, sort_keys=False)
+    lines = [f"| {part} | {count:,} |" for part, count in counts.items()]
+    table = "\n".join(["| part | frames |", "|---|---|", *lines])
+    about = f"{source.about or source.name}. Sonar frames, {pictures.picture_kind} pictures, exported by mitsonar."
+    names = ", ".join(name for name in source.like.shape_names if name)
+    return f"---\n{text}---\n# Sonar frames\n{about}\n\n{table}\n" + (f"\nShapes: {names}.\n" if names else "")
+
+
+def _croissant(source: ExportSource, folder: Path, parts: list[str], keys: dict[str, str]) -> dict[str, PlainValue]:
+    """Return the metadata of the layout: a table of each part, and its pictures."""
+    objects: list[PlainValue] = []
+    records: list[PlainValue] = []
+    for part in parts:
+        path, table = f"data/{part}/metadata.jsonl", f"{part}-metadata"
+        one = {"@type": "cr:FileObject", "@id": table, "name": table, "contentUrl": path}
+        objects.append({**one, "encodingFormat": "application/jsonlines", "sha256": digest_of(folder / path)})
+        fields = [
+            {
+                "@type": "cr:Field",
+                "@id": f"{part}/{key}",
+                "name": key,
+                "dataType": kind,
+                "source": {"fileObject": {"@id": table}, "extract": {"column": key}},
+            }
+            for key, kind in keys.items()
+        ]
+        records.append({"@type": "cr:RecordSet", "@id": part, "name": part, "field": fields})
+    return {
+        "@context": CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "name": "sonar-frames",
+        "description": source.about or source.name,
+        "distribution": objects,
+        "recordSet": records,
+    }
+
+
+# ---------------- WebDataset: tar files of samples, each a picture, its metadata and its label pictures
+
+
+OF_SHARD = 1000
+"""Samples of a shard."""
+
+
+def export_webdataset(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
+    """Write ``PART-000000.tar`` ... and ``about.json``; yield after each frame.
+
+    A sample has ``png``, ``json`` (time, pose, sequence, regions), and where there are labels ``shape.png`` and
+    ``object.png``: the label plus one, 16 bit, 0 for no echo.
+    """
+    counts: dict[str, int] = {}
+    with contextlib.ExitStack() as ends:
+        files: dict[str, tarfile.TarFile] = {}
+        for shot in shots(source):
+            number = counts.get(shot.part, 0)
+            if number % OF_SHARD == 0:
+                if shot.part in files:
+                    files[shot.part].close()
+                path = folder / f"{shot.part}-{number // OF_SHARD:06d}.tar"
+                files[shot.part] = ends.enter_context(tarfile.open(path, "w", format=tarfile.USTAR_FORMAT))
+            counts[shot.part] = number + 1
+            about = {"sequence": int(source.sequence[shot.number]), **pose_of(shot)}
+            parts = {"png": png(pictures.picture(shot.frames, shot.index))}
+            for name in ("shape", "object"):
+                if f"{name}_id" in source.labels:
+                    label = pictures.label(shot.frames, f"{name}_id", shot.index) + 1
+                    parts[f"{name}.png"] = png(np.clip(label, 0, 65535).astype(np.uint16))
+            parts["json"] = json_line({**about, "regions": regions_of(shot, pictures, source)}).encode()
+            for ending, content in parts.items():
+                entry = tarfile.TarInfo(f"{shot.name}.{ending}")
+                entry.size = len(content)
+                files[shot.part].addfile(entry, io.BytesIO(content))
+            yield 1
+    names = {"shapes": list(source.like.shape_names), "objects": list(source.like.object_names)}
+    told = {"source": source.name, "about": source.about, "picture": pictures.picture_kind, "samples": counts, **names}
+    write_whole(folder / "about.json", as_json(told))
+
+
+# ---------------- Layouts of pictures with poses: KITTI's sequences, and the views of neusis
+
+
+CAMERA = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""A camera's axes (starboard, down, forward) as columns in (starboard, forward, up)."""
+
+
+def export_kitti(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
+    """Write ``poses/00.txt``, ``sequences/00/times.txt`` and ``sequences/00/image_0/``; yield after each frame.
+
+    A line of poses is the first three rows of the matrix from the sonar's axes (x starboard, y down, z forward) to those of
+    the first frame of its sequence. Frames of a sequence follow each other.
+    """
+    refuse_unposed(source)
+    (folder / "poses").mkdir()
+    sequence, first, number = -1, np.eye(4), 0
+    poses: IO[str] | None = None
+    times: IO[str] | None = None
+    try:
+        for shot in shots(source):
+            if source.sequence[shot.number] != sequence or poses is None or times is None:
+                sequence, number = int(source.sequence[shot.number]), 0
+                name = f"{sequence:02d}"
+                (folder / "sequences" / name / "image_0").mkdir(parents=True)
+                for file in (poses, times):
+                    if file is not None:
+                        file.close()
+                poses = (folder / "poses" / f"{name}.txt").open("w")
+                times = (folder / "sequences" / name / "times.txt").open("w")
+                begun = float(np.mean(shot.frames.time_s[shot.index]))
+            assert shot.frames.poses is not None
+            matrix = np.eye(4)
+            matrix[:3, :3] = vehicle_rotation(shot.frames.poses[shot.index]).as_matrix()[0] @ CAMERA
+            matrix[:3, 3] = shot.frames.poses[shot.index, :3]
+            first = matrix if number == 0 else first
+            relative = np.linalg.inv(first) @ matrix
+            poses.write(" ".join(f"{value:.12e}" for value in relative[:3].ravel()) + "\n")
+            times.write(f"{float(np.mean(shot.frames.time_s[shot.index])) - begun:.9e}\n")
+            picture = png(pictures.picture(shot.frames, shot.index))
+            write_whole(folder / "sequences" / f"{sequence:02d}" / "image_0" / f"{number:06d}.png", picture)
+            number += 1
+            yield 1
+    finally:
+        for file in (poses, times):
+            if file is not None:
+                file.close()
+
+
+def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
+    """Write ``Data/000000.pkl`` ... and ``Config.json``, as neusis' ``load_data`` reads them; yield after each frame.
+
+    A pickle holds ``ImagingSonar``, float32 ``(bins, beams)`` in 0..1, row 0 nearest, column 0 most to *starboard*, and
+    ``PoseSensor``, the matrix ``(4, 4)`` from the sonar's axes (x forward, y to port, z up) to the world. In neusis the
+    bearing of a pixel grows to port with its column. Pictures are polar in any case.
+    """
+    refuse_unposed(source)
+    (folder / "Data").mkdir()
+    for shot in shots(source):
+        assert shot.frames.poses is not None
+        values = to_float32(shot.frames.image[shot.index])
+        state = {"ImagingSonar": values[:, ::-1].copy(), "PoseSensor": port_matrix(shot.frames.poses[shot.index])}
+        write_whole(folder / "Data" / f"{shot.name}.pkl", pickle.dumps(state, protocol=4))
+        yield 1
+    sonar = source.like.sonar
+    across = source.like.bearing_rad
+    fov = float(np.ptp(across)) * (1 + 1 / max(1, len(across) - 1))
+    told = {
+        "Azimuth": math.degrees(fov),
+        "Elevation": sonar.elevation_fov_deg,
+        "RangeMin": sonar.range_min,
+        "RangeMax": sonar.range_max,
+        "RangeBins": sonar.range_bins,
+        "AzimuthBins": len(across),
+    }
+    agent = {"sensors": [{"sensor_type": "ImagingSonar", "configuration": told}]}
+    write_whole(folder / "Config.json", as_json({"name": source.name, "agents": [agent]}))
+
+
+def port_matrix(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrix ``(4, 4)`` from (forward, port, up) to the world of a pose [m, rad]."""
+    place, turn = CONVENTIONS["ros-enu"].from_ours(pose[None, :3], vehicle_rotation(pose))
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn.as_matrix()[0], place[0]
+    return matrix
+
+
+# ---------------- named exports
+
+
+Exporter = Callable[[ExportSource, LabelledPictures, Path], Iterator[int]]
+
+EXPORTS: dict[str, Exporter] = {
+    "coco": export_coco,
+    "yolo": export_yolo,
+    "webdataset": export_webdataset,
+    "huggingface": export_hugging_face,
+    "kitti": export_kitti,
+    "neusis": export_neusis,
+}
+"""What writes each layout; it yields how many more frames are done."""
+
+
+def export_to(
+    layout: str,
+    source: ExportSource,
+    out: Path,
+    *,
+    picture: PictureKind = "polar",
+    classes: Sequence[tuple[str, str]] = (),
+    least: int = 1,
+    least_snr_db: float = LEAST_SNR_DB,
+    polygons: bool = False,
+    every_class: bool = False,
+    progress: Callable[[int], None] = lambda done: None,
+) -> LabelledPictures:
+    """Write frames in a layout of another tool; the folder is whole or absent, and a few frames at a time are in memory.
+
+    Args:
+        layout: a name of :data:`EXPORTS`.
+        source: of the frames.
+        out: folder to make.
+        picture: ``polar`` or ``fan``.
+        classes: globs of names of shapes with their classes; see
+            :class:`~mitsonar.bridges.export_source.LabelledPictures`.
+        least: pixels of a region, at least.
+        least_snr_db: signal-to-noise ratio of a region, at least [dB].
+        polygons: outlines in place of boxes; of YOLO.
+        every_class: refuse classes that no picture of the training part shows.
+        progress: is called with how many more frames are done.
+
+    Returns:
+        What made the pictures, which has counted the regions of COCO and YOLO.
+
+    Raises:
+        MitsonarError: an unknown layout, a folder that is there, frames that lack what the layout needs, COCO or YOLO
+            without any object.
+    """
+    if layout not in EXPORTS:
+        raise MitsonarError(f"unknown layout {layout!r}: {nearest_names(layout, EXPORTS)}")
+    if polygons and layout != "yolo":
+        raise MitsonarError(f"--polygons is of the layout yolo: got {layout}; COCO has masks in any case")
+    if layout == "neusis" and picture != "polar":
+        raise MitsonarError("the layout neusis has polar pictures only: leave --picture out")
+    exporter = partial(export_yolo, polygons=True) if polygons else EXPORTS[layout]
+    pictures = LabelledPictures(source.like, picture, classes, least, least_snr_db)
+    with new_folder(out) as folder:
+        for done in exporter(source, pictures, folder):
+            progress(done)
+        missing = [name for name in pictures.classes if every_class and not pictures.boxes["train", name]]
+        if missing:
+            raise MitsonarError(
+                f"the class {missing[0]} is in no picture of the training part: make more frames, nearer to it, lower "
+                f"--least-snr-db or --least, or leave it out with --classes {missing[0]}="
+            )
+    return pictures

@@ -1,0 +1,1106 @@
+"""Frames with labels of a run, a recording or a data set, read some at a time."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import shutil
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from mitsonar.acoustics.water import noise_of
+from mitsonar.config.data import Recipe, Split, recipe_from
+from mitsonar.datasets.modality import Values
+from mitsonar.datasets.plan import Plan, Scene
+from mitsonar.datasets.store import PACKAGES, PARTS, DataStore, deal, names_of_scenes, world_of
+from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
+from mitsonar.estimation.sonar_fit import NOISE_FIELDS, as_instrument
+from mitsonar.geometry.fan import nearest_cells
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.io.runs import shown, versions
+from mitsonar.io.storage import Storage
+from mitsonar.mapping.sources import is_data_set, open_frames, poses_at, recording_at, stretches, view_in
+from mitsonar.motion.composition import motions
+from mitsonar.motion.trajectory import Trajectory, velocities
+from mitsonar.plotting.fans import FanPictures
+from mitsonar.recordings.recording import Part
+from mitsonar.records.frames import COLUMNS, LABELS, SonarFrames, open_group, to_float32, to_uint8
+
+__all__ = [
+    "LEAST_SNR_DB",
+    "Axes",
+    "ExportSource",
+    "FramesWithPoses",
+    "LabelledPictures",
+    "PictureKind",
+    "RecordedDataSet",
+    "Region",
+    "Shot",
+    "Stretch",
+    "as_json",
+    "as_pixels",
+    "axes_of",
+    "class_rules",
+    "compressed",
+    "digest_of",
+    "frames_with_poses",
+    "json_line",
+    "new_folder",
+    "open_export",
+    "png",
+    "pose_of",
+    "recorded_recipe",
+    "refuse_unlabelled",
+    "refuse_unposed",
+    "regions_of",
+    "runs_of",
+    "shots",
+    "write_recorded",
+]
+
+
+AT_ONCE_BYTES = 2**24
+"""Approximate size of the pixels and labels that are read at a time [bytes]."""
+
+Read = Callable[[slice], SonarFrames]
+
+
+@dataclass(frozen=True)
+class ExportSource:
+    """Frames to export; pixels and labels are read on demand.
+
+    Attributes:
+        name: of the source.
+        frames: number of them.
+        sequence: number of the sequence of each frame ``(frames,)``.
+        like: no frames, but all that is the same for each of them: sonar, ranges, bearings, names of shapes and objects.
+        labels: names of the labels that there are.
+        posed: whether poses are known.
+        part: of each frame, ``train``, ``validation`` or ``test`` ``(frames,)``, as the recipe splits; else ``train``.
+        read: reads frames with labels.
+        about: what made them, for metadata.
+        raised_db: by which the noise of each frame is above that of the sonar ``(frames,)`` [dB].
+    """
+
+    name: str
+    frames: int
+    sequence: NDArray[np.int64]
+    like: SonarFrames
+    labels: tuple[str, ...]
+    posed: bool
+    part: NDArray[np.str_]
+    read: Read
+    about: str = ""
+    raised_db: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.raised_db):
+            object.__setattr__(self, "raised_db", np.zeros(self.frames))
+
+    def pieces(self) -> Iterator[tuple[int, SonarFrames]]:
+        """Yield the frames a few at a time, with the number of the first."""
+        cells = max(1, self.like.image.shape[1] * self.like.image.shape[2])
+        many = max(1, AT_ONCE_BYTES // (cells * (4 + 4 * len(self.labels))))
+        for first in range(0, self.frames, many):
+            yield first, self.read(slice(first, min(first + many, self.frames)))
+
+
+def open_export(
+    where: str | Path, *, view: str | None = None, split: tuple[float, float, float] | None = None
+) -> ExportSource:
+    """Open the frames at a path or URL for export: all sequences of a data set, a run, or a recording.
+
+    Args:
+        where: a data set, ``frames.npz``, ``frames.zarr``, the folder of a run, or a recording.
+        view: of a data set; default: the first.
+        split: shares of training, validation and test. Sequences or scenes of a data set are dealt out, as its recipe says;
+            frames of a run or a recording are cut into three stretches of time. Default: the recipe's; of a run all frames
+            are for training.
+
+    Raises:
+        MitsonarError: no frames there, shares that do not add up to 1, too few sequences or frames for them.
+    """
+    if split is not None and not (min(split) >= 0 and abs(sum(split) - 1) < 1e-6):
+        raise MitsonarError(f"--split is three shares that add up to 1, 0.7,0.15,0.15 for example: got {split}")
+    if is_data_set(where):
+        return _of_data_set(str(where), view, split)
+    source = _of_frames(where, view)
+    return source if split is None else replace(source, part=_stretches(source.frames, split))
+
+
+def _of_frames(where: str | Path, view: str | None) -> ExportSource:
+    """Take the frames of a run or of a recording."""
+    if view is not None:
+        raise MitsonarError(f"{where} is no data set: --view chooses among the views of one; leave it out")
+    path = Path(where)
+    if os.path.isdir(path):
+        found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
+        path = found[0] if found else path
+    if path.suffix == ".npz":
+        return _in_memory(SonarFrames.load(path), str(where))
+    source = open_frames(where)
+    if not len(source):
+        raise MitsonarError(f"{source.name} holds no frames: give those of a finished run")
+    stored, like = _labels_of_zarr(path) if path.suffix == ".zarr" else ({}, {})
+
+    def read(part: slice) -> SonarFrames:
+        index = np.arange(part.start, part.stop)
+        frames = source.read(index)
+        labels: dict[str, Any] = {name: np.asarray(array[part]) for name, array in stored.items()}
+        # estimators are not given these, and exports are
+        poses, attitude = (None if values is None else values[part] for values in (source.poses, source.attitude_rad))
+        return replace(frames, poses=poses, attitude_rad=attitude, **like, **labels)
+
+    base = replace(source.like, **like)
+    sequence, posed = np.zeros(len(source), np.int64), source.poses is not None
+    return ExportSource(source.name, len(source), sequence, base, tuple(stored), posed, _all_train(len(source)), read)
+
+
+def _in_memory(frames: SonarFrames, name: str) -> ExportSource:
+    """Take frames that are in memory."""
+    if not len(frames):
+        raise MitsonarError(f"{name} holds no frames: give those of a finished run")
+    labels = tuple(label for label in LABELS if getattr(frames, label) is not None)
+    sequence, posed = np.zeros(len(frames), np.int64), frames.poses is not None
+    like = frames.select(slice(0))
+    return ExportSource(name, len(frames), sequence, like, labels, posed, _all_train(len(frames)), frames.select)
+
+
+def _all_train(frames: int) -> NDArray[np.str_]:
+    return np.full(frames, "train", dtype="<U10")
+
+
+def _labels_of_zarr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the label arrays of a long run, unread, and the names that they refer to."""
+    found, _ = open_group(path, COLUMNS, "time_s", "frames_done")
+    stored = {name: found[name] for name in LABELS if name in found}
+    nothing = {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
+    for name in COLUMNS:
+        if name in found:
+            nothing[name] = found[name][:0] if name not in ("range_m", "bearing_rad") else found[name][...]
+    like = SonarFrames.from_arrays(nothing, str(path))
+    return stored, {"shape_names": like.shape_names, "object_names": like.object_names}
+
+
+def _stretches(frames: int, split: tuple[float, float, float]) -> NDArray[np.str_]:
+    """Cut frames into a stretch for each part, in the order of time.
+
+    Raises:
+        MitsonarError: fewer frames than parts.
+    """
+    wanted = [share > 0 for share in split]
+    ends = np.rint(np.cumsum(split) * frames).astype(int)
+    counts = np.maximum(np.diff(ends, prepend=0), wanted)
+    counts[int(np.argmax(split))] -= counts.sum() - frames
+    if (counts[wanted] < 1).any():
+        raise MitsonarError(
+            f"{frames} frames are too few for training, validation and test of {split}: give more, or another --split"
+        )
+    return np.repeat(np.array(PARTS, dtype="<U10"), counts)
+
+
+def _of_data_set(url: str, view: str | None, split: tuple[float, float, float] | None) -> ExportSource:
+    """Take all frames of one view of a data set.
+
+    Raises:
+        MitsonarError: too few sequences or scenes for a split that was given.
+    """
+    store = DataStore.open(url)
+    chosen = view_in(store, view)
+    labels = {label: f"{label}{store.recipe.suffix(chosen.name)}" for label in store.recipe.labels}
+    scene = np.asarray(store.read("scene"))
+    names, places = names_of_scenes(store) if "shape_id" in labels else ((), {})
+
+    def read(part: slice) -> SonarFrames:
+        told: dict[str, Any] = {label: store.read(array, part) for label, array in labels.items()}
+        for number in np.unique(scene[part]) if places else ():
+            own = scene[part] == number
+            told["shape_id"][own] = places[int(number)][told["shape_id"][own]]
+        return replace(
+            chosen.like,
+            image=store.read(chosen.array, part),
+            time_s=store.read("time_s", part),
+            poses=store.read("pose", part),
+            height_m=store.read("height_m", part),
+            shape_names=names,
+            **told,
+        )
+
+    sequence = np.asarray(store.read("sequence"), dtype=np.int64)
+    about = str(store.about["recipe"].get("about") or store.recipe.name)
+    raised = store.recipe.noise_raised_db(scene)
+    parts = _parts(store, split)
+    return ExportSource(url, len(store), sequence, read(slice(0, 0)), tuple(labels), True, parts, read, about, raised)
+
+
+def _parts(store: DataStore, shares: tuple[float, float, float] | None) -> NDArray[np.str_]:
+    """Return the part of each frame by the recipe's split, or by shares; a split of samples does not divide frames.
+
+    Raises:
+        MitsonarError: too few sequences or worlds for shares that were given.
+    """
+    parts, split = _all_train(len(store)), store.recipe.split
+    if shares is not None:
+        by = "sequence" if split.by == "sample" else split.by
+        split = Split(by=by, seed=split.seed, **dict(zip(PARTS, shares, strict=True)))
+    if split.by == "sample":
+        return parts
+    sequence = np.asarray(store.read("sequence"), dtype=np.int32)
+    world = world_of(store.recipe, store.scenes)[np.asarray(store.read("scene"))]
+    try:
+        for name in ("validation", "test"):
+            if getattr(split, name) > 0:
+                parts[deal(world, sequence, split, name)] = name
+    except MitsonarError as error:  # too few sequences or worlds for its parts
+        if shares is not None:
+            raise
+        warnings.warn(f"all frames are for training: {error}", MitsonarWarning, stacklevel=2)
+        return _all_train(len(store))
+    return parts
+
+
+# ---------------- The folder of an export, whole or absent: it gets its name when all is in it
+
+
+MARK = ".mitsonar-export"
+"""A file in a folder that is being written: only such a folder is removed."""
+
+
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """Make a folder beside ``out``, which takes its name in the end; what is left of one that was broken off is removed.
+
+    Raises:
+        MitsonarError: something is there already.
+    """
+    part = out.with_name(f".{out.name}.part")
+    if out.exists():
+        raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or remove it")
+    if part.exists() and not (part / MARK).is_file():
+        raise MitsonarError(f"{part} is in the way and no export of mitsonar made it: remove it, or choose another -o")
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        (part / MARK).touch()
+        yield part
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    (part / MARK).unlink()
+    part.rename(out)
+
+
+def png(picture: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    """Return a grey picture as PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="PNG", compress_level=3)
+    return buffer.getvalue()
+
+
+def json_line(value: object) -> str:
+    """Return a value as JSON in one line."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False)
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# ---------------- One frame at a time, with what every layout says of it: its pose, and what its regions are
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame that is exported: its number, its part, and where it is among those that were read."""
+
+    number: int
+    part: str
+    frames: SonarFrames
+    index: int
+
+    @property
+    def name(self) -> str:
+        """Return the name of its files."""
+        return f"{self.number:06d}"
+
+
+def shots(source: ExportSource) -> Iterator[Shot]:
+    """Yield the frames of a source one by one; a few are in memory."""
+    for first, frames in source.pieces():
+        for index in range(len(frames)):
+            yield Shot(first + index, str(source.part[first + index]), frames, index)
+
+
+def refuse_unlabelled(source: ExportSource) -> None:
+    """Refuse frames without labels.
+
+    Raises:
+        MitsonarError: they have no ``shape_id``.
+    """
+    if "shape_id" not in source.labels:
+        raise MitsonarError(
+            f"{source.name} has no label shape_id: render with --labels, or give the recipe `labels: [shape_id, object_id]`"
+        )
+
+
+def refuse_unposed(source: ExportSource) -> None:
+    """Refuse frames without poses.
+
+    Raises:
+        MitsonarError: they have none.
+    """
+    if not source.posed:
+        raise MitsonarError(f"{source.name} has no poses, which this layout is made of: choose another --to")
+
+
+def regions_of(shot: Shot, pictures: LabelledPictures, source: ExportSource) -> dict[str, list[object]]:
+    """Return boxes, classes and names of a frame's regions as plain lists; empty where there are no labels."""
+    raised_db = float(source.raised_db[shot.number])
+    found = pictures.regions(shot.frames, shot.index, raised_db) if "shape_id" in source.labels else []
+    return {
+        "bbox": [list(region.box) for region in found],
+        "category": [region.kind for region in found],
+        "name": [pictures.classes[region.kind] for region in found],
+        "object": [region.number for region in found],
+    }
+
+
+def pose_of(shot: Shot) -> dict[str, float]:
+    """Return time and pose of a frame [s, m, deg]; no pose where it is not known."""
+    time = float(np.mean(shot.frames.time_s[shot.index]))
+    if shot.frames.poses is None:
+        return {"time_s": time}
+    six = shot.frames.poses[shot.index]
+    angles = np.degrees(six[3:])
+    place = dict(zip(("x_m", "y_m", "z_m"), map(float, six[:3]), strict=True))
+    turned = dict(zip(("pitch_deg", "roll_deg", "heading_deg"), map(float, angles), strict=True))
+    return {"time_s": time, **place, **turned}
+
+
+def as_json(value: object) -> bytes:
+    """Return a value as JSON for a file."""
+    return (json.dumps(value, indent=2, allow_nan=False) + "\n").encode()
+
+
+# ---------------- Pictures of frames, polar or fan, with the regions that their labels make: a mask, a box and a
+# class each
+
+
+PictureKind: TypeAlias = Literal["polar", "fan"]
+
+Mask: TypeAlias = NDArray[np.bool_]
+
+LEAST_SNR_DB = 3.0
+"""Signal-to-noise ratio of an object that is marked, at least [dB]."""
+
+NUMBER = re.compile(r"[\s_.-]*\d+$")
+"""The number at the end of a shape's name, with what separates it."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """What one object shows in a picture.
+
+    Attributes:
+        kind: number of its class, from 0; see :attr:`LabelledPictures.classes`.
+        shape: its shape's place in the scene.
+        number: of the object within its shape; 0 for none.
+        mask: of the picture ``(rows, columns)``.
+        box: first column, first row, columns, rows [pixels].
+    """
+
+    kind: int
+    shape: int
+    number: int
+    mask: Mask
+    box: tuple[int, int, int, int]
+
+
+class LabelledPictures:
+    """Makes pictures and regions of frames of one sonar.
+
+    Args:
+        like: whose ranges and bearings the pictures have, and whose shapes the classes are of.
+        picture: ``polar``, a row a range, nearest above; or ``fan``, forward up, starboard to the right.
+        classes: names of shapes, as globs, and the class of each; an empty class leaves a shape out. The first glob that
+            matches counts. Shapes that none matches have their own names as classes; those whose names differ only by a
+            number at the end share one.
+        least: pixels of a region, at least.
+        least_snr_db: signal-to-noise ratio of a region, at least [dB]; see :meth:`snr_db`. ``-inf`` keeps all.
+
+    Attributes:
+        size: columns and rows of the pictures.
+        classes: their names, by number; of shapes without names those that were seen.
+        left_out: names of shapes without a class.
+        boxes: number of regions that were counted, by part and class.
+        faint: number of regions that were left out since their ratio is too low.
+        small: number of those that have too few pixels.
+
+    Raises:
+        MitsonarError: an unknown picture, a glob that matches no shape, no class that is left.
+    """
+
+    def __init__(
+        self,
+        like: SonarFrames,
+        picture: PictureKind = "polar",
+        classes: Sequence[tuple[str, str]] = (),
+        least: int = 1,
+        least_snr_db: float = LEAST_SNR_DB,
+    ) -> None:
+        if picture not in ("polar", "fan"):
+            raise MitsonarError(f"--picture is polar or fan: got {picture!r}")
+        self.picture_kind, self.least, self.least_snr_db = picture, least, least_snr_db
+        self._rules = tuple(classes)
+        names = like.shape_names
+        for glob, _ in classes if names else ():
+            if not any(fnmatchcase(name, glob) for name in names):
+                raise MitsonarError(f"no shape is named {glob!r}: {nearest_names(glob, names)}")
+        class_of = self._class_names(names)
+        self.classes = list(dict.fromkeys(name for name in class_of if name))
+        self.left_out = [shape for shape, name in zip(names, class_of, strict=True) if not name]
+        if names and not self.classes:
+            raise MitsonarError(f"no class is left of the shapes {', '.join(names[:6])}: leave fewer of them out")
+        self._kinds = {place: self.classes.index(name) if name else None for place, name in enumerate(class_of)}
+        self.fan = FanPictures(like) if picture == "fan" else None
+        rows, columns = like.image.shape[1:] if self.fan is None else self.fan.fan.index.shape[1:]
+        self.size = int(columns), int(rows)
+        self.boxes: Counter[tuple[str, str]] = Counter()
+        self.faint = self.small = 0
+
+    def _class_names(self, names: Sequence[str]) -> list[str]:
+        """Return the class of each shape; it is empty for one that is left out."""
+        stems = [NUMBER.sub("", name) or name for name in names]
+        shared = Counter(stems)
+        own = [stem if shared[stem] > 1 else name for name, stem in zip(names, stems, strict=True)]
+        return [
+            next((kind for glob, kind in self._rules if fnmatchcase(name, glob)), mine)
+            for name, mine in zip(names, own, strict=True)
+        ]
+
+    def _kind_of(self, shape: int) -> int | None:
+        """Return the number of a shape's class; None where it is left out. Classes of shapes without names are added."""
+        if shape not in self._kinds:
+            name = f"shape {shape}"
+            kind = next((kind for glob, kind in self._rules if fnmatchcase(name, glob)), name)
+            if kind and kind not in self.classes:
+                self.classes.append(kind)
+            self._kinds[shape] = self.classes.index(kind) if kind else None
+        return self._kinds[shape]
+
+    def picture(self, frames: SonarFrames, index: int) -> NDArray[np.uint8]:
+        """Return the levels of a frame ``(rows, columns)``, 0..255."""
+        image = frames.image[index]
+        if self.fan is not None:
+            return self.fan.picture(image)
+        return image if image.dtype == np.uint8 else to_uint8(image)
+
+    def label(self, frames: SonarFrames, name: str, index: int) -> NDArray[np.int64]:
+        """Return a label of a frame in the picture ``(rows, columns)``; -1 where there is none.
+
+        Raises:
+            MitsonarError: the frames lack it.
+        """
+        shown = _label(frames, name, index)
+        return shown if self.fan is None else np.asarray(nearest_cells(self.fan.fan, shown, -1), dtype=np.int64)
+
+    def regions(self, frames: SonarFrames, index: int, raised_db: float = 0.0) -> list[Region]:
+        """Return what each object of each shape shows in a frame, by shape and object.
+
+        Args:
+            frames: with ``shape_id``.
+            index: of the frame.
+            raised_db: by which its noise is above that of the sonar [dB].
+
+        Raises:
+            MitsonarError: the frames have no ``shape_id``.
+        """
+        shape = self.label(frames, "shape_id", index)
+        part = self.label(frames, "object_id", index) if frames.object_id is not None else np.zeros_like(shape)
+        snr = self.snr_db(frames, index, raised_db) if self.least_snr_db > -np.inf else {}
+        found = []
+        for place in (int(one) for one in np.unique(shape) if one >= 0):
+            kind = self._kind_of(place)
+            if kind is None:
+                continue
+            of_kind = shape == place
+            for number in (int(one) for one in np.unique(part[of_kind])):
+                mask = of_kind & (part == number)
+                if snr.get((place, number), np.inf) < self.least_snr_db:
+                    self.faint += 1
+                elif np.count_nonzero(mask) < self.least:
+                    self.small += 1
+                else:
+                    found.append(Region(kind, place, max(0, number), mask, _box(mask)))
+        return found
+
+    def snr_db(self, frames: SonarFrames, index: int, raised_db: float = 0.0) -> dict[tuple[int, int], float]:
+        """Compute the signal-to-noise ratio of each object in a frame, by shape and object [dB].
+
+        The signal is the mean level of the object's cells less the mean level of noise alone there. Noise is known of
+        frames of the model ``coherent``: that of the sonar, after the gain. In other frames it is the mean of the cells
+        without an echo; where these are dark the ratio is infinite. Of images of contrast nothing is known: the answer is
+        empty.
+        """
+        if frames.level == "contrast":
+            return {}
+        level = frames.select(slice(index, index + 1)).linear_values()[0].astype(float)
+        shape = _label(frames, "shape_id", index)
+        part = _label(frames, "object_id", index) if frames.object_id is not None else np.zeros_like(shape)
+        echo = shape >= 0
+        noise = _noise_levels(frames, raised_db)
+        if noise is None:
+            dark = level[~echo]
+            noise = np.full(len(level), float(dark.mean()) if dark.size else 0.0)
+        pairs, place = np.unique(np.stack([shape[echo], part[echo]], axis=-1), axis=0, return_inverse=True)
+        place = place.ravel()
+        alone = np.bincount(place, np.broadcast_to(noise[:, None], level.shape)[echo])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.where(alone > 0, np.maximum(0.0, np.bincount(place, level[echo]) - alone) / alone, np.inf)
+            decibels = 10 * np.log10(ratio)
+        return {(int(kind), int(number)): float(one) for (kind, number), one in zip(pairs, decibels, strict=True)}
+
+    def count(self, part: str, regions: Sequence[Region]) -> None:
+        """Add regions that were written to :attr:`boxes`."""
+        self.boxes.update((part, self.classes[region.kind]) for region in regions)
+
+    def refuse_none(self, frames: int) -> None:
+        """Refuse frames of which no region was counted.
+
+        Raises:
+            MitsonarError: there is none.
+        """
+        if not self.boxes:
+            raise MitsonarError(
+                f"no object is seen in any of {frames:,} frames ({self.faint:,} are below --least-snr-db "
+                f"{self.least_snr_db:g}, {self.small:,} have fewer pixels than --least {self.least}): move the sonar nearer "
+                "to the objects, or lower these"
+            )
+
+
+def class_rules(text: str) -> list[tuple[str, str]]:
+    """Parse classes as a command takes them: ``pillar*=pillar,seabed*=``.
+
+    Raises:
+        MitsonarError: a part is not GLOB=CLASS.
+    """
+    rules = []
+    for one in filter(None, (part.strip() for part in text.split(","))):
+        glob, equals, kind = (word.strip() for word in one.partition("="))
+        if not glob or not equals:
+            raise MitsonarError(
+                f"--classes is GLOB=CLASS, with commas between, an empty class leaves shapes out: got {one!r}"
+            )
+        rules.append((glob, kind))
+    return rules
+
+
+def _label(frames: SonarFrames, name: str, index: int) -> NDArray[np.int64]:
+    """Return a label of a frame ``(bins, beams)``.
+
+    Raises:
+        MitsonarError: the frames lack it.
+    """
+    values = getattr(frames, name)
+    if values is None:
+        raise MitsonarError(f"the frames have no {name}: render with --labels, or give the recipe `labels: [{name}]`")
+    return np.asarray(values[index], dtype=np.int64)
+
+
+def _noise_levels(frames: SonarFrames, raised_db: float) -> NDArray[np.float64] | None:
+    """Return the mean level of the receiver's noise in each bin, relative to full scale ``(bins,)``; None if unknown."""
+    if frames.sonar.model != "coherent":
+        return None
+    return noise_of(frames.sonar) * 10 ** (raised_db / 10) / frames.level_scale
+
+
+def _box(mask: Mask) -> tuple[int, int, int, int]:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return int(columns[0]), int(rows[0]), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
+
+
+# ---------------- Masks as COCO stores them: lengths of runs down the columns, as a short text
+
+
+def runs_of(mask: NDArray[np.bool_]) -> list[int]:
+    """Return the lengths of the runs of a mask ``(rows, columns)``, column by column; the first is of zeros."""
+    flat = mask.ravel(order="F")
+    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    edges = np.concatenate([[0], changes, [flat.size]])
+    lengths = np.diff(edges).tolist()
+    return [0, *lengths] if flat[0] else lengths
+
+
+def compressed(runs: list[int]) -> str:
+    """Return runs as the text that COCO's tools read: differences to the run before the last, 5 bits a letter."""
+    letters = []
+    for place, run in enumerate(runs):
+        value = run - runs[place - 2] if place > 2 else run
+        while True:
+            bits = value & 31
+            value >>= 5
+            more = value != -1 if bits & 16 else value != 0
+            letters.append(chr((bits | 32 if more else bits) + 48))
+            if not more:
+                break
+    return "".join(letters)
+
+
+# ---------------- Frames of runs and recordings with their poses, in stretches: what a data set is made of that was
+# not rendered for it
+
+
+Array = NDArray[np.float64]
+
+TENTH = 0.1
+"""Largest distance of a bin or beam from its place in the sonar, as part of the step from one to the next."""
+
+EXACT = 1e-6
+"""The same, below which axes are those of the sonar: files round them."""
+
+SAME = 1e-3
+"""Largest difference of numbers of one sonar in two files, as part of them."""
+
+OTHER = ("name", "seed", "frame_rate_hz", "quality", "thesis_rays", "rays_per_beam", "rays_across", "jitter", *NOISE_FIELDS)
+"""Fields of a sonar in which frames of one data set may differ."""
+
+AXES = ("range_min", "range_max", "azimuth_fov_deg", "beam_layout")
+"""Fields that are compared as ranges and bearings."""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """The sonar of frames, whose window and bins are theirs.
+
+    Attributes:
+        sonar: the instrument.
+        bearing_rad: axes of the beams ``(beams,)`` [rad], where they are not those of the sonar.
+        level: how pixels stand for levels.
+    """
+
+    sonar: Sonar
+    bearing_rad: Array | None
+    level: str
+
+    @property
+    def bearings(self) -> Array:
+        """Return the axes of the beams ``(beams,)`` [rad]."""
+        return self.sonar.bearing_rad if self.bearing_rad is None else self.bearing_rad
+
+    def other(self, than: Axes) -> list[str]:
+        """List what differs from another sonar, with both values: ``range_bins 128, not 256``."""
+        mine, its = ({**one.sonar.model_dump(), "level": one.level} for one in (self, than))
+        keys = [key for key in mine if key not in (*OTHER, *AXES) and not _same(mine[key], its[key])]
+        if self.sonar.range_bins == than.sonar.range_bins and not _near(self.sonar.range_m, than.sonar.range_m, TENTH):
+            keys += ["range_min", "range_max"]
+        if self.sonar.beams == than.sonar.beams and not _near(self.bearings, than.bearings, TENTH):
+            keys += ["azimuth_fov_deg", "bearings"]
+        mine, its = ({**table, "bearings": "of other beams"} for table in (mine, its))
+        return [f"{key} {shown(mine[key])}, not {shown(its[key])}" for key in keys]
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Consecutive frames of a part, two or more, each with a pose.
+
+    Attributes:
+        part: of a recording.
+        first: number of the first frame in the part.
+        time_s: of the frames ``(frames,)`` [s].
+        poses: of the sonar ``(frames, 6)`` [m, rad].
+        height_m: over the ground ``(frames,)``; nan where unknown.
+    """
+
+    part: Part
+    first: int
+    time_s: Array
+    poses: Array
+    height_m: Array
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.time_s)
+
+    def read(self, here: slice) -> SonarFrames:
+        """Read some of the frames, by their numbers in the stretch."""
+        return self.part.read(np.arange(self.first + here.start, self.first + here.stop))
+
+
+@dataclass(frozen=True)
+class FramesWithPoses:
+    """What was taken from one file or run.
+
+    Attributes:
+        name: of the file, as it was given.
+        format: in words.
+        poses: where the poses come from.
+        axes: of its frames.
+        level_scale: level of a pixel of 1.
+        stretches: the frames.
+        left_out: number of frames without a pose, of another geometry, or with no neighbour.
+        notes: sentences on the recording.
+    """
+
+    name: str
+    format: str
+    poses: str
+    axes: Axes
+    level_scale: float
+    stretches: list[Stretch]
+    left_out: int
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        """Return the number of frames that were taken."""
+        return sum(map(len, self.stretches))
+
+
+def frames_with_poses(
+    where: str,
+    *,
+    path: str | Path | None = None,
+    frame: str = "mitsonar",
+    height_m: float | None = None,
+    cut: int | None = None,
+    geometry: str | Path | None = None,
+) -> FramesWithPoses:
+    """Find the frames of a file or run whose poses are known. No pixels are read.
+
+    Of a recording in several parts those are taken that have the geometry of the longest.
+
+    Args:
+        where: a recording of a real sonar, ``frames.npz``, ``frames.zarr``, or the folder of a run.
+        path: file of poses, TUM or CSV; None: the poses of the frames.
+        frame: convention of that file.
+        height_m: over the ground [m], for frames without one.
+        cut: frames of a stretch, at most.
+        geometry: file that tells how the pictures of a recording are laid out.
+
+    Raises:
+        MitsonarError: no frames there, no poses, a sonar that a data set cannot hold.
+    """
+    if is_data_set(where):
+        raise MitsonarError(f"{where} is a data set already: give runs or recordings")
+    recording = recording_at(where, geometry=geometry)
+    longest = recording.part()
+    axes = axes_of(longest.like, where)
+    known = None if path is None else Trajectory.load(path, frame)
+    found: list[Stretch] = []
+    for number, part in enumerate(recording.parts):
+        if number == recording.longest or (len(part) and not axes_of(part.like, where).other(axes)):
+            found += _stretches_of(part, where, known, height_m, cut)
+    if not found:
+        raise MitsonarError(
+            f"{where} has no two consecutive frames with a pose: give --poses with a path that has the times of its frames"
+        )
+    taken = sum(map(len, found))
+    poses = "its own" if path is None else str(path)
+    scale = float(longest.like.level_scale)
+    notes = recording.notes
+    return FramesWithPoses(str(where), recording.format, poses, axes, scale, found, len(recording) - taken, notes)
+
+
+def axes_of(like: SonarFrames, name: str) -> Axes:
+    """Return the sonar of frames, fitted to their ranges and bearings where it has others.
+
+    Args:
+        like: frames, or none of them: their axes count.
+        name: for errors.
+
+    Raises:
+        MitsonarError: frames of contrast; ranges at uneven steps.
+    """
+    if like.level == "contrast":
+        raise MitsonarError(f"{name} holds contrast, no levels: give the frames before their contrast")
+    sonar = like.sonar
+    own = sonar.range_bins == len(like.range_m) and sonar.beams == len(like.bearing_rad)
+    if not (own and _near(sonar.range_m, like.range_m, EXACT) and _near(sonar.bearing_rad, like.bearing_rad, EXACT)):
+        if min(len(like.range_m), len(like.bearing_rad)) < 2:
+            raise MitsonarError(f"{name} has frames of one bin or one beam: their sonar must tell its window")
+        sonar = as_instrument(like)[0].sonar
+    if not _near(sonar.range_m, like.range_m, TENTH):
+        raise MitsonarError(
+            f"the ranges of {name} are not at even steps, and a data set holds no others: resample its frames, or give a "
+            "recording whose bins are even"
+        )
+    even = _near(sonar.bearing_rad, like.bearing_rad, EXACT)
+    return Axes(sonar, None if even else np.asarray(like.bearing_rad, dtype=float), like.level)
+
+
+def _stretches_of(part: Part, name: str, path: Trajectory | None, height_m: float | None, cut: int | None) -> list[Stretch]:
+    """Return the stretches of a part whose frames have poses."""
+    time = np.asarray(part.time_s, dtype=float)
+    time = time.mean(axis=1) if time.ndim == 2 else time
+    if not np.isfinite(time).all() or not (np.diff(time) > 0).all():
+        raise MitsonarError(f"the times of {name} do not rise: its frames have no order")
+    if path is not None:
+        poses, known = poses_at(path, time, name, part.attitude_rad)
+    elif part.poses is None:
+        raise MitsonarError(
+            f"{name} holds no poses: give --poses PATH.tum, the path of the sonar by DVL and INS, by another instrument or "
+            "by `mitsonar odometry`"
+        )
+    else:
+        poses = np.asarray(part.poses, dtype=float)
+        known = np.asarray(np.isfinite(poses).all(axis=1))
+    height = np.full(len(time), np.nan) if part.height_m is None else np.array(part.height_m, dtype=float)
+    height = np.where(np.isfinite(height) | (height_m is None), height, np.nan if height_m is None else height_m)
+    found = []
+    for one in stretches(known, time):
+        step = cut or one.stop - one.start
+        for first in range(one.start, one.stop - 1, step):
+            here = slice(first, min(first + step, one.stop))
+            found.append(Stretch(part, first, time[here], poses[here], height[here]))
+    return [one for one in found if len(one) > 1]
+
+
+def as_pixels(image: NDArray[np.generic], pixel: str, name: str) -> NDArray[np.generic]:
+    """Return images as a data set stores them: uint8 as they are, or float32 in 0..1.
+
+    Raises:
+        MitsonarError: values outside 0..1.
+    """
+    if pixel == "uint8" and image.dtype == np.uint8:
+        return image
+    values = to_float32(image)
+    if not (values.size and values.min() >= 0 and values.max() <= 1):  # also of nan
+        raise MitsonarError(f"{name} has pixels {values.min():g}..{values.max():g}, allowed 0..1: it is damaged")
+    return values
+
+
+def _near(one: Array, other: Array, part: float) -> bool:
+    """Return whether two axes agree, within this part of their least step."""
+    if len(one) != len(other):
+        return False
+    step = float(np.diff(other).min()) if len(other) > 1 else max(abs(float(other[0])), 1.0)
+    return bool(np.abs(one - other).max() <= part * step)
+
+
+def _same(one: object, other: object) -> bool:
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=SAME, abs_tol=1e-9)
+    return one == other
+
+
+# ---------------- A data set of frames that were not rendered for it: of runs, and of recordings of real sonars, with
+# known poses
+
+
+OTHER_GAIN = 0.01
+"""Difference of the level scales of two files, as part of them, that the user is told of."""
+
+
+@dataclass(frozen=True)
+class RecordedDataSet:
+    """What was written.
+
+    Attributes:
+        path: of the data set.
+        frames: of it.
+        sequences: of it.
+        notes: a sentence each.
+    """
+
+    path: Path
+    frames: int
+    sequences: int
+    notes: list[str]
+
+
+def write_recorded(
+    sources: Sequence[FramesWithPoses],
+    out: str | Path,
+    *,
+    begun: Callable[[int, int], None] = lambda frames, done: None,
+    progress: Callable[[int], None] = lambda frames: None,
+) -> RecordedDataSet:
+    """Write frames with their poses as a data set, whole or absent; a shard at a time is in memory.
+
+    Each source is a scene, each stretch of it a sequence. Pixels, levels and bearings stay as they are.
+
+    Args:
+        sources: files and runs of one sonar.
+        out: folder to make.
+        begun: called with the number of frames of the data set, and 0.
+        progress: called with the number of frames that were added.
+
+    Raises:
+        MitsonarError: something is there, no sources, sonars that differ, no heights, frames that cannot be read.
+    """
+    if "://" in str(out):
+        raise MitsonarError(f"-o must name a folder here: got {out}; copy the finished data set to its storage")
+    path = Path(out)
+    recipe = recorded_recipe(sources, path.stem)
+    plan = _plan(sources)
+    stretches = [stretch for source in sources for stretch in source.stretches]
+    scale = sources[0].level_scale
+    about = {"gain": 1 / scale, "level_scale": scale, "variant": "none", "versions": versions(PACKAGES)}
+    begun(len(plan), 0)
+    with new_folder(path) as folder:
+        store = DataStore.create(Storage(folder), recipe, plan, about)
+        for shard in range(store.shards):
+            here = store.frames_of(shard)
+            store.write_shard(shard, _values(store, stretches, here))
+            progress(here.stop - here.start)
+        store.finish()
+    return RecordedDataSet(path, len(plan), len(stretches), _notes(sources, len(stretches)))
+
+
+def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
+    """Return the recipe of a data set of these frames.
+
+    Raises:
+        MitsonarError: no sources, sonars that differ, a name that occurs twice, no heights.
+    """
+    if not sources:
+        raise MitsonarError("a data set needs frames: give a run or a recording, or more")
+    first = sources[0]
+    for one in sources[1:]:
+        other = one.axes.other(first.axes)
+        if other:
+            raise MitsonarError(
+                f"{one.name} is of another sonar than {first.name}: {'; '.join(other[:6])}; make a data set of each"
+            )
+    names = [one.name for one in sources]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise MitsonarError(f"{twice[0]} is given twice: its frames would be in training and in validation")
+    stretches = [stretch for source in sources for stretch in source.stretches]
+    poses = np.concatenate([one.poses for one in stretches])
+    moved = np.abs(np.concatenate([motions(one.poses) for one in stretches])).max(axis=0)
+    low, high = _heights(stretches)
+    pitch, roll = (float(np.round(np.degrees(np.median(poses[:, axis])), 2)) for axis in (3, 4))
+    floats = any(one.part.like.image.dtype != np.uint8 for one in stretches)
+    several = {"by": "scene", "train": 0.8, "validation": 0.2, "test": 0.0}
+    bearings = first.axes.bearing_rad
+    return recipe_from(
+        {
+            "name": name,
+            "about": f"frames of {len(sources)} runs or recordings, with known poses",
+            "scenes": [{"sequences": len(one.stretches)} for one in sources],
+            "sonar": first.axes.sonar.model_dump(mode="json"),
+            "mount": {"pitch_deg": pitch, "roll_deg": roll},
+            "flight": {
+                "kind": "recorded",
+                "height_m": [low, high],
+                "sideways_mm": 1e3 * float(moved[0]),
+                "forward_mm": 1e3 * float(moved[1]),
+                "yaw_deg": float(np.degrees(moved[2])),
+                "jump_m": None,
+            },
+            "pixel": "float32" if floats else "uint8",
+            **({"split": several} if len(sources) > 1 else {}),
+            "recorded": {
+                "level": first.axes.level,
+                "bearings": None if bearings is None else bearings.tolist(),
+                "sources": [_source(one) for one in sources],
+            },
+        }
+    )
+
+
+def _source(one: FramesWithPoses) -> dict[str, str | int | float]:
+    """Return the keys of a source in the recipe."""
+    return {
+        "name": one.name,
+        "format": one.format,
+        "poses": one.poses,
+        "frames": len(one),
+        "left_out": one.left_out,
+        "level_scale": one.level_scale,
+        "start_s": float(one.stretches[0].time_s[0]),
+    }
+
+
+def _heights(stretches: Sequence[Stretch]) -> tuple[float, float]:
+    """Return the lowest and highest height over the ground [m]; over z = 0 where no frame tells one.
+
+    Raises:
+        MitsonarError: no frame tells a height, and z = 0 is not below all of them.
+    """
+    told = np.concatenate([one.height_m for one in stretches])
+    told = told[np.isfinite(told) & (told > 0)]
+    if not told.size:
+        told = np.concatenate([one.poses[:, 2] for one in stretches])
+    if told.min() <= 0:
+        raise MitsonarError("no frame tells its height over the ground, and their poses are below z = 0: give --height")
+    return float(told.min()), float(told.max())
+
+
+def _plan(sources: Sequence[FramesWithPoses]) -> Plan:
+    """Return the poses of all frames, in the order in which they are stored."""
+    stretches = [stretch for source in sources for stretch in source.stretches]
+    counts = [len(one) for one in stretches]
+    scene = [number for number, source in enumerate(sources) for _ in source.stretches]
+    poses = np.concatenate([one.poses for one in stretches])
+    nan = np.full((1, 3), np.nan)
+    return Plan(
+        scenes=[Scene(number, number, 0, len(source.stretches)) for number, source in enumerate(sources)],
+        scene=np.repeat(scene, counts).astype(np.int32),
+        sequence=np.repeat(np.arange(len(counts)), counts).astype(np.int32),
+        time_s=np.concatenate([one.time_s - one.time_s[0] for one in stretches]),
+        vehicle=poses * [1, 1, 1, 0, 0, 1],
+        poses=poses,
+        motion=np.concatenate([part for one in stretches for part in (motions(one.poses), nan)]),
+        velocity=np.concatenate([velocities(Trajectory(one.poses, one.time_s)) for one in stretches]),
+    )
+
+
+def _values(store: DataStore, stretches: Sequence[Stretch], here: slice) -> dict[str, Values]:
+    """Read the frames of a shard. Return what is stored of them, by name."""
+    images, heights, first = [], [], 0
+    for one in stretches:
+        part = slice(max(here.start - first, 0), min(here.stop - first, len(one)))
+        if part.start < part.stop:
+            frames = one.read(part)
+            images.append(as_pixels(frames.image, store.recipe.pixel, f"frame {first + part.start} and those after it"))
+            heights.append(one.height_m[part])
+        first += len(one)
+    image = np.concatenate(images)
+    full = 255 if store.recipe.pixel == "uint8" else 1
+    return {
+        "image": image,
+        "height_m": np.concatenate(heights),
+        "dropped": np.zeros(len(image), dtype=np.uint32),
+        "saturated": (image == full).sum(axis=(1, 2), dtype=np.uint32),
+    }
+
+
+def _notes(sources: Sequence[FramesWithPoses], sequences: int) -> list[str]:
+    """Return what the user should know, a sentence each."""
+    notes = [f"{one.name}: {note}" for one in sources for note in one.notes]
+    notes += [
+        f"{one.name}: left out: {counted(one.left_out, 'frame')} without a pose, of another geometry, or with no neighbour"
+        for one in sources
+        if one.left_out
+    ]
+    scales = np.array([one.level_scale for one in sources])
+    if np.ptp(scales) > OTHER_GAIN * scales.max():
+        notes.append(
+            f"the gains of the files differ (levels of a pixel of 1 from {scales.min():.3g} to {scales.max():.3g}): pixels "
+            "stay as they are, and levels can be compared within a file only"
+        )
+    if not all(np.isfinite(one.height_m).all() for source in sources for one in source.stretches):
+        notes.append("not all frames have a height over the ground, which most estimators need: --height gives one")
+    if sequences == 1:
+        notes.append(
+            "one sequence cannot be split: read it with `--part all`, or cut it with --cut to train on some sequences and "
+            "validate on others"
+        )
+    return notes

@@ -1,0 +1,163 @@
+"""A live sonar on a Foxglove WebSocket: poses in; fan, polar image, transform, pose and timing out."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import Any
+
+import foxglove
+import numpy as np
+from foxglove.channels import CompressedImageChannel, FrameTransformChannel, PoseInFrameChannel
+from foxglove.messages import CompressedImage, FrameTransform, Pose, PoseInFrame, Quaternion, Timestamp, Vector3
+from foxglove.websocket import Capability, ServerListener
+from numpy.typing import NDArray
+
+from mitsonar.bridges.live import (
+    PROJECTED,
+    PROJECTED_TYPE,
+    FanEncoder,
+    LivePing,
+    PoseMailbox,
+    asked_pose,
+    pose_in_ros,
+    projected_image,
+    timing,
+)
+from mitsonar.errors import MitsonarError, shortened
+
+__all__ = ["SONAR_FRAME", "WORLD_FRAME", "FoxgloveServer"]
+
+SONAR_FRAME, WORLD_FRAME, POSE_TOPIC = "sonar", "world", "/pose"
+
+FAREWELL_S = 1.0
+"""How long :meth:`FoxgloveServer.close` waits for the clients' farewell [s]."""
+
+NUMBERS = ("number", "dropped", "pose_ns", "published_ns", "render_ms", "latency_ms")
+TIMING = {
+    "type": "object",
+    "title": "mitsonar.Timing",
+    "properties": {
+        **{name: {"type": "number"} for name in (*NUMBERS, "x", "y", "z", "pitch", "roll", "heading")},
+        "source": {"type": "string"},
+    },
+}
+
+
+class FoxgloveServer:
+    """Publishes pings to Foxglove clients, and puts the poses that they publish on ``/pose`` into a mailbox.
+
+    Args:
+        mailbox: where poses go.
+        host: address to listen on.
+        port: to listen on; 0: a free one.
+
+    Attributes:
+        port: it listens on.
+
+    Raises:
+        MitsonarError: the address cannot be listened on.
+    """
+
+    def __init__(self, mailbox: PoseMailbox, host: str = "127.0.0.1", port: int = 8765) -> None:
+        context = self._context = foxglove.Context()  # channels close with it
+        self._fan = CompressedImageChannel("/sonar/fan", context=context)
+        schema = foxglove.Schema(name=PROJECTED_TYPE, encoding="ros2msg", data=PROJECTED.encode())
+        self._polar = foxglove.Channel("/sonar/image", schema=schema, message_encoding="cdr", context=context)
+        self._transform = FrameTransformChannel("/tf", context=context)
+        self._pose = PoseInFrameChannel("/sonar/pose", context=context)
+        self._timing = foxglove.Channel("/sonar/timing", schema=TIMING, message_encoding="json", context=context)
+        self._encoder = FanEncoder()
+        try:
+            self._server = foxglove.start_server(
+                name="mitsonar",
+                host=host,
+                port=port,
+                context=context,
+                capabilities=[Capability.ClientPublish],
+                supported_encodings=["json"],
+                server_listener=_Poses(mailbox, self.complain),
+                message_backlog_size=16,
+            )
+        except (RuntimeError, OSError) as error:
+            raise MitsonarError(
+                f"cannot listen on {host}:{port} ({' '.join(str(error).split())}): give another --port, or 0 for a free one"
+            ) from None
+        self.port = int(self._server.port)
+
+    def publish(self, ping: LivePing) -> None:
+        """Publish a ping, its fan first: TCP may hold back what follows. What nobody listens to is not encoded."""
+        frames, when = ping.frames, ping.time_ns
+        stamp = Timestamp(sec=when // 10**9, nsec=when % 10**9)
+        if self._fan.has_sinks():
+            data = self._encoder.jpeg(frames)
+            image = CompressedImage(timestamp=stamp, frame_id=SONAR_FRAME, data=data, format="jpeg")
+            self._fan.log(image, log_time=when)
+        assert frames.poses is not None
+        place, turn = pose_in_ros(frames.poses[0])
+        position, rotation = _vector(place), _quaternion(turn)
+        transform = FrameTransform(
+            timestamp=stamp,
+            parent_frame_id=WORLD_FRAME,
+            child_frame_id=SONAR_FRAME,
+            translation=position,
+            rotation=rotation,
+        )
+        self._transform.log(transform, log_time=when)
+        pose = PoseInFrame(timestamp=stamp, frame_id=WORLD_FRAME, pose=Pose(position=position, orientation=rotation))
+        self._pose.log(pose, log_time=when)
+        if self._polar.has_sinks():
+            self._polar.log(projected_image(frames, when, SONAR_FRAME), log_time=when)
+        self._timing.log(json.dumps(timing(ping)).encode(), log_time=when)
+
+    def complain(self, sentence: str) -> None:
+        """Send all clients a warning, which Foxglove lists under problems."""
+        self._server.publish_status(sentence, foxglove.StatusLevel.Warning)
+
+    def close(self) -> None:
+        """End all connections, and wait a moment for it: a client that no longer reads never takes leave."""
+        stopping = threading.Thread(target=self._server.stop, daemon=True)
+        stopping.start()
+        stopping.join(FAREWELL_S)
+
+
+class _Poses(ServerListener):
+    """Reads poses in the server's threads. A pose that cannot be read is refused with one sentence."""
+
+    def __init__(self, mailbox: PoseMailbox, complain: Any) -> None:
+        self.mailbox, self.complain = mailbox, complain
+        self._lock, self._channels = threading.Lock(), dict[tuple[int, int], str]()
+
+    def on_client_advertise(self, client: Any, channel: Any) -> None:
+        fault = None
+        if channel.topic != POSE_TOPIC:
+            fault = f"poses are read from {POSE_TOPIC}: got the topic {shortened(channel.topic)}"
+        elif channel.encoding != "json":
+            fault = f"poses are read as json: got the encoding {shortened(channel.encoding)}"
+        if fault is not None:
+            self.complain(fault)
+            return
+        with self._lock:
+            self._channels[client.id, channel.id] = channel.topic
+
+    def on_client_unadvertise(self, client: Any, client_channel_id: int) -> None:
+        with self._lock:
+            self._channels.pop((client.id, client_channel_id), None)
+
+    def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None:
+        if (client.id, client_channel_id) not in self._channels:
+            return
+        try:
+            self.mailbox.put(asked_pose(data))
+        except MitsonarError as error:
+            self.complain(f"a pose was refused: {error}")
+
+
+def _vector(values: NDArray[np.float64]) -> Vector3:
+    x, y, z = (float(value) for value in values)
+    return Vector3(x=x, y=y, z=z)
+
+
+def _quaternion(values: NDArray[np.float64]) -> Quaternion:
+    x, y, z, w = (float(value) for value in values)
+    return Quaternion(x=x, y=y, z=z, w=w)

@@ -1,0 +1,696 @@
+"""One vehicle as an environment of Gymnasium."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypedDict, Unpack
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.acoustics.noise import NoiseModel, refuse_noise
+from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names, refuse_unknown
+from mitsonar.geometry.fan import CartesianMap, cartesian_map
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
+from mitsonar.motion.bodies import Moving
+from mitsonar.motion.composition import steered
+from mitsonar.simulation.pings import constant_gain, to_image
+from mitsonar.simulation.scene import load_scene, sonar_in
+from mitsonar.simulation.simulator import Simulator
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitsonar.simulation.tracing import Clearance
+
+__all__ = [
+    "OBSERVABLE",
+    "Array",
+    "Observation",
+    "Reward",
+    "SonarEnv",
+    "SonarFleet",
+    "SonarSource",
+    "SonarTask",
+    "SonarVectorEnv",
+    "TaskFields",
+    "Transition",
+    "action_space",
+    "fan_of",
+    "fan_picture",
+    "observation_space",
+    "observed",
+]
+
+
+# ---------------- Vehicles with a sonar each, in one scene: they move, and ping together in one launch
+
+
+SonarSource: TypeAlias = "Simulator | mi.Scene | str | Path"
+"""What pings: a simulator, a scene, or its file or name."""
+
+FIRST_PINGS = 2**31
+"""Numbers of first pings that episodes draw from."""
+
+
+class SonarFleet:
+    """Vehicles in one scene. What one of them sees does not depend on the others.
+
+    An episode draws from its vehicle's own generator: six numbers for the start, and the number of its first ping, of which
+    jitter and noise are functions.
+
+    Args:
+        source: of the pings.
+        sonar: the instrument, or its name; default: the scene's.
+        count: of vehicles.
+        moving: bodies that move in the scene, by the time of the episode.
+        task: what the vehicles may do.
+
+    Attributes:
+        poses: of the vehicles' sonars ``(count, 6)`` [m, rad].
+        steps: of each since the begin of its episode ``(count,)``.
+
+    Raises:
+        MitsonarError: no vehicle, a source that is no scene, no start, or one where every episode ends.
+
+    Warns:
+        MitsonarWarning: the start seems to lie below the seabed.
+    """
+
+    def __init__(
+        self, source: SonarSource, sonar: Sonar | str | None, count: int, moving: Moving | None, task: SonarTask
+    ) -> None:
+        if not (isinstance(count, int | np.integer) and 1 <= count <= 100_000):
+            raise MitsonarError(f"num_envs must be a whole number in 1..100000: got {count!r}")
+        if not isinstance(source, Simulator | str | Path) and not hasattr(source, "shapes"):
+            raise MitsonarError(f"scene is a scene, its file or name, or a Simulator: got {type(source).__name__}")
+        if isinstance(source, Simulator):
+            if sonar is not None or moving is not None:
+                raise MitsonarError("a simulator has its sonar and its moving bodies: leave sonar and moving out")
+            self.simulator = source
+        else:
+            scene = load_scene(source) if isinstance(source, str | Path) else source
+            instrument = load_sonar(sonar) if isinstance(sonar, str) else sonar
+            self.simulator = Simulator(scene, instrument, moving=moving)
+        self.sonar, self.task = self.simulator.sonar, task
+        refuse_noise(task.noise, self.sonar)
+        self.step_s = 1 / self.sonar.frame_rate_hz if task.step_s is None else task.step_s
+        from mitsonar.simulation.tracing import Clearance  # now that the simulator has set a variant
+
+        self._clearance = Clearance(self.simulator.tracer)
+        self._span = self._start_of(task)
+        self._check_start()
+        self.gain = self._gain() if task.gain is None else task.gain
+        self.poses = np.repeat(self._span[:1], count, axis=0)
+        self.steps = np.zeros(count, dtype=np.int64)
+        self._first = np.zeros(count, dtype=np.int64)
+
+    @property
+    def clearance(self) -> Clearance:
+        """Return what measures the clearance in the scene as it is now."""
+        if self._clearance.tracer is not self.simulator.tracer:  # the simulator has followed a change of the scene
+            self._clearance = type(self._clearance)(self.simulator.tracer)
+        return self._clearance
+
+    def _start_of(self, task: SonarTask) -> Table:
+        """Return the poses between which episodes begin."""
+        if task.start is not None:
+            return task.span
+        found = sonar_in(self.simulator.tracer.scene)
+        if found is None:
+            raise MitsonarError("the scene has no sonar whose pose episodes could begin at: give start, a pose or two")
+        span = np.repeat(np.asarray(found[1], dtype=float)[None], 2, axis=0)
+        task.refuse_outside(span)
+        return span
+
+    def _check_start(self) -> None:
+        """Refuse a start at whose ends the vehicle collides; warn where it seems to lie below the seabed."""
+        places = self._span[:, :3]
+        clearance_m = self.clearance.of(places, places, np.zeros(2))
+        if (clearance_m < self.task.clearance_m).all():
+            raise MitsonarError(
+                f"start is {clearance_m.max():.3g} m from a surface, nearer than clearance_m {self.task.clearance_m:g}: "
+                "every episode would end at its first step; move it, or lower clearance_m"
+            )
+        below, above = (self.clearance.straight(places, way) for way in ((0, 0, -1), (0, 0, 1)))
+        if (np.isinf(below) & np.isfinite(above)).all():
+            warnings.warn(
+                f"below start there is nothing, and a surface {above.min():.3g} m above it: a vehicle under the seabed sees "
+                "it from below; nothing is wrong where that is a hull or ice",
+                MitsonarWarning,
+                stacklevel=4,
+            )
+
+    def _gain(self) -> float:
+        """Return the constant gain by eight poses between those of the start, always the same."""
+        part = np.random.Generator(np.random.PCG64(0)).random((8, 6))
+        return constant_gain(self.simulator.pings(self._span[0] + part * np.ptp(self._span, axis=0)))[0]
+
+    def renew(self, which: NDArray[np.bool_], generators: Sequence[np.random.Generator]) -> None:
+        """Begin new episodes of the vehicles ``which`` ``(count,)``."""
+        for number in map(int, np.flatnonzero(which)):
+            part = generators[number].random(6)
+            self.poses[number] = self._span[0] + part * (self._span[1] - self._span[0])
+            self._first[number] = generators[number].integers(FIRST_PINGS)
+            self.steps[number] = 0
+
+    def look(self) -> tuple[NDArray[np.uint8], Table]:
+        """Ping from all vehicles in one launch; return images ``(count, bins, beams)`` and altitudes ``(count,)`` [m].
+
+        In the model ``coherent`` they ping one after the other.
+        """
+        numbers = [int(number) for number in self._first + self.steps]
+        batches = list(self.simulator.pings(self.poses, first=numbers, time_s=self.time_s))
+        image = to_image(np.concatenate([pings.levels for pings in batches]), self.gain, self.sonar)
+        if self.task.noise is not None:
+            image = self.task.noise.apply(image, seed=self.sonar.seed, frames=np.array(numbers))
+        height_m = np.concatenate([pings.height_m for pings in batches])
+        altitude_m = np.minimum(np.nan_to_num(height_m, nan=np.inf), self.task.altimeter_m)
+        return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8), altitude_m
+
+    @property
+    def time_s(self) -> Table:
+        """Return the time of each vehicle since the begin of its episode ``(count,)`` [s]."""
+        return np.asarray(self.steps * self.step_s, dtype=float)
+
+    def advance(
+        self, action: ArrayLike, renewed: NDArray[np.bool_], generators: Sequence[np.random.Generator]
+    ) -> Transition:
+        """Move all vehicles by their actions, but those ``renewed`` to the begin of a new episode; then ping.
+
+        Args:
+            action: ``(count, 4)``, clipped to -1..1.
+            renewed: vehicles whose episode has ended ``(count,)``.
+            generators: of the vehicles.
+
+        Raises:
+            MitsonarError: an action of another shape, or that is not finite.
+        """
+        given = np.asarray(action, dtype=float)
+        if given.shape != (len(self.poses), 4) or not np.isfinite(given).all():
+            raise MitsonarError(f"an action is four finite numbers for each of {len(self.poses)}: got {_wrong(given)}")
+        taken, before = np.clip(given, -1, 1), self.poses.copy()
+        self.poses = steered(before, taken * np.asarray(self.task.max_velocity), self.step_s)
+        self.steps += 1
+        self.renew(renewed, generators)
+        before[renewed] = self.poses[renewed]
+        image, altitude_m = self.look()
+        clearance_m = self.clearance.of(before[:, :3], self.poses[:, :3], self.time_s)
+        low, high = self.task.box
+        outside = ((self.poses[:, :3] < low) | (self.poses[:, :3] > high)).any(axis=1)
+        collided = clearance_m < self.task.clearance_m
+        return Transition(taken, before, self.poses.copy(), image, altitude_m, clearance_m, collided, outside)
+
+    def rewards(self, step: Transition) -> Table:
+        """Return the rewards of a step ``(count,)``.
+
+        Raises:
+            MitsonarError: the reward function gives other than one finite number for each vehicle, or for all.
+        """
+        if self.task.reward is None:
+            return np.zeros(len(self.poses))
+        found = np.asarray(self.task.reward(step), dtype=float)
+        if found.shape not in ((len(self.poses),), ()) or not np.isfinite(found).all():
+            raise MitsonarError(f"reward must give {len(self.poses)} finite numbers, or one for all: got {_wrong(found)}")
+        return np.array(np.broadcast_to(found, len(self.poses)))
+
+
+def _wrong(given: Table) -> str:
+    """Return what is wrong with numbers: one that is not finite, with its place, else their shape."""
+    bad = np.argwhere(~np.isfinite(given))
+    place = bad[0].tolist() if len(bad) else []
+    return f"{given[tuple(place)]} at {place}" if len(bad) else f"the shape {given.shape}"
+
+
+# ---------------- Spaces of actions and observations, and observations in their layout
+
+
+Array: TypeAlias = NDArray[np.generic]
+Observation: TypeAlias = "Array | dict[str, Array]"
+"""The image, or several arrays by name."""
+
+FARTHEST = 1e9
+"""No number of a pose is larger [m, rad]."""
+
+PICTURE_ROWS = 400
+
+
+def action_space() -> spaces.Box:
+    """Return the space of actions: starboard, forward, up, turn, each as a part of its largest value."""
+    return spaces.Box(-1.0, 1.0, (4,), np.float32)
+
+
+def observation_space(fleet: SonarFleet) -> spaces.Space[Observation]:
+    """Return the space of one vehicle's observation: ``(bins, beams, 1)`` uint8, or a dictionary with it."""
+    sonar, task = fleet.sonar, fleet.task
+    known: dict[str, spaces.Space[Array]] = {
+        "image": spaces.Box(0, 255, (sonar.range_bins, sonar.beams, 1), np.uint8),
+        "altitude": spaces.Box(0.0, task.altimeter_m, (1,), np.float32),
+        "pose": spaces.Box(-FARTHEST, FARTHEST, (6,), np.float64),
+    }
+    chosen = {name: known[name] for name in task.observe}
+    made: spaces.Space[Observation] = known["image"] if len(chosen) == 1 else spaces.Dict(chosen)  # type: ignore[assignment]
+    return made
+
+
+def observed(fleet: SonarFleet, image: NDArray[np.uint8], altitude_m: Table) -> Observation:
+    """Return the observations of all vehicles, with the vehicle as the first axis."""
+    known: dict[str, Array] = {
+        "image": image[..., None].copy(),
+        "altitude": altitude_m[:, None].astype(np.float32),
+        "pose": fleet.poses.copy(),
+    }
+    chosen = {name: known[name] for name in fleet.task.observe}
+    return known["image"] if len(chosen) == 1 else chosen
+
+
+def fan_of(sonar: Sonar) -> CartesianMap:
+    """Return the map from images to pictures of the fan."""
+    return cartesian_map(sonar.range_m, sonar.bearing_rad, PICTURE_ROWS)
+
+
+def fan_picture(fan: CartesianMap, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a picture of the fan ``(rows, columns, 3)`` uint8, forward up, of one image ``(bins, beams)``."""
+    grey = np.rint(fan.apply(image.astype(np.float32))).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)
+
+
+# ---------------- sonar env
+
+
+class SonarEnv(gymnasium.Env[Observation, Array]):
+    """A vehicle with a sonar: the action is its velocity, the observation the sonar's image.
+
+    It collides and ends near a surface, and ends outside its bounds. :class:`SonarVectorEnv` steps many at once.
+
+    Args:
+        scene: a scene, its file or name, or a :class:`Simulator`.
+        sonar: the instrument, or its name; default: the scene's.
+        moving: bodies that move, by the time since the begin of the episode.
+        render_mode: ``rgb_array`` for pictures of the fan; default: none.
+        task: fields of :class:`mitsonar.bridges.gymnasium.SonarTask`: ``start``, ``bounds``, ``reward`` ...
+
+    Raises:
+        MitsonarError: a value that is not allowed.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # as Gymnasium has it
+
+    def __init__(
+        self,
+        scene: SonarSource,
+        sonar: Sonar | str | None = None,
+        *,
+        moving: Moving | None = None,
+        render_mode: str | None = None,
+        **task: Unpack[TaskFields],
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise MitsonarError(f"render_mode is rgb_array or None: got {render_mode!r}")
+        self.fleet = SonarFleet(scene, sonar, 1, moving, SonarTask.create({**task}, own=("moving", "render_mode")))
+        self.render_mode = render_mode
+        self.action_space, self.observation_space = action_space(), observation_space(self.fleet)
+        self._image: NDArray[np.uint8] | None = None
+
+    def __repr__(self) -> str:
+        return f"SonarEnv({self.fleet.sonar}; observes {', '.join(self.fleet.task.observe)}, {self.fleet.step_s:g} s a step)"
+
+    def __str__(self) -> str:
+        return repr(self)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; return the first observation, and the info: the ``pose`` (6,) [m, rad]."""
+        super().reset(seed=seed, options=options)
+        self.fleet.renew(np.array([True]), [self.np_random])
+        image, altitude_m = self.fleet.look()
+        self._image = image[0]
+        return _first(observed(self.fleet, image, altitude_m)), {"pose": self.fleet.poses[0].copy()}
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Move by the action ``(4,)``, then ping.
+
+        Returns:
+            observation, reward, terminated, truncated, info, as Gymnasium has them: terminated where the vehicle collided or
+            left its bounds, truncated after ``max_steps``. The info holds ``pose`` (6,) [m, rad], ``clearance_m``,
+            ``collided`` and ``outside``.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            MitsonarError: an action of another shape, or that is not finite.
+        """
+        if self._image is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        fleet = self.fleet
+        moved = fleet.advance(np.asarray(action, dtype=float)[None], np.array([False]), [self.np_random])
+        self._image = moved.image[0]
+        info = {
+            "pose": moved.poses[0].copy(),
+            "clearance_m": float(moved.clearance_m[0]),
+            "collided": bool(moved.collided[0]),
+            "outside": bool(moved.outside[0]),
+        }
+        terminated = info["collided"] or info["outside"]
+        truncated = fleet.task.max_steps is not None and int(fleet.steps[0]) >= fleet.task.max_steps
+        reward = float(fleet.rewards(moved)[0])
+        return _first(observed(fleet, moved.image, moved.altitude_m)), reward, terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a picture of the last ping's fan ``(rows, columns, 3)``, forward up; None before it, or without a mode."""
+        if self.render_mode is None or self._image is None:
+            return None
+        return fan_picture(fan_of(self.fleet.sonar), self._image)
+
+
+def _first(many: Observation) -> Observation:
+    """Return the observation of the only vehicle."""
+    return {name: values[0] for name, values in many.items()} if isinstance(many, dict) else many[0]
+
+
+# ---------------- What the vehicles of an environment may do, and what ends an episode
+
+
+Table: TypeAlias = NDArray[np.float64]
+
+OBSERVABLE = ("image", "altitude", "pose")
+"""What can be observed."""
+
+VELOCITY = ("starboard", "forward", "up", "turn")
+
+FULL_TURNS = np.array([np.pi, np.pi, 4 * np.pi])
+"""Largest pitch, roll and heading of a start [rad]; a heading may be drawn across 360 deg."""
+
+
+@dataclass(frozen=True)
+class Transition:
+    """A step of all vehicles, from which rewards follow.
+
+    Attributes:
+        action: clipped to -1..1 ``(n, 4)``: starboard, forward, up, turn to starboard.
+        before: poses before ``(n, 6)`` [m, rad].
+        poses: after ``(n, 6)``.
+        image: of the sonar ``(n, bins, beams)`` uint8.
+        altitude_m: over what is straight below ``(n,)`` [m].
+        clearance_m: to the nearest surface ``(n,)`` [m].
+        collided: whether that is too near ``(n,)``.
+        outside: whether the vehicle has left its bounds ``(n,)``.
+    """
+
+    action: Table
+    before: Table
+    poses: Table
+    image: NDArray[np.uint8]
+    altitude_m: Table
+    clearance_m: Table
+    collided: NDArray[np.bool_]
+    outside: NDArray[np.bool_]
+
+
+Reward: TypeAlias = Callable[[Transition], ArrayLike]
+"""Gives the reward of each vehicle ``(n,)``, or one number for all."""
+
+
+class TaskFields(TypedDict, total=False):
+    """Fields of a :class:`SonarTask` as arguments of an environment."""
+
+    start: ArrayLike | None
+    bounds: Sequence[Sequence[float]] | NDArray[Any] | None
+    max_velocity: tuple[float, float, float, float]
+    step_s: float | None
+    clearance_m: float
+    max_steps: int | None
+    observe: tuple[str, ...]
+    reward: Reward | None
+    gain: float | None
+    noise: NoiseModel | None
+    altimeter_m: float
+
+
+@dataclass(frozen=True)
+class SonarTask:
+    """What vehicles may do. They are level, and move with the velocity of the action.
+
+    Attributes:
+        start: pose of the sonar at the begin of an episode, or two poses between which it is drawn, number by number
+            [m, rad]; default: the pose of the scene's sonar.
+        bounds: lowest and highest x, y, z [m]; who leaves them has ended. Default: none.
+        max_velocity: of the actions -1 and 1: starboard, forward, up [m/s], turn [rad/s].
+        step_s: duration of a step [s]; default: 1 / ``frame_rate_hz``.
+        clearance_m: distance to a surface below which a vehicle has collided [m].
+        max_steps: steps after which an episode is cut off; default: none.
+        observe: of :data:`OBSERVABLE`; the image alone is a box, several are a dictionary.
+        reward: of each step, by its :class:`Transition`; default: 0.
+        gain: of the image; default: by eight poses of ``start``.
+        noise: of the image; default: none.
+        altimeter_m: an altitude beyond is told as this [m].
+
+    Raises:
+        MitsonarError: a value that is not allowed.
+    """
+
+    start: ArrayLike | None = None
+    bounds: ArrayLike | None = None
+    max_velocity: tuple[float, float, float, float] = (0.5, 1.0, 0.5, 0.5)
+    step_s: float | None = None
+    clearance_m: float = 0.3
+    max_steps: int | None = None
+    observe: tuple[str, ...] = ("image",)
+    reward: Reward | None = None
+    gain: float | None = None
+    noise: NoiseModel | None = None
+    altimeter_m: float = 100.0
+
+    def __post_init__(self) -> None:
+        for name, least in (("step_s", 1e-6), ("gain", 0.0), ("max_steps", 1), ("clearance_m", 0.0), ("altimeter_m", 1e-6)):
+            value = getattr(self, name)
+            known = int | np.integer if name == "max_steps" else int | float | np.number
+            if value is not None and not (isinstance(value, known) and least <= value < np.inf):
+                kind = "whole" if name == "max_steps" else "finite"
+                raise MitsonarError(f"{argument(name)} must be a {kind} number of at least {least:g}: got {value!r}")
+        if self.noise is not None and not isinstance(self.noise, NoiseModel):
+            raise MitsonarError(f"noise is a NoiseModel, as mitsonar.acoustics.noise.load_noise gives: got {self.noise!r}")
+        speeds = _numbers("max_velocity", self.max_velocity)
+        if speeds.shape != (4,) or not (np.isfinite(speeds).all() and (speeds >= 0).all()):
+            raise MitsonarError(f"max_velocity is four numbers of 0 or more, {', '.join(VELOCITY)}: got {self.max_velocity}")
+        if not isinstance(self.observe, tuple | list):
+            raise MitsonarError(f"observe is a tuple of image and others: got {self.observe!r}; give ('image',)")
+        unknown = [name for name in self.observe if name not in OBSERVABLE]
+        if unknown or "image" not in self.observe:
+            wrong = str(unknown[0] if unknown else self.observe)
+            raise MitsonarError(f"observe is a tuple of image and others: got {wrong!r}; {nearest_names(wrong, OBSERVABLE)}")
+        self.refuse_outside(self.span)
+
+    def refuse_outside(self, span: Table) -> None:
+        """Refuse poses where episodes begin ``(2, 6)`` that lie outside the bounds, or whose angles are no radians.
+
+        Raises:
+            MitsonarError: one does, or is.
+        """
+        low, high = self.box
+        for pose in span[np.isfinite(span).all(axis=1)]:
+            shown = ", ".join(f"{value:g}" for value in pose)
+            if (pose[:3] < low).any() or (pose[:3] > high).any():
+                raise MitsonarError(
+                    f"start lies outside bounds, where every episode ends at its first step: got {shown}, and bounds "
+                    f"{low.tolist()}, {high.tolist()}; move one of them"
+                )
+            if (np.abs(pose[3:]) > FULL_TURNS).any():
+                raise MitsonarError(f"start is x, y, z [m], pitch, roll, heading in rad: got {shown}; are these degrees?")
+
+    @classmethod
+    def create(cls, given: dict[str, Any], own: Sequence[str] = ()) -> Self:
+        """Create a task from its fields by name; ``own`` are other arguments of an environment, for the message.
+
+        Raises:
+            MitsonarError: an unknown field, or a value that is not allowed.
+        """
+        refuse_unknown(given, (*(field.name for field in fields(cls)), *own), "an environment")
+        return cls(**given)
+
+    @property
+    def span(self) -> Table:
+        """Return the two poses between which episodes begin ``(2, 6)``; of nan without a start.
+
+        Raises:
+            MitsonarError: not one or two finite poses.
+        """
+        if self.start is None:
+            return np.full((2, 6), np.nan)
+        table = np.atleast_2d(_numbers("start", self.start))
+        if table.shape not in ((1, 6), (2, 6)) or not np.isfinite(table).all():
+            raise MitsonarError(f"start is one pose or two, of x, y, z [m], pitch, roll, heading [rad]: got {table.shape}")
+        return np.asarray(np.broadcast_to(table, (2, 6)))
+
+    @property
+    def box(self) -> Table:
+        """Return the lowest and the highest place ``(2, 3)`` [m].
+
+        Raises:
+            MitsonarError: they are not two places, the lower first.
+        """
+        if self.bounds is None:
+            return np.array([[-np.inf] * 3, [np.inf] * 3])
+        box = _numbers("bounds", self.bounds)
+        if box.shape != (2, 3) or not (box[0] < box[1]).all():
+            raise MitsonarError(f"bounds are the lowest and the highest x, y, z [m]: got {box.tolist()}")
+        return box
+
+
+def _numbers(name: str, value: object) -> Table:
+    """Return numbers as a table.
+
+    Raises:
+        MitsonarError: they are none.
+    """
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise MitsonarError(f"{name} is made of numbers, rows of one length: got {value!r}") from None
+
+
+# ---------------- Many vehicles as one vector environment of Gymnasium: a step of all is one launch
+
+
+class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
+    """Vehicles with a sonar each in one scene, stepped together. They do not see each other.
+
+    Vehicle k with the seed s sees, to the bit, what :class:`SonarEnv` with the seed s + k sees, whatever ``num_envs`` is.
+    An episode that has ended begins anew with the next step, whose action for it counts for nothing.
+
+    Args:
+        scene: a scene, its file or name, or a :class:`Simulator`.
+        sonar: the instrument, or its name; default: the scene's.
+        num_envs: vehicles.
+        moving: bodies that move, by the time since the begin of each episode.
+        render_mode: ``rgb_array`` for pictures of the fans; default: none.
+        autoreset_mode: ``NextStep``, or ``Disabled`` for ``reset(options={"reset_mask": ...})``.
+        task: fields of :class:`mitsonar.bridges.gymnasium.SonarTask`: ``start``, ``bounds``, ``reward`` ...
+
+    Raises:
+        MitsonarError: a value that is not allowed.
+    """
+
+    metadata = {  # noqa: RUF012  # as Gymnasium has it
+        "render_modes": ["rgb_array"],
+        "render_fps": 10,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        scene: SonarSource,
+        sonar: Sonar | str | None = None,
+        num_envs: int = 64,
+        *,
+        moving: Moving | None = None,
+        render_mode: str | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        **task: Unpack[TaskFields],
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise MitsonarError(f"render_mode is rgb_array or None: got {render_mode!r}")
+        modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)}
+        name = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        if name not in modes:
+            raise MitsonarError(f"autoreset_mode is {' or '.join(modes)}: got {name!r}")
+        self.fleet = SonarFleet(
+            scene,
+            sonar,
+            num_envs,
+            moving,
+            SonarTask.create({**task}, own=("num_envs", "moving", "render_mode", "autoreset_mode")),
+        )
+        self.num_envs, self.render_mode, self._mode = num_envs, render_mode, modes[name]
+        self.metadata = {**self.metadata, "autoreset_mode": self._mode}
+        self.single_action_space, self.single_observation_space = action_space(), observation_space(self.fleet)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._generators: list[np.random.Generator] = [seeding.np_random()[0] for _ in range(num_envs)]
+        self._ended = np.zeros(num_envs, dtype=bool)
+        self._image: NDArray[np.uint8] | None = None
+
+    def __repr__(self) -> str:
+        sonar, task = self.fleet.sonar, self.fleet.task
+        return (
+            f"SonarVectorEnv({self.num_envs} of {sonar}; observes {', '.join(task.observe)}, {self.fleet.step_s:g} s a step)"
+        )
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode of all vehicles, or of those of ``options["reset_mask"]`` ``(num_envs,)``.
+
+        Args:
+            seed: vehicle k has the seed ``seed + k``, or that of a list; default: generators go on.
+            options: may hold ``reset_mask``.
+
+        Raises:
+            MitsonarError: another number of seeds, or no mask of booleans.
+        """
+        seeds = [seed + place for place in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+        seeds = [None] * self.num_envs if seeds is None else list(seeds)
+        which = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if len(seeds) != self.num_envs or which.shape != (self.num_envs,) or which.dtype != bool:
+            raise MitsonarError(
+                f"a seed and a boolean of reset_mask for each of {self.num_envs}: got {len(seeds)}, {which.shape}"
+            )
+        for place in np.flatnonzero(which):
+            if seeds[place] is not None:
+                self._generators[place] = seeding.np_random(seeds[place])[0]
+        self.fleet.renew(which, self._generators)
+        self._ended[which] = False
+        self._image, altitude_m = self.fleet.look()
+        return observed(self.fleet, self._image, altitude_m), _masked({"pose": self.fleet.poses.copy()}, which)
+
+    def step(self, actions: ArrayLike) -> tuple[Observation, Table, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Move all vehicles by their actions ``(num_envs, 4)``, then ping in one launch.
+
+        Returns:
+            observations, rewards, terminated, truncated, infos, as Gymnasium has them, each ``(num_envs, ...)``: terminated
+            where a vehicle collided or left its bounds, truncated after ``max_steps``. The infos hold ``pose``,
+            ``clearance_m``, ``collided`` and ``outside``, and a mask of each with ``_`` before its name.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            MitsonarError: an episode has ended and resets are yours to do.
+        """
+        if self._image is None:
+            raise ResetNeeded("call reset() before step()")
+        fleet, renewed = self.fleet, self._ended.copy()
+        if renewed.any() and self._mode is AutoresetMode.DISABLED:
+            raise MitsonarError(f"{renewed.sum()} episodes have ended: reset them with options={{'reset_mask': ...}}")
+        moved = fleet.advance(actions, renewed, self._generators)
+        self._image = moved.image
+        rewards = np.where(renewed, 0.0, fleet.rewards(moved))
+        terminated = (moved.collided | moved.outside) & ~renewed
+        truncated = (fleet.steps >= (np.inf if fleet.task.max_steps is None else fleet.task.max_steps)) & ~renewed
+        self._ended = terminated | truncated
+        return observed(fleet, moved.image, moved.altitude_m), rewards, terminated, truncated, _infos(moved, ~renewed)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a picture of each fan ``(rows, columns, 3)``, forward up; None before a ping, or without a mode."""
+        if self.render_mode is None or self._image is None:
+            return None
+        fan = fan_of(self.fleet.sonar)
+        return tuple(fan_picture(fan, image) for image in self._image)
+
+
+def _infos(moved: Transition, which: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return what is known of the vehicles beside their observations."""
+    whole = _masked({"pose": moved.poses.copy()}, np.ones(len(which), dtype=bool))
+    table = {"clearance_m": moved.clearance_m.copy(), "collided": moved.collided.copy(), "outside": moved.outside.copy()}
+    return whole | _masked(table, which)
+
+
+def _masked(values: dict[str, Array], which: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return arrays by name, each with the mask of the vehicles that it holds for, as Gymnasium has it."""
+    return values | {f"_{name}": which.copy() for name in values}

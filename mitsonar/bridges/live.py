@@ -1,0 +1,497 @@
+"""The loop of a live sonar: the newest pose becomes a ping, and the ping is published. A path is played where none comes."""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count
+from threading import Event
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+
+from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.errors import MitsonarError, meant, shortened
+from mitsonar.io.files import PlainValue, parse_json
+from mitsonar.motion.pose import Pose, poses_from, vehicle_rotation
+from mitsonar.motion.trajectory import CONVENTIONS, Trajectory
+from mitsonar.plotting.fans import FanPictures
+from mitsonar.records.frames import SonarFrames, to_uint8
+
+__all__ = [
+    "PROJECTED",
+    "PROJECTED_TYPE",
+    "AskedPose",
+    "Delivered",
+    "FanEncoder",
+    "LivePing",
+    "LivePublisher",
+    "Pinger",
+    "PoseMailbox",
+    "asked_pose",
+    "live_pings",
+    "pose_from_ros",
+    "pose_in_ros",
+    "projected_image",
+    "timing",
+]
+
+
+LOOK_S = 0.25
+"""How long the loop waits for a pose before it looks again whether it shall end [s]."""
+
+
+@dataclass(frozen=True)
+class LivePing:
+    """One ping of a live sonar.
+
+    Attributes:
+        frames: one frame, with its pose.
+        number: of the ping since the start.
+        time_ns: wall clock when the pose came, or when the path's turn came [ns].
+        source: ``client``, or ``path`` that is played.
+        mark: what the client's pose had in ``id``.
+        dropped: poses that came since the ping before and that no ping took.
+        render_s: time for the frame [s].
+    """
+
+    frames: SonarFrames
+    number: int
+    time_ns: int
+    source: str
+    mark: PlainValue
+    dropped: int
+    render_s: float
+
+
+class LivePublisher(Protocol):
+    """Takes pings to those who listen: a Foxglove server, or a ROS 2 node."""
+
+    def publish(self, ping: LivePing) -> None:
+        """Publish a ping to all who listen."""
+
+    def complain(self, sentence: str) -> None:
+        """Tell all who listen what was refused."""
+
+    def close(self) -> None:
+        """End all connections."""
+
+
+class Pinger(Protocol):
+    """What the loop needs of a simulator."""
+
+    def step(self, pose: ArrayLike, *, noise: NoiseModel | None = None, seed: int = 0) -> SonarFrames:
+        """Render the next ping."""
+
+
+def live_pings(
+    simulator: Pinger,
+    mailbox: PoseMailbox,
+    publisher: LivePublisher,
+    path: Trajectory,
+    *,
+    rate_hz: float,
+    noise: NoiseModel | None = None,
+    seed: int = 0,
+    quiet_s: float = 2.0,
+    ends: Event | None = None,
+) -> Iterator[LivePing]:
+    """Ping until told to end, and publish each ping; yield it afterwards.
+
+    A client's pose is rendered at once. The path is played in a circle until the first pose comes, and goes on when none
+    came for a while. A path of a single pose is one ping.
+
+    Args:
+        simulator: of the scene and the sonar.
+        mailbox: where poses arrive.
+        publisher: of the pings.
+        path: is played where no pose comes.
+        rate_hz: pings a second of the path [Hz].
+        noise: drawn from (seed, number of the ping, cell); default none.
+        seed: of the noise.
+        quiet_s: time without a pose after which the path goes on [s].
+        ends: ends the loop between two pings, once it is set; an exception within a ping would leave the renderer broken.
+
+    Raises:
+        MitsonarError: a rate or a time that is not positive.
+    """
+    if not (rate_hz > 0 and quiet_s > 0):
+        raise MitsonarError(f"rate_hz and quiet_s must be positive: got {rate_hz:g}, {quiet_s:g}")
+    ends = Event() if ends is None else ends
+    numbers, next_in_path, heard, due = count(), 0, -float("inf"), time.monotonic()
+    while not ends.is_set():
+        now = time.monotonic()
+        playing = now - heard > quiet_s and (len(path) > 1 or next_in_path == 0)
+        delivered, source = mailbox.take(min(LOOK_S, max(0.0, due - now)) if playing else LOOK_S), "client"
+        if delivered is not None:
+            heard = time.monotonic()
+        elif playing and time.monotonic() >= due:
+            delivered, source = _played(path, next_in_path), "path"
+            next_in_path += 1
+            due = max(due, time.monotonic() - 1 / rate_hz) + 1 / rate_hz
+        else:
+            continue
+        begun = time.perf_counter()
+        try:
+            frames = simulator.step(delivered.asked.pose, noise=noise, seed=seed)
+        except MitsonarError as error:
+            publisher.complain(f"this pose cannot be rendered: {error}")
+            continue
+        ping = _ping(frames, next(numbers), delivered, source, time.perf_counter() - begun)
+        publisher.publish(ping)
+        yield ping
+
+
+def _ping(frames: SonarFrames, number: int, delivered: Delivered, source: str, render_s: float) -> LivePing:
+    """Return a ping with what is known of its pose."""
+    return LivePing(frames, number, delivered.came_ns, source, delivered.asked.mark, delivered.dropped, render_s)
+
+
+def _played(path: Trajectory, number: int) -> Delivered:
+    """Return the pose of a path that is played in a circle."""
+    pose = path.poses[number % len(path)]
+    return Delivered(AskedPose(Pose.from_row(float(value) for value in pose)), time.time_ns(), 0)
+
+
+# ---------------- Poses as messages: JSON of six numbers, or of ROS and Foxglove, in and out
+
+
+SIX = ("x", "y", "z", "pitch", "roll", "heading")
+ALSO = ("id", "header", "timestamp", "frame_id", "pose")
+
+FARTHEST_M = 1e6
+"""No pose lies farther from the origin [m]: single precision would round it to decimetres."""
+
+LONGEST = 2**16
+"""Bytes of a message that asks for a ping, at most."""
+
+ROS = CONVENTIONS["ros-enu"]
+
+
+@dataclass(frozen=True)
+class AskedPose:
+    """A pose that a client asks for.
+
+    Attributes:
+        pose: of the sonar [m, rad].
+        mark: what the client's message has in ``id``, which the timing of the ping returns.
+    """
+
+    pose: Pose
+    mark: PlainValue = None
+
+
+def asked_pose(message: bytes) -> AskedPose:
+    """Read a pose from JSON.
+
+    Two forms are read. ``{"x", "y", "z", "pitch", "roll", "heading"}`` are mitsonar's own, in m and deg; what is left out is
+    0. ``{"pose": {"position": {"x", "y", "z"}, "orientation": {"x", "y", "z", "w"}}}``, as ``foxglove.PoseInFrame`` and
+    ``geometry_msgs/PoseStamped`` have it, follows REP 103: x forward, y to port, z up.
+
+    Raises:
+        MitsonarError: not JSON, unknown or missing keys, no numbers, a turn of length 0, or beyond 1000 km.
+    """
+    if len(message) > LONGEST:
+        raise MitsonarError(f"a pose is at most {LONGEST:,} bytes: got {len(message):,}")
+    table = parse_json(message, "the pose")
+    if not isinstance(table, dict):
+        raise MitsonarError(
+            f"a pose is a JSON object of {', '.join(SIX)} (m, deg), or has a key pose: got {shortened(table)}"
+        )
+    unknown = [key for key in table if key not in (*SIX, *ALSO)]
+    if unknown:
+        raise MitsonarError(
+            f"a pose has no key {shortened(unknown[0])}{meant(unknown[0], SIX)}: give {', '.join(SIX)} in m and deg, or pose"
+        )
+    mark = table.get("id")
+    if not isinstance(mark, int | float | str | None) or (isinstance(mark, float) and not math.isfinite(mark)):
+        raise MitsonarError(f"id of a pose is a finite number or a text: got {shortened(mark)}")
+    if "pose" in table:
+        both = [key for key in SIX if key in table]
+        if both:
+            raise MitsonarError(f"a pose gives pose or {both[0]}, not both")
+        inner = _table(table["pose"], "pose", ("position", "orientation"))
+        position = _numbers(inner.get("position", {}), "position", ("x", "y", "z"))
+        turn = _numbers(inner.get("orientation", {"w": 1.0}), "orientation", ("x", "y", "z", "w"))
+        return AskedPose(pose_from_ros(position, turn), mark)
+    if not any(key in table for key in SIX):
+        raise MitsonarError(f"a pose has none of {', '.join(SIX)}, and no pose: give numbers in m and deg")
+    values = _numbers({key: table[key] for key in SIX if key in table}, "pose", SIX)
+    return AskedPose(_near(Pose.from_degrees(values)), mark)
+
+
+def pose_from_ros(position: ArrayLike, quaternion: ArrayLike) -> Pose:
+    """Return mitsonar's pose for one of REP 103.
+
+    Args:
+        position: x, y, z [m], z up.
+        quaternion: x, y, z, w, from (forward, port, up) to the world.
+
+    Raises:
+        MitsonarError: a quaternion of length 0, or a position beyond 1000 km.
+    """
+    turn = np.asarray(quaternion, dtype=float)
+    length = float(np.linalg.norm(turn))
+    if not 1e-6 < length < 1e6:
+        raise MitsonarError(f"the orientation of a pose must be a quaternion of length 1: got length {length:g}")
+    placed, rotation = ROS.to_ours(np.asarray(position, dtype=float).reshape(1, 3), Rotation.from_quat(turn[None] / length))
+    return _near(Pose(*(float(value) for value in poses_from(placed, rotation)[0])))
+
+
+def pose_in_ros(pose: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return position ``(3,)`` [m] and quaternion ``(4,)`` x, y, z, w of a pose, after REP 103."""
+    table = np.atleast_2d(np.asarray(pose, dtype=float))
+    position, rotation = ROS.from_ours(table[:, :3], vehicle_rotation(table))
+    return position[0], rotation.as_quat(canonical=True)[0]
+
+
+def _near(pose: Pose) -> Pose:
+    """Return a pose whose numbers can be rendered.
+
+    Raises:
+        MitsonarError: they cannot.
+    """
+    if max(abs(value) for value in pose[:3]) > FARTHEST_M:
+        raise MitsonarError(
+            f"a pose must lie within {FARTHEST_M:g} m of the origin: got {', '.join(f'{v:g}' for v in pose[:3])}"
+        )
+    return pose
+
+
+def _table(value: PlainValue, name: str, keys: tuple[str, ...]) -> dict[str, PlainValue]:
+    """Return a table with known keys only.
+
+    Raises:
+        MitsonarError: it is no table, or has others.
+    """
+    if not isinstance(value, dict):
+        raise MitsonarError(f"{name} must be an object with {', '.join(keys)}: got {shortened(value)}")
+    unknown = [key for key in value if key not in keys]
+    if unknown:
+        raise MitsonarError(f"{name} has no key {shortened(unknown[0])}: it has {', '.join(keys)}")
+    return value
+
+
+def _numbers(value: PlainValue, name: str, keys: tuple[str, ...]) -> list[float]:
+    """Return the numbers of a table; 0 where a key is left out.
+
+    Raises:
+        MitsonarError: other keys, or no finite numbers.
+    """
+    table = _table(value, name, keys)
+    for key, number in table.items():
+        fine = isinstance(number, int | float) and not isinstance(number, bool)
+        if not fine or not math.isfinite(number):
+            raise MitsonarError(f"{key} of {name} must be a finite number: got {shortened(number)}")
+    return [float(table.get(key, 0.0)) for key in keys]
+
+
+# ---------------- The place where poses arrive and the loop takes the newest: older ones that no ping took are dropped
+
+
+@dataclass(frozen=True)
+class Delivered:
+    """A pose and when it came.
+
+    Attributes:
+        asked: what a client asked for.
+        came_ns: wall clock at its arrival [ns].
+        dropped: poses that came before it and that no ping took.
+    """
+
+    asked: AskedPose
+    came_ns: int
+    dropped: int
+
+
+class PoseMailbox:
+    """Holds the newest pose. Threads of a server put, the loop takes."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._newest: Delivered | None = None
+
+    def put(self, asked: AskedPose) -> None:
+        """Deliver a pose in place of the one that waits."""
+        with self._changed:
+            waiting = self._newest
+            dropped = 0 if waiting is None else waiting.dropped + 1
+            self._newest = Delivered(asked, time.time_ns(), dropped)
+            self._changed.notify_all()
+
+    def take(self, wait_s: float) -> Delivered | None:
+        """Return the newest pose and empty the box; wait for one at most that long [s]. None: none came."""
+        with self._changed:
+            if self._newest is None and wait_s > 0:
+                self._changed.wait(wait_s)
+            taken, self._newest = self._newest, None
+            return taken
+
+
+# ---------------- A ping as messages: the fan as JPEG, the polar image as ROS 2 has it, its timing
+
+
+PROJECTED_TYPE = "marine_acoustic_msgs/msg/ProjectedSonarImage"
+
+PROJECTED = "\n".join(
+    (
+        "std_msgs/Header header",
+        "marine_acoustic_msgs/PingInfo ping_info",
+        "geometry_msgs/Vector3[] beam_directions",
+        "float32[] ranges",
+        "marine_acoustic_msgs/SonarImageData image",
+        "=" * 80,
+        "MSG: std_msgs/Header",
+        "builtin_interfaces/Time stamp",
+        "string frame_id",
+        "=" * 80,
+        "MSG: builtin_interfaces/Time",
+        "int32 sec",
+        "uint32 nanosec",
+        "=" * 80,
+        "MSG: marine_acoustic_msgs/PingInfo",
+        "float32 frequency",
+        "float32 sound_speed",
+        "float32[] tx_beamwidths",
+        "float32[] rx_beamwidths",
+        "=" * 80,
+        "MSG: geometry_msgs/Vector3",
+        "float64 x",
+        "float64 y",
+        "float64 z",
+        "=" * 80,
+        "MSG: marine_acoustic_msgs/SonarImageData",
+        "bool is_bigendian",
+        "uint32 dtype",
+        "uint32 beam_count",
+        "uint8[] data",
+        "",
+    )
+)
+"""Definition of the message as ROS 2 writes it, without constants and comments."""
+
+UINT8 = 0
+
+
+class FanEncoder:
+    """Encodes frames of one sonar as JPEG fans: those of :class:`FanPictures` to one step of 255, by a sparse matrix.
+
+    Args:
+        quality: of JPEG, 1..95.
+    """
+
+    def __init__(self, quality: int = 85) -> None:
+        self.quality = quality
+        self._inside: NDArray[np.intp] | None = None
+
+    def jpeg(self, frames: SonarFrames, index: int = 0) -> bytes:
+        """Return one frame's fan, forward up, starboard to the right, grey; black outside the fan."""
+        buffer = io.BytesIO()
+        Image.fromarray(self.picture(frames, index)).save(buffer, format="JPEG", quality=self.quality)
+        return buffer.getvalue()
+
+    def picture(self, frames: SonarFrames, index: int = 0) -> NDArray[np.uint8]:
+        """Return one frame's fan ``(rows, columns)``, 0..255."""
+        if self._inside is None:
+            fan = FanPictures(frames).fan
+            self._shape = fan.index.shape[1:]
+            self._inside = np.flatnonzero(fan.weight.any(axis=0))
+            cells = fan.index.reshape(4, -1)[:, self._inside].T
+            parts = fan.weight.reshape(4, -1)[:, self._inside].T
+            rows = np.arange(0, 4 * len(cells) + 1, 4)
+            size = (len(cells), frames.image[0].size)
+            self._matrix = csr_array((parts.ravel(), cells.ravel().astype(np.int32), rows), shape=size)
+        image = frames.image[index]
+        levels = image if image.dtype == np.uint8 else to_uint8(image)  # beam by beam, as sonars send them
+        picture = np.zeros(self._shape, np.uint8)
+        picture.reshape(-1)[self._inside] = self._matrix @ levels.reshape(-1).astype(np.float32) + np.float32(0.5)
+        return picture
+
+
+def projected_image(frames: SonarFrames, time_ns: int, frame_id: str, index: int = 0) -> bytes:
+    """Encode a frame as ``marine_acoustic_msgs/msg/ProjectedSonarImage`` in CDR, little-endian.
+
+    Beams lie in the message's own axes: z forward, x up, y to starboard. Data are 8 bit, all beams of the nearest range
+    first.
+
+    Args:
+        frames: whose frame it is.
+        time_ns: of the ping [ns].
+        frame_id: name of the sonar's axes.
+        index: of the frame.
+    """
+    sonar, image = frames.sonar, frames.image[index]
+    bearing = np.asarray(frames.bearing_rad, dtype=float)
+    directions = np.column_stack([np.zeros(len(bearing)), np.sin(bearing), np.cos(bearing)])
+    writer = _Cdr()
+    writer.pack("<iI", *divmod(time_ns, 10**9))
+    writer.text(frame_id)
+    writer.pack("<ff", sonar.frequency_hz or 0.0, sonar.sound_speed)
+    writer.array(np.full(len(bearing), np.radians(sonar.elevation_fov_deg), np.float32))
+    writer.array(np.full(len(bearing), sonar.beam_width_rad, np.float32))
+    writer.array(directions, len(directions))
+    writer.array(frames.range_m.astype(np.float32))
+    writer.pack("<?", False)
+    writer.pack("<II", UINT8, len(bearing))
+    writer.array(np.ascontiguousarray(image if image.dtype == np.uint8 else to_uint8(image)))
+    return bytes(writer.content)
+
+
+def timing(ping: LivePing, published_ns: int | None = None) -> dict[str, PlainValue]:
+    """Return number, pose, source and times of a ping, as JSON can hold them."""
+    assert ping.frames.poses is not None
+    six = ping.frames.poses[0]
+    angles = np.degrees(six[3:])
+    now = time.time_ns() if published_ns is None else published_ns
+    return {
+        "number": ping.number,
+        "id": ping.mark,
+        "source": ping.source,
+        "dropped": ping.dropped,
+        "pose_ns": ping.time_ns,
+        "published_ns": now,
+        "render_ms": round(1e3 * ping.render_s, 3),
+        "latency_ms": round((now - ping.time_ns) / 1e6, 3),
+        "x": float(six[0]),
+        "y": float(six[1]),
+        "z": float(six[2]),
+        "pitch": float(angles[0]),
+        "roll": float(angles[1]),
+        "heading": float(angles[2]),
+    }
+
+
+class _Cdr:
+    """Writes the common data representation: values aligned to their own size, counted from after the first 4 bytes."""
+
+    def __init__(self) -> None:
+        self.content = bytearray(b"\x00\x01\x00\x00")
+
+    def align(self, size: int) -> None:
+        self.content += bytes(-(len(self.content) - 4) % size)
+
+    def pack(self, form: str, *values: float) -> None:
+        """Append numbers of one size."""
+        self.align(struct.calcsize(form[:2]))
+        self.content += struct.pack(form, *values)
+
+    def text(self, text: str) -> None:
+        encoded = text.encode() + b"\x00"
+        self.pack("<I", len(encoded))
+        self.content += encoded
+
+    def array(self, values: NDArray[Any], length: int | None = None) -> None:
+        """Append an array with its length; ``length`` where its elements are rows."""
+        self.pack("<I", values.size if length is None else length)
+        if values.size:
+            self.align(values.itemsize)
+            self.content += values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes()

@@ -1,0 +1,421 @@
+"""Bodies of a scene of another simulator: links or prims with a place and geometries of their own."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NoReturn, TypeAlias
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from mitsonar.errors import MitsonarError, shortened
+from mitsonar.io.files import read_bytes
+from mitsonar.worlds.meshes import MOST_TRIANGLES, UP, Piece, read_pieces
+
+__all__ = [
+    "Body",
+    "Matrix",
+    "ModelSearch",
+    "ReadScene",
+    "Shapes",
+    "attribute_of",
+    "number_of",
+    "numbers_of",
+    "placed",
+    "primitive",
+    "read_xml",
+    "refused",
+    "rigid",
+]
+
+
+Matrix: TypeAlias = NDArray[np.float64]
+"""From the axes of a body to others, ``(4, 4)``; lengths in m."""
+
+SECTIONS = 96
+"""Corners around a cylinder: its side is flat to 0.05 % of its radius."""
+
+SUBDIVISIONS = 4
+"""Halvings of the edges of a sphere, which is then flat to 0.1 % of its radius."""
+
+PLANE_M = 100.0
+"""Edge of a plane without a size [m]."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A link or prim.
+
+    Attributes:
+        name: becomes the id of its shape.
+        pose: from its axes to the world.
+        pieces: in its axes.
+        within: names of what it belongs to: models, prims above it, the robot.
+    """
+
+    name: str
+    pose: Matrix
+    pieces: list[Piece]
+    within: tuple[str, ...] = ()
+
+
+@dataclass
+class ReadScene:
+    """What was read of a file.
+
+    Attributes:
+        bodies: with geometries.
+        frames: pose of each name that a body may have or lie within.
+        left_out: what was not read, by kind, and how often.
+    """
+
+    bodies: list[Body] = field(default_factory=list)
+    frames: dict[str, Matrix] = field(default_factory=dict)
+    left_out: dict[str, int] = field(default_factory=dict)
+
+    def leave_out(self, kind: str) -> None:
+        """Count something that is not read."""
+        self.left_out[kind] = self.left_out.get(kind, 0) + 1
+
+
+def placed(position: ArrayLike, rotation: Rotation | None = None) -> Matrix:
+    """Return the matrix of a position ``(3,)`` [m] and a rotation."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    if rotation is not None:
+        matrix[:3, :3] = rotation.as_matrix()
+    return matrix
+
+
+def rigid(matrix: Matrix) -> Matrix:
+    """Return the nearest matrix that only turns and moves; scales, shears and mirrors are taken out."""
+    first, _, last = np.linalg.svd(matrix[:3, :3])
+    turn = first @ np.diag([1, 1, np.linalg.det(first @ last)]) @ last
+    return placed(matrix[:3, 3], Rotation.from_matrix(turn))
+
+
+def _box(size: Mapping[str, float]) -> trimesh.Trimesh:
+    made: trimesh.Trimesh = trimesh.creation.box((size["x"], size["y"], size["z"]))
+    return made
+
+
+def _sphere(size: Mapping[str, float]) -> trimesh.Trimesh:
+    made: trimesh.Trimesh = trimesh.creation.icosphere(SUBDIVISIONS, size["radius"])
+    return made
+
+
+def _ellipsoid(size: Mapping[str, float]) -> trimesh.Trimesh:
+    ball = trimesh.creation.icosphere(SUBDIVISIONS, 1.0)
+    return trimesh.Trimesh(ball.vertices * (size["x"], size["y"], size["z"]), ball.faces, process=False)
+
+
+def _cylinder(size: Mapping[str, float]) -> trimesh.Trimesh:
+    made: trimesh.Trimesh = trimesh.creation.cylinder(size["radius"], size["length"], SECTIONS)
+    return made
+
+
+def _capsule(size: Mapping[str, float]) -> trimesh.Trimesh:
+    made = trimesh.creation.capsule(size["length"], size["radius"], count=[SECTIONS, SECTIONS // 2])
+    return trimesh.Trimesh(made.vertices - made.bounds.mean(axis=0), made.faces, process=False)
+
+
+def _cone(size: Mapping[str, float]) -> trimesh.Trimesh:
+    made = trimesh.creation.cone(size["radius"], size["length"], SECTIONS)
+    return trimesh.Trimesh(made.vertices - (0, 0, size["length"] / 2), made.faces, process=False)
+
+
+def _plane(size: Mapping[str, float]) -> trimesh.Trimesh:
+    corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) / 2 * (size["x"], size["y"], 1)
+    return trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
+
+
+PRIMITIVES: dict[str, Callable[[Mapping[str, float]], trimesh.Trimesh]] = {
+    "box": _box,
+    "sphere": _sphere,
+    "ellipsoid": _ellipsoid,
+    "cylinder": _cylinder,
+    "capsule": _capsule,
+    "cone": _cone,
+    "plane": _plane,
+}
+"""Primitives about their middle, cylinders, capsules and cones along z; ``length`` of a capsule is that of its cylinder."""
+
+
+def primitive(kind: str, size: Mapping[str, float], reflectivity: float, source: str) -> Piece:
+    """Return a primitive of :data:`PRIMITIVES`.
+
+    Args:
+        kind: its name.
+        size: ``x``, ``y``, ``z``, or ``radius`` and ``length`` [m].
+        reflectivity: of all of it, 0..1.
+        source: what names it, for errors.
+
+    Raises:
+        MitsonarError: a size is not above 0.
+    """
+    wrong = [f"{name} {value:g}" for name, value in size.items() if not 1e-6 <= value <= 1e6]
+    if wrong:
+        raise MitsonarError(f"{source}: a {kind} needs sizes of 1e-6 to 1e6 m: got {wrong[0]}")
+    made = PRIMITIVES[kind](size)
+    vertices, faces = np.asarray(made.vertices, dtype=float), np.asarray(made.faces)
+    return Piece(vertices, faces, np.full(len(faces), reflectivity))
+
+
+class Shapes:
+    """Reads geometries, each file once, and bounds their number.
+
+    Args:
+        value: ``red``, ``luminance`` or a number: what of a colour is the reflectivity.
+    """
+
+    def __init__(self, value: str | float) -> None:
+        self.value = value
+        self._files: dict[Path, list[Piece]] = {}
+        self._triangles = 0
+
+    def counted(self, pieces: list[Piece], source: str) -> list[Piece]:
+        """Return pieces, and count their triangles.
+
+        Raises:
+            MitsonarError: all together have too many.
+        """
+        self._triangles += sum(len(piece.faces) for piece in pieces)
+        if self._triangles > MOST_TRIANGLES:
+            raise MitsonarError(f"{source} places more than {MOST_TRIANGLES:,} triangles: give a smaller scene")
+        return pieces
+
+    def of_file(self, path: Path, scale: ArrayLike, reflectivity: float | None) -> list[Piece]:
+        """Return the geometries of a model file, z upwards, in m.
+
+        Args:
+            path: of the file; glTF has y upwards, and COLLADA tells its unit.
+            scale: along its axes ``(3,)``.
+            reflectivity: of all of it, in place of its colours; default: by its colours.
+
+        Raises:
+            MitsonarError: it cannot be read.
+        """
+        if path not in self._files:
+            self._files[path] = read_pieces(path, self.value)
+        suffix = path.suffix.lower()
+        unit = _unit_m(path) if suffix == ".dae" else 1.0
+        turn = np.asarray(UP["y" if suffix in (".glb", ".gltf") else "z"], dtype=float) * unit
+        pieces = [piece.moved(np.diag(np.asarray(scale, dtype=float)) @ turn, np.zeros(3)) for piece in self._files[path]]
+        return [piece if reflectivity is None else piece.uniform(reflectivity) for piece in self.counted(pieces, str(path))]
+
+
+def _unit_m(path: Path) -> float:
+    """Return the unit of a COLLADA file [m]."""
+    for element in read_xml(path, "COLLADA file").iter():
+        if element.tag.endswith("}unit") or element.tag == "unit":
+            unit = number_of(path, element, element.get("meter"), 1.0)
+            return unit if 1e-9 <= unit <= 1e9 else 1.0
+    return 1.0
+
+
+# ---------------- Files that a scene names: found within its own folder and the folders that the user allows, and
+# nowhere else
+
+
+LONGEST = 1024
+"""Letters of a file's name in a scene, at most."""
+
+PACKAGES = ("model://", "package://")
+"""Begin of names whose next word is the name of a folder, of Gazebo and ROS."""
+
+
+class ModelSearch:
+    """Finds the files that a scene names.
+
+    Args:
+        file: of the scene.
+        folders: where models and packages lie as well.
+
+    Attributes:
+        roots: folders within which a file must lie, without links.
+
+    Raises:
+        MitsonarError: the file, or one of the folders, is not there.
+    """
+
+    def __init__(self, file: Path, folders: Sequence[str | Path] = ()) -> None:
+        if not os.path.lexists(file):
+            raise MitsonarError(f"no such file: {file}")
+        missing = [folder for folder in folders if not os.path.isdir(folder)]
+        if missing:
+            raise MitsonarError(f"there is no folder {missing[0]} to search: give a folder that holds models or packages")
+        roots = (_without_links(file).parent, *(_without_links(folder) for folder in folders))
+        self.roots = list(dict.fromkeys(roots))  # each once
+
+    def find(self, name: str, beside: Path) -> Path:
+        """Return the file or folder that a scene names.
+
+        Args:
+            name: a path, or ``model://``, ``package://`` or ``file://`` and one. ``model://NAME/...`` is the folder NAME
+                within a folder that is searched, or that folder itself.
+            beside: file that names it; a path without a scheme counts from there, then from the folders that are searched.
+
+        Raises:
+            MitsonarError: it is not there, lies outside the folders, or is an address of the net.
+        """
+        name = name.strip()
+        if len(name) > LONGEST or "\0" in name or not name:
+            raise MitsonarError(f"{beside} names the file {shortened(name)}: give a path of 1 to {LONGEST} letters")
+        scheme = next((scheme for scheme in PACKAGES if name.startswith(scheme)), "")
+        if not scheme and "://" in name and not name.startswith("file://"):
+            raise MitsonarError(
+                f"{beside} names {shortened(name)}: nothing is fetched from the net; download it, name it model://..., and "
+                "give the folder by --search"
+            )
+        for candidate in self._candidates(name, scheme, beside):
+            found = _without_links(candidate)
+            if any(found.is_relative_to(root) for root in self.roots) and os.path.exists(found):
+                return found
+        candidates = [_without_links(path) for path in self._candidates(name, scheme, beside)]
+        inside = any(path.is_relative_to(root) for path in candidates for root in self.roots)
+        outside = any(os.path.exists(path) for path in candidates)
+        missing = "there is no such file" if inside and not outside else "which is not"
+        raise MitsonarError(
+            f"{beside} names {shortened(name)}, {missing} within {', '.join(map(str, self.roots))}: give the folder that "
+            "holds it by --search"
+        )
+
+    def _candidates(self, name: str, scheme: str, beside: Path) -> list[Path]:
+        """List where a file may lie."""
+        path = Path(name.removeprefix(scheme) if scheme else name.removeprefix("file://"))
+        if not scheme:
+            return [beside.parent / path, *(root / path for root in self.roots)]
+        package, *rest = [part for part in path.parts if part not in ("/", ".")] or [""]
+        return [
+            *(root / package / Path(*rest) for root in self.roots),
+            *(root / Path(*rest) for root in self.roots if root.name == package),
+        ]
+
+
+def _without_links(path: str | Path) -> Path:
+    """Return a path without links. One that leads to itself stays as it is, where :meth:`Path.resolve` raises."""
+    return Path(os.path.realpath(path))
+
+
+# ---------------- XML of strangers: no document types, so no entities; a bounded size, depth and number of elements
+
+
+DEEPEST = 100
+"""Largest depth of nested elements."""
+
+MOST_ELEMENTS = 2_000_000
+"""Largest number of elements of a file."""
+
+LARGEST = 2**28
+"""Largest size of a file [bytes]."""
+
+FARTHEST = 1e9
+"""Largest number that a file may give [m, rad]."""
+
+
+class _Bounded(TreeBuilder):
+    """Builds a tree of a bounded depth and size, and no document type."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.depth = self.count = 0
+
+    def start(self, tag: str, attrs: dict[str, str]) -> Element:
+        self.depth += 1
+        self.count += 1
+        if self.depth > DEEPEST:
+            raise ValueError(f"its elements nest more than {DEEPEST} deep")
+        if self.count > MOST_ELEMENTS:
+            raise ValueError(f"it has more than {MOST_ELEMENTS:,} elements")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str) -> Element:
+        self.depth -= 1
+        return super().end(tag)
+
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> NoReturn:
+        """Refuse a document type before anything of it is read: entities may name files, or grow without bound."""
+        raise ValueError("it has a document type (<!DOCTYPE>), which scenes do not need")
+
+
+def read_xml(path: Path, what: str) -> Element:
+    """Read the tree of an XML file.
+
+    Args:
+        path: of the file.
+        what: kind of file, for errors: ``URDF file``.
+
+    Raises:
+        MitsonarError: it is unreadable, no XML, has a document type, or is too large or too deep.
+    """
+    parser = XMLParser(target=_Bounded())
+    try:
+        parser.feed(read_bytes(path, what, LARGEST))
+        tree = parser.close()
+    except (ParseError, ValueError, LookupError) as error:
+        if isinstance(error, MitsonarError):
+            raise
+        raise MitsonarError(f"{path} is no {what}: {' '.join(str(error).split())[:160]}; export it again") from None
+    assert isinstance(tree, Element)
+    return tree
+
+
+def refused(path: Path, element: Element, reason: str) -> MitsonarError:
+    """Return the error for an element of a file; ``reason`` is what, got, allowed."""
+    name = element.get("name")
+    where = f"<{element.tag[:40]}{f' name={shortened(name)}' if name else ''}>"
+    return MitsonarError(f"{path}, {where}: {reason}")
+
+
+def attribute_of(path: Path, element: Element, key: str) -> str:
+    """Return an attribute that must be there.
+
+    Raises:
+        MitsonarError: it is missing or empty.
+    """
+    value = element.get(key)
+    if not value:
+        raise refused(path, element, f"the attribute {key} is missing")
+    return value
+
+
+def numbers_of(path: Path, element: Element, text: str | None, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the numbers of an attribute or of the text of an element, separated by spaces.
+
+    Args:
+        path: of the file, for errors.
+        element: for errors.
+        text: of the numbers; None or empty: ``default``.
+        count: how many.
+        default: numbers where there is no text.
+
+    Raises:
+        MitsonarError: not that many finite numbers, or too large ones.
+    """
+    if text is None or not text.strip():
+        return default
+    try:
+        values = tuple(float(word) for word in text.split()) if "_" not in text else ()
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(math.isfinite(value) and abs(value) <= FARTHEST for value in values):
+        raise refused(path, element, f"{count} finite numbers up to {FARTHEST:g} are needed: got {shortened(text.strip())}")
+    return values
+
+
+def number_of(path: Path, element: Element, text: str | None, default: float | None = None) -> float:
+    """Return one number, as :func:`numbers_of` reads it.
+
+    Raises:
+        MitsonarError: it is no finite number, or missing and without a default.
+    """
+    if default is None and (text is None or not text.strip()):
+        raise refused(path, element, "a number is missing")
+    return numbers_of(path, element, text, 1, (default or 0.0,))[0]

@@ -1,0 +1,228 @@
+"""Frames, scene and paths as a recording of Rerun: fan, polar image, levels, meshes, the wedge of the beams, poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from mitsonar.bridges.live import FanEncoder
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.mapping.sources import FrameSource
+from mitsonar.motion.pose import vehicle_rotation
+from mitsonar.motion.trajectory import Trajectory
+from mitsonar.records.frames import SonarFrames, to_uint8
+from mitsonar.simulation.scene import Triangles
+
+__all__ = ["Shown", "first_eye", "lit_corners", "wedge_lines", "write_recording"]
+
+AT_ONCE = 16
+"""Frames that are read at once."""
+
+BOXED, TRUE, ESTIMATED, BEAMS = (110, 110, 140), (90, 200, 90), (240, 140, 40), (80, 170, 250)
+WHOLE = ((168, 158, 132), (128, 132, 138), (160, 118, 92))
+"""Colours of the shapes in turn: one colour for all hides a wreck on its seabed."""
+
+BEHIND = np.array([0.54, -0.64, 0.54])
+"""Direction of the eye at first, to starboard, forward and up of a sonar that is level."""
+
+HALF_VIEW_RAD = np.radians(27.5)
+"""Half of the viewer's field of view."""
+
+LINE = rr.Radius.ui_points(1.5)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a recording shows.
+
+    Attributes:
+        name: of what is shown.
+        source: the frames; None: only the scene.
+        sonar: the instrument, for the wedge of its beams; None: no wedge.
+        path: of the sonar; None: the poses of the frames.
+        shapes: of the scene.
+        estimated: paths beside the true one, by name.
+    """
+
+    name: str
+    source: FrameSource | None = None
+    sonar: Sonar | None = None
+    path: Trajectory | None = None
+    shapes: Sequence[Triangles] = ()
+    estimated: dict[str, Trajectory] = field(default_factory=dict)
+
+
+def write_recording(shown: Shown, path: Path | None, progress: Callable[[int], None] = lambda done: None) -> list[str]:
+    """Write what is shown as a recording (.rrd), whole or absent; without a path, open the viewer and send it there.
+
+    Args:
+        shown: frames, scene and paths.
+        path: of the file.
+        progress: is called with how many more frames are done.
+
+    Returns:
+        Names of the shapes of which only boxes are shown.
+
+    Raises:
+        MitsonarError: nothing to show.
+    """
+    if shown.source is None and not shown.shapes and shown.path is None:
+        raise MitsonarError(f"{shown.name} has no frames, no scene and no path: there is nothing to show")
+    recording = rr.RecordingStream("mitsonar", send_properties=False)
+    part = None if path is None else path.with_name(f".{path.name}.part")
+    if part is None:
+        recording.spawn()
+    else:
+        recording.save(part)
+    try:
+        recording.send_blueprint(_blueprint(shown))
+        _log_still(recording, shown)
+        if shown.source is not None:
+            _log_frames(recording, shown.source, progress)
+        elif shown.path is not None:
+            for pose, time in zip(shown.path.poses, shown.path.time_s, strict=True):
+                recording.set_time("time", duration=float(time))
+                _log_pose(recording, pose)
+        recording.flush()
+        recording.disconnect()
+    except BaseException:
+        recording.disconnect()
+        if part is not None:
+            part.unlink(missing_ok=True)
+        raise
+    if part is not None and path is not None:
+        part.replace(path)
+    return [one.name for one in shown.shapes if not one.whole]
+
+
+def _blueprint(shown: Shown) -> rrb.Blueprint:
+    """Arrange the views: the world beside fan, polar image and levels, of what there is."""
+    places = first_eye(shown)
+    eye = None if places is None else rrb.EyeControls3D(position=places[0], look_target=places[1], eye_up=(0, 0, 1))
+    world = [rrb.Spatial3DView(origin="world", name="world", eye_controls=eye)]
+    if shown.source is None:
+        return rrb.Blueprint(*world, collapse_panels=True)
+    has_world = bool(shown.shapes or shown.estimated or shown.path is not None or shown.source.poses is not None)
+    below = rrb.Horizontal(
+        rrb.Spatial2DView(origin="polar", name="polar"),
+        rrb.TimeSeriesView(origin="levels", name="levels", axis_y=rrb.ScalarAxis(range=(0, 1.02))),
+        rrb.BarChartView(origin="levels_by_range", name="mean by range"),
+    )
+    images = rrb.Vertical(rrb.Spatial2DView(origin="fan", name="fan"), below, row_shares=[2, 1])
+    return rrb.Blueprint(rrb.Horizontal(*(world if has_world else []), images), collapse_panels=True)
+
+
+def first_eye(shown: Shown) -> NDArray[np.float64] | None:
+    """Return where the eye is at first and at what it looks ``(2, 3)`` [m]; None: there is no pose to look at.
+
+    It sees path and beams from behind and above: the scene may be many times as large.
+    """
+    known = [] if shown.path is None else [shown.path.poses]
+    if shown.source is not None and shown.source.poses is not None:
+        known.append(shown.source.poses)
+    poses = np.concatenate([*known, *(one.poses for one in shown.estimated.values()), np.empty((0, 6))])
+    poses = poses[np.isfinite(poses).all(axis=1)]  # a recording may lack depth or attitude
+    if not len(poses):
+        return None
+    edges = np.zeros((1, 3)) if shown.sonar is None else np.concatenate(wedge_lines(shown.sonar))
+    seen = [vehicle_rotation(pose).apply(edges) + pose[:3] for pose in poses[[0, len(poses) // 2, -1]]]
+    points = np.concatenate([poses[:, :3], *seen])
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    if radius == 0:
+        return None
+    away = Rotation.from_rotvec([0, 0, -float(poses[len(poses) // 2, 5])]).apply(BEHIND / np.linalg.norm(BEHIND))
+    return np.stack([centre + radius / np.sin(HALF_VIEW_RAD) * away, centre])
+
+
+def wedge_lines(sonar: Sonar, steps: int = 16) -> list[NDArray[np.float64]]:
+    """Return the edges of the volume that the beams see, as lines ``(points, 3)`` [m] in (starboard, forward, up)."""
+    half = sonar.bearing_rad[[0, -1]] + np.array([-0.5, 0.5]) * sonar.beam_width_rad
+    elevation = np.radians(sonar.elevation_fov_deg) / 2 * np.array([-1, 1])
+    across, up = np.linspace(half[0], half[1], steps), np.linspace(elevation[0], elevation[1], steps)
+    ends = (max(sonar.range_min, 1e-3), sonar.range_max)
+    lines = [radius * _direction(sonar, across, np.full(steps, edge)) for radius in ends for edge in elevation]
+    lines += [radius * _direction(sonar, np.full(steps, edge), up) for radius in ends for edge in half]
+    for bearing in half:
+        for edge in elevation:
+            lines.append(np.array(ends)[:, None] * _direction(sonar, np.array([bearing]), np.array([edge])))
+    return lines
+
+
+def _direction(sonar: Sonar, b: NDArray[np.float64], e: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit vectors ``(n, 3)`` of bearings and elevations [rad], as the sonar measures bearings."""
+    if sonar.bearing == "azimuth":
+        return np.stack([np.cos(e) * np.sin(b), np.cos(e) * np.cos(b), np.sin(e)], -1)
+    return np.stack([np.sin(b), np.cos(b) * np.cos(e), np.cos(b) * np.sin(e)], -1)
+
+
+def lit_corners(shape: Triangles) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return three corners of each face ``(3 faces, 3)`` [m] and the unit normal of the face at each of them.
+
+    Without normals the viewer draws all faces in one colour, so that no relief shows. A face without area has none: zero.
+    """
+    corners = shape.vertices[shape.faces.astype(np.intp)]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+    return corners.reshape(-1, 3), np.repeat(unit, 3, axis=0)
+
+
+def _log_still(recording: rr.RecordingStream, shown: Shown) -> None:
+    """Log what does not move: scene, wedge in the sonar's axes, paths."""
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for number, one in enumerate(shown.shapes):
+        colour = WHOLE[number % len(WHOLE)] if one.whole else BOXED
+        corners, normals = lit_corners(one)
+        mesh = rr.Mesh3D(vertex_positions=corners, vertex_normals=normals, albedo_factor=colour)
+        recording.log(["world", "scene", f"{number:03d} {one.name}"], mesh, static=True)
+    if shown.sonar is not None:
+        wedge = rr.LineStrips3D(wedge_lines(shown.sonar), colors=BEAMS, radii=LINE)
+        recording.log("world/sonar/beams", wedge, static=True)
+    poses = None if shown.path is None else shown.path.poses
+    if poses is None and shown.source is not None:
+        poses = shown.source.poses
+    paths = {} if poses is None else {"path": (poses, TRUE)}
+    paths |= {name: (flown.poses, ESTIMATED if name == "estimated" else TRUE) for name, flown in shown.estimated.items()}
+    for name, (table, colour) in paths.items():
+        line = rr.LineStrips3D([table[:, :3]], colors=colour, radii=LINE)
+        recording.log(["world", "paths", name], line, static=True)
+
+
+def _log_frames(recording: rr.RecordingStream, source: FrameSource, progress: Callable[[int], None]) -> None:
+    """Log frames a few at a time, each at its time: fan, polar image, levels, pose."""
+    encoder = FanEncoder()
+    for first in range(0, len(source), AT_ONCE):
+        index = np.arange(first, min(first + AT_ONCE, len(source)))
+        frames = source.read(index)
+        for place, number in enumerate(index):
+            recording.set_time("frame", sequence=int(number))
+            recording.set_time("time", duration=float(source.time_s[number]))
+            if source.poses is not None:  # those of the frames that are read hide position and heading from estimators
+                _log_pose(recording, source.poses[number])
+            _log_image(recording, encoder, frames, place)
+        progress(len(index))
+
+
+def _log_pose(recording: rr.RecordingStream, pose: NDArray[np.float64]) -> None:
+    turn = vehicle_rotation(pose).as_quat(canonical=True)[0]
+    recording.log("world/sonar", rr.Transform3D(translation=pose[:3], quaternion=rr.Quaternion(xyzw=turn)))
+
+
+def _log_image(recording: rr.RecordingStream, encoder: FanEncoder, frames: SonarFrames, place: int) -> None:
+    image = frames.image[place]
+    levels = image if image.dtype == np.uint8 else to_uint8(image)
+    recording.log("fan", rr.EncodedImage(contents=encoder.jpeg(frames, place), media_type="image/jpeg"))
+    recording.log("polar", rr.Image(levels[::-1]))  # far ranges above, as in the fan
+    shares = levels.astype(np.float32) / 255
+    recording.log("levels/mean", rr.Scalars(float(shares.mean())))
+    recording.log("levels/brightest", rr.Scalars(float(shares.max())))
+    recording.log("levels_by_range", rr.BarChart(shares.mean(axis=1), abscissa=frames.range_m))

@@ -1,0 +1,124 @@
+"""A live sonar as a ROS 2 node: the same topics as the Foxglove server, where rclpy is installed."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import threading
+from typing import Any
+
+from mitsonar.bridges.live import (
+    AskedPose,
+    FanEncoder,
+    LivePing,
+    PoseMailbox,
+    pose_from_ros,
+    pose_in_ros,
+    projected_image,
+    timing,
+)
+from mitsonar.errors import MitsonarError
+
+__all__ = ["RosNode"]
+
+
+class RosNode:
+    """Publishes pings as ROS 2 messages, and puts the poses of the topic ``pose`` into a mailbox.
+
+    ``sonar/image`` is published where ``marine_acoustic_msgs`` is installed.
+
+    Args:
+        mailbox: where poses go.
+        name: of the node.
+
+    Raises:
+        MitsonarError: rclpy or the standard messages are not installed.
+    """
+
+    def __init__(self, mailbox: PoseMailbox, name: str = "mitsonar") -> None:
+        self._rclpy, messages = _ros("rclpy"), _ros("geometry_msgs.msg")
+        self._messages, self._sensor, self._text = messages, _ros("sensor_msgs.msg"), _ros("std_msgs.msg")
+        self._mailbox, self._encoder = mailbox, FanEncoder()
+        self._rclpy.init(args=[])
+        self.node = self._rclpy.create_node(name)
+        self._fan = self.node.create_publisher(self._sensor.CompressedImage, "sonar/fan/compressed", 4)
+        self._pose = self.node.create_publisher(messages.PoseStamped, "sonar/pose", 4)
+        self._timing = self.node.create_publisher(self._text.String, "sonar/timing", 4)
+        self._transform = _ros("tf2_ros").TransformBroadcaster(self.node)
+        try:
+            polar = importlib.import_module("marine_acoustic_msgs.msg").ProjectedSonarImage
+        except ModuleNotFoundError:
+            self._polar = None
+            self.complain("marine_acoustic_msgs is not installed: sonar/image is not published")
+        else:
+            self._polar = self.node.create_publisher(polar, "sonar/image", 4)
+        self.node.create_subscription(messages.PoseStamped, "pose", self._take, 1)
+        self._spinning = threading.Thread(target=self._spin, daemon=True)
+        self._spinning.start()
+
+    def publish(self, ping: LivePing) -> None:
+        """Publish a ping. The polar image goes as its bytes, which rclpy takes in place of a message."""
+        frames, when = ping.frames, ping.time_ns
+        assert frames.poses is not None
+        place, turn = pose_in_ros(frames.poses[0])
+        pose, moved = self._messages.PoseStamped(), self._messages.TransformStamped()
+        fan = self._sensor.CompressedImage()
+        for message, frame in ((pose, "world"), (moved, "world"), (fan, "sonar")):
+            message.header.frame_id = frame
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(when, 10**9)
+        moved.child_frame_id = "sonar"
+        for key, value in zip("xyz", place, strict=True):
+            setattr(pose.pose.position, key, float(value))
+            setattr(moved.transform.translation, key, float(value))
+        for key, value in zip("xyzw", turn, strict=True):
+            setattr(pose.pose.orientation, key, float(value))
+            setattr(moved.transform.rotation, key, float(value))
+        self._transform.sendTransform(moved)
+        self._pose.publish(pose)
+        fan.format, fan.data = "jpeg", self._encoder.jpeg(frames)
+        self._fan.publish(fan)
+        if self._polar is not None:
+            self._polar.publish(projected_image(frames, when, "sonar"))
+        self._timing.publish(self._text.String(data=json.dumps(timing(ping))))
+
+    def complain(self, sentence: str) -> None:
+        """Log a warning of the node."""
+        self.node.get_logger().warning(sentence)
+
+    def close(self) -> None:
+        """End the node."""
+        self._rclpy.try_shutdown()
+        self._spinning.join(timeout=2)
+
+    def _spin(self) -> None:
+        """Take messages until the node is shut down; Ctrl-C is the main thread's."""
+        try:
+            self._rclpy.spin(self.node)
+        except Exception:  # rclpy raises its own ExternalShutdownException, of a name that versions change
+            if self._rclpy.ok():
+                raise
+
+    def _take(self, message: Any) -> None:
+        """Take a pose, or refuse it with one sentence."""
+        place, turn = message.pose.position, message.pose.orientation
+        try:
+            pose = pose_from_ros([place.x, place.y, place.z], [turn.x, turn.y, turn.z, turn.w])
+        except MitsonarError as error:
+            self.complain(f"a pose was refused: {error}")
+            return
+        self._mailbox.put(AskedPose(pose))
+
+
+def _ros(name: str) -> Any:
+    """Import a module of ROS 2.
+
+    Raises:
+        MitsonarError: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise MitsonarError(
+            f"--ros needs {error.name}, which comes with ROS 2 and not from pip: install ROS 2, type "
+            "`source /opt/ros/DISTRO/setup.bash` and use its Python; or leave --ros out and connect Foxglove"
+        ) from None

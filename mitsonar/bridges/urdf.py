@@ -1,0 +1,264 @@
+"""URDF: the links of a robot where its joints put them.
+
+The reader is our own: URDF and SDF share geometries, colours and poses, no package of Python's registry reads SDF, and those
+for URDF (yourdfpy, urchin) open any path that a file names.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mitsonar.bridges.model_files import (
+    Body,
+    Matrix,
+    ModelSearch,
+    ReadScene,
+    Shapes,
+    attribute_of,
+    number_of,
+    numbers_of,
+    placed,
+    primitive,
+    read_xml,
+    refused,
+)
+from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names, shortened
+from mitsonar.worlds.meshes import UNCOLOURED, Piece, one_number
+
+__all__ = ["check_joint_names", "joint_motion", "read_urdf"]
+
+MOVING = ("revolute", "continuous", "prismatic")
+"""Types of joints that have one value; others are read as fixed."""
+
+MOST_MIMICS = 20
+
+FULL_TURN = 6.3
+"""Angles beyond this are told [rad]."""
+
+
+def read_urdf(
+    path: Path, search: ModelSearch, shapes: Shapes, joints: Mapping[str, float], collision: bool = False
+) -> ReadScene:
+    """Read the links of a URDF file; its root link lies at the origin.
+
+    Args:
+        path: of the file; xacro must be expanded.
+        search: finds its meshes.
+        shapes: reads geometries.
+        joints: value of joints by name [rad, m]; others are at 0, or follow the joint that they mimic.
+        collision: whether the collision shapes are read, in place of the visual ones.
+
+    Raises:
+        MitsonarError: the file is damaged, or names what is not there.
+    """
+    robot = read_xml(path, "URDF file")
+    if robot.tag != "robot":
+        raise MitsonarError(f"{path} is no URDF file: its first element is <{robot.tag[:40]}>, not <robot>")
+    links = _by_name(path, robot, "link")
+    found = ReadScene()
+    found.frames = _link_poses(path, links, _by_name(path, robot, "joint"), joints)
+    name = robot.get("name", "")
+    group = (name,) if name and name not in links else ()
+    found.frames |= {name: np.eye(4) for name in group}
+    colours = {one.get("name", ""): one for one in robot.findall("material")}
+    for link, element in links.items():
+        pieces = [
+            piece
+            for part in element.findall("collision" if collision else "visual")
+            for piece in _pieces(path, part, search, shapes, colours)
+        ]
+        if pieces:
+            found.bodies.append(Body(link, found.frames[link], pieces, group))
+    return found
+
+
+def _by_name(path: Path, parent: Element, tag: str) -> dict[str, Element]:
+    """Return the elements of a kind by their names."""
+    found: dict[str, Element] = {}
+    for element in parent.findall(tag):
+        name = attribute_of(path, element, "name")
+        if name in found:
+            raise refused(path, element, f"there are two of this {tag}: name each differently")
+        found[name] = element
+    return found
+
+
+# ---------------------------------------------------------------- where links are
+
+
+def _link_poses(
+    path: Path, links: dict[str, Element], joints: dict[str, Element], asked: Mapping[str, float]
+) -> dict[str, Matrix]:
+    """Return the pose of each link relative to the root, which is the one link that is no joint's child."""
+    check_joint_names(path, asked, [name for name, joint in joints.items() if joint.get("type") in MOVING])
+    parents: dict[str, tuple[str, Matrix]] = {}
+    for name, joint in joints.items():
+        ends = [_end(path, joint, tag, links) for tag in ("parent", "child")]
+        if ends[1] in parents:
+            raise refused(path, joint, f"link {shortened(ends[1])} is the child of two joints: URDF is a tree")
+        value = _value_of(path, name, joints, asked)
+        origin = _origin(path, joint)
+        axis = joint.find("axis")
+        along = (1.0, 0.0, 0.0) if axis is None else numbers_of(path, axis, axis.get("xyz"), 3, (1.0, 0.0, 0.0))
+        kind = joint.get("type", "fixed")
+        parents[ends[1]] = (ends[0], origin @ joint_motion(path, joint, kind, along, value))
+    roots = [link for link in links if link not in parents]
+    if len(roots) != 1:
+        told = "none" if not roots else f"{len(roots)}: {', '.join(roots[:3])[:80]}"
+        raise MitsonarError(f"{path}: one link must be the child of no joint, the root of the tree: got {told}")
+    poses = {roots[0]: np.eye(4)}
+    for link in links:
+        chain: dict[str, None] = {}
+        one = link
+        while one not in poses:
+            if one in chain:
+                raise MitsonarError(f"{path}: the joints of link {shortened(link)} lead round in a circle")
+            chain[one] = None
+            one = parents[one][0]
+        for one in reversed(chain):
+            poses[one] = poses[parents[one][0]] @ parents[one][1]
+    return poses
+
+
+def check_joint_names(path: Path, asked: Mapping[str, float], known: list[str]) -> None:
+    """Check that joints are there, can move, and have finite values.
+
+    Raises:
+        MitsonarError: one is not.
+    """
+    for name, value in asked.items():
+        if name not in known:
+            there = nearest_names(name, known) if known else "it has none"
+            raise MitsonarError(f"{path} has no joint {shortened(name)} that moves: {there}"[:400])
+        if not abs(value) <= 1e6:
+            raise MitsonarError(f"joint {name} needs a finite number [rad, m]: got {value:g}")
+
+
+def _end(path: Path, joint: Element, tag: str, links: dict[str, Element]) -> str:
+    """Return the name of a joint's parent or child link."""
+    element = joint.find(tag)
+    if element is None:
+        raise refused(path, joint, f"it has no {tag}")
+    name = attribute_of(path, element, "link")
+    if name not in links:
+        raise refused(path, joint, f"its {tag} is the link {shortened(name)}, which is not there")
+    return name
+
+
+def _value_of(path: Path, name: str, joints: dict[str, Element], asked: Mapping[str, float]) -> float:
+    """Return the value of a joint: that which is asked for, that of the joint that it mimics, or 0."""
+    factor, offset = 1.0, 0.0
+    for _ in range(MOST_MIMICS):
+        joint = joints[name]
+        mimic = joint.find("mimic")
+        if name in asked or mimic is None:
+            limit = joint.find("limit")
+            value = asked.get(name, 0.0)
+            if name in asked and limit is not None and joint.get("type") != "continuous":
+                low = number_of(path, joint, limit.get("lower"), 0.0)
+                high = number_of(path, joint, limit.get("upper"), 0.0)
+                if not low <= value <= high:
+                    raise MitsonarError(f"joint {name} must lie in {low:g}..{high:g} [rad, m]: got {value:g}")
+            if joint.get("type") == "continuous":
+                _warn_of_degrees(f"joint {name}", [value])
+            return factor * value + offset
+        offset += factor * number_of(path, joint, mimic.get("offset"), 0.0)
+        factor *= number_of(path, joint, mimic.get("multiplier"), 1.0)
+        name = attribute_of(path, mimic, "joint")
+        if name not in joints:
+            raise refused(path, joint, f"it mimics the joint {shortened(name)}, which is not there")
+    raise refused(path, joints[name], "joints mimic each other in a circle")
+
+
+def joint_motion(path: Path, joint: Element, kind: str, axis: tuple[float, ...], value: float) -> Matrix:
+    """Return how a joint moves its child, in the axes of the joint.
+
+    Args:
+        path: of the file, for errors.
+        joint: for errors.
+        kind: its type; those without a single value do not move.
+        axis: of the joint ``(3,)``.
+        value: of the joint [rad, m].
+
+    Raises:
+        MitsonarError: the axis has no direction.
+    """
+    if kind not in MOVING or value == 0:
+        return np.eye(4)
+    length = float(np.linalg.norm(axis))
+    if not length >= 1e-9:
+        raise refused(path, joint, "its axis has length 0")
+    along = np.asarray(axis) / length * value
+    return placed(along) if kind == "prismatic" else placed(np.zeros(3), Rotation.from_rotvec(along))
+
+
+def _warn_of_degrees(what: str, angles: Iterable[float]) -> None:
+    """Warn of angles [rad] beyond a turn: they look like degrees."""
+    largest = max(map(abs, angles))
+    if largest > FULL_TURN:
+        told = f"{what} is in radians and holds {largest:g}, more than a turn: are these degrees?"
+        warnings.warn(told, MitsonarWarning, stacklevel=2)
+
+
+def _origin(path: Path, element: Element) -> Matrix:
+    """Return the pose in the child ``origin`` of an element; rpy are turns about the fixed axes x, y, z."""
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(4)
+    position = numbers_of(path, element, origin.get("xyz"), 3, (0.0, 0.0, 0.0))
+    rpy = numbers_of(path, element, origin.get("rpy"), 3, (0.0, 0.0, 0.0))
+    _warn_of_degrees(f"{path}, <{element.tag}>: rpy", rpy)
+    return placed(position, Rotation.from_euler("xyz", rpy))
+
+
+# ---------------------------------------------------------------- what links look like
+
+
+def _pieces(path: Path, part: Element, search: ModelSearch, shapes: Shapes, colours: dict[str, Element]) -> list[Piece]:
+    """Return the geometry of a visual or collision in the axes of its link."""
+    geometry = part.find("geometry")
+    kind = None if geometry is None else next(iter(geometry), None)
+    if kind is None:
+        raise refused(path, part, "it has no geometry")
+    colour = _reflectivity(path, part, shapes, colours)
+    if kind.tag == "mesh":
+        file = search.find(attribute_of(path, kind, "filename"), path)
+        scale = numbers_of(path, kind, kind.get("scale"), 3, (1.0, 1.0, 1.0))
+        pieces = shapes.of_file(file, scale, colour)
+    else:
+        size = _size(path, kind)
+        made = primitive(kind.tag, size, UNCOLOURED if colour is None else colour, f"{path}, <{kind.tag}>")
+        pieces = shapes.counted([made], str(path))
+    pose = _origin(path, part)
+    return [piece.moved(pose[:3, :3], -pose[:3, 3]) for piece in pieces]
+
+
+def _size(path: Path, kind: Element) -> dict[str, float]:
+    """Return the sizes of a primitive."""
+    if kind.tag == "box":
+        return dict(zip("xyz", numbers_of(path, kind, attribute_of(path, kind, "size"), 3, ()), strict=True))
+    keys = {"sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
+    if kind.tag not in keys:
+        raise refused(path, kind, f"a geometry is a box, a cylinder, a sphere, a capsule or a mesh: got {kind.tag[:40]}")
+    return {key: number_of(path, kind, kind.get(key)) for key in keys[kind.tag]}
+
+
+def _reflectivity(path: Path, part: Element, shapes: Shapes, colours: dict[str, Element]) -> float | None:
+    """Return the reflectivity of a visual's own colour, or of the robot's colour that it names; None without one."""
+    if not isinstance(shapes.value, str):
+        return float(shapes.value)
+    material = part.find("material")
+    if material is None:
+        return None
+    named = colours.get(material.get("name", ""), material)
+    colour = material.find("color") if material.find("color") is not None else named.find("color")
+    if colour is None:
+        return None
+    rgba = numbers_of(path, material, colour.get("rgba"), 4, (0.5, 0.5, 0.5, 1.0))
+    return float(one_number(np.clip(np.array([rgba[:3]]), 0, 1), shapes.value)[0])

@@ -1,0 +1,113 @@
+"""USD: the prims of a stage, read by a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.bridges.model_files import Body, Matrix, ModelSearch, ReadScene, Shapes, placed, primitive
+from mitsonar.errors import MitsonarError, explain_missing
+from mitsonar.io.files import PlainValue
+from mitsonar.worlds.meshes import LUMINANCE, UNCOLOURED, UP, Piece
+
+__all__ = ["read_usd"]
+
+SECONDS = 600
+"""Time that a stage may take."""
+
+
+def read_usd(path: Path, search: ModelSearch, shapes: Shapes, collision: bool = False) -> ReadScene:
+    """Read the meshes and primitives of a USD stage, at its first time; z upwards, in m.
+
+    Args:
+        path: of a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
+        search: has the folders within which its layers must lie.
+        shapes: reads geometries.
+        collision: whether the prims that bodies bump into are read, in place of those that are seen.
+
+    Raises:
+        MitsonarError: the stage is damaged, names layers elsewhere, or usd-core is not installed.
+    """
+    if find_spec("pxr") is None:
+        raise explain_missing(ModuleNotFoundError(name="pxr"))
+    told, arrays = _read_apart(path, search, collision)
+    metres, up = told["metres"], told["up"]
+    if not (np.isfinite(metres) and 1e-9 <= metres <= 1e9) or up not in UP:
+        raise MitsonarError(f"{path}: metersPerUnit must lie in 1e-9..1e9 and upAxis be X, Y or Z: got {metres:g}, {up}")
+    lift = np.eye(4)
+    lift[:3, :3] = np.asarray(UP[up], dtype=float) * metres
+    found = ReadScene(left_out={str(kind): int(count) for kind, count in told["left_out"].items()})
+    back = placed(np.zeros(3))
+    back[:3, :3] = np.asarray(UP[up], dtype=float).T
+    found.frames = {name: _finite(path, name, lift @ np.array(matrix) @ back) for name, matrix in told["frames"].items()}
+    for number, body in enumerate(told["bodies"]):
+        name = body["path"]
+        own = {key.partition(":")[2]: value for key, value in arrays.items() if key.startswith(f"{number}:")}
+        piece = _piece(path, body, own, shapes)
+        if len(piece.faces):
+            turned = piece.moved(back[:3, :3].T, np.zeros(3))  # the axes of frames have z upwards
+            parents = [str(parent) for parent in Path(name).parents][-2::-1]
+            found.bodies.append(Body(name, found.frames[name], shapes.counted([turned], str(path)), tuple(parents)))
+    return found
+
+
+def _read_apart(path: Path, search: ModelSearch, collision: bool) -> tuple[PlainValue, dict[str, NDArray[Any]]]:
+    """Read a stage in another process; return what it tells of the prims, and their arrays."""
+    if not os.path.isfile(path):
+        raise MitsonarError(f"no such file: {path}")
+    asked = {"path": str(path.resolve()), "roots": [str(root) for root in search.roots], "collision": collision}
+    settings = {name: value for name, value in os.environ.items() if not name.startswith(("PXR_", "USD_"))}
+    with tempfile.TemporaryDirectory() as folder:
+        # -P: modules beside the scene, in the folder that the command runs in, are a stranger's
+        command = [sys.executable, "-P", "-m", "mitsonar.bridges.usd_reading", f"{folder}/prims.npz"]
+        try:
+            done = subprocess.run(
+                command, input=json.dumps(asked).encode(), capture_output=True, timeout=SECONDS, env=settings
+            )
+        except subprocess.TimeoutExpired:
+            raise MitsonarError(f"cannot read {path}: it takes more than {SECONDS} s; give a smaller stage") from None
+        try:
+            told = json.loads(done.stdout)
+        except ValueError:
+            raise MitsonarError(f"cannot read {path}: USD's reader ended on it; export the stage again") from None
+        if "error" in told:
+            raise MitsonarError(f"cannot read {path}: {told['error']}")
+        with np.load(f"{folder}/prims.npz", allow_pickle=False) as table:
+            return told, dict(table)
+
+
+def _finite(path: Path, name: str, matrix: Matrix) -> Matrix:
+    """Return the pose of a prim.
+
+    Raises:
+        MitsonarError: it is not finite, or flat.
+    """
+    if not np.isfinite(matrix).all() or not np.abs(matrix).max() <= 1e9:
+        raise MitsonarError(f"{path}: the pose of the prim {name[:80]} is not finite, or too large; export the stage again")
+    return matrix
+
+
+def _piece(path: Path, body: PlainValue, arrays: dict[str, NDArray[Any]], shapes: Shapes) -> Piece:
+    """Return the geometry of a prim in its own axes and units."""
+    if body["kind"] != "mesh":
+        made = primitive(body["kind"], body["sizes"], UNCOLOURED, f"{path}, {body['path'][:80]}")
+        made = made.moved(np.asarray(UP[body["axis"]], dtype=float).T, np.zeros(3))
+        colours = np.nan if body["colour"] is None else np.array(body["colour"])
+        table = np.broadcast_to(colours, (len(made.faces), 3))
+    else:
+        made = Piece(arrays["vertices"], arrays["faces"])
+        table = arrays.get("colours", np.full((len(made.faces), 3), np.nan))
+    if not isinstance(shapes.value, str):
+        return made.uniform(float(shapes.value))
+    linear = np.clip(table, 0, 1)
+    value = linear[:, 0] if shapes.value == "red" else linear @ LUMINANCE
+    return Piece(made.vertices, made.faces, np.where(np.isnan(value), UNCOLOURED, value))

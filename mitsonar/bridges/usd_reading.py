@@ -1,0 +1,297 @@
+"""The process that reads a USD stage: its C++ library may end on a damaged file, and it opens what a stage names.
+
+    python -m mitsonar.bridges.usd_reading OUT.npz < asked.json
+
+It writes arrays, and a list of prims as JSON; :mod:`mitsonar.bridges.usd` starts it and reads them.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+
+__all__: list[str] = []
+
+Prim: TypeAlias = Any
+"""A prim, attribute or layer of USD, which has no types."""
+
+MEMORY = 2**34
+"""Bytes of address space that a stage may take."""
+
+SECONDS = 300
+"""Processor time that a stage may take."""
+
+MOST_LAYERS = 10_000
+MOST_PRIMS = 200_000
+MOST_TRIANGLES = 50_000_000
+
+GPRIMS = {
+    "Cube": ("box", ("size",)),
+    "Sphere": ("sphere", ("radius",)),
+    "Cylinder": ("cylinder", ("radius", "height")),
+    "Capsule": ("capsule", ("radius", "height")),
+    "Cone": ("cone", ("radius", "height")),
+    "Plane": ("plane", ("width", "length")),
+}
+"""Prims with sizes: the primitive of each, and its attributes."""
+
+WHEN = Usd.TimeCode.EarliestTime()
+
+
+class RefusedError(Exception):
+    """What is wrong with a stage, in words."""
+
+
+def main() -> None:
+    """Read the stage that standard input asks for; print ``{"error": ...}`` where it cannot be read."""
+    for kind, most in ((resource.RLIMIT_AS, MEMORY), (resource.RLIMIT_CPU, SECONDS), (resource.RLIMIT_CORE, 0)):
+        known = [limit for limit in resource.getrlimit(kind) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(kind, (min([most, *known]), min([most, *known])))
+    asked = json.loads(sys.stdin.read())
+    try:
+        check_layers(asked["path"], [Path(root) for root in asked["roots"]])
+        stage = Usd.Stage.Open(asked["path"])
+        arrays: dict[str, NDArray[Any]] = {}
+        told = read_stage(stage, asked["collision"], arrays)
+        np.savez(sys.argv[1], **arrays)  # type: ignore[arg-type]  # the stubs take a name for allow_pickle
+    except RefusedError as error:
+        told = {"error": str(error)}
+    except Tf.ErrorException as error:
+        reason = str(error).partition(" : '")[2].splitlines() or ["it is damaged"]
+        told = {"error": f"USD's reader refuses it ({reason[0].strip()[:160]})"}
+    except MemoryError:
+        told = {"error": "it needs too much memory"}
+    json.dump(told, sys.stdout)
+
+
+# ---------------------------------------------------------------- what a stage names
+
+
+def check_layers(path: str, roots: list[Path]) -> None:
+    """Check that all layers that a stage is composed of lie within folders, before any but the first is opened.
+
+    Raises:
+        RefusedError: one does not, is not there, or cannot be read.
+    """
+    waiting, seen = [path], {path}
+    while waiting:
+        name = waiting.pop()
+        layer = Sdf.Layer.FindOrOpen(name)
+        if layer is None:
+            raise RefusedError(f"the layer {short(name)} cannot be read: it is damaged, or no USD")
+        clips: list[str] = []
+
+        def note(at: Prim, layer: Prim = layer, clips: list[str] = clips) -> None:
+            if at.IsPrimPath() and layer.GetObjectAtPath(at).HasInfo("clips"):
+                clips.append(str(at))
+
+        layer.Traverse(Sdf.Path.absoluteRootPath, note)
+        if clips:
+            raise RefusedError(f"the prim {short(clips[0])} has value clips, which are not read: flatten the stage")
+        for asset in layer.GetCompositionAssetDependencies():
+            found = _allowed(layer, asset, roots)
+            if found not in seen:
+                seen.add(found)
+                waiting.append(found)
+        if len(seen) > MOST_LAYERS:
+            raise RefusedError(f"it is composed of more than {MOST_LAYERS:,} layers")
+
+
+def _allowed(layer: Prim, asset: str, roots: list[Path]) -> str:
+    """Return where a layer lies that another names."""
+    if "://" in asset or "`" in asset:
+        raise RefusedError(f"it names the layer {short(asset)}: only files beside it, or in folders of --search, are read")
+    found = str(Sdf.ComputeAssetPathRelativeToLayer(layer, asset))
+    outer = Path(Ar.SplitPackageRelativePathOuter(found)[0] if Ar.IsPackageRelativePath(found) else found)
+    if not outer.is_file():
+        raise RefusedError(f"it names the layer {short(asset)}, which is not there")
+    if not any(outer.resolve().is_relative_to(root) for root in roots):
+        raise RefusedError(
+            f"it names the layer {short(asset)}, outside its folder: give the folder that holds it by --search"
+        )
+    return found
+
+
+def short(name: str) -> str:
+    """Return a name for a message."""
+    return repr(name if len(name) <= 80 else f"{name[:80]}...")
+
+
+# ---------------------------------------------------------------- prims
+
+
+def read_stage(stage: Prim, collision: bool, arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return the prims with geometries; their arrays are put into ``arrays``.
+
+    Raises:
+        RefusedError: a geometry is damaged, or there are too many.
+    """
+    cache = UsdGeom.XformCache(WHEN)
+    bodies: list[dict[str, Any]] = []
+    frames: dict[str, list[list[float]]] = {}
+    left_out: dict[str, int] = {}
+    triangles = 0
+    for count, prim in enumerate(prims_of(stage)):
+        if count >= MOST_PRIMS:
+            raise RefusedError(f"it has more than {MOST_PRIMS:,} prims")
+        kind = str(prim.GetTypeName())
+        if prim.IsA(UsdGeom.Xformable):
+            frames[str(prim.GetPath())] = np.array(cache.GetLocalToWorldTransform(prim)).T.tolist()
+        if not _wanted(prim, collision):
+            continue
+        if kind == "Mesh":
+            shape, faces = read_mesh(prim)
+            triangles += faces
+            arrays |= {f"{len(bodies)}:{name}": values for name, values in shape.items()}
+            body: dict[str, Any] = {"kind": "mesh"}
+        elif kind in GPRIMS:
+            body = _gprim(prim, kind)
+        else:
+            if prim.IsA(UsdGeom.Gprim) or kind == "PointInstancer":
+                left_out[kind] = left_out.get(kind, 0) + 1
+            continue
+        if triangles > MOST_TRIANGLES:
+            raise RefusedError(f"it has more than {MOST_TRIANGLES:,} triangles")
+        bodies.append({**body, "path": str(prim.GetPath()), "colour": _colour_of_all(prim)})
+    up, metres = str(UsdGeom.GetStageUpAxis(stage)), float(UsdGeom.GetStageMetersPerUnit(stage))
+    return {"bodies": bodies, "frames": frames, "left_out": left_out, "up": up.lower(), "metres": metres}
+
+
+def prims_of(stage: Prim) -> Iterator[Prim]:
+    """Yield the prims of a stage and those of its instances; the prototypes of a point instancer are not placed by it."""
+    whole = iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)))
+    for prim in whole:
+        if prim.GetTypeName() == "PointInstancer":
+            whole.PruneChildren()
+        yield prim
+
+
+def _wanted(prim: Prim, collision: bool) -> bool:
+    """Return whether a prim is seen, or, for collision shapes, bumped into."""
+    imageable = UsdGeom.Imageable(prim)
+    if not imageable:
+        return False
+    if collision:
+        return bool(prim.HasAPI(UsdPhysics.CollisionAPI)) or prim.GetTypeName() == "PointInstancer"
+    purpose = imageable.ComputePurpose()
+    return purpose in ("default", "render") and imageable.ComputeVisibility(WHEN) != "invisible"
+
+
+def _gprim(prim: Prim, kind: str) -> dict[str, Any]:
+    """Return a prim with sizes."""
+    primitive, names = GPRIMS[kind]
+    values = [float(prim.GetAttribute(name).Get(WHEN)) for name in names]
+    sizes: dict[str, float] = dict(zip(("radius", "length"), values, strict=False))
+    if kind == "Cube":
+        sizes = dict.fromkeys("xyz", values[0])
+    if kind == "Plane":
+        sizes = {"x": values[0], "y": values[1]}
+    axis = prim.GetAttribute("axis")
+    return {"kind": primitive, "sizes": sizes, "axis": str(axis.Get(WHEN)).lower() if axis else "z"}
+
+
+def read_mesh(prim: Prim) -> tuple[dict[str, NDArray[Any]], int]:
+    """Return vertices, triangles and colours of a mesh, and the number of triangles; faces are cut into fans.
+
+    Raises:
+        RefusedError: its arrays do not belong together.
+    """
+    mesh = UsdGeom.Mesh(prim)
+    points = np.array(mesh.GetPointsAttr().Get(WHEN) or [], dtype=np.float64).reshape(-1, 3)
+    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(WHEN) or [], dtype=np.int64)
+    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(WHEN) or [], dtype=np.int64)
+    what = f"the mesh {short(str(prim.GetPath()))}"
+    if counts.size and (counts.min() < 0 or counts.sum() != len(corners)):
+        raise RefusedError(f"{what} counts {counts.sum():,} corners of faces and has {len(corners):,}")
+    if corners.size and (corners.min() < 0 or corners.max() >= len(points)):
+        raise RefusedError(f"a face of {what} names a point that is not there")
+    if not np.isfinite(points).all():
+        raise RefusedError(f"{what} has points that are not finite")
+    cut = np.maximum(counts - 2, 0)
+    face = np.repeat(np.arange(len(counts)), cut)
+    place = np.arange(int(cut.sum())) - np.repeat(np.cumsum(cut) - cut, cut)
+    begin = (np.cumsum(counts) - counts)[face]
+    fan = np.stack([begin, begin + place + 1, begin + place + 2], -1)
+    if mesh.GetOrientationAttr().Get(WHEN) == UsdGeom.Tokens.leftHanded:
+        fan = fan[:, ::-1]
+    shape = {"vertices": points, "faces": corners[fan].reshape(-1, 3)}
+    colours = _own_colours(prim, counts, corners, len(points))
+    if colours is not None:
+        shape["colours"] = colours[face]
+    return shape, len(fan)
+
+
+# ---------------------------------------------------------------- colours
+
+
+def _own_colours(
+    prim: Prim, counts: NDArray[np.int64], corners: NDArray[np.int64], points: int
+) -> NDArray[np.float64] | None:
+    """Return the linear colours of faces ``(faces, 3)``, by materials, else by ``displayColor``; None without any."""
+    colours = np.full((len(counts), 3), np.nan)
+    for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
+        colour = _material_colour(subset.GetPrim())
+        faces = np.array(subset.GetIndicesAttr().Get(WHEN) or [], dtype=np.int64)
+        if colour is not None and faces.size and faces.min() >= 0 and faces.max() < len(counts):
+            colours[faces] = colour
+    whole = _material_colour(prim)
+    whole = _display_colours(prim, counts, corners, points) if whole is None else whole
+    if whole is not None:
+        colours = np.where(np.isnan(colours), whole, colours)
+    return None if np.isnan(colours).all() else colours
+
+
+def _display_colours(
+    prim: Prim, counts: NDArray[np.int64], corners: NDArray[np.int64], points: int
+) -> NDArray[np.float64] | None:
+    """Return the ``displayColor`` of each face ``(faces, 3)``: the mean of its corners."""
+    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
+    values = primvar.ComputeFlattened(WHEN) if primvar and primvar.HasValue() else None
+    if values is None or not len(values):
+        return None
+    table = np.array(values, dtype=np.float64).reshape(-1, 3)
+    if len(table) == 1:
+        return np.repeat(table, len(counts), axis=0)
+    if len(table) == len(counts) and primvar.GetInterpolation() == UsdGeom.Tokens.uniform:
+        return table
+    if len(table) == points:
+        table = table[corners]
+    if len(table) != len(corners) or not counts.size:
+        return None
+    sums = np.add.reduceat(np.concatenate([table, np.zeros((1, 3))]), np.cumsum(counts) - counts)
+    return np.asarray(sums / np.maximum(counts, 1)[:, None], dtype=np.float64)
+
+
+def _colour_of_all(prim: Prim) -> list[float] | None:
+    """Return the one colour of a primitive."""
+    colour = _material_colour(prim)
+    if colour is None:
+        painted = _display_colours(prim, np.array([1]), np.array([0]), 1)
+        colour = None if painted is None else painted[0]
+    return None if colour is None else [float(value) for value in colour]
+
+
+def _material_colour(prim: Prim) -> NDArray[np.float64] | None:
+    """Return the diffuse colour of the material that a prim is bound to, where it is one colour."""
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    if not material:
+        return None
+    for shader in Usd.PrimRange(material.GetPrim()):
+        for name in ("diffuseColor", "diffuse_color_constant", "base_color"):
+            given = UsdShade.Shader(shader).GetInput(name) if shader.IsA(UsdShade.Shader) else None
+            if given and not given.HasConnectedSource() and given.Get(WHEN) is not None:
+                colour = np.array(given.Get(WHEN), dtype=np.float64).ravel()
+                return colour[:3] if len(colour) >= 3 and np.isfinite(colour).all() else None
+    return None
+
+
+if __name__ == "__main__":
+    main()
