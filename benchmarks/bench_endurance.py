@@ -126,8 +126,8 @@ def to_and_fro(way: SonarFrames, frames: int, folder: Path) -> Path:
 
 def command() -> None:
     """Run a command of mitsonar whose progress bar writes a line of processor time, count and memory each time."""
+    from mitsonar.cli import estimate
     from mitsonar.cli import main as run
-    from mitsonar.cli import odometry_command
 
     log = Path(os.environ[WATCHED])
 
@@ -148,7 +148,7 @@ def command() -> None:
         yield add
         note(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10)
 
-    with patch.object(odometry_command, "progress_bar", noted):
+    with patch.object(estimate, "progress_bar", noted):
         run()
 
 

@@ -15,12 +15,13 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from types import FrameType, TracebackType
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, Protocol, TypeVar
 
 import typer
+from rich.markup import escape
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, explain_missing
 
@@ -36,7 +37,9 @@ __all__ = [
     "say_json",
     "say_stopped",
     "warn",
+    "with_plain_brackets",
 ]
+
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -314,3 +317,40 @@ class LaterBar:
     ) -> None:
         if self.inner is not None:
             self.inner.__exit__(kind, error, traceback)
+
+
+# ---------------- Help texts with square brackets, such as ``[m]``, which rich would take for markup and omit
+
+
+class Helpful(Protocol):
+    """What a Click command has, in Click itself and in Typer's copy of it."""
+
+    help: str | None
+
+    @property
+    def params(self) -> Sequence[object]:
+        """Return the options and arguments."""
+
+
+AnyCommand = TypeVar("AnyCommand", bound=Helpful)
+
+
+def with_plain_brackets(command: AnyCommand) -> AnyCommand:
+    """Escape brackets in the help of a command, of its options, and of its existing subcommands.
+
+    A group that creates its commands on demand calls this itself.
+
+    Args:
+        command: a Click command of :func:`typer.main.get_command`. It is changed.
+
+    Returns:
+        The same command.
+    """
+    command.help = command.help and escape(command.help)
+    for parameter in command.params:
+        text = getattr(parameter, "help", None)
+        if text:
+            parameter.help = escape(text)  # type: ignore[attr-defined]  # arguments have help in Typer only
+    for inner in getattr(command, "commands", {}).values():
+        with_plain_brackets(inner)
+    return command

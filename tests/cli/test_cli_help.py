@@ -11,7 +11,7 @@ import typer
 from helpers import Command
 
 from mitsonar.cli import application
-from mitsonar.cli.help_texts import with_plain_brackets
+from mitsonar.cli.console import with_plain_brackets
 
 
 def commands(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:

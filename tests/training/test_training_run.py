@@ -30,7 +30,7 @@ from mitsonar.io.runs import differences
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves")]
 
-from mitsonar.cli.train_command import train as command  # noqa: E402
+from mitsonar.cli.train import train as command  # noqa: E402
 from mitsonar.config.training import (  # noqa: E402
     Loss,
     Optimiser,
@@ -694,7 +694,7 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
         if report.step == 9:
             os.kill(os.getpid(), signal.SIGINT)
 
-    from mitsonar.cli.train_command import asked_to_stop
+    from mitsonar.cli.train import asked_to_stop
 
     with asked_to_stop() as stop, pytest.raises(KeyboardInterrupt):
         train(told, made, out, progress=interrupt, stop=stop, threads=1)

@@ -502,7 +502,7 @@ def test_segments_and_their_sums() -> None:
 
 
 def command(*arguments: object) -> tuple[int, str]:
-    from mitsonar.cli.crlb_command import crlb
+    from mitsonar.cli.estimate import crlb
 
     app = typer.Typer()
     app.command()(crlb)

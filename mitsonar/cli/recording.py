@@ -1,0 +1,513 @@
+"""``mitsonar recording``: look at recordings of real sonars and at runs, and convert them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
+
+import numpy as np
+import typer
+
+from mitsonar.cli.console import answered, changes_of, command_line, progress_bar, say, say_json, warn
+from mitsonar.cli.estimate import Geometry
+from mitsonar.errors import MitsonarError, counted, nearest_names
+from mitsonar.io.files import write_whole
+from mitsonar.io.runs import refuse_to_replace
+
+if TYPE_CHECKING:
+    from mitsonar.instruments.sonar import Sonar
+    from mitsonar.recordings.recording import Part, Recording
+    from mitsonar.records.frames import SonarFrames
+
+__all__ = [
+    "LEAST_SNR_DB",
+    "Classes",
+    "Least",
+    "LeastSnr",
+    "Out",
+    "Picture",
+    "Polygons",
+    "Shares",
+    "To",
+    "Without",
+    "classes_of",
+    "convert",
+    "exported",
+    "fit",
+    "frames",
+    "from_recording",
+    "info",
+    "numbers_of",
+    "recordings",
+    "shares_of",
+    "show",
+    "sonars",
+    "video",
+]
+
+
+File = Annotated[
+    str, typer.Argument(metavar="FILE|RUN", help="A recording of a sonar, frames.npz, frames.zarr or a run's folder.")
+]
+PartNumber = Annotated[int | None, typer.Option("--part", help="Part of the recording (default: the longest).")]
+TopicName = Annotated[str | None, typer.Option("--topic", help="Topic of a ROS bag (default: the only sonar's).")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+Span = Annotated[float, typer.Option("--span-db", help="Levels from full scale down that are shown [dB].")]
+
+
+def recordings() -> typer.Typer:
+    """Create the group of commands."""
+    app = typer.Typer(help="Look at recordings of real sonars and at runs, and convert them.", no_args_is_help=True)
+    for command in (
+        info,
+        show,
+        video,
+        answered(convert, {"beams": "--beams", "crop_bins": "--crop-bins", "crop_beams": "--crop-beams"}),
+    ):
+        app.command()(command)
+    return app
+
+
+@answered
+def info(
+    file: File,
+    topic: TopicName = None,
+    geometry: Geometry = None,
+    handedness: Annotated[
+        bool,
+        typer.Option("--handedness", help="Tell whether pictures are mirrored, by the compass or poses."),
+    ] = False,
+    turn_deg: Annotated[
+        float | None,
+        typer.Option(help="Turn from the first to the last frame [deg], > 0 to starboard, without a compass."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print what a recording holds: frames, parts, window, beams, rate, times, gaps, attitude, facts and notes."""
+    from mitsonar.recordings.handedness import handedness_of
+    from mitsonar.recordings.open import summary_lines, summary_of
+
+    recording = _opened(file, topic, geometry)
+    summary = summary_of(recording)
+    found = None
+    if handedness or turn_deg is not None:
+        found = handedness_of(recording.part(), None if turn_deg is None else math.radians(turn_deg))
+    if as_json:
+        told = {} if found is None else {"handedness": found._asdict()}
+        say_json({**summary, **told})
+        return
+    for line in summary_lines(summary):
+        say(line)
+    if found is not None:
+        why = f" ({found.reason})" if found.reason else ""
+        say(
+            f"handedness             {found.verdict}{why}: "
+            f"correlation {found.correlation:.2f} over {counted(found.pairs, 'pair')}"
+        )
+
+
+@answered
+def show(
+    file: File,
+    out: Annotated[Path, typer.Option("-o", "--out", help="PNG to write.")],
+    frame: Annotated[int, typer.Option(min=0, help="Number of the frame in its part.")] = 0,
+    part: PartNumber = None,
+    topic: TopicName = None,
+    geometry: Geometry = None,
+    span_db: Span = 60.0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Draw one frame as a fan with axes in metres and a colour bar in dB."""
+    from mitsonar.plotting.fans import coded_in_decibels, save_fan
+
+    refuse_to_replace(out, overwrite=overwrite)
+    recording = _opened(file, topic, geometry)
+    frames = coded_in_decibels(recording.part(part).read([frame]), span_db)
+    save_fan(out, frames, title=f"{Path(file).name}, frame {frame}")
+    say(f"picture: {out}")
+
+
+@answered
+def video(
+    file: File,
+    out: Annotated[Path, typer.Option("-o", "--out", help="MP4 or AVI to write.")],
+    part: PartNumber = None,
+    topic: TopicName = None,
+    geometry: Geometry = None,
+    span_db: Span = 60.0,
+    rate: Annotated[float | None, typer.Option(help="Frames a second (default: those of the recording).")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the frames as a video of fans."""
+    from mitsonar.plotting.fans import write_fan_video
+
+    recording = _opened(file, topic, geometry)
+    _say_notes(recording)
+    chosen = recording.part(part)
+    steps = np.diff(chosen.time_s)
+    found = 1 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else 10.0
+    if rate is not None and not 0 < rate <= 1000:
+        raise MitsonarError(f"--rate must lie in 0..1000 a second: got {rate:g}")
+    with progress_bar("drawing", len(chosen), "frames") as progress:
+        speed = rate or min(1000.0, found)
+        count = write_fan_video(chosen.chunks(), out, speed, span_db=span_db, overwrite=overwrite, progress=progress)
+    say(f"{counted(count, 'frame')} at {speed:.4g} a second in {out}")
+
+
+def convert(
+    file: File,
+    out: Annotated[Path, typer.Option("-o", "--out", help="FOLDER of a run, FILE.mcap or FILE.aris to make.")],
+    part: PartNumber = None,
+    topic: TopicName = None,
+    geometry: Geometry = None,
+    picture: Annotated[str, typer.Option(help="Format of the fans in an MCAP file: jpeg or png.")] = "jpeg",
+    full: Annotated[
+        bool, typer.Option("--full", help="MCAP: samples bit for bit, float32 where they are, and labels (default: 8 bit).")
+    ] = False,
+    labels: Annotated[bool, typer.Option("--labels", help="MCAP: the points of the labels, where there are.")] = False,
+    beams: Annotated[
+        int | None, typer.Option(help="Beams of an ARIS file: 48, 64, 96 or 128 (default: those of the frames).")
+    ] = None,
+    crop_bins: Annotated[
+        str | None, typer.Option("--crop-bins", help="Bins to keep: first,end, numbered from 0, the end not counted.")
+    ] = None,
+    crop_beams: Annotated[str | None, typer.Option("--crop-beams", help="Beams to keep, likewise, from port.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped conversion to a folder.")] = False,
+) -> None:
+    """Convert frames to the folder of a run (frames.npz, or frames.zarr of more than 1,000), to ROS (.mcap) or to .aris."""
+    from mitsonar.recordings.pictures import write_frames
+    from mitsonar.recordings.write_mcap import write_mcap
+
+    if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
+        raise MitsonarError(f"{out}: unknown ending; {nearest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
+    if (full or labels) and out.suffix != ".mcap":
+        raise MitsonarError(f"--full and --labels are of MCAP files: got {out}; leave them out")
+    if resume and out.suffix:
+        raise MitsonarError("--resume is for folders: files are whole or absent")
+    recording = _opened(file, topic, geometry)
+    _say_notes(recording)
+    chosen = recording.part(part)
+    spans = [None if text is None else _span(text, option) for text, option in ((crop_bins, "bins"), (crop_beams, "beams"))]
+    if len(recording.parts) > 1:
+        number = recording.longest if part is None else part
+        say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {counted(len(recording), 'frame')}")
+    if any(spans):
+        chosen = chosen.cropped(*spans)
+        # a resumed conversion compares formats, so that it does not go on with another crop
+        crop = ", ".join(f"{what} {text}" for what, text in (("bins", crop_bins), ("beams", crop_beams)) if text)
+        recording, part = replace(recording, format=f"{crop} of {recording.format}", parts=(chosen,)), None
+    made = out
+    with progress_bar("converting", len(chosen), "frames") as progress:
+        if out.suffix == ".mcap":
+            words = {"picture": picture, "full": full, "labels": labels, "overwrite": overwrite}
+            write_mcap(chosen.chunks(), out, **words, progress=progress)  # type: ignore[arg-type]
+        elif out.suffix == ".aris":
+            _to_aris(chosen, out, beams=beams, overwrite=overwrite, progress=progress)
+        else:
+            made = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
+    say(f"{counted(len(chosen), 'frame')} in {made}")
+
+
+def _span(text: str, what: str) -> tuple[int, int]:
+    """Return the numbers of a span.
+
+    Raises:
+        MitsonarError: something else than two whole numbers.
+    """
+    words = text.split(",")
+    if len(words) != 2 or not all(word.strip().isdecimal() for word in words):
+        raise MitsonarError(f"--crop-{what} is two whole numbers, first,end, such as 0,512: got {text!r}")
+    return int(words[0]), int(words[1])
+
+
+def _opened(file: str, topic: str | None, geometry: Path | None) -> Recording:
+    from mitsonar.mapping.sources import recording_at
+
+    return recording_at(file, view=topic, geometry=geometry)
+
+
+def _say_notes(recording: Recording) -> None:
+    for note in recording.notes:
+        warn(note)
+
+
+def _to_aris(part: Part, out: Path, *, beams: int | None, overwrite: bool, progress: Callable[[int], None]) -> None:
+    """Write a part as an ARIS file; what had to be changed is warned of."""
+    from mitsonar.recordings.write_aris import write_aris
+
+    refuse_to_replace(out, overwrite=overwrite)
+    part_file = out.with_name(f".{out.stem}.new.aris")  # the writer replaces nothing
+    part_file.unlink(missing_ok=True)
+
+    def counted() -> Iterator[SonarFrames]:
+        for frames in part.chunks():
+            yield frames
+            progress(len(frames))
+
+    try:
+        written = write_aris(part_file, counted(), beams=beams)
+        part_file.replace(out)
+    finally:
+        part_file.unlink(missing_ok=True)
+    for note in written.notes:
+        warn(note)
+
+
+# ---------------- ``mitsonar sonar``: sonars from recordings
+
+
+def sonars() -> typer.Typer:
+    """Create the group of commands."""
+    app = typer.Typer(help="Make a sonar's file from what a real sonar recorded.", no_args_is_help=True)
+    app.command()(fit)
+    app.command("from-recording")(from_recording)
+    return app
+
+
+@answered
+def fit(
+    frames: Annotated[Path, typer.Argument(help="Frames of the sonar: frames.npz, or a run's folder.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="YAML file to write, for --sonar.")],
+    sonar: Annotated[
+        str | None,
+        typer.Option(help="Preset or YAML file of what frames do not tell: carrier, beam width, patterns."),
+    ] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="A field that is known, frequency_hz=1.8e6 for one."),
+    ] = None,
+    measure_coding: Annotated[
+        bool, typer.Option("--measure-coding", help="Take span [dB] or gamma from the grain, not from the frames.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+) -> None:
+    """Fit noise, water, coding, stripes, crosstalk and speckle to a recording, and write a sonar that the simulator reads.
+
+    Give frames of a resting or slow sonar whose darkest parts, shadows or black water, are noise. Bright speckle
+    that is new in every frame counts as volume scattering: that holds for a sonar that rests.
+    """
+    from mitsonar.records.frames import SonarFrames
+
+    refuse_to_replace(out, overwrite=overwrite)
+    told = _told(sonar, changes)
+    _fit_and_write(SonarFrames.load(frames), told, out, measure_coding=measure_coding)
+
+
+@answered
+def from_recording(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording of a real sonar, or frames.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="YAML file to write, for --sonar.")],
+    noise: Annotated[
+        Path | None, typer.Option(help="YAML file to write noise, water and grain to; default: they stand in OUT too.")
+    ] = None,
+    sonar: Annotated[
+        str | None, typer.Option(help="Preset or YAML file of what the file does not tell: beam width, patterns.")
+    ] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="A field that is known, frequency_hz=1.8e6 for one."),
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames from the middle that are read.")] = 12,
+    part: Annotated[int | None, typer.Option(min=0, help="Part of the recording (default: the longest).")] = None,
+    topic: Annotated[str | None, typer.Option(help="Topic of a ROS bag (default: the only one).")] = None,
+    geometry: Geometry = None,
+    measure_coding: Annotated[
+        bool, typer.Option("--measure-coding", help="Take span [dB] or gamma from the grain, not from the frames.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
+) -> None:
+    """Make a sonar that records like the one of a recording: its window, bins and beams, and its fitted noise.
+
+    `mitsonar render` and recipes of data sets take it by --sonar. With --noise the files are laid over one another:
+    --sonar sonar.yaml,noise.yaml.
+    """
+    from mitsonar.estimation.sonar_fit import as_instrument
+    from mitsonar.mapping.sources import open_frames
+
+    for path in (out, noise):
+        if path is not None:
+            refuse_to_replace(path, overwrite=overwrite)
+    told = _told(sonar, changes)
+    source = open_frames(file, sequence=part, view=topic, geometry=geometry)
+    first = max(0, (len(source) - frames) // 2)
+    chosen, notes = as_instrument(source.read(range(first, min(first + frames, len(source)))))
+    _fit_and_write(chosen, told, out, noise, notes, measure_coding=measure_coding)
+
+
+class _Told(NamedTuple):
+    """A sonar that fitting starts from, and fields that are known."""
+
+    sonar: Sonar | None
+    fields: dict[str, Any]  # pairs of a command line, which the sonar checks
+
+
+def _told(sonar: str | None, changes: list[str] | None) -> _Told:
+    """Return what the user tells: faults of it are reported before frames are read."""
+    from mitsonar.instruments.sounder import load_sonar
+
+    return _Told(None if sonar is None else load_sonar(sonar), dict(changes_of(changes or [], None)))
+
+
+def _fit_and_write(
+    frames: SonarFrames,
+    told: _Told,
+    out: Path,
+    noise: Path | None = None,
+    notes: Sequence[str] = (),
+    *,
+    measure_coding: bool,
+) -> None:
+    """Fit a sonar to frames, write it to OUT, or its noise to another file, and say what was found."""
+    from mitsonar.estimation.sonar_fit import NOISE_FIELDS, fit_sonar
+
+    found = fit_sonar(frames, told.sonar, measure_coding=measure_coding, **told.fields)
+    if noise is None:
+        write_whole(out, found.yaml().encode())
+    else:
+        write_whole(out, found.yaml(leave=NOISE_FIELDS).encode())
+        write_whole(noise, found.yaml(only=NOISE_FIELDS).encode())
+    for line in found.lines():
+        say(line)
+    for note in (*notes, *found.notes):
+        warn(note)
+    say(f"{out}: {command_line('render', 'SCENE', '--sonar', out if noise is None else f'{out},{noise}')}")
+
+
+# ---------------- ``mitsonar frames``: frames of a run or a recording, for other tools
+
+
+OF_RUN = 0.7, 0.15, 0.15
+"""Shares of training, validation and test of a run's frames."""
+
+LEAST_SNR_DB = 3.0
+"""That of the export, which is not loaded yet."""
+
+To = Annotated[str, typer.Option("--to", help="coco, yolo, webdataset, huggingface, kitti or neusis.")]
+Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to make; it is whole or absent.")]
+Picture = Annotated[str, typer.Option(help="polar, or fan: forward up, starboard to the right.")]
+Without = Annotated[list[str] | None, typer.Option("--without", help="Name of a shape that gets no box: the ground.")]
+Classes = Annotated[
+    str,
+    typer.Option(
+        "--classes",
+        help="Classes of shapes by name, GLOB=CLASS,...: pillar*=pillar,seabed*= (empty: left out); default: their names, "
+        "one class where only numbers at the end differ.",
+    ),
+]
+Least = Annotated[int, typer.Option(min=1, help="Pixels of an object, at least.")]
+LeastSnr = Annotated[
+    float,
+    typer.Option("--least-snr-db", help="Signal-to-noise ratio of an object, at least [dB]; -inf: all that is labelled."),
+]
+Shares = Annotated[
+    str | None,
+    typer.Option(
+        "--split",
+        help="Shares of training, validation and test, default: the recipe's; of a run 0.7,0.15,0.15.",
+    ),
+]
+Polygons = Annotated[bool, typer.Option("--polygons", help="YOLO: outlines in place of boxes.")]
+
+
+def frames() -> typer.Typer:
+    """Create the group of commands."""
+    app = typer.Typer(help="Write frames for other tools.", no_args_is_help=True)
+    app.command()(export)
+
+    @app.callback()
+    def group() -> None:
+        """Keep the name of the only command."""
+
+    return app
+
+
+@answered
+def export(
+    run: Annotated[str, typer.Argument(metavar="RUN|FILE", help="A run's folder, frames.npz, frames.zarr, or a recording.")],
+    to: To,
+    out: Out,
+    picture: Picture = "polar",
+    without: Without = None,
+    classes: Classes = "",
+    least: Least = 1,
+    least_snr_db: LeastSnr = LEAST_SNR_DB,
+    split: Shares = None,
+    polygons: Polygons = False,
+) -> None:
+    """Write frames in the layout of another tool, whole or absent. COCO and YOLO need labels, KITTI and neusis poses."""
+    from mitsonar.mapping.sources import is_data_set
+
+    if is_data_set(run):
+        raise MitsonarError(f"{run} is a data set: {command_line('dataset', 'export', run)} exports it")
+    rules = classes_of(classes, without)
+    shares = shares_of(split) or (OF_RUN if to in ("coco", "yolo") else None)
+    exported(run, to, out, picture, rules, least, least_snr_db, shares, polygons, None)
+
+
+def classes_of(classes: str, without: list[str] | None) -> list[tuple[str, str]]:
+    """Return the rules of classes that options give."""
+    from mitsonar.bridges.export_source import class_rules
+
+    return [*((name, "") for name in without or []), *class_rules(classes)]
+
+
+def shares_of(split: str | None) -> tuple[float, float, float] | None:
+    """Return the shares of training, validation and test that an option gives.
+
+    Raises:
+        MitsonarError: no three numbers.
+    """
+    if split is None:
+        return None
+    train, validation, test = numbers_of(split, "--split", 3)
+    return train, validation, test
+
+
+def numbers_of(text: str, option: str, count: int | None) -> list[float]:
+    """Return the numbers of an option, with commas between.
+
+    Raises:
+        MitsonarError: something else, or another count of them.
+    """
+    try:
+        numbers = [float(one) for one in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or len(numbers) != (count or len(numbers)) or not all(map(math.isfinite, numbers)):
+        raise MitsonarError(f"{option} takes {count or 'some'} numbers with commas between: got {text!r}")
+    return numbers
+
+
+def exported(
+    where: str,
+    to: str,
+    out: Path,
+    picture: str,
+    classes: list[tuple[str, str]],
+    least: int,
+    least_snr_db: float,
+    split: tuple[float, float, float] | None,
+    polygons: bool,
+    view: str | None,
+    every_class: bool = False,
+) -> None:
+    """Export frames and say where they are."""
+    from mitsonar.bridges.export_formats import export_to
+    from mitsonar.bridges.export_source import PictureKind, open_export
+
+    source = open_export(where, view=view, split=split)
+    words = {"classes": classes, "least": least, "least_snr_db": least_snr_db, "polygons": polygons}
+    with progress_bar("exporting", source.frames, "frames") as progress:
+        kind = cast(PictureKind, picture)
+        made = export_to(to, source, out, picture=kind, every_class=every_class, progress=progress, **words)  # type: ignore[arg-type]
+    say(f"{counted(source.frames, 'frame')} as {to}: {out}")
+    for part in ("train", "validation", "test"):
+        counts = ", ".join(f"{name} {made.boxes[part, name]:,}" for name in made.classes)
+        if to in ("coco", "yolo") and (source.part == part).any():
+            say(f"{part:10} {int((source.part == part).sum()):,} pictures, boxes: {counts}")
+    if to in ("coco", "yolo") and made.faint + made.small:
+        say(f"without a box: {made.faint:,} below {least_snr_db:g} dB over the noise, {made.small:,} below {least} pixels")
