@@ -40,8 +40,8 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     """Open the recording of a sonar in a ROS bag; pixels are read on demand.
 
     Times are those in the headers of the messages; where they are all 0, or all the same, those of reception. Values count
-    as amplitudes. Poses are those of the bag, where they are unambiguous (:mod:`mitsonar.recordings.ros_topics`). A file that
-    mitsonar wrote tells its sonar and coding (:mod:`mitsonar.recordings.ros_messages`).
+    as amplitudes. Poses are those of the bag, where they are unambiguous (:mod:`mitsonar.recordings.ros_topics`). A file
+    that mitsonar wrote states its sonar and coding (:mod:`mitsonar.recordings.ros_messages`).
 
     Args:
         path: of a ``.bag``, ``.mcap`` or ``.db3``, or of the folder of a ROS 2 bag.

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import integrate
-
-from mitsonar.acoustics.sonar_equation import (
+from sonar_equation import (
     ambient_noise_db,
     apply_tvg,
     area_strength_db,
@@ -32,6 +31,7 @@ from mitsonar.acoustics.sonar_equation import (
     undo_tvg,
     volume_reverberation_db,
 )
+
 from mitsonar.errors import MitsonarError
 
 RANGE = np.geomspace(0.1, 500, 200)

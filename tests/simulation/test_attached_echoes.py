@@ -24,8 +24,7 @@ POSE = np.array([0.1, -0.2, 2.5, 0.6, 0.1, 0.2])
 def totals(loaded: mi.Scene, pose: Any) -> tuple[Any, Any]:
     """Mean range and summed level of all rays."""
     import drjit as dr
-
-    from mitsonar.simulation.attached_echoes import attached_echoes
+    from attached_echoes import attached_echoes
 
     found = attached_echoes(loaded, SONAR, pose)
     return dr.mean(found.range_m), dr.sum(found.level)
@@ -96,8 +95,7 @@ def test_by_a_vertex(variant: str) -> None:
 
 def test_attitude_is_that_of_the_poses(variant: str) -> None:
     import mitsuba as mi
-
-    from mitsonar.simulation.attached_echoes import turned
+    from attached_echoes import turned
 
     d: Array = np.array([0.3, -0.2, 0.9])
     got = turned([mi.Float(float(v)) for v in POSE], mi.Vector3f(*d.tolist()))
@@ -106,8 +104,7 @@ def test_attitude_is_that_of_the_poses(variant: str) -> None:
 
 def test_other_models_are_refused(variant: str) -> None:
     import mitsuba as mi
-
-    from mitsonar.simulation.attached_echoes import attached_echoes
+    from attached_echoes import attached_echoes
 
     loaded = scene(floor=floor(diffuse(0.5)))
     with pytest.raises(MitsonarError, match="those of the model physical"):
