@@ -1,7 +1,8 @@
-"""The grid on which a coherent ping is summed, and the matrices that turn it into beams and bins.
+"""How a coherent field becomes beams and bins: its grid, the matrices of pattern and pulse, and the beam of a direction.
 
-A line array's response depends on the difference of sines of the bearings only. So one grid over (sine, range) serves all
-beams: a banded matrix over range applies the pulse, a dense one over the sine the pattern.
+The response of a line array depends only on the difference of the sines of two bearings. One grid over (sine, range)
+therefore serves all beams: a banded matrix over range applies the pulse, and a dense matrix over the sine applies the
+pattern.
 """
 
 from __future__ import annotations
@@ -40,33 +41,33 @@ __all__ = [
 
 
 SINES_A_LOBE, RANGES_A_PULSE = 8, 4
-"""Lines of the grid a wavelength over the aperture, and a resolution."""
+"""Grid lines per wavelength over aperture in sine, and per resolution in range."""
 
 SIDE_LOBES_DB, MOST_LOBES = 45.0, 8
-"""Echoes beside the fan are kept where side lobes reach this level, at most so many wavelengths over the aperture."""
+"""Side-lobe level down to which echoes beside the fan are kept, and the limit in wavelengths over aperture."""
 
 PULSE_LENGTHS = 4
-"""Echoes beside the window are kept this many resolutions away."""
+"""Distance beside the window within which echoes are kept, in resolutions."""
 
 ELEVATION_END = {"receive": 1.0, "two_way": 0.845}
-"""End of the fan over elevation in x of sinc(x): its first zero one way, -30 dB both ways."""
+"""Edge of the fan over elevation, as x of sinc(x): the first zero for a one-way pattern, -30 dB for a two-way one."""
 
 ELEVATION_HALF = {"receive": 0.442946, "two_way": 0.318883}
-"""x of sinc(x) where the power is one half."""
+"""Half-power point of the pattern, as x of sinc(x)."""
 
 COLUMNS_A_BEAM = {"draft": 2, "standard": 4, "fine": 8}
-"""Rays across the width of a beam."""
+"""Number of ray columns across the width of a beam, by quality."""
 
 STEEPEST_DEG = 85.0
-"""Largest elevation of the fan."""
+"""Largest elevation of the fan [deg]."""
 
 FOCUS_BLOCKS = 24
-"""Blocks of range with a pattern each, where the array is focused at one range."""
+"""Number of range blocks, each with its pattern, of an array focused at one range."""
 
 
 @dataclass(frozen=True)
 class CommonFan:
-    """Rays of a coherent ping, even in the sine of the bearing and the tangent of the elevation.
+    """Rays of a coherent ping, evenly spaced in the sine of the bearing and the tangent of the elevation.
 
     Attributes:
         columns, rows: number of rays across and over elevation.
@@ -81,7 +82,7 @@ class CommonFan:
 
     @classmethod
     def of(cls, sonar: Sonar) -> CommonFan:
-        """Derive the fan of a sonar; its density follows from the sonar's quality."""
+        """Derive the fan of a sonar, with the ray density of its quality."""
         end = elevation_end(sonar)
         sine = min(0.999, math.sin(math.radians(sonar.azimuth_fov_deg) / 2) + side_lobes(sonar.aperture))
         columns = math.ceil(2 * sine / sonar.beam_width_rad * COLUMNS_A_BEAM[sonar.quality])
@@ -95,7 +96,7 @@ class CommonFan:
 
 
 def elevation_end(sonar: Sonar) -> float:
-    """Return the largest elevation of rays [rad]: the edge of the field of view, or where the pattern has faded."""
+    """Return the largest elevation of rays [rad]: the edge of the field of view or of the pattern over elevation."""
     half = math.radians(sonar.elevation_fov_deg) / 2
     if sonar.vertical_pattern == "box":
         return half
@@ -104,19 +105,20 @@ def elevation_end(sonar: Sonar) -> float:
 
 
 def side_lobes(aperture: Aperture) -> float:
-    """Return how far beside a beam's axis its side lobes count, as a difference of sines."""
+    """Return the distance from a beam's axis within which side lobes count, as a difference of sines."""
     return min(aperture.reach(SIDE_LOBES_DB), MOST_LOBES / aperture.length)
 
 
 class BeamFormer:
-    """Turn fields over (sine of the bearing, range) into beams and bins.
+    """Beam former and matched filter for fields over (sine of the bearing, range).
 
-    The level of an even ground is that of a box as wide as the beam and as long as a bin, so that energies equal those of
-    the model ``physical``. What linear deposit on the grid loses of the power is divided out.
+    The level of even ground equals that of a box as wide as the beam and as long as a bin, so energies agree with those of
+    the model ``physical``. The power that linear deposit on the grid loses is divided out.
 
     Attributes:
-        sines, ranges: number of lines of the grid.
-        first_sine, sine_step, first_range, range_step: where its lines lie.
+        sines, ranges: numbers of grid lines.
+        first_sine, sine_step: first line and spacing in sine.
+        first_range, range_step: first line and spacing in range [m].
     """
 
     def __init__(self, sonar: Sonar) -> None:
@@ -132,13 +134,15 @@ class BeamFormer:
 
     @cached_property
     def over_range(self) -> csr_array[Any, Any]:
-        """Return the matrix of the pulse ``(bins, ranges)`` float32."""
+        """Return the pulse as a banded matrix ``(bins, ranges)`` float32."""
+        # 1. Grid columns within reach of each bin's pulse.
         sonar, pulse = self.sonar, self.pulse
         reach = math.ceil(PULSE_LENGTHS * pulse.resolution_m / self.range_step)
         middle = np.round((sonar.range_m - self.first_range) / self.range_step).astype(int)
         column = middle[:, None] + np.arange(-reach, reach + 1)
         inside = (column >= 0) & (column < self.ranges)
         away = sonar.range_m[:, None] - (self.first_range + column * self.range_step)
+        # 2. Pulse shape at these columns, scaled to the energy of a bin and corrected for the linear deposit.
         kept = _kept_power(pulse.shape, self.range_step, 20 * pulse.resolution_m)
         value = pulse.shape(away) * math.sqrt(sonar.bin_m / (pulse.equivalent_m * kept))
         row = np.broadcast_to(np.arange(sonar.range_bins)[:, None], column.shape)
@@ -147,30 +151,30 @@ class BeamFormer:
 
     @cached_property
     def _gain(self) -> float:
-        """Return the factor that gives a beam the level of a box of its width."""
+        """Return the factor that gives a beam the level of a box of the same width."""
         kept = _kept_power(self.aperture.pattern, self.sine_step, 40 / self.aperture.length)
         return math.sqrt(self.sonar.beam_width_rad / (self.aperture.equivalent_width * kept))
 
     @cached_property
     def kept(self) -> float:
-        """Return the part of the power that linear deposit on the grid keeps, over sine and range."""
+        """Return the fraction of power that linear deposit on the grid preserves, over sine and range."""
         over_range = _kept_power(self.pulse.shape, self.range_step, 20 * self.pulse.resolution_m)
         return over_range * _kept_power(self.aperture.pattern, self.sine_step, 40 / self.aperture.length)
 
     @cached_property
     def _away(self) -> NDArray[np.float64]:
-        """Return the sine of each beam's axis less that of each line ``(beams, sines)``."""
+        """Return the sine of each beam's axis minus that of each grid line ``(beams, sines)``."""
         line = self.first_sine + np.arange(self.sines) * self.sine_step
         return np.asarray(np.sin(self.sonar.bearing_rad)[:, None] - line, dtype=np.float64)
 
     @cached_property
     def over_sine(self) -> NDArray[np.float32]:
-        """Return the matrix of the pattern ``(beams, sines)``, focused at every range."""
+        """Return the pattern as a matrix ``(beams, sines)``, for an array focused at every range."""
         return np.asarray(self.aperture.pattern(self._away) * self._gain, dtype=np.float32)
 
     @cached_property
     def focused(self) -> list[tuple[slice, NDArray[np.complex64]]]:
-        """Return blocks of bins and their matrices ``(beams, sines)``, of an array focused at one range."""
+        """Return blocks of bins and their pattern matrices ``(beams, sines)``, for an array focused at one range."""
         sonar = self.sonar
         assert sonar.focus_m is not None
         assert sonar.frequency_hz is not None
@@ -183,7 +187,8 @@ class BeamFormer:
         return found
 
     def beams(self, field: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Return the image ``(bins, beams)`` of a field ``(sines, ranges)``."""
+        """Compute the complex image ``(bins, beams)`` of a field ``(sines, ranges)``."""
+        # pulse first; real and imaginary part stay apart because both matrices are real unless the array is focused
         parts = self.over_range @ np.concatenate([field.real, field.imag]).T  # (bins, 2 sines)
         real, imag = parts[:, : self.sines], parts[:, self.sines :]
         if self.sonar.focus_m is None:
@@ -195,21 +200,20 @@ class BeamFormer:
 
 
 def _kept_power(shape: Any, step: float, reach: float) -> float:
-    """Return the part of the power that linear deposit on a grid keeps, mean over places between its lines."""
+    """Return the fraction of power that linear deposit on a grid preserves, averaged over positions between lines."""
     x = np.linspace(-reach, reach, 40_001)
     places = (np.arange(32) + 0.5) / 32
     power = [np.trapezoid(((1 - part) * shape(x) + part * shape(x - step)) ** 2, x) for part in places]
     return float(np.mean(power) / np.trapezoid(shape(x) ** 2, x))
 
 
-# ---------------- The beam that a direction lies in: bearing, elevation and index, for echoes that come another way
-# than their ray
+# ---------------- Beam of a direction
 
 
 def beam_of(
     sonar: Sonar, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray
 ) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Return beam, whether the direction lies in the field of view, and elevation [rad]."""
+    """Return the beam of unit directions, whether they lie in the field of view, and their elevation [rad]."""
     bearing, elevation = angles_of(sonar, starboard, forward, up)
     beam, inside = beam_at(sonar, bearing)
     lift: DeviceArray = dr.abs(elevation)
@@ -220,14 +224,15 @@ def beam_of(
 def angles_of(
     sonar: Sonar, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Return bearing and elevation of unit directions [rad]."""
+    """Return bearing and elevation of unit directions [rad], by the sonar's kind of bearing."""
     if sonar.bearing == "azimuth":
         return dr.atan2(starboard, forward), _asin(up)
     return _asin(starboard), dr.atan2(up, forward)
 
 
 def beam_at(sonar: Sonar, bearing: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
-    """Return the beam at bearings [rad], and whether they lie in one."""
+    """Return the beam at bearings [rad], and whether a beam contains them."""
+    # place in the fan in units of beams, by even angles or even sines
     place: DeviceArray
     half = math.radians(sonar.azimuth_fov_deg) / 2
     if sonar.beam_layout == "even":
@@ -238,7 +243,8 @@ def beam_at(sonar: Sonar, bearing: DeviceArray) -> tuple[DeviceArray, DeviceArra
     inside = (place >= 0) & (place < sonar.beams) & (aside <= half)
     beam = mi.UInt32(dr.select(inside, place, 0))
     if sonar.beam_width_deg is not None and sonar.model == "physical":
-        part = (mi.Float(beam) + (0.5 - sonar.beams / 2)) * (2 / sonar.beams)  # a table would be no input of the launch
+        # beams narrower than their spacing leave gaps: compare with the axis of the beam
+        part = (mi.Float(beam) + (0.5 - sonar.beams / 2)) * (2 / sonar.beams)  # computed: a table would not be an input
         axis = part * half if sonar.beam_layout == "even" else dr.asin(part * math.sin(half))
         away: DeviceArray = dr.abs(bearing - axis)
         inside &= away <= sonar.beam_width_rad / 2
@@ -249,20 +255,23 @@ def _asin(value: DeviceArray) -> DeviceArray:
     return dr.asin(dr.select(value < 1, dr.select(value > -1, value, -1), 1))
 
 
-# ---------------- The sum over echoes, a non-uniform FFT of type 1: finufft, or cufinufft where the renderer runs on CUDA
+# ---------------- Sums of phasors by non-uniform FFT
 
 
 TOLERANCE = 1e-9
-"""Relative error of the sums."""
+"""Relative error of the sums of phasors."""
 
 
 def phasor_sums(turn: NDArray[np.float64], strength: NDArray[np.complex128], modes: int) -> NDArray[np.complex128]:
-    """Sum strength exp(-i k turn) over the echoes, for an odd number of k around 0.
+    """Sum strength exp(-i k turn) over echoes, for an odd number of integers k centred on 0.
+
+    This is a non-uniform FFT of type 1. It is computed by finufft, or by cufinufft if it is installed and the renderer
+    runs on CUDA.
 
     Args:
         turn: phase step of each echo, -pi..pi ``(n,)`` [rad].
         strength: complex amplitude of each echo ``(n,)``.
-        modes: number of k.
+        modes: number of values of k.
 
     Returns:
         The sums ``(modes,)``.
@@ -276,9 +285,9 @@ def phasor_sums(turn: NDArray[np.float64], strength: NDArray[np.complex128], mod
 
 @cache
 def _has_cufinufft() -> bool:
-    """Test whether cufinufft is installed and loads; it finds CUDA's libraries in torch's, if their versions agree."""
+    """Test whether cufinufft is installed and loads; it uses the CUDA libraries of torch, if their versions agree."""
     try:
-        import torch  # noqa: F401, I001  # first: its libraries are found then
+        import torch  # noqa: F401, I001  # first: makes its CUDA libraries available
 
         import cufinufft  # noqa: F401
     except (ImportError, OSError):
@@ -300,21 +309,28 @@ def phasors(
     """Compute phase step and complex amplitude of echoes in NumPy, as a launch does on the device.
 
     Args:
-        delay: of each echo ``(n,)`` [s].
-        amplitude: of each echo ``(n,)``, before the carrier's phase.
-        sonar: carrier and frequency step.
-        padding: factor by which the frequency response is sampled finer.
+        delay: delay of each echo ``(n,)`` [s].
+        amplitude: amplitude of each echo ``(n,)``, before the phase of the carrier.
+        sonar: the instrument, with its carrier and frequency step.
+        padding: oversampling factor of the frequency response.
+
+    Returns:
+        Phase steps ``(n,)``, -pi..pi [rad], and complex amplitudes ``(n,)``.
     """
+    # whole turns are removed before multiplying by 2 pi, to preserve precision
     turn, phase = delay * (sonar.frequency_step_hz / padding), delay * sonar.carrier_hz
     strength = amplitude * np.exp(-2j * np.pi * (phase - np.rint(phase)))
     return 2 * np.pi * (turn - np.rint(turn)), np.asarray(strength, np.complex128)
 
 
-# ---------------- Pattern over elevation: a uniform aperture whose power is one half at the edges of the field of view
+# ---------------- Pattern over elevation
 
 
 def elevation_gain(sonar: Sonar, tangent: DeviceArray) -> DeviceArray:
-    """Return the amplitude at a tangent of the elevation, of a ``mi.Float``: a uniform aperture's, or 1."""
+    """Return the amplitude of the pattern over elevation at a tangent of the elevation, a ``mi.Float``.
+
+    The pattern is that of a uniform aperture with half power at the edges of the field of view, or 1 without a pattern.
+    """
     pattern = sonar.vertical_pattern
     if pattern == "box":
         return mi.Float(1)
@@ -323,9 +339,14 @@ def elevation_gain(sonar: Sonar, tangent: DeviceArray) -> DeviceArray:
 
 
 def elevation_gain_of_ends(sonar: Sonar, arrival: DeviceArray, departure: DeviceArray) -> DeviceArray:
-    """Return the amplitude of a path that comes back at another tangent of the elevation than it left at.
+    """Return the amplitude of a path that arrives at a different elevation than it departed at.
 
-    An array that only receives hears the arrival; one that sends as well counts at both ends.
+    The pattern of a receiving array applies to the arrival only, that of a transmitting and receiving array to both ends.
+
+    Args:
+        sonar: the instrument, with its pattern over elevation.
+        arrival: tangent of the elevation at which the path arrives.
+        departure: tangent of the elevation at which the path departs.
     """
     pattern = sonar.vertical_pattern
     if pattern == "box":
@@ -335,6 +356,7 @@ def elevation_gain_of_ends(sonar: Sonar, arrival: DeviceArray, departure: Device
 
 
 def _one_way(sonar: Sonar, tangent: DeviceArray) -> DeviceArray:
+    """Return the one-way amplitude sinc(x) of the uniform aperture at a tangent of the elevation."""
     half = math.sin(math.radians(sonar.elevation_fov_deg) / 2)
     x = tangent * dr.rsqrt(1 + tangent * tangent) * (ELEVATION_HALF[sonar.vertical_pattern] * math.pi / half)
     return dr.select(dr.abs(x) > 1e-4, dr.sin(x) / x, 1)

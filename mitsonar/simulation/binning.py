@@ -1,12 +1,12 @@
-"""Sum echoes in range bins and beams, in one kernel and exactly.
+"""How echoes are summed in range bins and beams: exactly, in the kernel that traces them, and for each view of a ping.
 
 Every sum is 64-bit fixed point, so it does not depend on the order of rays, threads or batches. The scale follows from the
 largest possible sum, so nothing can overflow.
 
-``thesis``: a ray adds its level to the bin that holds its range (Almanza-Medina, eq. 2.2-2.3). ``physical``: its level is
-spread evenly over the range interval that its elevation cell covers. A box of density q over [a, b) is kept as its
-derivative by bins, four additions for any length: q (1 - frac a) at floor a, q frac a at the next bin, and the same at b
-with the other sign. One running sum over the bins then gives the image.
+In the model ``thesis`` a ray adds its level to the bin that contains its range (Almanza-Medina, eq. 2.2-2.3). In the model
+``physical`` its level is spread evenly over the range interval that its elevation cell covers. A box of density q over
+[a, b) is stored as its difference from bin to bin, which takes four additions for any length: q (1 - frac a) at floor a,
+q frac a at the next bin, and the same at b with opposite sign. A running sum over the bins then gives the image.
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ __all__ = [
 
 
 ADD = dr.ReduceMode.Local
-"""Mode of the additions: Dr.Jit's default assumes that the number of threads is the same when a launch is replayed."""
+"""Mode of the scatter-additions; Dr.Jit's default assumes an unchanged number of threads when a launch is replayed."""
 
 COUNTERS = 3
-"""Cells of a beam after its bins: returns nearer than the window, returns farther than it, and misses."""
+"""Number of counter cells after the bins of a beam: returns nearer than the window, returns farther, and misses."""
 
 
 @dataclass
 class Counts:
     """Numbers of rays of each beam ``(frames, beams)``: inside the window, nearer, farther, missed.
 
-    Where the rays of a beam differ from ping to ping (``View.rays_a_beam`` is None), ``inside`` is -1.
+    ``inside`` is -1 where the number of rays of a beam differs from ping to ping (``View.rays_a_beam`` is None).
     """
 
     inside: NDArray[np.int64]
@@ -72,46 +72,51 @@ class Counts:
 
 
 def stride(sonar: Sonar) -> int:
-    """Return the cells of a beam in the sums: bins, the cell after the last, counters."""
+    """Return the number of cells of a beam in the sums: the bins, one cell after the last, and the counters."""
     return sonar.range_bins + 1 + COUNTERS
 
 
 def accumulate(
     seen: ViewEchoes, ping: mi.UInt32, pings: int, tracer: ViewTracer, more: mi.UInt64 | None = None, *, counted: bool = True
 ) -> mi.UInt64:
-    """Sum the levels of a launch; joins the kernel that traces the echoes.
+    """Sum the levels of a launch, in the same kernel that traces the echoes.
 
     Args:
-        seen: Dr.Jit arrays, one value for each ray.
+        seen: echoes of the view, as Dr.Jit arrays with one value for each ray.
         ping: index of each ray's ping in the launch.
         pings: number of pings in the launch.
-        tracer: of the view.
-        more: sums that these levels are added to; default: none.
-        counted: whether the rays that bring nothing into the window are counted.
+        tracer: tracer of the view.
+        more: sums to which these levels are added; default: none.
+        counted: whether to count the rays without an echo in the window (model ``physical``).
 
     Returns:
         The sums ``(pings, beams, stride)``, flat.
     """
+    # 1. Find each ray's row of cells, and its level in fixed point.
     sonar, active, beams = tracer.view.sonar, seen.active, len(tracer.view.bearing_rad)
     exact = _exact(seen.echoes)
     hit = exact.hit > 0
     sums = dr.zeros(mi.UInt64, pings * beams * stride(sonar)) if more is None else more
     start = (ping * beams + seen.beam) * stride(sonar)
     value = level(exact, sonar, dr.select) * 2.0**tracer.bits
+    # 2. Model thesis: one addition to the bin that contains the range, or 1 to a counter.
     if sonar.model == "thesis":
         place = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
         inside = active & hit & (place >= 0) & (place < sonar.range_bins)
         cell = dr.select(inside, _whole(place), _counter(hit, place < 0, sonar))
         dr.scatter_reduce(dr.ReduceOp.Add, sums, dr.select(inside, mi.UInt64(value), 1), start + cell, active, mode=ADD)
         return sums
+    # 3. Model physical: clip the footprint to the window; its density stays that of the whole footprint.
     a, b, width = footprint(exact, sonar)
     inside = active & hit & (b > 0) & (a < sonar.range_bins)
     a, b = _clip(a, sonar.range_bins), _clip(b, sonar.range_bins)
     first, last = _whole(a), _whole(b)
+    # 4. Round the density and its fractional parts once, so that the four additions of a box cancel exactly.
     density = value / width
     whole, late, left = (mi.UInt64(density * part) for part in (1, a - dr.floor(a), b - dr.floor(b)))
     cell = dr.select(inside, first, _counter(hit, b <= 0, sonar))
-    # additions to one cell are joined: a footprint within a bin takes two, across one border three
+    # 5. Add the differences. Additions to the same cell are merged: a footprint within a bin takes two, one that crosses
+    # a single border takes three.
     same, apart = inside & (last == first), inside & (last > first + 1)
     second = dr.select(same, late - left, dr.select(apart, late, late + left - whole))
     begin = dr.select(inside, dr.select(same, left, whole) - late, 1)
@@ -123,7 +128,7 @@ def accumulate(
 
 
 def footprint(exact: Echoes, sonar: Sonar) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Return begin, end and length of each ray's range interval [bins], at least :data:`NARROWEST` long."""
+    """Return start, end and length of each ray's range interval [bins], at least :data:`NARROWEST` long."""
     a = (exact.near_m - sonar.range_min) * (1 / sonar.bin_m)
     b = (exact.far_m - sonar.range_min) * (1 / sonar.bin_m)
     wide = b - a > NARROWEST
@@ -139,10 +144,10 @@ def develop(
     """Turn sums into levels ``(pings, beams, stride)`` and counters ``(COUNTERS, pings, beams)``, flat.
 
     Args:
-        sums: of :func:`accumulate`.
+        sums: sums from :func:`accumulate`.
         pings: number of pings in the launch.
-        tracer: of the view.
-        more: sums of other fraction bits, and these, whose levels are added; default: none.
+        tracer: tracer of the view.
+        more: further sums whose levels are added, and their number of fraction bits; default: none.
     """
     view = tracer.view
     size, lines = stride(view.sonar), pings * len(view.bearing_rad)
@@ -158,7 +163,7 @@ def develop(
 def fetch(image: mi.Float, counters: mi.UInt64, pings: int, view: View) -> tuple[NDArray[np.float32], Counts]:
     """Copy the results of :func:`develop` to NumPy: levels ``(pings, bins, beams)``, beam-major in memory, and counts.
 
-    A transposition on the device would take ten times as long as the copy (scattered reads).
+    Transposing on the device would take ten times as long as the copy, because of scattered reads.
     """
     beams = len(view.bearing_rad)
     levels = np.array(image, copy=False).reshape(pings, beams, stride(view.sonar))[:, :, : view.sonar.range_bins]
@@ -170,8 +175,9 @@ def fetch(image: mi.Float, counters: mi.UInt64, pings: int, view: View) -> tuple
 def strongest(seen: ViewEchoes, ping: mi.UInt32, ray: mi.UInt32, pings: int, view: View) -> mi.UInt64:
     """Find the strongest ray in each cell ``(pings, beams, bins)``.
 
-    The high 32 bits hold the density, the low 32 bits the number of the ray in its ping.
+    The high 32 bits of a result hold the density, the low 32 bits the index of the ray in its ping.
     """
+    # 1. Compute the density of each ray, and the bins that it covers.
     sonar, beams = view.sonar, len(view.bearing_rad)
     exact = _exact(seen.echoes)
     best = dr.zeros(mi.UInt64, pings * beams * sonar.range_bins)
@@ -184,11 +190,13 @@ def strongest(seen: ViewEchoes, ping: mi.UInt32, ray: mi.UInt32, pings: int, vie
         value = value / width
     inside = seen.active & (exact.hit > 0) & (b > 0) & (a < sonar.range_bins) & (value > 0)
     a, b = _clip(a, sonar.range_bins), _clip(b, sonar.range_bins)
+    # 2. Pack density and ray into one integer. The bits of positive floats order as the floats do, so a maximum finds both.
     strength: DeviceArray = dr.reinterpret_array(mi.UInt32, mi.Float(value))
-    # a level below float32's smallest still beats an empty cell
+    # a level that underflows float32 still beats an empty cell
     key = (mi.UInt64(dr.select(strength > 0, strength, 1)) << 32) | mi.UInt64(ray)
     start, bin_, end = (ping * beams + seen.beam) * sonar.range_bins, _whole(a), _whole(dr.ceil(b))
 
+    # 3. Visit the covered bins of each ray in turn.
     def step(bin_: mi.UInt32) -> tuple[mi.UInt32]:
         dr.scatter_reduce(dr.ReduceOp.Max, best, key, start + bin_, inside & (bin_ < end))
         return (bin_ + 1,)
@@ -198,18 +206,18 @@ def strongest(seen: ViewEchoes, ping: mi.UInt32, ray: mi.UInt32, pings: int, vie
 
 
 def _exact(echoes: Echoes) -> Echoes:
-    """Return the echoes in double precision, as NumPy computes them."""
+    """Return the echoes in double precision, to match the results of NumPy."""
     return Echoes(**{field.name: mi.Float64(getattr(echoes, field.name)) for field in fields(Echoes)})
 
 
 def _counter(hit: mi.Bool, near: mi.Bool, sonar: Sonar) -> mi.UInt32:
-    """Return the cell that counts a ray outside the window."""
+    """Return the counter cell of a ray outside the window, within its beam."""
     near_cell = mi.UInt32(sonar.range_bins + 1)
     return dr.select(hit, dr.select(near, near_cell, near_cell + 1), near_cell + 2)
 
 
 def _clip(place: DeviceArray, bins: int) -> DeviceArray:
-    """Clip into 0..bins by comparisons, since LLVM 15 and 16 abort on `max` (see simulation.variant)."""
+    """Clip to 0..bins by comparisons, since LLVM 15 and 16 abort on `max` (see CONTRIBUTING.md)."""
     return dr.select(place > 0, dr.select(place < bins, place, bins), 0)
 
 
@@ -217,22 +225,22 @@ def _whole(place: DeviceArray) -> mi.UInt32:
     return mi.UInt32(dr.select(place > 0, place, 0))
 
 
-# ---------------- Echoes of a view: all echoes of a ping, or those of a portion of the field of view
+# ---------------- Views: the whole field of view or a portion
 
 
 NARROWEST = 2.0**-6
-"""Shortest footprint [bins]: a surface at normal incidence has none, and a density needs one."""
+"""Shortest footprint [bins]: at normal incidence the footprint has no length, and the density would be infinite."""
 
 
 @dataclass(frozen=True)
 class ViewEchoes:
-    """The echoes of a launch in one view, one value for each ray, not evaluated yet.
+    """Echoes of a launch in one view, one value for each ray, not evaluated yet.
 
     Attributes:
-        echoes: with ranges and levels of this view.
+        echoes: echoes with the ranges and levels of this view.
         beam: index of the view's beam.
         active: whether the ray belongs to the view; other rays are not counted.
-        elevation: of each ray in the view's own frame [rad].
+        elevation: elevation of each ray in the frame of the view [rad].
     """
 
     echoes: Echoes
@@ -242,7 +250,7 @@ class ViewEchoes:
 
 
 class ViewTracer(Protocol):
-    """Turn the echoes of a launch into those of one view.
+    """Protocol of an object that turns the echoes of a launch into those of one view.
 
     Attributes:
         bits: fraction bits of the fixed-point sums.
@@ -255,21 +263,21 @@ class ViewTracer(Protocol):
         """Return the view."""
 
     def tables(self, poses: ArrayLike) -> LaunchTables:
-        """Return the view's inputs of a launch, given the sonar's poses ``(pings, 6)`` [m, rad]."""
+        """Return the inputs that the view adds to a launch, for sonar poses ``(pings, 6)`` [m, rad]."""
 
     def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
-        """Return the echoes of a launch in this view; joins the kernel that traces them."""
+        """Return the echoes of a launch in this view, in the same kernel that traces them."""
 
 
 class WholeTracer:
-    """All echoes, each in the beam of its ray."""
+    """View tracer of the whole field of view: every echo, in the beam of its ray."""
 
     def __init__(self, view: Whole) -> None:
         self.view = view
         self.bits = fraction_bits(view.sonar, view.sonar.rays // view.sonar.beams)
 
     def tables(self, poses: ArrayLike) -> LaunchTables:
-        """Return an empty table: the view needs no inputs."""
+        """Return an empty dictionary: the view needs no inputs."""
         return {}
 
     def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
@@ -278,7 +286,7 @@ class WholeTracer:
 
 
 class SegmentTracer:
-    """The echoes of a portion of the field of view."""
+    """View tracer of a portion of the field of view."""
 
     def __init__(self, view: Segment) -> None:
         self.view = view
@@ -294,11 +302,11 @@ class SegmentTracer:
         return {"member": table}
 
     def tables(self, poses: ArrayLike) -> LaunchTables:
-        """Return the pixels of the film that belong to the portion."""
+        """Return the mask of film pixels that belong to the portion."""
         return self._on_device
 
     def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
-        """Return the echoes of the portion; beams count from its first."""
+        """Return the echoes of the portion; beams are numbered from its first."""
         import drjit as dr
         import mitsuba as mi
 
@@ -307,7 +315,7 @@ class SegmentTracer:
 
 
 def fraction_bits(sonar: Sonar, rays: int, gain: float = 1.0) -> int:
-    """Return the fraction bits of the fixed-point sums: ``rays`` of the largest level in one bin stay below 2^62.
+    """Return the fraction bits of fixed-point sums such that ``rays`` of the largest level in one bin stay below 2^62.
 
     Args:
         sonar: the instrument.
@@ -319,24 +327,26 @@ def fraction_bits(sonar: Sonar, rays: int, gain: float = 1.0) -> int:
     return 62 - math.ceil(math.log2(largest if sonar.model == "thesis" else largest / NARROWEST))
 
 
-# ---------------- Echoes at a receiver beside the transmitter (Almanza-Medina, 3.6): the transmitter's rays, seen
-# from the receiver
+# ---------------- Views: a bistatic receiver
 
 
 class ReceiverTracer:
-    """The transmitter's echoes at a receiver beside it; see :class:`~mitsonar.instruments.views.Receiver`."""
+    """View tracer of a receiver away from the transmitter (Almanza-Medina, 3.6): the transmitter's rays, seen from there.
+
+    See :class:`~mitsonar.instruments.views.Receiver` for the geometry.
+    """
 
     def __init__(self, view: Receiver) -> None:
         self.view = view
         sonar, apart = view.sonar, math.dist(view.offset[:3], (0, 0, 0))
-        # r = (R_A + R_B) / 2 <= R_B + apart / 2, and r is at least the window's begin where it counts
+        # r = (R_A + R_B) / 2 <= R_B + apart / 2, and r is at least the start of the window where it counts
         nearest = max(sonar.range_min, sonar.bin_m)
         gain = (nearest / (nearest - apart / 2)) ** 2 if sonar.model == "physical" else 1.0
-        traced = {name: getattr(view.transmitter, name) for name in RAYS}  # another window would want others
+        traced = {name: getattr(view.transmitter, name) for name in RAYS}  # another window would imply other ray counts
         self.bits = fraction_bits(view.transmitter.replace(**_window(sonar), **traced), view.transmitter.rays, gain)
 
     def tables(self, poses: ArrayLike) -> LaunchTables:
-        """Return the receiver's poses: three rows of ``to_world`` for each ping."""
+        """Return the poses of the receiver: three rows of ``to_world`` for each ping."""
         import mitsuba as mi
 
         rows = to_world_matrices(mounted(poses, self.view.offset))[:, :3].astype(np.float32)
@@ -350,6 +360,7 @@ class ReceiverTracer:
         from mitsonar.simulation.beams import beam_of
         from mitsonar.simulation.tracing import hidden
 
+        # 1. Direction and distance from the receiver to the point that each ray hits.
         lines = [dr.gather(mi.Vector4f, tables["rows"], rays.ping * 3 + axis) for axis in range(3)]
         u: DeviceArray
         normal: DeviceArray = mi.Normal3f(echoes.nx, echoes.ny, echoes.nz)
@@ -357,27 +368,36 @@ class ReceiverTracer:
         way = mi.Vector3f(*(p - line.w for p, line in zip(point, lines, strict=True)))
         distance = dr.norm(way)
         u = way / distance
+        # 2. The receiver's beam in that direction.
         port, up, forward = (sum(line[axis] * u[row] for row, line in enumerate(lines)) for axis in range(3))
         beam, inside, elevation = beam_of(self.view.sonar, -port, forward, up)
+        # 3. Visibility: both ends on the same side of the surface, and nothing between the point and the receiver.
         toward = dr.dot(normal, u)
         lit = (echoes.hit > 0) & inside & (toward * dr.dot(normal, fan.d) > 0)
         active = lit & ~hidden(scene, point, normal, u, distance, lit)
         return ViewEchoes(self._received(echoes, fan, way, distance, normal), dr.select(active, beam, 0), active, elevation)
 
     def _received(self, echoes: Echoes, fan: Fan, way: DeviceArray, distance: DeviceArray, normal: DeviceArray) -> Echoes:
-        """Compute range, footprint, cosine and weight of the echoes between transmitter and receiver; ``way`` from it."""
+        """Compute range, footprint, cosine and weight of the echoes at the receiver.
+
+        ``way`` is the vector from the receiver to the point hit, and ``distance`` its length [m].
+        """
         import drjit as dr
 
+        # 1. The range is half of the path. The copy leaves the echoes of other views unchanged.
         half = (echoes.range_m + distance) * 0.5
         received = replace(echoes, **{field.name: getattr(echoes, field.name) for field in fields(Echoes)})
         received.range_m = half
         if self.view.sonar.model == "thesis":
             received.near_m = received.far_m = half
             return received
+        # 2. Footprint: carry half the path from the ray to the lower and upper edge of its cell, on the tangent plane.
+        # Jitter displaces the ray from the middle of its cell, by ``aside`` in bearing.
         u = way / distance
         lift = half_path_rate(echoes.range_m, fan.d, fan.lift, u, normal)
         side = half_path_rate(echoes.range_m, fan.d, fan.side, u, normal)
         middle = half + side * fan.aside
+        # The nearer end of the monostatic footprint belongs to the lower edge where the range grows with elevation.
         rises = dr.dot(normal, fan.lift) * dr.dot(normal, fan.d) < 0
         ends = (dr.select(rises, echoes.near_m, echoes.far_m), dr.select(rises, echoes.far_m, echoes.near_m))
         low, high = (
@@ -385,9 +405,10 @@ class ReceiverTracer:
             for angle, end in zip((fan.below, fan.above), ends, strict=True)
         )
         received.near_m, received.far_m = dr.select(low < high, low, high), dr.select(low < high, high, low)
+        # 3. The receiver's cosine, since the transmitter's cancels in the lit area.
         cosine = dr.abs(dr.dot(normal, u))
         received.cosine = dr.select(cosine < 1, cosine, 1)
-        # spreading is 1/R_B^2, and the sonar equation divides by half the path squared
+        # 4. Spreading is 1 / R_B^2, whereas the sonar equation divides by half the path squared.
         received.solid_angle_sr = echoes.solid_angle_sr * (half / distance) ** 2
         return received
 
@@ -401,7 +422,10 @@ class ReceiverTracer:
         normal: DeviceArray,
         otherwise: DeviceArray,
     ) -> DeviceArray:
-        """Return half the path by way of a flat edge, ``end`` from the transmitter [m]; elsewhere ``otherwise``."""
+        """Return half the path via the edge of a cell at grazing incidence, and ``otherwise`` elsewhere [m].
+
+        ``end`` is the distance of the edge from the transmitter [m], ``angle`` its elevation relative to the ray [rad].
+        """
         import drjit as dr
 
         from mitsonar.plugins.echo_integrator import edge_direction, flatter
@@ -414,14 +438,14 @@ class ReceiverTracer:
 def half_path_rate(
     range_m: DeviceArray, d: DeviceArray, turn: DeviceArray, u: DeviceArray, normal: DeviceArray
 ) -> DeviceArray:
-    """Return the change of half a path by an angle of its ray, on the tangent plane [m/rad].
+    """Return the derivative of half a path by an angle of its ray, on the tangent plane [m/rad].
 
     Args:
-        range_m: along the ray [m].
+        range_m: range along the ray [m].
         d: direction of the ray.
-        turn: its derivative by the angle.
+        turn: derivative of the direction by the angle.
         u: unit direction from the other end of the path to the point hit.
-        normal: of the surface there.
+        normal: unit normal of the surface at that point.
     """
     import drjit as dr
 
@@ -435,12 +459,12 @@ def _window(sonar: Sonar) -> dict[str, float]:
     return {name: getattr(sonar, name) for name in ("range_min", "range_max", "range_bins")}
 
 
-# ---------------- The tracer of each kind of view
+# ---------------- View tracers by kind of view
 
 
 TRACERS = {Whole: WholeTracer, Segment: SegmentTracer, Receiver: ReceiverTracer}
 
 
 def view_tracers(views: Iterable[View]) -> list[ViewTracer]:
-    """Return the tracer of each view, in their order."""
+    """Return the view tracer of each view, in the same order."""
     return [TRACERS[type(view)](view) for view in views]

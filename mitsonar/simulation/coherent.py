@@ -1,4 +1,4 @@
-"""Coherent pings: field, beams, losses, leaks, noise, and levels after the gain, in the order of the instrument."""
+"""How a coherent ping is made: field, beams, losses, crosstalk, noise and gain, in the order of the instrument."""
 
 from __future__ import annotations
 
@@ -34,37 +34,37 @@ if TYPE_CHECKING:
 __all__ = ["CoherentImager", "coherent_imager"]
 
 FEWEST_A_CELL = 4.0
-"""Points in a resolution cell below which the speckle's contrast exceeds theory by 3 % and more (measured)."""
+"""Points per resolution cell below which the contrast of speckle exceeds theory by 3 % or more (measured)."""
 
 MOST_CUT = 1e-3
-"""Part of the rays that may miss points: those that graze the sides of bodies do, and carry little."""
+"""Fraction of rays that may miss points: rays that graze the sides of bodies do, and contribute little."""
 
 STRIPES, NOISE, VOLUME, GLOW = 0x57121, 0x6E6F6973, 0x766F6C75, 0x676C6F77
-"""Keep the draws of stripes, noise, volume and glow apart."""
+"""Salts of the seed that make the draws of stripes, noise, volume and glow independent."""
 
 MEDIAN_SQUARE = 0.25
-"""Median over even beams of the square of the bearing, relative to the outermost."""
+"""Median of the squared bearing over evenly spaced beams, relative to the outermost beam."""
 
 SIDE_SALT = {0: 0, 1: 0x7570 << 32, -1: 0x646F << 32}
-"""Keep the noise of both sides of the elevation apart."""
+"""Salts of the seed that make the noise of both sides of the elevation independent, keyed by side."""
 
 
 class CoherentImager:
-    """Render the complex images of a sonar: amplitudes relative to the source's at 1 m, without the gain.
+    """Renderer of a sonar's complex images: amplitudes relative to the source at 1 m, without the gain.
 
     Args:
         scene: any Mitsuba scene.
-        sonar: of the model ``coherent``.
-        mirrors: parts of shapes that reflect as mirrors, by the shapes' ids; default: none.
-        views: the whole, or portions of the field of view.
-        motion: of bodies of the scene; default: all stands still.
+        sonar: a sonar of the model ``coherent``.
+        mirrors: mirror parts of shapes, keyed by shape id, or ``"materials"``; default: none.
+        views: the whole field of view or portions of it; default: the whole.
+        motion: motion of the scene's bodies; default: nothing moves.
 
     Attributes:
-        sides: of the elevation, each rendered by itself: of the whole view 0, of portions +1 and -1.
-        notes: what a user should know about scene and sonar.
+        sides: sides of the elevation that are rendered separately: 0 for the whole view, +1 and -1 for portions.
+        notes: warnings about scene and sonar.
 
     Raises:
-        MitsonarError: receivers elsewhere, cones, or portions with mirrors.
+        MitsonarError: a view is a receiver elsewhere or a cone; there are mirrors in portions.
     """
 
     def __init__(
@@ -95,9 +95,9 @@ class CoherentImager:
         """Return the complex image of one ping ``(bins, sides * beams)`` with its noise, and the counts of its rays.
 
         Args:
-            pose: of the sonar ``(6,)`` [m, rad].
-            ping: its number, of which the noise is a function.
-            time_s: when bodies that move are where they are [s].
+            pose: sonar pose ``(6,)`` [m, rad].
+            ping: ping number, which determines the noise.
+            time_s: time at which moving bodies are placed [s].
         """
         images, counts = zip(*(self._of_side(pose, ping, side, time_s) for side in self.sides), strict=True)
         return np.concatenate(images, axis=1) if len(images) > 1 else images[0], FieldCounts.joined(counts)
@@ -105,7 +105,7 @@ class CoherentImager:
     def _of_side(
         self, pose: NDArray[np.float64], ping: int, side: int, time_s: float
     ) -> tuple[NDArray[np.complex64], FieldCounts]:
-        """Return what one side of the elevation, or both, give ``(bins, beams)``, and the counts of its rays."""
+        """Return the complex image of one side of the elevation ``(bins, beams)`` with its noise, and its ray counts."""
         image, counts = self.echoes(pose, side, time_s)
         if self.sonar.volume_db is not None:
             image = image + self.volume(ping, side)
@@ -118,31 +118,35 @@ class CoherentImager:
     def echoes(
         self, pose: NDArray[np.float64], side: int | None = None, time_s: float = 0.0
     ) -> tuple[NDArray[np.complex64], FieldCounts]:
-        """Return the complex image of the scene alone ``(bins, beams)``, without noise, volume and stripes, and the counts.
+        """Return the complex image of the scene alone ``(bins, beams)``, and the ray counts.
+
+        The image has no noise, volume reverberation or stripes.
 
         Args:
-            pose: of the sonar ``(6,)`` [m, rad].
-            side: of the elevation, one of :attr:`sides`; default: the first.
-            time_s: when bodies that move are where they are [s].
+            pose: sonar pose ``(6,)`` [m, rad].
+            side: side of the elevation, one of :attr:`sides`; default: the first.
+            time_s: time at which moving bodies are placed [s].
         """
+        # field of the scatterers, then of mirror images and paths of several reflections
         field, counts = (self.tracer if side is None else self.tracers[side]).field(pose, time_s)
         if self.glints is not None:
             self.glints.add(pose, field, time_s)
         for further in (self.ghosts, self.corners, self.diffuse):
             if further is not None:
                 further.add(pose, field, time_s)
+        # beams and bins, absorption, and the crosstalk of all beams
         image = self.former.beams(field) * self._loss[:, None]
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
         return np.asarray(image, dtype=np.complex64), counts
 
     def of_quality(self, quality: Quality) -> CoherentImager:
-        """Return what renders the same scatterers with more or fewer rays."""
+        """Return a renderer of the same scatterers with the number of rays of another quality."""
         scene, mirrors, motion = self._given
         return CoherentImager(scene, self.sonar.replace(quality=quality), mirrors, motion=motion)
 
     def in_views(self, pings: RenderedPings) -> list[RenderedPings]:
-        """Return pings of :attr:`sides` ``(pings, bins, sides * beams)`` as one part for each view."""
+        """Split pings of all :attr:`sides` ``(pings, bins, sides * beams)`` into one part for each view."""
         found = []
         for view in self.views:
             first = self.sides.index(side_of(view)) * self.sonar.beams
@@ -153,14 +157,14 @@ class CoherentImager:
     def levels(
         self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0
     ) -> tuple[NDArray[np.float32], Counts, CutRays]:
-        """Return the levels of one ping after the gain ``(bins, sides * beams)`` float32, counts of rays, and cut ones."""
+        """Return the levels of one ping after gain ``(bins, sides * beams)`` float32, its ray counts, and its cut rays."""
         image, found = self.image(pose, ping, time_s)
         power = image.real * image.real + image.imag * image.imag
         rays = (np.array([[number]]) for number in (found.inside, found.nearer, found.farther, found.missed))
         return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), self._cut_rays(found)
 
     def _cut_rays(self, found: FieldCounts) -> CutRays:
-        """Return the rays that missed points, where they are so many that a picture may show it."""
+        """Return the rays that missed points, if they are numerous enough to affect the image."""
         if found.cut <= MOST_CUT * found.inside:
             return CutRays()
         return CutRays(found.cut, self.tracer.pitch * math.sqrt(1.1 * found.widest / MOST_CANDIDATES))
@@ -172,27 +176,28 @@ class CoherentImager:
 
     @cached_property
     def _loss(self) -> NDArray[np.float32]:
-        """Return the amplitude that absorption leaves, there and back ``(bins,)``."""
+        """Return the two-way amplitude factor of absorption ``(bins,)``."""
         return np.asarray(np.sqrt(loss_of(self.sonar)), dtype=np.float32)
 
     @cached_property
     def _stripes(self) -> NDArray[np.float32]:
-        """Return the gain of each beam's amplitude ``(beams,)``, from the seed."""
+        """Return the amplitude gain of each beam ``(beams,)``, drawn from the seed."""
         rng = np.random.default_rng([abs(self.sonar.seed), STRIPES])
         return np.asarray(10 ** (rng.normal(0, self.sonar.stripes_db, self.sonar.beams) / 20), dtype=np.float32)
 
-    # ---------------------------------------------------------------- noise and volume
+    # ---------------- Noise and volume reverberation
 
     def noise(self, ping: int, side: int = 0) -> NDArray[np.complex64]:
-        """Return the receiver's noise of one ping ``(bins, beams)``: complex Gaussian, filtered as echoes are.
+        """Return the receiver noise of one ping ``(bins, beams)``: complex Gaussian, filtered as echoes are.
 
-        White noise of the water and of the elements passes the array, so neighbouring beams share part of it, and the
-        matched filter. Near the sonar it may glow. Each number is a function of (seed, ping, cell), those of the part of the
-        glow that stays of (seed, cell).
+        White noise from the water and the array elements passes the array, which correlates neighbouring beams, and the
+        matched filter. The noise may rise near the sonar (near glow). Each value is a function of (seed, ping, cell); the
+        part of the glow that is constant over pings is a function of (seed, cell).
         """
         sonar, amplitude, salt = self.sonar, self._noise_amplitude, SIDE_SALT[side]
         if sonar.near_glow_still == 0 or sonar.near_glow_db == 0:
             return self._white(ping, NOISE ^ salt, 1) * np.asarray(amplitude, np.float32)
+        # split the excess power of the glow into a part that is constant over pings and a part drawn for each ping
         power = np.square(amplitude)
         still = sonar.near_glow_still * power * (1 - 10 ** (-self._glow / 10))
         new = self._white(ping, NOISE ^ salt, 1) * np.asarray(np.sqrt(power - still), np.float32)
@@ -201,7 +206,7 @@ class CoherentImager:
 
     @cached_property
     def _glow(self) -> NDArray[np.float64]:
-        """Return what the noise near the sonar exceeds that behind by ``(bins, 1)`` or ``(bins, beams)`` [dB]."""
+        """Return the excess of the noise near the sonar over that farther away ``(bins, 1)`` or ``(bins, beams)`` [dB]."""
         sonar = self.sonar
         fall = (sonar.near_glow_db * (1 - sonar.range_m / sonar.near_glow_m))[:, None]
         if sonar.near_glow_db == 0 or (sonar.near_glow_edge_db == 0 and sonar.near_glow_spread_db == 0):
@@ -211,43 +216,43 @@ class CoherentImager:
         return np.asarray(np.maximum(0, fall - sonar.near_glow_edge_db * (bearing**2 - MEDIAN_SQUARE) + drawn))
 
     def volume(self, ping: int, side: int = 0) -> NDArray[np.complex64]:
-        """Return the echo of what drifts in the water ``(bins, beams)``, new in each ping: Sv times the volume over R^4.
+        """Return the volume reverberation of one ping ``(bins, beams)``, drawn anew for each ping.
 
-        One side of the elevation holds half of the volume.
+        Its power is Sv times the volume of the cell over R^4. One side of the elevation contains half of the volume.
         """
         amplitude = np.asarray(self._volume_amplitude * (math.sqrt(0.5) if side else 1), np.float32)
         return self._white(ping, VOLUME ^ SIDE_SALT[side], 2) * amplitude[:, None]
 
     def noise_powers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the mean power of noise and of volume in each bin, two arrays ``(bins,)``; 0 where there is none.
+        """Return the mean powers of noise and of volume reverberation, two arrays ``(bins,)``; 0 where there is none.
 
-        Glow that differs from beam to beam counts by its mean.
+        Glow that differs from beam to beam is averaged over the beams.
         """
         sonar, none = self.sonar, np.zeros(self.sonar.range_bins)
         noise = none if sonar.noise_level_db is None else np.square(self._noise_amplitude).mean(axis=1)
         return noise, none if sonar.volume_db is None else np.square(self._volume_amplitude)
 
     def beam_correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the correlation of the beams ``(beams, beams)`` of noise, of volume, and of speckle on even ground."""
+        """Return the beam correlations ``(beams, beams)`` of noise, volume reverberation, and speckle on even ground."""
         noise, volume = (self._plane_waves(ways).astype(float) for ways in (1, 2))
         lines = self.former.over_sine.T.astype(float)
         return noise.T @ noise, volume.T @ volume, _correlation(lines.T @ lines)
 
     def bin_correlation(self) -> csr_array[Any, Any]:
-        """Return the correlation of the bins ``(bins, bins)``, by the pulse, of noise, volume and speckle alike."""
+        """Return the bin correlation ``(bins, bins)`` due to the pulse, the same for noise, volume and speckle."""
         rows = self._noise_ranges.astype(float)
         return csr_array(rows @ rows.T)
 
     @cached_property
     def _noise_amplitude(self) -> NDArray[np.float64]:
-        """Return the amplitude of the receiver's noise with its glow ``(bins, 1)`` or ``(bins, beams)``."""
+        """Return the amplitude of the receiver noise including glow ``(bins, 1)`` or ``(bins, beams)``."""
         sonar = self.sonar
         assert sonar.noise_level_db is not None
         return np.asarray(10 ** ((sonar.noise_level_db - sonar.source_level_db + self._glow) / 20), dtype=np.float64)
 
     @cached_property
     def _volume_amplitude(self) -> NDArray[np.float64]:
-        """Return the amplitude of the volume's echo ``(bins,)``."""
+        """Return the amplitude of the volume reverberation ``(bins,)``."""
         sonar = self.sonar
         assert sonar.volume_db is not None
         volume = sonar.range_m**2 * sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m
@@ -255,26 +260,28 @@ class CoherentImager:
         return np.asarray(np.sqrt(power), dtype=np.float64)
 
     def _plane_waves(self, ways: int) -> NDArray[np.float32]:
-        """Return :meth:`_waves`, computed once."""
+        """Return :meth:`_waves` from a cache."""
         if ways not in self._kept_waves:
             self._kept_waves[ways] = self._waves(ways)
         return self._kept_waves[ways]
 
     def _white(self, ping: int, salt: int, ways: int) -> NDArray[np.complex64]:
-        """Return complex Gaussian noise of unit power ``(bins, beams)`` that has passed array and matched filter."""
+        """Return complex Gaussian noise of unit power ``(bins, beams)``, filtered by the array and the matched filter."""
         waves = self._plane_waves(ways)
         shape = 1, self.former.ranges, len(waves)
         first, second = uniform(shape, seed=self.sonar.seed ^ salt, frames=np.array([ping]), like=np.empty(0))
+        # 1. Draw complex Gaussian noise of every plane wave and range (Box-Muller), real and imaginary part side by side.
         radius = np.sqrt(-np.log(first[0]))
         white = np.concatenate([radius * np.cos(2 * math.pi * second[0]), radius * np.sin(2 * math.pi * second[0])], axis=1)
+        # 2. Apply the matched filter over range, then the array over plane waves.
         filtered = self._noise_ranges @ white.astype(np.float32)
         real, imag = (np.ascontiguousarray(part) @ waves for part in np.split(filtered, 2, axis=1))
         return np.asarray(real + 1j * imag, dtype=np.complex64)
 
     def _waves(self, ways: int) -> NDArray[np.float32]:
-        """Return the amplitude of plane waves in each beam ``(waves, beams)``, by the pattern one way or both ways.
+        """Return the amplitude of plane waves in each beam ``(waves, beams)``, for a one-way or two-way pattern.
 
-        Waves are 1 / (ways x length) apart, which resolves that pattern. Each beam has unit power.
+        Waves are 1 / (ways x length) apart in sine, which resolves that pattern. Each beam has unit power.
         """
         length = self.former.aperture.length
         reach = math.sin(math.radians(self.sonar.azimuth_fov_deg) / 2) + 4 / length
@@ -286,20 +293,20 @@ class CoherentImager:
 
     @cached_property
     def _noise_ranges(self) -> csr_array[Any, Any]:
-        """Return the matrix of the matched filter with rows of unit power ``(bins, ranges)``."""
+        """Return the matched filter as a matrix ``(bins, ranges)`` with rows of unit power."""
         rows = self.former.over_range
         power = np.asarray(rows.multiply(rows).sum(axis=1)).ravel()
         return csr_array(rows.multiply(1 / np.sqrt(power)[:, None]), dtype=np.float32)
 
 
 def _correlation(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the correlation that belongs to a covariance ``(n, n)``."""
+    """Convert a covariance matrix ``(n, n)`` to a correlation matrix."""
     std = np.sqrt(np.diag(covariance))
     return np.asarray(covariance / np.outer(std, std), dtype=np.float64)
 
 
 def point_notes(sonar: Sonar) -> list[str]:
-    """Return a sentence where points are too few for speckle: a resolution cell should hold four."""
+    """Return a warning if points are too sparse for speckle: a resolution cell should hold :data:`FEWEST_A_CELL`."""
     pitch = point_pitch(sonar)
     nearest = max(sonar.range_min, sonar.bin_m)
     held = nearest * sonar.beam_width_rad * sonar.resolution_m / pitch**2
@@ -320,10 +327,10 @@ def coherent_imager(
     mirrors: Mirroring = None,
     motion: SceneMotion | None = None,
 ) -> CoherentImager | None:
-    """Return what renders pings of the model ``coherent``; None for other models.
+    """Return the renderer of pings of the model ``coherent``; None for other models.
 
     Raises:
-        MitsonarError: receivers elsewhere, cones, or portions with mirrors.
+        MitsonarError: a view is a receiver elsewhere or a cone; there are mirrors in portions.
     """
     if sonar.model != "coherent":
         return None
@@ -331,10 +338,10 @@ def coherent_imager(
 
 
 def check_views(views: Sequence[View], mirrors: Mirroring) -> Sequence[View]:
-    """Return the views, which are the whole field of view or portions whose borders are beams and the horizon.
+    """Return the views if each is the whole field of view, or a portion bounded by beams and the horizon.
 
     Raises:
-        MitsonarError: receivers elsewhere, cones, or portions with mirrors.
+        MitsonarError: a view is a receiver elsewhere or a cone; there are mirrors in portions.
     """
     for view in views:
         if not isinstance(view, Whole | Segment) or view.name in CONES:

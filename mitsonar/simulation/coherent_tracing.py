@@ -1,8 +1,9 @@
-"""One ping's complex field over (sine of the bearing, range), summed over hash-anchored scatterers in one launch.
+"""How the complex field of a coherent ping is summed over hashed scatterers, in one launch.
 
-Each ray looks through the lattice cells (:mod:`mitsonar.simulation.points`) of its own cell of the surface. A point
-counts where its own direction lies in that ray's cell, so on a plane each point counts exactly once, whatever the rays.
-Its echo is zeta sqrt(C cos^2 dA) / R^2 times the elevation's pattern and exp(-2 j k R). Sums are 64-bit fixed point.
+The field is a function of the sine of the bearing and the range. Each ray visits the lattice cells
+(:mod:`mitsonar.simulation.points`) within its cell of the surface. A point counts if its direction lies in the cell of
+that ray, so on a plane each point counts exactly once, for any set of rays. Its echo is zeta sqrt(C cos^2 dA) / R^2, times
+the pattern over elevation and exp(-2 j k R). Sums are 64-bit fixed point.
 """
 
 from __future__ import annotations
@@ -31,29 +32,29 @@ from mitsonar.simulation.tracing import MovingSurfaces, surfaces_of
 __all__ = ["STRIP", "CoherentTracer", "FanRays", "FieldCounts", "add_waves", "elevation_gain"]
 
 ADD = dr.ReduceMode.Local
-"""Mode of the additions: Dr.Jit's default assumes that the number of threads is the same when a launch is replayed."""
+"""Mode of the scatter-additions; Dr.Jit's default assumes an unchanged number of threads when a launch is replayed."""
 
 STRIP = 8
-"""Columns of a strip: rays that are traced together are neighbours."""
+"""Columns of a strip of rays, so that rays traced together are neighbours."""
 
 MOST_IN_A_CELL = 2.0**16
-"""Points that one cell of the grid is sure to hold without overflow."""
+"""Number of points that one cell of the grid can hold without overflow."""
 
 LARGEST_WEIGHT = 4.2
-"""Largest amplitude of a weight: the root of -log 2^-25."""
+"""Largest amplitude of a weight: the square root of -log 2^-25."""
 
 COUNTED = ("inside", "nearer", "farther", "missed", "cut", "points", "widest")
 
 
 @dataclass(frozen=True)
 class FieldCounts:
-    """Numbers of rays of a ping, and of points.
+    """Numbers of rays and of points of a ping.
 
     Attributes:
         inside, nearer, farther, missed: rays whose hit lies inside the window, nearer, farther; rays that hit nothing.
-        cut: rays whose cell of the surface holds more points than are looked through.
-        points: that were summed.
-        widest: lattice cells around the largest cell of a ray.
+        cut: rays whose cell of the surface holds more points than one ray may visit.
+        points: points that were summed.
+        widest: number of lattice cells that the largest cell of a cut ray covers.
     """
 
     inside: int
@@ -66,7 +67,7 @@ class FieldCounts:
 
     @staticmethod
     def joined(counts: Sequence[FieldCounts]) -> FieldCounts:
-        """Return the counts of several parts together: their sums, and the widest cell of all."""
+        """Combine the counts of several parts: their sums, and the widest cell of all."""
         if len(counts) == 1:
             return counts[0]
         sums = FieldCounts(*(sum(numbers) for numbers in zip(*map(astuple, counts), strict=True)))
@@ -74,18 +75,18 @@ class FieldCounts:
 
 
 class CoherentTracer:
-    """Sum the echoes of hash-anchored scatterers.
+    """Tracer of the echoes of hashed scatterers, for one sonar and one or both sides of the elevation.
 
     Args:
-        scene: to trace.
-        sonar: of the model ``coherent``.
-        former: gives the grid.
-        mirrors: what shapes reflect as mirrors, and do not scatter; default: nothing.
-        side: of the elevation whose points are summed: +1 up, -1 down, 0 both.
-        motion: of bodies of the scene, which take their points with them; default: all stands still.
+        scene: the scene to trace.
+        sonar: a sonar of the model ``coherent``.
+        former: beam former, which defines the grid.
+        mirrors: mirror parts of shapes, which do not scatter; default: none.
+        side: side of the elevation whose points are summed: +1 up, -1 down, 0 both.
+        motion: motion of the scene's bodies, whose points move with them; default: nothing moves.
 
     Attributes:
-        pitch: of the lattice [m].
+        pitch: pitch of the lattice [m].
     """
 
     def __init__(
@@ -105,6 +106,7 @@ class CoherentTracer:
         self.pitch = point_pitch(sonar)
         table = patch_amplitudes(None if sonar.speckle_nu is None else BLENDED * sonar.speckle_nu)
         self.patch_entries, self.patches = len(table), mi.Float(np.resize(table, max(2, len(table))))
+        # fixed point: scale such that no cell of the grid overflows
         nearest = max(former.first_range, sonar.bin_m)
         loudest = LARGEST_WEIGHT * float(table.max()) * self.pitch / nearest**2
         self.bits = 62 - math.ceil(math.log2(loudest * MOST_IN_A_CELL))
@@ -115,7 +117,7 @@ class CoherentTracer:
         self.launch = self._compile()
 
     def field(self, pose: NDArray[np.float64], time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
-        """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad] and a time [s], and its counts."""
+        """Return the field ``(sines, ranges)`` of one ping at a pose ``(6,)`` [m, rad] and a time [s], and its counts."""
         scene = scene_at(self.scene, self.motion, time_s)
         lines = to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64)
         if self.motion is not None:
@@ -129,12 +131,14 @@ class CoherentTracer:
         return field, FieldCounts(*map(int, np.array(counts)))
 
     def _compile(self) -> Callable[..., Any]:
+        """Return the launch of one ping, recorded at its first call."""
+
         @Frozen
         def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any) -> Any:
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
             rays = FanRays(self.fan, self.sonar, index, lines, self.side)
             ray, surfaces = mi.Ray3f(rays.origin, rays.d), replace(self.surfaces, **tables)
-            if isinstance(surfaces, MovingSurfaces):  # all that follows is in the axes of the body that is hit
+            if isinstance(surfaces, MovingSurfaces):  # everything below is in the axes of the body that is hit
                 hit, body = surfaces.hit_in_body(scene, ray)
                 lines = [[dr.gather(mi.Float64, rows, body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
                 rays = FanRays(self.fan, self.sonar, index, lines, self.side)
@@ -142,18 +146,20 @@ class CoherentTracer:
                 hit = surfaces.hit(scene, ray)
             if mirrors is not None:
                 hit = without_mirror_part(mirrors, hit, rays.d, 2 * math.pi / self.wavelength)
-            if isinstance(surfaces, MovingSurfaces):  # last: mirrors are known by their shapes
+            if isinstance(surfaces, MovingSurfaces):  # last: mirrors are looked up by shape
                 hit = replace(hit, shape_id=surfaces.own_lattice(scene, hit, body))
             return self._sums(rays, hit, patches)
 
         return launch
 
     def _sums(self, rays: FanRays, hit: Hit, patches: mi.Float) -> tuple[Any, ...]:
-        """Sum the points of all rays: real and imaginary part ``(sines * ranges,)``, and the counts."""
+        """Sum the points of all rays; return real and imaginary part ``(sines * ranges,)``, and the counts."""
+        # 1. Select the rays whose cell on the surface may contribute to the grid.
         former = self.former
         place: DeviceArray = rays.origin + rays.d * hit.t
         last = former.first_range + (former.ranges - 1) * former.range_step
         reached = rays.on_side & hit.valid & (hit.reflectivity > 0) & rays.may_reach(hit, former.first_range, last)
+        # 2. Find the lattice cells around the hit of each ray.
         points = HashedPoints(
             replace(hit, valid=reached),
             place,
@@ -166,6 +172,7 @@ class CoherentTracer:
         counts = dr.zeros(mi.UInt32, len(COUNTED))
         self._count(counts, rays, hit, points)
 
+        # 3. Visit the cells of each ray in turn and deposit their points; rays end their loop independently.
         def step(number: mi.Int32) -> tuple[mi.Int32]:
             self._deposit(rays, points, number, patches, (real, imag), counts)
             return (number + 1,)
@@ -176,7 +183,7 @@ class CoherentTracer:
         return *(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in (real, imag)), counts
 
     def _count(self, counts: mi.UInt32, rays: FanRays, hit: Hit, points: HashedPoints) -> None:
-        """Count what becomes of the rays of the field of view; those beside it only carry side lobes and skirts."""
+        """Count the outcomes of the rays in the field of view; rays beside it only carry side lobes and skirts."""
         near, far = hit.valid & (hit.t < self.sonar.range_min), hit.valid & (hit.t >= self.sonar.range_max)
         for place, found in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
             kept = found & rays.inside
@@ -194,12 +201,16 @@ class CoherentTracer:
         counts: mi.UInt32,
     ) -> None:
         """Add one point of each ray to the four cells of the grid around it."""
+        # 1. Position and weight of the point, and how the sonar sees it.
         point = points.point(number, patches, self.patch_entries)
         seen = rays.seen(points, point)
+        # 2. Phase in turns; whole turns are removed in double precision, since R is many wavelengths.
         turns = seen.range_m * (2 / self.wavelength)
         sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + point.turn) * (2 * math.pi))
+        # 3. Amplitude: strength, cosine, weight, two-way spreading and pattern over elevation.
         level = points.strength * seen.cosine * point.amplitude / dr.square(mi.Float(seen.range_m))
         level = level * elevation_gain(self.sonar, seen.tangent)
+        # 4. Deposit, if the point lies in the cell of this ray.
         wave = seen.sine, seen.range_m, level, cos, sin
         kept = add_waves(self.former, self.bits, sums, wave, seen.mine & (number < points.count))
         dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(COUNTED.index("points")), kept, mode=ADD)
@@ -208,15 +219,16 @@ class CoherentTracer:
 def add_waves(
     former: BeamFormer, bits: int, sums: tuple[mi.UInt64, mi.UInt64], wave: tuple[DeviceArray, ...], active: DeviceArray
 ) -> DeviceArray:
-    """Add waves to the four cells of the grid around each, in fixed point; return which lie on the grid.
+    """Add waves to the four cells of the grid around each, in fixed point; return which waves lie on the grid.
 
     Args:
-        former: gives the grid.
-        bits: after the point.
+        former: beam former, which defines the grid.
+        bits: number of fraction bits.
         sums: real and imaginary part ``(sines * ranges,)``.
         wave: sine of the bearing, range [m], amplitude, cosine and sine of the phase.
-        active: which to add.
+        active: which waves to add.
     """
+    # 1. Grid coordinates, and the lower of the two lines and ranges around each wave.
     sine, range_m, level, cos, sin = wave
     at_sine = (sine - former.first_sine) * (1 / former.sine_step)
     at_range = mi.Float(range_m - former.first_range) * (1 / former.range_step)
@@ -224,6 +236,7 @@ def add_waves(
     kept = active & (cell >= 0) & (cell < former.ranges - 1)
     kept &= (line >= 0) & (line < former.sines - 1)
     begin = mi.UInt32(dr.select(kept, line, 0)) * former.ranges + mi.UInt32(dr.select(kept, cell, 0))
+    # 2. Bilinear deposit; integer additions do not depend on the order of the rays.
     part = at_sine - line, at_range - cell
     for over_sine in (0, 1):
         for over_range in (0, 1):
@@ -237,9 +250,15 @@ def add_waves(
 
 @dataclass
 class SeenPoint:
-    """A point as the sonar sees it: exact range [m], sine of the bearing, tangent of the elevation, cosine, its ray.
+    """A point as the sonar sees it.
 
-    ``ahead``: whether its direction lies in the fan.
+    Attributes:
+        range_m: range in double precision [m].
+        sine: sine of the bearing.
+        tangent: tangent of the elevation.
+        cosine: absolute cosine between the surface normal and the line of sight.
+        mine: whether the point's direction lies in the cell of the ray.
+        ahead: whether the point's direction lies in the fan.
     """
 
     range_m: DeviceArray
@@ -251,31 +270,34 @@ class SeenPoint:
 
 
 class FanRays:
-    """The rays of a common fan in the world.
+    """Rays of a common fan in the world.
 
-    Bearing ``cone``: (sin b, cos b cos e, cos b sin e) as (starboard, forward, up); ``azimuth``: (cos e sin b,
-    cos e cos b, sin e).
+    The direction at bearing b and elevation e, as (starboard, forward, up), is (sin b, cos b cos e, cos b sin e) for a
+    bearing ``cone``, and (cos e sin b, cos e cos b, sin e) for ``azimuth``.
 
     Args:
-        fan: of the sonar.
-        sonar: tells the bearing.
+        fan: fan of the sonar.
+        sonar: the instrument, which defines the kind of bearing.
         index: number of each ray.
         lines: first three rows of ``to_world`` in double precision.
-        side: of the elevation: +1 up, -1 down, 0 both.
+        side: side of the elevation: +1 up, -1 down, 0 both.
 
     Attributes:
-        sine, tangent: of the bearing and of the elevation of each ray.
-        on_side: rays of that side; a point's side is that of its ray.
-        inside: those of them in the field of view.
+        sine, tangent: sine of the bearing and tangent of the elevation of each ray.
+        on_side: whether the ray is on that side; a point's side is that of its ray.
+        inside: whether the ray is on that side and in the field of view.
     """
 
     def __init__(self, fan: CommonFan, sonar: Sonar, index: mi.UInt32, lines: list[list[Any]], side: int = 0) -> None:
         self.fan, self.cone, self.lines, self.sonar, self.index = fan, sonar.bearing == "cone", lines, sonar, index
+        # 1. Column and row of each ray; rays run along the rows of a strip, then down.
         strip, place = index // (STRIP * fan.rows), index % (STRIP * fan.rows)
         self.column, self.row = mi.Int32(strip * STRIP + place % STRIP), mi.Int32(place // STRIP)
+        # 2. Direction through the middle of each cell; row 0 is the highest.
         self.sine_step, self.tangent_step = 2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows
         u = (mi.Float(self.column) + 0.5) * self.sine_step - fan.sine
         t: DeviceArray = fan.tangent - (mi.Float(self.row) + 0.5) * self.tangent_step
+        # 3. Side of the elevation, and field of view: the fan reaches beyond it.
         sides = math.sin(math.radians(sonar.azimuth_fov_deg) / 2), math.tan(math.radians(sonar.elevation_fov_deg) / 2)
         self.on_side = mi.Bool(True) if side == 0 else (t > 0) == (side > 0)
         aside: DeviceArray = dr.abs(u)
@@ -286,7 +308,7 @@ class FanRays:
         self._aim(u, t)
 
     def _aim(self, u: DeviceArray, t: DeviceArray) -> None:
-        """Point the rays at sines of the bearing and tangents of the elevation, and derive how they turn with these."""
+        """Set ray directions and their derivatives from sines of the bearing ``u`` and tangents of the elevation ``t``."""
         cos_b, cos_e = dr.sqrt(1 - u * u), dr.rsqrt(1 + t * t)
         sin_e, zero = cos_e * t, mi.Float(0)
         if self.cone:
@@ -301,16 +323,16 @@ class FanRays:
         self.origin = mi.Point3f(*(mi.Float(line[3]) for line in self.lines))
 
     def from_lines(self, lines: list[list[Any]]) -> FanRays:
-        """Return the same rays of a sonar elsewhere, of both sides of the elevation."""
+        """Return the same rays for a sonar at another pose, on both sides of the elevation."""
         return FanRays(self.fan, self.sonar, self.index, lines)
 
     def _world(self, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray) -> mi.Vector3f:
-        """Turn (starboard, forward, up) into the world's axes."""
+        """Rotate (starboard, forward, up) into world axes."""
         rows = [[mi.Float(value) for value in line[:3]] for line in self.lines]
         return mi.Vector3f(*(row[0] * -starboard + row[1] * up + row[2] * forward for row in rows))
 
     def direction(self, u: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-        """Return sine of the bearing and tangent of the elevation of directions, and whether these lie in the fan."""
+        """Return sine of the bearing and tangent of the elevation of directions, and whether they lie in the fan."""
         port, up, forward = (sum(mi.Float(line[axis]) * u[row] for row, line in enumerate(self.lines)) for axis in range(3))
         level = dr.sqrt(port * port + forward * forward)
         sine, tangent = -port if self.cone else -port / level, up / (forward if self.cone else level)
@@ -319,35 +341,39 @@ class FanRays:
         return sine, tangent, (forward > 0) & (aside <= self.fan.sine) & (lift <= self.fan.tangent)
 
     def _steep(self, hit: Hit) -> DeviceArray:
-        """Return the cosine between normal and ray, kept away from 0."""
+        """Return the cosine between normal and ray, bounded away from 0 by :data:`LEAST_COSINE`."""
         along = dr.dot(hit.n, self.d)
         return dr.select(dr.abs(along) > LEAST_COSINE, along, dr.select(along > 0, LEAST_COSINE, -LEAST_COSINE))
 
     def steps_on(self, hit: Hit) -> tuple[DeviceArray, DeviceArray]:
-        """Return how the hit moves on its tangent plane by one column and by one row [m]."""
+        """Return the displacement of the hit on its tangent plane for one column and for one row [m]."""
         steep = self._steep(hit)
         across: DeviceArray = hit.t * (self.by_sine - self.d * (dr.dot(hit.n, self.by_sine) / steep))
         down: DeviceArray = hit.t * (self.by_tangent - self.d * (dr.dot(hit.n, self.by_tangent) / steep))
         return across * self.sine_step, down * self.tangent_step
 
     def may_reach(self, hit: Hit, first: float, last: float) -> DeviceArray:
-        """Test whether a ray's cell of the surface may lie in a window of ranges [m]."""
+        """Test whether a ray's cell on the surface may overlap a window of ranges [m]."""
         down = dr.abs(dr.dot(hit.n, self.by_tangent) / self._steep(hit)) * hit.t * self.tangent_step
         across = dr.abs(dr.dot(hit.n, self.by_sine) / self._steep(hit)) * hit.t * self.sine_step
         return (hit.t + down + across > first) & (hit.t - down - across < last)
 
     def seen(self, points: HashedPoints, point: Point) -> SeenPoint:
-        """Return range, direction and cosine of points, and whether their direction lies in the ray's own cell."""
+        """Return range, direction and cosine of points, and whether their direction lies in the cell of the ray."""
+        # 1. Line of sight and range, in double precision because the phase needs fractions of a wavelength.
         origin = pick(points.axis, mi.Vector3d(*(line[3] for line in self.lines)))
         exact = [mi.Float64(own) - begin for own, begin in zip((point.p, point.q, point.a), origin, strict=True)]
         range_m = dr.sqrt(sum(value * value for value in exact))
         way = [mi.Float(value) for value in exact]
+        # 2. Direction in the axes of the sonar.
         starboard, up, forward = (self._along(points, way, column) for column in (0, 1, 2))
         starboard, radius = -starboard, mi.Float(range_m)
         level = dr.sqrt(starboard * starboard + forward * forward)
         sine = starboard / (radius if self.cone else level)
         tangent = up / (forward if self.cone else level)
+        # 3. Cosine of the angle of incidence.
         cosine = dr.abs(sum(n * v for n, v in zip(points.normal, way, strict=True))) / radius
+        # 4. Column and row of the fan, to compare with those of the ray: this assigns each point to one ray.
         column = mi.Int32(dr.floor((sine + self.fan.sine) * (1 / self.sine_step)))
         row = mi.Int32(dr.floor((self.fan.tangent - tangent) * (1 / self.tangent_step)))
         mine = (column == self.column) & (row == self.row) & (forward > 0)
@@ -361,7 +387,7 @@ class FanRays:
 
 
 def point_pitch(sonar: Sonar) -> float:
-    """Return the pitch of the lattice [m]: as given, or for the wanted points a resolution cell at mid range."""
+    """Return the pitch of the lattice [m]: as given, or for ``scatterers_per_cell`` points per cell at mid range."""
     if sonar.scatterer_spacing_m is not None:
         return sonar.scatterer_spacing_m
     middle = (sonar.range_min + sonar.range_max) / 2

@@ -1,14 +1,14 @@
-"""What a sonar receives, differentiated by its motion: central differences of rendered frames.
+"""How a sonar image changes with the sonar's motion: central differences of rendered frames.
 
-A frame with jitter is random. A frame without jitter is a function with jumps: a ray crosses the border of a bin or of a
-textured cell, or slides off a rock. The mean over the draws of the jitter has a derivative. It is estimated with common
-random numbers (both sides of a difference draw the same rays), over many pings, in two halves that share no ping. The noise
-of the rays biases J' W J by its own square. It does not bias J1' W J2.
+A frame with jitter is random. A frame without jitter is a discontinuous function of the pose: a ray crosses the border of
+a bin or of a textured cell, or slides off a rock. The mean over the draws of the jitter, however, is differentiable. Its
+derivative is estimated with common random numbers (both sides of a difference draw the same rays), over many pings, in two
+halves that share no ping. Ray noise biases J' W J by its square. It does not bias J1' W J2.
 
-A difference over 2 d is the derivative of the frame smoothed over a box of that length. If each axis were smoothed along
-itself only, the smoothings would differ, and a motion that is almost unobservable (sideways against yaw) would seem
-observable. So each ping is displaced along the other two axes, evenly within their boxes. All three derivatives are then
-those of one function.
+A difference over 2 d is the derivative of the frame smoothed over a box of that length. If each axis were smoothed only
+along itself, the three smoothings would differ, and a motion that is almost unobservable (sideways against yaw) would
+appear observable. Each ping is therefore also displaced along the other two axes, evenly within their boxes. All three
+derivatives are then derivatives of the same function.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from mitsonar.simulation.simulator import Simulator
 __all__ = ["FIRST_PING", "PINGS", "Derivative", "differentiate", "evenly", "jittered", "step_for"]
 
 FIRST_PING = 2**40
-"""First ping of derivatives. No run or data set counts so far, so its frames are independent of derivatives."""
+"""First ping number of derivatives. No run or data set has so many pings, so its frames are independent of derivatives."""
 
 STEP = 1 / 16
-"""Step, as a part of the bin or beam by which it moves echoes.
+"""Step, as a fraction of the bin or beam by which it moves echoes.
 
-It is small against both, and against the finest detail of textures. It is large enough that some rays cross a border;
-otherwise only the noise of the rays would remain. Halving it changes bounds by 2 % (model ``thesis``) to 10 %
-(``physical``): edges and nearest points of rocks have no scale of their own.
+It is small compared with both, and with the finest detail of textures. It is large enough that some rays cross a border;
+otherwise only ray noise would remain. Halving it changes bounds by 2 % (model ``thesis``) to 10 % (``physical``), because
+edges and nearest points of rocks have no characteristic length.
 """
 
 PINGS = 8
-"""Pings of each half: bounds of a full frame then vary by 1 to 4 %."""
+"""Number of pings in each half, with which bounds of a full frame vary by 1 to 4 %."""
 
 
 @dataclass(frozen=True)
 class Derivative:
-    """The mean of one view at one pose over its jitter, and its derivatives by the motion.
+    """Mean of one view at one pose over the jitter, and its derivatives by the sonar's motion.
 
     Attributes:
         level: mean of the pixels before noise, after gain and clipped to 0..1 ``(bins, beams)``.
-        filled: part of the pings in which a pixel holds an echo ``(bins, beams)``.
-        variance: of a pixel's level between pings, which is the noise of the rays ``(bins, beams)``.
+        filled: fraction of the pings in which a pixel holds an echo ``(bins, beams)``.
+        variance: variance of a pixel's level between pings, which is the ray noise ``(bins, beams)``.
         jacobian: two independent estimates of the derivatives of level and filled by sideways, forward [1/m] and yaw
             [1/rad], float32 ``(2, bins, beams, 2, 3)``.
         pings: number of pings in each half.
@@ -73,21 +73,21 @@ def differentiate(
 ) -> Iterator[list[Derivative]]:
     """Estimate the derivatives at each pose, one for each view of the simulator.
 
-    The motion is the one of eq. 3.4 (Almanza-Medina) at rest: sideways, forward, yaw of the sonar's own pose.
+    The motion is that of eq. 3.4 (Almanza-Medina) at rest: sideways, forward and yaw, relative to the pose of the sonar.
 
     Args:
-        simulator: of scene, sonar and views; its rays are jittered here, even where its sonar has no jitter.
-        poses: of the sonar ``(n, 6)`` x, y, z [m], pitch, roll, heading [rad].
+        simulator: simulator of scene, sonar and views; rays are jittered here even if its sonar has no jitter.
+        poses: sonar poses ``(n, 6)``: x, y, z [m], pitch, roll, heading [rad].
         gain: constant factor of the levels.
-        pings: of each half, at least 1; each is rendered on both sides of three steps, 12 frames.
+        pings: number of pings in each half, at least 1; one ping in each half takes 12 frames: both sides of 3 steps.
         step: half the distance between both sides; default: :func:`step_for` the sonar.
         first: number of the first ping.
 
     Yields:
-        The derivatives of each pose.
+        The derivatives at each pose, one for each view.
 
     Raises:
-        MitsonarError: poses that are not finite ``(n, 6)``, or no ping.
+        MitsonarError: poses are not finite numbers ``(n, 6)``; there is no ping.
     """
     table = np.atleast_2d(np.asarray(poses, dtype=float))
     if table.ndim != 2 or table.shape[1] != 6 or not np.isfinite(table).all():
@@ -100,7 +100,7 @@ def differentiate(
 
 
 def jittered(simulator: Simulator) -> Simulator:
-    """Return a simulator with rays that are jittered within their cells; the given one where it is so already."""
+    """Return a simulator whose rays are jittered within their cells, or the given one if its rays already are."""
     if simulator.sonar.jittered:
         return simulator
     sonar = simulator.sonar.replace(jitter=True)
@@ -108,13 +108,14 @@ def jittered(simulator: Simulator) -> Simulator:
 
 
 def step_for(sonar: Sonar, part: float = STEP) -> Motion:
-    """Return steps that move echoes by a part of a bin (forward) and of a beam (sideways, yaw) [m, rad]."""
+    """Return steps [m, rad] that move echoes by a fraction of a bin (forward) and of a beam (sideways, yaw)."""
     middle = (sonar.range_min + sonar.range_max) / 2
     return Motion(part * sonar.beam_width_rad * middle, part * sonar.bin_m, part * sonar.beam_width_rad)
 
 
 def _at(source: Simulator, pose: Pose, gain: float, pings: int, step: Motion, first: int) -> list[Derivative]:
     """Render both sides of each step, in two halves, and return one derivative for each view."""
+    # both sides of a step render the same ping numbers, hence the same jitter, at motions that differ along one axis only
     sums: list[_Sums] = []
     within = evenly(2 * pings) * np.array(step)
     for axis in range(3):
@@ -130,7 +131,10 @@ def _at(source: Simulator, pose: Pose, gain: float, pings: int, step: Motion, fi
 
 
 def evenly(count: int) -> NDArray[np.float64]:
-    """Return points ``(count, 3)`` that fill the cube -1..1 evenly, as does every run of them (M. Roberts' recurrence)."""
+    """Return points ``(count, 3)`` that fill the cube -1..1 evenly, as does every contiguous run of them.
+
+    The points follow the additive recurrence of M. Roberts.
+    """
     ratio = 1.2207440846057596  # the root of x^4 = x + 1
     return np.asarray((np.arange(1, count + 1)[:, None] / ratio ** np.arange(1, 4)) % 1 * 2 - 1)
 
@@ -140,8 +144,8 @@ class _Sums:
     """Sums over pings.
 
     Attributes:
-        of: half, axis, side; level and filled ``(2, 3, 2, 2, bins, beams)``.
-        squares: of levels, over all ``(bins, beams)``.
+        of: sums of level and filled, by half, axis and side ``(2, 3, 2, 2, bins, beams)``.
+        squares: sums of squared levels over all pings ``(bins, beams)``.
     """
 
     of: NDArray[np.float64]

@@ -1,4 +1,7 @@
-"""Choose and set the Mitsuba variant: ``cuda_ad_mono`` where there is a GPU, else ``llvm_ad_mono``."""
+"""Which Mitsuba variant runs, and how launches are recorded, replayed and given their memory.
+
+The default variant is ``cuda_ad_mono`` if there is a GPU, and ``llvm_ad_mono`` otherwise.
+"""
 
 from __future__ import annotations
 
@@ -31,24 +34,27 @@ __all__ = [
 
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "cuda_ad_rgb", "llvm_ad_rgb")
-"""The variants that mitsonar works with; monochrome ones need less memory."""
+"""Variants that mitsonar supports; monochrome ones need less memory."""
 
 INSTALL = "on Debian or Ubuntu type `sudo apt-get install libllvm19 libatomic1` (or another libllvm from 17 on)"
 
 
 class Backend(NamedTuple):
-    """The renderer's variant, and its version of LLVM (None on CUDA)."""
+    """Variant of the renderer, and its version of LLVM (None on CUDA)."""
 
     variant: str
     llvm: tuple[int, int, int] | None
 
 
 def ensure_variant(name: str | None = None) -> str:
-    """Set a variant where none is set, and return the name of the one that is; ``name`` or ``MITSONAR_VARIANT`` forces one.
+    """Set a Mitsuba variant if none is set, and return the name of the current one.
+
+    Args:
+        name: variant to set even if another is set; default: the environment variable ``MITSONAR_VARIANT``, if it is set.
 
     Raises:
-        MitsonarError: unknown variant; one is set that mitsonar does not work with; neither CUDA nor LLVM is found (with the
-            command that installs it).
+        MitsonarError: the variant is unknown; the variant already set is not supported; the library of the variant, CUDA or
+            LLVM, is not found (for LLVM, the message gives the command that installs it).
     """
     cuda, llvm = _backends()
     import mitsuba as mi
@@ -58,7 +64,7 @@ def ensure_variant(name: str | None = None) -> str:
         if mi.variant() in VARIANTS:
             return str(mi.variant())
         wanted = "cuda_ad_mono" if cuda else "llvm_ad_mono"
-        if mi.variant() is not None:  # chosen by the user, whose objects another variant would not know
+        if mi.variant() is not None:  # chosen by the user, whose objects would be invalid in another variant
             raise MitsonarError(
                 f"the Mitsuba variant {mi.variant()} is set, and mitsonar works with {', '.join(VARIANTS)}: call "
                 f'mi.set_variant("{wanted}") first, or leave set_variant out'
@@ -75,7 +81,7 @@ def ensure_variant(name: str | None = None) -> str:
 
 
 def backend() -> Backend:
-    """Return the variant and its version of LLVM; sets a variant if none is set."""
+    """Return the variant and its version of LLVM, after setting a variant if none is set."""
     variant = ensure_variant()
     import drjit as dr
 
@@ -83,7 +89,7 @@ def backend() -> Backend:
 
 
 def use_threads(count: int) -> None:
-    """Set the number of threads of the renderer; call it before anything is rendered."""
+    """Set the number of threads of the renderer; call this before anything is rendered."""
     import drjit as dr
 
     if dr.thread_count() != count:
@@ -91,7 +97,7 @@ def use_threads(count: int) -> None:
 
 
 def current_variant() -> str:
-    """Return the current variant; empty where Mitsuba is not loaded or no variant is set."""
+    """Return the current variant; empty if Mitsuba is not loaded or no variant is set."""
     import sys
 
     mi = sys.modules.get("mitsuba")
@@ -106,16 +112,19 @@ def thread_count() -> int:
 
 
 class Frozen:
-    """Record a launch at its first call and replay it at later ones: ``dr.freeze``, for launches that evaluate BSDFs.
+    """Launch that is recorded at its first call and replayed at later calls: ``dr.freeze`` for launches with BSDFs.
 
-    A kernel that evaluates BSDFs holds the code of all that are alive, those of other scenes included, and Dr.Jit records it
-    only if the values that they read are among the inputs. It collects these of every class of which the inputs hold a
-    pointer. A scene holds pointers to shapes only, and through a shape Dr.Jit finds the shape's BSDF, but not a BSDF of
-    another scene that no shape uses. Hence the pointer to a BSDF, which points at none.
+    A kernel that evaluates BSDFs contains the code of all BSDFs that are alive, including those of other scenes. Dr.Jit can
+    record it only if the values that they read are among the inputs. It collects these values for every class to which the
+    inputs hold a pointer. A scene holds pointers to shapes only. Through a shape, Dr.Jit finds the BSDF of that shape, but
+    not a BSDF of another scene that no shape uses. The inputs therefore include a null pointer to a BSDF.
 
-    For the same reason scenes must go as soon as nobody refers to them. ``dr.freeze`` makes a class for each function, and a
-    class refers to itself: what a launch holds would stay until Python collects its garbage. So Dr.Jit gets a function that
-    holds nothing.
+    For the same reason, scenes must be freed as soon as they are no longer referenced. ``dr.freeze`` creates a class for
+    each function, and a class refers to itself, so objects that the launch references would live until the next garbage
+    collection. Dr.Jit therefore gets a function that holds only a weak reference.
+
+    Args:
+        launch: function from the inputs to the results of a launch.
     """
 
     def __init__(self, launch: Callable[..., Any]) -> None:
@@ -137,15 +146,15 @@ class Frozen:
         return self._recorded(*inputs)
 
     def clear(self) -> None:
-        """Forget what was recorded."""
+        """Discard the recording."""
         self._recorded.clear()
 
 
 def replayed(launch: Any, *inputs: object) -> Any:
-    """Run a frozen launch; record it anew where Dr.Jit refuses to replay it.
+    """Run a frozen launch, and record it again if Dr.Jit refuses to replay it.
 
-    Garbage collection waits meanwhile: Dr.Jit 1.5 ends the process where an array is freed while a launch is recorded. It
-    refuses a replay where other scenes came or went since, as they do with the garbage.
+    Garbage collection is suspended meanwhile, because Dr.Jit 1.5 ends the process if an array is freed while a launch is
+    recorded. Dr.Jit refuses to replay a launch if other scenes were created or freed since, which garbage collection may do.
     """
     was = gc.isenabled()
     gc.disable()
@@ -162,7 +171,7 @@ def replayed(launch: Any, *inputs: object) -> Any:
 
 
 def release_memory() -> None:
-    """Free the memory of scenes that are no longer referenced: they are cycles of objects, and Dr.Jit caches memory."""
+    """Free the memory of scenes that are no longer referenced, which reference cycles and Dr.Jit's cache retain."""
     import drjit as dr
 
     gc.collect()
@@ -170,6 +179,7 @@ def release_memory() -> None:
 
 
 def _backends() -> tuple[bool, bool]:
+    """Return whether Dr.Jit finds CUDA, and whether it finds LLVM."""
     try:
         import drjit as dr
     except Exception as error:  # without libatomic1 this is a NameError about something else
@@ -179,32 +189,32 @@ def _backends() -> tuple[bool, bool]:
     return bool(dr.has_backend(dr.JitBackend.CUDA)), bool(dr.has_backend(dr.JitBackend.LLVM))
 
 
-# ---------------- The type of Dr.Jit arrays in signatures, and arrays of NumPy as Dr.Jit may read them
+# ---------------- Array types and aligned memory
 
 
 DeviceArray: TypeAlias = Any
 """A Dr.Jit array of any type and depth, such as ``mi.Float``, ``mi.Float64`` or ``mi.Vector3f``.
 
-The same lines run in single and in double precision, and Dr.Jit's stubs type ``dr.select``, ``dr.dot`` and mixed operations
-too widely for a narrower name. Functions that also accept NumPy arrays say so.
+The same code runs in single and in double precision, and Dr.Jit's stubs type ``dr.select``, ``dr.dot`` and mixed operations
+too broadly for a narrower alias. Functions that also accept NumPy arrays document this.
 """
 
 LaunchTables: TypeAlias = dict[str, DeviceArray]
-"""Arrays by name that a frozen launch takes as inputs."""
+"""Named arrays that a frozen launch takes as inputs."""
 
 MOST_LANES = 64
-"""More than a processor computes side by side."""
+"""Padding in values: more than a processor computes in parallel lanes."""
 
 ALIGNED_BYTES = 64
-"""Boundary that memory begins on for a launch: that of Dr.Jit's own arrays, or a multiple of it."""
+"""Alignment of memory for a launch [bytes]: that of arrays allocated by Dr.Jit, or a multiple of it."""
 
 
 def padded(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a copy of values ``(n,)`` behind whose end memory goes on, for a launch over all of them.
+    """Return an aligned copy of values ``(n,)`` with readable memory beyond its end, for a launch over all of them.
 
-    Dr.Jit 1.5 borrows the memory of NumPy and reads whole packets of 16 values: past the end of an array of another length.
-    Where no memory follows, the process dies. The copy begins on a boundary of :data:`ALIGNED_BYTES`: a frozen launch is
-    recorded anew where an input lies otherwise than before.
+    Dr.Jit 1.5 borrows the memory of NumPy arrays and reads whole packets of 16 values, hence past the end of an array whose
+    length is not a multiple of 16. If that memory is not mapped, the process crashes. The copy is aligned to
+    :data:`ALIGNED_BYTES`, since a frozen launch is recorded again whenever the alignment of an input changes.
     """
     room = np.zeros(len(values) + MOST_LANES + ALIGNED_BYTES // values.itemsize, dtype=values.dtype)
     first = -room.ctypes.data % ALIGNED_BYTES // values.itemsize

@@ -1,4 +1,4 @@
-"""The fused launch of the models ``physical`` and ``thesis``: rays, echoes, views, sums of many pings in one kernel."""
+"""How the models ``physical`` and ``thesis`` render many pings in one launch: rays, echoes, views and sums."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ __all__ = ["ImageLaunch"]
 
 @dataclass(frozen=True)
 class ImageLaunch:
-    """Compile launches of so many pings.
+    """Compiler of launches that render a given number of pings.
 
     Attributes:
-        tracer: of the rays.
-        views: of the images, and ``view_tracers`` of each.
-        formed: the sonar whose pattern over elevation weighs the echoes; None: none does.
-        bounces: sums the paths of several reflections; None: there is one.
+        tracer: tracer of the rays.
+        views: views that are rendered.
+        view_tracers: view tracer of each view.
+        formed: sonar whose pattern over elevation weighs the echoes; None: no pattern.
+        bounces: sums over paths with several reflections; None: single reflections only.
     """
 
     tracer: Tracer
@@ -40,20 +41,22 @@ class ImageLaunch:
     bounces: BounceSums | None
 
     def compiled(self, pings: int, labels: bool) -> tuple[Callable[..., Any], DeviceArray]:
-        """Compile the launch; also return its first input, the numbers of the rays.
+        """Compile the launch of a number of pings; also return its first input, the numbers of the rays.
 
-        It is traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python. It takes these
-        numbers, scene, rows of poses, keys of the jitter, tables of surfaces, of the views and of mirrors. It returns
-        heights, and of each view the levels, counters, truth for labels, and the levels of one reflection where labels go by
-        these.
+        The launch is recorded once and then replayed (``dr.freeze``), so a single ping costs its rays and hardly any Python.
+        Its inputs are the ray numbers, the scene, the rows of the poses, the jitter keys, and the tables of surfaces, views
+        and mirrors. It returns the heights and, for each view, the levels, the counters, the truth for labels, and the
+        levels of single reflections if labels are derived from these.
         """
         tracer, bounces = self.tracer, self.bounces
 
         @Frozen
         def launch(index: Any, scene: Any, rows: Any, keys: Any, surfaces: Any, tables: Any, mirrors: Any) -> Any:
+            # 1. Trace one echo for each ray.
             rays = Rays(tracer.sonar, index)
             ray, fan = tracer.rays_of(rays, rows, keys)
             echoes = tracer.echoes(scene, ray, fan, surfaces)
+            # 2. Sum paths with several reflections; the mirror part of a surface does not scatter.
             more = None
             if bounces is not None:
                 echoes, reflection = bounces.scattered(echoes, mirrors)
@@ -62,14 +65,16 @@ class ImageLaunch:
                 seen = fan, echoes, reflection
                 known = replace(tracer.surfaces, **surfaces)
                 more = bounces.sums(scene, known, rays, lines, seen, key, mirrors, pings)
+            # 3. Sum the echoes of each view, and find the strongest ray of each cell for labels.
             looks = self._looks(scene, rays, fan, echoes, tables)
             sums = [accumulate(seen, rays.ping, pings, own) for seen, own in zip(looks, self.view_tracers, strict=True)]
             truths = [
                 self._truth(seen, rays, pings, view) if labels else None
                 for seen, view in zip(looks, self.views, strict=True)
             ]
-            # all that reads the echoes in one kernel, before any sum is read: rays are traced once
+            # 4. Evaluate everything that reads the echoes in one kernel, before any sum is read: rays are traced only once.
             dr.eval(sums, more, truths)
+            # 5. Turn the sums into levels and counters.
             made: list[tuple[Any, ...]] = []
             for total, own, truth in zip(sums, self.view_tracers, truths, strict=True):
                 first = develop(total, pings, own)
@@ -84,7 +89,7 @@ class ImageLaunch:
         return launch, Rays.numbered(tracer.sonar, pings)
 
     def _looks(self, scene: Any, rays: Rays, fan: Fan, echoes: Echoes, tables: Sequence[DeviceArray]) -> list[ViewEchoes]:
-        """Return the echoes of each view."""
+        """Return the echoes of each view, weighted by the pattern over elevation if there is one."""
         if self.formed is not None:
             gain = dr.square(elevation_gain(self.formed, dr.tan(fan.elevation)))
             echoes = replace(echoes, reflectivity=echoes.reflectivity * gain)
@@ -95,6 +100,6 @@ class ImageLaunch:
 
     @staticmethod
     def _truth(seen: ViewEchoes, rays: Rays, pings: int, view: View) -> tuple[DeviceArray, ...]:
-        """Return what labels are made of."""
+        """Return the data of labels: strongest ray of each cell, and elevation, shape and object of each ray."""
         best = strongest(seen, rays.ping, rays.ray, pings, view)
         return best, seen.elevation, seen.echoes.shape_id, seen.echoes.object_id

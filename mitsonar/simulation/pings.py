@@ -1,4 +1,4 @@
-"""Poses and times of pings as a simulator takes them, and frames whose groups of beams are rendered ping by ping."""
+"""What a rendered ping is: its pose and time, levels, gain, per-pixel labels, and the warnings of a run."""
 
 from __future__ import annotations
 
@@ -44,31 +44,33 @@ __all__ = [
 
 
 FirstPing: TypeAlias = int | Sequence[int]
-"""Number of the first of consecutive pings, or of each ping."""
+"""Number of the first of several consecutive pings, or the number of each ping."""
 
 
 class OnePing(Protocol):
-    """Renders pings, each at one moment."""
+    """Protocol of a renderer of pings, each at one moment."""
 
     def pings(
         self, poses: ArrayLike, *, first: FirstPing = 0, labels: bool = False, time_s: ArrayLike | None = None
     ) -> Iterator[RenderedPings]:
-        """Levels of consecutive pings, in batches."""
+        """Yield batches of consecutive pings."""
 
 
 def moments_of(
     sonar: Sonar, poses: ArrayLike, time_s: ArrayLike | None, first: FirstPing
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], list[int]]:
-    """Return poses and times of pings, both with an axis for groups of beams where there are several, and their numbers.
+    """Check and complete the poses and times of pings, and return them with the ping numbers.
+
+    Poses and times get an axis for groups of beams where the sonar has several.
 
     Args:
         sonar: the instrument.
-        poses: ``(frames, 6)``, which hold for all groups of a frame, or ``(frames, groups, 6)`` [m, rad].
-        time_s: ``(frames,)`` or ``(frames, groups)`` [s]; default: the number of the frame / ``frame_rate_hz``.
-        first: number of the first frame, or of each.
+        poses: ``(frames, 6)``, valid for all groups of a frame, or ``(frames, groups, 6)`` [m, rad].
+        time_s: ``(frames,)`` or ``(frames, groups)`` [s]; default: frame number / ``frame_rate_hz``.
+        first: number of the first frame, or the number of each frame.
 
     Raises:
-        MitsonarError: another shape, numbers that are not finite, or too large ones.
+        MitsonarError: a shape is wrong; a value is not finite or too large; ping numbers are negative or of another count.
     """
     table, groups = np.atleast_2d(np.asarray(poses, dtype=float)), sonar.ping_groups
     shapes = [(len(table), 6)] + ([(len(table), groups, 6)] if groups > 1 else [])
@@ -93,11 +95,11 @@ def moments_of(
 
 
 def sonar_of_one_ping(sonar: Sonar) -> Sonar | None:
-    """Return the sonar whose pings make up the frames; None where one launch traces all groups, each from its own pose.
+    """Return the sonar whose separate pings make up a frame; None if one launch can trace all groups of beams.
 
-    That is so where the beams are apart: boxes. Where each beam is formed of more than its own rays, or hears those of
-    others by way of several reflections, all beams of the fan are formed at each group's pose, and those of the group are
-    kept. A head that turns has one beam.
+    One launch can trace each group from its pose if beams are independent boxes. If a beam also receives rays of other
+    beams, through its pattern or several reflections, all beams of the fan are formed at the pose of each group, and only
+    those of the group are used. A scanning head has a single beam.
     """
     if sonar.ping_groups == 1 or (sonar.beam_pattern == "box" and sonar.bounces == 1):
         return None
@@ -105,10 +107,11 @@ def sonar_of_one_ping(sonar: Sonar) -> Sonar | None:
 
 
 def check_timed(sonar: Sonar, moving: object, views: Sequence[View] | None, mirrors: object) -> None:
-    """Refuse what has no bodies that move, and no groups of beams.
+    """Reject views and mirrors that do not support the model, moving bodies or groups of beams.
 
     Raises:
-        MitsonarError: receivers elsewhere or portions; mirrors in a model without them.
+        MitsonarError: bodies move, or beams ping in groups, with receivers elsewhere or portions of the field of view; the
+            model has no mirrors.
     """
     what = "bodies that move" if moving else "ping groups" if sonar.ping_groups > 1 else ""
     check_image_mirrors(sonar, views, bool(mirrors))
@@ -117,11 +120,11 @@ def check_timed(sonar: Sonar, moving: object, views: Sequence[View] | None, mirr
 
 
 class GroupedPings:
-    """Frames whose groups of beams are pings of their own.
+    """Renderer of frames in which every group of beams is a separate ping.
 
     Args:
-        inner: renders the pings of the sonar of :func:`sonar_of_one_ping`.
-        sonar: with groups.
+        inner: renderer for the sonar that :func:`sonar_of_one_ping` returns.
+        sonar: the sonar with groups of beams.
     """
 
     def __init__(self, inner: OnePing, sonar: Sonar) -> None:
@@ -130,7 +133,7 @@ class GroupedPings:
     def pings(
         self, poses: NDArray[np.float64], time_s: NDArray[np.float64], numbers: list[int], labels: bool
     ) -> Iterator[RenderedPings]:
-        """Levels of frames, one at a time; arguments as :func:`moments_of` returns them."""
+        """Yield frames one at a time; the arguments are those that :func:`moments_of` returns."""
         groups = self.sonar.ping_groups
         heads = turned_heads(self.sonar, poses) if scans(self.sonar) else poses
         for place, number in enumerate(numbers):
@@ -138,7 +141,7 @@ class GroupedPings:
             yield self._joined(list(made), number)
 
     def _joined(self, parts: list[RenderedPings], number: int) -> RenderedPings:
-        """Return the pings of a frame's groups as one frame: each beam from the ping of its group."""
+        """Join the pings of a frame's groups into one frame, taking each beam from the ping of its group."""
         group = group_of_beams(self.sonar)
         beam = np.zeros_like(group) if scans(self.sonar) else np.arange(self.sonar.beams)
 
@@ -161,25 +164,25 @@ class GroupedPings:
         )
 
     def _of_beams(self, count: NDArray[np.int64], group: NDArray[np.int64], beam: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return numbers of rays of the frame's beams, or of all where the pings do not tell them beam by beam."""
+        """Return the ray counts of the frame's beams, or their total if the pings do not count rays for each beam."""
         if count.shape[1] == (1 if scans(self.sonar) else self.sonar.beams):
             return np.asarray(count[group, beam][None])
         return np.asarray([[count.sum()]])
 
 
-# ---------------- Rendered pings: levels of a batch, the constant gain of a run, and images of both
+# ---------------- Rendered pings and their gain
 
 
 CALIBRATION_FRAMES = 20
-"""Frames whose brightest pixels set the gain of a run."""
+"""Number of frames whose brightest pixels set the gain of a run."""
 
 
 class CutRays(NamedTuple):
-    """Rays of the model ``coherent`` whose cells of a surface hold more points than are looked through.
+    """Rays of the model ``coherent`` whose surface cells hold more points than one ray may visit.
 
     Attributes:
-        rays: how many.
-        enough_m: pitch of the points with which none would be cut [m].
+        rays: number of such rays.
+        enough_m: pitch of points at which no ray would be cut [m].
     """
 
     rays: int = 0
@@ -194,13 +197,14 @@ class RenderedPings:
     """A batch of consecutive pings.
 
     Attributes:
-        first: number of the first.
+        first: number of the first ping.
         levels: ``(pings, bins, beams)`` float32, before gain.
-        counts: what became of the rays.
-        height_m: ``(pings,)``.
-        labels: ``elevation_rad``, ``shape_id``, ``object_id``, ``shadow``, like ``levels``, where asked for.
-        expected: levels without speckle, noise and patterns, like ``levels``, that labels of the model ``coherent`` go by;
-            None: the levels themselves.
+        counts: numbers of rays inside the window, nearer, farther and missed.
+        height_m: height of the sonar above the surface straight below it ``(pings,)`` [m].
+        labels: ``elevation_rad``, ``shape_id``, ``object_id`` and ``shadow``, each shaped like ``levels``; empty unless
+            requested.
+        expected: levels without speckle, noise and patterns, shaped like ``levels``, from which labels are derived; None:
+            labels are derived from ``levels``.
         cut: rays that missed points, in the model ``coherent``.
     """
 
@@ -217,14 +221,17 @@ class RenderedPings:
 
     @property
     def echoes(self) -> NDArray[np.float32]:
-        """Return the levels that tell where echoes are ``(pings, bins, beams)``."""
+        """Return the levels that determine which pixels hold an echo ``(pings, bins, beams)``."""
         return self.levels if self.expected is None else self.expected
 
 
 def constant_gain(batches: Iterable[RenderedPings]) -> tuple[float, Iterator[RenderedPings]]:
-    """Find the gain that lifts the 99.9th percentile of all pixels of the first 20 frames to 0.9, and all the batches again.
+    """Compute the gain that scales the 99.9th percentile of the pixels of the first 20 frames to 0.9.
 
-    Where that percentile is empty the largest pixel takes its place; where all pixels are, the gain is 1.
+    If that percentile is 0, the largest pixel takes its place; if all pixels are 0, the gain is 1.
+
+    Returns:
+        The gain, and an iterator over all batches, including those that were consumed to compute it.
     """
     batches = iter(batches)
     head: list[RenderedPings] = []
@@ -236,17 +243,22 @@ def constant_gain(batches: Iterable[RenderedPings]) -> tuple[float, Iterator[Ren
 
 
 def to_image(levels: NDArray[np.float32], gain: float, sonar: Sonar) -> NDArray[np.float32]:
-    """Return values 0..1 of levels times the gain, in the sonar's coding, of the same shape."""
+    """Return image values 0..1, of the same shape: levels times the gain, in the sonar's value coding."""
     return coded(levels * np.float32(gain), sonar)
 
 
-# ---------------- Per-pixel truth of frames: elevation, shape, object and shadow, from the strongest ray of each cell
+# ---------------- Per-pixel truth
 
 
 def labels_of(pings: RenderedPings, truth: Any, rays: int) -> dict[str, NDArray[Any]]:
-    """Label maps of a batch (see :class:`mitsonar.records.frames.SonarFrames`), from the strongest ray of each cell.
+    """Return the label maps of a batch: elevation, shape and object of each cell's strongest ray, and shadow.
 
-    ``rays`` is how many a ping has.
+    See :class:`mitsonar.records.frames.SonarFrames` for the maps.
+
+    Args:
+        pings: the batch.
+        truth: strongest ray of each cell, and elevation, shape and object of each ray.
+        rays: number of rays of a ping.
     """
     best, elevation, shape_id, object_id = truth
     frames, bins, beams = pings.levels.shape
@@ -266,9 +278,9 @@ def labels_above(pings: RenderedPings, gain: float, floor: float | NDArray[np.fl
     """Return the label maps of a batch without the pixels whose level is at most ``floor``.
 
     Args:
-        pings: with labels, or without.
-        gain: that lifts levels to full scale, 1.
-        floor: part of full scale, one or of each bin ``(bins, 1)``; 0: every echo is labelled, however faint.
+        pings: a batch with or without labels.
+        gain: factor that scales levels to a full scale of 1.
+        floor: fraction of full scale, a single one or one for each bin ``(bins, 1)``; 0 labels every echo, however faint.
     """
     if np.max(floor) <= 0 or not pings.labels:
         return pings.labels
@@ -279,16 +291,18 @@ def labels_above(pings: RenderedPings, gain: float, floor: float | NDArray[np.fl
 
 
 def shadow(pings: RenderedPings, echo: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
-    """Return where no echo came from ``(frames, bins, beams)``.
+    """Classify the pixels without an echo ``(frames, bins, beams)``.
 
-    0: lit, or not yet intercepted. 1: dark between what intercepts and what still travels. 2: dark beyond all echoes.
+    0: an echo, or no ray has been intercepted yet. 1: dark, although some rays travel on. 2: dark beyond all echoes.
 
     Args:
-        pings: of a batch.
+        pings: the batch.
         echo: which pixels count as echoes; default: all that are not 0.
     """
     echo = pings.echoes > 0 if echo is None else echo
     beams = echo.shape[2]
+    # A pixel is behind the first echo of its beam, or behind a return nearer than the window; rays travel on if a farther
+    # echo follows, a return lies beyond the window, or a ray of the beam hit nothing.
     near, far, missed = (_of_beams(one, beams) for one in (pings.counts.nearer, pings.counts.farther, pings.counts.missed))
     nearer = np.logical_or.accumulate(echo, axis=1) | (near > 0)[:, None]
     still = np.logical_or.accumulate(echo[:, ::-1], axis=1)[:, ::-1]
@@ -297,21 +311,33 @@ def shadow(pings: RenderedPings, echo: NDArray[np.bool_] | None = None) -> NDArr
 
 
 def _of_beams(counts: NDArray[Any], beams: int) -> NDArray[Any]:
-    """Return counts of rays in the beams of the image: with a pattern, boxes beside the fan are traced too."""
+    """Return the ray counts of the image's beams, without the boxes traced beside the fan for a beam pattern."""
     beside = max(0, counts.shape[-1] - beams) // 2
     return counts[..., beside : counts.shape[-1] - beside]
 
 
-# ---------------- The tally of a run: what its frames add up to warn of
+# ---------------- Tally of a run, for its warnings
 
 
 NEGLIGIBLE = 1e-3
-"""Part of the returns that may lie outside the window without a warning."""
+"""Fraction of the returns that may lie outside the window without a warning."""
 
 
 @dataclass
 class Tally:
-    """What a run adds up to warn of."""
+    """Running totals of a run, from which its warnings are derived.
+
+    Attributes:
+        sonar: the instrument.
+        gain_from: origin of the gain, as the warnings state it.
+        frames: number of frames.
+        rays: numbers of rays inside the window, nearer, farther and missed.
+        pixels: number of pixels.
+        filled: number of pixels with an echo.
+        saturated: number of pixels at the maximum.
+        worst: largest number of returns outside the window in one frame, and the number of that frame.
+        empty: number of empty frames.
+    """
 
     sonar: Sonar
     gain_from: str = "set on the first 20 frames"
@@ -323,13 +349,14 @@ class Tally:
     worst: tuple[int, int] = (0, 0)
     empty: int = 0
     first_empty: tuple[int, ...] = ()
-    """Number of the first empty frame, then of its rays those inside the window, nearer, farther, missed."""
+    """Number of the first empty frame, then its rays inside the window, nearer, farther and missed."""
     cut: int = 0
-    """Rays that missed points, and the pitch of points that would do [m]."""
+    """Number of rays that missed points."""
     enough_m: float = 0.0
+    """Pitch of points at which no ray would miss any [m]."""
 
     def add(self, pings: RenderedPings, image: NDArray[np.float32]) -> None:
-        """Count a batch; ``image`` before noise."""
+        """Add a batch to the totals; ``image`` is its image without the noise model."""
         self.frames += len(pings)
         filled = np.count_nonzero(image, axis=(1, 2))
         if self.sonar.model == "coherent":  # noise and side lobes fill every pixel
@@ -351,17 +378,17 @@ class Tally:
             self.worst = int(outside.max()), pings.first + int(outside.argmax())
 
     def warnings(self, source: Any, poses: NDArray[np.float64]) -> list[str]:
-        """Return a sentence for each thing that the user should know; ``source`` finds the ranges of the worst frame."""
+        """Return the warnings of the run; ``source`` is the simulator, which traces the worst frame again for its ranges."""
         return list(self.findings(source, poses).values())
 
     def findings(self, source: Any, poses: NDArray[np.float64], first: int = 0, told: Container[str] = ()) -> dict[str, str]:
-        """Return the sentences of :meth:`warnings`, each by the name of what it is about.
+        """Return the sentences of :meth:`warnings`, keyed by the name of their subject.
 
         Args:
-            source: finds the ranges of the worst frame.
-            poses: of the frames ``(frames, 6)``.
-            first: number of the first of them.
-            told: names of sentences that are not wanted again; ranges, which take another tracing, are not sought for them.
+            source: the simulator, which traces the worst frame again for its ranges.
+            poses: poses of the frames ``(frames, 6)`` [m, rad].
+            first: number of the first of these frames.
+            told: names of warnings that have been issued already; frames are not traced again for these.
         """
         sonar, rays = self.sonar, self.rays
         outside = rays["nearer"] + rays["farther"]
@@ -409,13 +436,13 @@ class Tally:
         return found
 
     def state(self) -> dict[str, Any]:
-        """As JSON can hold it; :meth:`restore` reads it back."""
+        """Return the totals in a form that JSON can hold; :meth:`restore` reads it back."""
         names = ("frames", "rays", "pixels", "filled", "saturated", "worst", "empty", "first_empty", "cut", "enough_m")
         return {name: getattr(self, name) for name in names}
 
     @classmethod
     def restore(cls, sonar: Sonar, state: dict[str, Any]) -> Tally:
-        """Restore the tally of a run that was broken off, as JSON gives it back.
+        """Restore the tally of an interrupted run from its :meth:`state`, as read from JSON.
 
         Raises:
             MitsonarError: the state is damaged.
@@ -442,23 +469,23 @@ class Tally:
 
 
 def rounding_reach_m(sonar: Sonar) -> float | None:
-    """Return the distance at which single precision rounds to an eighth of the wavelength; None for other models."""
+    """Return the coordinate at which single precision rounds to 1/8 wavelength [m]; None except in model ``coherent``."""
     if sonar.model != "coherent" or sonar.frequency_hz is None:
         return None
     return sonar.sound_speed / sonar.frequency_hz / 8 * 2.0**24
 
 
 def _up(length_m: float) -> str:
-    """Return a length to two digits, rounded up."""
+    """Format a length with two digits, rounded up."""
     step = 10.0 ** (math.floor(math.log10(length_m)) - 1)
     return f"{math.ceil(length_m / step) * step:.2g}"
 
 
-# ---------------- Describe frames without echoes: pose and view of the sonar, what its rays hit, and what may be wrong
+# ---------------- Frames without echoes: their likely causes
 
 
 NEARLY_EMPTY = 1e-4
-"""Part of the pixels below which a frame counts as empty: 5 pixels of 512 x 96."""
+"""Fraction of filled pixels below which a frame counts as empty: 5 pixels of 512 x 96."""
 
 
 def empty_frames(
@@ -474,12 +501,12 @@ def empty_frames(
 
     Args:
         empty: number of frames with no echo, or almost none (:data:`NEARLY_EMPTY`).
-        frames: number of all frames.
+        frames: total number of frames.
         first: number of the first empty frame, and its pose ``(6,)`` [m, rad].
-        rays: numbers of that frame's rays that hit something inside the window, nearer, farther, and nothing.
+        rays: numbers of that frame's rays that hit something inside the window, nearer, farther, and that hit nothing.
         window: nearest and farthest range of the image [m].
-        found: nearest and farthest return outside the window in that frame [m]; None where there is none.
-        buried: that the sonar is below the ground or inside an object in that frame; empty where it is not.
+        found: nearest and farthest return outside the window in that frame [m]; None if there is none.
+        buried: description of how the sonar is below the ground or inside an object in that frame; empty if it is not.
     """
     number, pose = first
     hint = angle_hint(pose) or (buried and f"the sonar {buried}")
@@ -498,7 +525,7 @@ def empty_frames(
 
 
 def percent(share: float) -> str:
-    """Return a share in percent to two digits, without an exponent."""
+    """Format a fraction as a percentage with two digits, without an exponent."""
     return "100" if share >= 0.995 else f"{100 * share:.2g}"
 
 
@@ -514,7 +541,7 @@ def view_of(pose: NDArray[np.float64]) -> str:
 
 
 def angle_hint(pose: NDArray[np.float64]) -> str:
-    """Suggest what is wrong with the angles of an empty frame: their unit, or a view upwards; else return an empty text.
+    """Suggest what is wrong with the angles of an empty frame, their unit or an upward view; empty if nothing is.
 
     Args:
         pose: x, y, z [m], pitch, roll, heading [rad].

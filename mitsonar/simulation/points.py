@@ -1,8 +1,8 @@
-"""Scatterers that no memory holds: points on a lattice of the world, placed and weighted by a hash of their cell.
+"""Where the scatterers of a surface lie: points on a world lattice, placed and weighted by a hash instead of stored.
 
-A surface is divided by a lattice over the two axes of the world that its normal leans on least. Cell (i, j) of shape, axis
-and side holds one point. A hash of these gives its place in the cell and its complex Gaussian weight of mean power 1, so
-the point is the same from everywhere, in every ping, for any rays.
+A surface is divided by a lattice over two world axes, all but the one nearest to its normal. Each cell (i, j) of a shape,
+axis and side holds one point. A hash of these gives its position in the cell and its complex Gaussian weight of mean power
+1. The point is therefore the same from every viewpoint, in every ping and for any set of rays.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ __all__ = [
 
 
 LEAST_COSINE = 4e-3
-"""Grazing cosine below which a ray's cell is no longer stretched along the surface."""
+"""Grazing cosine below which a ray's cell on the surface is not stretched further."""
 
 MOST_CANDIDATES = 4096
-"""Lattice cells that one ray may look through."""
+"""Largest number of lattice cells that one ray may visit."""
 
 LARGEST_COUNT = 2.0**30
-"""Largest number of lattice cells that is told."""
+"""Largest number of lattice cells that is reported."""
 
 
 @dataclass
 class Point:
-    """A point of the lattice: coordinates ``p``, ``q``, ``a`` in the order of :func:`pick`, weight and turn of phase.
+    """A point of the lattice.
 
     Attributes:
-        p, q, a: position [m].
-        amplitude: of the weight.
+        p, q, a: position, in the order of :func:`pick` [m].
+        amplitude: amplitude of the weight.
         turn: phase of the weight, in turns 0..1.
     """
 
@@ -76,22 +76,22 @@ def pick(axis: DeviceArray, v: DeviceArray) -> tuple[DeviceArray, DeviceArray, D
 
 
 class HashedPoints:
-    """The lattice cells around the points where rays hit surfaces.
+    """Lattice cells around the points where rays hit surfaces.
 
     Args:
-        hit: where the rays end.
-        place: these points [m].
-        over_column, over_row: change of the point by one step to the next ray, on the tangent plane [m].
-        pitch: of the lattice [m].
-        patch: side of a patch of one mean strength, which goes evenly over into its neighbours' [m].
-        seed: of the hash.
+        hit: hits of the rays.
+        place: the points hit [m].
+        over_column, over_row: displacement of the point for one step to the next ray, on the tangent plane [m].
+        pitch: pitch of the lattice [m].
+        patch: side of a patch of uniform mean strength, which blends smoothly into its neighbours [m].
+        seed: seed of the hash.
 
     Attributes:
-        axis: the axis of the world nearest to each normal, 0 to 2.
-        count: lattice cells that may hold a point of the ray.
-        wanted: lattice cells around each ray's cell, 2^30 at most.
-        cut: rays with more than :data:`MOST_CANDIDATES` of them.
-        strength: root of reflectivity times the area of a lattice cell [m].
+        axis: world axis nearest to each normal, 0 to 2.
+        count: number of lattice cells to visit, which may hold a point of the ray.
+        wanted: number of lattice cells that each ray's cell covers, at most 2^30.
+        cut: whether the ray covers more than :data:`MOST_CANDIDATES` of them.
+        strength: square root of the reflectivity times the area of surface in a lattice cell [m].
     """
 
     def __init__(
@@ -105,33 +105,37 @@ class HashedPoints:
         patch: float,
         seed: int,
     ) -> None:
+        # 1. Express everything in lattice axes: two that span the lattice, and the one nearest to the normal.
         self.pitch, self.patch = pitch, patch
         self.axis = nearest_axis(hit.n)
         self.normal = pick(self.axis, hit.n)
         self.middle = pick(self.axis, place)
         across, down = pick(self.axis, over_column), pick(self.axis, over_row)
+        # 2. Bound the ray's cell by a rectangle of lattice cells: half a step each way, plus a margin for rounding.
         low, high = [], []
-        for k in range(2):  # half a step each way, and a little for rounding
+        for k in range(2):
             half = (dr.abs(across[k]) + dr.abs(down[k])) * 0.55
             low.append(mi.Int32(dr.floor((self.middle[k] - half) * (1 / pitch))))
             high.append(mi.Int32(dr.floor((self.middle[k] + half) * (1 / pitch))))
         self.low = low
+        # 3. Count them in floating point, since integers would overflow at grazing incidence.
         self.wide = high[0] - low[0] + 1
         wanted = mi.Float(self.wide) * mi.Float(high[1] - low[1] + 1)
         self.wanted: DeviceArray = dr.select(wanted < LARGEST_COUNT, wanted, LARGEST_COUNT)
         self.cut = hit.valid & (wanted > MOST_CANDIDATES)
         self.count = dr.select(hit.valid, mi.Int32(dr.select(self.cut, MOST_CANDIDATES, wanted)), 0)
+        # 4. Choose the hash of this lattice, and project the area of a lattice cell onto the surface.
         side = dr.select(self.normal[2] > 0, mi.UInt32(1), mi.UInt32(0))
         self.key = lattice_key(mi.UInt32(hit.shape_id), self.axis, side, seed)
         self.strength = dr.sqrt(hit.reflectivity * (pitch * pitch) / dr.abs(self.normal[2]))
 
     def point(self, number: DeviceArray, patches: mi.Float, many: int) -> Point:
-        """Return the point in one of each ray's cells.
+        """Return the point in one of each ray's lattice cells.
 
         Args:
-            number: of the cell, 0 to ``count`` - 1.
-            patches: amplitudes of patches by equal probabilities, of :func:`mitsonar.acoustics.speckle.patch_amplitudes`.
-            many: entries of that table.
+            number: index of the cell, 0 to ``count`` - 1.
+            patches: equiprobable patch amplitudes from :func:`mitsonar.acoustics.speckle.patch_amplitudes`.
+            many: number of entries of that table.
         """
         i, j = self.low[0] + number % self.wide, self.low[1] + number // self.wide
         p, q, bits = place_in_cell(i, j, self.key, self.pitch)
@@ -144,20 +148,20 @@ class HashedPoints:
 
 
 def nearest_axis(normal: DeviceArray) -> DeviceArray:
-    """Return the axis of the world that normals lean on most, 0 to 2."""
+    """Return the world axis nearest to each normal, 0 to 2."""
     leans: DeviceArray = dr.abs(normal)
     others = dr.select(leans.x >= leans.y, mi.UInt32(0), mi.UInt32(1))
     return dr.select((leans.z >= leans.x) & (leans.z >= leans.y), mi.UInt32(2), others)
 
 
 def lattice_key(shape: DeviceArray, axis: DeviceArray, side: DeviceArray, seed: int) -> DeviceArray:
-    """Return 32 bits that choose the hash of a lattice.
+    """Return a 32-bit key that selects the hash of a lattice.
 
     Args:
         shape: index of the shape in the scene.
-        axis: of the world that its normal leans on most, 0 to 2.
-        side: 1 where the normal points along that axis, 0 where against it.
-        seed: of the hash.
+        axis: world axis nearest to its normal, 0 to 2.
+        side: 1 where the normal points along that axis, 0 where it points against it.
+        seed: seed of the hash.
     """
     return _mixed(shape * 8 + axis * 2 + side + mi.UInt32(seed * 7919 & 0xFFFFFFFF))
 
@@ -165,13 +169,13 @@ def lattice_key(shape: DeviceArray, axis: DeviceArray, side: DeviceArray, seed: 
 def place_in_cell(
     i: DeviceArray, j: DeviceArray, key: DeviceArray, pitch: float
 ) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Return where the point of a lattice's cell lies along both axes [m], and 32 bits for :func:`weight_of`.
+    """Return the position of a lattice cell's point along both axes [m], and 32 bits for :func:`weight_of`.
 
     Args:
-        i: of the cell along the first axis.
-        j: along the second.
-        key: of :func:`lattice_key`.
-        pitch: of the lattice [m].
+        i: index of the cell along the first axis.
+        j: index of the cell along the second axis.
+        key: key from :func:`lattice_key`.
+        pitch: pitch of the lattice [m].
     """
     place = _hash(i, j, key)
     p = (mi.Float(i) + (mi.Float(place & 0xFFFF) + 0.5) * 2.0**-16) * pitch
@@ -180,7 +184,7 @@ def place_in_cell(
 
 
 def weight_of(place: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Return amplitude and phase (turns 0..1) of a point's complex Gaussian weight, and bits for what else is drawn."""
+    """Return amplitude and phase (turns 0..1) of a point's complex Gaussian weight, and 32 bits for further draws."""
     bits = _mixed(place ^ mi.UInt32(0x68BC21EB))
     return dr.sqrt(-dr.log(_unit(bits))), _unit(_mixed(bits + mi.UInt32(0x2545F491))), bits
 
@@ -188,18 +192,19 @@ def weight_of(place: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray
 def patch_weight(
     place: tuple[DeviceArray, DeviceArray], bits: DeviceArray, key: DeviceArray, patches: mi.Float, many: int, side: float
 ) -> DeviceArray:
-    """Return the amplitude of a point's patch: of the four whose middles are nearest, each by its bilinear weight.
+    """Return the amplitude of a point's patch, drawn from the four nearest patches with their bilinear weights.
 
-    The points of a resolution cell are so many that their mean power goes evenly from patch to patch: no edge shows.
+    A resolution cell holds so many points that the mean power varies smoothly from patch to patch, without visible edges.
 
     Args:
-        place: of the point along both axes [m].
-        bits: of :func:`weight_of`.
-        key: of :func:`lattice_key`.
-        patches: amplitudes of patches by equal probabilities, of :func:`mitsonar.acoustics.speckle.patch_amplitudes`.
-        many: entries of that table, a power of 2.
-        side: of a patch [m].
+        place: position of the point along both axes [m].
+        bits: bits from :func:`weight_of`.
+        key: key from :func:`lattice_key`.
+        patches: equiprobable patch amplitudes from :func:`mitsonar.acoustics.speckle.patch_amplitudes`.
+        many: number of entries of that table, a power of 2.
+        side: side of a patch [m].
     """
+    # a shift by up to half a patch each way chooses a patch with exactly its bilinear weight
     drawn = _mixed(bits ^ mi.UInt32(0x1B56C4E9))
     moved = (mi.Float(drawn & 0xFFFF) * 2.0**-16 - 0.5, mi.Float(drawn >> 16) * 2.0**-16 - 0.5)
     i, j = (mi.Int32(dr.floor(v * (1 / side) + by)) for v, by in zip(place, moved, strict=True))
@@ -207,14 +212,14 @@ def patch_weight(
 
 
 def _hash(i: DeviceArray, j: DeviceArray, key: DeviceArray) -> DeviceArray:
-    """Return 32 bits of a cell."""
+    """Hash a cell to 32 bits."""
     one: DeviceArray = dr.reinterpret_array(mi.UInt32, i)
     other: DeviceArray = dr.reinterpret_array(mi.UInt32, j)
     return _mixed(one * mi.UInt32(0x9E3779B1) ^ _mixed(other ^ key))
 
 
 def _mixed(x: DeviceArray) -> DeviceArray:
-    """Mix 32 bits by Chris Wellons's integer hash `lowbias32`."""
+    """Mix 32 bits with Chris Wellons's integer hash `lowbias32`."""
     x = x ^ (x >> 16)
     x = x * mi.UInt32(0x7FEB352D)
     x = x ^ (x >> 15)
@@ -223,35 +228,32 @@ def _mixed(x: DeviceArray) -> DeviceArray:
 
 
 def _unit(bits: DeviceArray) -> DeviceArray:
-    """Return a number in 0..1, neither 0 nor 1."""
+    """Convert bits to a number between 0 and 1, both excluded."""
     return (mi.Float(bits >> 8) + 0.5) * 2.0**-24
 
 
-# ---------------- All points that the hashed lattice puts on one shape: those that images of the model ``coherent``
-# find by their rays
-# Rays along each axis of the world pass through the places that the hash draws. They end on the surfaces that lean on that
-# axis most. Any shape that can be traced has its points so, exactly on its surface.
+# ---------------- All points of one shape
 
 
 AT_A_TIME = 2**22
-"""Rays of a launch."""
+"""Number of rays of a launch."""
 
 BEYOND = 1e-5
-"""Part of a ray's length by which the next one begins behind a surface that was hit."""
+"""Fraction of a ray's length by which the next ray begins behind a surface that was hit."""
 
 
 ROUNDING = 5e-6
-"""The same as a part of the coordinate, forty times its rounding: or a ray would meet a far, small shape without end."""
+"""The same as a fraction of the coordinate, 40 times its rounding; less, and a small, distant shape is hit endlessly."""
 
 
 class SurfacePoints(NamedTuple):
     """Points of a shape.
 
     Attributes:
-        place: ``(points, 3)`` float32 [m].
+        place: positions ``(points, 3)`` float32 [m].
         normal: unit normal of the surface ``(points, 3)`` float32.
         strength: reflectivity times the area that a point represents, times the power of its weight ``(points,)`` [m2].
-        phase: of its weight ``(points,)``, -pi..pi [rad].
+        phase: phase of its weight ``(points,)``, -pi..pi [rad].
     """
 
     place: NDArray[np.float32]
@@ -261,14 +263,26 @@ class SurfacePoints(NamedTuple):
 
 
 class Patches(NamedTuple):
-    """Patches whose mean power varies by a Gamma law: its shape, and their side [m]."""
+    """Patches whose mean power follows a Gamma distribution.
+
+    Attributes:
+        nu: shape parameter of the distribution.
+        side_m: side of a patch [m].
+    """
 
     nu: float
     side_m: float
 
 
 class _Cells(NamedTuple):
-    """The lattice cells under a shape, seen along one axis: of the first, how many each way, and the shape's ends [m]."""
+    """Lattice cells that cover a shape, seen along one axis.
+
+    Attributes:
+        axis: world axis of the view, 0 to 2.
+        low: indices of the first cell.
+        wide, tall: numbers of cells along both lattice axes.
+        ends: coordinates along ``axis`` just outside the shape [m].
+    """
 
     axis: int
     low: tuple[int, int]
@@ -278,19 +292,22 @@ class _Cells(NamedTuple):
 
 
 def lattice_size(shape: mi.Shape, pitch: float) -> float:
-    """Return how many cells a lattice has to be searched for a shape's points, both sides of all axes."""
+    """Return the number of lattice cells to search for a shape's points, over both sides of all axes."""
     return sum(2.0 * cells.wide * cells.tall for cells in _cells_of(shape, pitch))
 
 
 def lattice_points(shape: mi.Shape, number: int, pitch: float, seed: int, patches: Patches | None = None) -> SurfacePoints:
-    """Find the points of one shape.
+    """Find all points that the hashed lattice places on one shape, those that coherent images find with their rays.
+
+    Rays along each world axis pass through the positions that the hash draws. Where they hit a surface whose normal is
+    nearest to that axis, they give a point exactly on it.
 
     Args:
-        shape: any that can be traced.
-        number: of the shape in its scene.
-        pitch: of the lattice [m].
-        seed: of the hash.
-        patches: of unequal strength; default: none.
+        shape: any shape that can be traced.
+        number: index of the shape in its scene.
+        pitch: pitch of the lattice [m].
+        seed: seed of the hash.
+        patches: patches of unequal strength; default: none.
     """
     search = _Search(shape, pitch, patches)
     found = []
@@ -304,6 +321,7 @@ def lattice_points(shape: mi.Shape, number: int, pitch: float, seed: int, patche
 
 
 def _cells_of(shape: mi.Shape, pitch: float) -> Iterator[_Cells]:
+    """Yield the lattice cells that cover a shape, along each world axis."""
     low, high = _reach(shape)
     for axis in range(3):
         one, other = (axis + 1) % 3, (axis + 2) % 3
@@ -314,8 +332,8 @@ def _cells_of(shape: mi.Shape, pitch: float) -> Iterator[_Cells]:
 
 
 def _reach(shape: mi.Shape) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the least and the largest coordinates of a shape [m]."""
-    if isinstance(shape, mi.Mesh):  # the box of meshes that Mitsuba has merged is that of one of them
+    """Return the minimum and maximum coordinates of a shape [m]."""
+    if isinstance(shape, mi.Mesh):  # the bounding box of meshes merged by Mitsuba is that of only one of them
         vertex = np.array(shape.vertex_positions_buffer(), dtype=float).reshape(-1, 3)
         return vertex.min(axis=0), vertex.max(axis=0)
     box = shape.bbox()
@@ -323,7 +341,7 @@ def _reach(shape: mi.Shape) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 class _Search:
-    """Follows rays through one shape."""
+    """Search for the points of one shape, by rays that pass through all of its surfaces."""
 
     def __init__(self, shape: mi.Shape, pitch: float, patches: Patches | None) -> None:
         name = shape.id()
@@ -334,7 +352,8 @@ class _Search:
         self.table = None if patches is None else mi.Float(patch_amplitudes(BLENDED * patches.nu))
 
     def on_rays(self, cells: _Cells, side: int, key: DeviceArray, numbers: NDArray[np.uint32]) -> list[SurfacePoints]:
-        """Return the points on the rays through some cells: those of first hits, of second ones, and so on."""
+        """Return the points on the rays through some cells: at their first hits, their second hits, and so on."""
+        # 1. Position and weight of the point in each cell, as the hash draws them.
         cell = mi.UInt32(padded(numbers))
         i = mi.Int32(cell % cells.wide) + cells.low[0]
         j = mi.Int32(cell // cells.wide) + cells.low[1]
@@ -342,10 +361,12 @@ class _Search:
         amplitude, turn, bits = weight_of(bits)
         if self.patches is not None and self.table is not None:
             amplitude *= patch_weight((p, q), bits, key, self.table, dr.width(self.table), self.patches.side_m)
-        begin, way = (cells.ends[1], -1.0) if side else (cells.ends[0], 1.0)  # from where the surface faces
+        # 2. Start each ray outside the shape, on the side that the surfaces face.
+        begin, way = (cells.ends[1], -1.0) if side else (cells.ends[0], 1.0)
         reach = max(BEYOND * (cells.ends[1] - cells.ends[0]), ROUNDING * max(abs(end) for end in cells.ends))
         a, skip = dr.full(mi.Float, begin, len(numbers)), way * reach
         u = _along(cells.axis, mi.Float(0), mi.Float(0), mi.Float(way))
+        # 3. Trace, keep the points on suitable surfaces, and continue behind every hit until no ray hits anything.
         made: list[SurfacePoints] = []
         while True:
             hit = self.surfaces.hit(self.scene, mi.Ray3f(mi.Point3f(_along(cells.axis, p, q, a)), u))
@@ -362,7 +383,7 @@ class _Search:
     def _kept(
         self, axis: int, side: int, hit: Hit, place: tuple[DeviceArray, ...], weight: tuple[DeviceArray, ...]
     ) -> SurfacePoints:
-        """Return the hits where the surface leans on the axis most, to the side given, and scatters."""
+        """Return the hits on scattering surfaces whose normal is nearest to the axis and points to the given side."""
         along = pick(mi.UInt32(axis), hit.n)[2]
         own = hit.valid & (nearest_axis(hit.n) == axis) & ((along > 0) == bool(side)) & (hit.reflectivity > 0)
         strength = hit.reflectivity * (self.pitch * self.pitch) / dr.abs(along) * weight[0] * weight[0]
@@ -376,5 +397,5 @@ class _Search:
 
 
 def _along(axis: int, p: DeviceArray, q: DeviceArray, a: DeviceArray) -> mi.Vector3f:
-    """Return the vector whose components :func:`~mitsonar.simulation.points.pick` returns."""
+    """Return the vector with the given lattice components, the inverse of :func:`pick`."""
     return (mi.Vector3f(a, p, q), mi.Vector3f(q, a, p), mi.Vector3f(p, q, a))[axis]

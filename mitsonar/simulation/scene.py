@@ -1,4 +1,7 @@
-"""Scenes from Mitsuba XML files, the user's or shipped ones, and the sonar in them."""
+"""How a scene is loaded and what it contains: names, boxes, sonars, triangles and the motion of its shapes.
+
+Scenes are Mitsuba XML files, either the user's or those shipped with the package.
+"""
 
 from __future__ import annotations
 
@@ -57,36 +60,36 @@ __all__ = [
 
 
 MOST_OBJECTS = 1_000_000
-"""Objects that are named; beyond, their numbers have to do."""
+"""Largest number of objects that get names; beyond it, objects are known by number only."""
 
 QUOTING = {
     r"(failed to load spectrum from file \".*?\"): .*": r"\1: it must hold a wavelength and a value in each line",
     r"(Error while loading .*? curve\(s\) from \".*?\"): .*": r"\1: it must hold x, y, z and a radius in each line",
 }
-"""Mitsuba's errors that quote the file which the scene names, and what is shown of them."""
+"""Patterns of Mitsuba errors that quote the contents of a file named by the scene, and what is shown instead."""
 
 LONGEST_REASON = 600
-"""Letters of Mitsuba's errors that are shown."""
+"""Number of characters of a Mitsuba error that are shown."""
 
 
 TOO_LARGE = 20
-"""Ends of the window [m] that a body's smallest extent may have before its unit is doubted."""
+"""Smallest extent of a shape, in multiples of the far end of the window, above which its unit is doubted."""
 
 FARTHEST_WINDOW_M = 500.0
-"""End of a window beyond the reach of imaging sonars [m]: those of 100 kHz see some hundred metres."""
+"""Far end of a window beyond the reach of imaging sonars [m]: those of 100 kHz see a few hundred metres."""
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Return the scenes of the package by name; a trajectory of the same name lies beside each."""
+    """Return the scene files shipped with the package, keyed by name; a trajectory of the same name accompanies each."""
     folder = Path(str(files("mitsonar.scenes")))
     return {path.stem: path for path in sorted(folder.glob("*.xml"))}
 
 
 def shipped_trajectory(name: str) -> Path:
-    """Return the file of the trajectory for a shipped scene (TUM).
+    """Return the trajectory file (TUM format) of a shipped scene.
 
     Raises:
-        MitsonarError: no such scene.
+        MitsonarError: there is no such scene.
     """
     return find_scene(name).with_suffix(".tum")
 
@@ -95,7 +98,7 @@ def find_scene(name_or_file: str | Path) -> Path:
     """Return the XML file at a path, or the shipped scene of that name.
 
     Raises:
-        MitsonarError: there is neither.
+        MitsonarError: neither exists.
     """
     path = Path(name_or_file)
     if os.path.isfile(path):
@@ -112,12 +115,12 @@ def find_scene(name_or_file: str | Path) -> Path:
 def load_scene(name_or_file: str | Path, **parameters: object) -> mi.Scene:
     """Load a Mitsuba scene; ``parameters`` replace its ``$name`` values, as in ``mi.load_file``.
 
-    The scene may be a stranger's: unlike ``mi.load_file``, this loads no library from the scene's folder, and checks the
-    files that the scene names before Mitsuba reads them (SECURITY.md).
+    The scene may come from an untrusted source. Unlike ``mi.load_file``, this function loads no library from the scene's
+    folder, and it checks the files that the scene names before Mitsuba reads them (SECURITY.md).
 
     Raises:
-        MitsonarError: missing file, malformed XML, an unknown plugin, a damaged mesh or picture, a plugin that refuses its
-            properties, a trajectory that no shape reads.
+        MitsonarError: the file is missing or is malformed XML; a plugin is unknown or rejects its properties; a mesh or
+            picture is damaged; no shape reads a trajectory.
     """
     path = find_scene(name_or_file)
     variant = ensure_variant()
@@ -135,17 +138,17 @@ def load_scene(name_or_file: str | Path, **parameters: object) -> mi.Scene:
 
 
 def _loaded(path: Path, variant: str, parameters: dict[str, str]) -> object:
-    """Read a scene's XML, check it, and create its objects; what was checked is what is created."""
+    """Parse a scene's XML, check it, and create its objects from the same parsed state that was checked."""
     import mitsuba as mi
 
     parser = mi.parser
     config = parser.ParserConfig(variant)
     config.merge_equivalent = config.merge_meshes = False  # merged meshes would lose their ids
-    config.parallel = False  # in parallel, one load in some 150 failed on a good file, and none is faster
+    config.parallel = False  # in parallel, about one load in 150 failed on a valid file, and none was faster
     with search_in([path.parent]):
         check_text(path, parameters, [Path(str(folder)) for folder in file_resolver()])
         state = parser.parse_file(config, str(path), **parameters)
-        looked_at = parser.ParserState(state)  # a copy: Mitsuba refuses properties that nothing has looked at
+        looked_at = parser.ParserState(state)  # a copy: Mitsuba rejects properties that nothing has queried
         check_parsed(looked_at)
         refuse_unread_motions(looked_at)
         parser.transform_all(config, state)
@@ -154,10 +157,10 @@ def _loaded(path: Path, variant: str, parameters: dict[str, str]) -> object:
 
 
 def shape_names_in(scene: mi.Scene) -> tuple[str, ...]:
-    """Return the name of each shape of a scene, by its place there, which is its ``shape_id``.
+    """Return the name of each shape of a scene, indexed by ``shape_id``, its position in the scene.
 
-    The name is the shape's id. Without one it is the stem of the mesh file, the id of the shape group that is placed, or
-    the type of the plugin: ``pot01``, ``cannon_parts``, ``sphere``.
+    The name is the shape's id. A shape without an id is named after its mesh file, the shape group that it instantiates,
+    or its plugin type, for example ``pot01``, ``cannon_parts`` or ``sphere``.
     """
     return tuple(shape.id() or _name_without_id(shape) for shape in scene.shapes())
 
@@ -169,16 +172,16 @@ def _name_without_id(shape: mi.Shape) -> str:
 
 
 def shape_boxes_in(scene: mi.Scene) -> NDArray[np.float64]:
-    """Return the box around each shape of a scene: least and largest x, y, z ``(shapes, 2, 3)`` [m]."""
+    """Return the bounding box of each shape of a scene: minimum and maximum x, y, z ``(shapes, 2, 3)`` [m]."""
     boxes = [(shape.bbox().min, shape.bbox().max) for shape in scene.shapes()]
     corners = [[np.array(corner, dtype=float).ravel() for corner in box] for box in boxes]
     return np.array(corners, dtype=np.float64).reshape(-1, 2, 3)
 
 
 def covered_squares_in(scene: mi.Scene) -> NDArray[np.float64]:
-    """Return half the edge of the square around the origin that each shape covers, seen from above ``(shapes,)`` [m].
+    """Return half the edge of the largest square around the origin that each shape covers from above ``(shapes,)`` [m].
 
-    Of a mesh that of its convex hull counts, of another shape that of its box; 0 where the origin is outside.
+    A mesh is represented by its convex hull, any other shape by its bounding box. The value is 0 if the origin lies outside.
     """
     halves = []
     for shape, (low, high) in zip(scene.shapes(), shape_boxes_in(scene), strict=True):
@@ -187,7 +190,7 @@ def covered_squares_in(scene: mi.Scene) -> NDArray[np.float64]:
             points = np.array(shape.vertex_positions_buffer(), dtype=float).reshape(-1, 3)[:, :2]
             try:
                 normals = ConvexHull(points).equations  # n x + d <= 0 inside
-            except QhullError:  # upright: it covers nothing
+            except QhullError:  # an upright mesh covers nothing
                 normals = np.array([[1.0, 0.0, 0.0]])
             half = float((-normals[:, 2] / np.abs(normals[:, :2]).sum(axis=1)).min())
         halves.append(max(0.0, half))
@@ -195,9 +198,10 @@ def covered_squares_in(scene: mi.Scene) -> NDArray[np.float64]:
 
 
 def object_names_in(scene: mi.Scene) -> tuple[str, ...]:
-    """Return the name of each object of a scene's meshes, by the number that ``object_id`` tells: ``cubes 12``.
+    """Return the name of each object of a scene's meshes, indexed by ``object_id``, for example ``cubes 12``.
 
-    An object is what a mesh numbers by its attribute ``face_id``. Number 0 is what no mesh numbers; its name is empty.
+    A mesh numbers its objects in the attribute ``face_id``. Number 0 means that no mesh numbers the object; its name is
+    empty.
     """
     names: dict[int, str] = {}
     for shape in scene.shapes():
@@ -209,7 +213,10 @@ def object_names_in(scene: mi.Scene) -> tuple[str, ...]:
 
 
 def sonar_in(scene: mi.Scene, index: int = 0) -> tuple[Sonar, Pose] | None:
-    """Return sonar and pose of the scene's ``imaging_sonar`` number ``index``, None without one; cameras are ignored."""
+    """Return sonar and pose of the scene's ``imaging_sonar`` number ``index``; None if there is none.
+
+    Cameras are ignored.
+    """
     from mitsonar.plugins.imaging_sonar_sensor import is_imaging_sonar
 
     found = [sensor for sensor in scene.sensors() if is_imaging_sonar(sensor)]
@@ -217,7 +224,7 @@ def sonar_in(scene: mi.Scene, index: int = 0) -> tuple[Sonar, Pose] | None:
 
 
 def channel_sonar_in(scene: mi.Scene, index: int = 0) -> tuple[ChannelSonar, Pose] | None:
-    """Return instrument and pose of the scene's ``channel_sonar`` number ``index``; None where there is none."""
+    """Return instrument and pose of the scene's ``channel_sonar`` number ``index``; None if there is none."""
     from mitsonar.plugins.channel_sonar_sensor import is_channel_sonar
 
     found = [sensor for sensor in scene.sensors() if is_channel_sonar(sensor)]
@@ -225,10 +232,10 @@ def channel_sonar_in(scene: mi.Scene, index: int = 0) -> tuple[ChannelSonar, Pos
 
 
 def scale_notes(scene: mi.Scene, sonar: Sonar) -> list[str]:
-    """Return a sentence where sizes show that a scene is probably not in metres.
+    """Return a warning if the sizes in a scene suggest that it is not in metres; an empty list otherwise.
 
-    A body counts as too large where its smallest extent exceeds :data:`TOO_LARGE` windows (floors are flat), and a window
-    where it reaches farther than an imaging sonar does. A scene counts as too small where it fits into a range bin.
+    A shape is too large if its smallest extent (floors are flat) exceeds :data:`TOO_LARGE` times the far end of the window.
+    A window is too long if it ends beyond :data:`FARTHEST_WINDOW_M`. A scene is too small if it fits into a range bin.
     """
     do = (
         'scenes are in metres; where this one is in millimetres, give its shapes <scale value="0.001"/>, or `mitsonar '
@@ -251,7 +258,7 @@ def scale_notes(scene: mi.Scene, sonar: Sonar) -> list[str]:
 
 
 def _parameters(path: Path, error: BaseException) -> str:
-    """Name the parameters of a scene, where the error is an unknown one; else return nothing."""
+    """Suggest the known parameters of a scene if the error is an unknown parameter; otherwise return an empty string."""
     wrong = re.search(r"unused parameters:\s*-?\s*\$(\w+)", str(error))
     if wrong is None:
         return ""
@@ -260,7 +267,7 @@ def _parameters(path: Path, error: BaseException) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    """Return Mitsuba's error in one line: our own error where a plugin raised one, else the text without its traceback."""
+    """Condense a Mitsuba error to one line: the MitsonarError a plugin raised, else the text without its traceback."""
     text = str(error).strip()
     ours = re.findall(r"^mitsonar\.errors\.MitsonarError: (.+)$", text, flags=re.MULTILINE)
     if ours:
@@ -273,14 +280,14 @@ def _reason(error: BaseException) -> str:
     return words if len(words) <= LONGEST_REASON else f"{words[:LONGEST_REASON]}..."
 
 
-# ---------------- Shapes of a scene as triangles, for those who draw it
+# ---------------- Shapes as triangles, for drawing
 
 
 MOST_FACES = 300_000
-"""Faces of a mesh that is drawn; of a larger one, its box is."""
+"""Largest number of faces of a mesh that is drawn; a larger mesh is drawn as its bounding box."""
 
 STEPS = 24
-"""Corners of a circle."""
+"""Number of segments that approximate a circle."""
 
 BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 BOX_FACES = np.array(
@@ -292,13 +299,13 @@ BOX_FACES = np.array(
 
 
 class Triangles(NamedTuple):
-    """One shape.
+    """Triangle mesh of one shape.
 
     Attributes:
-        name: of the shape.
-        vertices: ``(vertices, 3)`` [m] in the world.
-        faces: three vertices each ``(faces, 3)``.
-        whole: False where it is only the box around the shape.
+        name: id of the shape.
+        vertices: world coordinates ``(vertices, 3)`` [m].
+        faces: three vertex indices per triangle ``(faces, 3)``.
+        whole: False if the mesh is only the bounding box of the shape.
     """
 
     name: str
@@ -310,8 +317,8 @@ class Triangles(NamedTuple):
 def triangles_in(scene: mi.Scene) -> list[Triangles]:
     """Return all shapes of a scene as triangles.
 
-    Meshes are as they are, up to :data:`MOST_FACES`. Rectangles, disks, cylinders and spheres are approximated. Of all
-    others, such as instances, the box around them is returned.
+    Meshes of up to :data:`MOST_FACES` faces are returned unchanged. Rectangles, disks, cylinders and spheres are
+    approximated. Every other shape, such as an instance, is replaced by its bounding box.
     """
     return [_triangles_of(shape) for shape in scene.shapes()]
 
@@ -335,7 +342,7 @@ def _triangles_of(shape: mi.Shape) -> Triangles:
 
 
 def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return vertices and faces of a surface that is sampled at ``(rows, columns, 3)``."""
+    """Triangulate a surface sampled at points ``(rows, columns, 3)``; return vertices and faces."""
     rows, columns = points.shape[:2]
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     right, below = corner + 1, corner + columns
@@ -344,7 +351,7 @@ def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def _round(radius: NDArray[np.float64], height: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return a surface of revolution about z, from its radius by height."""
+    """Triangulate a surface of revolution about z, given radius and height along its profile."""
     turn = np.linspace(0, 2 * np.pi, STEPS + 1)
     circle = np.stack([np.cos(turn), np.sin(turn)], -1)
     across = radius[:, None, None] * circle[None]
@@ -359,26 +366,26 @@ UNIT = {
     "Cylinder": _round(np.ones(2), np.array([0.0, 1.0])),
     "Sphere": _round(np.cos(SLOPE), np.sin(SLOPE)),
 }
-"""Vertices and faces of Mitsuba's own shapes, in their own axes, by the name of their class."""
+"""Vertices and faces of Mitsuba's analytic shapes in object coordinates, keyed by class name."""
 
 
-# ---------------- Motions of bodies that files say: read by the ids of the shapes, from a scene's own shapes or a
-# YAML file
+# ---------------- Motion of shapes: from the scene or a YAML file
 
 
 STAYS = Trajectory(np.zeros((1, 6)), np.zeros(1))
-"""The path of a body that stays where the scene has it."""
+"""Trajectory of a body that stays where the scene places it."""
 
 BYTES_A_VERTEX = 12
+"""Memory of one vertex: three float32 coordinates."""
 
 
 class Said(NamedTuple):
-    """What is said of a shape's motion.
+    """Motion specification of one shape, before its files are read.
 
     Attributes:
         name: id of the shape.
-        motion: of it.
-        folders: one of which holds the files that it names.
+        motion: motion of the shape.
+        folders: folders in which to look for the files that the motion names, in this order.
     """
 
     name: str
@@ -387,30 +394,32 @@ class Said(NamedTuple):
 
 
 def load_motions(file: str | Path) -> dict[str, Any]:
-    """Read the motions in a YAML file, as ``moving`` of :class:`mitsonar.Simulator`; paths are relative to its folder.
+    """Read the motions in a YAML file, in the form of ``moving`` of :class:`mitsonar.Simulator`.
+
+    Paths in the file are relative to its folder.
 
     Raises:
-        MitsonarError: unreadable files, wrong keys.
+        MitsonarError: a file is unreadable, or has wrong keys.
     """
     return read_said(said_in(file))
 
 
 def motions_of(scene: mi.Scene) -> dict[str, Any]:
-    """Return what the shapes of a scene say of their motion, by their ids; empty where all stand still.
+    """Return the motion of every moving shape of a scene, keyed by shape id; empty if nothing moves.
 
     Raises:
-        MitsonarError: unreadable files, or wrong keys.
+        MitsonarError: a file is unreadable, or the scene has wrong keys.
     """
     return read_said(said_by(scene))
 
 
 def said_in(file: str | Path) -> list[Said]:
-    """Return what a YAML file says; the files that it names are not read."""
+    """Return the motion specifications in a YAML file, without reading the files that they name."""
     return [Said(name, motion, [Path(file).parent]) for name, motion in read_motions(file).items()]
 
 
 def said_by(scene: mi.Scene) -> list[Said]:
-    """Return what the shapes of a scene say; the files that they name are not read."""
+    """Return the motion specifications of the shapes of a scene, without reading the files that they name."""
     from mitsonar.plugins.trajectory_texture import MOTION
 
     found = []
@@ -426,10 +435,10 @@ def said_by(scene: mi.Scene) -> list[Said]:
 
 
 def read_said(said: Sequence[Said]) -> dict[str, Any]:
-    """Read the files that are named, and return motions by the ids of the shapes.
+    """Read the files that motion specifications name, and return the motions keyed by shape id.
 
     Raises:
-        MitsonarError: unreadable files; a body that deforms or follows the vehicle, in several places.
+        MitsonarError: a file is unreadable; a shape that deforms or follows the vehicle has several motions.
     """
     found: dict[str, Any] = {}
     for name, motion, folders in said:
@@ -441,7 +450,7 @@ def read_said(said: Sequence[Said]) -> dict[str, Any]:
 
 
 def digests_of(said: Sequence[Said]) -> dict[str, str]:
-    """Return what tells the motions again: their keys and the digests of their files, by the ids of the shapes."""
+    """Return a digest of each shape's motion, over its specification and its files, keyed by shape id."""
     found: dict[str, str] = {}
     for name, motion, folders in said:
         named = [one for one in (motion.path, motion.meshes) if one and one != VEHICLE]
@@ -451,10 +460,14 @@ def digests_of(said: Sequence[Said]) -> dict[str, str]:
 
 
 def refuse_motion(scene: mi.Scene, what: str) -> None:
-    """Refuse a scene whose shapes say that they move.
+    """Reject a scene with moving shapes.
+
+    Args:
+        scene: the scene to check.
+        what: plural noun for the caller's results, which begins the message.
 
     Raises:
-        MitsonarError: one does.
+        MitsonarError: a shape moves.
     """
     said = said_by(scene)
     if said:
@@ -462,13 +475,13 @@ def refuse_motion(scene: mi.Scene, what: str) -> None:
 
 
 def refuse_unread_motions(state: mi.parser.ParserState) -> None:
-    """Refuse a texture ``trajectory`` that no shape holds under the name ``motion``: Mitsuba leaves it out without a word.
+    """Reject a ``trajectory`` texture that no shape holds under the name ``motion``; Mitsuba ignores it silently.
 
     Args:
-        state: of the parsed scene, not instantiated yet.
+        state: parser state of the scene, not instantiated yet.
 
     Raises:
-        MitsonarError: there is one.
+        MitsonarError: there is such a texture.
     """
     import mitsuba as mi
 
@@ -478,7 +491,7 @@ def refuse_unread_motions(state: mi.parser.ParserState) -> None:
     paths = [number for number, node in enumerate(state.nodes) if node.props.plugin_name() == "trajectory"]
     ids = {state.nodes[number].props.id() for number in paths} - {""}
     for node in state.nodes if paths else ():
-        if node.type == mi.ObjectType.Scene:  # there a texture only waits to be referred to
+        if node.type == mi.ObjectType.Scene:  # a texture there is only a target of references
             continue
         for name in list(node.props):
             kind, held = node.props.type(name), node.props[name]
@@ -494,15 +507,15 @@ def refuse_unread_motions(state: mi.parser.ParserState) -> None:
 
 
 def load_meshes(files: Sequence[Path], rate_hz: float, *, loop: bool = True) -> MeshSequence:
-    """Read PLY meshes of the same triangles that follow one another.
+    """Read a sequence of PLY meshes that share their triangles, the successive states of a deforming body.
 
     Args:
-        files: in the order of time.
-        rate_hz: meshes a second.
-        loop: after the last comes the first.
+        files: mesh files in order of time.
+        rate_hz: meshes per second.
+        loop: whether the first mesh follows the last.
 
     Raises:
-        MitsonarError: no mesh, a damaged one, other triangles, or more than the memory holds.
+        MitsonarError: there is no mesh; a mesh is damaged or has other triangles; the sequence exceeds the memory.
     """
     if isinstance(files, str | Path) or not len(files):
         raise MitsonarError(
@@ -520,7 +533,7 @@ def load_meshes(files: Sequence[Path], rate_hz: float, *, loop: bool = True) -> 
 
 
 def _mesh(file: Path) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return vertices and triangles of a PLY file."""
+    """Read vertices and triangles of a PLY file."""
     import mitsuba as mi
 
     check_mesh(file, "ply")
@@ -529,7 +542,7 @@ def _mesh(file: Path) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
 
 
 def _loaded_motion(name: str, motion: BodyMotion, folders: Sequence[Path]) -> Any:
-    """Return the motion of a shape as :class:`mitsonar.Simulator` takes it."""
+    """Read the motion of a shape, in the form that :class:`mitsonar.Simulator` takes."""
     if motion.path == VEHICLE and motion.meshes is None:
         return VEHICLE
     if motion.path == VEHICLE:
@@ -544,7 +557,7 @@ def _loaded_motion(name: str, motion: BodyMotion, folders: Sequence[Path]) -> An
 
 
 def _found(name: str, folders: Sequence[Path]) -> list[Path]:
-    """Return the files of a name in the first folder that has them."""
+    """Return the files that a name stands for, in the first folder that contains all of them."""
     errors = []
     for folder in folders:
         try:

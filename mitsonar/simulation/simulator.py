@@ -1,4 +1,4 @@
-"""Scene, sonar and poses to frames: tracing and binning in one launch, many pings a launch, constant memory."""
+"""How a scene, a sonar and poses become frames: many pings are traced and binned in one launch, in constant memory."""
 
 from __future__ import annotations
 
@@ -46,25 +46,27 @@ __all__ = ["Simulator"]
 
 
 class Simulator:
-    """Renders what a sonar receives in a scene.
+    """Simulator of what a sonar receives in a scene.
 
-    Parameters of the scene may be changed at any time (``mi.traverse``): the next ping is of the scene as it is then.
+    Scene parameters may change at any time (through ``mi.traverse``): the next ping shows the scene as it is then.
 
     Args:
         scene: a Mitsuba scene; its cameras are ignored.
         sonar: the instrument; default: the scene's ``imaging_sonar``.
-        views: makes the images of a ping from its echoes; default: one, of all of them.
-        mirrors: reflection coefficient and rms height [m] of shapes that reflect as mirrors, by the shapes' ids, or their
-            materials (model ``coherent``, and ``physical`` with several ``bounces``); default: none.
-        moving: trajectories, or their files, by the shapes' ids (docs/guides/moving.md); default: as the shapes say.
-        rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
+        views: the images made from the echoes of each ping; default: one image of all echoes.
+        mirrors: reflection coefficient and rms height [m] of the shapes that reflect as mirrors, keyed by shape id, or
+            ``"materials"`` to take them from the shapes' materials (model ``coherent``, and ``physical`` with several
+            ``bounces``); default: none.
+        moving: trajectories or trajectory files, keyed by shape id (docs/guides/moving.md); default: the motion that the
+            scene specifies for its shapes.
+        rays_per_launch: upper bound on the rays of a launch and on its image cells, about 30 bytes each.
 
     Attributes:
-        gain: of the closed loop that :meth:`step` renders; None before its first ping.
-        mirrors: as given.
+        gain: gain of the closed loop that :meth:`step` renders; None until it is set.
+        mirrors: the mirrors as given.
 
     Raises:
-        MitsonarError: no sonar given and none in the scene; mirrors that move.
+        MitsonarError: there is no sonar, neither given nor in the scene; a mirror moves.
     """
 
     def __init__(
@@ -101,7 +103,7 @@ class Simulator:
         return f"Simulator({self.sonar} in a scene of {shapes} shapes{also}; {self.variant})"
 
     def _build(self) -> None:
-        """Make all that follows from the scene as it is now: tables of its surfaces, mirrors, moving bodies, launches."""
+        """Build everything derived from the current scene: surface tables, mirrors, moving bodies and launches."""
         scene, views, moving, rays_per_launch = self._given
         sonar, mirrors = self.sonar, self.mirrors
         from mitsonar.instruments.views import Whole
@@ -139,7 +141,7 @@ class Simulator:
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
-        # a launch has one shape of each body
+        # a launch holds one state of each deforming body, hence one ping
         self.pings_per_launch = 1 if self.tracer.deforms else max(1, rays_per_launch // max(traced.rays, cells))
         self.bounces = bounce_sums(scene, one, traced, mirrors)
         formed = None if self.former is None else one
@@ -147,10 +149,11 @@ class Simulator:
         self._launches: dict[tuple[int, bool], tuple[Callable[..., Any], Any]] = {}
 
     def _follow_scene(self) -> None:
-        """Make anew what follows from the scene where its parameters have changed since.
+        """Rebuild whatever depends on scene parameters that have changed since the last ping.
 
-        Launches stay where only their inputs change: normals and reflectivities in the tables of a scene that stands still.
-        One that evaluates a BSDF is recorded anew after a change of it: Dr.Jit 1.5 replays it with the texture of before.
+        Compiled launches remain valid where only their inputs change: the normals and reflectivities in the tables of a
+        static scene. A launch that evaluates a BSDF is recorded again once that BSDF changes, because Dr.Jit 1.5 would
+        replay it with the old texture.
         """
         changed = self._watch.changed()
         if changed is None:
@@ -170,23 +173,29 @@ class Simulator:
     def pings(
         self, poses: ArrayLike, *, first: FirstPing = 0, labels: bool = False, time_s: ArrayLike | None = None
     ) -> Iterator[RenderedPings]:
-        """Levels of consecutive pings in the first view; see :meth:`render_views`."""
+        """Yield batches of consecutive pings in the first view; see :meth:`render_views`."""
         for looks in self.render_views(poses, first=first, labels=labels, time_s=time_s):
             yield looks[0]
 
     def render_views(
         self, poses: ArrayLike, *, first: FirstPing = 0, labels: bool = False, time_s: ArrayLike | None = None
     ) -> Iterator[list[RenderedPings]]:
-        """Levels of consecutive pings, in batches, one of each view.
+        """Render consecutive pings in batches; each item holds the levels of one batch in every view.
 
-        Ping ``first + k`` draws its own jitter whatever the batches are.
+        The jitter of a ping depends on its number only, not on how pings are split into batches.
 
         Args:
-            poses: of the sonar ``(frames, 6)`` x, y, z [m], pitch, roll, heading [rad]; of each group of beams that pings by
-                itself ``(frames, groups, 6)``.
-            first: number of the first ping, or the number of each.
-            labels: per-pixel truth as well.
-            time_s: of the poses [s]; default: their number / ``frame_rate_hz``. Bodies that move are where they are then.
+            poses: sonar poses ``(frames, 6)``: x, y, z [m], pitch, roll, heading [rad]; or ``(frames, groups, 6)``, one pose
+                for each group of beams that pings separately.
+            first: number of the first ping, or the number of each ping.
+            labels: whether to return per-pixel truth as well.
+            time_s: times of the poses [s], at which moving bodies are placed; default: ping number / ``frame_rate_hz``.
+
+        Yields:
+            The rendered pings of one batch, one entry for each view.
+
+        Raises:
+            MitsonarError: labels of portions in the model ``coherent``.
         """
         self._follow_scene()
         table, time, numbers = moments_of(self.sonar, poses, time_s, first)
@@ -205,7 +214,7 @@ class Simulator:
             yield self._launch(table[part], time[part], numbers[part], labels)
 
     def _coherent_ping(self, pose: NDArray[np.float64], time_s: float, number: int, labels: bool) -> RenderedPings:
-        """Render one coherent ping. Labels are those of the expected levels, from the same surfaces."""
+        """Render one coherent ping; its labels come from the expected levels of the same surfaces."""
         assert self.coherent is not None
         levels, counts, cut = self.coherent.levels(pose, number, time_s)
         if labels:
@@ -218,12 +227,13 @@ class Simulator:
     def _launch(
         self, poses: NDArray[np.float64], time_s: NDArray[np.float64], numbers: list[int], labels: bool
     ) -> list[RenderedPings]:
+        """Render one batch of pings in a single launch and return it in each view."""
         from mitsonar.simulation import binning
 
         key = (len(poses), labels)
         if key not in self._launches:
             self._launches[key] = self._maker.compiled(*key)
-        scene = self.tracer.scene_at(time_s)  # first: bodies may deform, and the inputs are of their normals
+        scene = self.tracer.scene_at(time_s)  # first: it deforms bodies, and the inputs include their normals
         inputs = self.tracer.inputs(poses, numbers)
         tables = [tracer.tables(poses) for tracer in self.view_tracers]
         mirrors = None if self.bounces is None else self.bounces.tables_of_mirrors
@@ -240,31 +250,31 @@ class Simulator:
         return looks
 
     def _formed(self, pings: RenderedPings, former: ExpectedFormer) -> RenderedPings:
-        """Return pings of traced boxes as the beams and the pulse spread them; labels are those of the boxes."""
+        """Spread the levels of traced boxes over beams and pulse; the labels remain those of the boxes."""
         labels = {name: former.crop(values) for name, values in pings.labels.items()}
         expected = former.crop(pings.echoes) if labels else None
         return RenderedPings(pings.first, former.levels(pings.levels), pings.counts, pings.height_m, labels, expected)
 
     def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
-        """One ping's echoes as NumPy arrays, in the order of the film; all beams ping at ``time_s`` [s]."""
+        """Return the echoes of one ping as NumPy arrays, in film order; all beams ping at ``time_s`` [s]."""
         self._follow_scene()
         time_s = ping / self.sonar.frame_rate_hz if time_s is None else time_s
         return self._own_tracer.film_echoes(pose, ping, time_s)
 
     @cached_property
     def _own_tracer(self) -> Tracer:
-        """Return the tracer of the sonar's own rays: those of the launch may reach beyond the field of view."""
+        """Return a tracer of exactly the sonar's rays; those of a launch may extend beyond the field of view."""
         from mitsonar.simulation.tracing import tracer_of
 
         known = self.former is None and self.grouped is None
         return self.tracer if known else tracer_of(self.tracer.scene, self.sonar, self.motion)
 
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
-        """Nearest and farthest return outside the window of one ping [m]; None where all lie inside."""
+        """Return the nearest and farthest return outside the window of one ping [m]; None if all lie inside."""
         return self.film_echoes(pose, ping).outside(self.sonar)
 
     def buried(self, pose: ArrayLike) -> str:
-        """Describe where a pose lies below the ground or inside an object; empty where it does not, or bodies move."""
+        """Describe how a pose lies below the ground or inside an object; empty if it does not, or if bodies move."""
         from mitsonar.simulation.tracing import buried_in
 
         found = (
@@ -286,15 +296,15 @@ class Simulator:
 
         Args:
             trajectory: poses with times, or poses ``(frames, 6)`` [m, rad], one every ``1 / frame_rate_hz``.
-            noise: drawn from (seed, frame, cell); default none.
-            seed: of the noise; the jitter's is the sonar's.
-            labels: per-pixel truth as well.
-            gain: the constant that levels are multiplied by; default: from the first 20 frames.
-            label_floor: part of full scale above which a pixel is labelled; 0: every echo.
+            noise: noise model, drawn from (seed, frame, cell); default: none.
+            seed: seed of the noise; the jitter uses the seed of the sonar.
+            labels: whether to return per-pixel truth as well.
+            gain: constant factor of the levels; default: set on the first 20 frames.
+            label_floor: fraction of full scale above which a pixel is labelled; 0 labels every echo.
 
         Warns:
-            MitsonarWarning: nothing hit, returns outside the window, saturated pixels, too few rays a bin, BSDFs
-                without a diffuse reflectance, frames whose pings overlap.
+            MitsonarWarning: nothing was hit; returns lie outside the window; pixels saturate; there are too few rays per
+                bin; a BSDF has no diffuse reflectance; the pings of frames overlap.
         """
         refuse_noise(noise, self.sonar)
         if not isinstance(trajectory, Trajectory):
@@ -328,7 +338,7 @@ class Simulator:
         gain: float,
         labelled: dict[str, Any],
     ) -> SonarFrames:
-        """Return images and labels as frames of the sonar; with labels go the names that these refer to."""
+        """Assemble images and labels into frames of the sonar, with the names that the labels refer to."""
         shapes, objects = self.label_names(bool(labelled))
         time_s, beam_poses = timed.of_beams(self.sonar)
         return SonarFrames(
@@ -349,7 +359,7 @@ class Simulator:
         )
 
     def label_names(self, labels: bool = True) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the names that labels refer to, of shapes and of objects; none without labels."""
+        """Return the names of shapes and of objects that labels refer to; both empty without labels."""
         from mitsonar.simulation.scene import object_names_in, shape_names_in
 
         if not labels:
@@ -358,7 +368,7 @@ class Simulator:
         return shape_names_in(self.tracer.scene), objects if self.motion is None else self.motion.object_names(objects)
 
     def bodies(self, time_s: ArrayLike) -> BodyStates:
-        """Return the names of the bodies that move, their poses and velocities at times; none where all is still."""
+        """Return the names, poses and velocities of the moving bodies at given times [s]; empty if nothing moves."""
         return BodyStates() if self.motion is None else self.motion.bodies.states(time_s)
 
     def step(
@@ -374,21 +384,21 @@ class Simulator:
     ) -> SonarFrames:
         """Render the next ping of a closed loop, in which each pose follows from the frame before it.
 
-        The simulator counts its pings, so that each draws its own jitter and noise, and keeps one gain. Stepping over poses
-        gives the images of ``render(poses, gain=simulator.gain)``, bit for bit. Without a gain the first frame with echoes
-        sets it. Each warning is given once in a loop. :meth:`reset` begins a new loop.
+        The simulator counts the pings, so that each draws different jitter and noise, and holds the gain constant. Stepping
+        through poses gives bit for bit the images of ``render(poses, gain=simulator.gain)``. If no gain is given, the first
+        frame with echoes sets it. Each kind of warning is issued once in a loop. Call :meth:`reset` to begin a new loop.
 
         Args:
-            pose: of the sonar: x, y, z [m], pitch, roll, heading [rad].
-            time_s: of the ping [s]; default: its number / ``frame_rate_hz``.
-            noise: drawn from (seed, number of the ping, cell); default none.
-            seed: of the noise; the jitter's is the sonar's.
-            labels: per-pixel truth as well.
-            gain: the constant that levels are multiplied by; default: set on the first frame with echoes.
-            label_floor: part of full scale above which a pixel is labelled; 0: every echo.
+            pose: sonar pose: x, y, z [m], pitch, roll, heading [rad].
+            time_s: time of the ping [s]; default: ping number / ``frame_rate_hz``.
+            noise: noise model, drawn from (seed, ping number, cell); default: none.
+            seed: seed of the noise; the jitter uses the seed of the sonar.
+            labels: whether to return per-pixel truth as well.
+            gain: constant factor of the levels; default: set on the first frame with echoes.
+            label_floor: fraction of full scale above which a pixel is labelled; 0 labels every echo.
 
         Raises:
-            MitsonarError: not one pose; a gain other than that of the steps before.
+            MitsonarError: there is not exactly one pose; the gain differs from that of earlier steps.
         """
         refuse_noise(noise, self.sonar)
         table = np.atleast_2d(np.asarray(pose, dtype=float))
@@ -414,13 +424,13 @@ class Simulator:
         return self._frames(noisy, timed, pings.height_m, kept, labelled)
 
     def reset(self) -> None:
-        """Begin a new loop: the next :meth:`step` is ping 0, sets the gain anew, and may warn again."""
+        """Begin a new loop: the next :meth:`step` is ping 0, sets a new gain, and may repeat warnings."""
         self._stepped = 0
         self._gain_from, self.gain = "", None
         self._told.clear()
 
     def _warn_once(self, pings: RenderedPings, image: NDArray[np.float32], pose: NDArray[np.float64]) -> None:
-        """Warn of what a step shows, each kind once in a loop."""
+        """Issue the warnings of one step, each kind once in a loop."""
         tally = Tally(self.sonar, self._gain_from)
         tally.add(pings, image)
         found = {note: note for note in self.notes} | tally.findings(self, pose, pings.first, self._told)

@@ -1,4 +1,7 @@
-"""Scene, sonar and poses to echoes: only this file and the plugins call the ray tracer."""
+"""How a scene is traced: the rays of a sonar, their echoes, moving bodies, reflected rays and clearances.
+
+Only this file and the plugins call the ray tracer.
+"""
 
 from __future__ import annotations
 
@@ -46,34 +49,36 @@ __all__ = [
 
 
 OFF_SURFACE = 1e-5
-"""Distance off a surface at which a shadow ray begins, as a part of the coordinates' size: ten times their rounding."""
+"""Offset of a ray's origin from a surface, as a fraction of the coordinates: ten times their rounding error."""
 
 
 class Rays:
-    """Number the rays of a launch.
+    """Indices of the rays of a launch: their ping, beam, row, column and film pixel.
 
-    Rays run down strips of a few columns, so that rays that are traced together are neighbours.
+    Rays are numbered down strips of a few columns, so that rays traced together are neighbours.
 
     Attributes:
-        ping: number of the ping in the launch.
-        moment: number of the pose in the launch: that of the ping, or of its group of beams.
-        ray: number of the ray in its ping.
-        column: ray across, ``beam * across + k``.
-        row: ray over elevation, 0 the highest.
-        beam: the sonar's beam that the ray belongs to.
+        ping: index of the ray's ping in the launch.
+        moment: index of the ray's pose in the launch: that of its ping, or of its group of beams.
+        ray: index of the ray in its ping.
+        column: index of the ray across the fan, ``beam * across + k``.
+        row: index of the ray over elevation; 0 is the highest.
+        beam: index of the beam that the ray belongs to.
         film: pixel of the ray on the sensor's film.
 
     Args:
         sonar: the instrument.
-        index: numbers of the rays in the launch, of :meth:`numbered`.
+        index: ray numbers in the launch, as returned by :meth:`numbered`.
     """
 
     def __init__(self, sonar: Sonar, index: mi.UInt32) -> None:
+        # 1. Ping, and place of the ray in its strip: rays run along the rows of a strip, then down.
         wide = strip_columns(sonar)
         self.ping, self.ray = index // sonar.rays, index % sonar.rays
         strip, place = self.ray // (wide * sonar.rays_per_beam), self.ray % (wide * sonar.rays_per_beam)
         self.column, self.row = strip * wide + place % wide, place // wide
         self.beam = self.column // sonar.across
+        # 2. Pose: one for each ping, or one for each group of beams of a ping.
         self.moment = self.ping
         if sonar.ping_groups > 1:
             every = sonar.group_order == "interleaved"
@@ -83,10 +88,10 @@ class Rays:
 
     @staticmethod
     def numbered(sonar: Sonar, pings: int) -> mi.UInt32:
-        """Return 0, 1, 2 ... for all rays of a launch, evaluated: the width of a frozen launch follows from its inputs.
+        """Return 0, 1, 2 ... for all rays of a launch, as an evaluated array.
 
-        Without an input as wide as the launch, Dr.Jit 1.5 infers the width from any input that divides it, the
-        data of virtual calls too, and a replay can lose rays.
+        A frozen launch derives its width from its inputs. Without an input as wide as the launch, Dr.Jit 1.5 infers the
+        width from any input that divides it, including the data of virtual calls, and a replay can lose rays.
         """
         index = dr.arange(mi.UInt32, pings * sonar.rays)
         dr.make_opaque(index)
@@ -94,7 +99,7 @@ class Rays:
 
 
 def strip_columns(sonar: Sonar) -> int:
-    """Return the columns of a strip: a power of two that divides all columns and makes 16 rays nearly a square."""
+    """Return the columns of a strip: a power of two that divides all columns and makes 16 rays nearly square."""
     across = sonar.beam_width_rad / sonar.across
     down = math.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
     wanted = 2 ** min(4, max(0, round(math.log2(math.sqrt(16 * down / across)))))
@@ -102,11 +107,11 @@ def strip_columns(sonar: Sonar) -> int:
 
 
 class Tracer:
-    """Trace the echoes of a scene for one sonar.
+    """Ray tracer of a scene for one sonar.
 
     Attributes:
-        notes: what a user should know about the scene's BSDFs and materials.
-        deforms: whether a body deforms, so that a launch is of one moment.
+        notes: warnings about the scene's BSDFs and materials.
+        deforms: whether a body deforms, which limits a launch to one moment.
     """
 
     deforms = False
@@ -120,36 +125,37 @@ class Tracer:
         self.notes = self.surfaces.notes
 
     def inputs(self, poses: ArrayLike, numbers: Sequence[int]) -> tuple[mi.Float, mi.UInt32, LaunchTables]:
-        """Return the inputs of a launch: poses as rows of ``to_world``, keys of the jitter, tables of the surfaces.
+        """Return the inputs of a launch: poses as rows of ``to_world``, jitter keys, and surface tables.
 
-        ``numbers`` are those of the pings. Poses are ``(pings, 6)``, or ``(pings, groups, 6)`` where groups of beams ping
-        one after another.
+        Args:
+            poses: ``(pings, 6)``, or ``(pings, groups, 6)`` where groups of beams ping one after another.
+            numbers: numbers of the pings, which determine their jitter.
         """
         matrices = to_world_matrices(np.reshape(poses, (-1, 6)))[:, :3].astype(np.float32)
         keys = [self.sensor.key(number) for number in numbers]
-        # copies: memory that NumPy owns is aligned by chance, and a frozen launch is recorded anew for each alignment
+        # Copy: NumPy memory has arbitrary alignment, and a frozen launch is recorded again for each alignment.
         return mi.Float(matrices.ravel().tolist()), mi.UInt32(keys), self.surfaces.arrays()
 
     def rays_of(self, rays: Rays, rows: mi.Float, keys: mi.UInt32) -> tuple[mi.Ray3f, imaging_sonar_sensor.Fan]:
-        """Return the rays in the world, and their fan with its directions in world axes."""
+        """Return the rays in world coordinates, and their fan with directions in world axes."""
         fan = self.sensor.fan(rays.column, rays.row, dr.gather(mi.UInt32, keys, rays.ping))
         lines = [dr.gather(mi.Vector4f, rows, rays.moment * 3 + axis) for axis in range(3)]
         fan = fan.carried(lines)
         return mi.Ray3f(mi.Point3f(*(line.w for line in lines)), fan.d), fan
 
     def echoes(self, scene: DeviceArray, ray: mi.Ray3f, fan: imaging_sonar_sensor.Fan, tables: LaunchTables) -> Echoes:
-        """Trace the rays of :meth:`rays_of`; the echoes are not evaluated yet."""
+        """Trace the rays returned by :meth:`rays_of`; the echoes are not evaluated yet."""
         edges = self.sonar.model == "physical"
         return echo_integrator.Echo.measure(scene, replace(self.surfaces, **tables), ray, fan, edges=edges)
 
     def scene_at(self, time_s: ArrayLike) -> DeviceArray:
-        """Return what is traced at the moments of a launch's pings [s]: the scene, for nothing moves here."""
+        """Return the scene to trace at the moments of a launch's pings [s]; a static scene is always the same."""
         return self.scene
 
     def film_echoes(self, pose: ArrayLike, ping: int, time_s: float = 0.0) -> Echoes:
-        """Trace one ping and return its echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film.
+        """Trace one ping and return its echoes as NumPy arrays ``(rays_per_beam * columns,)``, in film order.
 
-        All beams ping at once.
+        All beams ping at the same time.
         """
         rays = Rays(self.sonar, Rays.numbered(self.sonar, 1))
         scene = self.scene_at([time_s] * self.sonar.ping_groups)
@@ -162,13 +168,13 @@ class Tracer:
         return Echoes(**{name: np.array(value) for name, value in values.items()})
 
     def height_m(self, scene: DeviceArray, rows: mi.Float) -> DeviceArray:
-        """Return the height of each pose over what is straight below it [m]; nan where there is nothing."""
+        """Return the height of each pose above the surface straight below it [m]; nan where there is none."""
         line = dr.arange(mi.UInt32, dr.width(rows) // 12) * 3
         return height_below(scene, mi.Point3f(*(dr.gather(mi.Vector4f, rows, line + axis).w for axis in range(3))))
 
 
 def height_below(scene: mi.Scene, place: mi.Point3f) -> DeviceArray:
-    """Return the height of points over what is straight below them [m]; nan where there is nothing."""
+    """Return the height of points above the surface straight below them [m]; nan where there is none."""
     found = scene.ray_intersect_preliminary(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
     return dr.select(found.is_valid(), found.t, dr.nan)
 
@@ -191,14 +197,15 @@ def hidden(
     """Test whether a surface blocks the line between points of a surface and a receiver.
 
     Args:
-        scene: to trace.
-        point: on the surface [m].
-        normal: unit normal of the surface there; its sign does not matter.
+        scene: the scene to trace.
+        point: points on the surface [m].
+        normal: unit normal of the surface at each point; its sign does not matter.
         u: unit direction from the receiver to the point.
-        distance: from the receiver to the point [m].
-        active: points to test.
-        moment: number of the moment of each ray in a scene that moves; default: 0, or a still scene.
+        distance: distance from the receiver to the point [m].
+        active: which points to test.
+        moment: index of the moment of each ray in a moving scene; default: 0, or a static scene.
     """
+    # start off the surface, on the receiver's side, so that the ray does not hit the surface itself
     size = dr.select(dr.abs(point.x) > dr.abs(point.y), dr.abs(point.x), dr.abs(point.y)) + dr.abs(point.z)
     off = (1 + size) * OFF_SURFACE
     begin = point + normal * dr.select(dr.dot(normal, u) > 0, -off, off)
@@ -209,19 +216,20 @@ def hidden(
     return scene.ray_test(ray, True, active)  # type: ignore[call-overload]  # the stubs want mi.Bool for coherent
 
 
-# ---------------- Echoes of a scene whose bodies move: hits are read in the axes of the body and told in those of the
-# world
+# ---------------- Scenes with moving bodies
 
 
 @dataclass
 class MovingSurfaces(Surfaces):
-    """Tables of a scene's shapes, read where bodies have moved.
+    """Surface tables of a scene with moving bodies.
+
+    Hits are read in the axes of the body and returned in those of the world.
 
     Attributes:
-        first_object: number below that of the first body's object.
-        shape_count: shapes of the scene.
-        motion: of the scene.
-        versions: of the meshes that deform, when their normals were read.
+        first_object: object number just below that of the first body.
+        shape_count: number of shapes in the scene.
+        motion: motion of the scene.
+        versions: version of each deforming mesh at which its normals were last read.
     """
 
     first_object: int = 0
@@ -231,13 +239,13 @@ class MovingSurfaces(Surfaces):
 
     @classmethod
     def of_motion(cls, motion: SceneMotion, sonar: Sonar) -> MovingSurfaces:
-        """Return the tables of the scene that a motion belongs to, for one sonar."""
+        """Return the tables of the scene that a motion belongs to, for one sonar's frequency and model."""
         tables = cls.of(motion.scene, motion.shapes).heard_by(sonar)
         assert isinstance(tables, MovingSurfaces)
         return replace(tables, first_object=motion.first_objects, shape_count=len(motion.shapes), motion=motion)
 
     def arrays(self) -> dict[str, DeviceArray]:
-        """Return the tables by name, with the normals that meshes have now."""
+        """Return the tables by name, after updating the normals of meshes that have deformed."""
         deformed = () if self.motion is None else self.motion.deformed
         now = tuple(one.version for one in deformed)
         if now != self.versions:
@@ -247,17 +255,17 @@ class MovingSurfaces(Surfaces):
         return super().arrays()
 
     def hit(self, scene: mi.Scene | MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
-        """Trace rays to the nearest surface; directions are of the world."""
+        """Trace rays to the nearest surface and return the hit in world axes."""
         assert isinstance(scene, MovingScene)
         return self.hit_and_body(scene, ray, active)[0]
 
     def hit_and_body(self, scene: MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[Hit, DeviceArray]:
-        """Trace rays to the nearest surface; return the hit in the axes of the world, and the number of the body."""
+        """Trace rays to the nearest surface; return the hit in world axes and the number of the body."""
         hit, body = self.hit_in_body(scene, ray, active)
         return replace(hit, n=carried_back(scene.lines(mi.UInt32(ray.time), body), hit.n)), body
 
     def hit_in_body(self, scene: MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[Hit, DeviceArray]:
-        """Trace rays to the nearest surface; return the hit in the axes of its body, and the number of the body."""
+        """Trace rays to the nearest surface; return the hit in the axes of its body and the number of the body."""
         found, body = scene.find(ray, active)
         hit = self.read(found, scene.carried(ray, body), active)
         numbered = (body > 0) & (hit.object_id == 0)
@@ -265,7 +273,7 @@ class MovingSurfaces(Surfaces):
         return replace(hit, object_id=object_id), body
 
     def own_lattice(self, scene: MovingScene, hit: Hit, body: DeviceArray) -> DeviceArray:
-        """Return the number of the lattice of points on each hit: the shape's, of further bodies of one shape their own."""
+        """Return the scatterer lattice of each hit: the shape's number, or a unique one for further bodies of one shape."""
         number, first = hit.shape_id, 1
         for copies in scene.copies:
             number = dr.select((body > first) & (body < first + copies), self.shape_count + mi.Int32(body), number)
@@ -274,10 +282,10 @@ class MovingSurfaces(Surfaces):
 
 
 class MovingTracer(Tracer):
-    """Trace the echoes of a scene whose bodies move.
+    """Ray tracer of a scene with moving bodies, for one sonar.
 
     Args:
-        motion: of the scene.
+        motion: motion of the scene.
         sonar: the instrument.
     """
 
@@ -291,58 +299,57 @@ class MovingTracer(Tracer):
         return self.motion.at(np.ravel(time_s))
 
     def rays_of(self, rays: Rays, rows: mi.Float, keys: mi.UInt32) -> tuple[mi.Ray3f, Fan]:
-        """Return the rays in the world, each with the number of its moment, and their fan."""
+        """Return the rays in world coordinates, each carrying the index of its moment as its time, and their fan."""
         ray, fan = super().rays_of(rays, rows, keys)
         moment: DeviceArray = mi.Float(rays.moment)
         ray.time = moment
         return ray, fan
 
     def height_m(self, scene: DeviceArray, rows: mi.Float) -> DeviceArray:
-        """Return the height of each pose over the still shapes straight below it [m]; nan where there is nothing."""
+        """Return the height of each pose above the static shapes straight below it [m]; nan where there is none."""
         assert isinstance(scene, MovingScene)
         return super().height_m(scene.still, rows)
 
 
 def tracer_of(scene: mi.Scene, sonar: Sonar, motion: SceneMotion | None) -> Tracer:
-    """Return what traces a scene for a sonar, with bodies that move or without."""
+    """Return the tracer of a scene for a sonar, with or without moving bodies."""
     return Tracer(scene, sonar) if motion is None else MovingTracer(motion, sonar)
 
 
 def surfaces_of(scene: mi.Scene, sonar: Sonar, motion: SceneMotion | None) -> Surfaces:
-    """Return the tables of a scene's shapes for a sonar, with bodies that move or without."""
+    """Return the surface tables of a scene for a sonar, with or without moving bodies."""
     return Surfaces.of(scene).heard_by(sonar) if motion is None else MovingSurfaces.of_motion(motion, sonar)
 
 
-# ---------------- Rays that go on from a surface: as from a mirror, or drawn from Lambert's law; and both ends of a
-# path in one beam
+# ---------------- Reflected and scattered rays
 
 
 FLATTEST = 0.02
-"""Cosine to the normal below which the next ray begins no farther along its direction."""
+"""Smallest cosine to the normal used to place the origin of the next ray: it bounds the offset of grazing rays."""
 
 HALF_LOG_2 = math.log(2) / 2
 
 
 def reflected(v: DeviceArray, normal: DeviceArray) -> DeviceArray:
-    """Return vectors as a mirror of that unit normal turns them."""
+    """Reflect vectors in a mirror with the given unit normal."""
     return v - normal * (2 * dr.dot(normal, v))
 
 
 def going_on(place: DeviceArray, direction: DeviceArray, normal: DeviceArray) -> DeviceArray:
-    """Return the distance along a direction at which the next ray begins, clear of the surface that it leaves [m]."""
+    """Return how far along its direction the next ray must begin to clear the surface that it leaves [m]."""
     size = dr.select(dr.abs(place.x) > dr.abs(place.y), dr.abs(place.x), dr.abs(place.y)) + dr.abs(place.z)
     along: DeviceArray = dr.abs(dr.dot(normal, direction))
     return (1 + size) * OFF_SURFACE / dr.select(along > FLATTEST, along, FLATTEST)
 
 
 def lambert_direction(normal: DeviceArray, d: DeviceArray, ray: DeviceArray, key: DeviceArray) -> mi.Vector3f:
-    """Draw directions by Lambert's law around the side of a surface that rays meet, from a hash.
+    """Draw scattered directions by Lambert's law on the side of a surface that rays meet, from a hash.
 
     Args:
         normal: unit normal of the surface; its sign does not matter.
-        d: of the rays that meet it.
+        d: directions of the incident rays.
         ray: number of each ray.
-        key: of the draw, 32 bits.
+        key: 32-bit key of the draw.
     """
     first, second = mi.sample_tea_32(ray, key, ROUNDS)
     place = mi.Point2f((mi.Float(first >> 8) + 0.5) * 2.0**-24, (mi.Float(second >> 8) + 0.5) * 2.0**-24)
@@ -352,12 +359,12 @@ def lambert_direction(normal: DeviceArray, d: DeviceArray, ray: DeviceArray, key
 
 
 def mirrored_lines(lines: list[list[Any]], normal: DeviceArray, place: DeviceArray) -> list[list[Any]]:
-    """Return the rows of a sonar's ``to_world`` as a plane mirror shows it, in double precision.
+    """Return the rows of ``to_world`` of a sonar's image in a plane mirror, in double precision.
 
     Args:
-        lines: three rows of four numbers.
-        normal: of the mirror.
-        place: a point on it [m].
+        lines: the sonar's ``to_world``, three rows of four numbers.
+        normal: normal of the mirror, of any length.
+        place: a point on the mirror [m].
     """
     n: DeviceArray = mi.Vector3d(normal)
     n = n * dr.rsqrt(dr.squared_norm(n))
@@ -368,28 +375,31 @@ def mirrored_lines(lines: list[list[Any]], normal: DeviceArray, place: DeviceArr
 
 
 def overlap(sonar: Sonar, apart: DeviceArray) -> DeviceArray:
-    """Return the amplitude that a beam has for a path whose ends are ``apart``, relative to a path in the middle of both.
+    """Return a beam's amplitude for a path that leaves and arrives at different bearings.
 
-    Two beams of Gaussian main lobes, one steered to each end, make one in the middle times this. ``apart`` is a difference
-    of sines of the bearing.
+    The amplitude is relative to a path that leaves and arrives in the middle of both. The product of two Gaussian main
+    lobes, one steered to each end, equals a lobe in the middle times this factor.
+
+    Args:
+        sonar: the instrument, with its beam width and pattern.
+        apart: difference between the sines of both bearings.
     """
     ways = 1 if sonar.beam_pattern == "two_way" else 2
     return dr.exp(dr.square(apart * (1 / sonar.beam_width_rad)) * (-HALF_LOG_2 * ways))
 
 
-# ---------------- Free water around vehicles: how near the nearest surface is, by a few rays from each, and who lies
-# below the ground
+# ---------------- Clearance of vehicles and buried poses
 
 
 AROUND = np.array([way for way in itertools.product((-1, 0, 1), repeat=3) if any(way)], dtype=float)
-"""Directions in which surfaces are sought: the faces, edges and corners of a cube."""
+"""Directions in which to search for surfaces: towards the faces, edges and corners of a cube."""
 
 
 class Clearance:
-    """Measures the clearance of vehicles, all in one launch.
+    """Clearance of vehicles to the nearest surface, traced for all of them in one launch.
 
     Args:
-        tracer: of the scene.
+        tracer: tracer of the scene.
     """
 
     def __init__(self, tracer: Tracer) -> None:
@@ -400,42 +410,45 @@ class Clearance:
     def of(
         self, before: NDArray[np.float64], after: NDArray[np.float64], time_s: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the distance of each place to the nearest surface in 26 directions and along the way there ``(n,)`` [m].
+        """Return the distance to the nearest surface in 26 directions and along the path travelled ``(n,)`` [m].
 
-        A surface that was passed on the way counts as a negative distance. Thin things between the directions are missed.
+        The distance is negative if the path passed through a surface. Thin objects between the directions are missed.
 
         Args:
-            before: places that vehicles came from ``(n, 3)`` [m].
-            after: places where they are.
-            time_s: of each, for bodies that move ``(n,)`` [s].
+            before: positions that the vehicles came from ``(n, 3)`` [m].
+            after: positions of the vehicles ``(n, 3)`` [m].
+            time_s: time of each position, at which moving bodies are placed ``(n,)`` [s].
         """
         count = len(after)
-        if self.tracer.deforms and count > 1:  # a launch has one shape of each body
+        if self.tracer.deforms and count > 1:  # a launch holds one state of each deforming body
             each = (slice(number, number + 1) for number in range(count))
             return np.concatenate([self.of(before[one], after[one], time_s[one]) for one in each])
+        # direction of travel; straight down for a vehicle that did not move
         way = after - before
         gone = np.linalg.norm(way, axis=1)
         ahead = np.where(gone[:, None] > 0, way / np.maximum(gone, 1e-12)[:, None], (0.0, 0.0, -1.0))
+        # 26 rays from where each vehicle is, and one from where it was
         ways = np.concatenate([np.broadcast_to(self._ways, (count, *self._ways.shape)), ahead[:, None]], axis=1)
         begin = np.concatenate([np.repeat(after[:, None], len(self._ways), axis=1), before[:, None]], axis=1)
+        # trace; the launch is recorded once for each number of vehicles
         if count not in self._launches:
             self._launches[count] = Frozen(self._traced)
         number = mi.Float(np.repeat(np.arange(count), ways.shape[1]).astype(np.float32).tolist())
         rays = [mi.Float(part.ravel().astype(np.float32).tolist()) for part in (begin, ways)]
         free = replayed(self._launches[count], self.tracer.scene_at(time_s), number, *rays)
         distance = np.array(free, dtype=float).reshape(ways.shape[:2])
-        distance[:, -1] -= gone
+        distance[:, -1] -= gone  # the last ray began at the old position
         return np.asarray(distance.min(axis=1))
 
     def straight(self, places: NDArray[np.float64], way: tuple[float, float, float]) -> NDArray[np.float64]:
-        """Return the distance from each place ``(n, 3)`` to the surface in one direction ``(n,)`` [m], at time 0; or inf."""
+        """Return the distance from positions ``(n, 3)`` to the surface in one direction ``(n,)`` [m], at time 0; or inf."""
         begin = mi.Point3f(*(mi.Float(column.astype(np.float32).tolist()) for column in places.T))
         found = free_way(self.tracer.scene_at(np.zeros(len(places))), mi.Ray3f(begin, mi.Vector3f(*way)))
         return np.array(found, dtype=float)
 
     @staticmethod
     def _traced(scene: DeviceArray, number: mi.Float, begin: mi.Float, ways: mi.Float) -> DeviceArray:
-        """Trace the rays of all vehicles; a ray carries the number of its vehicle as its time."""
+        """Trace the rays of all vehicles; a ray carries the index of its vehicle, which is its moment, as its time."""
         at = dr.arange(mi.UInt32, dr.width(number))
         ray = mi.Ray3f(dr.gather(mi.Point3f, begin, at), dr.gather(mi.Vector3f, ways, at))
         time: DeviceArray = number
@@ -444,17 +457,17 @@ class Clearance:
 
 
 SEA_SURFACE = "surface"
-"""Id of the shape that worlds give the sea above them: what lies below it is in the water."""
+"""Id of the sea surface in generated worlds; a pose below it is in the water."""
 
 
 class Buried(NamedTuple):
     """A pose below the ground or inside an object.
 
     Attributes:
-        frame: its number.
-        frames: number of all such poses.
-        text: what is wrong, in a sentence without its subject.
-        inside: whether it is inside an object.
+        frame: index of the pose.
+        frames: number of such poses in total.
+        text: predicate of a sentence that describes the fault.
+        inside: whether the pose is inside an object.
     """
 
     frame: int
@@ -464,18 +477,19 @@ class Buried(NamedTuple):
 
 
 def buried_in(scene: mi.Scene, poses: NDArray[np.float64]) -> Buried | None:
-    """Find poses below the ground or inside an object: straight up a ray meets the back of a surface.
+    """Find poses below the ground or inside an object, where a ray straight up meets the back of a surface.
 
-    Below the ground there is nothing straight below; inside an object there is the back of the same shape. Surfaces whose
-    normals point down, and scenes that move, are not judged.
+    Below the ground, a ray straight down meets nothing; inside an object, it meets the back of the same shape. Surfaces
+    whose normals point down and moving scenes are not judged.
 
     Args:
-        scene: that stands still.
-        poses: of the sonar or vehicle ``(n, 6)`` [m, rad].
+        scene: a static scene.
+        poses: poses of the sonar or vehicle ``(n, 6)`` [m, rad].
 
     Returns:
-        The first of them; None where all poses are in the water, or nothing shows that they are not.
+        The first such pose; None if all poses are in the water, or nothing shows that they are not.
     """
+    # 1. Trace straight up and down from each pose; most often no ray meets the back of a surface.
     places = np.asarray(poses, dtype=float)[:, :3]
     begin = mi.Point3f(*(mi.Float(column.astype(np.float32).tolist()) for column in places.T))
     above, below = (scene.ray_intersect(mi.Ray3f(begin, mi.Vector3f(0, 0, way))) for way in (1, -1))
@@ -483,6 +497,7 @@ def buried_in(scene: mi.Scene, poses: NDArray[np.float64]) -> Buried | None:
     open_below = ~np.array(below.is_valid())
     if not roofed.any():
         return None
+    # 2. Identify the shapes met, by their numbers in the registry of Dr.Jit.
     shapes = [dr.reinterpret_array(mi.UInt32, found.shape) for found in (above, below)]
     names = {
         number: shape.id()
@@ -490,11 +505,13 @@ def buried_in(scene: mi.Scene, poses: NDArray[np.float64]) -> Buried | None:
         for number in np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))
     }
     up, down = (np.array(number) for number in shapes)
+    # 3. A back above means buried if nothing, or the back of the same shape, lies below; the sea surface does not count.
     wet = np.array([names.get(int(number), "") == SEA_SURFACE for number in up])
     inside = (up == down) & ~open_below & (np.array(below.n)[2] < 0)
     wrong = np.flatnonzero(roofed & ~wet & (open_below | inside))
     if not len(wrong):
         return None
+    # 4. Describe the first of them.
     first = int(wrong[0])
     x, y, z = places[first]
     where, name = f"at ({x:g}, {y:g}, {z:g}) m", names.get(int(up[first]), "")
