@@ -1,4 +1,7 @@
-"""Echoes to complex channel impulse responses, for any transmitter and receivers (Almanza-Medina, 5.2)."""
+"""Channel simulation: how echoes become complex impulse responses, for any transmitter and receivers.
+
+The symbols and equation numbers are those of Almanza-Medina, section 5.2.
+"""
 
 from __future__ import annotations
 
@@ -37,14 +40,14 @@ LACKING = (
     'give reflection and rms height by the ids of shapes, mirrors={"surface": (-1.0, 0.0)}, or "materials" (--mirrors) with '
     "a material that has both"
 )
-"""What to do where the instrument needs mirrors."""
+"""Advice in the error of an instrument that needs mirrors."""
 
 NO_MIRRORS = (
     "the scene has no mirrors: no shape has an acoustic_material with reflection and roughness_m; all is as without mirrors"
 )
 
 PINGS_AT_A_TIME = 16
-"""Pings whose echoes wait in memory for their transforms: 50 bytes an echo and receiver."""
+"""Number of pings whose echoes wait in memory for their transforms: 50 bytes per echo and receiver."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class Channels:
     Attributes:
         first: number of the first ping.
         response: ``(pings, receivers, taps)`` complex64.
-        height_m: of the transmitter over what is straight below it ``(pings,)`` [m]; nan where nothing is.
+        height_m: height of the transmitter above the surface straight below it ``(pings,)`` [m]; nan if there is none.
         echoes: number of echoes within ``range_max`` ``(pings, receivers)``.
         dropped: number of echoes from beyond ``range_max`` ``(pings, receivers)``.
     """
@@ -74,12 +77,13 @@ class Paths:
     """The echoes of one ping at one receiver.
 
     Attributes:
-        delay_s: ``(n,)`` float64.
+        delay_s: delay ``(n,)`` float64 [s].
         amplitude: ``(n,)`` complex128, before the carrier's phase -2 pi f_c tau; real and positive in the model ``rays``.
-        doppler_hz: shift of the carrier ``(n,)``, positive where the path gets shorter.
+        doppler_hz: Doppler shift of the carrier ``(n,)`` [Hz], positive where the path gets shorter.
         dropped: number of echoes from beyond ``range_max``.
-        way: index of what the path meets in ``ways`` ``(n,)``; by default all are of the first.
-        ways: what paths may meet in turn: ``scatterer``, ``surface-scatterer``, ``direct``, ``surface-seabed`` ...
+        way: kind of each path, as an index into ``ways`` ``(n,)``; by default all paths are of the first kind.
+        ways: kinds of paths, named after what they meet in turn: ``scatterer``, ``surface-scatterer``, ``direct``,
+            ``surface-seabed`` ...
     """
 
     delay_s: NDArray[np.float64]
@@ -90,13 +94,13 @@ class Paths:
     ways: tuple[str, ...] = ("scatterer",)
 
     def by(self, name: str) -> Paths:
-        """Return the paths of one way.
+        """Return the paths of one kind.
 
         Args:
-            name: of :attr:`ways`.
+            name: one of :attr:`ways`.
 
         Raises:
-            MitsonarError: no such way.
+            MitsonarError: there is no such kind of path.
         """
         if name not in self.ways:
             raise MitsonarError(f"no path goes by {name!r}: {nearest_names(name, self.ways)}")
@@ -106,30 +110,32 @@ class Paths:
 
 
 class ChannelSimulator:
-    """Simulate the impulse responses that a channel sonar measures in a scene.
+    """Simulator of the impulse responses that a channel sonar measures in a scene.
 
     Model ``scatterers``: points of the world (:mod:`mitsonar.simulation.scatterers`) that the transmitter sees, with one
-    shadow ray each. The amplitude is zeta sqrt(C dA cos_A cos_B) / (r_A r_B), where zeta is the point's own complex Gaussian
-    number. The mean of its square is the level of an imaging sonar's echo. Model ``rays`` (Almanza-Medina, 5.2.1): rays that
-    are fixed to the vehicle, evenly over each receiver's field of view. The amplitude is C cos_A.
+    shadow ray each. The amplitude is zeta sqrt(C dA cos_A cos_B) / (r_A r_B), where zeta is an independent complex Gaussian
+    number for each point. The mean of its square is the level of an imaging sonar's echo. Model ``rays`` (Almanza-Medina,
+    5.2.1): rays that are fixed to the vehicle and cover each receiver's field of view evenly. The amplitude is C cos_A.
 
-    With ``mirrors`` sound also arrives by way of flat mirrors, with up to ``sonar.bounces`` reflections in all: from image
-    sources, with the carrier's phase of each path. Mirrors that are not flat, such as waves, reflect once.
+    With ``mirrors``, sound also arrives via flat mirrors, with up to ``sonar.bounces`` reflections in total. These paths
+    are computed from image sources and include the phase of the carrier. Mirrors that are not flat, such as waves, reflect
+    once.
 
-    Parameters of the scene may be changed at any time (``mi.traverse``): the next ping is of the scene as it is then.
+    Parameters of the scene may be changed at any time (``mi.traverse``): the next ping uses the changed scene.
 
     Args:
         scene: any Mitsuba scene.
         sonar: the instrument.
-        like: a simulator of the same scene; its scatterers are shared where both instruments have the same.
-        mirrors: reflection coefficient and rms height [m] by the ids of shapes, ``{"surface": (-1.0, 0.0)}``, or
-            ``materials``: those of the shapes' materials.
+        like: a simulator of the same scene; its scatterers are reused if both instruments have the same ones.
+        mirrors: reflection coefficient and rms height [m] keyed by shape id, ``{"surface": (-1.0, 0.0)}``, or
+            ``materials`` to use those of the shapes' materials.
 
     Attributes:
-        ways: what paths meet in turn, by name: ``scatterer``, ``surface-scatterer``, ``direct``, ``surface`` ...
+        ways: kinds of paths, named after what they meet in turn: ``scatterer``, ``surface-scatterer``, ``direct``,
+            ``surface`` ...
 
     Raises:
-        MitsonarError: no surface can carry scatterers; a mirror that the scene does not have; bounces without mirrors.
+        MitsonarError: no surface can carry scatterers; a mirror is not in the scene; bounces without mirrors.
     """
 
     def __init__(
@@ -152,7 +158,7 @@ class ChannelSimulator:
         return f"ChannelSimulator({self.sonar} in a scene of {shapes} shapes; ways {ways})"
 
     def _build(self, like: ChannelTracer | None = None) -> None:
-        """Make all that follows from the scene as it is now: scatterers or tables of its surfaces, and mirrors."""
+        """Build everything that depends on the current scene: scatterers or surface tables, and mirrors."""
         scene, mirrors = self._given
         sonar = self.sonar
         from mitsonar.simulation.mirror_paths import MirrorPaths
@@ -167,13 +173,13 @@ class ChannelSimulator:
         self.ways = tuple([way.name for way in self.tracer.ways] + self.without_scatterer.names)
 
     def _follow_scene(self) -> None:
-        """Make anew what follows from the scene where its parameters have changed since."""
+        """Rebuild everything that depends on the scene if its parameters have changed."""
         if self._watch.changed() is not None:
             self._build()
 
     @property
     def notes(self) -> list[str]:
-        """Return what a user should know about the scene's BSDFs and mirrors."""
+        """Return notes to the user about the scene's BSDFs and mirrors."""
         notes = [*self.tracer.notes, *self.without_scatterer.notes]
         return [*notes, NO_MIRRORS] if self._without_mirrors else notes
 
@@ -184,12 +190,12 @@ class ChannelSimulator:
 
         Args:
             flown: poses of the transmitter and times.
-            velocity: in the vehicle's axes, see :class:`~mitsonar.records.responses.ImpulseResponses`; default:
+            velocity: velocity in the vehicle's axes, see :class:`~mitsonar.records.responses.ImpulseResponses`; default:
                 that of the trajectory (:func:`~mitsonar.motion.trajectory.velocities`).
             progress: called with the number of new pings.
 
         Raises:
-            MitsonarError: velocities that do not fit.
+            MitsonarError: the velocities are not valid.
         """
         parts = []
         velocity = velocities(flown) if velocity is None else velocity
@@ -210,20 +216,20 @@ class ChannelSimulator:
     def step(self, pose: ArrayLike, velocity: ArrayLike, *, time_s: float | None = None) -> ImpulseResponses:
         """Simulate the next ping of a closed loop.
 
-        Stepping over the poses and velocities of a trajectory gives the bits of :meth:`responses`. Each step needs its
-        velocity, since one pose does not determine it. The loop has no other state than the number of pings, for their
-        times: responses have no gain and no random numbers of a ping.
+        Stepping through the poses and velocities of a trajectory gives the same bits as :meth:`responses`. Each step needs
+        a velocity, since a single pose does not determine it. The only state of the loop is the number of pings, which
+        determines their times: responses have no gain, and a ping draws no random numbers.
 
         Args:
-            pose: of the transmitter: x, y, z [m], pitch, roll, heading [rad].
-            velocity: in the vehicle's axes ``(4,)``, starboard, forward, up [m/s], turn to starboard [rad/s].
-            time_s: of the ping [s]; default: its number / ``frame_rate_hz``.
+            pose: pose of the transmitter: x, y, z [m], pitch, roll, heading [rad].
+            velocity: velocity in the vehicle's axes ``(4,)``, starboard, forward, up [m/s], turn to starboard [rad/s].
+            time_s: time of the ping [s]; default: its number / ``frame_rate_hz``.
 
         Returns:
             The responses of one ping.
 
         Raises:
-            MitsonarError: not one pose, or a velocity that is not finite or too large.
+            MitsonarError: not exactly one pose, or a velocity that is not finite or too large.
         """
         table = np.atleast_2d(np.asarray(pose, dtype=float))
         if table.shape != (1, 6):
@@ -238,19 +244,19 @@ class ChannelSimulator:
         self._stepped = 0
 
     def pings(self, poses: ArrayLike, velocity: ArrayLike | None = None, *, first: int = 0) -> Iterator[Channels]:
-        """Simulate consecutive pings in batches: memory does not grow with their number.
+        """Simulate consecutive pings in batches, so that memory does not grow with their number.
 
         Args:
-            poses: of the transmitter when a ping is sent ``(pings, 6)``.
-            velocity: in the vehicle's axes ``(pings, 4)``, starboard, forward, up [m/s], turn to starboard [rad/s], or one
-                of all pings ``(4,)``; default: at rest.
+            poses: poses of the transmitter when the pings are sent ``(pings, 6)``.
+            velocity: velocity in the vehicle's axes ``(pings, 4)``, starboard, forward, up [m/s], turn to starboard [rad/s],
+                or one for all pings ``(4,)``; default: at rest.
             first: number of the first ping.
 
         Yields:
             The responses of each batch.
 
         Raises:
-            MitsonarError: velocities that do not fit.
+            MitsonarError: the velocities are not valid.
         """
         self._follow_scene()
         table = np.atleast_2d(np.asarray(poses, dtype=float))
@@ -264,9 +270,9 @@ class ChannelSimulator:
         """Trace the echoes of one ping at one receiver.
 
         Args:
-            pose: of the transmitter: x, y, z [m], pitch, roll, heading [rad].
-            velocity: as of :meth:`pings`.
-            receiver: its name or number.
+            pose: pose of the transmitter: x, y, z [m], pitch, roll, heading [rad].
+            velocity: as in :meth:`pings`.
+            receiver: name or number of the receiver.
 
         Raises:
             MitsonarError: no such receiver, or a pose or velocity that is not valid.
@@ -293,13 +299,15 @@ class ChannelSimulator:
     def _channels(
         self, poses: NDArray[np.float64], velocity: NDArray[np.float64], first: int, threads: ThreadPoolExecutor
     ) -> Channels:
-        """Simulate some pings, one launch each; threads select its points and transform its echoes in parallel."""
+        """Simulate a batch of pings; threads select points and transform echoes while the device traces."""
         shape = (len(poses), len(self.sonar.receivers))
         ways = self.tracer.ways
         each = [(k, receiver, way) for k, receiver in np.ndindex(shape) for way in ways]
+        # select the points of all launches ahead, in threads
         asked = [threads.submit(self.tracer.asked, poses[k], receiver, way) for k, receiver, way in each]
         made = []
         parts: list[EchoValues] = []
+        # trace one kind of path after another; a response is transformed once all its kinds have arrived
         for (k, receiver, way), ready in zip(each, asked, strict=True):
             parts.append(self.tracer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES, ready.result(), way))
             if len(parts) == len(ways):
@@ -317,12 +325,12 @@ class ChannelSimulator:
 
 
 def joined(parts: list[EchoValues]) -> EchoValues:
-    """Return the echoes of several ways as one."""
+    """Concatenate the echoes of several kinds of paths."""
     return parts[0] if len(parts) == 1 else {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _one_response(sonar: ChannelSonar, parts: list[EchoValues]) -> tuple[NDArray[np.complex128], int, int]:
-    """Return one response of the echoes of all ways, the number of echoes, and the number from beyond ``range_max``."""
+    """Return the response of all echoes, the number of echoes, and the number from beyond ``range_max``."""
     received = joined(parts)
     keep = np.flatnonzero(received["counts"])
     strength = np.empty(len(keep), np.complex128)
@@ -337,12 +345,12 @@ def frequency_response(
     """Compute the frequency response H_f of echoes (Almanza-Medina, eq. 5.15) by a type 1 non-uniform FFT.
 
     Args:
-        delay_s: of each echo ``(n,)`` [s].
-        amplitude: of each echo ``(n,)``, real or complex.
+        delay_s: delay of each echo ``(n,)`` [s].
+        amplitude: amplitude of each echo ``(n,)``, real or complex.
         sonar: carrier, band and frequency step.
 
     Returns:
-        Frequencies of the band ``(k,)``, from the carrier [Hz], and H_f ``(k,)``.
+        Frequencies of the band relative to the carrier ``(k,)`` [Hz], and H_f ``(k,)``.
     """
     delay = np.asarray(delay_s, dtype=float)
     turn, strength = phasors(delay, np.asarray(amplitude), sonar, 1)
@@ -357,8 +365,8 @@ def impulse_response(delay_s: ArrayLike, amplitude: ArrayLike, sonar: ChannelSon
     The frequency response is weighted by a raised cosine, padded, and transformed by an inverse FFT.
 
     Args:
-        delay_s: of each echo ``(n,)`` [s].
-        amplitude: of each echo ``(n,)``, real or complex.
+        delay_s: delay of each echo ``(n,)`` [s].
+        amplitude: amplitude of each echo ``(n,)``, real or complex.
         sonar: carrier, band, frequency step and taps.
 
     Returns:
@@ -370,7 +378,7 @@ def impulse_response(delay_s: ArrayLike, amplitude: ArrayLike, sonar: ChannelSon
 
 
 def _half(sonar: ChannelSonar, padding: int) -> int:
-    """Return the index of the last frequency within the band, counted from its middle."""
+    """Return the index of the last frequency within the band, counted from its centre."""
     return math.floor((1 + sonar.rolloff) * sonar.bandwidth_hz / 2 / sonar.frequency_step_hz * padding + 1e-9)
 
 
@@ -382,7 +390,7 @@ def _spectrum(
 
 
 def _taps(sonar: ChannelSonar, spectrum: NDArray[np.complex128], padding: int) -> NDArray[np.complex128]:
-    """Apply raised cosine and inverse FFT (eq. 5.17), and cut the padded response to the taps."""
+    """Apply the raised cosine and the inverse FFT (eq. 5.17), and cut the padded response to the taps."""
     half = _half(sonar, padding)
     number = np.arange(-half, half + 1)
     length_ = sonar.taps * padding
@@ -392,7 +400,7 @@ def _taps(sonar: ChannelSonar, spectrum: NDArray[np.complex128], padding: int) -
 
 
 def _checked(velocity: ArrayLike | None, pings: int, sound_speed: float) -> NDArray[np.float64]:
-    """Return velocities ``(pings, 4)``.
+    """Validate velocities and return them as an array ``(pings, 4)``; zeros by default.
 
     Raises:
         MitsonarError: another shape, not finite, or above a tenth of the sound speed.

@@ -1,4 +1,7 @@
-"""Geometry between transmitter and receiver in one ping, and the echoes of a launch as Dr.Jit arrays."""
+"""Link geometry: where transmitter and receiver are in one ping, and what echoes they exchange via points.
+
+Echoes are Dr.Jit arrays of one launch.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +22,17 @@ from mitsonar.simulation.tracing import hidden
 __all__ = ["LINK", "EchoBatch", "Leg", "LinkGeometry", "ScatteringPoints", "link_table"]
 
 LINK = 30
-"""Numbers of :func:`link_table`."""
+"""Length of :func:`link_table`."""
 
 DRJIT = Maths(dr.asin, dr.atan2, dr.cos, dr.clip, dr.select)
 
 
 class ScatteringPoints(NamedTuple):
-    """Points of surfaces.
+    """Points on surfaces.
 
     Attributes:
         at: position [m].
-        exact: the same in double precision, three arrays [m].
+        exact: position in double precision, three arrays [m].
         normal: unit normal of the surface.
     """
 
@@ -39,7 +42,7 @@ class ScatteringPoints(NamedTuple):
 
 
 class Leg(NamedTuple):
-    """The unit direction from transmitter or receiver (or its image) to points, and the distance [m]."""
+    """Unit direction from transmitter or receiver (or its image) to points, and distance [m]."""
 
     u: DeviceArray
     length: DeviceArray
@@ -47,17 +50,17 @@ class Leg(NamedTuple):
 
 @dataclass
 class EchoBatch:
-    """Echoes as Dr.Jit arrays that are not evaluated yet, one value for each point.
+    """Echoes as unevaluated Dr.Jit arrays, one value for each point.
 
     Attributes:
-        delay: of the echo [s].
+        delay: delay of the echo [s].
         amplitude: magnitude of the echo.
-        phase: of the scatterer itself, beside that of the delay [rad]; one 0 for all in the model rays.
-        doppler: shift of the carrier [Hz].
+        phase: phase of the scatterer, without that of the delay [rad]; a single 0 in the model ``rays``.
+        doppler: Doppler shift of the carrier [Hz].
         counts: whether there is an echo within ``range_max``.
         beyond: whether there is an echo from beyond ``range_max``.
-        turn: phase of the delay at the finest frequency, -pi..pi, for the transform [rad].
-        real, imag: the amplitude with the scatterer's and the carrier's phase.
+        turn: phase of the delay at the finest frequency step, -pi..pi, for the transform [rad].
+        real, imag: complex amplitude, with the phases of the scatterer and the carrier.
     """
 
     delay: DeviceArray
@@ -76,8 +79,8 @@ def link_table(
 ) -> NDArray[np.float64]:
     """Return the geometry of one ping in the world ``(30,)``.
 
-    Three numbers each: positions of transmitter and receiver [m], their velocities [m/s]. Nine numbers each: axes of the
-    receiver's field of view, and of the transmitter's.
+    The table holds the positions of transmitter and receiver [m] and their velocities [m/s], three numbers each, then the
+    axes of the receiver's and of the transmitter's field of view, nine numbers each.
     """
     turn = vehicle_rotation(pose).as_matrix()[0]
     one = sonar.receivers[receiver]
@@ -89,28 +92,30 @@ def link_table(
 
 
 class LinkGeometry:
-    """Geometry between transmitter and receiver in one ping, on the device; what affects the phase is float64.
+    """Geometry between transmitter and receiver in one ping, on the device.
+
+    Quantities that affect the phase are float64.
 
     Args:
         sonar: the instrument.
-        receiver: its index.
-        table: of :func:`link_table`.
+        receiver: index of the receiver.
+        table: as returned by :func:`link_table`.
     """
 
     def __init__(self, sonar: ChannelSonar, receiver: int, table: mi.Float64) -> None:
         self.sonar = sonar
         self.numbers = [dr.gather(mi.Float64, table, mi.UInt32(k)) for k in range(self.size)]
-        dr.eval(self.numbers)  # read once, not once a point
+        dr.eval(self.numbers)  # read once, not once per point
         self.listens: FieldOfView = sonar.field_of_view[sonar.receivers[receiver].name]
         self.sends: FieldOfView = sonar.transmitter
 
     @property
     def size(self) -> int:
-        """Return how many numbers the table has."""
+        """Return the length of the table."""
         return LINK
 
     def vector(self, start: int) -> list[DeviceArray]:
-        """Return three numbers of the table."""
+        """Return three consecutive numbers of the table."""
         return self.numbers[start : start + 3]
 
     @property
@@ -128,12 +133,12 @@ class LinkGeometry:
         return [mi.Vector3f(*self.vector(12 + 9 * which + 3 * k)) for k in range(3)]
 
     def to_point(self, point: list[DeviceArray]) -> tuple[list[DeviceArray], list[DeviceArray]]:
-        """Return the vectors from the transmitter and from the receiver to points of the world [m]."""
+        """Return the vectors from the transmitter and from the receiver to points in the world [m]."""
         sent, received = ([p - a for p, a in zip(point, self.vector(start), strict=True)] for start in (0, 3))
         return sent, received
 
     def sensitivity(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
-        """Return the sensitivity of transmitter and receiver together, given unit directions to the points."""
+        """Return the combined sensitivity of transmitter and receiver, given unit directions to the points."""
         ahead, aside, above = (dr.dot(axis, received) for axis in self.axes(0))
         both = self.listens.sensitivity(ahead, aside, above, DRJIT)
         if self.sends.shape != "all":
@@ -144,17 +149,17 @@ class LinkGeometry:
     def reached(
         self, scene: mi.Scene, point: ScatteringPoints, sent: Leg, received: Leg, active: DeviceArray
     ) -> tuple[DeviceArray, DeviceArray | None]:
-        """Return which points sound reaches, and by what mirrors multiply its amplitude; None: there are none.
+        """Return which points sound reaches, and the factor of mirrors on its amplitude; None without mirrors.
 
-        Only the way from the transmitter is tested: receivers are near it.
+        Only the path from the transmitter is tested, since receivers are near it.
         """
         return ~hidden(scene, point.at, point.normal, sent.u, sent.length, active), None
 
     def doppler(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
-        """Return the shift of the carrier [Hz], given unit directions to the points.
+        """Return the Doppler shift of the carrier [Hz], given unit directions to the points.
 
-        It is positive where the vehicle approaches the point: both parts of the path get shorter. In a turn transmitter and
-        receiver have velocities of their own. Terms of second order in velocity over sound speed are left out.
+        The shift is positive where the vehicle approaches the point, because both legs of the path get shorter. In a turn,
+        transmitter and receiver have different velocities. Terms of second order in velocity over sound speed are neglected.
         """
         sender, receiver = (mi.Vector3f(*self.vector(start)) for start in (6, 9))
         return (dr.dot(sent, sender) + dr.dot(received, receiver)) * (1 / self.sonar.wavelength_m)
@@ -162,11 +167,12 @@ class LinkGeometry:
     def echo_batch(
         self, delay: DeviceArray, amplitude: DeviceArray, phase: DeviceArray, doppler: DeviceArray, valid: DeviceArray
     ) -> EchoBatch:
-        """Return the echoes, divided into those within ``range_max`` and those from beyond."""
+        """Return the echoes, split into those within ``range_max`` and those from beyond."""
         beyond = valid & (delay > 2 * self.sonar.range_max / self.sonar.sound_speed)
         turn = delay * (self.sonar.frequency_step_hz / PADDING)
         turns = delay * self.sonar.carrier_hz
-        sin, cos = dr.sincos(mi.Float((turns - dr.round(turns)) * (2 * math.pi)) - phase)  # float32 once the turns are away
+        # remove whole cycles in float64; the rest of the phase fits float32
+        sin, cos = dr.sincos(mi.Float((turns - dr.round(turns)) * (2 * math.pi)) - phase)
         return EchoBatch(
             delay=delay,
             amplitude=amplitude,

@@ -1,7 +1,7 @@
-"""Delay of sound from the transmitter by way of a point to a moving receiver (Almanza-Medina, 5.2.2 and 5.2.3).
+"""Delays of links: how long sound takes from the transmitter via a point to a moving receiver.
 
-The functions accept NumPy arrays and Dr.Jit arrays. A vector is a sequence of three arrays, or an array whose first axis
-holds the three coordinates.
+The equations are those of Almanza-Medina, sections 5.2.2 and 5.2.3. The functions accept NumPy arrays and Dr.Jit arrays. A
+vector is a sequence of three arrays, or an array whose first axis holds the three coordinates.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ def length(a: Vector) -> DeviceArray:
 
 
 def delay_static(to_point: Vector, from_receiver: Vector, sound_speed: float) -> DeviceArray:
-    """Return the delay of a vehicle at rest (Almanza-Medina, eq. 5.1-5.4) [s].
+    """Return the delay for a vehicle at rest (Almanza-Medina, eq. 5.1-5.4) [s].
 
     Args:
-        to_point: from the transmitter to the point, P - A [m].
-        from_receiver: from the receiver to the point, P - B, when the sound is sent [m].
+        to_point: vector from the transmitter to the point, P - A [m].
+        from_receiver: vector from the receiver to the point, P - B, when the sound is sent [m].
         sound_speed: [m/s].
     """
     return (length(to_point) + length(from_receiver)) / sound_speed
@@ -44,9 +44,9 @@ def delay_static(to_point: Vector, from_receiver: Vector, sound_speed: float) ->
 def delay_iterated(
     to_point: Vector, from_receiver: Vector, velocity: Vector, sound_speed: float, times: int = 2
 ) -> DeviceArray:
-    """Return the delay of a receiver that moves while sound travels, by iteration (Almanza-Medina, eq. 5.5-5.14) [s].
+    """Return the delay to a receiver that moves while sound travels, by iteration (Almanza-Medina, eq. 5.5-5.14) [s].
 
-    Each round moves the receiver by the previous delay. Almanza-Medina takes two rounds.
+    Each round moves the receiver along its velocity for the previous delay. Almanza-Medina takes two rounds.
     """
     out = length(to_point) / sound_speed
     delay = out + length(from_receiver) / sound_speed
@@ -57,11 +57,11 @@ def delay_iterated(
 
 
 def delay_exact(to_point: Vector, from_receiver: Vector, velocity: Vector, sound_speed: float) -> DeviceArray:
-    """Return the exact delay of a receiver that moves while sound travels [s]: the limit of :func:`delay_iterated`.
+    """Return the exact delay to a receiver that moves while sound travels [s]: the limit of :func:`delay_iterated`.
 
-    |P - B - v tau| = c (tau - tau_0) is a quadratic equation. Its larger root is the one after tau_0. Let s = tau - tau_0,
-    and let q be the vector from the receiver to P when the sound is at P. Then (c^2 - v^2) s^2 + 2 q.v s - q^2 = 0, in which
-    nothing cancels.
+    |P - B - v tau| = c (tau - tau_0) is a quadratic equation, whose larger root is the one after tau_0. Let s = tau - tau_0,
+    and let q be the vector from the receiver to P when the sound is at P. Then (c^2 - v^2) s^2 + 2 q.v s - q^2 = 0. This
+    form suffers no cancellation.
     """
     out = length(to_point) / sound_speed
     left = [q - v * out for q, v in zip(from_receiver, velocity, strict=True)]

@@ -1,4 +1,4 @@
-"""Paths without a scatterer: from transmitter to receiver directly, by planes, and by the facets of waves."""
+"""Paths without a scatterer: what reaches a receiver directly, via flat mirrors, and via the facets of waves."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ __all__ = ["APART_M", "FacetEchoes", "MirrorPaths", "facet_echoes", "half_fresne
 
 
 APART_M = 1e-3
-"""A receiver nearer to the transmitter than this has no direct arrival [m]."""
+"""Distance from the transmitter below which a receiver has no direct arrival [m]."""
 
 
 class MirrorPaths:
-    """Find the paths of one ping that no scatterer takes part in.
+    """Tracer of the paths of one ping that involve no scatterer.
 
-    The pressure falls as that of a point source whose pressure at 1 m is 1: ``V / r`` for the length r of the path and the
-    product V of the reflection coefficients. Waves are summed by :mod:`mitsonar.simulation.mirror_paths`.
+    The pressure falls as that of a point source with pressure 1 at 1 m: ``V / r``, where r is the length of the path and V
+    the product of the reflection coefficients. Waves are summed by :func:`facet_echoes`.
 
     Args:
-        tracer: of the scatterers; gives scene, instrument and mirrors.
+        tracer: tracer of the scatterers, which gives scene, instrument and mirrors.
 
     Attributes:
-        names: of the ways: ``direct``, the names of the planes as ``surface-seabed``, the names of the waves.
-        notes: what a user should know about mirrors.
+        names: names of the paths: ``direct``, the names of planes such as ``surface-seabed``, the names of waves.
+        notes: notes to the user about mirrors.
     """
 
     def __init__(self, tracer: ChannelTracer) -> None:
@@ -57,13 +57,13 @@ class MirrorPaths:
     def trace(
         self, pose: NDArray[np.float64], velocity: NDArray[np.float64], receiver: int, wanted: Sequence[str]
     ) -> list[EchoValues]:
-        """Return the paths of one ping at one receiver: values of an echo batch, a list entry for each of :attr:`names`.
+        """Return the paths of one ping at one receiver: a list of echo values, one entry for each of :attr:`names`.
 
         Args:
-            pose: of the transmitter ``(6,)`` [m, rad].
-            velocity: of the vehicle in its own axes ``(4,)`` [m/s, rad/s].
-            receiver: its index.
-            wanted: names of the values.
+            pose: pose of the transmitter ``(6,)`` [m, rad].
+            velocity: velocity of the vehicle in its own axes ``(4,)`` [m/s, rad/s].
+            receiver: index of the receiver.
+            wanted: names of the values to return.
         """
         table = link_table(self.sonar, receiver, pose, velocity)
         found = [part for length, ways in self.ways.items() for part in self._by_planes(table, receiver, length, ways)]
@@ -71,17 +71,20 @@ class MirrorPaths:
         return [{name: part[name] for name in wanted} for part in found]
 
     def _by_planes(self, table: NDArray[np.float64], receiver: int, length: int, ways: list[MirrorWay]) -> list[EchoValues]:
-        """Return the path of each way of ``length`` planes."""
+        """Return the paths via sequences of ``length`` planes, one entry for each sequence."""
+        # 1. image sources, and which of them the receiver sees through its mirrors
         sent_from, heard_at = table[0:3], table[3:6]
         image = np.array([way.images(sent_from)[-1] for way in ways])
         rows = np.array([way.rows(sent_from, self.registry) for way in ways])
         is_open, factor = self._open(image, heard_at, rows, length)
+        # 2. direction and distance from the receiver to the image
         way = image - heard_at
         distance = np.linalg.norm(way, axis=1)
         apart = distance > APART_M
         u = way / np.where(apart, distance, 1)[:, None]
-        # in the axes of the transmitter itself, which sends as its image does
+        # 3. the direction in which sound departs from the transmitter itself, mirrored back from that of its image
         departed = np.einsum("nij,ni->nj", np.array([one.turn for one in ways]), -u)
+        # 4. delay, amplitude and Doppler shift
         valid = is_open & apart
         delay = delay_exact(np.zeros(way.T.shape), way.T, table[9:12, None], self.sonar.sound_speed)
         amplitude = factor * self._sensitivity(table, receiver, departed, u)
@@ -96,7 +99,7 @@ class MirrorPaths:
     def _sensitivity(
         self, table: NDArray[np.float64], receiver: int, departed: NDArray[np.float64], u: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the sensitivity of transmitter and receiver together ``(n,)``, given unit directions from each."""
+        """Return the combined sensitivity of transmitter and receiver ``(n,)``, given unit directions from each."""
         listens, sends = self.sonar.receivers[receiver].field, self.sonar.transmitter
         heard = listens.sensitivity(*(table[12:21].reshape(3, 3) @ u.T))
         return np.asarray(heard * sends.sensitivity(*(table[21:30].reshape(3, 3) @ departed.T)), dtype=float)
@@ -104,7 +107,7 @@ class MirrorPaths:
     def _open(
         self, image: NDArray[np.float64], heard_at: NDArray[np.float64], rows: NDArray[np.float64], length: int
     ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which ways nothing blocks ``(n,)``, and their reflection coefficients ``(n,)``."""
+        """Return which paths are unobstructed ``(n,)``, and the products of their reflection coefficients ``(n,)``."""
         if length not in self.launches:
             self.launches[length] = _compile_open(length, self.wavenumber)
         inputs = [np.broadcast_to(heard_at, image.shape), image, rows.reshape(len(image), -1)]
@@ -114,7 +117,7 @@ class MirrorPaths:
         return np.broadcast_to(np.array(seen), len(image)), np.broadcast_to(np.array(factor, dtype=float), len(image))
 
     def _by_facets(self, table: NDArray[np.float64], receiver: int, mirror: MirrorFacets) -> EchoValues:
-        """Return the echoes of the facets of a mirror that is not flat, those of one reflection."""
+        """Return the echoes of one reflection from the facets of a mirror that is not flat."""
         found = facet_echoes(mirror, table[0:3], table[3:6], table[9:12], self.sonar.carrier_hz, self.sonar.sound_speed)
         self._tell(mirror, table)
         valid = found.lit & self._lit(mirror, table)
@@ -136,7 +139,7 @@ class MirrorPaths:
         return np.broadcast_to(np.array(replayed(self.shadows, number, numbers, self.scene)), len(middle))
 
     def _tell(self, mirror: MirrorFacets, table: NDArray[np.float64]) -> None:
-        """Note once where facets are too large for the integral."""
+        """Add a note, once, if facets are too large for the integral."""
         largest, allowed = half_fresnel_m(mirror, table[0:3], table[3:6], self.sonar.wavelength_m)
         if largest > allowed and not self.notes:
             self.notes.append(
@@ -146,7 +149,7 @@ class MirrorPaths:
 
 
 def _compile_open(length: int, wavenumber: float) -> Callable[..., list[DeviceArray]]:
-    """Record the launch that follows ways by ``length`` planes from a receiver to the transmitter."""
+    """Record the launch that follows paths via ``length`` planes from a receiver to the transmitter."""
 
     @Frozen
     def launch(number: mi.UInt32, table: mi.Float64, scene: mi.Scene) -> list[DeviceArray]:
@@ -162,15 +165,15 @@ def _compile_open(length: int, wavenumber: float) -> Callable[..., list[DeviceAr
 
 
 def _columns(kind: Any, table: DeviceArray, number: mi.UInt32, count: int) -> list[DeviceArray]:
-    """Return the columns of a table of ``count`` of them.
+    """Return the ``count`` columns of a flat table.
 
-    One array, since a frozen launch is recorded anew for each alignment of each of its inputs.
+    The table is one array, since a frozen launch is recorded again for each alignment of each of its inputs.
     """
     return [dr.gather(kind, table, number * count + k) for k in range(count)]
 
 
 def _compile_shadows() -> Callable[..., DeviceArray]:
-    """Record the launch that tests which facets two places see."""
+    """Record the launch that tests which facets are visible from two positions."""
 
     @Frozen
     def launch(number: mi.UInt32, table: mi.Float, scene: mi.Scene) -> DeviceArray:
@@ -195,14 +198,14 @@ def echo_values(
     doppler: NDArray[np.float64],
     valid: NDArray[np.bool_],
 ) -> EchoValues:
-    """Return echoes in NumPy as :class:`~mitsonar.simulation.link_geometry.EchoBatch` has them on the device.
+    """Return echoes as NumPy arrays with the fields of :class:`~mitsonar.simulation.link_geometry.EchoBatch`.
 
     Args:
         sonar: the instrument.
-        delay: ``(n,)`` [s].
-        amplitude: real or complex, before the carrier's phase ``(n,)``.
-        doppler: ``(n,)`` [Hz].
-        valid: which echoes there are ``(n,)``; those of amplitude 0 are none.
+        delay: delay of each echo ``(n,)`` [s].
+        amplitude: amplitude, real or complex, before the carrier's phase ``(n,)``.
+        doppler: Doppler shift ``(n,)`` [Hz].
+        valid: which echoes exist ``(n,)``; those of amplitude 0 are dropped.
     """
     valid = valid & (np.abs(amplitude) > 0)
     beyond = valid & (delay > 2 * sonar.range_max / sonar.sound_speed)
@@ -220,29 +223,23 @@ def echo_values(
     }
 
 
-# ---------------- Kirchhoff's integral over the facets of a mirror that is no plane, such as waves of the sea surface
-# p = sum_f j k / 4 pi V exp(-k^2 h^2 (cos_A + cos_B)^2 / 2) (cos_A + cos_B) dA T / (r_A r_B) exp(-j k (r_A + r_B))
-#
-# It is the law of :mod:`mitsonar.simulation.multipath_coherent` for a receiver apart from the transmitter. T is the mean of
-# the phase over the facet, exact for a phase that is linear on it. A plane of facets returns the image source's V / r
-# but for the diffraction at its edge (Kirchhoff's boundary condition; Medwin and Clay, Fundamentals of Acoustical
-# Oceanography, 1998).
+# ---------------- Kirchhoff's integral over facets
 
 
 NEAR = 1e-2
-"""Differences of phase below which the mean over a facet is a series [rad]."""
+"""Phase difference below which the mean over a facet is computed by a series [rad]."""
 
 
 class FacetEchoes(NamedTuple):
     """Echoes of facets.
 
     Attributes:
-        delay: by way of the middle of each facet ``(n,)`` [s].
-        amplitude: complex, before the carrier's phase ``(n,)`` [1/m].
+        delay: delay via the centre of each facet ``(n,)`` [s].
+        amplitude: complex amplitude before the carrier's phase ``(n,)`` [1/m].
         sent: unit direction from the transmitter ``(n, 3)``.
         received: unit direction from the receiver ``(n, 3)``.
-        length: of the path ``(n,)`` [m].
-        lit: whether transmitter and receiver are on one side of the facet ``(n,)``.
+        length: length of the path ``(n,)`` [m].
+        lit: whether transmitter and receiver are on the same side of the facet ``(n,)``.
     """
 
     delay: NDArray[np.float64]
@@ -261,27 +258,39 @@ def facet_echoes(
     carrier_hz: float,
     sound_speed: float,
 ) -> FacetEchoes:
-    """Compute the echo of each facet at the carrier.
+    """Compute the echo of each facet at the carrier, by Kirchhoff's integral.
+
+    The pressure is that of a mirror which is not a plane, such as waves of the sea surface::
+
+        p = sum_f j k / 4 pi V exp(-k^2 h^2 (cos_A + cos_B)^2 / 2) (cos_A + cos_B) dA T / (r_A r_B) exp(-j k (r_A + r_B))
+
+    This is the integral of :mod:`mitsonar.simulation.multipath_coherent` for a receiver apart from the transmitter. T is the
+    mean phase factor over the facet, exact for a phase that is linear on it. A plane of facets returns the image source's
+    V / r, except for the diffraction at its edge (Kirchhoff's boundary condition; Medwin and Clay, Fundamentals of
+    Acoustical Oceanography, 1998).
 
     Args:
         mirror: the facets.
         sent_from: position of the transmitter ``(3,)`` [m].
         heard_at: position of the receiver when sound is sent ``(3,)`` [m].
-        velocity: of the receiver ``(3,)`` [m/s].
-        carrier_hz: frequency.
+        velocity: velocity of the receiver ``(3,)`` [m/s].
+        carrier_hz: frequency of the carrier [Hz].
         sound_speed: [m/s].
     """
+    # 1. centre, normal and twice the area of each facet
     middle = mirror.corners.mean(axis=1)
     edges = mirror.corners[:, 1] - mirror.corners[:, 0], mirror.corners[:, 2] - mirror.corners[:, 0]
     across = np.cross(*edges)
     twice = np.linalg.norm(across, axis=1)
     normal = across / np.maximum(twice, 1e-30)[:, None]
+    # 2. directions from both ends, and the sum of the cosines to the normal
     legs = [middle - place for place in (sent_from, heard_at)]
     sent, received = (np.linalg.norm(leg, axis=1) for leg in legs)
     u = [leg / np.maximum(length, 1e-9)[:, None] for leg, length in zip(legs, (sent, received), strict=True)]
     cosines = [np.einsum("ni,ni->n", normal, one) for one in u]
     total = np.abs(cosines[0] + cosines[1])
 
+    # 3. delay via the centre, and phase at the corners relative to it
     def delay(places: NDArray[np.float64]) -> NDArray[np.float64]:
         ways = [np.moveaxis(places - place, -1, 0) for place in (sent_from, heard_at)]
         moving = velocity.reshape(3, *[1] * (ways[0].ndim - 1))
@@ -289,8 +298,9 @@ def facet_echoes(
 
     arrival, wavenumber = delay(middle), 2 * np.pi * carrier_hz / sound_speed
     phase = 2 * np.pi * carrier_hz * (delay(mirror.corners) - arrival[:, None])
-    # curvature raises the corners' mean; over the triangle it is a quarter of that
+    # curvature raises the mean over the corners; its mean over the triangle is only a quarter of that
     phase -= 0.75 * phase.mean(axis=1, keepdims=True)
+    # 4. weight of the integral, with the coherent loss of the roughness
     smooth = np.exp(-((wavenumber * mirror.roughness_m * total) ** 2) / 2)
     weight = wavenumber / (4 * np.pi) * mirror.reflection * smooth * total * twice / 2 / np.maximum(sent * received, 1e-18)
     return FacetEchoes(arrival, 1j * weight * phase_mean(phase), u[0], u[1], sent + received, cosines[0] * cosines[1] > 0)
@@ -299,10 +309,10 @@ def facet_echoes(
 def phase_mean(phase: NDArray[np.float64]) -> NDArray[np.complex128]:
     """Return the mean of ``exp(-j phase)`` over triangles on which the phase is linear ``(n,)``.
 
-    It is twice the divided difference of exp over the corners (Hermite and Genocchi).
+    The mean is twice the divided difference of exp over the corners (Hermite and Genocchi).
 
     Args:
-        phase: at the corners ``(n, 3)`` [rad].
+        phase: phase at the corners ``(n, 3)`` [rad].
     """
     low, mid, high = np.sort(phase, axis=1).T
     wide = high - low
@@ -311,6 +321,7 @@ def phase_mean(phase: NDArray[np.float64]) -> NDArray[np.complex128]:
     def step(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.complex128]:
         return np.asarray(np.exp(-0.5j * (a + b)) * np.sinc((b - a) / (2 * np.pi)))
 
+    # nearly equal phases: a series of second order, since the divided difference would cancel
     mean = (low + mid + high) / 3
     spread = (low - mean) ** 2 + (mid - mean) ** 2 + (high - mean) ** 2
     series = np.exp(-1j * mean) * (1 - spread / 24)
@@ -321,13 +332,13 @@ def phase_mean(phase: NDArray[np.float64]) -> NDArray[np.complex128]:
 def half_fresnel_m(
     mirror: MirrorFacets, sent_from: NDArray[np.float64], heard_at: NDArray[np.float64], wavelength_m: float
 ) -> tuple[float, float]:
-    """Return the longest edge near the shortest path, and half the Fresnel radius there [m].
+    """Return the longest edge of the facet on the shortest path, and half the Fresnel radius there [m].
 
     Args:
         mirror: the facets.
         sent_from: position of the transmitter ``(3,)`` [m].
         heard_at: position of the receiver ``(3,)`` [m].
-        wavelength_m: of the carrier.
+        wavelength_m: wavelength of the carrier [m].
     """
     middle = mirror.corners.mean(axis=1)
     sent, received = (np.linalg.norm(middle - place, axis=1) for place in (sent_from, heard_at))

@@ -1,8 +1,8 @@
-"""The mirror part of smooth surfaces: which shapes have one, how much of an echo it is, and what is left to scatter.
+"""Mirrors: which shapes reflect specularly, how strongly, and by which paths sound reaches points via them.
 
-A shape of reflection coefficient V and rms height h reflects the amplitude ``V exp(-2 k^2 h^2 cos^2)`` as a mirror: its
-energy is ``V^2 exp(-4 k^2 h^2 cos^2)``. What it scatters is multiplied by ``1 - exp(-4 k^2 h^2 cos^2)``. Both are the laws
-of :mod:`mitsonar.acoustics.materials`.
+A shape with reflection coefficient V and rms height h reflects the amplitude ``V exp(-2 k^2 h^2 cos^2)`` as a mirror; the
+energy is ``V^2 exp(-4 k^2 h^2 cos^2)``. Its scattered energy is multiplied by ``1 - exp(-4 k^2 h^2 cos^2)``. Both are the
+laws of :mod:`mitsonar.acoustics.materials`.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ __all__ = [
 
 
 MirrorPart: TypeAlias = tuple[float, float] | Material
-"""Reflection coefficient of pressures, -1 to 1, and rms height of the roughness [m]; or a material that has both."""
+"""Pressure reflection coefficient, -1 to 1, and rms height of the roughness [m]; or a material that has both."""
 
 Mirroring: TypeAlias = Mapping[str, MirrorPart] | Literal["materials"] | None
-"""Mirror parts by the ids of the shapes, those of the shapes' materials, or none."""
+"""Mirror parts keyed by shape id, or ``materials`` for those of the shapes' materials, or None."""
 
 ROUGHEST_M = 1.0
 """Largest rms height [m]."""
@@ -65,10 +65,10 @@ ROUGHEST_M = 1.0
 
 @dataclass(frozen=True)
 class Mirrors:
-    """Mirror parts of the shapes of a scene, by their place in ``scene.shapes()``.
+    """Mirror parts of a scene's shapes, in the order of ``scene.shapes()``.
 
     Attributes:
-        reflection: coefficient V of pressures ``(shapes,)``, 0: no mirror part.
+        reflection: pressure reflection coefficient V ``(shapes,)``; 0 if a shape has no mirror part.
         roughness_m: rms height ``(shapes,)`` [m].
     """
 
@@ -76,21 +76,21 @@ class Mirrors:
     roughness_m: NDArray[np.float64]
 
     def table(self) -> mi.Float:
-        """Return V and rms height in turn, and zeros for one shape more: the input of a launch."""
+        """Return pairs of V and rms height as the input of a launch, with zeros for one shape more."""
         rows = np.append(np.stack([self.reflection, self.roughness_m], axis=1), np.zeros((1, 2)), axis=0)
         return mi.Float(rows.ravel().astype(np.float32))
 
 
 def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
-    """Collect the mirror parts of a scene's shapes; None where there are none.
+    """Collect the mirror parts of a scene's shapes; return None if there are none.
 
     Args:
-        scene: any.
-        mirrors: parts by the ids of the shapes, or ``materials``: those of each shape's ``acoustic_material``. A material
-            without a mirror part gives none.
+        scene: any Mitsuba scene.
+        mirrors: parts keyed by shape id, or ``materials`` to use each shape's ``acoustic_material``. A material without
+            a mirror part gives none.
 
     Raises:
-        MitsonarError: a shape that the scene does not have, or a number out of limits.
+        MitsonarError: a shape is not in the scene, or a number is out of limits.
     """
     if isinstance(mirrors, str):
         mirrors = _of_materials(scene, mirrors)
@@ -113,7 +113,7 @@ def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
 
 
 def _numbers_of(name: str, part: MirrorPart) -> tuple[float, float]:
-    """Return reflection and rms height [m] of a mirror part; without either 0."""
+    """Return reflection and rms height [m] of a mirror part; a missing one is 0."""
     if isinstance(part, Material):
         return part.reflection or 0.0, part.roughness_m or 0.0
     try:
@@ -126,7 +126,7 @@ def _numbers_of(name: str, part: MirrorPart) -> tuple[float, float]:
 
 
 def _of_materials(scene: mi.Scene, asked: str) -> dict[str, MirrorPart]:
-    """Return the materials of a scene's shapes by the shapes' ids."""
+    """Return the materials of a scene's shapes, keyed by shape id."""
     if asked != "materials":
         raise MitsonarError(f"mirrors are parts by the ids of the shapes, or `materials`: got {asked!r}")
     found: dict[str, MirrorPart] = {}
@@ -138,12 +138,12 @@ def _of_materials(scene: mi.Scene, asked: str) -> dict[str, MirrorPart]:
 
 
 def refuse_moving_mirrors(scene: mi.Scene, mirrors: Mirroring, moving: Collection[str]) -> None:
-    """Refuse mirrors that move: images of the sonar are of planes that stand still.
+    """Refuse mirrors that move, since image sources assume planes at rest.
 
     Args:
-        scene: any.
-        mirrors: as of :func:`mirror_of`.
-        moving: ids of the shapes that move.
+        scene: any Mitsuba scene.
+        mirrors: as in :func:`mirror_of`.
+        moving: ids of the moving shapes.
 
     Raises:
         MitsonarError: a mirror moves.
@@ -158,21 +158,21 @@ def refuse_moving_mirrors(scene: mi.Scene, mirrors: Mirroring, moving: Collectio
 
 
 def parts_at(table: mi.Float, hit: Hit) -> tuple[DeviceArray, DeviceArray]:
-    """Return V and rms height [m] where rays hit, 0 where there is no mirror part."""
+    """Return V and rms height [m] at hits; 0 where there is no mirror part."""
     known = hit.valid & (hit.shape_id >= 0)
     pair = dr.gather(mi.Vector2f, table, mi.UInt32(dr.select(known, hit.shape_id, 0)), known)
     return pair.x, pair.y
 
 
 def smooth_share(roughness_m: DeviceArray, cosine: DeviceArray, wavenumber: float) -> DeviceArray:
-    """Return the amplitude that roughness leaves of a mirror's, ``exp(-2 k^2 h^2 cos^2)``."""
+    """Return the factor by which roughness reduces a mirror's amplitude, ``exp(-2 k^2 h^2 cos^2)``."""
     return dr.exp(-2 * dr.square(roughness_m * cosine * wavenumber))
 
 
 def without_mirror_part(table: mi.Float, hit: Hit, d: DeviceArray, wavenumber: float) -> Hit:
-    """Return hits whose reflectivity is what roughness takes from the mirror part; others stay as they are.
+    """Scale the reflectivity of mirrors by the share of energy that roughness removes from the mirror part.
 
-    The law of a material holds that share already.
+    Other hits are unchanged. So are those with a material, whose scattering law includes this share already.
     """
     reflection, roughness_m = parts_at(table, hit)
     taken = 1 - dr.square(smooth_share(roughness_m, dr.dot(hit.n, d), wavenumber))
@@ -181,37 +181,37 @@ def without_mirror_part(table: mi.Float, hit: Hit, d: DeviceArray, wavenumber: f
     )
 
 
-# ---------------- The flat mirrors of a scene as planes, and the others as facets, in double precision
+# ---------------- Planes and facets of mirrors
 
 
 MOST_PLANES = 16
-"""Planes of a mesh, at most; one of more is a curved surface."""
+"""Largest number of planes in a mesh; a mesh with more is treated as a curved surface."""
 
 MOST_FACETS = 2_000_000
-"""Triangles of a curved mirror, at most: 1 ms of processor time a thousand and ping."""
+"""Largest number of triangles in a curved mirror; a thousand cost 1 ms of processor time per ping."""
 
 STEEPEST, HIGHEST = 0.5, 0.1
-"""A mesh is a plane with waves where no facet leans by more than 60 deg, and rms heights stay below a part of its size."""
+"""Limits of a plane with waves: cosine of the steepest facet (60 deg), and rms height as a fraction of the mesh's size."""
 
 FLAT = ("Rectangle", "Disk")
-"""Mitsuba's shapes that are flat."""
+"""Flat shapes of Mitsuba."""
 
 SAME_PLANE = 2e-6
-"""Facets are on one plane where normals and offsets (as a part of the mesh's size) differ by less."""
+"""Largest distance of a facet from a plane that it lies on, as a fraction of the mesh's size."""
 
 
 @dataclass(frozen=True)
 class MirrorPlane:
-    """One plane of a mirror, ``normal . x = offset``; both sides reflect.
+    """Plane of a mirror, ``normal . x = offset``; both sides reflect.
 
     Attributes:
-        name: of the shape.
-        shape: its place in ``scene.shapes()``.
-        normal: unit vector ``(3,)``.
+        name: id of the shape.
+        shape: index of the shape in ``scene.shapes()``.
+        normal: unit normal ``(3,)``.
         offset: [m].
-        reflection: coefficient V of pressures, -1 to 1.
+        reflection: pressure reflection coefficient V, -1 to 1.
         roughness_m: rms height [m].
-        slab_m: how far the shape's points lie off the plane, at most [m]; 0 where it is flat.
+        slab_m: largest distance of the shape's points from the plane [m]; 0 if the shape is flat.
     """
 
     name: str
@@ -225,11 +225,11 @@ class MirrorPlane:
 
 @dataclass(frozen=True)
 class MirrorFacets:
-    """The triangles of a mirror that is no plane.
+    """Triangles of a mirror that is not flat.
 
     Attributes:
-        name: of the shape.
-        corners: ``(facets, 3, 3)`` [m].
+        name: id of the shape.
+        corners: corners of the triangles ``(facets, 3, 3)`` [m].
         reflection, roughness_m: see :class:`MirrorPlane`.
     """
 
@@ -244,10 +244,10 @@ class FlatMirrors:
     """Mirrors of a scene.
 
     Attributes:
-        planes: of what is flat.
-        facets: of what is not flat.
-        means: mean planes of the latter, for ways of several reflections; their roughness is that of all waves.
-        notes: on shapes that mirror nothing.
+        planes: planes of the flat mirrors.
+        facets: facets of the other mirrors.
+        means: mean planes of the latter, for paths of several reflections; their roughness includes the waves.
+        notes: notes to the user about shapes that mirror nothing.
     """
 
     planes: list[MirrorPlane] = field(default_factory=list)
@@ -256,11 +256,11 @@ class FlatMirrors:
     notes: list[str] = field(default_factory=list)
 
     def reflecting(self, reflections: int) -> list[MirrorPlane]:
-        """Return the planes of ways of several reflections; of ways of one, which the facets have, the flat ones."""
+        """Return the planes for paths with several reflections; for one, the flat ones, since facets cover the others."""
         return self.planes if reflections < 2 else self.planes + self.means
 
     def notes_on(self, bounces: int) -> list[str]:
-        """Return what a user should know, given the largest number of reflections."""
+        """Return notes to the user, given the largest number of reflections."""
         found = list(self.notes)
         for mirror in self.facets if bounces > 1 else []:
             mean = next((plane for plane in self.means if plane.name == mirror.name), None)
@@ -276,14 +276,16 @@ class FlatMirrors:
 
 
 def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
-    """Find the planes of a scene's mirrors: rectangles, disks, and meshes of up to :data:`MOST_PLANES` planes.
+    """Find planes and facets of a scene's mirrors.
+
+    Rectangles, disks, and meshes of up to :data:`MOST_PLANES` planes become planes. Other meshes become facets.
 
     Args:
-        scene: any.
-        mirrors: parts of its shapes.
+        scene: any Mitsuba scene.
+        mirrors: mirror parts of its shapes.
 
     Raises:
-        MitsonarError: a curved mirror of more than :data:`MOST_FACETS` triangles.
+        MitsonarError: a curved mirror has more than :data:`MOST_FACETS` triangles.
     """
     found = FlatMirrors()
     for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
@@ -315,7 +317,7 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
 
 
 def mirror_planes(scene: mi.Scene, mirrors: Mirrors | None) -> list[MirrorPlane]:
-    """Return the planes of a scene's flat mirrors; mirrors that are not flat have none."""
+    """Return the planes of a scene's flat mirrors."""
     found = []
     for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
         assert mirrors is not None
@@ -339,7 +341,8 @@ def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
 def _mean_plane(
     name: str, place: int, corners: NDArray[np.float64], reflection: float, roughness_m: float
 ) -> MirrorPlane | None:
-    """Return the plane through the middle of a mesh of waves; None where heights or slopes are too large for waves."""
+    """Return the mean plane of a mesh of waves; None if heights or slopes are too large for waves."""
+    # area-weighted principal axes; the axis of least variance is the normal
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     weight = np.repeat(np.linalg.norm(normal, axis=1), 3)
     points = corners.reshape(-1, 3)
@@ -355,7 +358,7 @@ def _mean_plane(
 
 
 def _planes(corners: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]] | None:
-    """Return normal and offset of each plane that triangles lie in; None where there are more than :data:`MOST_PLANES`."""
+    """Return normal and offset of each plane that triangles lie in; None if there are more than :data:`MOST_PLANES`."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
     keep = area > 0
@@ -366,6 +369,7 @@ def _planes(corners: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], flo
     while left.any():
         if len(planes) == MOST_PLANES:
             return None
+        # take the plane of the largest triangle left, and remove all triangles that lie in it
         largest = int(np.argmax(np.where(left, area, 0)))
         chosen, offset = normal[largest], float(normal[largest] @ corners[largest].mean(axis=0))
         flat = np.abs(corners @ chosen - offset).max(axis=1) < SAME_PLANE * size
@@ -376,30 +380,30 @@ def _planes(corners: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], flo
     return planes
 
 
-# ---------------- Image sources: a transmitter or receiver behind mirrors, for each sequence of planes that sound meets
+# ---------------- Image sources
 
 
 ROW = 10
-"""Numbers of a plane in :meth:`MirrorWay.rows`; the registry index of its shape is one more."""
+"""Number of values of a plane in :meth:`MirrorWay.rows`, not counting the registry index of its shape."""
 
 
 MOST_WAYS = 20_000
-"""Ways of one number of planes, at most: some 1 ms each, ping and receiver."""
+"""Largest number of sequences with a given number of planes; each costs about 1 ms per ping and receiver."""
 
 
 @dataclass(frozen=True)
 class MirrorWay:
-    """Planes that sound meets one after another on its way from (or, backwards, to) a transducer; none: the direct way."""
+    """Sequence of planes that sound meets on its path from (or, backwards, to) a transducer; empty for the direct path."""
 
     planes: tuple[MirrorPlane, ...] = ()
 
     @property
     def name(self) -> str:
-        """Return the names of the mirrors from the transducer on, as ``surface-seabed``."""
+        """Return the names of the mirrors in order from the transducer, such as ``surface-seabed``."""
         return "-".join(plane.name for plane in self.planes)
 
     def images(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the transducer and its images, one more mirror each ``(planes + 1, 3)`` [m]."""
+        """Return the transducer's position and its successive images, one for each mirror ``(planes + 1, 3)`` [m]."""
         places = [np.asarray(place, dtype=float)]
         for plane in self.planes:
             last = places[-1]
@@ -408,20 +412,21 @@ class MirrorWay:
 
     @property
     def turn(self) -> NDArray[np.float64]:
-        """Return the matrix that mirrors vectors of the transducer, such as its velocity ``(3, 3)``."""
+        """Return the matrix that mirrors the transducer's vectors, such as its velocity ``(3, 3)``."""
         turn = np.eye(3)
         for plane in self.planes:
             turn = turn - 2 * np.outer(plane.normal, plane.normal @ turn)
         return turn
 
     def rows(self, place: NDArray[np.float64], registry: dict[int, int]) -> NDArray[np.float64]:
-        """Return what tests of the way need ``(planes, 11)``.
+        """Return the table that visibility tests of the path need ``(planes, 11)``.
 
-        A row holds the image before the plane, normal, offset, reflection, roughness, slab and registry index of the shape.
+        A row holds the transducer's image in the mirrors before the plane, and the plane's normal, offset, reflection,
+        roughness, slab and registry index of the shape.
 
         Args:
-            place: of the transducer [m].
-            registry: index of each mirror by its place in the scene.
+            place: position of the transducer [m].
+            registry: registry index of each mirror's shape, keyed by the shape's index in the scene.
         """
         images = self.images(place)
         return np.array(
@@ -436,10 +441,10 @@ class MirrorWay:
 
 
 def mirror_ways(planes: Sequence[MirrorPlane], length: int) -> list[MirrorWay]:
-    """Return all sequences of ``length`` planes in which none follows itself.
+    """Return all sequences of ``length`` planes in which no plane follows itself.
 
     Raises:
-        MitsonarError: more than :data:`MOST_WAYS`.
+        MitsonarError: there are more than :data:`MOST_WAYS`.
     """
     count = len(planes) * (len(planes) - 1) ** (length - 1) if length else 1
     if count > MOST_WAYS:
@@ -456,14 +461,14 @@ def mirror_ways(planes: Sequence[MirrorPlane], length: int) -> list[MirrorWay]:
 def mirrored_table(
     table: NDArray[np.float64], out: MirrorWay, back: MirrorWay, registry: dict[int, int]
 ) -> NDArray[np.float64]:
-    """Return the geometry of a link by way of mirrors: :func:`~mitsonar.simulation.link_geometry.link_table` of the images.
+    """Return the geometry of a link via mirrors: :func:`~mitsonar.simulation.link_geometry.link_table` of the images.
 
-    Places, velocities and fields of view are those of the images; the rows of both ways follow.
+    Positions, velocities and fields of view are those of the images; the rows of both sequences of mirrors follow.
 
     Args:
-        table: of the link itself ``(30,)``.
-        out: from the transmitter to the points.
-        back: from the receiver to the points, backwards in time.
+        table: table of the link without mirrors ``(30,)``.
+        out: mirrors from the transmitter to the points.
+        back: mirrors from the receiver to the points, backwards in time.
         registry: see :meth:`MirrorWay.rows`.
     """
     places = out.images(table[0:3])[-1], back.images(table[3:6])[-1]
@@ -473,21 +478,20 @@ def mirrored_table(
     return np.concatenate([*places, *velocities, *(part.ravel() for part in (*axes, *rows))])
 
 
-# ---------------- Ways by mirrors, unfolded: where each leg meets its mirror, whether nothing is in between, what the
-# mirrors leave
+# ---------------- Unfolded paths: visibility and loss
 
 
 class PlaneRow(NamedTuple):
-    """One mirror of a way on the device; see :meth:`~mitsonar.simulation.mirrors.MirrorWay.rows`.
+    """One mirror of a path on the device; see :meth:`~mitsonar.simulation.mirrors.MirrorWay.rows`.
 
     Attributes:
-        image: of the transducer by the mirrors before this one, three arrays [m].
-        normal: three arrays.
-        offset: of the plane [m].
-        reflection: coefficient of pressures.
+        image: image of the transducer in the mirrors before this one, three arrays [m].
+        normal: unit normal, three arrays.
+        offset: offset of the plane [m].
+        reflection: pressure reflection coefficient.
         roughness_m: rms height [m].
-        slab_m: how far the mirror's points lie off the plane, at most [m].
-        registry: index of the shape.
+        slab_m: largest distance of the mirror's points from the plane [m].
+        registry: registry index of the shape.
     """
 
     image: list[DeviceArray]
@@ -500,7 +504,7 @@ class PlaneRow(NamedTuple):
 
     @classmethod
     def of(cls, numbers: list[DeviceArray]) -> PlaneRow:
-        """Take the eleven numbers of a row."""
+        """Create a mirror from the eleven numbers of a row."""
         return cls(numbers[:3], numbers[3:6], *numbers[6:])
 
 
@@ -513,40 +517,47 @@ def unfolded(
     active: DeviceArray,
     moment: DeviceArray = None,
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Follow ways from points back to a transducer by its mirrors.
+    """Follow paths from points back to a transducer via its mirrors.
+
+    A path is unfolded: each leg points to an image of the transducer, and its intersection with the plane is where the
+    next leg begins.
 
     Args:
-        scene: to trace.
-        point: where the ways begin; a normal of 0 where that is no surface.
-        image: of the transducer by all mirrors [m].
-        rows: the mirrors in the order from the transducer on.
+        scene: scene to trace.
+        point: points where the paths begin; the normal is 0 if a point is not on a surface.
+        image: image of the transducer in all mirrors [m].
+        rows: the mirrors in order from the transducer.
         wavenumber: [rad/m].
-        active: ways to follow.
-        moment: number of the moment of each way in a scene that moves; default: 0, or a still scene.
+        active: paths to follow.
+        moment: index of the moment of each path in a moving scene; default: 0, or a still scene.
 
     Returns:
-        Which ways are open: each leg meets its mirror first, and the last one the transducer. And the product of the
+        Which paths are open (each leg meets its mirror first, and the last leg the transducer), and the product of the
         mirrors' reflection coefficients.
     """
     at, normal, far, factor = point.exact, point.normal, image, mi.Float(1)
-    slab: DeviceArray = mi.Float(0)  # of the mirror that a leg leaves; waves in it hide nothing
+    slab: DeviceArray = mi.Float(0)  # of the mirror that a leg leaves; its waves hide nothing
     for row in reversed(rows):
+        # 1. the point and the image must be on opposite sides of the plane, and outside its waves
         above, below = (dot(row.normal, place) - row.offset for place in (at, far))
         size = dr.abs(at[0]) + dr.abs(at[1]) + dr.abs(at[2]) + 1
-        # a point on the mirror itself has no way by it
+        # a point on the mirror itself has no path via it
         active = active & (above * below < 0) & (dr.abs(above) > size * OFF_SURFACE + row.slab_m)
         active = active & (dr.abs(below) > row.slab_m)
+        # 2. the leg to the foot, where the line to the image crosses the plane, must not be obstructed
         part = above / (above - below)
         foot = [a + (b - a) * part for a, b in zip(at, far, strict=True)]
         way = [b - a for a, b in zip(at, foot, strict=True)]
         u = mi.Vector3f(*(axis / length(way) for axis in way))
         active = active & _meets(scene, mi.Point3f(*at) + u * slab, normal, u, row, active, moment)
+        # 3. loss at the mirror; the next leg begins at the foot and points to the image before this mirror
         normal = mi.Normal3f(*row.normal)
         facing: DeviceArray = mi.Vector3f(*row.normal)
         cosine = dr.abs(dr.dot(facing, u))
         factor = factor * mi.Float(row.reflection) * smooth_share(mi.Float(row.roughness_m), cosine, wavenumber)
         at, far = foot, row.image
         slab = mi.Float(row.slab_m) / cosine
+    # 4. the last leg, to the transducer itself
     last = [a - b for a, b in zip(at, far, strict=True)]
     distance = length(last)
     u = mi.Vector3f(*(axis / distance for axis in last))
@@ -572,7 +583,7 @@ def _meets(
     index: DeviceArray = dr.reinterpret_array(mi.UInt32, found.shape)
     met = ray.o + u * found.t
     size = 1 + dr.abs(met.x) + dr.abs(met.y) + dr.abs(met.z)
-    # a mesh may have several planes
+    # the shape alone does not suffice, since a mesh may have several planes
     aside = dr.abs(dr.dot(mi.Vector3f(*row.normal), met) - mi.Float(row.offset))
     near = 4 * size * OFF_SURFACE + mi.Float(row.slab_m)
     return found.is_valid() & (index == mi.UInt32(row.registry)) & (aside < near)
@@ -583,8 +594,8 @@ class MirroredLink(LinkGeometry):
 
     Args:
         sonar: the instrument.
-        receiver: its index.
-        table: of :func:`~mitsonar.simulation.mirrors.mirrored_table`.
+        receiver: index of the receiver.
+        table: as returned by :func:`~mitsonar.simulation.mirrors.mirrored_table`.
         out: number of mirrors between transmitter and points.
         back: number of mirrors between points and receiver.
     """
@@ -596,13 +607,13 @@ class MirroredLink(LinkGeometry):
 
     @property
     def size(self) -> int:
-        """Return how many numbers the table has."""
+        """Return the length of the table."""
         return LINK + (ROW + 1) * (self.out + self.back)
 
     def reached(
         self, scene: mi.Scene, point: ScatteringPoints, sent: Leg, received: Leg, active: DeviceArray
     ) -> tuple[DeviceArray, DeviceArray]:
-        """Return which points sound reaches by the mirrors, there and back, and the mirrors' factor."""
+        """Return which points sound reaches via the mirrors, out and back, and the product of the mirrors' factors."""
         starts = [LINK + (ROW + 1) * k for k in range(self.out + self.back)]
         rows = [PlaneRow.of(self.numbers[start : start + ROW + 1]) for start in starts]
         active, there = unfolded(scene, point, self.vector(0), rows[: self.out], self.wavenumber, active)
@@ -610,20 +621,19 @@ class MirroredLink(LinkGeometry):
         return active, there * back
 
 
-# ---------------- The way back by another mirror than the way out: image sources of the sonar behind the planes of a
-# scene
+# ---------------- Return paths via a second mirror
 
 
 MOST_SECOND = 8
-"""Planes that are looked through for the way back, at most: each costs two rays for every ray."""
+"""Largest number of planes for return paths; each costs two rays for every ray."""
 
 ON_PLANE = 1e-4
-"""Part of its distance from the origin by which a point may lie off a plane that it is on."""
+"""Tolerance for a point on a plane, as a fraction of its distance from the origin."""
 
 
 @dataclass(frozen=True)
 class SecondMirror:
-    """A plane of a mirror, and the index of its shape by which kernels know it."""
+    """Plane of a mirror, and the registry index of its shape, by which kernels identify it."""
 
     plane: MirrorPlane
     registry: int
@@ -641,14 +651,14 @@ class SecondMirror:
 
 @dataclass(frozen=True)
 class WayBack:
-    """The way from points back to the sonar by one plane.
+    """Return path from points to the sonar via one plane.
 
     Attributes:
         mirror: the plane.
         u: direction from the image of the sonar to the points.
-        distance: from that image [m].
-        factor: amplitude that the mirror leaves.
-        is_open: whether nothing is in between, and the plane is not that of the way out.
+        distance: distance from that image [m].
+        factor: factor of the mirror on the amplitude.
+        is_open: whether the path is unobstructed, and the plane differs from that of the outward path.
     """
 
     mirror: SecondMirror
@@ -660,11 +670,13 @@ class WayBack:
 
 @dataclass(frozen=True)
 class SecondMirrors:
-    """Planes for the way back.
+    """Planes for return paths.
+
+    The sonar's image behind a plane gives the path back via a mirror other than that of the outward path.
 
     Attributes:
         mirrors: the planes.
-        wavenumber: of the carrier [1/m].
+        wavenumber: wavenumber of the carrier [1/m].
     """
 
     mirrors: tuple[SecondMirror, ...]
@@ -672,7 +684,7 @@ class SecondMirrors:
 
     @classmethod
     def of(cls, scene: mi.Scene, mirrors: Mirrors | None, wavenumber: float) -> SecondMirrors | None:
-        """Find the planes of a scene's mirrors; None where there are not two, or more than :data:`MOST_SECOND`."""
+        """Find the planes of a scene's mirrors; None if there are fewer than two or more than :data:`MOST_SECOND`."""
         planes = mirror_planes(scene, mirrors)
         if not 2 <= len(planes) <= MOST_SECOND:
             return None
@@ -688,21 +700,22 @@ class SecondMirrors:
         active: DeviceArray,
         moment: DeviceArray = None,
     ) -> Iterator[WayBack]:
-        """Yield the way back by each plane.
+        """Yield the return path via each plane.
 
         Args:
-            scene: to trace.
-            origin: place of the sonar [m].
-            point: place and normal where rays meet a rough surface.
-            first: place and normal where they met their mirror.
+            scene: scene to trace.
+            origin: position of the sonar [m].
+            point: position and normal where rays meet a rough surface.
+            first: position and normal where they met their mirror.
             active: rays to follow.
-            moment: number of the moment of each ray in a scene that moves.
+            moment: index of the moment of each ray in a moving scene.
         """
         place, normal = point
         exact = [mi.Float64(value) for value in place]
         sonar: DeviceArray = mi.Vector3d(origin)
         scattering = ScatteringPoints(mi.Point3f(place), exact, normal)
         for mirror in self.mirrors:
+            # image of the sonar, and the direct line from it to the points
             plane, facing = mirror.plane, mirror.normal
             image = sonar - facing * (2 * (dr.dot(facing, sonar) - plane.offset))
             way: DeviceArray = mi.Vector3d(*exact) - image
@@ -716,13 +729,14 @@ class SecondMirrors:
                 slab_m=mi.Float64(0),
                 registry=mi.UInt32(mirror.registry),
             )
+            # the plane of the outward path is left out: callers sum that return path separately
             other = active & ~_on(plane, *first)
             is_open, factor = unfolded(scene, scattering, list(image), [row], self.wavenumber, other, moment)
             yield WayBack(mirror, mi.Vector3f(way / distance), mi.Float(distance), factor, is_open)
 
 
 def _on(plane: MirrorPlane, place: DeviceArray, normal: DeviceArray) -> DeviceArray:
-    """Test whether mirrors that rays met lie in a plane."""
+    """Test whether the mirrors that rays met lie in a plane."""
     facing: DeviceArray = mi.Vector3f(*plane.normal.tolist())
     along: DeviceArray = dr.abs(dr.dot(facing, normal))
     off: DeviceArray = dr.abs(dr.dot(facing, place) - plane.offset)
@@ -731,7 +745,7 @@ def _on(plane: MirrorPlane, place: DeviceArray, normal: DeviceArray) -> DeviceAr
 
 
 def second_notes(scene: mi.Scene, mirrors: Mirroring) -> list[str]:
-    """Return a sentence where mirrors have too many planes for ways by one there and another back."""
+    """Return a note if mirrors have too many planes for paths out via one and back via another."""
     count = len(mirror_planes(scene, mirror_of(scene, mirrors)))
     if count <= MOST_SECOND:
         return []
@@ -741,15 +755,17 @@ def second_notes(scene: mi.Scene, mirrors: Mirroring) -> list[str]:
     ]
 
 
-# ---------------- Surfaces that send on more than arrives: harmless in one reflection, too loud in several
+# ---------------- Notes on too large reflectivities
 
 
 def bright_notes(scene: mi.Scene, surfaces: Surfaces) -> list[str]:
-    """Return a sentence where meshes without a material have a Lambert's mu above 1 / pi.
+    """Return a note if meshes without a material have a Lambert's mu above 1 / pi.
+
+    Such surfaces reflect more energy than arrives. This is harmless in one reflection, but too loud in several.
 
     Args:
-        scene: any.
-        surfaces: its tables.
+        scene: any Mitsuba scene.
+        surfaces: surface tables of the scene.
     """
     rows = np.array(surfaces.facets).reshape(-1, 4)[:, 3]
     found, largest = [], 1 / math.pi + 1e-3

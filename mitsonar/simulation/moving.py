@@ -1,7 +1,8 @@
-"""A scene with bodies that move: the still shapes as one scene, each moving shape as one of its own, rays carried to it.
+"""Moving bodies in a scene: how rays are traced, how meshes deform, and how changed parameters are detected.
 
-A ray is turned to the axes of each body and traced there, and the nearest hit counts. No tree is ever built anew: a million
-triangles that move cost what a million that stand still do. A ray carries the number of its moment as its time.
+The still shapes form one scene, and each moving shape forms another. A ray is transformed to the axes of each body and
+traced there, and the nearest hit counts. Search trees are not rebuilt for rigid motion: a million moving triangles cost
+as much as a million still ones. A ray carries the index of its moment as its time.
 """
 
 from __future__ import annotations
@@ -28,14 +29,16 @@ __all__ = ["DeformingMesh", "MovingScene", "SceneMotion", "SceneWatch", "carried
 
 @dataclass
 class MovingScene:
-    """The input of a launch that :meth:`SceneMotion.at` makes; it is traced as a scene of Mitsuba is.
+    """Scene with moving bodies as the input of a launch; created by :meth:`SceneMotion.at`.
+
+    It is traced like a Mitsuba scene.
 
     Attributes:
-        still: all that stands still.
-        shapes: a scene of each moving shape, in its own axes.
-        copies: number of bodies of each of these.
-        rows: world to body, 12 numbers by moment and body; body 0 is the still scene.
-        spheres: middle and radius around each moving shape, in its own axes.
+        still: scene of the still shapes.
+        shapes: a scene for each moving shape, in the shape's own axes.
+        copies: number of bodies of each moving shape.
+        rows: transforms from world to body, 12 numbers for each moment and body; body 0 is the still scene.
+        spheres: centre and radius of a sphere around each moving shape, in its own axes.
     """
 
     still: mi.Scene
@@ -47,16 +50,16 @@ class MovingScene:
     def ray_intersect_preliminary(
         self, ray: mi.Ray3f, coherent: DeviceArray = True, active: DeviceArray = True
     ) -> mi.PreliminaryIntersection3f:
-        """Trace rays to the nearest surface; ``shape`` and ``prim_uv`` are of the body's own axes."""
+        """Trace rays to the nearest surface; ``shape`` and ``prim_uv`` refer to the body's own axes."""
         return self.find(ray, active)[0]
 
     def ray_test(self, ray: mi.Ray3f, coherent: DeviceArray = True, active: DeviceArray = True) -> DeviceArray:
-        """Test whether anything lies on rays before their ``maxt``."""
+        """Test whether rays hit anything before their ``maxt``."""
         found, _ = self.find(ray, active)
         return found.is_valid() & (found.t < ray.maxt)
 
     def find(self, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[mi.PreliminaryIntersection3f, DeviceArray]:
-        """Trace rays to the nearest surface; return what they meet and the number of the body, 0 for still shapes."""
+        """Trace rays to the nearest surface; return the hit and the number of the body, 0 for still shapes."""
         coherent: DeviceArray = True
         best: DeviceArray = self.still.ray_intersect_preliminary(mi.Ray3f(ray.o, ray.d), coherent=coherent, active=active)
         body = dr.zeros(mi.UInt32, dr.width(ray.d))
@@ -79,7 +82,7 @@ class MovingScene:
         body: DeviceArray,
         active: DeviceArray,
     ) -> tuple[DeviceArray, DeviceArray]:
-        """Look through the bodies of one shape in a loop: the kernel stays as short as that of one body."""
+        """Test all bodies of one shape in a loop, which keeps the kernel as short as that of one body."""
         first, copies = which
         number = mi.UInt32(first) + dr.zeros(mi.UInt32, dr.width(ray.d))
 
@@ -100,7 +103,7 @@ class MovingScene:
         body: DeviceArray,
         active: DeviceArray,
     ) -> tuple[DeviceArray, DeviceArray]:
-        """Return the nearer of what was found so far and of a body; rays that miss its sphere are not traced."""
+        """Return the nearer of the best hit so far and the hit of a body; rays that miss its sphere are not traced."""
         own = self.carried(ray, number)
         way: DeviceArray = mi.Point3f(sphere.x, sphere.y, sphere.z) - own.o
         along = dr.dot(way, own.d)
@@ -114,24 +117,24 @@ class MovingScene:
         return dr.select(nearer, found, best), dr.select(nearer, number, body)
 
     def lines(self, moment: DeviceArray, body: DeviceArray) -> list[mi.Vector4f]:
-        """Return the three rows of what turns the world's axes to those of bodies."""
+        """Return the three rows of the transforms from world to bodies."""
         begin = (moment * self.stride + body) * 3
         return [dr.gather(mi.Vector4f, self.rows, begin + axis) for axis in range(3)]
 
     def carried(self, ray: mi.Ray3f, body: DeviceArray) -> mi.Ray3f:
-        """Return rays in the axes of bodies."""
+        """Transform rays to the axes of bodies."""
         lines = self.lines(mi.UInt32(ray.time), body)
         origin = mi.Point3f(*(line.x * ray.o.x + line.y * ray.o.y + line.z * ray.o.z + line.w for line in lines))
         return mi.Ray3f(origin, mi.Vector3f(*(line.x * ray.d.x + line.y * ray.d.y + line.z * ray.d.z for line in lines)))
 
     @property
     def stride(self) -> int:
-        """Return the bodies of a moment, with the still scene."""
+        """Return the number of bodies at a moment, including the still scene."""
         return 1 + sum(self.copies)
 
 
 def carried_back(lines: list[mi.Vector4f], v: mi.Vector3f) -> mi.Vector3f:
-    """Return directions of bodies' axes in the world's, by the rows of :meth:`MovingScene.lines`."""
+    """Rotate directions from bodies' axes to the world, given the rows of :meth:`MovingScene.lines`."""
     first, second, third = lines
     turned: DeviceArray = mi.Vector3f(first.x, first.y, first.z) * v.x
     turned += mi.Vector3f(second.x, second.y, second.z) * v.y + mi.Vector3f(third.x, third.y, third.z) * v.z
@@ -139,19 +142,19 @@ def carried_back(lines: list[mi.Vector4f], v: mi.Vector3f) -> mi.Vector3f:
 
 
 class SceneMotion:
-    """What moves in a scene, on the host.
+    """Moving and deforming shapes of a scene, on the host.
 
     Args:
-        scene: any; its moving shapes lie in their own axes.
-        bodies: that move.
+        scene: any Mitsuba scene; its moving shapes are given in their own axes.
+        bodies: the moving bodies.
 
     Attributes:
-        still: a scene of the other shapes.
-        shapes: of the scene; those that deform are copies.
-        deformed: those that deform.
+        still: scene of the other shapes.
+        shapes: shapes of the scene; deforming ones are copies.
+        deformed: the deforming meshes.
 
     Raises:
-        MitsonarError: a shape that the scene does not have, or that cannot deform; a scene with instances.
+        MitsonarError: a shape is not in the scene or cannot deform; the scene has instances.
     """
 
     def __init__(self, scene: mi.Scene, bodies: MovingBodies) -> None:
@@ -180,9 +183,9 @@ class SceneMotion:
         dr.make_opaque(self._spheres)
 
     def at(self, time_s: ArrayLike) -> MovingScene:
-        """Return the scene at moments ``(moments,)`` [s]; rays name theirs by its number, as their time.
+        """Return the scene at the given moments ``(moments,)`` [s]; a ray's time is the index of its moment.
 
-        Bodies that deform have one shape at all of them: that of the middle.
+        Deforming bodies have one shape at all moments: that at the mean time.
         """
         for one in self.deformed:
             one.deform(float(np.asarray(time_s, dtype=float).mean()))
@@ -195,18 +198,18 @@ class SceneMotion:
         return MovingScene(self.still, self._movers, self.copies, mi.Float(table.ravel().tolist()), self._spheres)
 
     def sonar_lines(self, pose: NDArray[np.float64], time_s: float) -> NDArray[np.float64]:
-        """Return three rows of the sonar's ``to_world`` in the world's axes, and in each body's ``(1 + bodies, 3, 4)``."""
+        """Return three rows of the sonar's ``to_world``, in the world and in each body's axes ``(1 + bodies, 3, 4)``."""
         own = to_world_matrices(pose.reshape(1, 6))[0]
         rows = self.bodies.from_world(time_s)[0]
         return np.concatenate([own[None, :3], rows @ own])
 
     def body_lines(self, time_s: float) -> NDArray[np.float64]:
-        """Return three rows of what turns the world's axes to its own, and to each body's ``(1 + bodies, 3, 4)``."""
+        """Return three rows of the transforms from world to world (identity) and to each body ``(1 + bodies, 3, 4)``."""
         return np.concatenate([np.eye(4)[None, :3], self.bodies.from_world(time_s)[0]])
 
     @cached_property
     def first_objects(self) -> int:
-        """Return the number below that of the first body's object: the largest that a mesh of the scene gives."""
+        """Return the largest object number in the scene's meshes; the bodies' objects are numbered after it."""
         largest = 0
         for shape in self.scene.shapes():
             if shape.is_mesh() and shape.has_attribute("face_id")[0]:
@@ -214,13 +217,13 @@ class SceneMotion:
         return largest
 
     def object_names(self, known: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the names of objects by their numbers: those of the scene's meshes, then those of the bodies."""
+        """Return the names of objects in the order of their numbers: those of the scene's meshes, then the bodies."""
         blank = ("",) * (self.first_objects + 1 - len(known))
         return (*known[: self.first_objects + 1], *blank, *self.bodies.names)
 
 
 def motion_in(scene: mi.Scene, moving: Moving | MovingBodies | None) -> SceneMotion | None:
-    """Return what moves in a scene: as given, or by default as the scene's own shapes say; None where nothing does."""
+    """Return the motion of a scene, as given or by default as specified in its shapes; None if nothing moves."""
     moving = motions_of(scene) if moving is None else moving
     if not moving:
         return None
@@ -228,23 +231,23 @@ def motion_in(scene: mi.Scene, moving: Moving | MovingBodies | None) -> SceneMot
 
 
 def scene_at(scene: mi.Scene, motion: SceneMotion | None, time_s: float) -> mi.Scene | MovingScene:
-    """Return a scene as it is at a time [s]; itself where nothing moves."""
+    """Return a scene at a time [s]; the scene itself if nothing moves."""
     return scene if motion is None else motion.at(time_s)
 
 
 def scene_of(shapes: list[mi.Shape]) -> mi.Scene:
-    """Return a scene of some shapes of another."""
+    """Build a scene from some shapes of another scene."""
     names = [shape.id() for shape in shapes]
     numbered = {f"shape{number}": shape for number, shape in enumerate(shapes)}
-    scene = load_dict({"type": "scene", **numbered}, optimize=False)  # merged meshes would be other shapes
+    scene = load_dict({"type": "scene", **numbered}, optimize=False)  # merged meshes would be different shapes
     assert isinstance(scene, mi.Scene)
     for shape, name in zip(shapes, names, strict=True):
-        shape.set_id(name)  # the loader has changed it
+        shape.set_id(name)  # restore the id, which the loader changes
     return scene
 
 
 def _sphere(shape: mi.Shape) -> mi.Vector4f:
-    """Return middle and radius of a sphere around a shape, a little wider for rounding."""
+    """Return centre and radius of a sphere around a shape, slightly enlarged against rounding."""
     box = shape.bbox()
     low, high = (np.array(end, dtype=float).ravel() for end in (box.min, box.max))
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
@@ -252,23 +255,25 @@ def _sphere(shape: mi.Shape) -> mi.Vector4f:
     return mi.Vector4f(*middle.tolist(), radius + margin)
 
 
-# ---------------- A mesh whose vertices move between pings: its search tree is built anew, those of all other shapes stay
+# ---------------- Deforming meshes
 
 
 class DeformingMesh:
-    """A copy of a mesh with vertices of its own.
+    """Copy of a mesh whose vertices move between pings.
+
+    Only the search tree of this mesh is rebuilt; those of all other shapes stay.
 
     Args:
-        shape: to copy.
-        law: vertices at a time, as many as the mesh has.
+        shape: mesh to copy.
+        law: function that returns the vertices at a time, as many as the mesh has.
 
     Attributes:
         mesh: the copy.
-        scene: that holds it alone.
+        scene: scene that contains only the copy.
         version: number of changes so far.
 
     Raises:
-        MitsonarError: a shape that is no mesh.
+        MitsonarError: the shape is not a mesh.
     """
 
     def __init__(self, shape: mi.Shape, law: VertexLaw) -> None:
@@ -282,7 +287,7 @@ class DeformingMesh:
         """Return the vertices ``(vertices, 3)`` at a time [s].
 
         Raises:
-            MitsonarError: another number of them, or some that are not finite.
+            MitsonarError: the number of vertices differs from the mesh's, or some are not finite.
         """
         found = np.asarray(self.law(time_s), dtype=np.float32)
         count = self.mesh.vertex_count()
@@ -293,16 +298,16 @@ class DeformingMesh:
         return found
 
     def deform(self, time_s: float) -> None:
-        """Move the vertices to where they are at a time [s].
+        """Move the vertices to their positions at a time [s].
 
         Raises:
-            MitsonarError: as :meth:`vertices`.
+            MitsonarError: as in :meth:`vertices`.
         """
         if time_s == self._time_s:
             return
         vertices = self.vertices(time_s)
         assert self.scene is not None
-        values: Any = mi.traverse(self.scene)  # its types lack the keys
+        values: Any = mi.traverse(self.scene)  # the type stubs lack keys()
         (name,) = [key for key in values.keys() if key.endswith("vertex_positions")]  # noqa: SIM118  no dict
         values[name] = mi.Float(vertices.ravel().tolist())
         values.update()
@@ -310,7 +315,7 @@ class DeformingMesh:
 
 
 def _copied(mesh: mi.Mesh) -> mi.Mesh:
-    """Return a mesh of the same triangles, uv and numbers of objects, without normals at vertices."""
+    """Return a mesh with the same triangles, uv and object numbers, without vertex normals."""
     props = mi.Properties()
     props["bsdf"] = mesh.bsdf()
     uv = mesh.has_vertex_texcoords()
@@ -326,23 +331,24 @@ def _copied(mesh: mi.Mesh) -> mi.Mesh:
     return made
 
 
-# ---------------- Notice that parameters of a scene have changed since something was made of it, such as a table of
-# its normals
+# ---------------- Detection of changed scene parameters
 
 
 WITHOUT_ECHO = ("silhouette_sampling_weight", "vertex_normals")
-"""Ends of the names of parameters that no echo depends on: facets are flat."""
+"""Suffixes of parameter names that no echo depends on; vertex normals do not matter because facets are flat."""
 
 
 class SceneWatch:
-    """Watches the parameters of a scene's shapes, materials and textures that ``mi.traverse`` reaches.
+    """Detector of changes to the parameters of a scene's shapes, materials and textures that ``mi.traverse`` reaches.
 
-    Dr.Jit numbers its arrays, and a changed one has another number: a look costs about 0.1 us an array, whatever its size.
-    Copies that share the memory keep numbers from being given again.
+    Data derived from a scene, such as a table of its normals, is rebuilt when a change is detected. Dr.Jit numbers its
+    arrays, and a changed array has another number, so a check costs about 0.1 us per array, regardless of its size.
+    Copies that share the memory prevent numbers from being reused.
 
     Args:
-        scene: any.
-        places: whether the places of instances, spheres, cylinders and disks count, which Mitsuba looks up when it traces.
+        scene: any Mitsuba scene.
+        places: whether to watch the transforms of instances, spheres, cylinders and disks, which Mitsuba looks up when it
+            traces.
     """
 
     def __init__(self, scene: mi.Scene, *, places: bool = True) -> None:
@@ -350,9 +356,9 @@ class SceneWatch:
         self._begin()
 
     def _begin(self) -> None:
-        """Take hold of the parameters, and remember them as they are."""
-        found: Any = mi.traverse(self._scene)  # its types lack the keys
-        self._arrays: dict[str, Any] = {}  # references: they show what the scene holds now
+        """Collect references to the parameters, and record their current state."""
+        found: Any = mi.traverse(self._scene)  # the type stubs lack keys()
+        self._arrays: dict[str, Any] = {}  # references, which follow the scene's current values
         self._others: dict[str, Any] = {}
         self._owners: dict[str, mi.Object] = {}
         for name, (place, kind, owner, _) in found.properties.items():
@@ -371,9 +377,9 @@ class SceneWatch:
         self._keep()
 
     def changed(self) -> dict[str, mi.Object] | None:
-        """Return the parameters that changed since the last call, by name with what they belong to; None where none did."""
+        """Return the owners of the parameters that changed since the last call, keyed by name; None if none did."""
         materials = self._materials()
-        if materials != self._kept_materials:  # another BSDF of a shape, with parameters of its own
+        if materials != self._kept_materials:  # a shape has another BSDF, with other parameters
             found: dict[str, mi.Object] = {"bsdf": self._scene}
             self._begin()
             return found
@@ -390,7 +396,7 @@ class SceneWatch:
         return [shape.bsdf() for shape in self._scene.shapes()]
 
     def _values(self) -> dict[str, Any]:
-        """Return the parameters that are no plain arrays, such as transforms and tensors, as they are now."""
+        """Return the current values of the parameters that are not plain arrays, such as transforms and tensors."""
         read: Any = mi.get_property
         return {
             name: place if kind is None else read(place, kind, self._owners[name])
@@ -398,16 +404,16 @@ class SceneWatch:
         }
 
     def _fingerprints(self) -> dict[str, Hashable]:
-        """Return what tells these parameters from others."""
+        """Return a fingerprint of each of these parameters, which differs after a change."""
         return {name: tuple(dr.detail.collect_indices([value])) or str(value) for name, value in self._values().items()}
 
     def _keep(self) -> None:
-        """Remember the parameters as they are."""
+        """Record the current state of the parameters."""
         self._kept = [[dr.copy(value) for value in self._live], [_shared(value) for value in self._values().values()]]
         self._numbers, self._kept_others = [one.index for one in self._live], self._fingerprints()
         self._kept_materials = self._materials()
 
 
 def _shared(value: Any) -> Any:
-    """Return a copy that holds the same arrays."""
+    """Return a copy that refers to the same arrays; None if the value has no arrays."""
     return dr.copy(value) if dr.detail.collect_indices([value]) else None

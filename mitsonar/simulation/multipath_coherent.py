@@ -1,24 +1,27 @@
-"""The field of mirrors: Kirchhoff's integral over the surfaces that rays meet, a plane for each ray's cell.
+"""Multipath of the model ``coherent``: how mirrors echo, how scatterers appear via mirrors, and how corners reflect.
+
+The field of mirrors is Kirchhoff's integral over the surfaces that rays meet, with a plane for each ray's cell::
 
     s = sum j k / 2 pi V exp(-2 k^2 h^2 cos^2) cos dA sinc(g_u / 2) sinc(g_t / 2) exp(-2 j k R) / R^2
 
 with g = 2 k d . dX, where dX is the step of the hit on its tangent plane by one column (u) or row (t), and
-sinc x = sin x / x. So the echo of a mirror plane is 1 / 2R, that of a rigid sphere a / 2 R^2 (target strength a^2 / 4).
+sinc x = sin x / x. The echo of a mirror plane is thus 1 / 2R, and that of a rigid sphere a / 2 R^2 (target strength
+a^2 / 4).
 
-A plane's cells join exactly. On curved bodies and at edges the cells of the common fan are too coarse, so a first launch
-finds where: a cell is divided until it is at most a quarter of the Fresnel radius sqrt(lambda a R / (2 (a + R))), a being
-the radius of curvature from the normals of neighbouring hits; at edges that face the sonar it is divided most. A second
-launch traces these finer rays. Bodies between the rays of the fan are not found.
+The cells of a plane join exactly. On curved bodies and at edges the cells of the common fan are too coarse, and a first
+launch finds where. It divides a cell until it is at most a quarter of the Fresnel radius sqrt(lambda a R / (2 (a + R))),
+where a is the radius of curvature from the normals of neighbouring hits. Cells at edges that face the sonar are divided
+most. A second launch traces these finer rays. Bodies between the rays of the fan are not found.
 
-Facets of meshes are planes here. A mesh that stands for a curved body needs facets below half the Fresnel radius: larger
-ones glint as the polyhedron that they are. Vertex normals count for nothing.
+Facets of meshes are treated as planes, and vertex normals are ignored. A mesh that approximates a curved body needs facets
+below half the Fresnel radius: larger ones glint like the faces of a polyhedron.
 
-Beyond 30 deg from the normal the integral fades and ends at 45 deg: a mirror sends nothing back there, and what is left of
-the sum is the edge of the fan. So bodies of less than some five wavelengths' radius (k a < 30) are too weak.
+Beyond 30 deg from the normal the integral fades, and it ends at 45 deg. A mirror sends nothing back there, and the rest of
+the sum is due to the edge of the fan. Bodies with a radius below about five wavelengths (k a < 30) are therefore too weak.
 
-An image's levels are those of a box as wide as the beam and as long as a bin, so its peak is no target strength. Their sum
-is: 10 log10(sum of the levels over bins and beams around the echo, without gain, times spacing over width of the beams)
-+ 40 log10(R) is the target strength in dB, and absorption comes on top.
+The levels of an image are those of a box as wide as the beam and as long as a bin, so its peak is not a target strength.
+The target strength in dB follows from their sum: 10 log10(sum of the levels over bins and beams around the echo, without
+gain, times spacing over width of the beams) + 40 log10(R), plus absorption.
 """
 
 from __future__ import annotations
@@ -62,39 +65,39 @@ __all__ = [
 
 
 FADING, LAST = 0.866, 0.707
-"""Cosines between normal and ray where the integral begins to fade, and where it ends."""
+"""Cosines between normal and ray at which the integral begins to fade, and at which it ends."""
 
 FACING = 0.985
 """Cosine above which an edge counts as facing the sonar: beyond 10 deg its echo is far below the mirror's."""
 
 FINEST = 16
-"""Parts that a ray's cell is divided into each way, at most and at edges."""
+"""Largest number of parts of a ray's cell in each direction; used at edges."""
 
 FRESNEL_PARTS = 4
-"""Cells a Fresnel radius that are wanted; two are needed."""
+"""Desired number of cells per Fresnel radius; at least two are needed."""
 
 NEIGHBOURS = [(over, down) for over in (-1, 0, 1) for down in (-1, 0, 1) if (over, down) != (0, 0)]
 
 TURN_PART = 1.5
-"""A mirror may face the sonar between hits where this times the turn of the normal to the next exceeds its slope."""
+"""A mirror may face the sonar between hits if this factor times the turn of the normal to the next exceeds its slope."""
 
 LEVEL_PART = 0.3
-"""Neighbouring hits are on one surface where they leave the tangent plane by less than this part of their distance."""
+"""Largest distance from the tangent plane of neighbouring hits on one surface, as a fraction of their distance."""
 
 MOST_RAYS = 2**20
-"""Rays of the second launch, at most."""
+"""Largest number of rays in the second launch."""
 
 
 class MirrorTracer:
-    """Sum the echoes of mirrors.
+    """Tracer that sums the echoes of mirrors.
 
     Args:
-        scene: to trace.
-        sonar: of the model ``coherent``.
-        former: gives the grid.
-        mirrors: of the scene's shapes.
-        finest: parts that a ray's cell is divided into each way, at most.
-        motion: of bodies of the scene, which may hide mirrors; default: all stands still.
+        scene: scene to trace.
+        sonar: sonar of the model ``coherent``.
+        former: beamformer that gives the grid.
+        mirrors: mirror parts of the scene's shapes.
+        finest: largest number of parts of a ray's cell in each direction.
+        motion: motion of the scene's bodies, which may hide mirrors; default: nothing moves.
     """
 
     def __init__(
@@ -114,7 +117,7 @@ class MirrorTracer:
         self.wavelength = sonar.sound_speed / sonar.frequency_hz
         self.wavenumber = 2 * math.pi / self.wavelength
         self.last = former.first_range + (former.ranges - 1) * former.range_step
-        # the sum of all amplitudes in a cell of the grid is below k / pi times its solid angle, at most twice this
+        # fixed point: the amplitudes in a cell of the grid sum to less than k / pi times its solid angle, at most twice this
         loudest = 16 / self.wavelength * former.sine_step * self.fan.tangent
         self.bits = 61 - math.ceil(math.log2(max(loudest, 1.0)))
         self.index = dr.arange(mi.UInt32, self.fan.rays)
@@ -133,12 +136,12 @@ class MirrorTracer:
         """Add the mirrors' echoes of one ping to its field, in place.
 
         Args:
-            pose: of the sonar ``(6,)`` [m, rad].
-            field: on the grid ``(sines, ranges)``.
-            time_s: when bodies that move are where they are [s].
+            pose: pose of the sonar ``(6,)`` [m, rad].
+            field: field on the grid ``(sines, ranges)``.
+            time_s: time that determines the poses of moving bodies [s].
 
         Warns:
-            MitsonarWarning: once, where cells exceed half the Fresnel radius and no finer ones were traced.
+            MitsonarWarning: once, if cells exceed half the Fresnel radius and no finer ones were traced.
         """
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
         scene = scene_at(self.scene, self.motion, time_s)
@@ -154,7 +157,7 @@ class MirrorTracer:
         field.imag += np.array(imag, copy=False).reshape(field.shape)
 
     def _parts(self, wanted: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return into how many parts each way cells are divided: powers of two, fewer where rays are too many."""
+        """Return the number of parts of cells in each direction: powers of two, reduced if there are too many rays."""
         parts = 2 ** np.ceil(np.log2(np.clip(wanted, 1, self.finest)) - 1e-6).astype(np.int64)
         parts = np.minimum(parts, self.finest)
         while (parts * parts).sum() > MOST_RAYS and parts.max() > 1:
@@ -162,7 +165,7 @@ class MirrorTracer:
         return parts
 
     def _tell(self, wanted: NDArray[np.float32], parts: NDArray[np.int64]) -> None:
-        """Warn where the cells of a curved mirror stay larger than half the Fresnel radius."""
+        """Warn, once, if cells of a curved mirror remain larger than half the Fresnel radius."""
         excess = np.where(wanted > 0, wanted, 0) / parts * (2 / FRESNEL_PARTS)
         if self.told or not (excess > 1).any():
             return
@@ -176,17 +179,19 @@ class MirrorTracer:
             stacklevel=2,
         )
 
-    # ---------------------------------------------------------------- first launch
+    # ---------------- First launch: which cells to divide
 
     def _compile_survey(self) -> Callable[..., Any]:
         @Frozen
         def survey(index: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
+            # 1. mirrors within the window; kind -1 is anything else
             rays = FanRays(self.fan, self.sonar, index, rows_of(rows))
             hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
             mirror = hit.valid & (parts_at(table, hit)[0] != 0)
             mirror &= rays.may_reach(hit, self.former.first_range, self.last)
             kind = dr.select(mirror, mi.Int32(hit.shape_id), -1)
             place: DeviceArray = rays.d * hit.t
+            # 2. comparison with neighbours, which are gathered from evaluated arrays
             seen = kind, place, mi.Vector3f(hit.n), dr.dot(hit.n, rays.d)
             dr.eval(*seen, hit.t)
             facing, needed, mixed = self._around(rays, hit, seen)
@@ -194,53 +199,59 @@ class MirrorTracer:
             near = facing
             for over, down in NEIGHBOURS:
                 near |= dr.gather(mi.Bool, facing, self._beside(rays, over, down))
+            # 3. parts for the curvature; the most, marked by a negative sign, at edges near a mirror that faces the sonar
             smooth = dr.select(mirror & (dr.abs(seen[-1]) > LAST), dr.select(needed > 1, needed, 1), 0)
             return dr.select(mixed & near & (smooth <= self.finest), -float(self.finest), smooth)
 
         return survey
 
     def _around(self, rays: FanRays, hit: Hit, seen: tuple[Any, ...]) -> tuple[DeviceArray, ...]:
-        """Compare each hit with those around it.
+        """Compare each hit with its neighbours.
 
         Returns:
-            Whether a mirror there may face the sonar, how many parts each way its curvature needs, whether an edge is near.
+            Whether a mirror there may face the sonar, how many parts in each direction its curvature needs, and whether an
+            edge is near.
         """
         kind, place, normal, along = seen
         steps = [dr.norm(step) for step in rays.steps_on(hit)]
         mixed, turned, needed = mi.Bool(False), mi.Float(0), mi.Float(0)
         same: dict[tuple[int, int], DeviceArray] = {}
         for beside in NEIGHBOURS:
+            # 1. is the neighbour on the same surface: the same kind, and close to the tangent plane?
             other = self._beside(rays, *beside)
             chord: DeviceArray = dr.gather(mi.Vector3f, place, other) - place
             length = dr.norm(chord)
             alike = dr.gather(mi.Int32, kind, other) == kind
             same[beside] = alike & ((kind < 0) | (dr.abs(dr.dot(normal, chord)) <= LEVEL_PART * length))
             mixed |= ~same[beside]
+            # 2. turn of the normal; along columns and rows it gives the curvature, and that the size of a cell
             turn = dr.select(alike, dr.norm(dr.gather(mi.Vector3f, normal, other) - normal), 0)
             turned = dr.select(turn > turned, turn, turned)
             if 0 in beside:
                 bent = dr.select(same[beside] & (length > 0), turn / length, 0)
                 wanted = self._cells(steps[beside.index(0) ^ 1], bent, hit.t)
                 needed = dr.select(wanted > needed, wanted, needed)
+        # 3. a body without a neighbour on its surface on either side is not resolved: assume a radius of one step
         thin = ~(same[1, 0] | same[-1, 0]) | ~(same[0, 1] | same[0, -1])
         least = dr.select(steps[0] < steps[1], steps[0], steps[1])
         unresolved = dr.select(thin, self._cells(least, 1 / least, hit.t), 0)
+        # 4. a mirror faces the sonar if its normal does here, or may do between this hit and the next
         steep = dr.sqrt(dr.select(along * along < 1, 1 - along * along, 0))
         facing = (kind >= 0) & ((dr.abs(along) > FACING) | thin | (turned * TURN_PART > steep))
         return facing, dr.select(unresolved > needed, unresolved, needed), mixed
 
     def _cells(self, step: DeviceArray, bent: DeviceArray, range_m: DeviceArray) -> DeviceArray:
-        """Return a step over the wanted size of a cell, where the surface has that curvature [1/m]."""
+        """Return the ratio of a step to the desired size of a cell on a surface of the given curvature [1/m]."""
         return step * FRESNEL_PARTS * dr.sqrt((bent + 1 / range_m) * (2 / self.wavelength))
 
     def _beside(self, rays: FanRays, over: int, down: int) -> mi.UInt32:
-        """Return the index of the neighbour of each ray, itself at the border of the fan."""
+        """Return the index of each ray's neighbour; the ray itself at the border of the fan."""
         column, row = rays.column + over, rays.row + down
         column = dr.select((column >= 0) & (column < self.fan.columns), column, rays.column)
         row = dr.select((row >= 0) & (row < self.fan.rows), row, rays.row)
         return mi.UInt32(column // STRIP * (STRIP * self.fan.rows) + row * STRIP + column % STRIP)
 
-    # ---------------------------------------------------------------- second launch
+    # ---------------- Second launch: sum over the finer rays
 
     def _compile_sum(self) -> Callable[..., Any]:
         @Frozen
@@ -257,15 +268,18 @@ class MirrorTracer:
         self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]
     ) -> None:
         """Add the echo of each ray's cell to the grid."""
+        # 1. trace, and look up the mirror part
         hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
         wavenumber = self.wavenumber
         reflection, roughness_m = parts_at(table, hit)
         cosine = dr.abs(dr.dot(hit.n, rays.d))
         across, down = rays.steps_on(hit)
+        # 2. magnitude of the integral over the cell, see the module's docstring
         level = reflection * smooth_share(roughness_m, cosine, wavenumber) * _fading(cosine)
         level *= (wavenumber / (2 * math.pi)) * cosine * dr.norm(dr.cross(across, down)) / dr.square(hit.t)
         level *= sinc(dr.dot(rays.d, across) * wavenumber) * sinc(dr.dot(rays.d, down) * wavenumber)
         level *= elevation_gain(self.sonar, rays.tangent)
+        # 3. phase in cycles, in float64; the quarter is the factor j
         range_m = mi.Float64(hit.t)
         turns = range_m * (2 / self.wavelength)
         sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + 0.25) * (2 * math.pi))
@@ -274,16 +288,16 @@ class MirrorTracer:
 
 
 class FinerRays(FanRays):
-    """Rays of parts of a fan's cells.
+    """Rays through parts of a fan's cells.
 
     Args:
-        fan: of the sonar.
-        sonar: tells the bearing.
-        inputs: index of the cell, parts of it each way, the part's column and row, of each ray.
+        fan: fan of the sonar.
+        sonar: sonar that defines the bearing.
+        inputs: for each ray, index of the cell, number of its parts in each direction, and column and row of the part.
         lines: first three rows of ``to_world`` in double precision.
 
     Attributes:
-        sine, tangent: of the bearing and of the elevation of each ray.
+        sine, tangent: sine of the bearing and tangent of the elevation of each ray.
     """
 
     def __init__(self, fan: CommonFan, sonar: Sonar, inputs: tuple[mi.UInt32, ...], lines: list[list[Any]]) -> None:
@@ -298,14 +312,14 @@ class FinerRays(FanRays):
         self._aim(self.sine, self.tangent)
 
     def from_lines(self, lines: list[list[Any]]) -> FinerRays:
-        """Return the same rays of a sonar elsewhere."""
+        """Return the same rays for a sonar at another pose."""
         return FinerRays(self.fan, self.sonar, self.inputs, lines)
 
 
 def _expanded(cell: NDArray[np.intp], parts: NDArray[np.int64]) -> tuple[NDArray[np.uint32], ...]:
-    """Return cell, parts each way, the part's column and row of each ray, for cells and their parts ``(n,)``.
+    """Return, for each ray, cell, parts in each direction, and the part's column and row, given cells and parts ``(n,)``.
 
-    Divided on the host: the processor ends the process where idle lanes of a kernel divide integers by 0.
+    The integers are divided on the host, because a processor ends the process if idle lanes of a kernel divide by 0.
     """
     count = parts * parts
     number = np.arange(count.sum(), dtype=np.uint32) - np.repeat((np.cumsum(count) - count).astype(np.uint32), count)
@@ -314,7 +328,7 @@ def _expanded(cell: NDArray[np.intp], parts: NDArray[np.int64]) -> tuple[NDArray
 
 
 def rows_of(rows: mi.Float64) -> list[list[Any]]:
-    """Return three rows of four numbers of an array of twelve."""
+    """Gather three rows of four numbers from an array of twelve."""
     return [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
 
 
@@ -326,9 +340,9 @@ def _fading(cosine: DeviceArray) -> DeviceArray:
 
 
 def facing_share(cosine: DeviceArray) -> DeviceArray:
-    """Return what counts of a mirror's cell, by the cosine between its mirrored ray and the line to the sonar.
+    """Return the weight of a mirror's cell, given the cosine between its mirrored ray and the line to the sonar.
 
-    A ray that meets one mirror at an angle from its normal leaves at twice this angle from the line back.
+    A ray that meets a single mirror at an angle from its normal leaves at twice this angle from the line back.
     """
     return _fading(dr.sqrt((1 + dr.select(cosine > -1, cosine, -1)) * 0.5))
 
@@ -339,32 +353,22 @@ def sinc(x: DeviceArray) -> DeviceArray:
     return dr.select(size > 1e-3, dr.sin(x) / x, 1 - x * x / 6)
 
 
-# ---------------- Ghosts of the model ``coherent``: hash-anchored scatterers seen by way of mirrors, in one launch
-# A ray that meets a mirror goes on, and looks at the surface behind it from the image of the sonar: the sonar mirrored
-# at the plane that the ray met. So :class:`~mitsonar.simulation.coherent_tracing.FanRays` of mirrored axes see each
-# point of the lattice at the range R' of the image. A point at the range R that the sonar sees straight as well gives
-# two paths of length R + R', there and back the other way round, of amplitude
-#
-#     V exp(-2 k^2 h^2 cos^2) zeta sqrt(C cos cos' dA) / (R R')
-#
-# By the same mirror both ways it gives one of length 2 R', of three reflections, and by another mirror back one of R' +
-# R''. Points, weights and grid are those of one reflection, so ghosts carry the speckle of what they are ghosts of.
-# Whether the sonar sees a point straight is tested once a ray, at the point that the ray meets.
+# ---------------- Ghosts: scatterers seen via mirrors
 
 
 PATHS = 4
-"""Waves of a point in one cell of the grid, at most, in waves of one reflection."""
+"""Bound of a point's waves in one cell of the grid, relative to its wave of one reflection."""
 
 
 @dataclass
 class MirroredRays:
-    """Rays of a fan behind mirrors.
+    """Rays of a fan after reflection by mirrors.
 
     Attributes:
-        rays: as they are seen from the image of the sonar.
-        hit: where they end now, ``t`` from that image [m].
-        gain: amplitude that the mirrors have left.
-        body: number of the body that they meet; 0: what stands still.
+        rays: the rays as seen from the image of the sonar.
+        hit: where the rays currently end, with ``t`` from that image [m].
+        gain: factor of the mirrors on the amplitude.
+        body: number of the body that the rays meet; 0 for still shapes.
     """
 
     rays: FanRays
@@ -374,11 +378,22 @@ class MirroredRays:
 
 
 class GhostTracer:
-    """Sum the echoes of scatterers that are seen by way of mirrors.
+    """Tracer that sums the echoes of hash-anchored scatterers seen via mirrors, in one launch.
+
+    A ray that meets a mirror continues, and sees the surface behind it from the image of the sonar: the sonar mirrored at
+    the plane that the ray met. :class:`~mitsonar.simulation.coherent_tracing.FanRays` with mirrored axes therefore see each
+    point of the lattice at its range R' from the image. A point that the sonar also sees directly, at the range R, gives two
+    paths of length R + R', one the reverse of the other, with the amplitude::
+
+        V exp(-2 k^2 h^2 cos^2) zeta sqrt(C cos cos' dA) / (R R')
+
+    Out and back via the same mirror, it gives a path of length 2 R' with three reflections; back via another mirror, one of
+    length R' + R''. Points, weights and grid are those of one reflection, so ghosts have the speckle of their originals.
+    Whether the sonar sees a point directly is tested once per ray, at the point that the ray meets.
 
     Args:
-        tracer: of one reflection, with mirrors.
-        mirrors: of the scene, for ways by one of them there and another back; default: no such ways.
+        tracer: tracer of one reflection, with mirrors.
+        mirrors: mirrors of the scene, for paths out via one of them and back via another; default: no such paths.
     """
 
     def __init__(self, tracer: CoherentTracer, mirrors: Mirrors | None = None) -> None:
@@ -405,12 +420,14 @@ class GhostTracer:
     def _compile(self) -> Callable[..., Any]:
         @Frozen
         def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any, bodies: Any) -> Any:
+            # 1. the rays of the fan and their first hits
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
             rays = FanRays(self.direct.fan, self.sonar, index, lines)
             surfaces = replace(self.direct.surfaces, **tables)
             hit = surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d))
             now = MirroredRays(rays, hit, mi.Float(1), mi.UInt32(0))
             sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))
+            # 2. follow them from mirror to mirror, and sum the points that they meet
             for number in range(2, self.sonar.bounces + 1):
                 first = rays.origin + rays.d * now.hit.t, now.hit.n
                 now = mirrored_on(scene, surfaces, now, mirrors, self.wavenumber)
@@ -434,10 +451,11 @@ class GhostTracer:
         first: tuple[DeviceArray, DeviceArray] | None,
         bodies: mi.Float64 | None,
     ) -> None:
-        """Sum the points that rays behind mirrors look through.
+        """Sum the points in the cells of mirrored rays.
 
-        ``first`` is place and normal of the only mirror so far, where the way back may be by mirrors as well.
+        ``first`` is position and normal of the only mirror so far, given if the return path may also be via mirrors.
         """
+        # 1. return paths: directly to the sonar, if the point is visible from it and the path lies in the window ...
         hit = without_mirror_part(mirrors, now.hit, now.rays.d, self.wavenumber)
         place: DeviceArray = now.rays.origin + now.rays.d * hit.t
         way: DeviceArray = place - rays.origin
@@ -447,14 +465,17 @@ class GhostTracer:
         straight = matt & (dr.dot(hit.n, u) * dr.dot(hit.n, now.rays.d) > 0)
         straight &= self._within((hit.t + distance) * 0.5, now)
         straight &= ~hidden(scene, mi.Point3f(place), hit.n, u, distance, straight)
+        # ... via the same mirror ...
         back = matt & self._within(hit.t, now) if first is not None else mi.Bool(False)
+        # ... and via each other mirror
         ways: list[tuple[FanRays, DeviceArray, DeviceArray]] = []
         if first is not None and self.second is not None:
             for way in self.second.ways(scene, rays.origin, (place, hit.n), first, matt):
                 beyond = rays.from_lines(mirrored_lines(rays.lines, way.mirror.normal, way.mirror.place))
                 facing = dr.dot(hit.n, way.u) * dr.dot(hit.n, now.rays.d) > 0
                 ways.append((beyond, way.factor, way.is_open & facing & self._within((hit.t + way.distance) * 0.5, now)))
-        if bodies is not None:  # all that follows is in the axes of the body that is hit
+        # 2. points are anchored to bodies: everything below is in the axes of the body that is hit
+        if bodies is not None:
             assert isinstance(self.direct.surfaces, MovingSurfaces)
             turn = [[dr.gather(mi.Float64, bodies, now.body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
             rays, now = in_body(turn, rays), replace(now, rays=in_body(turn, now.rays))
@@ -462,6 +483,7 @@ class GhostTracer:
             normal = [mi.Float(row[0]) * hit.n.x + mi.Float(row[1]) * hit.n.y + mi.Float(row[2]) * hit.n.z for row in turn]
             lattice = self.direct.surfaces.own_lattice(scene, hit, now.body)
             hit, place = replace(hit, n=mi.Normal3f(*normal), shape_id=lattice), now.rays.origin + now.rays.d * hit.t
+        # 3. add the waves of all points in each ray's cell
         points = HashedPoints(
             replace(hit, valid=straight | back | _any_of(ways)),
             place,
@@ -483,7 +505,7 @@ class GhostTracer:
         dr.while_loop((begin,), lambda number: number < points.count, step)
 
     def _within(self, range_m: DeviceArray, now: MirroredRays) -> DeviceArray:
-        """Test whether paths by way of a ray's cell may lie in the window."""
+        """Test whether paths via a ray's cell may lie in the window."""
         across, down = now.rays.steps_on(now.hit)
         wide = dr.norm(across) + dr.norm(down)
         return (range_m + wide > self.former.first_range) & (range_m - wide < self.last)
@@ -497,11 +519,13 @@ class GhostTracer:
         active: tuple[DeviceArray, DeviceArray | None],
     ) -> None:
         """Add the paths of one point of each ray to the grid."""
+        # 1. the point as seen via the mirrors (there) and directly (here)
         rays, now = ways
         there, here = now.rays.seen(points, point), rays.seen(points, point)
         far, near = (self._clear(seen.range_m) for seen in (there, here))
         level = points.strength * point.amplitude * now.gain
         both = level * dr.sqrt(there.cosine * here.cosine) / (far * near)
+        # 2. the path and its reverse: one length, with both ends' patterns exchanged
         half = (there.range_m + here.range_m) * 0.5
         wave = (half, *self._turned(half, point))
         seen = active[0] & there.mine & here.ahead
@@ -514,6 +538,7 @@ class GhostTracer:
             for one, other in ((there, here), (here, there)):
                 gain = elevation_gain_of_ends(self.sonar, one.tangent, other.tangent)
                 self._add(sums, one.sine, both * gain, wave, seen)
+        # 3. out and back via the same mirrors
         if active[1] is not None:
             gain = (
                 now.gain * there.cosine / dr.square(far) * elevation_gain_of_ends(self.sonar, there.tangent, there.tangent)
@@ -529,7 +554,7 @@ class GhostTracer:
         sums: tuple[mi.UInt64, mi.UInt64],
         active: DeviceArray,
     ) -> None:
-        """Add the path of one point of each ray that leaves by another mirror; its reverse is another ray's."""
+        """Add the path of one point of each ray that returns via another mirror; its reverse belongs to another ray."""
         now, beyond, factor = way
         there, other = now.rays.seen(points, point), beyond.seen(points, point)
         half = (there.range_m + other.range_m) * 0.5
@@ -543,12 +568,12 @@ class GhostTracer:
         self._add(sums, sine, level, (half, *self._turned(half, point)), active & there.mine & other.ahead)
 
     def _clear(self, range_m: DeviceArray) -> DeviceArray:
-        """Return ranges for spreading, which is held constant nearer than the window or one bin."""
+        """Return ranges for spreading, which is constant closer than the window or one bin."""
         near = mi.Float(range_m)
         return dr.select(near > self.nearest, near, self.nearest)
 
     def _turned(self, half: DeviceArray, point: Point) -> tuple[DeviceArray, DeviceArray]:
-        """Return cosine and sine of the phase of paths of half a length."""
+        """Return cosine and sine of the phase of paths, given half their length."""
         turns = half * (self.wavenumber / math.pi)
         sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + point.turn) * (2 * math.pi))
         return cos, sin
@@ -561,13 +586,13 @@ class GhostTracer:
         wave: tuple[DeviceArray, ...],
         active: DeviceArray,
     ) -> None:
-        """Add waves of a half path, cosine and sine of the phase to the grid."""
+        """Add waves to the grid; ``wave`` holds half the path, and cosine and sine of the phase."""
         half, cos, sin = wave
         add_waves(self.former, self.bits, sums, (sine, half, level, cos, sin), active)
 
 
 def _any_of(ways: list[tuple[FanRays, DeviceArray, DeviceArray]]) -> DeviceArray:
-    """Return which rays have an open way by another mirror."""
+    """Return which rays have an open path via another mirror."""
     found = mi.Bool(False)
     for _, _, is_open in ways:
         found |= is_open
@@ -577,14 +602,14 @@ def _any_of(ways: list[tuple[FanRays, DeviceArray, DeviceArray]]) -> DeviceArray
 def mirrored_on(
     scene: DeviceArray, surfaces: Surfaces, now: MirroredRays, mirrors: mi.Float, wavenumber: float
 ) -> MirroredRays:
-    """Follow rays that meet mirrors to the next surface; others end.
+    """Follow rays that meet mirrors to the next surface; other rays end.
 
     Args:
-        scene: to trace.
-        surfaces: its tables.
-        now: rays and where they end.
+        scene: scene to trace.
+        surfaces: surface tables of the scene.
+        now: rays and their current hits.
         mirrors: table of mirror parts.
-        wavenumber: of the carrier [1/m].
+        wavenumber: wavenumber of the carrier [1/m].
     """
     rays, hit = now.rays, now.hit
     reflection, roughness_m = parts_at(mirrors, hit)
@@ -603,11 +628,11 @@ def mirrored_on(
 
 
 def in_body(turn: list[list[DeviceArray]], rays: FanRays) -> FanRays:
-    """Return rays in the axes of bodies.
+    """Transform rays to the axes of bodies.
 
     Args:
-        turn: three rows of what turns the world's axes to those of each ray's body, in double precision.
-        rays: in the world.
+        turn: three rows of the transform from the world to each ray's body, in double precision.
+        rays: rays in the world.
     """
     lines = rays.lines
     carried = [[sum(row[k] * lines[k][column] for k in range(3)) for column in range(4)] for row in turn]
@@ -616,39 +641,28 @@ def in_body(turn: list[list[DeviceArray]], rays: FanRays) -> FanRays:
     return rays.from_lines(carried)
 
 
-# ---------------- The field of corners: Kirchhoff's integral over the last of two or three mirrors, a plane for each
-# ray's cell
-# A ray goes from mirror to mirror. At the last one, at P, its cell sends back to the sonar what Kirchhoff's integral says,
-#
-#     s = sum j k / 2 pi V1 V2 .. (cos + cos') / 2 dA sinc(g_u / 2) sinc(g_t / 2) exp(-j k (L + R)) / (L R)
-#
-# L is the distance of P from the image of the sonar, R that from the sonar itself, cos and cos' those of both lines, dA
-# the area of the cell on the last mirror, dX its steps by one column (u) and row (t), g = k (d + (P - O) / R) . dX.
-# This is "shooting and bouncing rays" (Ling, Chou, Lee 1989). The ray tells how the path leaves; the line to P tells
-# how it arrives. Its reverse is another ray's.
-#
-# As for one mirror a first launch finds what to divide: cells whose neighbours meet other mirrors are divided most. What
-# leaves the last mirror farther than 60 deg from the line to the sonar fades, and ends at 90 deg.
+# ---------------- Corners: two or three mirrors in sequence
 
 
 ONE_PLANE = 1e-4
-"""Images of the sonar that are nearer than this part of their distance are those of one chain of planes."""
+"""Largest distance between the images of the sonar in one chain of planes, as a fraction of the range."""
 
 MOST_STRETCH = 16.0
-"""Largest part by which range or slant at the last mirror may exceed those of the line straight to it."""
+"""Largest factor by which range or slant at the last mirror may exceed those of the direct line to it."""
 
 
 @dataclass
 class LastMirror:
-    """The last mirror of rays.
+    """Last mirror of each ray.
 
     Attributes:
-        way: from the sonar to the point there, in double precision [m].
-        distance: its length [m]; ``length``: from the image of the sonar [m]; both in double precision.
-        u: its direction.
-        reflection: amplitude that all mirrors leave.
-        share: of Kirchhoff's integral, by what leaves the mirror.
-        heard: whether it sends anything back.
+        way: vector from the sonar to the point on the mirror, in double precision [m].
+        distance: length of that vector, in double precision [m].
+        length: distance of the point from the image of the sonar, in double precision [m].
+        u: unit direction from the sonar to the point.
+        reflection: factor of all mirrors on the amplitude.
+        share: weight of Kirchhoff's integral, given the direction in which the ray leaves the mirror.
+        heard: whether the mirror sends anything back.
     """
 
     way: DeviceArray
@@ -661,12 +675,26 @@ class LastMirror:
 
 
 class CornerTracer(MirrorTracer):
-    """Sum the echoes of two and more mirrors one after the other; arguments as of :class:`MirrorTracer`."""
+    """Tracer that sums the echoes of two or more mirrors in sequence; arguments as for :class:`MirrorTracer`.
+
+    A ray goes from mirror to mirror. Kirchhoff's integral over the last one gives the echo of the ray's cell there, which is
+    treated as a plane around the point P::
+
+        s = sum j k / 2 pi V1 V2 .. (cos + cos') / 2 dA sinc(g_u / 2) sinc(g_t / 2) exp(-j k (L + R)) / (L R)
+
+    L is the distance of P from the image of the sonar, R that from the sonar itself, cos and cos' those of both lines, dA
+    the area of the cell on the last mirror, dX its steps by one column (u) and row (t), g = k (d + (P - O) / R) . dX.
+    This is "shooting and bouncing rays" (Ling, Chou, Lee 1989). The ray determines how the path leaves the sonar; the line
+    to P determines how it arrives. The reverse path belongs to another ray.
+
+    As for one mirror, a first launch finds the cells to divide: cells whose neighbours meet other mirrors are divided most.
+    The integral fades if a ray leaves the last mirror farther than 60 deg from the line to the sonar, and ends at 90 deg.
+    """
 
     def _chains(
         self, scene: mi.Scene, tables: Any, rays: FanRays, table: mi.Float
     ) -> Iterator[tuple[MirroredRays, LastMirror]]:
-        """Yield rays at their second mirror, at their third, and what these send back."""
+        """Yield rays at their second mirror, then at their third, each with what that mirror sends back."""
         surfaces = replace(self.surfaces, **tables)
         now = MirroredRays(rays, surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d)), mi.Float(1), mi.UInt32(0))
         for _ in range(2, self.sonar.bounces + 1):
@@ -675,6 +703,7 @@ class CornerTracer(MirrorTracer):
 
     def _last(self, scene: mi.Scene, rays: FanRays, now: MirroredRays, table: mi.Float) -> LastMirror:
         """Return what the surface that rays meet sends back as a mirror."""
+        # 1. distances from the sonar and from its image, in float64 for the phase
         hit, d = now.hit, now.rays.d
         reflection, roughness_m = parts_at(table, hit)
         image, origin = (mi.Point3d(*(line[3] for line in one.lines)) for one in (now.rays, rays))
@@ -683,6 +712,7 @@ class CornerTracer(MirrorTracer):
         way = place - origin
         distance, length = dr.norm(way), dr.norm(place - image)
         u: DeviceArray = mi.Vector3f(way / distance)
+        # 2. what counts: a mirror that faces the sonar from the side that the ray meets, within the window, and visible
         share = facing_share(dr.dot(reflected(d, hit.n), -u))
         heard = hit.valid & (reflection != 0) & (share > 0) & (length < distance * MOST_STRETCH)
         heard &= dr.dot(hit.n, u) * dr.dot(hit.n, d) > 0
@@ -692,7 +722,7 @@ class CornerTracer(MirrorTracer):
         left = smooth_share(roughness_m, dr.dot(hit.n, d), self.wavenumber)
         return LastMirror(way, distance, length, u, now.gain * reflection * left, share, heard)
 
-    # ---------------------------------------------------------------- first launch
+    # ---------------- First launch: which cells to divide
 
     def _compile_survey(self) -> Callable[..., Any]:
         @Frozen
@@ -707,11 +737,12 @@ class CornerTracer(MirrorTracer):
         return survey
 
     def _parts_of(self, rays: FanRays, now: MirroredRays, last: LastMirror) -> DeviceArray:
-        """Return into how many parts each way cells are to be divided: 0 not at all heard, negative at edges."""
+        """Return the number of parts of cells in each direction: 0 if nothing is sent back, negative at edges."""
         heard, image, normal = last.heard, mi.Vector3f(now.rays.origin), mi.Vector3f(now.hit.n)
         place: DeviceArray = mi.Vector3f(image + now.rays.d * now.hit.t)
         dr.eval(heard, image, normal, place)
         near, mixed = heard, mi.Bool(False)
+        # 1. edges: a neighbour sends nothing back, or belongs to another chain of planes or another surface
         for beside in NEIGHBOURS:
             other = self._beside(rays, *beside)
             also = dr.gather(mi.Bool, heard, other)
@@ -720,6 +751,7 @@ class CornerTracer(MirrorTracer):
             alike = (apart <= ONE_PLANE * (1 + now.hit.t)) & (dr.abs(dr.dot(normal, chord)) <= LEVEL_PART * dr.norm(chord))
             mixed |= (also != heard) | (also & heard & ~alike)
             near |= also
+        # 2. parts for the width of the cell across the ray
         d = now.rays.d
         steps = [dr.norm(step - d * dr.dot(d, step)) for step in now.rays.steps_on(now.hit)]
         longest = dr.select(steps[0] > steps[1], steps[0], steps[1])
@@ -727,7 +759,7 @@ class CornerTracer(MirrorTracer):
         smooth = dr.select(heard, dr.select(needed > 1, needed, 1), 0)
         return dr.select(mixed & near, -float(self.finest), smooth)
 
-    # ---------------------------------------------------------------- second launch
+    # ---------------- Second launch: sum over the finer rays
 
     def _sum(
         self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]
@@ -737,7 +769,8 @@ class CornerTracer(MirrorTracer):
             self._add_last(rays, now, last, sums)
 
     def _add_last(self, rays: FinerRays, now: MirroredRays, last: LastMirror, sums: tuple[mi.UInt64, mi.UInt64]) -> None:
-        """Add what the last mirror sends back."""
+        """Add what the last mirror sends back to the grid."""
+        # 1. magnitude of the integral over the cell, see the class's docstring
         hit, d = now.hit, now.rays.d
         across, down = now.rays.steps_on(hit)
         steep, back = dr.abs(dr.dot(hit.n, d)), dr.abs(dr.dot(hit.n, last.u))
@@ -746,11 +779,13 @@ class CornerTracer(MirrorTracer):
         level *= dr.norm(dr.cross(across, down)) / (length * distance)
         turn: DeviceArray = (d + last.u) * (self.wavenumber / 2)
         level *= sinc(dr.dot(turn, across)) * sinc(dr.dot(turn, down))
+        # 2. pattern: the path leaves along the ray and arrives along the line to the last mirror
         sine, tangent, ahead = rays.direction(last.u)
         level *= elevation_gain_of_ends(self.sonar, tangent, rays.tangent)
         if self.sonar.beam_pattern == "two_way":
             level *= overlap(self.sonar, sine - rays.sine)
             sine = (sine + rays.sine) * 0.5
+        # 3. phase in cycles, in float64; the quarter is the factor j
         half = (last.length + last.distance) * 0.5
         turns = half * (2 / self.wavelength)
         sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + 0.25) * (2 * math.pi))

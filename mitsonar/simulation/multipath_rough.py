@@ -1,4 +1,8 @@
-"""Paths of several reflections in pings of the model ``physical``: which beams hear them, and exact sums of their levels."""
+"""Multipath via rough surfaces: how the energies of paths with several reflections are traced and summed.
+
+The model ``physical`` sums the levels of these paths exactly, in the beams that receive them. The model ``coherent`` adds
+them as speckle.
+"""
 
 from __future__ import annotations
 
@@ -38,23 +42,23 @@ __all__ = ["Arrival", "BounceSums", "DiffuseField", "Vertex", "Walk", "at_most_o
 
 
 MOST_OF_A_RAY = 64
-"""Levels of a ray's arrivals in one bin, at most, in levels of one reflection at the same ranges: C is at most 1."""
+"""Bound of the levels of a ray's arrivals in one bin, relative to one reflection at the same ranges with C = 1."""
 
 
 class BounceSums:
-    """Sum the levels of paths of several reflections.
+    """Sums of the levels of paths with several reflections.
 
     Args:
-        scene: to trace.
-        sonar: tells the patterns.
-        traced: its hard boxes; the sonar itself without a pattern.
+        scene: scene to trace.
+        sonar: sonar that gives the beam patterns.
+        traced: the sonar with hard boxes as beams; the sonar itself if it has no pattern.
         mirroring: mirror parts of shapes.
 
     Attributes:
-        tracer: of the whole view; its fraction bits are those of these sums, apart from those of one reflection.
+        tracer: tracer of the whole view; its fraction bits are those of these sums, separate from those of one reflection.
 
     Raises:
-        MitsonarError: rough mirrors and no carrier.
+        MitsonarError: mirrors are rough, but the sonar has no carrier.
     """
 
     def __init__(self, scene: mi.Scene, sonar: Sonar, traced: Sonar, mirroring: Mirroring) -> None:
@@ -77,7 +81,7 @@ class BounceSums:
             dr.eval(self.tables_of_mirrors)
 
     def scattered(self, echoes: Echoes, mirrors: LaunchTables | None) -> tuple[Echoes, DeviceArray]:
-        """Return echoes without the mirrors' part, and the amplitude that mirrors leave; 0: no mirror."""
+        """Return echoes without the mirror part, and the amplitude factor of mirrors; 0 if there is no mirror."""
         if mirrors is None:
             return echoes, mi.Float(0)
         known = (echoes.hit > 0) & (echoes.shape_id >= 0)
@@ -102,15 +106,16 @@ class BounceSums:
         """Return the sums of a launch ``(pings, beams, stride)``, flat, as :func:`mitsonar.simulation.binning.accumulate`.
 
         Args:
-            scene: to trace.
-            surfaces: its tables.
-            rays: of the launch.
+            scene: scene to trace.
+            surfaces: surface tables of the scene.
+            rays: rays of the launch.
             lines: three rows of ``to_world`` for each ray.
             seen: fan in world axes, echoes of one reflection and amplitudes of :meth:`scattered`, without a pattern.
-            keys: of the draws, one for each ray.
+            keys: keys of the random numbers, one for each ray.
             mirrors: tables of :attr:`tables_of_mirrors`.
             pings: number of pings in the launch.
         """
+        # 1. the first surface of each ray, as traced for one reflection
         fan, echoes, reflection = seen
         mirror = reflection != 0
         begin = Vertex(
@@ -127,6 +132,7 @@ class BounceSums:
             pure=mi.Bool(True),
             first=mirror,
         )
+        # 2. follow the paths, and add each arrival in the beams that receive it
         origin = mi.Point3f(*(line.w for line in lines))
         table, width = None if mirrors is None else mirrors["parts"], (echoes.far_m - echoes.near_m) * 0.25
         moment: DeviceArray = mi.Float(rays.moment) if isinstance(surfaces, MovingSurfaces) else None
@@ -140,22 +146,26 @@ class BounceSums:
         return sums
 
     def _heard(self, arrival: Arrival, echoes: Echoes, fan: Fan, lines: list[mi.Vector4f], rays: Rays) -> list[ViewEchoes]:
-        """Return the arrivals in the beams that hear them, a path and its reverse where both are to be added."""
+        """Return the arrivals in the beams that receive them: a path, and its reverse if that is to be added too."""
         sonar, traced = self.sonar, self.traced
         level = self._levels(arrival, echoes)
+        # 1. a path that leaves along its ray as well has one direction only
         if arrival.same:
             gain = dr.square(self._vertical(fan.elevation, fan.elevation))
             return [ViewEchoes(_scaled(level, gain), rays.beam, arrival.active, fan.elevation)]
+        # 2. angles of both ends; the other end must lie in the view, too
         bearing, elevation = self._angles(fan.d, lines)
         other, lift = self._angles(arrival.toward, lines)
         at, inside = beam_at(traced, other)
         high: DeviceArray = dr.abs(lift)
         active = arrival.active & inside & (high <= math.radians(traced.elevation_fov_deg) / 2)
         there, back = dr.square(self._vertical(elevation, lift)), dr.square(self._vertical(lift, elevation))
-        if sonar.beam_pattern == "two_way":  # heard in the beams between both ends, a path and its reverse in phase
+        # 3. two-way pattern: the beams between both ends receive the path and its reverse in phase
+        if sonar.beam_pattern == "two_way":
             part = dr.square(overlap(sonar, dr.sin(bearing) - dr.sin(other))) * dr.select(arrival.reverse, 4.0, 2.0)
             middle, known = beam_at(traced, (bearing + other) * 0.5)
             return [ViewEchoes(_scaled(level, there * part), middle, active & known, fan.elevation)]
+        # 4. otherwise each end receives one of them; they add coherently as far as the beams overlap
         if sonar.beam_pattern == "box":
             together = dr.select(at == rays.beam, 2.0, 1.0)
         else:
@@ -165,7 +175,7 @@ class BounceSums:
         return found
 
     def _levels(self, arrival: Arrival, echoes: Echoes) -> Echoes:
-        """Return arrivals as echoes of which :func:`mitsonar.acoustics.levels.level` makes their level."""
+        """Return arrivals as echoes from which :func:`mitsonar.acoustics.levels.level` computes their level."""
         radius, distance = (dr.select(v > self.nearest, v, self.nearest) for v in (arrival.range_m, arrival.distance))
         return replace(
             echoes,
@@ -179,61 +189,52 @@ class BounceSums:
         )
 
     def _vertical(self, arrival: DeviceArray, departure: DeviceArray) -> DeviceArray:
-        """Return the amplitude of the pattern over elevation; 1 without a pattern of the beams."""
+        """Return the amplitude of the pattern over elevation; 1 if the beams have no pattern."""
         if self.sonar.beam_pattern == "box":
             return mi.Float(1)
         return elevation_gain_of_ends(self.sonar, dr.tan(arrival), dr.tan(departure))
 
     def _angles(self, u: DeviceArray, lines: list[mi.Vector4f]) -> tuple[DeviceArray, DeviceArray]:
-        """Return bearing and elevation of directions in the world [rad]."""
+        """Return bearing and elevation of directions given in the world [rad]."""
         port, up, forward = (sum(line[axis] * u[row] for row, line in enumerate(lines)) for axis in range(3))
         return angles_of(self.traced, -port, forward, up)
 
 
 def _scaled(echoes: Echoes, gain: DeviceArray) -> Echoes:
-    """Return echoes of which a part is heard."""
+    """Return echoes with their reflectivity scaled."""
     return replace(echoes, reflectivity=echoes.reflectivity * gain)
 
 
 def bounce_sums(scene: mi.Scene, sonar: Sonar, traced: Sonar, mirroring: Mirroring) -> BounceSums | None:
-    """Return what sums paths of several reflections in the model ``physical``; None where there is one reflection."""
+    """Return the sums of paths with several reflections in the model ``physical``; None if there is one reflection."""
     if sonar.bounces == 1 or sonar.model != "physical":
         return None
     return BounceSums(scene, sonar, traced, mirroring)
 
 
-# ---------------- Paths of two and three reflections, one a ray: energies by way of mirrors and of rough surfaces
-# A ray that meets a mirror goes on as from a mirror; what it brings back is multiplied by V^2 exp(-4 k^2 h^2 cos^2).
-# One that meets another surface goes on in a direction drawn from Lambert's law, and is multiplied by pi C, so that its
-# mean is the integral over all directions. Each further surface P of reflectivity C that the sonar sees sends back
-#
-#     level = product  C_P cos_P / R_P^2  dOmega
-#
-# with the angle and the range of P from the sonar: the source lights P straight, and the ray's cell dOmega hears it.
-# The range is half of the path. A path and its reverse have one length. What begins at a mirror is not drawn from its
-# other end, so the caller adds the reverse. Rays to P by one mirror and back by the same or another one are further
-# kinds, of three.
+# ---------------- Paths of two and three reflections
 
 
 DRAWS = 0x6D756C74
-"""Keeps the draws of directions apart from those of the jitter."""
+"""Key that separates the random directions from the random jitter."""
 
 
 @dataclass
 class Vertex:
-    """Where a path meets a surface.
+    """Point where a path meets a surface.
 
     Attributes:
-        valid: whether it does.
-        place: the point [m].
+        valid: whether the path meets a surface.
+        place: position [m].
         n: unit normal.
-        d: direction of the ray that meets it; ``lift`` and ``side``: how it turns with the first ray's angles, where all
-            reflections so far were of mirrors.
-        reflectivity: of what is scattered.
-        reflection: amplitude that a mirror leaves; 0: it is none.
-        length: of the path so far [m].
-        gain: of the energy so far.
-        pure: whether all reflections so far were of mirrors; ``first``: whether the first was.
+        d: direction of the incident ray.
+        lift, side: derivatives of ``d`` by the first ray's elevation and bearing, if all reflections so far were specular.
+        reflectivity: reflectivity of the scattered part.
+        reflection: amplitude factor of the mirror; 0 if the surface is not a mirror.
+        length: length of the path so far [m].
+        gain: gain of the energy so far.
+        pure: whether all reflections so far were specular.
+        first: whether the first reflection was specular.
     """
 
     valid: DeviceArray
@@ -252,19 +253,19 @@ class Vertex:
 
 @dataclass
 class Arrival:
-    """A path that has come back along its ray.
+    """Path that has returned along its ray.
 
     Attributes:
-        active: whether it has.
-        reflectivity: of the last surface, times the energy's gain on the way.
-        cosine: to the normal there, of the line to the sonar.
-        distance: of the last surface from the sonar [m].
-        range_m: half of the path [m].
-        low_m, high_m: of the path by the cell's lower and upper edge.
+        active: whether the path exists.
+        reflectivity: reflectivity of the last surface, times the gain of the energy along the path.
+        cosine: cosine between the normal of the last surface and the line to the sonar.
+        distance: distance of the last surface from the sonar [m].
+        range_m: half the length of the path [m].
+        low_m, high_m: nearest and farthest half length of the paths via the cell's lower and upper edge [m].
         toward: unit direction from the sonar to the last surface.
-        reverse: whether the reverse is to be added.
-        pure: whether all reflections but that of the last surface were of mirrors.
-        same: whether it left along its ray as well.
+        reverse: whether the reverse path is to be added.
+        pure: whether all reflections except that of the last surface were specular.
+        same: whether the path also left along its ray.
     """
 
     active: DeviceArray
@@ -282,19 +283,30 @@ class Arrival:
 
 @dataclass
 class Walk:
-    """Follow paths from their first surface on.
+    """Tracer that follows paths of two and three reflections from their first surface, one per ray.
+
+    A ray that meets a mirror is reflected specularly, and its energy is multiplied by V^2 exp(-4 k^2 h^2 cos^2). A ray that
+    meets another surface continues in a direction drawn from Lambert's law, and its energy is multiplied by pi C, so that
+    the mean is the integral over all directions. Each further surface P of reflectivity C that the sonar sees sends back::
+
+        level = product  C_P cos_P / R_P^2  dOmega
+
+    with the angle and the range of P from the sonar: the source insonifies P directly, and the ray's cell dOmega receives
+    it. The range is half the length of the path. A path and its reverse have the same length. A path that begins at a mirror
+    is not drawn from its other end, so the caller adds the reverse. Further kinds, with three reflections, go to P via one
+    mirror and return via the same or another one.
 
     Attributes:
-        scene: to trace.
-        surfaces: its tables.
-        mirrors: table of :class:`~mitsonar.simulation.mirrors.Mirrors`; None: no mirrors.
+        scene: scene to trace.
+        surfaces: surface tables of the scene.
+        mirrors: table of :class:`~mitsonar.simulation.mirrors.Mirrors`; None without mirrors.
         bounces: largest number of reflections.
-        wavenumber: of the carrier [1/m].
-        origin: of the sonar [m].
-        below, above, aside: elevations of the edges and bearing of the middle of each ray's cell, relative to the ray [rad].
-        width: half-length of the path's range interval by way of rough surfaces [m].
-        moment: number of the moment of each ray in a scene that moves; None: a still scene.
-        second: planes for ways back by another mirror; None: there are no such ways.
+        wavenumber: wavenumber of the carrier [1/m].
+        origin: position of the sonar [m].
+        below, above, aside: elevations of the edges and bearing of the centre of each ray's cell, relative to the ray [rad].
+        width: half the width of the range interval of paths via rough surfaces [m].
+        moment: index of the moment of each ray in a moving scene; None for a still scene.
+        second: planes for return paths via another mirror; None if there are no such paths.
     """
 
     scene: mi.Scene
@@ -316,7 +328,7 @@ class Walk:
         Args:
             begin: the first surface of each ray.
             ray: number of each ray.
-            key: of the draws, 32 bits.
+            key: 32-bit key of the random numbers.
         """
         now = begin
         for number in range(2, self.bounces + 1):
@@ -328,21 +340,24 @@ class Walk:
 
     def _next(self, now: Vertex, ray: DeviceArray, key: DeviceArray) -> Vertex:
         """Follow paths to the next surface."""
+        # 1. new direction and gain: specular at mirrors, drawn from Lambert's law at rough surfaces
         mirror = now.reflection != 0
-        # a drawn direction turns with no angle of the first ray, so what is turned of a rough surface's counts for nothing
         d = dr.select(mirror, reflected(now.d, now.n), lambert_direction(now.n, now.d, ray, key))
         gain = now.gain * dr.select(mirror, dr.square(now.reflection), now.reflectivity * dr.pi)
+        # 2. trace on from just off the surface
         begin = going_on(now.place, d, now.n)
         active = now.valid & (gain > 0)
         onward = mi.Ray3f(now.place + d * begin, d)
         if self.moment is not None:
             onward.time = self.moment
         hit = self.surfaces.hit(self.scene, onward, active)
+        # 3. split the next surface into its mirror part and its scattered part
         reflection: DeviceArray = mi.Float(0)
         if self.mirrors is not None:
             part, roughness_m = parts_at(self.mirrors, hit)
             reflection = part * smooth_share(roughness_m, dr.dot(hit.n, d), self.wavenumber)
             hit = without_mirror_part(self.mirrors, hit, d, self.wavenumber)
+        # 4. lift and side are mirrored everywhere; after a rough surface they have no meaning, and ``pure`` is false
         along: DeviceArray = begin + hit.t
         return Vertex(
             valid=active & hit.valid,
@@ -360,13 +375,15 @@ class Walk:
         )
 
     def _straight(self, now: Vertex) -> Arrival:
-        """Return what arrives from a surface that the sonar lights straight."""
+        """Return what arrives from a surface that the sonar insonifies directly."""
+        # 1. visible from the sonar, on the side that the path meets
         way: DeviceArray = now.place - self.origin
         distance = dr.norm(way)
         u = way / distance
         toward = dr.dot(now.n, u)
         lit = now.valid & (now.reflectivity > 0) & (toward * dr.dot(now.n, now.d) > 0)
         lit &= ~hidden(self.scene, mi.Point3f(now.place), now.n, u, distance, lit, self.moment)
+        # 2. range interval: from the cell's edges after mirrors only, of constant width otherwise
         half = (now.length + distance) * 0.5
         low, high = self._edges(now, u, half)
         cosine = dr.abs(toward)
@@ -384,7 +401,7 @@ class Walk:
         )
 
     def _back_again(self, now: Vertex) -> Arrival:
-        """Return what leaves and arrives by the same mirror."""
+        """Return what leaves and arrives via the same mirror."""
         low, high = self._edges(now, now.d, now.length)
         cosine = dr.abs(dr.dot(now.n, now.d))
         return Arrival(
@@ -402,7 +419,7 @@ class Walk:
         )
 
     def _by_others(self, first: Vertex, now: Vertex) -> Iterator[Arrival]:
-        """Yield what left by one mirror and arrives by another. The reverse is that of the ray to the other mirror."""
+        """Yield what leaves via one mirror and arrives via another; the reverse belongs to the ray to the other mirror."""
         if self.second is None:
             return
         met = now.valid & now.pure & (now.reflectivity > 0)
@@ -426,7 +443,10 @@ class Walk:
             )
 
     def _edges(self, now: Vertex, u: DeviceArray, half: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
-        """Return half the path by way of a cell's lower and upper edge, on the tangent plane; ``u`` from the other end."""
+        """Return the sorted half lengths of paths via a cell's lower and upper edge, on the tangent plane.
+
+        ``u`` is the direction from the other end.
+        """
         lift = half_path_rate(now.length, now.d, now.lift, u, now.n)
         middle = half + half_path_rate(now.length, now.d, now.side, u, now.n) * self.aside
         low, high = middle + lift * self.below, middle + lift * self.above
@@ -434,29 +454,29 @@ class Walk:
 
 
 def at_most_one(reflectivity: DeviceArray) -> DeviceArray:
-    """Return Lambert's mu of further reflections, at most 1: laws of materials exceed it where a ray grazes."""
+    """Limit Lambert's mu of further reflections to 1, which scattering laws exceed at grazing incidence."""
     return dr.select(reflectivity < 1, reflectivity, 1)
 
 
-# ---------------- The field of paths by way of two and three rough surfaces, in the model ``coherent``
-# Their energies are sums over rays (:mod:`mitsonar.simulation.multipath_rough`) in coarse cells of sine and range, about as
-# large as beam and pulse resolve. Each node of the grid in a cell gets its part of the energy times a complex Gaussian
-# number, a hash of (seed, node). So the speckle is that of very many paths, and a sonar at rest sees it unchanged; its
-# grain does not move with the ground.
+# ---------------- Speckle in the model ``coherent``
 
 
 GRAIN = 0x64696666
-"""Keeps the grain of these paths apart from noise and volume."""
+"""Key that separates the speckle of these paths from noise and volume."""
 
 SMOOTHED = 3
-"""Coarse cells each way over which the energies of single rays are spread."""
+"""Number of coarse cells in each direction over which the energies of single rays are spread."""
 
 
 class DiffuseField:
-    """Sum the energies of paths by way of rough surfaces, and give them speckle.
+    """Field of paths via two and three rough surfaces, with speckle, in the model ``coherent``.
+
+    The energies are sums over rays in coarse cells of sine and range, about as large as beam and pulse resolve. Each node of
+    the grid in a cell gets its part of the energy times a complex Gaussian number, a hash of (seed, node). The speckle is
+    therefore that of very many paths, and a sonar at rest sees it unchanged; its grain does not move with the ground.
 
     Args:
-        tracer: of one reflection.
+        tracer: tracer of one reflection.
     """
 
     def __init__(self, tracer: CoherentTracer) -> None:
@@ -484,7 +504,7 @@ class DiffuseField:
         field += made[: field.shape[0], : field.shape[1]]
 
     def energy(self, pose: NDArray[np.float64], time_s: float = 0.0) -> NDArray[np.float64]:
-        """Return the energies of one ping in coarse cells ``self.shape``, relative to the source's at 1 m."""
+        """Return the energies of one ping in coarse cells ``self.shape``, relative to that of the source at 1 m."""
         direct = self.direct
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
         scene = scene_at(direct.scene, direct.motion, time_s)
@@ -493,7 +513,7 @@ class DiffuseField:
 
     @cached_property
     def _grain(self) -> NDArray[np.complex64]:
-        """Return complex Gaussian numbers of mean power 1 on all nodes of the coarse cells."""
+        """Return complex Gaussian numbers with mean power 1 on all nodes of the coarse cells."""
         shape = 1, self.shape[0] * SINES_A_LOBE, self.shape[1] * RANGES_A_PULSE
         first, second = uniform(shape, seed=self.sonar.seed ^ GRAIN, frames=np.array([0]), like=np.empty(0))
         return np.asarray(np.sqrt(-np.log(first[0])) * np.exp(2j * math.pi * second[0]), dtype=np.complex64)
@@ -501,14 +521,17 @@ class DiffuseField:
     def _compile(self) -> Callable[..., Any]:
         @Frozen
         def launch(index: Any, scene: Any, rows: Any, tables: Any, mirrors: Any) -> Any:
+            # 1. the rays of the fan and their first surfaces
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
             rays = FanRays(self.direct.fan, self.sonar, index, lines)
             surfaces = replace(self.direct.surfaces, **tables)
             hit = surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d))
             begin = self._begin(rays, hit, mirrors)
+            # 2. follow the paths; coarse cells need no range intervals
             none = mi.Float(0)
             origin: DeviceArray = rays.origin
             walk = Walk(scene, surfaces, mirrors, self.sonar.bounces, self.wavenumber, origin, none, none, none, none)
+            # 3. energy of each arrival, from the solid angle of its ray's cell
             cell = dr.norm(dr.cross(rays.by_sine, rays.by_tangent)) * (rays.sine_step * rays.tangent_step)
             sums = dr.zeros(mi.UInt64, self.shape[0] * self.shape[1])
             for arrival in walk.arrivals(begin, index, mi.UInt32(self.sonar.seed * 7919 & 0xFFFFFFFF)):
@@ -542,14 +565,15 @@ class DiffuseField:
         )
 
     def _deposit(self, rays: FanRays, arrival: Arrival, cell: DeviceArray, sums: mi.UInt64) -> None:
-        """Add the energies of arrivals to the coarse cells of the beams that hear them."""
+        """Add the energies of arrivals to the coarse cells of the beams that receive them."""
         other, tangent, ahead = rays.direction(arrival.toward)
         sine, own = rays.sine, rays.tangent
         distance = dr.select(arrival.distance > self.nearest, arrival.distance, self.nearest)
         level = arrival.reflectivity * arrival.cosine * cell / dr.square(distance)
         there = dr.square(elevation_gain_of_ends(self.sonar, own, tangent))
+        # paths via mirrors alone are left out: their fields have a phase, and GhostTracer sums them
         active, both = arrival.active & ~arrival.pure & ahead, overlap(self.sonar, sine - other)
-        if self.sonar.beam_pattern == "two_way":  # heard in the beams between both ends, a path and its reverse in phase
+        if self.sonar.beam_pattern == "two_way":  # the beams between both ends receive path and reverse in phase
             level = level * there * dr.square(both) * dr.select(arrival.reverse, 4.0, 2.0)
             self._add(sums, (sine + other) * 0.5, arrival.range_m, level, active)
             return

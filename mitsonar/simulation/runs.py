@@ -1,4 +1,8 @@
-"""Runs on disk: frames, pictures and echoes are written as they are made; a run that is killed goes on to the same bits."""
+"""Runs on disk: how results are written as they are computed, and how an interrupted run is resumed.
+
+Imaging sonars, channel sonars, cameras, sounders and whole vehicles each have a kind of run. A run that was killed can be
+resumed, and ends with the same bits as an uninterrupted one.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +77,7 @@ __all__ = [
 
 
 SIMULATORS = ("mitsonar", "mitsuba", "drjit", "numpy")
-"""Packages that decide what is simulated, to the last bit."""
+"""Packages whose versions determine the simulation, to the last bit."""
 
 RENDERING = RunKind(
     "rendering",
@@ -88,7 +92,7 @@ RENDERING = RunKind(
 
 
 class Source(Protocol):
-    """Where levels come from: a simulator that traces, or echoes that were stored."""
+    """A source of levels: a simulator that traces, or stored echoes."""
 
     sonar: Sonar
     notes: list[str]
@@ -97,36 +101,36 @@ class Source(Protocol):
     def pings(
         self, poses: ArrayLike, *, first: int = 0, labels: bool = False, time_s: ArrayLike | None = None
     ) -> Iterator[RenderedPings]:
-        """Levels of consecutive pings, in batches."""
+        """Yield the levels of consecutive pings, in batches."""
 
     def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
-        """One ping's echoes in the order of the film."""
+        """Return the echoes of one ping in the order of the film."""
 
     def bodies(self, time_s: ArrayLike) -> BodyStates:
-        """Return the names of the bodies that move, their poses and velocities at times."""
+        """Return the names of the moving bodies, with their poses and velocities at the given times."""
 
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
-        """Nearest and farthest return outside the window [m]."""
+        """Return the ranges of the nearest and the farthest return outside the window [m]."""
 
     def buried(self, pose: ArrayLike) -> str:
-        """Describe where a pose lies below the ground or inside an object; empty where it does not."""
+        """Describe how a pose lies below the ground or inside an object; empty if it does not."""
 
     def label_names(self, labels: bool = True) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the names that labels refer to, of shapes and of objects; none without labels."""
+        """Return the names of shapes and of objects that labels refer to; both empty without labels."""
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a run writes beside its frames.
+    """Noise and output options of a run.
 
     Attributes:
-        noise: that is added.
-        labels: per-pixel truth.
-        cartesian: a figure with axes for each frame.
-        exr: the echoes of each ray.
-        frame: the convention of ``poses.tum``.
-        fan: a plain fan picture for each frame, and of its labels.
-        label_floor: part of full scale above which a pixel is labelled.
+        noise: noise model to apply to the frames.
+        labels: write per-pixel ground truth.
+        cartesian: write a figure with axes for each frame.
+        exr: write the echoes of each ray.
+        frame: coordinate convention of ``poses.tum``.
+        fan: write a plain fan picture of each frame and of its labels.
+        label_floor: fraction of full scale above which a pixel is labelled.
     """
 
     noise: NoiseModel
@@ -140,7 +144,7 @@ class Outputs:
 
 @dataclass(frozen=True)
 class RenderReport:
-    """What a run did."""
+    """Folder, number of frames, pictures and warnings of a run."""
 
     folder: Path
     frames: int
@@ -159,21 +163,24 @@ def run(
     resume: bool = False,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> RenderReport:
-    """Make a run's folder, or go on with one.
+    """Render a trajectory into a run folder, or resume an interrupted run.
 
     Args:
-        source: where levels come from.
+        source: source of the levels.
         trajectory: poses and times.
-        folder: is made; holds ``frames.npz`` (or ``frames.zarr``), ``images/``, ``poses.tum``, ``run.json`` and what
-            ``outputs`` asks for.
-        outputs: what is written.
-        origin: what repeats the run beside sonar, poses and outputs: scene, its digest, parameters.
-        overwrite: replace a run that is there.
-        resume: go on with a run that was broken off.
+        folder: folder to create; holds ``frames.npz`` (or ``frames.zarr``), ``images/``, ``poses.tum``, ``run.json`` and the
+            files that ``outputs`` selects.
+        outputs: noise and output options.
+        origin: what else is needed to reproduce the run, besides sonar, poses and outputs: scene, its digest, parameters.
+        overwrite: replace an existing run.
+        resume: continue an interrupted run.
         progress: called with the number of frames that were added.
 
+    Returns:
+        The report of the run.
+
     Raises:
-        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
+        MitsonarError: the folder exists; the run to resume has other inputs; the folder cannot be written.
     """
     timed = timed_path(source.sonar, trajectory)
     if outputs.exr and timed.time_s.ndim > 1:
@@ -202,7 +209,7 @@ def run(
 
 
 def _asked(source: Source, trajectory: Trajectory, outputs: Outputs, origin: dict[str, Any]) -> dict[str, Any]:
-    """All that decides the bits of a run."""
+    """Return everything that determines the bits of a run."""
     return {
         **origin,
         "variant": source.variant,
@@ -220,7 +227,7 @@ def _asked(source: Source, trajectory: Trajectory, outputs: Outputs, origin: dic
 
 
 def _save_bodies(source: Source, trajectory: Trajectory, folder: Path, frame: str) -> None:
-    """Write the path of each body that moves, a file each, at the times of the frames."""
+    """Write the trajectory of each moving body at the times of the frames, one file per body."""
     names, poses, _ = source.bodies(trajectory.time_s)
     for number, name in enumerate(names):
         assert poses is not None
@@ -231,7 +238,8 @@ def _save_bodies(source: Source, trajectory: Trajectory, folder: Path, frame: st
 def _make_frames(
     source: Source, timed: TimedPath, made: RunDirectory, outputs: Outputs, progress: Callable[[int], None]
 ) -> FrameStore:
-    """Write the frames that are missing; the run's notes follow each batch."""
+    """Render and write the missing frames; update the run's notes after each batch."""
+    # 1. read the progress of an earlier call, and check that the stored frames agree with it
     trajectory = timed.frames
     folder, earlier, store = made.path, progress_of(made, source.sonar, len(trajectory)), None
     done, tally, gain = earlier.frames, earlier.tally, earlier.gain
@@ -240,6 +248,7 @@ def _make_frames(
         store.check(len(trajectory), source.sonar, done)
     if store is not None and done == len(trajectory):
         return store
+    # 2. levels of the missing frames; the first frames of a run fix the gain of all frames
     batches = source.pings(timed.poses[done:], first=done, labels=outputs.labels, time_s=timed.time_s[done:])
     names = source.label_names(outputs.labels)
     if outputs.labels:
@@ -247,6 +256,7 @@ def _make_frames(
     if done == 0:
         gain, batches = constant_gain(batches)
         made.notes["gain"] = gain
+    # 3. write each batch, and note the progress only after all its files are complete
     for pings in batches:
         frames, image = _frames_of(pings, source, timed, outputs, gain, names)
         store = store or FrameStore.create(folder / "frames.zarr", len(trajectory), frames)
@@ -263,7 +273,7 @@ def _make_frames(
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is: frames that are written, the gain of all frames (1 before the first), and what they add up to."""
+    """Progress of a run: number of frames written, gain of all frames (1 before the first), and their tally."""
 
     frames: int
     gain: float
@@ -271,7 +281,7 @@ class Progress:
 
 
 def progress_of(made: RunDirectory, sonar: Sonar, frames: int) -> Progress:
-    """How far a run of ``frames`` frames is, from its file.
+    """Read the progress of a run of ``frames`` frames from its file.
 
     Raises:
         MitsonarError: the file is damaged.
@@ -292,11 +302,12 @@ def progress_of(made: RunDirectory, sonar: Sonar, frames: int) -> Progress:
 
 
 class StoredEchoes:
-    """The echoes of a run that was rendered with ``--exr``, as a source: bins again, without tracing.
+    """Source that bins the stored echoes of a run again, without tracing; the run was rendered with ``--exr``.
 
     Args:
         folder: the run.
-        sonar: other bins or window than the run's; default: the run's own.
+        bins: number of range bins; default: that of the run.
+        window: nearest and farthest range [m]; default: those of the run.
 
     Raises:
         MitsonarError: no run, or one without echoes.
@@ -316,15 +327,15 @@ class StoredEchoes:
         self.traced = frames.sonar
         change: dict[str, Any] = {} if bins is None else {"range_bins": bins}
         change |= {} if window is None else {"range_min": window[0], "range_max": window[1]}
-        if frames.sonar.model == "coherent":  # echoes have no phase: what can be binned are expected levels in hard boxes
+        if frames.sonar.model == "coherent":  # echoes have no phase: only expected levels in hard boxes can be binned
             change |= {"model": "physical", "pattern": "box"}
-        self.sonar = frames.sonar.replace(**change, bounces=1)  # echoes are of one reflection
+        self.sonar = frames.sonar.replace(**change, bounces=1)  # stored echoes have one reflection
         self.notes: list[str] = []
 
     def pings(
         self, poses: ArrayLike, *, first: int = 0, labels: bool = False, time_s: ArrayLike | None = None
     ) -> Iterator[RenderedPings]:
-        """Levels of the stored frames, one at a time; ``poses`` only tells how many."""
+        """Yield the levels of the stored frames, one at a time; only the number of ``poses`` is used."""
         import drjit as dr
         import mitsuba as mi
 
@@ -344,23 +355,23 @@ class StoredEchoes:
             yield RenderedPings(number, levels, counts, self.height_m[number : number + 1])
 
     def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
-        """Read the echoes of one frame's EXR."""
+        """Read the echoes of one frame from its EXR file."""
         return load_exr(self.folder / "echoes" / f"{ping:06d}.exr", self.traced)
 
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
-        """Nearest and farthest return outside the window [m]."""
+        """Return the ranges of the nearest and the farthest return outside the window [m]."""
         return self.film_echoes(pose, ping).outside(self.sonar)
 
     def buried(self, pose: ArrayLike) -> str:
-        """Return nothing: where the ground is, the run that stored the echoes knows."""
+        """Return an empty string: stored echoes do not include the position of the ground."""
         return ""
 
     def bodies(self, time_s: ArrayLike) -> BodyStates:
-        """Return none: where bodies were is in the run that stored the echoes."""
+        """Return no bodies: the run that stored the echoes has their poses."""
         return BodyStates()
 
     def label_names(self, labels: bool = True) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return none: stored echoes have no labels."""
+        """Return no names: stored echoes have no labels."""
         return (), ()
 
 
@@ -372,7 +383,7 @@ def _frames_of(
     gain: float,
     names: tuple[tuple[str, ...], tuple[str, ...]],
 ) -> tuple[SonarFrames, NDArray[np.float32]]:
-    """Return a batch as frames, and its images before noise."""
+    """Convert a batch to frames; return them, and the images before noise."""
     sonar = source.sonar
     image = to_image(pings.levels, gain, sonar)
     numbers = np.arange(pings.first, pings.first + len(pings))
@@ -424,7 +435,7 @@ def _write_echoes(folder: Path, source: Source, frames: SonarFrames, first: int)
         part.replace(path)
 
 
-# ---------------- Runs of impulse responses on disk. A run that was killed can be resumed and ends with the same bits
+# ---------------- Runs of impulse responses
 
 
 SOUNDING = RunKind(
@@ -436,22 +447,22 @@ SOUNDING = RunKind(
 )
 
 OVERSPREAD = 0.3
-"""Delay spread times Doppler spread of a receiver above which a channel is reported as overspread."""
+"""Product of a receiver's delay spread and Doppler spread above which a channel is reported as overspread."""
 
 MOST_ENERGY = (0.01, 0.99)
-"""Quantiles of the echoes' energy between which the spread of delays and Doppler shifts is measured."""
+"""Quantiles of the echo energy between which the spread of delays and Doppler shifts is measured."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Delay spread [s] and Doppler spread [Hz] of a receiver's echoes: 98 % of their energy lies within each."""
+    """Delay spread [s] and Doppler spread [Hz] of a receiver's echoes; each contains 98 % of their energy."""
 
     delay_s: float
     doppler_hz: float
 
     @property
     def factor(self) -> float:
-        """Return delay spread times Doppler spread; above 1 a channel changes within one response."""
+        """Return the product of delay spread and Doppler spread; above 1 a channel changes within one response."""
         return self.delay_s * self.doppler_hz
 
 
@@ -476,20 +487,25 @@ def run_impulse(
     resume: bool = False,
     progress: Callable[[int], None] = lambda pings: None,
 ) -> ImpulseReport:
-    """Make a run's folder, or resume one: ``responses.zarr`` and ``.npz``, two figures, ``run.json``.
+    """Simulate impulse responses into a run folder, or resume an interrupted run.
+
+    The folder holds ``responses.zarr`` and ``responses.npz``, two figures and ``run.json``.
 
     Args:
         simulator: scene and instrument.
         flown: poses and times of the pings.
-        velocity: of the vehicle in each, see :class:`~mitsonar.records.responses.ImpulseResponses`.
-        folder: of the run.
-        origin: what reproduces the run, beside instrument and trajectory.
-        overwrite: replace a run that is there.
-        resume: continue a run that was interrupted.
+        velocity: velocity of the vehicle in each ping, see :class:`~mitsonar.records.responses.ImpulseResponses`.
+        folder: folder of the run.
+        origin: what else is needed to reproduce the run, besides instrument and trajectory.
+        overwrite: replace an existing run.
+        resume: continue an interrupted run.
         progress: called with the number of new pings.
 
+    Returns:
+        The report of the run.
+
     Raises:
-        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
+        MitsonarError: the folder exists; the run to resume has other inputs; the folder cannot be written.
     """
     sonar = simulator.sonar
     asked = {**origin, "sonar": sonar.model_dump(mode="json"), "pings": len(flown)}
@@ -501,7 +517,7 @@ def run_impulse(
         _refuse_silence(simulator, flown, paths)
     run = RunDirectory.begin(folder, SOUNDING, asked, resume=resume, overwrite=overwrite)
     run.start(frames_done=0)
-    if not (run.path / "responses.npz").exists():  # the last that is written
+    if not (run.path / "responses.npz").exists():  # the file that is written last
         progress(run.count("frames_done", len(flown)))
         made = _make(simulator, flown, velocity, run, progress)
         run.note(warnings=[*simulator.notes, *warnings_of(made, spread)])
@@ -556,7 +572,7 @@ def _make(
 
 
 def _check(group: zarr.Group, pings: int, sonar: ChannelSonar) -> None:
-    """Check that a store is that of the run, before anything is written into it.
+    """Check that a store belongs to the run, before anything is written into it.
 
     Raises:
         MitsonarError: an array is missing or has another shape or type.
@@ -572,10 +588,10 @@ def _check(group: zarr.Group, pings: int, sonar: ChannelSonar) -> None:
 
 
 def _refuse_silence(simulator: ChannelSimulator, flown: Trajectory, paths: list[Paths]) -> None:
-    """Refuse a run without echoes in the first, the middle and the last ping; the first is known to have none.
+    """Refuse a run without echoes in the first, the middle and the last ping; the caller has checked the first.
 
     Raises:
-        MitsonarError: there are none in the other two either.
+        MitsonarError: the middle and the last ping have no echo either.
     """
     sonar = simulator.sonar
     for pose in flown.poses[[len(flown) // 2, -1]]:
@@ -597,9 +613,10 @@ FAR_ARM_M = 10.0
 
 
 def spread_of(paths: list[Paths]) -> Spread:
-    """Measure the spread of the echoes of 98 % of each receiver's energy, and return the spread of the largest factor.
+    """Measure the spread of 98 % of each receiver's echo energy, and return the spread with the largest factor.
 
-    Each receiver has a channel of its own: shifts of receivers that look different ways do not blur one response.
+    Each receiver is a separate channel: Doppler shifts of receivers that look in different directions do not blur one
+    response.
     """
     return max((_own_spread(path) for path in paths), key=lambda spread: spread.factor)
 
@@ -609,6 +626,7 @@ def _own_spread(path: Paths) -> Spread:
     energy = np.abs(path.amplitude) ** 2
     widths = []
     for values in (path.delay_s, path.doppler_hz):
+        # the cumulative energy along the sorted values gives the quantiles of MOST_ENERGY
         order = np.argsort(values)
         share = np.cumsum(energy[order])
         if not share.size or share[-1] == 0:
@@ -654,12 +672,12 @@ def warnings_of(made: ImpulseResponses, spread: Spread) -> list[str]:
 
 
 def iteration_error(flown: Trajectory, velocity: NDArray[np.float64], sonar: ChannelSonar) -> tuple[float, float]:
-    """Bound the error of a moving receiver's delay by Almanza-Medina's iteration (eq. 5.5-5.14).
+    """Bound the error of a moving receiver's delay in Almanza-Medina's iteration (eq. 5.5-5.14).
 
-    The points lie ahead and behind at ``range_max``.
+    The bound is evaluated for points ahead and behind at ``range_max``.
 
     Returns:
-        Largest errors without iteration and after two rounds [turns of the carrier]; 0, 0 where they are not finite.
+        Largest errors without iteration and after two rounds [cycles of the carrier]; 0, 0 where they are not finite.
     """
     speed = float(np.linalg.norm(velocity[:, :3], axis=1).max(initial=0.0))
     ahead = (np.array([sonar.range_max, -sonar.range_max]), np.zeros(2), np.zeros(2))
@@ -672,7 +690,7 @@ def iteration_error(flown: Trajectory, velocity: NDArray[np.float64], sonar: Cha
     return (errors[0], errors[1]) if math.isfinite(sum(errors)) else (0.0, 0.0)
 
 
-# ---------------- Pictures of a camera on disk: PNG files as they are made; a run that is killed goes on
+# ---------------- Runs of cameras
 
 
 PHOTOGRAPHS = RunKind(
@@ -695,20 +713,22 @@ def run_camera(
     resume: bool = False,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> None:
-    """Make a folder of pictures, or go on with one: ``images/000000.png`` ..., ``poses.tum``, ``run.json``.
+    """Render a camera's pictures into a run folder, or resume an interrupted run.
+
+    The folder holds ``images/000000.png`` ..., ``poses.tum`` and ``run.json``.
 
     Args:
         simulator: scene and camera.
         flown: poses and times of the camera.
-        folder: of the run.
-        origin: what repeats the run beside the path.
-        frame: the convention of ``poses.tum``.
-        overwrite: replace a run that is there.
-        resume: go on with a run that was broken off.
+        folder: folder of the run.
+        origin: what else is needed to reproduce the run, besides the trajectory.
+        frame: coordinate convention of ``poses.tum``.
+        overwrite: replace an existing run.
+        resume: continue an interrupted run.
         progress: called with the number of new pictures.
 
     Raises:
-        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
+        MitsonarError: the folder exists; the run to resume has other inputs; the folder cannot be written.
     """
     asked = {**origin, "variant": current_variant(), "camera": told_of(simulator.camera), "frames": len(flown)}
     asked |= {"samples": simulator.samples, "frame": frame}
@@ -731,17 +751,16 @@ def run_camera(
 
 
 def _picture(folder: Path, number: int) -> Path:
-    """Return the file of a picture."""
+    """Return the path of a picture."""
     return folder / "images" / f"{number:06d}.png"
 
 
 def _whole(folder: Path, done: int) -> int:
-    """Return how many of the first pictures are there: one that was deleted is made again, and those after it."""
+    """Return how many pictures exist up to the first missing one; that one and all after it are rendered again."""
     return next((number for number in range(done) if not _picture(folder, number).is_file()), done)
 
 
-# ---------------- Runs of sounders on disk: parts as they are rendered, then the files of each kind; a run that is
-# killed goes on
+# ---------------- Runs of sounders
 
 
 SOUNDINGS = RunKind(
@@ -756,21 +775,21 @@ SOUNDINGS = RunKind(
 )
 
 WITH_LEVELS = ("sidescan", "altimeter")
-"""Kinds that keep all levels, and not detections alone."""
+"""Kinds of sounders that store all levels, not only detections."""
 
 DETECTED = ("range_m", "level_db", "quality")
 
 
 @dataclass(frozen=True)
 class SoundingReport:
-    """What a run did.
+    """Files, number of detections and warnings of a run.
 
     Attributes:
-        folder: of the run.
-        files: that were written, by name.
-        found: beams with an echo, of ``beams``.
-        beams: of all pings.
-        warnings: sentences on what a user should know.
+        folder: folder of the run.
+        files: names of the files that were written.
+        found: number of beams with an echo, out of ``beams``.
+        beams: number of beams in all pings.
+        warnings: warnings to the user, one sentence each.
     """
 
     folder: Path
@@ -791,20 +810,25 @@ def run_sounder(
     resume: bool = False,
     progress: Callable[[int], None] = lambda pings: None,
 ) -> SoundingReport:
-    """Make a run's folder, or go on with one.
+    """Render a sounder's pings into a run folder, or resume an interrupted run.
+
+    Batches are stored as parts while they are rendered; the files of the kind of instrument follow at the end.
 
     Args:
         simulator: scene and instrument.
         flown: poses of the vehicle and times of the pings.
-        folder: is made; holds ``run.json``, ``poses.tum`` and the files of the kind of instrument.
-        origin: what repeats the run beside instrument and path.
-        frame: the convention of ``poses.tum``.
-        overwrite: replace a run that is there.
-        resume: go on with a run that was broken off.
+        folder: folder to create; holds ``run.json``, ``poses.tum`` and the files of the kind of instrument.
+        origin: what else is needed to reproduce the run, besides instrument and trajectory.
+        frame: coordinate convention of ``poses.tum``.
+        overwrite: replace an existing run.
+        resume: continue an interrupted run.
         progress: called with the number of new pings.
 
+    Returns:
+        The report of the run.
+
     Raises:
-        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
+        MitsonarError: the folder exists; the run to resume has other inputs; the folder cannot be written.
     """
     sounder = simulator.sounder
     asked = {**origin, "variant": simulator.variant, "sounder": sounder.model_dump(mode="json"), "pings": len(flown)}
@@ -824,7 +848,7 @@ def run_sounder(
 
 
 def _render(simulator: SounderSimulator, flown: Trajectory, run: RunDirectory, progress: Callable[[int], None]) -> None:
-    """Render the pings that are missing, a part a batch."""
+    """Render the missing pings, one part per batch."""
     folder, done = run.path / "parts", run.count("pings_done", len(flown))
     folder.mkdir(exist_ok=True)
     if done == len(flown):
@@ -840,7 +864,7 @@ def _render(simulator: SounderSimulator, flown: Trajectory, run: RunDirectory, p
 
 
 def _kept(simulator: SounderSimulator, batch: SoundedPings) -> dict[str, NDArray[Any]]:
-    """Return what is kept of a batch."""
+    """Return the arrays of a batch to store: detections, and for some kinds the levels."""
     detected = simulator.detect(batch.levels)
     kept: dict[str, NDArray[Any]] = dict(zip(DETECTED, detected, strict=True))
     if simulator.sounder.kind in WITH_LEVELS:
@@ -849,7 +873,7 @@ def _kept(simulator: SounderSimulator, batch: SoundedPings) -> dict[str, NDArray
 
 
 def _joined(folder: Path, pings: int) -> dict[str, NDArray[Any]]:
-    """Return the arrays of all parts.
+    """Read all parts and return their concatenated arrays.
 
     Raises:
         MitsonarError: a part is missing or damaged.
@@ -865,7 +889,7 @@ def _joined(folder: Path, pings: int) -> dict[str, NDArray[Any]]:
 
 
 def _write(folder: Path, soundings: Soundings, parts: Mapping[str, NDArray[Any]]) -> list[str]:
-    """Write the files of the kind of instrument; return what a user should know."""
+    """Write the files of the kind of instrument; return warnings."""
     kind, notes = soundings.sounder.kind, []
     if kind in WITH_LEVELS:
         levels, height_m = parts["levels"], parts["height_m"]
@@ -883,7 +907,7 @@ def _write(folder: Path, soundings: Soundings, parts: Mapping[str, NDArray[Any]]
 
 
 def _draw(folder: Path, echogram: Echogram, soundings: Soundings) -> None:
-    """Write the pictures of an echogram, and a side-scan's XTF file."""
+    """Write the picture of an echogram, and for a side-scan sonar the XTF file."""
     if echogram.sounder.kind == "sidescan":
         write_xtf(folder / "sidescan.xtf", echogram)
         figures.save_sounding_figure(figures.waterfall_figure_of(echogram), folder / "waterfall.png")
@@ -892,7 +916,7 @@ def _draw(folder: Path, echogram: Echogram, soundings: Soundings) -> None:
 
 
 def _write_dvl(folder: Path, soundings: Soundings) -> list[str]:
-    """Write the readings of a DVL, and the file that odometry takes."""
+    """Write the readings of a DVL, and the sensor file that odometry reads; return warnings."""
     readings = dvl_readings(soundings, soundings.sounder.fan.seed)
     readings.save(folder / "dvl.csv")
     figures.save_sounding_figure(figures.dvl_figure(readings), folder / "dvl.png")
@@ -904,7 +928,7 @@ def _write_dvl(folder: Path, soundings: Soundings) -> list[str]:
 
 
 def _write_points(folder: Path, soundings: Soundings) -> list[str]:
-    """Write soundings as tables, point clouds and pictures."""
+    """Write soundings as table, point cloud and pictures; return warnings."""
     soundings.save(folder / "soundings.csv")
     if soundings.sounder.kind == "altimeter":
         return []
@@ -919,14 +943,13 @@ def _write_points(folder: Path, soundings: Soundings) -> list[str]:
 
 
 def _report(run: RunDirectory, soundings: Soundings) -> SoundingReport:
-    """Return what a finished run holds."""
+    """Return the report of a finished run."""
     files = [name for name in SOUNDINGS.outputs if (run.path / name).is_file()]
     warnings = [str(one) for one in run.notes.get("warnings") or []]
     return SoundingReport(run.path, files, int(soundings.found.sum()), soundings.found.size, warnings)
 
 
-# ---------------- A run of all sensors of a vehicle: a folder for each, made one after another; a run that is killed
-# goes on
+# ---------------- Runs of vehicles
 
 
 VEHICLE_RUN = RunKind("run of a vehicle", outputs=("vehicle.tum",), notes={"begun": list, "warnings": list})
@@ -934,7 +957,7 @@ VEHICLE_RUN = RunKind("run of a vehicle", outputs=("vehicle.tum",), notes={"begu
 
 @dataclass(frozen=True)
 class VehicleReport:
-    """What a run did: its folder, the names of the sensors, each of which has a folder in it, and warnings."""
+    """Folder, sensor names and warnings of a run; each sensor has a subfolder of its name."""
 
     folder: Path
     sensors: tuple[str, ...]
@@ -952,21 +975,24 @@ def run_vehicle(
     resume: bool = False,
     progress: Callable[[int], None] = lambda pings: None,
 ) -> VehicleReport:
-    """Make a folder with a run of each sensor, or go on with one.
+    """Run all sensors of a vehicle one after another, each into its own subfolder, or resume an interrupted run.
 
     Args:
-        simulator: scene, sensors, and bodies that move.
-        vehicle: path of the vehicle.
-        folder: is made; holds ``vehicle.tum``, ``run.json`` and a folder for each sensor.
-        outputs: what imaging sonars write; its convention is that of all files of poses.
-        origin: what repeats the run beside sensors and path.
-        overwrite: replace a run that is there.
-        resume: go on with a run that was broken off.
+        simulator: scene, sensors and moving bodies.
+        vehicle: trajectory of the vehicle.
+        folder: folder to create; holds ``vehicle.tum``, ``run.json`` and a folder for each sensor.
+        outputs: output options of imaging sonars; its coordinate convention applies to all pose files.
+        origin: what else is needed to reproduce the run, besides sensors and trajectory.
+        overwrite: replace an existing run.
+        resume: continue an interrupted run.
         progress: called with the number of new pings.
 
+    Returns:
+        The report of the run.
+
     Raises:
-        MitsonarError: a sensor cannot follow the path; the folder exists; the run to resume was another one; the folder
-            cannot be written.
+        MitsonarError: a sensor cannot follow the trajectory; the folder exists; the run to resume has other inputs; the
+            folder cannot be written.
     """
     sensors, bodies = simulator.sensors(vehicle), simulator.bodies(vehicle)
     refuse_path(sensors, vehicle, outputs.noise)
@@ -980,7 +1006,7 @@ def run_vehicle(
         again = name in begun
         if not again:
             begun.append(name)
-            made.note(begun=begun)  # a folder that is there from now on is this run's
+            made.note(begun=begun)  # noted first, so that a resumed run treats the sensor's folder as its own
         how = {"resume": again, "overwrite": not again, "progress": progress, "origin": dict(origin)}
         said = _run_sensor(simulator, one, vehicle, bodies, made.path / name, outputs, how)
         warnings += [line for line in (f"{name}: {sentence}" for sentence in said) if line not in warnings]
@@ -1015,7 +1041,7 @@ def _run_sensor(
 
 
 def _told(one: Mounted) -> dict[str, Any]:
-    """Return what tells a sensor again."""
+    """Return the keys and the mount that describe a sensor."""
     instrument = one.instrument
     if isinstance(instrument, Sonar | Sounder | ChannelSonar):
         return {"keys": instrument.model_dump(mode="json"), "mount": list(one.mount)}

@@ -1,4 +1,4 @@
-"""Echoes of a scene at a receiver: delay and amplitude of each, from scatterers of the world or from rays."""
+"""Echoes of a scene at a receiver: delay and amplitude of each, from scatterers in the world or from rays."""
 
 from __future__ import annotations
 
@@ -40,42 +40,42 @@ __all__ = ["DIRECT", "ChannelTracer", "EchoValues", "ScattererWay", "Scatterers"
 
 
 EchoValues: TypeAlias = dict[str, NDArray[Any]]
-"""Fields of :class:`~mitsonar.simulation.link_geometry.EchoBatch` by name as NumPy arrays ``(points,)``."""
+"""Fields of :class:`~mitsonar.simulation.link_geometry.EchoBatch` keyed by name, as NumPy arrays ``(points,)``."""
 
 _Launch: TypeAlias = Callable[..., list[DeviceArray]]
-"""A frozen launch: indices, scene, link table and tables to values."""
+"""A frozen launch, which maps indices, scene, link table and source tables to values."""
 
 
 class ScattererWay(NamedTuple):
-    """The mirrors between transmitter and scatterers, and those between receiver and scatterers."""
+    """Mirrors between transmitter and scatterers, and between receiver and scatterers."""
 
     out: MirrorWay = MirrorWay()
     back: MirrorWay = MirrorWay()
 
     @property
     def name(self) -> str:
-        """Return the names of what sound meets, as ``surface-scatterer-seabed``."""
+        """Return the names of what sound meets in turn, such as ``surface-scatterer-seabed``."""
         return "-".join([name for name in (self.out.name, "scatterer", MirrorWay(self.back.planes[::-1]).name) if name])
 
 
 DIRECT = ScattererWay()
-"""The way without mirrors."""
+"""The path without mirrors."""
 
 
 class ChannelTracer:
-    """Trace the echoes of a scene at the receivers of a channel sonar.
+    """Tracer of a scene's echoes at the receivers of a channel sonar.
 
     Args:
-        scene: any.
+        scene: any Mitsuba scene.
         sonar: the instrument.
         like: a tracer of the same scene, whose scatterers may be shared.
         mirrors: mirror parts of the scene's shapes.
 
     Attributes:
-        notes: what a user should know about the scene's BSDFs.
+        notes: notes to the user about the scene's BSDFs.
         flat: the scene's mirrors.
-        registry: index of each mirror's shape by its place in the scene.
-        ways: by which scatterers are reached, the direct one first.
+        registry: registry index of each mirror's shape, keyed by the shape's index in the scene.
+        ways: kinds of paths that reach scatterers, the direct one first.
 
     Raises:
         MitsonarError: no surface can carry scatterers, or a mirror has too many triangles.
@@ -112,15 +112,15 @@ class ChannelTracer:
         asked: NDArray[np.uint32] | None = None,
         way: ScattererWay = DIRECT,
     ) -> EchoValues:
-        """Trace one ping at one receiver: values of an echo batch, one for each point that it may receive from.
+        """Trace one ping at one receiver; return echo values, one for each point that it may receive from.
 
         Args:
-            pose: of the transmitter ``(6,)`` [m, rad].
-            velocity: of the vehicle in its own axes ``(4,)`` [m/s, rad/s].
-            receiver: its index.
-            wanted: names of the values.
+            pose: pose of the transmitter ``(6,)`` [m, rad].
+            velocity: velocity of the vehicle in its own axes ``(4,)`` [m/s, rad/s].
+            receiver: index of the receiver.
+            wanted: names of the values to return.
             asked: indices of the points to trace; default: those that the receiver may receive from.
-            way: the mirrors between sonar and points.
+            way: mirrors between sonar and points.
         """
         asked = self.asked(pose, receiver, way) if asked is None else asked
         if not len(asked):
@@ -134,7 +134,7 @@ class ChannelTracer:
         return {name: np.broadcast_to(np.array(values), len(asked)) for name, values in zip(wanted, received, strict=True)}
 
     def asked(self, pose: NDArray[np.float64], receiver: int, way: ScattererWay = DIRECT) -> NDArray[np.uint32]:
-        """Return indices of the points that a receiver may receive from, by way of mirrors."""
+        """Return indices of the points that a receiver may receive from, via the given mirrors."""
         return self.source.asked(self._table(pose, np.zeros(4), receiver, way), receiver)
 
     def _table(
@@ -144,12 +144,12 @@ class ChannelTracer:
         return table if way == DIRECT else mirrored_table(table, way.out, way.back, self.registry)
 
     def height_m(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the height of each pose over what is straight below it ``(pings,)`` [m]; nan where there is nothing."""
+        """Return the height of each pose above the surface straight below it ``(pings,)`` [m]; nan if there is none."""
         place = mi.Point3f(*(mi.Float(padded(axis.astype(np.float32))) for axis in poses[:, :3].T))
         return np.array(height_below(self.scene, place), dtype=float)
 
     def _compile(self, receiver: int, wanted: tuple[str, ...], out: int, back: int) -> _Launch:
-        """Record a receiver's launch by a number of mirrors; later calls replay it (``dr.freeze``)."""
+        """Record a receiver's launch for the given numbers of mirrors; later calls replay it (``dr.freeze``)."""
 
         @Frozen
         def launch(index: mi.UInt32, scene: mi.Scene, table: mi.Float64, tables: DeviceArray) -> list[DeviceArray]:
@@ -167,7 +167,7 @@ class ChannelTracer:
 
 
 def _scatterer_ways(flat: FlatMirrors, bounces: int) -> list[ScattererWay]:
-    """Return all ways of scatterers of up to ``bounces`` reflections; that of the scatterer counts as one."""
+    """Return all kinds of scatterer paths with up to ``bounces`` reflections, counting the scatterer as one."""
     return [
         ScattererWay(out, back)
         for mirrors in range(bounces)
@@ -178,7 +178,7 @@ def _scatterer_ways(flat: FlatMirrors, bounces: int) -> list[ScattererWay]:
 
 
 class _WorldScatterers:
-    """Echoes of the world's own scatterers."""
+    """Source of echoes from scatterers that are fixed in the world."""
 
     def __init__(self, scene: mi.Scene, sonar: ChannelSonar, like: _WorldScatterers | None, mirrors: Mirrors | None) -> None:
         self.sonar = sonar
@@ -196,14 +196,14 @@ class _WorldScatterers:
             self.scatterers = Scatterers.of(scene, sonar, self.smooth)
             self.stored = self._rows()
         self.wavenumber = 2 * math.pi / sonar.wavelength_m
-        self.roughness: mi.Float | None = None  # rms height of each point's mirror; below 0: it is no mirror
+        self.roughness: mi.Float | None = None  # rms height of each point's mirror; negative if it is no mirror
         if mirrors is not None:
             height = np.where(mirrors.reflection == 0, -1.0, mirrors.roughness_m).astype(np.float32)
             self.roughness = mi.Float(height[self.scatterers.shape])
 
     def _rows(self) -> mi.Float:
-        """Return place, strength, normal and phase of all points."""
-        rows = np.zeros((len(self.scatterers), 8), np.float32)  # two fetches of 16 bytes a point
+        """Return position, strength, normal and phase of all points."""
+        rows = np.zeros((len(self.scatterers), 8), np.float32)  # two fetches of 16 bytes per point
         rows[:, :3], rows[:, 3] = self.scatterers.place, self.scatterers.strength
         rows[:, 4:7], rows[:, 7] = self.scatterers.normal, self.scatterers.phase
         return mi.Float(rows.ravel())
@@ -213,34 +213,40 @@ class _WorldScatterers:
         return self.scatterers.within(table[3:6], table[12:21].reshape(3, 3), self.sonar.receivers[receiver].field)
 
     def tables(self, receiver: int) -> list[mi.Float]:
-        """Return the inputs of a launch: position, strength, normal and phase of all points; roughness with mirrors."""
+        """Return the inputs of a launch: position, strength, normal and phase of all points; with mirrors also roughness."""
         return [self.stored] if self.roughness is None else [self.stored, self.roughness]
 
     def received(self, link: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: list[mi.Float]) -> EchoBatch:
         """Return the echoes of the scatterers that transmitter and receiver see."""
+        # 1. fetch position, strength, normal and phase
         first: DeviceArray = dr.gather(mi.Vector4f, tables[0], index * 2)
         second: DeviceArray = dr.gather(mi.Vector4f, tables[0], index * 2 + 1)
         at, strength, normal = mi.Point3f(first.x, first.y, first.z), first.w, mi.Normal3f(second.x, second.y, second.z)
+        # 2. delay in double precision, since it determines the phase of the carrier
         exact = [mi.Float64(value) for value in at]
         to_point, from_receiver = link.to_point(exact)
         delay = delay_exact(to_point, from_receiver, link.velocity, self.sonar.sound_speed)
+        # 3. directions and distances; single precision is enough for amplitudes
         way_out, way_back = mi.Vector3f(*to_point), mi.Vector3f(*from_receiver)
         sent, received = dr.norm(way_out), dr.norm(way_back)
         u_sent: DeviceArray = way_out / sent
         u_received: DeviceArray = way_back / received
+        # 4. sensitivity and Lambert's cosines; both ends must be on the same side of the surface
         weight = link.sensitivity(u_sent, u_received)
         cosines = dr.dot(normal, u_sent), dr.dot(normal, u_received)
         lambert = cosines[0] * cosines[1]
         inside = (weight > 0) & (lambert > 0)
+        # 5. shadow rays, only for points that could contribute
         point = ScatteringPoints(at, exact, normal)
         open_, factor = link.reached(scene, point, Leg(u_sent, sent), Leg(u_received, received), inside)
         seen = inside & open_
+        # 6. amplitude: the strength is an energy; spreading and mirrors act on the pressure
         amplitude = weight * dr.sqrt(dr.select(seen, strength * lambert, 0))
         if self.sonar.spreads:
             amplitude /= sent * received
         if factor is not None:
             amplitude *= factor
-        if len(tables) > 1:  # a mirror scatters what its roughness takes from the mirror's echo
+        if len(tables) > 1:  # a mirror scatters the energy that its roughness removes from the specular echo
             height = dr.gather(mi.Float, tables[1], index)
             lost = 1 - dr.exp(-dr.square(height * self.wavenumber * (cosines[0] + cosines[1])))
             amplitude *= dr.sqrt(dr.select(height < 0, 1, lost))
@@ -248,12 +254,12 @@ class _WorldScatterers:
 
 
 def _points_of(sonar: ChannelSonar) -> tuple[float | None, ...]:
-    """Return what the points of a scene follow from."""
+    """Return the keys of a sonar that determine the points of a scene."""
     return sonar.points_per_m2, sonar.scatterer_spacing_m, sonar.speckle_nu, sonar.speckle_patch_m, sonar.seed
 
 
 class _VehicleRays:
-    """Echoes of rays that are fixed to the vehicle, evenly over each receiver's field of view (Almanza-Medina, 5.2.1)."""
+    """Source of echoes from rays fixed to the vehicle that cover each field of view evenly (Almanza-Medina, 5.2.1)."""
 
     def __init__(self, sonar: ChannelSonar, surfaces: Surfaces) -> None:
         self.sonar, self.surfaces = sonar, surfaces
@@ -266,20 +272,23 @@ class _VehicleRays:
         return self.numbers[receiver]
 
     def tables(self, receiver: int) -> tuple[mi.Float64, LaunchTables]:
-        """Return the inputs of a launch: directions of the rays, tables of the surfaces."""
+        """Return the inputs of a launch: directions of the rays, and tables of the surfaces."""
         return self.stored[receiver], self.surfaces.arrays()
 
     def received(
         self, link: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: tuple[mi.Float64, LaunchTables]
     ) -> EchoBatch:
         """Return the echoes of the points that the rays hit."""
+        # 1. turn the directions from the axes of the field of view to the world
         directions, facets = tables
         own = [dr.gather(mi.Float64, directions, index * 3 + k) for k in range(3)]
-        axes = [link.vector(12 + 3 * k) for k in range(3)]  # a direction is given along the axes of the field of view
+        axes = [link.vector(12 + 3 * k) for k in range(3)]
         u = [sum(own[k] * axes[k][axis] for k in range(3)) for axis in range(3)]
         u_sent = mi.Vector3f(*u)
+        # 2. trace from the transmitter; the point stays in double precision for the phase
         hit = replace(self.surfaces, **facets).hit(scene, mi.Ray3f(mi.Point3f(*link.sent_from), u_sent))
         point = [a + axis * mi.Float64(hit.t) for a, axis in zip(link.sent_from, u, strict=True)]
+        # 3. delay and amplitude of the path via the point
         to_point, from_receiver = link.to_point(point)
         delay = delay_iterated(to_point, from_receiver, link.velocity, self.sonar.sound_speed)
         way_back = mi.Vector3f(*from_receiver)
@@ -293,9 +302,9 @@ class _VehicleRays:
 
 
 def _even(field: FieldOfView, rays: int) -> NDArray[np.float64]:
-    """Return directions evenly over a field of view, along its axes ``(n, 3)``: about ``rays`` of them within it.
+    """Return directions that cover a field of view evenly, along its axes ``(n, 3)``; about ``rays`` lie within it.
 
-    They cover :data:`MARGIN_DEG` more: the field is the receiver's, but rays begin at the transmitter.
+    They exceed the field by :data:`MARGIN_DEG`, since the field is the receiver's but rays begin at the transmitter.
     """
     match field.shape:
         case "rectangular":
@@ -317,27 +326,27 @@ MARGIN_DEG = 2.0
 """Angle by which the rays exceed a receiver's field of view: 0.1 m at 3 m."""
 
 
-# ---------------- Points of the world that scatter sound, and a search for those in a field of view
+# ---------------- Scattering points, and their search
 # A surface whose reflectivity comes in cells (``cell_noise`` over uv, or a picture) has one point in each cell. Its
-# position is a hash of the cell. Any other surface has the points of a lattice of the world, as images of the model
-# ``coherent`` have them. With ``scatterer_spacing_m`` all surfaces do: images and impulse responses then come from one
-# field. The points do not depend on the sonar's pose, the time or the number of rays.
+# position is a hash of the cell. Any other surface has the points of a lattice in the world, the same as in images of the
+# model ``coherent``. With ``scatterer_spacing_m`` all surfaces use the lattice, so that images and impulse responses come
+# from one field. The points do not depend on the sonar's pose, the time or the number of rays.
 #
-# Each point scatters with a complex Gaussian number zeta of its own, E|zeta|^2 = 1: a hash of its cell. Echoes of many
-# points then add in power, as those of rough ground do. Their energy does not depend on the density of points.
+# Each point scatters with an independent complex Gaussian number zeta, E|zeta|^2 = 1, which is a hash of its cell. Echoes of
+# many points then add in power, as those of rough ground do. Their energy does not depend on the density of points.
 
 
 MOST = 2**26
-"""Largest number of points of a scene, 36 bytes each: place, normal, strength, phase and shape."""
+"""Largest number of points in a scene, 36 bytes each: position, normal, strength, phase and shape."""
 
 A_BUCKET = 256
-"""Points in a bucket, about: few enough to fit a field of view closely, enough to keep the buckets few."""
+"""Approximate number of points in a bucket: few enough to fit a field of view closely, enough to keep the buckets few."""
 
 A_BLOCK = 64
-"""Buckets in a block; the search tests blocks first."""
+"""Number of buckets in a block; the search tests blocks first."""
 
 BITS = 20
-"""Bits of a bucket's position along each axis."""
+"""Number of bits of a bucket's position along each axis."""
 
 
 @dataclass(frozen=True)
@@ -347,8 +356,9 @@ class Spheres:
     Attributes:
         middle: ``(groups, 3)`` [m].
         radius: ``(groups,)`` [m].
-        facing: mean normal of a group on a closed body, which is visible from outside only; else zero ``(groups, 3)``.
-        spread: largest angle between a normal of the group and ``facing`` ``(groups,)`` [rad].
+        facing: mean normal of a group on a closed body, which is visible from outside only; otherwise zero
+            ``(groups, 3)``.
+        spread: largest angle between ``facing`` and a normal of the group ``(groups,)`` [rad].
     """
 
     middle: NDArray[np.float64]
@@ -359,11 +369,13 @@ class Spheres:
     def may_be_seen(
         self, groups: NDArray[np.int64], eye: NDArray[np.float64], axes: NDArray[np.float64], field: FieldOfView
     ) -> NDArray[np.int64]:
-        """Return those of some groups that may have a visible point in a field of view at ``eye``."""
+        """Return the subset of groups that may have a visible point in a field of view at ``eye``."""
+        # direction to each sphere, and its angular radius as a margin; the eye inside a sphere sees all of it
         way = self.middle[groups] - eye
         distance = np.sqrt(np.einsum("gi,gi->g", way, way))
         unit, radius = way / np.maximum(distance, 1e-12)[:, None], self.radius[groups]
         margin = np.where(distance > radius, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-12), 1)), np.pi)
+        # closed bodies: skip groups whose normals all face away from the eye
         away = np.einsum("gi,gi->g", self.facing[groups], unit) > np.sin(np.minimum(margin + self.spread[groups], np.pi / 2))
         ahead, aside, above = axes @ unit.T
         kept: NDArray[np.int64] = groups[field.may_see(ahead, aside, above, margin) & ~away]
@@ -375,12 +387,12 @@ class Scatterers:
     """Scattering points of a scene, sorted so that neighbours are adjacent.
 
     Attributes:
-        place: positions ``(points, 3)`` float32 [m]; exact as they are.
+        place: positions ``(points, 3)`` float32 [m]; the float32 values are taken as exact.
         normal: unit normal of the surface ``(points, 3)`` float32.
         strength: reflectivity times the area that a point represents, times |zeta|^2 ``(points,)`` float32 [m2].
-        phase: of zeta ``(points,)`` float32, -pi..pi [rad].
-        shape: place in ``scene.shapes()`` of the shape that has the point ``(points,)`` int32.
-        first: index of the first point of each bucket, and the number of points ``(buckets + 1,)``.
+        phase: phase of zeta ``(points,)`` float32, -pi..pi [rad].
+        shape: index in ``scene.shapes()`` of the shape that the point lies on ``(points,)`` int32.
+        first: index of the first point of each bucket, and at the end the number of points ``(buckets + 1,)``.
         one_sided: whether a bucket's points lie on closed bodies, visible from outside only ``(buckets,)``.
     """
 
@@ -397,9 +409,9 @@ class Scatterers:
         """Place scatterers on a scene's shapes.
 
         Args:
-            scene: any.
-            sonar: gives number and seed of the points.
-            smooth: places in the scene of perfect mirrors, which scatter nothing; where it is given there may be no points.
+            scene: any Mitsuba scene.
+            sonar: instrument that gives number and seed of the points.
+            smooth: indices of perfect mirrors in the scene, which scatter nothing; if given, there may be no points at all.
 
         Raises:
             MitsonarError: no surface can carry scatterers, or there are more than :data:`MOST`.
@@ -430,7 +442,7 @@ class Scatterers:
 
     @cached_property
     def spheres(self) -> tuple[Spheres, Spheres]:
-        """Return bounding spheres of the blocks, and of the buckets."""
+        """Return the bounding spheres of the blocks, and those of the buckets."""
         buckets = np.arange(len(self.one_sided))
         blocks = self.first[:-1][::A_BLOCK]
         mixed = np.logical_and.reduceat(self.one_sided, buckets[::A_BLOCK])
@@ -446,11 +458,11 @@ class Scatterers:
         return Spheres((low + high) / 2, np.linalg.norm(high - low, axis=1) / 2, mean * one_sided[:, None], spread)
 
     def within(self, eye: NDArray[np.float64], axes: NDArray[np.float64], field: FieldOfView) -> NDArray[np.uint32]:
-        """Return indices of the points that may lie in a field of view: all that do, and some beside it.
+        """Return indices of the points that may lie in a field of view: all that do, and some just outside it.
 
         Args:
             eye: position of the receiver ``(3,)`` [m].
-            axes: :attr:`FieldOfView.axes` in the world ``(3, 3)``.
+            axes: :attr:`FieldOfView.axes`, turned to the world ``(3, 3)``.
             field: shape of the field of view.
         """
         if not len(self):
@@ -468,9 +480,9 @@ def _side(normal: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def _is_closed(mesh: mi.Mesh) -> bool:
-    """Test whether a mesh bounds bodies with normals outwards.
+    """Test whether a mesh bounds bodies with outward normals.
 
-    It does where each edge occurs once in each direction and each body has a volume above 0.
+    This is so if each edge occurs once in each direction and each connected body has a volume above 0.
     """
     faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
     vertex = np.array(mesh.vertex_positions_buffer(), dtype=float).reshape(-1, 3)
@@ -486,7 +498,7 @@ def _is_closed(mesh: mi.Mesh) -> bool:
 
 
 class _Grid(NamedTuple):
-    """The cells over uv of a shape's reflectivity; ``texture`` is None for a picture."""
+    """Cells over uv of a shape's reflectivity; ``texture`` is None for a picture."""
 
     texture: CellNoise | None
     columns: int
@@ -494,12 +506,12 @@ class _Grid(NamedTuple):
 
 
 def _grid_of(shape: mi.Shape) -> _Grid | None:
-    """Return the cells over uv of a shape's reflectivity; None where it has none."""
+    """Return the cells over uv of a shape's reflectivity; None if it has none."""
     textures = reflectances_of(shape.bsdf())
     if len(textures) != 1:
         return None
-    texture: Any = textures[0]  # Mitsuba's type of it is not the plugin's class
-    # by its name: the class is made anew with each variant
+    texture: Any = textures[0]  # Mitsuba's type stub does not know the plugin's class
+    # compare by name, since the class is created again for each variant
     if type(texture).__name__ == CellNoise.__name__ and texture.coordinates == "uv":
         fine = round(texture.cells * 2 ** (texture.octaves - 1))
         return _Grid(texture, fine, fine) if fine >= 1 else None
@@ -510,16 +522,18 @@ def _grid_of(shape: mi.Shape) -> _Grid | None:
 
 
 class _Zeta(NamedTuple):
-    """Complex Gaussian numbers of points on the device: |zeta|^2, and the phase [rad]."""
+    """Complex Gaussian numbers of points on the device: |zeta|^2 and phase [rad]."""
 
     power: DeviceArray
     phase: DeviceArray
 
 
 def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> SurfacePoints:
-    """Place one point in each cell. Place and zeta are hashes of the cell and the texture's seed (of a picture: the shape's
-    number).
+    """Place one point in each cell.
+
+    Position and zeta are hashes of the cell and the texture's seed (for a picture: the shape's number).
     """
+    # 1. the cells that the unit square of uv covers, after the texture's transform
     texture, columns, rows = grid
     turn = np.eye(3)
     if texture is not None:
@@ -529,21 +543,24 @@ def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> SurfacePoints:
     low = np.floor(corners[:2].min(axis=1) * (columns, rows)).astype(int)
     wide, tall = np.ceil(corners[:2].max(axis=1) * (columns, rows)).astype(int) - low
     _check_count(shape, float(wide) * float(tall), "give its texture fewer cells, or a scatterer_spacing_m")
+    # 2. a position in each cell, hashed from the cell's column and row
     cell = dr.arange(mi.UInt32, int(wide * tall))
     column, row = mi.Int32(cell % int(wide)) + int(low[0]), mi.Int32(cell // int(wide)) + int(low[1])
     seed = (texture.seed, 1) if texture is not None else (number, 0)
     bits: list[DeviceArray] = [dr.reinterpret_array(mi.UInt32, value) for value in (column, row)]
     first, second = mi.sample_tea_32(bits[0], bits[1] ^ _key(*seed, PLACE), ROUNDS)
     u, v = (mi.Float(column) + _fraction(first)) / columns, (mi.Float(row) + _fraction(second)) / rows
+    # 3. back to the shape's uv; cells at the border may have their position outside
     uv = mi.Point2f(*(float(a) * u + float(b) * v + float(c) for a, b, c in back[:2]))
     inside = (uv.x >= 0) & (uv.x < 1) & (uv.y >= 0) & (uv.y < 1)
+    # 4. position on the surface, and the area of the cell there
     si = shape.eval_parameterization(uv, mi.RayFlags.All, inside)
     area = dr.norm(dr.cross(si.dp_du, si.dp_dv)) * abs(float(np.linalg.det(back[:2, :2]))) / (columns * rows)
     return _kept(shape, si, area, _zeta_of(bits[0], bits[1] ^ _key(*seed, ZETA)), inside & si.is_valid())
 
 
 def _on_lattice(shape: mi.Shape, sonar: ChannelSonar, number: int) -> SurfacePoints:
-    """Return the points of the world's lattice on a surface, one in each cell."""
+    """Return the points of the world's lattice on a surface, one in each cell of the lattice."""
     pitch = sonar.lattice_pitch_m
     cells = lattice_size(shape, pitch) / 2
     enough = pitch * math.sqrt(cells / MOST) * 1.1
@@ -571,18 +588,18 @@ def _check_count(shape: mi.Shape, count: float, mend: str) -> None:
 
 
 PLACE, ZETA = 82, 83
-"""Last numbers of the keys that draw places within cells, and zeta of cells."""
+"""Last numbers of the keys for positions within cells, and for zeta."""
 
 
 def _key(seed: int, kind: int, drawn: int) -> DeviceArray:
-    """Return 32 bits that choose a hash; they differ from those that draw the reflectivity."""
+    """Return 32 bits that select a hash; they differ from those used to draw the reflectivity."""
     return mi.UInt32(int(np.random.SeedSequence([abs(seed), kind, drawn]).generate_state(1)[0]))
 
 
 def _zeta_of(first: DeviceArray, second: DeviceArray) -> _Zeta:
     """Hash 64 bits to complex Gaussian numbers of variance 1 (Box and Muller)."""
     bits: tuple[DeviceArray, DeviceArray] = mi.sample_tea_32(first, second, ROUNDS)
-    # 23 bits: with one half added they fit a float32, so that the logarithm of 1 is never taken
+    # 23 bits plus one half fit a float32 exactly, so that the logarithm of 1 is never taken
     return _Zeta(-dr.log((mi.Float(bits[0] >> 9) + 0.5) * 2.0**-23), (_fraction(bits[1]) - 0.5) * (2 * math.pi))
 
 
@@ -591,16 +608,18 @@ def _fraction(bits: mi.UInt32) -> mi.Float:
 
 
 def _buckets(place: NDArray[np.float32], side: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sort points into buckets: the points of one cube that face one direction.
+    """Sort points into buckets, each with the points of one cube that face one direction.
 
     Returns:
-        The order of the points, near cubes near each other; and the index where each bucket begins, with the end.
+        The order of the points, with neighbouring cubes close to each other, and the index where each bucket begins,
+        followed by the number of points.
     """
     low, high = place.min(axis=0).astype(float), place.max(axis=0).astype(float)
     reach = np.sort(high - low)[::-1]
-    # an edge that holds A_BUCKET points of a surface as large as the two longest sides
+    # the edge of a cube that holds A_BUCKET points, if they cover a surface as large as the two longest sides
     edge = math.sqrt(reach[0] * reach[1] * A_BUCKET / len(place))
     edge = max(edge, reach[0] / (2**BITS - 1), 1e-9)
+    # key: side first, then the cube's position on Morton's curve
     key = side.astype(np.uint64) << np.uint64(3 * BITS)
     for axis, values in enumerate(((place - low) / edge).T):
         key |= _spaced(values.astype(np.uint64)) << np.uint64(axis)
@@ -610,7 +629,7 @@ def _buckets(place: NDArray[np.float32], side: NDArray[np.int64]) -> tuple[NDArr
 
 
 def _spaced(number: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Put two zeros before each bit of numbers below 2^21: three such make a position on Morton's curve."""
+    """Insert two zeros before each bit of numbers below 2^21; three such numbers interleave to Morton's curve."""
     masks = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
     for shift, mask in zip((32, 16, 8, 4, 2), masks, strict=True):
         number = (number | (number << np.uint64(shift))) & np.uint64(mask)
@@ -618,10 +637,11 @@ def _spaced(number: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def _ranges(first: NDArray[np.int64], buckets: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return the indices of all points of some buckets."""
+    """Return the indices of all points in the given buckets."""
     begin, count = first[buckets], first[buckets + 1] - first[buckets]
     if not len(begin):
         return np.empty(0, np.uint32)
+    # the differences between consecutive indices: 1 within a bucket, a jump to the start of the next
     jump = np.ones(count.sum(), np.int64)
     ends = np.cumsum(count)
     jump[0] = begin[0]

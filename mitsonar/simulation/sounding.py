@@ -1,4 +1,4 @@
-"""Sounders in a scene: all fans of a ping, and many pings, in one launch."""
+"""Sounder simulation: what sounders and DVLs measure in a scene, with many pings and all their fans in one launch."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ __all__ = ["SoundedPings", "SounderSimulator", "dvl_readings", "dvl_sensors", "t
 
 
 FEW = 8
-"""Pings of a batch of the model coherent, which renders fan by fan: so many are lost when a run is killed."""
+"""Number of pings per batch in the model ``coherent``, which renders fan by fan: as many are lost if a run is killed."""
 
 
 class SoundedPings(NamedTuple):
     """A batch of consecutive pings.
 
     Attributes:
-        first: number of the first.
-        levels: of all fans ``(pings, channels, bins, beams)`` float32.
-        height_m: of the first fan over what is straight below it ``(pings,)``; nan where there is nothing.
+        first: number of the first ping.
+        levels: levels of all fans ``(pings, channels, bins, beams)`` float32.
+        height_m: height of the first fan above the surface straight below it ``(pings,)`` [m]; nan if there is none.
     """
 
     first: int
@@ -44,16 +44,16 @@ class SoundedPings(NamedTuple):
 
 
 class SounderSimulator:
-    """Renders what the fans of a sounder receive in a scene.
+    """Simulator of the echoes that the fans of a sounder receive in a scene.
 
     Args:
         scene: a Mitsuba scene.
         sounder: the instrument.
-        moving: trajectories of bodies, as of :class:`mitsonar.Simulator`.
-        rays_per_launch: bound of a launch's rays and of its image cells.
+        moving: trajectories of bodies, as in :class:`mitsonar.Simulator`.
+        rays_per_launch: upper bound of the rays, and of the image cells, in one launch.
 
     Raises:
-        MitsonarError: as :class:`mitsonar.Simulator` does.
+        MitsonarError: as in :class:`mitsonar.Simulator`.
     """
 
     def __init__(
@@ -74,16 +74,16 @@ class SounderSimulator:
 
     @property
     def notes(self) -> list[str]:
-        """Return what a user should know about the scene and the instrument."""
+        """Return notes to the user about the scene and the instrument."""
         return self.simulator.notes
 
     def pings(self, poses: ArrayLike, *, first: int = 0, time_s: ArrayLike | None = None) -> Iterator[SoundedPings]:
-        """Levels of consecutive pings of the vehicle, in batches; every fan of every ping draws its own jitter.
+        """Yield the levels of consecutive pings of the vehicle, in batches; each fan of each ping has independent jitter.
 
         Args:
-            poses: of the vehicle ``(pings, 6)`` x, y, z [m], pitch, roll, heading [rad].
+            poses: poses of the vehicle ``(pings, 6)`` x, y, z [m], pitch, roll, heading [rad].
             first: number of the first ping.
-            time_s: of the pings ``(pings,)``, where bodies move [s]; default: their number / ``frame_rate_hz``.
+            time_s: times of the pings ``(pings,)``, used if bodies move [s]; default: their number / ``frame_rate_hz``.
         """
         table = np.atleast_2d(np.asarray(poses, dtype=float))
         rate = self.sounder.fan.frame_rate_hz
@@ -99,16 +99,16 @@ class SounderSimulator:
             yield SoundedPings(first + start, levels.reshape(len(own), fans, *levels.shape[1:]), height_m)
 
     def detect(self, levels: NDArray[np.float32]) -> Detected:
-        """Detect an echo in each beam of levels ``(pings, channels, bins, beams)``: arrays ``(pings, channels, beams)``."""
+        """Detect an echo in each beam of levels ``(pings, channels, bins, beams)``; return ``(pings, channels, beams)``."""
         find = first_echoes if self.sounder.kind == "altimeter" else strongest_echoes
         limits = {"below_db": self.sounder.below_db, "above_noise_db": self.sounder.above_noise_db}
         return find(np.moveaxis(levels, 2, -1).astype(float), self.sounder.fan.range_m, self.noise, **limits)
 
     def echogram(self, flown: Trajectory) -> Echogram:
-        """Render all pings of an instrument of one beam a fan.
+        """Render all pings of an instrument with one beam per fan.
 
         Raises:
-            MitsonarError: several beams a fan.
+            MitsonarError: the fans have several beams.
         """
         if self.sounder.fan.beams > 1:
             raise MitsonarError(f"an echogram has one beam a fan: got {self.sounder.fan.beams}; use soundings()")
@@ -124,7 +124,7 @@ class SounderSimulator:
         return Soundings(flown.time_s, flown.poses, self.sounder, *joined)
 
     def _noise(self) -> NDArray[np.float64]:
-        """Return the mean level of noise and volume ``(bins,)``, after the gain; 0 where there is none."""
+        """Return the mean level of noise and volume after the gain ``(bins,)``; 0 if there is none."""
         fan, coherent = self.sounder.fan, self.simulator.coherent
         if coherent is not None:
             return np.asarray(sum(coherent.noise_powers()) * coherent.gain, dtype=np.float64)
@@ -133,27 +133,28 @@ class SounderSimulator:
         return np.asarray(10 ** ((fan.noise_level_db - fan.source_level_db) / 10) * gain_of(fan), dtype=np.float64)
 
 
-# ---------------- A DVL in a scene: ranges from its echoes, range rates from its motion and noise
+# ---------------- DVL readings
 
 
 Array = NDArray[np.float64]
 
 RATES, SCALE = 0x64766C, 0x7363616C
-"""Keep the draws of noise and of the scale apart."""
+"""Keys that separate the random numbers of the noise from that of the scale."""
 
 
 def dvl_readings(soundings: Soundings, seed: int = 0) -> DvlReadings:
-    """Make a DVL's readings of its soundings.
+    """Simulate a DVL's readings from its soundings.
 
-    A rate is that of the beam's axis, times one constant scale, plus Gaussian noise of the beam's standard deviation. Beams
-    without an echo have no rate. Fewer than three rates are no bottom lock.
+    Ranges come from the echoes, range rates from the motion. A rate is that along the beam's axis, times a constant scale,
+    plus Gaussian noise with the beam's standard deviation. Beams without an echo have no rate. Fewer than three rates mean
+    no bottom lock.
 
     Args:
-        soundings: of a dvl along its path.
-        seed: of noise and scale; the noise is a function of (seed, ping, beam).
+        soundings: soundings of a DVL along its trajectory.
+        seed: seed of noise and scale; the noise is a function of (seed, ping, beam).
 
     Raises:
-        MitsonarError: soundings of another kind of instrument.
+        MitsonarError: the soundings are of another kind of instrument.
     """
     sounder = soundings.sounder
     if sounder.kind != "dvl":
@@ -167,7 +168,7 @@ def dvl_readings(soundings: Soundings, seed: int = 0) -> DvlReadings:
 def true_rates(sounder: Sounder, flown: Trajectory) -> Array:
     """Compute the range rates of the beams over ground at rest ``(pings, beams)`` [m/s]: minus the velocity along them.
 
-    A mount beside the vehicle's middle moves with its turn as well. The velocity at a pose is the mean of those of the
+    A mount off the vehicle's origin also moves with the vehicle's turn. The velocity at a pose is the mean of those of the
     steps before and after it.
     """
     step = velocities(flown)
@@ -178,16 +179,17 @@ def true_rates(sounder: Sounder, flown: Trajectory) -> Array:
     return np.asarray(-np.einsum("pbi,bi->pb", at_pose[:, None, :3] + lever, sounder.axes))
 
 
-# ---------------- Velocities of a DVL as the readings that odometry takes
+# ---------------- DVL velocities for odometry
 
 
 def dvl_sensors(readings: DvlReadings) -> VehicleSensors:
-    """Return velocities sideways and forward in level axes, with their standard deviations, of the pings with bottom lock.
+    """Return sideways and forward velocities in level axes, with standard deviations, of the pings with bottom lock.
 
-    The correlation of both is left out; it is 0 while all beams of a symmetric DVL have an echo.
+    The readings have the form that odometry reads. The correlation of both velocities is neglected; it is 0 as long as all
+    beams of a symmetric DVL have an echo.
 
     Raises:
-        MitsonarError: no bottom lock in any ping.
+        MitsonarError: no ping has bottom lock.
     """
     locked = readings.locked
     if not locked.any():

@@ -1,4 +1,4 @@
-"""A vehicle with several sonars, hydrophones and cameras along one path, in one scene at the same times."""
+"""Vehicle simulation: what several sonars, hydrophones and cameras record along one trajectory in one scene."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ __all__ = [
 
 
 Instrument: TypeAlias = Union[Sonar, Sounder, ChannelSonar, "mi.Sensor"]
-"""What is mounted; a sensor of Mitsuba is a camera."""
+"""Instrument that can be mounted on a vehicle; a Mitsuba sensor is a camera."""
 
 Record: TypeAlias = SonarFrames | Echogram | Soundings | ImpulseResponses | NDArray[np.uint8]
-"""What a sensor brings back; of a camera pictures ``(frames, height, width)``, in colour with a last axis of 3."""
+"""Record of a sensor; for a camera, pictures ``(frames, height, width)``, in colour with a last axis of 3."""
 
 MIDDLE = Pose(0, 0, 0)
 
 FARTHEST_M = 100.0
-"""Largest distance of a sensor from its vehicle [m]: beyond, the scene shows another place than the path begins at."""
+"""Largest distance of a sensor from its vehicle [m]; beyond it, the scene shows another place than the path's start."""
 
 
 @dataclass(frozen=True)
 class Mounted:
-    """A sensor and its pose in the vehicle's axes (starboard, forward, up)."""
+    """Sensor and its pose in the vehicle's axes (starboard, forward, up)."""
 
     instrument: Instrument
     mount: Pose = MIDDLE
@@ -70,27 +70,27 @@ class Mounted:
         return f"Mounted({shown} at {self.mount})"
 
     def path(self, vehicle: Trajectory) -> Trajectory:
-        """Return the path of the sensor for that of the vehicle."""
+        """Return the trajectory of the sensor for a trajectory of the vehicle."""
         return Trajectory(mounted(vehicle.poses, self.mount), vehicle.time_s)
 
 
 class VehicleFile(NamedTuple):
-    """Sensors of a vehicle by name, and what its file says of bodies that move."""
+    """Sensors of a vehicle keyed by name, and the motion specifications of bodies in its file."""
 
     sensors: dict[str, Mounted]
     said: list[Said]
 
 
 class VehicleSimulator:
-    """Simulates all sensors of a vehicle, each for itself: sonars do not hear each other.
+    """Simulator of all sensors of a vehicle, each independent of the others: sonars do not receive each other.
 
     Args:
         scene: a Mitsuba scene.
-        sensors: by name; default: the scene's own, by their ids.
-        moving: trajectories of bodies, as of :class:`mitsonar.Simulator`; ``vehicle`` stands for the path.
+        sensors: sensors keyed by name; default: the sensors in the scene, keyed by id.
+        moving: trajectories of bodies, as in :class:`mitsonar.Simulator`; ``vehicle`` denotes the vehicle's trajectory.
 
     Raises:
-        MitsonarError: a scene without sensors.
+        MitsonarError: the scene has no sensors.
     """
 
     def __init__(
@@ -104,14 +104,14 @@ class VehicleSimulator:
         return f"VehicleSimulator(sensors {names[:160]}; a scene of {len(self.scene.shapes())} shapes)"
 
     def sensors(self, vehicle: Trajectory) -> Mapping[str, Mounted]:
-        """Return the sensors by name; those of the scene stand in it as at the path's first pose."""
+        """Return the sensors keyed by name; sensors in the scene are mounted as it shows them at the first pose."""
         return sensors_in(self.scene, Pose.from_row(vehicle.poses[0])) if self._sensors is None else self._sensors
 
     def bodies(self, vehicle: Trajectory) -> MovingBodies:
-        """Return the bodies that move while the vehicle flies a path.
+        """Return the bodies that move while the vehicle follows a trajectory.
 
         Raises:
-            MitsonarError: a body moves and a sensor's records are of still scenes.
+            MitsonarError: a body moves, but a sensor supports still scenes only.
         """
         found = MovingBodies.of(self.moving, vehicle=vehicle)
         listens = [name for name, one in self.sensors(vehicle).items() if isinstance(one.instrument, ChannelSonar)]
@@ -122,11 +122,11 @@ class VehicleSimulator:
         return found
 
     def render(self, vehicle: Trajectory, *, labels: bool = False) -> dict[str, Record]:
-        """Render all sensors into memory: frames, soundings, responses, pictures by the names of the sensors.
+        """Render all sensors into memory; return frames, soundings, responses or pictures, keyed by sensor name.
 
         Args:
-            vehicle: poses and times; each sensor pings at each of these, a head that turns sweeps as often as it can.
-            labels: per-pixel truth of imaging sonars as well.
+            vehicle: poses and times; each sensor pings at each of them, and a rotating head sweeps as often as it can.
+            labels: whether to render per-pixel ground truth for imaging sonars.
         """
         bodies, sensors = self.bodies(vehicle), self.sensors(vehicle)
         refuse_path(sensors, vehicle)
@@ -146,15 +146,16 @@ class VehicleSimulator:
 
 
 def refuse_path(sensors: Mapping[str, Mounted], vehicle: Trajectory, noise: NoiseModel | None = None) -> None:
-    """Refuse what one of the sensors cannot do, before any of them is rendered.
+    """Refuse a trajectory that one of the sensors cannot follow, before any sensor is rendered.
 
     Args:
-        sensors: by name.
-        vehicle: path of the vehicle.
-        noise: of imaging sonars.
+        sensors: sensors keyed by name.
+        vehicle: trajectory of the vehicle.
+        noise: noise model for imaging sonars.
 
     Raises:
-        MitsonarError: a path that is too short for a sweep, or noise for a sonar with its own; it names the sensor.
+        MitsonarError: the trajectory is too short for a sweep, or noise is given for a sonar that already includes noise;
+            the message names the sensor.
     """
     for name, one in sensors.items():
         if not isinstance(one.instrument, Sonar):
@@ -167,10 +168,10 @@ def refuse_path(sensors: Mapping[str, Mounted], vehicle: Trajectory, noise: Nois
 
 
 def sensors_in(scene: mi.Scene, vehicle: Pose) -> dict[str, Mounted]:
-    """Return the sensors of a scene by id, mounted as the scene shows them on a vehicle at a pose.
+    """Return the sensors of a scene keyed by id, with their mounts relative to a vehicle at the given pose.
 
     Raises:
-        MitsonarError: no sensors; two of one id; a sensor that is far from the vehicle, or scaled.
+        MitsonarError: there are no sensors; two have the same id; a sensor is far from the vehicle, or scaled.
     """
     from mitsonar.plugins.channel_sonar_sensor import is_channel_sonar
     from mitsonar.plugins.imaging_sonar_sensor import is_imaging_sonar
@@ -200,7 +201,7 @@ def load_vehicle(file: str | Path) -> VehicleFile:
     """Read the sensors of a vehicle and the motions of bodies from a YAML file; paths are relative to its folder.
 
     Raises:
-        MitsonarError: unreadable, wrong keys, unknown presets.
+        MitsonarError: the file is unreadable, has wrong keys, or names unknown presets.
     """
     recipe, folder = load_vehicle_recipe(file), Path(file).parent
     sensors = {}
@@ -210,7 +211,7 @@ def load_vehicle(file: str | Path) -> VehicleFile:
 
 
 def _instrument(keys: SensorKeys, folder: Path, name: str) -> Instrument:
-    """Return the instrument that the keys of a sensor say."""
+    """Return the instrument that the keys of a sensor describe."""
     if isinstance(keys.sonar, dict):
         return sonar_from({"name": name, **keys.sonar})
     if keys.sonar is not None:
@@ -226,20 +227,19 @@ def _instrument(keys: SensorKeys, folder: Path, name: str) -> Instrument:
 
 
 def _file(name: str, folder: Path) -> str:
-    """Return the path of a YAML file beside the vehicle's, or a name as it is."""
+    """Return the path of a YAML file relative to the vehicle's folder; other names are returned unchanged."""
     return str(folder / name) if name.lower().endswith((".yaml", ".yml")) else name
 
 
-# ---------------- Pictures of a camera on a vehicle: Mitsuba renders them, with the bodies of the scene where they
-# are at the time
+# ---------------- Cameras, rendered by Mitsuba
 
 
 PATH_DEPTH = 8
-"""Bounces of light in a scene without an integrator of its own for cameras."""
+"""Maximum depth of light paths in a scene without an integrator for cameras."""
 
 
 def camera_of(fov_deg: float, width: int, height: int, samples: int) -> mi.Sensor:
-    """Return a pinhole camera of Mitsuba; ``fov_deg`` is across the picture."""
+    """Create a Mitsuba pinhole camera; ``fov_deg`` is the horizontal field of view."""
     pixel = "luminance" if "mono" in str(mi.variant()) else "rgb"
     made = load_dict(
         {
@@ -256,18 +256,18 @@ def camera_of(fov_deg: float, width: int, height: int, samples: int) -> mi.Senso
 
 
 class CameraSimulator:
-    """Renders what a camera of Mitsuba sees from poses in a scene.
+    """Simulator of a Mitsuba camera's pictures from poses in a scene, with moving bodies at their poses at the time.
 
-    The scene's integrator is used; without one, paths of light of at most 8 bounces. The samples a pixel are those of the
-    camera's sampler.
+    The scene's integrator is used; without one, a path tracer with a maximum depth of 8. The camera's sampler gives the
+    number of samples per pixel.
 
     Args:
-        scene: with emitters.
-        camera: of Mitsuba, perspective or another.
-        moving: trajectories of bodies, as of :class:`mitsonar.Simulator`.
+        scene: scene with emitters.
+        camera: Mitsuba camera, perspective or another kind.
+        moving: trajectories of bodies, as in :class:`mitsonar.Simulator`.
 
     Raises:
-        MitsonarError: a scene without light.
+        MitsonarError: the scene has no light.
     """
 
     def __init__(self, scene: mi.Scene, camera: mi.Sensor, *, moving: Moving | MovingBodies | None = None) -> None:
@@ -282,18 +282,18 @@ class CameraSimulator:
         self.samples = int(camera.sampler().sample_count())
 
     def _build(self) -> None:
-        """Make the scene that is rendered: that given, or one with the bodies that move."""
+        """Build the scene to render: the given scene, or a copy of it with the moving bodies as instances."""
         scene, moving = self._given
         self.motion = motion_in(scene, moving)
         self.scene = scene if self.motion is None else _with_instances(scene, self.motion)
 
     def pictures(self, poses: ArrayLike, time_s: ArrayLike, *, first: int = 0) -> Iterator[NDArray[np.uint8]]:
-        """Render pictures, one a pose: ``(height, width)`` or ``(height, width, 3)``, sRGB.
+        """Yield one sRGB picture for each pose: ``(height, width)`` or ``(height, width, 3)``.
 
         Args:
-            poses: of the camera ``(pictures, 6)`` [m, rad]; it looks ahead.
-            time_s: of the pictures ``(pictures,)`` [s].
-            first: number of the first, of which the noise of rendering is a function.
+            poses: poses of the camera ``(pictures, 6)`` [m, rad]; it looks ahead.
+            time_s: times of the pictures ``(pictures,)`` [s].
+            first: number of the first picture; the numbers seed the rendering noise.
         """
         if self._watch.changed() is not None and self.motion is not None:
             self._build()
@@ -308,31 +308,31 @@ class CameraSimulator:
                 picture = self._picture(number)
                 yield picture[..., 0] if grey and picture.ndim == 3 else picture
         finally:
-            _turn(self.camera, place)  # a scene's camera stays where the scene has it
+            _turn(self.camera, place)  # restore the pose that the scene gives the camera
 
     def _picture(self, number: int) -> NDArray[np.uint8]:
-        """Render the scene as it is now; ``number`` seeds the noise of rendering."""
-        module: Any = mi  # its types lack conversions of seeds and films
+        """Render the scene in its current state; ``number`` seeds the rendering noise."""
+        module: Any = mi  # the type stubs lack conversions of seeds and films
         film = module.render(self.scene, sensor=self.camera, integrator=self.integrator, spp=self.samples, seed=number)
         return np.array(module.util.convert_to_bitmap(film))
 
 
 def told_of(camera: mi.Sensor) -> dict[str, str]:
-    """Return what tells a camera again, but for its place."""
+    """Return the parameters and the type of a camera as strings, without its pose."""
     values: Any = mi.traverse(camera)
     told = {name: str(values[name]) for name in values.keys() if not name.endswith("to_world")}  # noqa: SIM118  no dict
     return told | {"type": type(camera).__name__}
 
 
 def _turn(camera: mi.Sensor, to_world: mi.Transform4f) -> None:
-    """Put a camera at a place."""
+    """Set the pose of a camera."""
     values = mi.traverse(camera)
     values["to_world"] = to_world
     values.update()
 
 
 def _with_instances(scene: mi.Scene, motion: SceneMotion) -> mi.Scene:
-    """Return the scene with an instance for each body that moves."""
+    """Build a scene with an instance for each moving body."""
     parts: dict[str, Any] = {"type": "scene"}
     for number, emitter in enumerate(scene.emitters()):
         if emitter.get_shape() is None:
@@ -348,13 +348,13 @@ def _with_instances(scene: mi.Scene, motion: SceneMotion) -> mi.Scene:
     names = [shape.id() for shape in motion.shapes]
     made = load_dict(parts, optimize=False)
     for shape, name in zip(motion.shapes, names, strict=True):
-        shape.set_id(name)  # the loader has changed it
+        shape.set_id(name)  # restore the id, which the loader changes
     assert isinstance(made, mi.Scene)
     return made
 
 
 def _place(scene: mi.Scene, motion: SceneMotion, time_s: float) -> None:
-    """Move the instances, and the vertices of what deforms, to where they are at a time [s]."""
+    """Move the instances, and the vertices of deforming meshes, to their positions at a time [s]."""
     values: Any = mi.traverse(scene)
     for one in motion.deformed:
         group = f"group{motion.numbers[one.mesh.id()]}."
