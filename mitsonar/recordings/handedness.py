@@ -1,9 +1,9 @@
-"""Whether pictures are mirrored: the rotation that they show against the one that a compass, or the user, tells.
+"""Are pictures mirrored? The rotation that they show is compared with the rotation given by a compass or the user.
 
-A sonar that turns to starboard sees what is fixed move to port. In mirrored pictures it moves to starboard. Each pair of
-frames is registered over bearing and range by cross-correlation. Bearings are searched to both sides alike, up to twice the
-largest told rotation. Sideways motion moves bearings too, but has either sign. So over many pairs the sign of the
-correlation tells the side.
+To a sonar that turns to starboard, fixed objects move to port. In mirrored pictures they move to starboard. Each pair of
+frames is registered over bearing and range by cross-correlation. Bearings are searched symmetrically on both sides, up to
+twice the largest given rotation. Sideways motion shifts bearings too, but with either sign. Over many pairs, the sign of the
+correlation between given and observed rotations therefore decides.
 """
 
 from __future__ import annotations
@@ -23,45 +23,45 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 STEPS = (1, 2, 4, 8, 16, 32, 64)
-"""Frames between the two of a pair; the smallest that gives enough pairs is taken, else the one that gives most."""
+"""Candidate frame distances within a pair; the smallest that gives enough pairs is used, or else the one that gives most."""
 
 LEAST_TURN = 1.5
-"""Least rotation of a pair, in spacings of the beams."""
+"""Minimum rotation of a pair, in units of the beam spacing."""
 
 MOST_TURN = 0.25
-"""Largest rotation of a pair, as part of the field of view: beyond, too little is seen twice."""
+"""Maximum rotation of a pair, as a fraction of the field of view; beyond it, too little is visible in both frames."""
 
 MOST_PAIRS = 120
 ENOUGH_PAIRS = 40
 FEWEST_PAIRS = 5
-"""Pairs that are registered, at most; that are looked for; with fewer nothing is told."""
+"""Maximum number of pairs that are registered; number that is enough; minimum number for a verdict."""
 
 CLEAR, SIGMAS = 0.4, 3.0
-"""Least correlation, and least multiple of its standard deviation without any relation, for a verdict."""
+"""Minimum correlation for a verdict, absolute and in standard deviations of the correlation of unrelated rotations."""
 
 LEAST_SLOPE = 0.25
-"""Least seen rotation for each told one, for a verdict."""
+"""Minimum ratio of observed to given rotation for a verdict."""
 
 REACH = 2.0
-"""Largest rotation that is searched, as a multiple of the largest told one."""
+"""Largest rotation that is searched, as a multiple of the largest given one."""
 
 REACH_RANGE = 0.15
-"""Largest shift over range that is searched, as part of the bins."""
+"""Largest shift over range that is searched, as a fraction of the number of bins."""
 
 MOST_ROWS = 192
-"""Rows that pictures are averaged to."""
+"""Maximum number of rows to which pictures are averaged."""
 
 
 class Handedness(NamedTuple):
-    """What the rotation of the pictures tells.
+    """Result of comparing the rotation of pictures with the given headings.
 
     Attributes:
-        verdict: ``agree``, ``mirrored``, or ``unknown`` where the rotation is too small, or the two are not related.
-        correlation: of told and seen rotations, -1..1, about zero; nan without pairs.
-        slope: seen rotation for each told one; near 1 or -1 where field of view and headings are right; nan without pairs.
-        pairs: of frames that were registered.
-        turn_deg: told rotation of a pair, rms [deg].
-        reason: why nothing is told; empty otherwise.
+        verdict: ``agree``, ``mirrored``, or ``unknown`` if the rotation is too small or the two rotations are unrelated.
+        correlation: correlation about zero of given and observed rotations, -1..1; nan without pairs.
+        slope: ratio of observed to given rotation; near 1 or -1 if field of view and headings are right; nan without pairs.
+        pairs: number of registered pairs of frames.
+        turn_deg: rms given rotation of a pair [deg].
+        reason: why the verdict is ``unknown``; empty otherwise.
     """
 
     verdict: Literal["agree", "mirrored", "unknown"]
@@ -73,15 +73,15 @@ class Handedness(NamedTuple):
 
 
 def handedness_of(part: Part, heading_rad: ArrayLike | None = None) -> Handedness:
-    """Tell whether the pictures of a part rotate as its headings do.
+    """Determine whether the pictures of a part rotate as its headings do.
 
     Args:
-        part: of a recording.
-        heading_rad: of each frame ``(frames,)`` [rad], clockwise; or one number, the turn from the first frame to the last,
-            made evenly, > 0 to starboard. Default: that of the poses, else of the sonar's compass.
+        part: part of a recording.
+        heading_rad: heading of each frame ``(frames,)`` [rad], clockwise; or one number, the total turn from the first frame
+            to the last at a constant rate, > 0 to starboard. Default: headings of the poses, or else of the sonar's compass.
 
     Raises:
-        MitsonarError: headings that are not one a frame; pictures that cannot be read.
+        MitsonarError: if the number of headings is not that of frames, or pictures cannot be read.
     """
     heading = _headings(part, heading_rad)
     if heading is None:
@@ -89,19 +89,24 @@ def handedness_of(part: Part, heading_rad: ArrayLike | None = None) -> Handednes
     bearing = part.like.bearing_rad
     if len(bearing) < 8 or len(part) < FEWEST_PAIRS + 1:
         return _unknown("there are too few beams or frames")
+    # 1. Choose pairs of frames that turn by a measurable angle and still show the same ground.
     spacing, width = float(np.median(np.diff(bearing))), float(bearing[-1] - bearing[0])
     pairs = _pairs(heading, spacing, MOST_TURN * width)
     if pairs is None:
         return _unknown(f"no pairs of frames turn by {np.degrees(LEAST_TURN * spacing):.2g} deg and show the same ground")
+    # 2. Measure the rotation that the pictures show, and drop pairs for which there is none.
     told = _turns(heading, pairs)
     seen = _seen_turns(part, pairs, REACH * float(np.abs(told).max()))
     kept = np.isfinite(seen)
     told, seen = told[kept], seen[kept]
+    # 3. Correlate both about zero rather than about their means, which keeps the information of a turn to one side.
     energy = float(np.sum(told**2)), float(np.sum(seen**2))
     if len(told) < FEWEST_PAIRS or min(energy) <= 0:
         return _unknown("the pictures show no contrast that moves", len(told))
     both = float(np.sum(told * seen))
     correlation, slope = both / math.sqrt(energy[0] * energy[1]), both / energy[0]
+    # 4. Decide by the sign of the correlation, if it is significant: for unrelated rotations, its standard deviation is
+    #    1 / sqrt(pairs).
     clear = abs(correlation) >= max(CLEAR, SIGMAS / math.sqrt(len(told))) and abs(slope) >= LEAST_SLOPE
     rms = float(np.degrees(np.sqrt(np.mean(told**2))))
     if not clear:
@@ -116,7 +121,7 @@ def _unknown(reason: str, pairs: int = 0) -> Handedness:
 
 
 def _headings(part: Part, given: ArrayLike | None) -> Array | None:
-    """Return the heading of each frame ``(frames,)`` [rad]; None where nothing tells them."""
+    """Return the heading of each frame ``(frames,)`` [rad]; None if headings are unknown."""
     if given is not None:
         heading = np.asarray(given, dtype=float)
         heading = np.linspace(0.0, float(heading), len(part)) if heading.ndim == 0 else heading
@@ -132,13 +137,19 @@ def _headings(part: Part, given: ArrayLike | None) -> Array | None:
 
 
 def _turns(heading: Array, pairs: tuple[Index, Index]) -> Array:
-    """Return the told rotation of each pair ``(pairs,)`` [rad], in -pi..pi."""
+    """Return the given rotation of each pair ``(pairs,)`` [rad], in -pi..pi."""
     turn = heading[pairs[1]] - heading[pairs[0]]
     return np.asarray((turn + np.pi) % (2 * np.pi) - np.pi, dtype=float)
 
 
 def _pairs(heading: Array, spacing: float, most: float) -> tuple[Index, Index] | None:
-    """Return the frames of pairs, first and second, that turn by enough and not too much; None where there are too few."""
+    """Return the first and second frames of pairs whose rotation is suitable; None if there are too few.
+
+    Args:
+        heading: heading of each frame ``(frames,)`` [rad].
+        spacing: beam spacing, which determines the minimum rotation [rad].
+        most: maximum rotation [rad].
+    """
     found: list[tuple[Index, Index]] = []
     for step in STEPS:
         first = np.arange(0, len(heading) - step)
@@ -155,18 +166,20 @@ def _pairs(heading: Array, spacing: float, most: float) -> tuple[Index, Index] |
 
 
 def _seen_turns(part: Part, pairs: tuple[Index, Index], most: float) -> Array:
-    """Return the rotation that the pictures of each pair show ``(pairs,)`` [rad], to starboard; nan where none is seen.
+    """Return the rotation that the pictures of each pair show ``(pairs,)`` [rad], to starboard; nan if there is none.
 
     Args:
-        part: of a recording.
+        part: part of a recording.
         pairs: first and second frames.
         most: largest rotation that is searched [rad].
     """
+    # 1. Average some pictures. What does not move with the scene, such as the beam pattern, would suggest no rotation.
     bearing = part.like.bearing_rad
     some = np.unique(np.concatenate(pairs))
     shown = some[np.unique(np.linspace(0, len(some) - 1, min(MOST_PAIRS // 4, len(some))).astype(np.intp))]
     still = np.mean([part.read([number]).matching_values()[0] for number in shown], axis=0)
     still = still if len(shown) >= FEWEST_PAIRS else np.zeros_like(still)
+    # 2. Register each pair on evenly spaced bearings. The scene moves against the rotation of the sonar: negate the shift.
     even = np.linspace(bearing[0], bearing[-1], len(bearing))
     step = float(even[1] - even[0])
     turns = []
@@ -177,14 +190,24 @@ def _seen_turns(part: Part, pairs: tuple[Index, Index], most: float) -> Array:
 
 
 def _contrast(image: NDArray[np.floating], still: NDArray[np.floating], bearing: Array, even: Array) -> Array:
-    """Return what moves in a picture ``(rows, beams)``: on even bearings, without the mean of each range, tapered."""
+    """Return the moving content of a picture ``(rows, beams)`` on even bearings, prepared for correlation.
+
+    Args:
+        image: picture ``(bins, beams)``.
+        still: mean picture ``(bins, beams)``, which is subtracted.
+        bearing: bearings of the picture ``(beams,)`` [rad].
+        even: evenly spaced bearings of the result ``(beams,)`` [rad].
+    """
+    # 1. Subtract the stationary content, and average bins to at most MOST_ROWS rows.
     moving = np.asarray(image - still, dtype=float)
     together = -(-len(moving) // MOST_ROWS)
     moving = moving[: len(moving) // together * together].reshape(-1, together, moving.shape[1]).mean(axis=1)
+    # 2. Interpolate to even bearings, on which a rotation is the same shift in all columns.
     place = np.interp(even, bearing, np.arange(len(bearing)))
     left = np.minimum(place.astype(np.intp), len(bearing) - 2)
     over = place - left
     spread = moving[:, left] * (1 - over) + moving[:, left + 1] * over
+    # 3. Remove the mean of each range and taper the borders, so that neither rings nor borders dominate the correlation.
     spread -= spread.mean(axis=1, keepdims=True)
     return np.asarray(spread * _taper(len(spread))[:, None] * _taper(len(even)), dtype=float)
 
@@ -194,23 +217,27 @@ def _taper(count: int) -> Array:
 
 
 def _shift(a: Array, b: Array, reach: int) -> float:
-    """Return by how many columns ``b`` is moved to starboard against ``a``, to a part of one; nan where no peak is inside.
+    """Return the shift of ``b`` to starboard relative to ``a`` [columns], to subcolumn accuracy; nan without a peak inside.
 
     Args:
         a: first picture ``(rows, beams)``.
-        b: second picture, like ``a``.
-        reach: largest number of columns.
+        b: second picture ``(rows, beams)``.
+        reach: largest shift that is searched [columns].
     """
+    # 1. Cross-correlate by FFT, padded with zeros to twice the size to avoid wrap-around.
     rows, beams = a.shape
     size = (2 * rows, 2 * beams)
     found = np.fft.irfft2(np.conj(np.fft.rfft2(a, size)) * np.fft.rfft2(b, size), size)
+    # 2. Divide by the autocorrelation of the tapers: the overlap shrinks with the shift, which would favour small shifts.
     over = [np.fft.irfft(np.abs(np.fft.rfft(_taper(count), 2 * count)) ** 2, 2 * count) for count in (rows, beams)]
     down, across = max(2, int(REACH_RANGE * rows)), min(reach, beams - 2)
     lags = np.arange(-down, down + 1), np.arange(-across, across + 1)
     score = found[np.ix_(*lags)] / (over[0][lags[0]][:, None] * over[1][lags[1]])
+    # 3. Find the peak. One at the end of the search interval is no maximum.
     row, best = np.unravel_index(int(score.argmax()), score.shape)
     if not score[row, best] > 0 or best in (0, len(lags[1]) - 1):
         return float("nan")
+    # 4. Refine it by the vertex of the parabola through the peak and its neighbours.
     before, peak, after = score[row, best - 1 : best + 2]
     bend = before - 2 * peak + after
     return float(lags[1][best] + (0.5 * (before - after) / bend if bend < 0 else 0.0))

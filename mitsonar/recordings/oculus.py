@@ -1,8 +1,9 @@
-"""Oculus recordings of Blueprint Subsea: dumps of messages (``.raw``) and logs (``.oculus``), message versions 0, 1 and 2.
+"""How is a recording of a Blueprint Subsea Oculus read? Message dumps (``.raw``) and logs (``.oculus``), versions 0 to 2.
 
-Source of the layout: liboculus (BSD-3-Clause). Version 0 and 8 bits were checked on real pings. Version 2, other widths,
-gains of rows and logs were not: no such file was at hand. The authors of hydroformats (Apache-2.0) report a real log of
-version 2 whose start times are seconds, and whose bearings are negative to port.
+Sources of the layouts are public readers: liboculus (BSD-3-Clause) for messages, and oculus_driver (its files under
+BSD-3-Clause) for logs. Version 0 with 8-bit samples was checked on real pings. Version 2, other sample widths, row gains
+and logs were not, as no such file was available. The authors of hydroformats (Apache-2.0) report that real logs have these
+headers. They also report a real log of version 2 whose start times are in seconds and whose bearings are negative to port.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ FIRE = {
     "version": (8, "<u2"), "mode": (16, "u1"), "ping_rate": (17, "u1"), "gamma": (19, "u1"), "flags": (20, "u1"),
     "range_demand": (21, "<f8"), "gain_percent": (29, "<f8"), "salinity": (45, "<f8"),
 }  # fmt: skip
-"""What each version holds at the same place."""
+"""Fields that all versions hold at the same offset."""
 
 OLDER = layout(
     FIRE
@@ -70,7 +71,7 @@ OLDER = layout(
     },
     122,
 )  # fmt: skip
-"""Fields of a message of version 0 or 1: offset from its begin [bytes] and type."""
+"""Fields of a message of version 0 or 1: offset from its start [bytes] and type."""
 
 LATER = layout(
     FIRE
@@ -85,54 +86,55 @@ LATER = layout(
 """Fields of a message of version 2."""
 
 GAINED = 4
-"""Bit of the flags: each row of the image begins with its gain, 4 bytes."""
+"""Bit of the flags: each image row begins with its gain, 4 bytes."""
 
 RATES = {0: 10.0, 1: 15.0, 2: 40.0, 3: 5.0, 4: 2.0}
-"""Greatest ping rates by their code [Hz]."""
+"""Maximum ping rates by their code [Hz]."""
 
 SAME_STEP = 0.002
-"""Relative change of the range resolution up to which a window counts as the same: the sound speed drifts."""
+"""Relative change of the range resolution, caused by drift of the sound speed, up to which a window counts as the same."""
 
 WIDEST_DEG = 85.0
-"""Largest bearing that is believed [deg]."""
+"""Largest plausible bearing [deg]."""
 
 MOST_CELLS = 2**28
 LONGEST_M = 1e4
-"""What is believed of an image: cells, and its far end [m]."""
+"""Largest plausible number of cells of an image, and largest plausible range [m]."""
 
 LONGEST_S, LATEST_S = 1e4, 1e11
-"""What is believed of the time between two pings, and of a time [s]."""
+"""Largest plausible time between two pings, and largest plausible time [s]."""
 
 SAME_CLOCK_S = 1.0
-"""Difference between the clocks of sonar and log, beyond their shift, up to which they count as one [s]."""
+"""Largest deviation from a constant offset with which the clocks of sonar and log count as synchronous [s]."""
 
 BANDS = {
     "oculus-m750d-750khz": (6e5, 9e5),
     "oculus-m1200d-1200khz": (1e6, 1.5e6),
     "oculus-m1200d-2100khz": (1.9e6, 2.4e6),
 }
-"""Presets that tell the opening over elevation and the width of a beam, by the carrier [Hz]."""
+"""Carrier bands [Hz] of the presets that supply elevation aperture and beam width."""
 
 ELEVATION_DEG = 20.0
-"""Opening over elevation where no preset tells it [deg]."""
+"""Elevation aperture if no preset supplies it [deg]."""
 
 
 def read_oculus(path: str | Path) -> Recording:
-    """Open a dump of Oculus messages, or an Oculus log; pixels are read on demand.
+    """Open a dump of Oculus messages or an Oculus log; pixels are read on demand.
 
-    Row r lies at (r + 1/2) times the range resolution. Columns follow the bearings of each message, which need not be even,
-    from negative (port) to positive (starboard): the sonar stands upright. Counts are amplitude^gamma: 0.5 for the gamma
-    byte 127, 1 for 0 and 255. Where rows begin with a gain, counts are divided by its root, as two public readers do.
-    Where a frame has 8 bits and no gains its image is uint8, else float32.
+    Row r lies at (r + 1/2) times the range resolution. Columns follow the bearings in each message, which need not be
+    evenly spaced, from negative (port) to positive (starboard); the sonar is assumed to be mounted upright. Counts are
+    amplitude^gamma, with gamma 0.5 for the gamma byte 127, and 1 for 0 and 255. If rows begin with a gain, counts are
+    divided by its square root, as two public readers do. Images are uint8 if samples have 8 bits and no gains, otherwise
+    float32.
 
-    Times are those of a log, or the start times of version 2 [s]. A log of version 2 has both: then times are those of the
-    sonar, which do not jitter, shifted to the log's clock. The counter of older versions has no known unit: it rises by 62.5
-    million a ping in the real ones, and one public driver calls it microseconds. Frames of such a dump follow each other by
-    their numbers, at the ping rate, or at 10 Hz where that has no known code.
-    Attitude is that of version 2 [deg], its pitch taken as upward positive.
+    Times are those of the log, or the start times of version 2 [s]. A log of version 2 has both: then times are those of the
+    sonar, which do not jitter, shifted to the clock of the log. The counter of older versions has no known unit: it rises by
+    62.5 million per ping in real files, and one public driver calls it microseconds. Times of such a dump are computed from
+    the ping numbers and the ping rate, or 10 Hz if the code of that rate is unknown.
+    Attitude is that of version 2 [deg], whose pitch is assumed to be positive upwards.
 
     Raises:
-        MitsonarError: no such file, another format, an encrypted log, or no ping that can be read.
+        MitsonarError: if the file does not exist, has another format, is an encrypted log, or holds no readable ping.
     """
     data = mapped(path, "an Oculus recording", HEADER.size)
     name = str(path)
@@ -148,7 +150,14 @@ def read_oculus(path: str | Path) -> Recording:
 
 
 class _Pings(NamedTuple):
-    """Pings that can be read: numbers among the messages, fields, and which of the fans of bearings each has."""
+    """Readable pings.
+
+    Attributes:
+        place: index of the message of each ping ``(pings,)``.
+        head: header fields ``(pings,)``.
+        fan: index into ``fans`` of each ping ``(pings,)``.
+        fans: distinct bearing tables, each ``(beams,)`` [deg].
+    """
 
     place: Index
     head: Header
@@ -160,12 +169,14 @@ class _Pings(NamedTuple):
 
 
 def _pings_of(messages: Messages) -> tuple[_Pings, list[str]]:
-    """Return the messages whose header can be, and sentences on all others."""
+    """Return the pings whose header and bearings are plausible, and sentences on what is left out."""
     if not len(messages):
         raise MitsonarError(f"{messages.name} holds no ping of an Oculus: {len(messages.data):,} bytes without an image")
+    # Pad every header to the size of the longest version, so that all of them are checked in one array operation.
     blocks = b"".join(messages.head(one, LATER.itemsize).ljust(LATER.itemsize, b"\0") for one in range(len(messages)))
     head = _fields(np.frombuffer(blocks, np.dtype((np.void, LATER.itemsize))))
     whole = _whole(head, messages.size)
+    # Store each distinct bearing table once: pings of the same mode repeat it. -1 marks a table that is not plausible.
     fans: dict[bytes, int] = {}
     tables: list[Array] = []
     fan = np.full(len(messages), -1, dtype=np.intp)
@@ -197,7 +208,7 @@ def _header_size(version: int) -> int:
 
 
 def _fields(blocks: NDArray[np.void]) -> Header:
-    """Return the fields of messages ``(n,)`` of any version; those that older ones lack are nan."""
+    """Return the header fields of messages ``(n,)`` of any version; nan where an older version lacks a field."""
     older, later = (np.ndarray((len(blocks),), kind, blocks, 0, (LATER.itemsize,)) for kind in (OLDER, LATER))
     assert LATER.names is not None
     kinds = {name: "<f8" if name == "start" else LATER[name].str for name in LATER.names}
@@ -209,7 +220,7 @@ def _fields(blocks: NDArray[np.void]) -> Header:
 
 
 def _whole(head: Header, size: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which headers ``(n,)`` can be, in messages of these sizes ``(n,)`` [bytes]."""
+    """Return which headers ``(n,)`` are plausible for messages of these sizes ``(n,)`` [bytes]."""
     ranges, beams, image = (head[name].astype(np.int64) for name in ("ranges", "beams", "image"))
     rows = ranges * beams * (np.minimum(head["width"], 3) + 1)
     start = np.where(head["version"] >= 2, LATER.itemsize, OLDER.itemsize)
@@ -228,20 +239,20 @@ def _whole(head: Header, size: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _is_fan(bearings_deg: Array) -> bool:
-    """Return whether bearings rise or fall, and stay in front of the sonar."""
+    """Return whether bearings are strictly monotonic and lie in front of the sonar."""
     steps = np.diff(bearings_deg)
     return len(steps) > 0 and bool((steps > 0).all() or (steps < 0).all()) and np.abs(bearings_deg).max() <= WIDEST_DEG
 
 
 def _gained(head: Header) -> NDArray[np.bool_]:
-    """Return whether the rows of each image begin with a gain: by the flags, where there is room for them."""
+    """Return whether the rows of each image begin with a gain: the flag is set and the image is large enough for it."""
     ranges = head["ranges"].astype(np.int64)
     stride = head["beams"].astype(np.int64) * (head["width"] + 1) + 4
     return np.asarray((head["flags"] & GAINED > 0) & (head["image_size"] >= ranges * stride))
 
 
 def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
-    """Return the times of the pings ``(n,)`` [s], and a sentence where they are assumed."""
+    """Return the times of the pings ``(n,)`` [s], and a sentence if they are assumed."""
     head = pings.head
     start: Array = head["start"].astype(np.float64)
     steady = (head["version"] >= 2).all() and len(head) > 1 and _rise(start)
@@ -259,14 +270,14 @@ def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
 
 
 def _shifted(start_s: Array, logged_s: Array) -> Array:
-    """Return the sonar's times on the clock of the log ``(n,)`` [s]; those of the log where the clocks part."""
+    """Return the sonar's times shifted to the clock of the log ``(n,)`` [s]; those of the log if the clocks diverge."""
     late = logged_s - start_s
     shift = np.nanmedian(late)
     return start_s + shift if bool((np.abs(late - shift) < SAME_CLOCK_S).all()) else logged_s
 
 
 def _rise(time_s: Array) -> bool:
-    """Return whether each time comes after the one before, and not long after."""
+    """Return whether times are plausible: strictly increasing, by less than ``LONGEST_S`` at a time."""
     if not (np.abs(time_s) < LATEST_S).all():
         return False
     steps = time_s[1:] - time_s[:-1]
@@ -274,7 +285,7 @@ def _rise(time_s: Array) -> bool:
 
 
 def _windows(pings: _Pings) -> list[tuple[float, ...]]:
-    """Return what the geometry of each frame follows from; small drifts of the range resolution count as none."""
+    """Return the values that determine the geometry of each frame; small drifts of the range resolution are ignored."""
     keys, step = [], 0.0
     gained = _gained(pings.head)
     for one, ping in enumerate(pings.head):
@@ -302,7 +313,7 @@ def _part(messages: Messages, pings: _Pings, time_s: Array) -> Part:
 
 
 def _like(head: Header, bearings: Array, time_s: Array, images: OculusImages) -> SonarFrames:
-    """Return frames without images: the geometry of a part."""
+    """Return empty frames with the geometry of a part."""
     first = head[0]
     bins, beams = images.shape
     step = float(np.median(head["resolution"]))
@@ -338,12 +349,12 @@ def _like(head: Header, bearings: Array, time_s: Array, images: OculusImages) ->
 
 
 def _known(frequency: float) -> str | None:
-    """Return the preset of a carrier [Hz]; None where there is none."""
+    """Return the name of the preset for a carrier [Hz]; None if there is none."""
     return next((name for name, (low, high) in BANDS.items() if low < frequency < high), None)
 
 
 def _layout(bearings: Array) -> tuple[str, float]:
-    """Return whether beams are even in the angle or in its sine, and the field of view [deg]."""
+    """Return the beam layout, evenly spaced in the angle or in its sine, and the field of view [deg]."""
     spread = [float(np.std(steps) / np.mean(steps)) for steps in (np.diff(bearings), np.diff(np.sin(bearings)))]
     sides = len(bearings) / (len(bearings) - 1)
     if spread[0] <= spread[1]:
@@ -353,7 +364,7 @@ def _layout(bearings: Array) -> tuple[str, float]:
 
 
 def _gamma(code: int) -> float:
-    """Return the exponent that a gamma byte stands for: 0 and 255 none, 127 a half, those between in proportion."""
+    """Return the exponent encoded by a gamma byte: 1 for 0 and 255, otherwise the byte divided by 254 (127 is 0.5)."""
     return 1.0 if code in (0, 255) else code / 254
 
 
@@ -368,14 +379,14 @@ def _rate(time_s: Array) -> float:
 
 
 def _attitude(head: Header) -> Array | None:
-    """Return pitch, roll, heading ``(frames, 3)`` [rad], downward pitch positive; None where no message tells them."""
+    """Return pitch, roll, heading ``(frames, 3)`` [rad], pitch positive downwards; None if no message holds them."""
     degrees = np.stack([-head["pitch"], head["roll"], head["heading"]], axis=1).astype(float)
     degrees = np.where(np.abs(degrees) <= 360, degrees, np.nan)
     return np.radians(degrees) if np.nan_to_num(degrees).any() else None
 
 
 def _facts(head: Header) -> Facts:
-    """Return what the messages tell, by name."""
+    """Return header values, keyed by name."""
     if not len(head):
         return {}
     first = head[0]
@@ -389,7 +400,7 @@ def _facts(head: Header) -> Facts:
 
 
 def _notes(head: Header) -> list[str]:
-    """Return sentences on what changes inside the file, and on what is assumed."""
+    """Return sentences on what changes within the file and on what is assumed."""
     notes = []
     gains = np.unique(head["gain_percent"][np.isfinite(head["gain_percent"])])
     if len(gains) > 1:
@@ -410,53 +421,49 @@ def _notes(head: Header) -> list[str]:
     return notes
 
 
-# ---------------- Where the messages of an Oculus lie in a file: back to back in a dump (``.raw``), or in the items
-# of a log (``.oculus``)
-# Only headers are read to find them, so that a file of any size is opened at once. Source of both layouts: public readers,
-# liboculus (BSD-3-Clause) for messages and oculus_driver (its files under BSD-3-Clause) for logs. No log was at hand; the
-# authors of hydroformats (Apache-2.0) report that real ones have these headers.
+# ---------------- Messages in a dump or a log
 
 
 DUMP, LOG = b"SO", struct.pack("<I", 0x11223344)
-"""First bytes of a message, and so of a dump; first bytes of a log."""
+"""First bytes of a message, and therefore of a dump; first bytes of a log."""
 
 DATABASE = b"SQLite format 3\0"
-"""First bytes of a log of ViewPoint 2, which is not read."""
+"""First bytes of a log of ViewPoint 2, which is not supported."""
 
 ITEM = struct.pack("<I", 0xAABBCCDD)
-"""First bytes of an item of a log."""
+"""First bytes of an item in a log."""
 
 HEADER = struct.Struct("<HHHHHIH")
-"""Of a message: mark, source, destination, kind, version, bytes that follow, spare."""
+"""Header of a message: mark, source, destination, kind, version, number of bytes that follow, spare."""
 
 LOG_HEADER = struct.Struct("<II16sHH4xqd")
-"""Of a log: mark, size of this header, source, version, encryption, key, time."""
+"""Header of a log: mark, size of this header, source, version, encryption, key, time."""
 
 ITEM_HEADER = struct.Struct("<IIHH4xdH2xII")
-"""Of an item: mark, size of this header, kind, version, time [s], packing, bytes when unpacked, bytes that follow."""
+"""Header of an item: mark, size of this header, kind, version, time [s], compression, decompressed and stored bytes."""
 
 PING = 0x23
-"""Kind of a message with an image."""
+"""Kind of message that holds an image."""
 
 KINDS = (0x15, 0x22, PING, 0x55, 0x80, 0xFF)
-"""All kinds of messages."""
+"""All kinds of message."""
 
 LATEST = 2
-"""Version of a message, at most."""
+"""Latest supported version of a message."""
 
 MESSAGE_ITEM = 10
-"""Kind of an item that is one message."""
+"""Kind of item that holds one message."""
 
 LARGEST_HEADER = 4096
 LARGEST_MESSAGE = 2**26
-"""What is believed of a header of a log, and of a message that must be unpacked [bytes]."""
+"""Largest plausible header in a log, and largest plausible size of a decompressed message [bytes]."""
 
 STEP = 4096
-"""Packed bytes that are unpacked at a time."""
+"""Number of compressed bytes that are decompressed at a time."""
 
 
 class _Place(NamedTuple):
-    """A message in a file: begin, bytes there, bytes when unpacked (0: it is not packed), time of its item [s]."""
+    """Location of a message in a file: offset, stored bytes, decompressed bytes (0 if not compressed), item time [s]."""
 
     begin: int
     stored: int
@@ -466,17 +473,17 @@ class _Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Messages:
-    """The messages with images of a file.
+    """The image messages of a file.
 
     Attributes:
-        name: of the file.
+        name: name of the file.
         data: the whole file.
         begin: offset of each message ``(messages,)`` [bytes].
-        stored: its bytes in the file ``(messages,)``.
-        unpacked: its bytes when unpacked ``(messages,)``; 0 where it is not packed.
-        time_s: by the log ``(messages,)`` [s]; nan where unknown.
-        left_over: bytes of the file that belong to no message.
-        skipped: messages of other kinds.
+        stored: size of each message in the file ``(messages,)`` [bytes].
+        unpacked: decompressed size of each message ``(messages,)`` [bytes]; 0 if it is not compressed.
+        time_s: time of each message in the log ``(messages,)`` [s]; nan where unknown.
+        left_over: number of bytes of the file that belong to no message.
+        skipped: number of messages of other kinds.
     """
 
     name: str
@@ -494,11 +501,11 @@ class Messages:
 
     @property
     def size(self) -> NDArray[np.int64]:
-        """Return the size of each message with its header ``(messages,)`` [bytes]."""
+        """Return the size of each message including its header ``(messages,)`` [bytes]."""
         return np.where(self.unpacked > 0, self.unpacked, self.stored)
 
     def head(self, number: int, count: int) -> bytes:
-        """Return the first bytes of a message, at most ``count``; fewer where it is shorter or damaged."""
+        """Return the first ``count`` bytes of a message; fewer if it is shorter or damaged."""
         begin, stored = int(self.begin[number]), int(self.stored[number])
         if not self.unpacked[number]:
             return self.data[begin : begin + min(stored, count)].tobytes()
@@ -511,7 +518,7 @@ class Messages:
         """Return all bytes of a message.
 
         Raises:
-            MitsonarError: packed bytes that are damaged.
+            MitsonarError: if compressed bytes are damaged.
         """
         begin, stored, size = int(self.begin[number]), int(self.stored[number]), int(self.unpacked[number])
         if not size:
@@ -528,7 +535,7 @@ class Messages:
 
 
 def is_oculus(path: Path, first: bytes) -> bool:
-    """Return whether the first bytes of a file, 16 or more, are those of a dump or of a log."""
+    """Return whether the first bytes of a file, 16 or more, are those of a dump or a log."""
     if first.startswith(LOG) or (first.startswith(DATABASE) and path.suffix.lower() == ".oculus"):
         return True
     if not first.startswith(DUMP) or len(first) < HEADER.size:
@@ -538,16 +545,17 @@ def is_oculus(path: Path, first: bytes) -> bool:
 
 
 def find_messages(data: Bytes, name: str) -> Messages:
-    """Find all messages with images in a dump or a log.
+    """Find all image messages in a dump or a log.
 
-    Bytes that are no message are passed over up to the next one.
+    Messages follow one another in a dump (``.raw``), and are the content of items in a log (``.oculus``). Only headers are
+    read, so that a file of any size opens at once. Bytes that belong to no message are skipped.
 
     Args:
         data: the whole file.
-        name: of the file, for errors.
+        name: name of the file, for error messages.
 
     Raises:
-        MitsonarError: neither of them, or an encrypted log.
+        MitsonarError: if the file is neither a dump nor a log, or the log is encrypted.
     """
     first = data[:16].tobytes()
     if first.startswith(DATABASE):
@@ -563,7 +571,7 @@ def find_messages(data: Bytes, name: str) -> Messages:
 
 
 class _Found:
-    """Collects messages; arrays keep a few bytes of each."""
+    """Collector of message locations; compact arrays need only a few bytes per message."""
 
     def __init__(self) -> None:
         self.places = [array("q"), array("q"), array("q")]
@@ -590,7 +598,7 @@ def _in_dump(data: Bytes, name: str) -> Messages:
             break
         kind, version, follow = HEADER.unpack_from(view, place)[3:6]
         if kind not in KINDS or version > LATEST or place + HEADER.size + follow > len(view):
-            place += 1
+            place += 1  # the mark occurred by chance: search on behind its first byte
             continue
         size = HEADER.size + follow
         found.bytes += size
@@ -621,7 +629,7 @@ def _in_log(data: Bytes, name: str) -> Messages:
             break
         _, head, kind, _, time_s, packing, unpacked, follow = ITEM_HEADER.unpack_from(view, place)
         if not ITEM_HEADER.size <= head <= LARGEST_HEADER or place + head + follow > len(view):
-            place += 1
+            place += 1  # the mark occurred by chance: search on behind its first byte
             continue
         begin, time_s = place + head, time_s if abs(time_s) < 1e11 else np.nan
         found.bytes += head + follow
@@ -634,7 +642,10 @@ def _in_log(data: Bytes, name: str) -> Messages:
 
 
 def _add_item(found: _Found, view: memoryview, item: _Place) -> None:
-    """Keep an item whose message holds an image; a packed one has its size before it, most significant byte first."""
+    """Add an item if its message holds an image.
+
+    The content of a compressed item begins with its decompressed size, most significant byte first.
+    """
     if item.unpacked:
         size = int.from_bytes(view[item.begin : item.begin + 4], "big")
         most = min(LARGEST_MESSAGE, INFLATION * item.stored)
@@ -655,10 +666,10 @@ def _add_item(found: _Found, view: memoryview, item: _Place) -> None:
 
 
 def _unpacked(packed: memoryview, count: int) -> bytes:
-    """Unpack the first ``count`` bytes, or fewer where there are no more; never makes more than these.
+    """Decompress the first ``count`` bytes, or all if there are fewer; never allocates more than that.
 
     Raises:
-        zlib.error: damaged bytes.
+        zlib.error: if the bytes are damaged.
     """
     made, unpacker = bytearray(), zlib.decompressobj()
     for start in range(0, len(packed), STEP):
@@ -670,22 +681,21 @@ def _unpacked(packed: memoryview, count: int) -> bytes:
     return bytes(made)
 
 
-# ---------------- The images in messages of an Oculus: counts of 8 to 32 bits, row by row, where asked with the gain
-# of each row
+# ---------------- Images
 
 
 @dataclass(frozen=True)
 class OculusImages:
-    """The images of a part's frames.
+    """Function that reads the images of a part: rows of counts of 8 to 32 bits, each with or without a gain.
 
     Attributes:
-        messages: of the file.
-        place: number of each frame's message.
-        offset: of each frame's image in its message [bytes].
-        shape: bins and beams.
-        width: bytes of a count.
-        gained: each row begins with its gain.
-        falling: the message's first beam is the one most to starboard.
+        messages: messages of the file.
+        place: index of the message of each frame ``(frames,)``.
+        offset: offset of each frame's image in its message ``(frames,)`` [bytes].
+        shape: number of bins and of beams.
+        width: size of a count [bytes].
+        gained: whether each row begins with its gain.
+        falling: whether the first beam of a message is the one farthest to starboard.
     """
 
     messages: Messages
@@ -698,11 +708,14 @@ class OculusImages:
 
     @property
     def eight_bit(self) -> bool:
-        """Return whether images are the bytes of the file."""
+        """Return whether images are the unchanged bytes of the file."""
         return self.width == 1 and not self.gained
 
     def __call__(self, index: Index) -> Pixels:
-        """Return ``(n, bins, beams)``, column 0 most to port."""
+        """Return images ``(n, bins, beams)``, column 0 farthest to port.
+
+        Counts are scaled relative to the smallest gain of the part's first frame.
+        """
         made: Pixels = np.empty((len(index), *self.shape), np.uint8 if self.eight_bit else np.float32)
         reference = self._rows(0)[0].min(initial=np.inf) if self.gained and len(index) else 1.0
         for one, frame in enumerate(index):
@@ -715,7 +728,7 @@ class OculusImages:
         return made[:, :, ::-1] if self.falling else made
 
     def _rows(self, frame: int) -> tuple[Array, NDArray[Any]]:
-        """Return the gains ``(bins,)`` and the counts ``(bins, beams)`` of a frame."""
+        """Return the row gains ``(bins,)`` and the counts ``(bins, beams)`` of a frame."""
         bins, beams = self.shape
         begin, stride = int(self.offset[frame]), beams * self.width + 4 * self.gained
         whole = self.messages.whole(int(self.place[frame]))
@@ -727,7 +740,7 @@ class OculusImages:
 
 
 def _counts(rows: NDArray[np.uint8], width: int) -> NDArray[Any]:
-    """Return counts of 1 to 4 bytes each, the least significant byte first ``(bins, beams)``."""
+    """Return counts ``(bins, beams)`` assembled from 1 to 4 bytes each, least significant byte first."""
     if width == 1:
         return rows
     parts = rows.reshape(len(rows), -1, width)

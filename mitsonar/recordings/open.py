@@ -1,4 +1,4 @@
-"""Any recording, by its content: a file's first bytes or a folder's files tell the format."""
+"""How is a recording of unknown format opened? By the first bytes of the file, or the files in the folder."""
 
 from __future__ import annotations
 
@@ -31,13 +31,16 @@ __all__ = ["FORMATS", "Format", "Summary", "format_of", "known_formats", "open_r
 
 
 FIRST_BYTES = 16
-"""Bytes by which formats are told from each other."""
+"""Number of leading bytes of a file by which its format is recognised."""
 
 
 class Format(NamedTuple):
-    """A format: in words, whether a path with these first bytes (empty for a folder) has it, and what reads it.
+    """A recording format and its reader.
 
-    What reads it is given the path, a geometry file or None, and the topic of the sonar or None.
+    Attributes:
+        words: readable name.
+        fits: function that returns whether a path with these first bytes (empty for a folder) has the format.
+        read: function that opens a recording, given its path, a geometry file or None, and the topic of the sonar or None.
     """
 
     words: str
@@ -46,7 +49,7 @@ class Format(NamedTuple):
 
 
 def _of_pictures(read: Callable[[Path, Path | None], Recording]) -> Callable[[Path, Path | None, str | None], Recording]:
-    """Return a reader of a format whose files hold one sonar, which refuses a topic."""
+    """Wrap a reader of a format whose files hold a single sonar, so that it rejects a topic."""
 
     def checked(path: Path, geometry: Path | None, topic: str | None) -> Recording:
         if topic is not None:
@@ -57,7 +60,7 @@ def _of_pictures(read: Callable[[Path, Path | None], Recording]) -> Callable[[Pa
 
 
 def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path | None, str | None], Recording]:
-    """Return a reader of a format whose files hold one sonar and tell their geometry, which refuses another one."""
+    """Wrap a reader of a format whose files hold a single sonar and its geometry, so that it rejects a geometry file."""
 
     def checked(path: Path, geometry: Path | None) -> Recording:
         if geometry is not None:
@@ -83,7 +86,7 @@ FORMATS: tuple[Format, ...] = (
 
 
 def format_of(path: str | Path) -> Format | None:
-    """Return the format of a file or folder; None where it is no recording, or is not there."""
+    """Return the format of a file or folder; None if it is not a recording or does not exist."""
     path = Path(path)
     first = b""
     if os.path.isfile(path):
@@ -98,7 +101,7 @@ def format_of(path: str | Path) -> Format | None:
 
 
 def known_formats() -> str:
-    """Return all formats in words, for messages."""
+    """Return the names of all formats as one string, for messages."""
     return ", ".join(one.words for one in FORMATS)
 
 
@@ -106,12 +109,13 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     """Open a recording of a real sonar; pixels are read on demand.
 
     Args:
-        path: of a file or folder; its content tells the format (docs/guides/recordings.md).
-        geometry: a geometry file, for pictures. Other formats tell their geometry themselves.
-        topic: of the sonar in a ROS bag; default: the only one.
+        path: path of a file or folder; its content determines the format (docs/guides/recordings.md).
+        geometry: a geometry file, for pictures. Other formats contain their geometry.
+        topic: topic of the sonar in a ROS bag; default: the only one.
 
     Raises:
-        MitsonarError: nothing there, no known format, damaged, no such topic, or a geometry that is not needed.
+        MitsonarError: if the path does not exist, has no known format or is damaged, if there is no such topic, or if a
+            geometry is given that is not needed.
     """
     found = format_of(path)
     if found is None:
@@ -121,24 +125,27 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     return found.read(Path(path), None if geometry is None else Path(geometry), topic)
 
 
-# ---------------- What a recording is, in rows: frames, parts, window, beams, rate, times, gaps, attitude, poses,
-# facts and notes
+# ---------------- Summary of a recording
 
 
 Array = NDArray[np.float64]
 
 Summary: TypeAlias = dict[str, Any]
-"""Values by name as JSON holds them: numbers, texts, lists and tables of them."""
+"""JSON values, keyed by name: numbers, strings, lists and dictionaries of them."""
 
 GAP = 2.5
-"""A gap is a step between frames beyond this many usual ones."""
+"""A time step between frames counts as a gap if it exceeds this multiple of the median step."""
 
 SINCE_S = 946_684_800.0
-"""Times beyond this are dates: 2000-01-01 [s since 1970]."""
+"""Times from this one on are shown as dates: 2000-01-01 [s since 1970]."""
 
 
 def summary_of(recording: Recording) -> Summary:
-    """Return what a recording is; angles in degrees, all else SI."""
+    """Return a summary of a recording; angles are in degrees, all other values in SI units.
+
+    The summary lists frames, format, facts and notes, and of each part its window, beams, rate, times, gaps, attitude and
+    path length.
+    """
     return {
         "name": recording.name,
         "format": recording.format,
@@ -150,7 +157,7 @@ def summary_of(recording: Recording) -> Summary:
 
 
 def _part_of(part: Part) -> Summary:
-    """Return what a part is."""
+    """Return the summary of a part."""
     like, sonar = part.like, part.like.sonar
     bearing = np.degrees(like.bearing_rad)
     steps = np.diff(like.range_m)
@@ -195,13 +202,13 @@ def _times_of(time_s: Array) -> Summary:
 
 
 def _ends(values: Array) -> list[float] | None:
-    """Return the least and the greatest known value; None where none is known."""
+    """Return the minimum and maximum of the known values; None if none is known."""
     known = values[np.isfinite(values)]
     return [float(known.min()), float(known.max())] if len(known) else None
 
 
 def summary_lines(summary: Summary) -> list[str]:
-    """Return a summary as a table of two columns, a line each."""
+    """Return the lines of a summary, formatted as a table of two columns."""
     rows = [("file", summary["name"]), ("format", summary["format"]), ("frames", f"{summary['frames']:,}")]
     for number, part in enumerate(summary["parts"]):
         if len(summary["parts"]) > 1:
@@ -214,7 +221,7 @@ def summary_lines(summary: Summary) -> list[str]:
 
 
 def _rows_of(part: Summary) -> list[tuple[str, str]]:
-    """Return the rows of a part."""
+    """Return the table rows of a part: name and value."""
     low, high = part["window_m"]
     step = "" if part["bin_m"] is None else f" of {part['bin_m'] * 1e3:.4g} mm"
     first, last = part["bearing_deg"]
@@ -245,7 +252,7 @@ def _rows_of(part: Summary) -> list[tuple[str, str]]:
 
 
 def _date(time_s: float) -> str:
-    """Return a time: as a date in UTC where it is one, else in seconds."""
+    """Format a time: as a date in UTC if it is one, otherwise in seconds."""
     if time_s < SINCE_S:
         return f"{time_s:.6g} s"
     return datetime.fromtimestamp(time_s, UTC).isoformat(sep=" ", timespec="milliseconds").removesuffix("+00:00")

@@ -1,4 +1,4 @@
-"""Geometry files: YAML that tells how the pictures of a recording are laid out, and what else pictures do not tell."""
+"""How is the geometry of pictures described and checked? By YAML files, and by the outline of fans in the pictures."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ __all__ = ["Outline", "PictureGeometry", "doubts", "geometry_beside", "load_geom
 
 
 ANY_RANGE_MAX = 10.0
-"""End of the window where metres are not known [m]: any value does."""
+"""End of the window if the metric scale is unknown [m]; the value is arbitrary."""
 
 ANY_ELEVATION_DEG, ANY_RATE_HZ = 14.0, 10.0
-"""Opening over elevation [deg] and frame rate [Hz] that are assumed where nothing tells them."""
+"""Elevation aperture [deg] and frame rate [Hz] that are assumed if they are not given."""
 
 SAME_SCALE = 0.02
-"""Largest distance of ``near_px / far_px`` and ``range_min / range_max``, beyond which the apex is doubted."""
+"""Difference between ``near_px / far_px`` and ``range_min / range_max`` beyond which the apex is questioned."""
 
 FAN = ("apex_px", "near_px", "far_px", "half_angle_deg")
-"""Keys that a fan needs."""
+"""Keys that a fan requires."""
 
 FAN_ONLY = (*FAN, "stretch", "forward", "pixels_per_m", "bins", "beams")
 POLAR_ONLY = ("azimuth_fov_deg", "bearings_deg", "beam_layout", "rows", "transposed")
-"""Keys that belong to one layout."""
+"""Keys that are valid for one layout only."""
 
 SEE = "; see docs/reference/files.md#geometry-files"
 
@@ -39,13 +39,13 @@ Row = tuple[float, float]
 
 
 class PictureGeometry(BaseModel):
-    """How the pictures of a recording are laid out; each field is a key of the YAML file.
+    """Layout of the pictures of a recording; each field is a key of the YAML file.
 
-    Pixels count from 0 at the centre of the picture's upper left pixel: columns to the right, rows down. A fan's pixel
-    (u, v) lies at x = (u - apex column) ``stretch`` to the right and y = apex row - v forward.
+    Pixel coordinates are 0 at the centre of the upper left pixel; columns increase to the right, rows downwards. Pixel
+    (u, v) of a fan lies at x = (u - apex column) ``stretch`` to the right and y = apex row - v forward.
 
     Raises:
-        MitsonarError: through :meth:`create`, for an unknown key or values that do not fit together.
+        MitsonarError: by :meth:`create`, for an unknown key or inconsistent values.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -89,10 +89,10 @@ class PictureGeometry(BaseModel):
 
     @classmethod
     def create(cls, **fields: Any) -> Self:  # values of a file, before pydantic checks them
-        """Create a geometry with these keys.
+        """Create a geometry from its keys.
 
         Raises:
-            MitsonarError: an unknown key, a value outside its limits, keys that do not fit together.
+            MitsonarError: if a key is unknown, a value is outside its limits, or keys are inconsistent.
         """
         try:
             return cls(**fields)
@@ -136,17 +136,17 @@ class PictureGeometry(BaseModel):
 
     @property
     def near(self) -> float:
-        """Return ``near_px`` of a fan."""
+        """Return ``near_px`` of a fan; 0 if it is not given."""
         return float(self.near_px or 0.0)
 
     @property
     def far(self) -> float:
-        """Return ``far_px`` of a fan."""
+        """Return ``far_px`` of a fan; 0 if it is not given."""
         return float(self.far_px or 0.0)
 
     @property
     def window_m(self) -> Row:
-        """Return start and end of the window [m]."""
+        """Return the start and end of the window [m]."""
         if self.layout == "polar":
             return float(self.range_min or 0.0), float(self.range_max or 0.0)
         scale = self.pixels_per_m
@@ -155,7 +155,7 @@ class PictureGeometry(BaseModel):
         return start, end
 
     def bearing_of(self, half_angle_deg: float) -> Bearing:
-        """Return what a beam's angle is: as told, or by the half angle of the fan [deg]."""
+        """Return the meaning of a beam's angle: as given, or cone for half angles of the fan up to 90 deg, else azimuth."""
         return self.bearing or ("cone" if half_angle_deg <= 90 else "azimuth")
 
     def notes(self) -> list[str]:
@@ -180,7 +180,7 @@ def load_geometry(path: str | Path) -> PictureGeometry:
     """Load a geometry file.
 
     Raises:
-        MitsonarError: no such file, not YAML, an unknown key, or values that do not fit together.
+        MitsonarError: if the file does not exist or is not YAML, a key is unknown, or values are inconsistent.
     """
     fields = read_yaml(path, "geometry file")
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
@@ -196,7 +196,10 @@ def load_geometry(path: str | Path) -> PictureGeometry:
 
 
 def geometry_beside(path: Path) -> Path | None:
-    """Return the geometry file beside a recording: ``geometry.yaml`` in a folder; ``FILE.yaml`` or it beside a file."""
+    """Return the geometry file that belongs to a recording; None if there is none.
+
+    It is ``geometry.yaml`` in a folder, or else ``FILE.yaml`` or ``geometry.yaml`` next to the file or folder.
+    """
     path = path.absolute()
     near = [path / "geometry.yaml"] if path.is_dir() else []
     if not path.name:  # the root of the file system
@@ -205,40 +208,37 @@ def geometry_beside(path: Path) -> Path | None:
     return next((one for one in near if one.is_file() and one != path), None)
 
 
-# ---------------- The outline of a fan in its pictures, by which a told geometry is checked: straight edges, and a
-# circular far arc
-# The edges of a fan meet in its apex, also where the picture is squeezed sideways. Only one stretch of the columns
-# makes the far arc a circle about that apex. The half angle follows from the edges with that stretch.
+# ---------------- Check of a geometry by the outline of a fan
 
 
 Doubles = NDArray[np.float64]
 
 DARK = 16
-"""Largest value 0..255 of a pixel that counts as outside of the fan: videos ring there."""
+"""Largest value 0..255 of a pixel that counts as outside the fan, where compressed videos ring."""
 
 LEAST_ROWS = 24
-"""Rows, and columns, that an edge or arc must have."""
+"""Minimum number of rows of an edge, and of columns of an arc."""
 
 OFF_PX = 1.5
-"""Distance of a pixel inside a straight edge or the arc beyond which it does not belong to it [px]."""
+"""Distance inside an edge or arc beyond which a pixel does not belong to it [px]."""
 
 AGREEING = 0.5
-"""Least part of the pixels of an edge or arc that must belong to it."""
+"""Minimum fraction of the pixels of an edge or arc that must belong to it."""
 
 PASSES = 30
 
 SAME_STRETCH, SAME_ANGLE_DEG, SAME_PX = 0.05, 0.75, 0.02
-"""Differences of told and found geometry that are tolerated: relative, in degrees, and as part of ``far_px``."""
+"""Tolerated differences between given and measured geometry: relative, in degrees, and as a fraction of ``far_px``."""
 
 
 class Outline(NamedTuple):
-    """What the outline of a fan tells.
+    """Geometry of a fan, measured from its outline.
 
     Attributes:
-        apex_px: column and row where the edges meet.
-        far_px: distance of the far arc from the apex, along the fan's axis [px].
-        half_angle_deg: from the axis to an edge, with the stretch [deg].
-        stretch: of the columns that makes the far arc a circle.
+        apex_px: column and row where the edges meet [px].
+        far_px: distance of the far arc from the apex along the fan's axis [px].
+        half_angle_deg: angle from the axis to an edge after the stretch [deg].
+        stretch: factor on the columns that makes the far arc a circle.
     """
 
     apex_px: tuple[float, float]
@@ -248,33 +248,41 @@ class Outline(NamedTuple):
 
 
 def outline_of(brightest: NDArray[np.generic], *, forward: str = "up") -> Outline | None:
-    """Find the outline of a fan.
+    """Measure the outline of a fan: two straight edges and a circular far arc.
+
+    The edges of a fan meet in its apex even if the picture is squeezed sideways. Only one stretch of the columns turns the
+    far arc into a circle about that apex. The half angle follows from the edges after that stretch.
 
     Args:
-        brightest: largest value 0..255 of each pixel over some pictures ``(rows, columns)``.
-        forward: ``up`` or ``down``, the direction in which ranges rise.
+        brightest: largest value 0..255 of each pixel over several pictures ``(rows, columns)``.
+        forward: ``up`` or ``down``, the direction in which ranges increase.
 
     Returns:
-        None where there is none: no straight edges, no arc, or a fan that the picture cuts off.
+        The outline; None if there are no straight edges or no arc, or if the picture cuts the fan off.
     """
+    # 1. Separate the fan from its dark surroundings, and flip a fan that opens downwards.
     mask = np.asarray(brightest) > DARK
     mask = mask if forward == "up" else mask[::-1]
     rows = np.flatnonzero(mask.any(axis=1))
     columns = np.flatnonzero(mask.any(axis=0))
     if len(rows) < LEAST_ROWS or len(columns) < LEAST_ROWS:
         return None
+    # 2. Fit the edges to the first and last bright pixel of each row. Negated columns make the right edge a left one.
     first = mask[rows].argmax(axis=1).astype(float)
     last = mask.shape[1] - 1 - mask[rows][:, ::-1].argmax(axis=1).astype(float)
     left, right = _edge(rows.astype(float), first), _edge(rows.astype(float), -last)
     if left is None or right is None or left[1] + right[1] <= 0.02:
         return None
-    closing = left[1] + right[1]  # both edges lean inwards by so much a row
+    # 3. Intersect the edges in the apex.
+    closing = left[1] + right[1]  # the edges approach each other by this many columns per row
     row = (-right[0] - left[0]) / closing
     column = left[0] + left[1] * row
+    # 4. Fit the far arc to the topmost bright pixel of each column, relative to the apex.
     top = mask[:, columns].argmax(axis=0).astype(float)
     arc = _arc(np.asarray(columns - column, dtype=float), np.asarray(row - top, dtype=float))
     if arc is None:
         return None
+    # 5. Compute the half angle from the slopes of the edges after the stretch, and undo the flip.
     far, stretch = arc
     half = math.degrees(math.atan(stretch * closing / 2))
     row = row if forward == "up" else mask.shape[0] - 1 - row
@@ -282,7 +290,7 @@ def outline_of(brightest: NDArray[np.generic], *, forward: str = "up") -> Outlin
 
 
 def doubts(geometry: PictureGeometry, brightest: NDArray[np.generic]) -> list[str]:
-    """Compare a geometry with the outline of its pictures, and return sentences on what disagrees."""
+    """Compare a geometry with the outline of its pictures, and return sentences on the disagreements."""
     found = outline_of(brightest, forward=geometry.forward)
     if found is None:
         return ["the pictures show no outline of a fan: stretch and half angle could not be checked"]
@@ -311,10 +319,12 @@ def doubts(geometry: PictureGeometry, brightest: NDArray[np.generic]) -> list[st
 
 
 def _edge(row: Doubles, column: Doubles) -> tuple[float, float] | None:
-    """Fit the straight edge on the low side of columns ``(n,)``: column = a + b row; None where they are no edge.
+    """Fit a straight edge column = a + b row to the low side of pixels ``(n,)``; return a and b, or None if there is none.
 
-    Pixels inside the edge are dropped: they are dark parts of the fan. Columns fall until the far arc cuts them.
+    Pixels inside the edge are dropped, as they border dark parts of the fan or its far arc.
     """
+    # Alternate between fitting a line and selecting the pixels near it. The tolerance is wider outside the edge, so that
+    # the line moves outwards. While too few pixels are near, the outer half of them is used.
     kept = np.ones(len(row), dtype=bool)
     for _ in range(PASSES):
         slope, start = np.polyfit(row[kept], column[kept], 1)
@@ -330,10 +340,12 @@ def _edge(row: Doubles, column: Doubles) -> tuple[float, float] | None:
 
 
 def _arc(x: Doubles, y: Doubles) -> tuple[float, float] | None:
-    """Fit the far arc y^2 = far^2 - stretch^2 x^2 to pixels ``(n,)``: far [px] and stretch; None where they are no arc.
+    """Fit the far arc y^2 = far^2 - stretch^2 x^2 to pixels ``(n,)``; return far [px] and stretch, or None without an arc.
 
-    Pixels below the arc are dropped: they are dark parts of the fan, or its edges.
+    Pixels below the arc are dropped, as they border dark parts of the fan or belong to its edges.
     """
+    # Alternate between a least-squares fit, which is linear in far^2 and stretch^2, and selecting the pixels near the arc.
+    # Start with the upper half of the pixels, most of which belong to the arc.
     kept = y > np.median(y) - 1e-9
     far, squared = 0.0, 0.0
     for _ in range(PASSES):

@@ -1,4 +1,4 @@
-"""One picture file (PNG, JPEG, PGM): its size before anything is decoded, and its grey values."""
+"""How do pictures become a recording? Folders (PNG, JPEG, PGM), stacks (``.npz``) and videos, with a geometry file."""
 
 from __future__ import annotations
 
@@ -61,26 +61,26 @@ __all__ = [
 
 
 Grey = NDArray[np.generic]
-"""Values ``(rows, columns)``: uint8 in 0..255, or float32 in 0..1."""
+"""Grey values ``(rows, columns)``: uint8 in 0..255, or float32 in 0..1."""
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm")
-"""Endings of picture files."""
+"""Suffixes of picture files."""
 
 FORMATS = ("PNG", "JPEG", "PPM")
-"""What Pillow may take a file for, whatever its ending."""
+"""Formats that Pillow may detect, whatever the suffix of a file."""
 
 MOST_PIXELS = 2**25
-"""Pixels of a picture, at most."""
+"""Maximum number of pixels of a picture."""
 
 PNG, END_OF_PNG = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 """First and last bytes of a PNG file."""
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Return rows and columns of a picture, by its header; nothing is decoded.
+    """Return the number of rows and columns of a picture from its header, without decoding it.
 
     Raises:
-        MitsonarError: no picture, or larger than any of a sonar.
+        MitsonarError: if the file is not a picture, or is larger than any sonar picture.
     """
     with _opened(path) as picture:
         columns, rows = picture.size
@@ -89,10 +89,10 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def refuse_size(rows: int, columns: int, source: str) -> None:
-    """Refuse pictures that are larger than any of a sonar, or have a single row or column.
+    """Raise an error if pictures are larger than any sonar picture, or have a single row or column.
 
     Raises:
-        MitsonarError: they are.
+        MitsonarError: if the size is not that of a sonar picture.
     """
     if rows * columns > MOST_PIXELS or min(rows, columns) < 2:
         raise MitsonarError(
@@ -102,8 +102,11 @@ def refuse_size(rows: int, columns: int, source: str) -> None:
 
 
 def is_whole(path: Path) -> bool:
-    """Return whether a path is a file that is not visibly cut off: a PNG file ends as one, any other has bytes."""
-    if not os.path.isfile(path):  # a pipe would never end
+    """Return whether a path is a file that is not obviously truncated.
+
+    A PNG file must have its final chunk; any other file must not be empty.
+    """
+    if not os.path.isfile(path):  # reading a pipe would never end
         return False
     try:
         with path.open("rb") as file:
@@ -117,17 +120,17 @@ def is_whole(path: Path) -> bool:
 
 
 def read_picture(path: Path, shape: tuple[int, int]) -> Grey:
-    """Read the grey values of a picture; of colours the luminance.
+    """Read the grey values of a picture; colours are converted to luminance.
 
     Args:
-        path: of the file.
-        shape: rows and columns that it must have.
+        path: path of the file.
+        shape: number of rows and columns that it must have.
 
     Returns:
-        ``(rows, columns)`` uint8 in 0..255, or of 16 bits a value float32 in 0..1.
+        Values ``(rows, columns)``: uint8 in 0..255, or float32 in 0..1 if the picture has 16 bits per value.
 
     Raises:
-        MitsonarError: not a whole picture, or one of another size.
+        MitsonarError: if the picture is not complete, or has another size.
     """
     rows, columns = picture_size(path)
     if (rows, columns) != shape:
@@ -144,7 +147,7 @@ def read_picture(path: Path, shape: tuple[int, int]) -> Grey:
 
 
 def _opened(path: Path) -> Image.Image:
-    """Open a picture; only its header is read."""
+    """Open a picture, reading only its header."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -160,14 +163,13 @@ def _opened(path: Path) -> Image.Image:
         raise MitsonarError(f"cannot read the picture {path}: {reason}; give PNG, JPEG or PGM") from None
 
 
-# ---------------- Folders of pictures (PNG, JPEG, PGM): sorted naturally, with times from their names where these
-# look like times
+# ---------------- Folders of pictures
 
 
 Array = NDArray[np.float64]
 
 EPOCH_S = (946_684_800, 4_102_444_800)
-"""Times that names may tell: 2000 to 2100 [s since 1970]."""
+"""Range of times that are recognised in names: 2000 to 2100 [s since 1970]."""
 
 TIMES_IN_NAMES = (
     (re.compile(r"(?<!\d)(\d{19})(?!\d)"), 1e-9),
@@ -175,17 +177,17 @@ TIMES_IN_NAMES = (
     (re.compile(r"(?<!\d)(\d{13})(?!\d)"), 1e-3),
     (re.compile(r"(?<!\d)(\d{10})(?!\d)"), 1.0),
 )
-"""Whole numbers that look like times, and their unit [s]."""
+"""Patterns of whole numbers that look like times, and the unit of each [s]."""
 
 PARTED = re.compile(r"(?<!\d)(\d{10})[._](\d{1,9})(?!\d)")
-"""Seconds, and what follows their decimal point; with `_` nanoseconds, as ROS writes them."""
+"""Pattern of seconds and their decimals; after ``_`` come nanoseconds, as ROS writes them."""
 
 MOST_PICTURES = 2_000_000
-"""Files of a folder, at most."""
+"""Maximum number of pictures in a folder, or of frames in a video."""
 
 
 def holds_pictures(path: Path, first: bytes) -> bool:
-    """Return whether a path is a folder of pictures, and no folder of a run."""
+    """Return whether a path is a folder of pictures, and not the folder of a run."""
     if first or not path.is_dir() or any((path / name).exists() for name in ("run.json", "zarr.json", "frames.npz")):
         return False
     try:
@@ -197,12 +199,14 @@ def holds_pictures(path: Path, first: bytes) -> bool:
 def read_picture_folder(path: Path, geometry: Path | None = None) -> Recording:
     """Open a folder of pictures of one size; they are read on demand.
 
+    Pictures are sorted naturally. Their times are taken from their names if these look like times.
+
     Args:
-        path: of the folder.
-        geometry: a geometry file; default: ``geometry.yaml`` in the folder or beside it.
+        path: path of the folder.
+        geometry: a geometry file; default: ``geometry.yaml`` in the folder or next to it.
 
     Raises:
-        MitsonarError: no geometry, no picture that can be read, or a geometry that does not fit the pictures.
+        MitsonarError: if there is no geometry or no readable picture, or if the geometry does not fit the pictures.
     """
     told, told_by = geometry_for(path, geometry)
     files, shape, notes = _of_one_size(picture_paths(path), path)
@@ -230,10 +234,10 @@ def read_picture_folder(path: Path, geometry: Path | None = None) -> Recording:
 
 
 def picture_paths(folder: Path) -> list[Path]:
-    """Return the picture files of a folder, sorted naturally.
+    """Return the picture files of a folder in natural order.
 
     Raises:
-        MitsonarError: it cannot be read, or holds too many.
+        MitsonarError: if the folder cannot be read, or holds too many pictures.
     """
     try:
         found = [one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES and not one.name.startswith(".")]
@@ -245,16 +249,16 @@ def picture_paths(folder: Path) -> list[Path]:
 
 
 def naturally(name: str) -> tuple[tuple[int, int | str], ...]:
-    """Return the key by which names sort naturally: ``f2`` before ``f10``."""
+    """Return a sort key that puts names in natural order: ``f2`` before ``f10``."""
     parts = re.split(r"(\d+)", name)
     return tuple((0, int(part)) if place % 2 else (1, part.lower()) for place, part in enumerate(parts))
 
 
 def times_in_names(names: Sequence[str]) -> Array | None:
-    """Return the times ``(names,)`` [s since 1970] that all names tell; None where one does not.
+    """Return the times ``(names,)`` [s since 1970] that names contain; None if a name contains none.
 
-    Nanoseconds, microseconds, milliseconds or seconds since 1970 by their number of digits, also seconds with decimals, or
-    with ``_`` and nanoseconds. Only times from 2000 to 2100 count.
+    The number of digits decides whether a time is in nanoseconds, microseconds, milliseconds or seconds. Seconds may also
+    have decimals, or be followed by ``_`` and nanoseconds. Only times from 2000 to 2100 are accepted.
     """
     if not names:
         return None
@@ -279,7 +283,7 @@ def _plausible(times: Array) -> Array | None:
 
 
 def _numbers(names: Sequence[str]) -> Array | None:
-    """Return the last number in each name, in steps of the smallest one ``(names,)``; None where they do not rise."""
+    """Return the last number in each name ``(names,)``, in units of the smallest step; None if they do not increase."""
     found = [re.findall(r"\d{1,15}", Path(name).stem) for name in names]
     if not all(found):
         return None
@@ -289,7 +293,7 @@ def _numbers(names: Sequence[str]) -> Array | None:
 
 
 def _of_one_size(files: list[Path], folder: Path) -> tuple[list[Path], tuple[int, int], list[str]]:
-    """Return the whole pictures of the most frequent size, that size, and sentences on the others."""
+    """Return the complete pictures of the most frequent size, that size, and sentences on the others."""
     whole = [file for file in files if is_whole(file)]
     sizes: dict[Path, tuple[int, int]] = {}
     reason = ""
@@ -312,7 +316,7 @@ def _of_one_size(files: list[Path], folder: Path) -> tuple[list[Path], tuple[int
 
 
 def _has_colours(path: Path) -> bool:
-    """Return whether a picture has colours that differ from grey."""
+    """Return whether a picture has colours other than grey."""
     from PIL import Image
 
     with Image.open(path) as picture:
@@ -322,23 +326,22 @@ def _has_colours(path: Path) -> bool:
     return bool(max(abs(red - green).max(), abs(green - blue).max()) > 8)
 
 
-# ---------------- Stacks of pictures in one ``.npz`` file: arrays ``frames`` or ``images``, times, and often the
-# fan's own geometry
+# ---------------- Stacks of pictures (.npz)
 
 
 NAMES = ("frames", "images")
-"""Names of the array of pictures."""
+"""Possible names of the array of pictures."""
 
 TIME_ARRAYS = ("time_s", "times", "timestamps")
 RATES = ("fps", "frame_rate_hz")
-"""Names of the arrays of times [s] and of the rate [Hz]."""
+"""Possible names of the arrays of times [s] and of the frame rate [Hz]."""
 
 FAN = {"apex_xy": "apex_px", "rmin_px": "near_px", "rmax_px": "far_px", "half_fov_deg": "half_angle_deg", "kx": "stretch"}
-"""Arrays that tell a fan's geometry, and the keys of a geometry file that they are."""
+"""Arrays that describe the geometry of a fan, and the corresponding keys of a geometry file."""
 
 
 def is_picture_stack(path: Path, first: bytes) -> bool:
-    """Return whether a file is an npz file of pictures, and not frames of mitsonar."""
+    """Return whether a file is an npz file of pictures, and not one of mitsonar frames."""
     if not first.startswith(b"PK") or path.suffix.lower() != ".npz":
         return False
     try:
@@ -353,12 +356,13 @@ def read_picture_stack(path: Path, geometry: Path | None = None) -> Recording:
     """Open an npz file of pictures ``(pictures, rows, columns)``: uint8, or floats in 0..1.
 
     Args:
-        path: of the file. Its arrays ``apex_xy``, ``rmin_px``, ``rmax_px``, ``half_fov_deg`` and ``kx`` (optional) tell the
-            geometry of a fan whose metres are not known, where no geometry file does; ``fps`` or ``time_s`` the times.
-        geometry: a geometry file; default: ``FILE.yaml`` or ``geometry.yaml`` beside the file.
+        path: path of the file. Pictures are in the array ``frames`` or ``images``. Without a geometry file, the arrays
+            ``apex_xy``, ``rmin_px``, ``rmax_px``, ``half_fov_deg`` and ``kx`` (optional) describe a fan of unknown metric
+            scale. The array ``fps`` or ``time_s`` determines the times.
+        geometry: a geometry file; default: ``FILE.yaml`` or ``geometry.yaml`` next to the file.
 
     Raises:
-        MitsonarError: damaged, no pictures, or no geometry.
+        MitsonarError: if the file is damaged, or holds no pictures, or if there is no geometry.
     """
     try:
         table = read_npz(path)
@@ -389,7 +393,7 @@ def read_picture_stack(path: Path, geometry: Path | None = None) -> Recording:
 
 
 def _stack(values: FileArray, what: str) -> Grey:
-    """Check pictures and return them: uint8, or float32 in 0..1."""
+    """Validate pictures and return them as uint8, or as float32 in 0..1."""
     if values.ndim != 3 or not len(values) or values.dtype.kind not in "uf":
         raise MitsonarError(f"{what} must be pictures (pictures, rows, columns), uint8 or floats: got {values.shape}")
     refuse_size(values.shape[1], values.shape[2], what)
@@ -403,7 +407,7 @@ def _stack(values: FileArray, what: str) -> Grey:
 
 
 def _fan_in(table: dict[str, FileArray], path: Path) -> PictureGeometry | None:
-    """Return the geometry that the file's own arrays tell; None where they do not."""
+    """Return the geometry described by the arrays of the file; None if they do not describe one."""
     if not set(FAN) - {"kx"} <= set(table):
         return None
     apex = np.asarray(table["apex_xy"])
@@ -416,29 +420,29 @@ def _fan_in(table: dict[str, FileArray], path: Path) -> PictureGeometry | None:
 
 
 def _number(values: FileArray, name: str, path: Path) -> float:
-    """Return the one finite number of an array."""
+    """Return the only element of an array, which must be a finite number."""
     if values.size != 1 or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
         raise MitsonarError(f"{name} of {path} must be one number: got shape {values.shape}")
     return float(values.reshape(()))
 
 
-# ---------------- Videos of fans or polar pictures (``.avi``, ``.mp4``), read by OpenCV frame by frame
+# ---------------- Videos (.avi, .mp4)
 
 
 def is_video(path: Path, first: bytes) -> bool:
-    """Return whether a file is an AVI or MP4 video, by its first bytes."""
+    """Return whether the first bytes of a file are those of an AVI or MP4 video."""
     return (first[:4] == b"RIFF" and first[8:12] == b"AVI ") or first[4:8] == b"ftyp"
 
 
 def read_picture_video(path: Path, geometry: Path | None = None) -> Recording:
-    """Open a video; its frames are decoded on demand, and counted once.
+    """Open a video of fans or polar pictures; OpenCV counts its frames once, and decodes them on demand.
 
     Args:
-        path: of the video. Its nominal frame rate counts where the geometry tells none.
-        geometry: a geometry file; default: ``FILE.yaml`` or ``geometry.yaml`` beside the video.
+        path: path of the video. Its nominal frame rate is used if the geometry gives none.
+        geometry: a geometry file; default: ``FILE.yaml`` or ``geometry.yaml`` next to the video.
 
     Raises:
-        MitsonarError: OpenCV is not there, damaged, or no geometry.
+        MitsonarError: if OpenCV is not installed, the video is damaged, or there is no geometry.
     """
     told, told_by = geometry_for(path, geometry)
     video = _Video(path)
@@ -456,7 +460,7 @@ def read_picture_video(path: Path, geometry: Path | None = None) -> Recording:
 
 
 class _Video:
-    """A video that is decoded forward; going back begins anew."""
+    """A video that is decoded forwards; reading an earlier frame restarts from the beginning."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -474,7 +478,7 @@ class _Video:
         self.shape, self.rate_hz = (rows, columns), rate if np.isfinite(rate) and 0 < rate < 1e4 else None
 
     def _begin(self) -> None:
-        """Open the video at its first frame."""
+        """Open the video, or reopen it, at its first frame."""
         if self.capture is not None:
             self.capture.release()
         self.capture = self.cv2.VideoCapture(str(self.path))
@@ -483,7 +487,7 @@ class _Video:
             raise MitsonarError(f"OpenCV cannot open the video {self.path}: it is damaged, or of a codec that is not there")
 
     def count(self) -> int:
-        """Count the frames that can be decoded; the number in the header is a guess."""
+        """Return the number of frames that can be decoded; the number in the header is unreliable."""
         while self.capture.grab():
             self.at += 1
             if self.at > MOST_PICTURES:
@@ -495,7 +499,7 @@ class _Video:
         return count
 
     def read(self, place: int) -> Grey:
-        """Decode a frame by its number: ``(rows, columns)`` uint8, the luminance of colours."""
+        """Decode the frame with this index ``(rows, columns)`` as uint8; colours are converted to luminance."""
         if place < self.at:
             self._begin()
         while self.at < place:
@@ -510,30 +514,30 @@ class _Video:
         return np.asarray(grey, dtype=np.uint8)
 
 
-# ---------------- Fan pictures back to beams and bins: each cell is the mean of its own area in the picture
+# ---------------- Resampling of fans to beams and bins
 
 
 Doubles = NDArray[np.float64]
 
 MOST_WEIGHTS = 2**25
-"""Weights of a sampler, at most: a quarter of a GiB."""
+"""Maximum number of weights of a sampler: a quarter of a GiB."""
 
 MOST_BEAMS = 1024
-"""Beams that are made where their number is not told, at most."""
+"""Maximum number of beams if the geometry gives none."""
 
 AT_A_TIME = 2**20
-"""Weights that are computed at a time."""
+"""Number of weights that are computed at a time."""
 
 
 @dataclass(frozen=True)
 class FanSampler:
-    """The linear map from a fan picture to beams and bins.
+    """A linear map from a fan picture to beams and bins; each cell is the mean of its area in the picture.
 
     Attributes:
-        weights: of the picture's pixels in each cell ``(bins * beams, rows * columns)`` float32; rows of cells that lie in
-            the picture add up to 1, the others hold nothing.
-        bins: range bins.
-        beams: beams.
+        weights: weights of the pixels in each cell ``(bins * beams, rows * columns)`` float32. The row of a cell inside the
+            picture sums to 1, that of any other cell is empty.
+        bins: number of range bins.
+        beams: number of beams.
     """
 
     weights: csr_array
@@ -542,15 +546,16 @@ class FanSampler:
 
     @classmethod
     def of(cls, geometry: PictureGeometry, rows: int, columns: int) -> FanSampler:
-        """Make the map for pictures ``(rows, columns)``.
+        """Build the map for pictures ``(rows, columns)``.
 
-        A cell is covered by as many points, evenly, as it is wide in pixels. Each point reads the picture bilinearly. So a
-        cell smaller than a pixel is interpolated, and a larger one is averaged. Averages are of picture values: of dB where
-        the picture shows dB.
+        Evenly spaced points cover each cell, about one per pixel along range and across. Each point reads the picture by
+        bilinear interpolation, so that a cell smaller than a pixel is interpolated and a larger one is averaged. Averages
+        are taken over picture values, and so over dB if the picture shows dB.
 
         Raises:
-            MitsonarError: a fan outside the picture, or one that takes too much memory.
+            MitsonarError: if the fan lies outside the picture, or the map takes too much memory.
         """
+        # 1. Choose the number of points per cell by its largest size in pixels, at the far arc.
         bins, beams = cell_counts(geometry)
         half = math.radians(float(geometry.half_angle_deg or 0.0))
         step = (geometry.far - geometry.near) / bins
@@ -562,8 +567,10 @@ class FanSampler:
                 f"a fan of {bins:,} bins and {beams:,} beams takes {count:,} weights: {MOST_WEIGHTS:,} at most; give "
                 "smaller bins and beams in the geometry"
             )
+        # 2. Place the points at the centres of equal subdivisions of range and angle.
         radius = geometry.near + (np.arange(bins * along) + 0.5) * (step / along)
         angle = -half + (np.arange(beams * across) + 0.5) * (2 * half / (beams * across))
+        # 3. Compute the weights of some range bins at a time, which limits the memory for intermediate arrays.
         made = []
         at_once = max(1, AT_A_TIME // (beams * across * along * 4))
         for first in range(0, bins, at_once):
@@ -578,19 +585,19 @@ class FanSampler:
         return cls(weights, bins, beams)
 
     def apply(self, picture: NDArray[np.generic]) -> NDArray[np.float32]:
-        """Return the beams and bins ``(bins, beams)`` of a picture ``(rows, columns)``, float32 in 0..1; 0 outside it.
+        """Resample a picture ``(rows, columns)`` to ``(bins, beams)`` float32 in 0..1; cells outside the picture are 0.
 
         Pictures are uint8 in 0..255, or float32 in 0..1.
         """
         values = np.ravel(picture).astype(np.float32)
         if picture.dtype == np.uint8:
             values *= np.float32(1 / 255)
-        sampled = np.minimum(self.weights @ values, np.float32(1))  # weights of 1 in all are rounded
+        sampled = np.minimum(self.weights @ values, np.float32(1))  # rounded weights may sum to slightly more than 1
         return np.asarray(sampled, dtype=np.float32).reshape(self.bins, self.beams)
 
 
 def cell_counts(geometry: PictureGeometry) -> tuple[int, int]:
-    """Return the numbers of bins and beams of a fan: as told, or about one a pixel (beams: at mid range)."""
+    """Return the number of bins and beams of a fan: as given, or about one per pixel (beams: at mid range)."""
     bins = geometry.bins or max(2, round(geometry.far - geometry.near))
     half = math.radians(float(geometry.half_angle_deg or 0.0))
     arc = (geometry.near + geometry.far) / 2 * 2 * half / max(1.0, geometry.stretch)
@@ -603,20 +610,23 @@ def _weights(
     """Return the weights of some bins.
 
     Args:
-        geometry: of the fan.
-        radius: of the points ``(bins * points[0],)`` [px].
-        angle: of the points ``(beams * points[1],)`` [rad], most to port first.
-        points: of a cell along range and across.
-        shape: rows and columns of the picture.
+        geometry: geometry of the fan.
+        radius: distances of the points from the apex ``(bins * points[0],)`` [px].
+        angle: angles of the points ``(beams * points[1],)`` [rad], from port to starboard.
+        points: number of points of a cell along range and across.
+        shape: number of rows and columns of the picture.
     """
+    # 1. Locate the points in the picture: column u, row v.
     rows, columns = shape
     column, row = geometry.apex_px or (0.0, 0.0)
     sideways = (-1.0 if geometry.mirror else 1.0) / geometry.stretch
     u = column + sideways * radius[:, None] * np.sin(angle)
     v = row - (1.0 if geometry.forward == "up" else -1.0) * radius[:, None] * np.cos(angle)
+    # 2. Find the cell of each point, and keep the points that lie on a pixel of the picture.
     cell = np.arange(len(radius))[:, None] // points[0] * (len(angle) // points[1]) + np.arange(len(angle)) // points[1]
     inside = ((u >= -0.5) & (u <= columns - 0.5) & (v >= -0.5) & (v <= rows - 0.5)).ravel()
     u, v = (np.clip(axis.ravel()[inside], 0, most) for axis, most in ((u, columns - 1), (v, rows - 1)))
+    # 3. Compute the bilinear weights of the four pixels around each point.
     left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
     over, below = u - left, v - top
     pixels, parts = [], []
@@ -624,6 +634,8 @@ def _weights(
         for right in (0, 1):
             pixels.append(np.minimum(top + down, rows - 1) * columns + np.minimum(left + right, columns - 1))
             parts.append((below if down else 1 - below) * (over if right else 1 - over))
+    # 4. Sum the weights of a cell's points (csr_array adds up duplicates), and normalise each row to 1. Cells that are
+    #    partly outside the picture become the mean of the part inside, and cells fully outside keep an empty row.
     cells = len(radius) // points[0] * (len(angle) // points[1])
     index = np.tile(cell.ravel()[inside], 4)
     found = csr_array((np.concatenate(parts), (index, np.concatenate(pixels))), shape=(cells, rows * columns))
@@ -634,31 +646,30 @@ def _weights(
     return found.astype(np.float32)
 
 
-# ---------------- A sequence of pictures with a geometry becomes a recording: polar pictures are put in order, fans
-# are resampled
+# ---------------- Recording of a sequence of pictures
 
 
 OUTLINE_PICTURES = 16
-"""Pictures that the outline of a fan is taken from, at most."""
+"""Maximum number of pictures from which the outline of a fan is determined."""
 
 LARGEST_TIMES = 2**26
-"""Bytes of a file of times, at most."""
+"""Maximum size of a file of times [bytes]."""
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """Pictures of one size, in their own order.
+    """Pictures of one size, in the order of the file or folder.
 
     Attributes:
         source: path of the file or folder.
-        format: in words.
-        shape: rows and columns of each.
-        names: of the pictures, for messages and files of times.
-        read: reads one by its place.
-        time_s: of each ``(pictures,)`` [s], where known.
-        rate_hz: of the pictures, where the file tells it.
-        numbers: that each has in its name ``(pictures,)``, where known.
-        facts: what the file tells, by name.
+        format: readable name of the format.
+        shape: number of rows and columns of each picture.
+        names: names of the pictures, for messages and files of times.
+        read: function that reads the picture with a given index.
+        time_s: time of each picture ``(pictures,)`` [s], if known.
+        rate_hz: frame rate [Hz], if the file holds one.
+        numbers: number in the name of each picture ``(pictures,)``, if known.
+        facts: values that the file holds, keyed by name.
         notes: sentences on what was left out.
     """
 
@@ -675,10 +686,15 @@ class Pictures:
 
 
 def geometry_for(source: Path, geometry: Path | None, inside: PictureGeometry | None = None) -> tuple[PictureGeometry, Path]:
-    """Return the geometry of pictures and the file that tells it: the given one, the one beside them, or the one inside.
+    """Return the geometry of pictures and the path of its file.
+
+    Args:
+        source: path of the pictures.
+        geometry: a geometry file; default: the one next to the pictures.
+        inside: geometry contained in the file of the pictures, which is used if there is no geometry file.
 
     Raises:
-        MitsonarError: there is none, or it is damaged.
+        MitsonarError: if there is no geometry, or the geometry file is damaged.
     """
     found = geometry or geometry_beside(source)
     if found is not None:
@@ -692,15 +708,15 @@ def geometry_for(source: Path, geometry: Path | None, inside: PictureGeometry | 
 
 
 def recording_of(pictures: Pictures, geometry: PictureGeometry, told_by: Path) -> Recording:
-    """Make a recording of pictures.
+    """Create a recording of pictures; polar pictures are reordered, fans are resampled to beams and bins.
 
     Args:
-        pictures: in their own order.
-        geometry: of each of them.
-        told_by: file of the geometry, from which the path of a file of times counts.
+        pictures: pictures in the order of their source.
+        geometry: geometry that they share.
+        told_by: file of the geometry; the path of a file of times is relative to its folder.
 
     Raises:
-        MitsonarError: a geometry that does not fit the pictures; times that cannot be read.
+        MitsonarError: if the geometry does not fit the pictures, or times cannot be read.
     """
     times, notes = _times(pictures, geometry, told_by)
     kept, sorting = in_time_order(times, pictures.numbers)
@@ -726,10 +742,10 @@ def recording_of(pictures: Pictures, geometry: PictureGeometry, told_by: Path) -
 
 
 def polar_frames(geometry: PictureGeometry, bins: int, beams: int, rate_hz: float) -> SonarFrames:
-    """Return frames without images for polar pictures: sonar, ranges [m] and bearings [rad], most to port first.
+    """Return empty frames with the geometry of polar pictures: sonar, ranges [m], and bearings [rad] from port to starboard.
 
     Raises:
-        MitsonarError: bearings that are not one a beam, or a sonar that cannot be.
+        MitsonarError: if the number of bearings is not that of beams, or the parameters of the sonar are invalid.
     """
     if geometry.bearings_deg is None:
         sonar = _sonar(geometry, bins, beams, float(geometry.azimuth_fov_deg or 0.0), rate_hz)
@@ -745,7 +761,7 @@ def polar_frames(geometry: PictureGeometry, bins: int, beams: int, rate_hz: floa
 
 
 def _fan_frames(geometry: PictureGeometry, sampler: FanSampler, rate_hz: float) -> SonarFrames:
-    """Return frames without images for fans that are resampled."""
+    """Return empty frames with the geometry of resampled fans."""
     sonar = _sonar(geometry, sampler.bins, sampler.beams, 2 * float(geometry.half_angle_deg or 0.0), rate_hz)
     return _like(geometry, sonar, sonar.bearing_rad)
 
@@ -784,14 +800,14 @@ def _like(geometry: PictureGeometry, sonar: Sonar, bearing_rad: Array) -> SonarF
 
 @dataclass(frozen=True)
 class _Polar:
-    """Polar pictures as images."""
+    """Function that reads the images of a part of polar pictures."""
 
     pictures: Pictures
     places: NDArray[np.intp]
     geometry: PictureGeometry
 
     def __call__(self, index: NDArray[np.intp]) -> Pixels:
-        """Return ``(n, bins, beams)``, row 0 nearest, column 0 most to port."""
+        """Return images ``(n, bins, beams)``, row 0 nearest, column 0 farthest to port."""
         turned = self.geometry.transposed
         shape = self.pictures.shape[::-1] if turned else self.pictures.shape
         read = [self.pictures.read(int(place)) for place in self.places[index]]
@@ -804,14 +820,14 @@ class _Polar:
 
 @dataclass(frozen=True)
 class _Fan:
-    """Fans as images of beams and bins."""
+    """Function that reads the images of a part of fans, resampled to beams and bins."""
 
     pictures: Pictures
     places: NDArray[np.intp]
     sampler: FanSampler
 
     def __call__(self, index: NDArray[np.intp]) -> Pixels:
-        """Return ``(n, bins, beams)`` float32, resampled when they are read."""
+        """Return images ``(n, bins, beams)`` float32, row 0 nearest, column 0 farthest to port."""
         made = np.zeros((len(index), self.sampler.bins, self.sampler.beams), np.float32)
         for place, number in enumerate(self.places[index]):
             made[place] = self.sampler.apply(self.pictures.read(int(number)))
@@ -819,12 +835,12 @@ class _Fan:
 
 
 def _bytes(picture: Grey) -> Grey:
-    """Return a picture in 0..255."""
+    """Return a picture as uint8 in 0..255."""
     return picture if picture.dtype == np.uint8 else np.asarray(np.clip(picture, 0, 1) * 255, dtype=np.uint8)
 
 
 def _times(pictures: Pictures, geometry: PictureGeometry, told_by: Path) -> tuple[Array, list[str]]:
-    """Return the times ``(pictures,)`` [s] of the pictures, and sentences on what is assumed."""
+    """Return the times of the pictures ``(pictures,)`` [s], and sentences on what is assumed."""
     if geometry.times is not None:
         return _times_in(told_by.parent / geometry.times, pictures.names), []
     if pictures.time_s is not None:
@@ -838,7 +854,10 @@ def _times(pictures: Pictures, geometry: PictureGeometry, told_by: Path) -> tupl
 
 
 def _times_in(path: Path, names: tuple[str, ...]) -> Array:
-    """Read a file of times: a line ``TIME`` for each picture in order, or lines ``NAME, TIME``; # begins a comment."""
+    """Read a file of times: one line ``TIME`` per picture in order, or lines ``NAME, TIME``; ``#`` begins a comment.
+
+    Times ``(names,)`` [s] are nan for pictures whose name is missing.
+    """
     text = read_bytes(path, "file of times", LARGEST_TIMES).decode("utf-8", "replace")
     rows = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
     rows = [row for row in rows if row]
@@ -858,30 +877,30 @@ def _times_in(path: Path, names: tuple[str, ...]) -> Array:
 
 
 def _rate(times: Array, geometry: PictureGeometry) -> float:
-    """Return the frames a second: as told, or by the times."""
+    """Return the frame rate [Hz]: as given by the geometry, or computed from the times."""
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     return geometry.frame_rate_hz or (min(1e6, 1 / step) if step > 0 else ANY_RATE_HZ)
 
 
 def _attitude(geometry: PictureGeometry, frames: int) -> Array | None:
-    """Return pitch, roll, heading ``(frames, 3)`` [rad] where the geometry tells the pitch."""
+    """Return pitch, roll, heading ``(frames, 3)`` [rad] if the geometry gives the pitch; the heading is nan."""
     if geometry.pitch_deg is None:
         return None
     return np.tile([math.radians(geometry.pitch_deg), math.radians(geometry.roll_deg), np.nan], (frames, 1))
 
 
 def _height(geometry: PictureGeometry, frames: int) -> Array | None:
-    """Return the heights ``(frames,)`` [m] where the geometry tells one."""
+    """Return heights ``(frames,)`` [m] if the geometry gives one."""
     return None if geometry.height_m is None else np.full(frames, geometry.height_m)
 
 
-# ---------------- A part of a recording as the folder of a run, ``frames.zarr`` or ``frames.npz``, that can be resumed
+# ---------------- Conversion to mitsonar frames
 
 
 CONVERSION = RunKind("recording", ("frames.npz", "frames.zarr"), {"frames": int, "frames_done": int})
 
 CHUNK_BYTES = 32 * 2**20
-"""Approximate size of the pixels that are copied at a time [bytes]."""
+"""Approximate amount of pixel data that is copied at a time [bytes]."""
 
 
 def write_frames(
@@ -893,21 +912,21 @@ def write_frames(
     resume: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
-    """Copy a part of a recording into the folder of a run, in constant memory; a stopped copy can be resumed.
+    """Copy a part of a recording to a run folder in constant memory; an interrupted copy can be resumed.
 
     Args:
-        recording: any.
-        number: of the part; None: the longest.
-        folder: to make.
-        overwrite: replace a copy that is there.
-        resume: go on with one.
-        progress: called with how many more frames are copied.
+        recording: recording of any format.
+        number: index of the part; None selects the longest.
+        folder: folder to create.
+        overwrite: whether to replace an existing copy.
+        resume: whether to continue an existing copy.
+        progress: function that is called with the number of newly copied frames.
 
     Returns:
-        ``frames.npz`` of at most 1,000 frames, or ``frames.zarr`` of more.
+        Path of ``frames.npz`` for at most 1,000 frames, or of ``frames.zarr`` for more.
 
     Raises:
-        MitsonarError: the folder holds other things, or a copy that is neither resumed nor replaced.
+        MitsonarError: if the folder holds other files, or a copy that is neither resumed nor replaced.
     """
     part = recording.part(number)
     chosen = recording.longest if number is None else number
@@ -934,7 +953,7 @@ def write_frames(
 
 
 def _store(run: RunDirectory, recording: Recording, part: Part, path: Path) -> tuple[FrameStore, int]:
-    """Return the store that is there, or a new one, and how many frames it holds."""
+    """Return the existing store, or a new one, and the number of frames that it holds."""
     if run.resumed and path.exists():
         store = FrameStore.open(path)
         done = min(run.count("frames_done", len(part)), store.done)

@@ -1,20 +1,7 @@
-"""Sequences of the CANOE data set: polar PNG of an Oculus M3000d with the bearings in two rows, poses as CSV.
+"""How are public data sets read? CANOE (Oculus as PNG), UXO of DFKI (ARIS as PGM), and views of neusis (pickles).
 
-Source of the layout: the data set's reference, github.com/utiasASRL/pycanoe (``DATA_REFERENCE.md``, ``pycanoe/data``). No
-recording was at hand when this was written.
-
-| file | content |
-|---|---|
-| ``sonar/<microseconds since 1970>.png`` | two rows: the bearing of each column, int16 in 0.01 deg; then a row a range bin |
-| ``novatel/sonar_poses.csv`` | a row a picture: ``t, x, y, z, r, p, y, vx, vy, vz, wx, wy, wz, vx_bod, vy_bod, vz_bod`` |
-
-What the reference does not tell, and what is done:
-
-- The order of the bytes of a bearing. Every order is tried; the one that gives bearings which rise or fall evenly is taken.
-- The window: 0 to 30 m, as the reference says of the sonar; the first range bin is the nearest.
-- The side: negative bearings are to port, as in the messages of an Oculus. Check it by the rotation of the pictures.
-- The axes of the poses' sensor frame. Up is the axis that stays upright, forward the level one along which the boat sails.
-- The coding: amplitude^0.5, the usual one of an Oculus.
+No recording of CANOE or UXO was available when their readers were written; :func:`read_canoe`, :func:`read_uxo` and
+:func:`read_neusis` name the sources of the layouts.
 """
 
 from __future__ import annotations
@@ -60,57 +47,78 @@ POSES = "novatel/sonar_poses.csv"
 
 RANGE_MAX = 30.0
 CARRIER_HZ, ELEVATION_DEG = 1.2e6, 20.0
-"""Window [m] and carrier [Hz] by the reference; opening over elevation by the sonar's data sheet (not seen)."""
+"""Window [m] and carrier [Hz] from the reference of the data set; elevation aperture [deg] from a data sheet (not seen)."""
 
 HEAD_ROWS = 2
-"""Rows of bearings above the range bins."""
+"""Number of rows with bearings above the range bins."""
 
 STEP_DEG = (0.01, 5.0)
-"""Steps from beam to beam that can be [deg]."""
+"""Smallest and largest plausible step between beams [deg]."""
 
 WIDEST_DEG = 90.0
-"""Largest bearing [deg]."""
+"""Largest plausible bearing [deg]."""
 
 POSE_COLUMNS = 16
 
 SAME_VELOCITY = 0.2
-"""Largest difference of the velocity in the world and the turned one of the sensor, as part of it, in the median."""
+"""Largest median difference between the world velocity and the rotated sensor velocity, as a fraction of the speed."""
 
 UPRIGHT = 0.7
 SAILS = 3.0
-"""Least vertical part of the axis that is up; least ratio of the mean velocities along and across the sonar."""
+"""Minimum mean vertical component of the up axis; minimum ratio of mean velocities along and across the sonar."""
 
 
 def is_canoe(path: Path, first: bytes) -> bool:
-    """Return whether a path is a sequence's folder of CANOE, with its poses or without."""
+    """Return whether a path is the folder of a CANOE sequence, with or without poses."""
     if first or not (path / "sonar").is_dir() or not ((path / "novatel").is_dir() or (path / "calib").is_dir()):
         return False
     return any(_time_us(one) for one in (path / "sonar").glob("*.png"))
 
 
 def read_canoe(path: Path) -> Recording:
-    """Open a sequence of CANOE; pictures are read on demand. A change of the bearings makes a new part.
+    """Open a sequence of CANOE; pictures are read on demand. A change of the picture size starts a new part.
+
+    Source of the layout: the reference of the data set, github.com/utiasASRL/pycanoe (``DATA_REFERENCE.md``,
+    ``pycanoe/data``). The sonar is an Oculus M3000d.
+
+    | file | content |
+    |---|---|
+    | ``sonar/<microseconds since 1970>.png`` | two rows: the bearing of each column, int16 in 0.01 deg; then a row per bin |
+    | ``novatel/sonar_poses.csv`` | a row per picture, columns as below |
+
+    The columns are ``t, x, y, z, r, p, y, vx, vy, vz, wx, wy, wz, vx_bod, vy_bod, vz_bod``.
+    The reference leaves some questions open, which are resolved as follows:
+
+    - Byte order of a bearing: every order is tried, and the one that gives evenly rising or falling bearings is used.
+    - Window: 0 to 30 m, as the reference states for the sonar; the first range bin is the nearest.
+    - Side: negative bearings are to port, as in the messages of an Oculus. Check it by the rotation of the pictures.
+    - Axes of the sensor frame of the poses: up is the axis that stays upright, forward is the level axis along which the
+      boat sails.
+    - Coding: amplitude^0.5, which is usual for an Oculus.
 
     Raises:
-        MitsonarError: no picture that can be read, or bearings that cannot be.
+        MitsonarError: if no picture can be read, or bearings are not plausible.
     """
+    # 1. List the complete pictures and their times.
     found = sorted((time, one) for one in (path / "sonar").glob("*.png") if (time := _time_us(one)))
     whole = [(time, one) for time, one in found if is_whole(one)]
     notes = [f"left out: {counted(len(found) - len(whole), 'picture')} cut off"] if len(whole) < len(found) else []
     if not whole:
         raise MitsonarError(f"{path / 'sonar'} holds no whole picture")
     stamps, files = np.array([time for time, _ in whole], dtype=np.int64), [one for _, one in whole]
+    # 2. Assign poses, and leave out pictures without one if there are any poses.
     poses, told = _canoe_poses(path / POSES, stamps)
     if poses is not None and not np.isfinite(poses).all():
         posed = np.flatnonzero(np.isfinite(poses).all(axis=1))
         notes.append(f"left out: {counted(len(files) - len(posed), 'picture')} without a pose")
         stamps, files, poses = stamps[posed], [files[place] for place in posed], poses[posed]
+    # 3. Make a part of each run of pictures of the same size.
     times = np.asarray(stamps * 1e-6, dtype=float)
     kept, sorting = in_time_order(times)
     sizes = [picture_size(files[place]) for place in kept]
     parts = []
     for size, run in runs_of(sizes):
-        assert isinstance(size, tuple)  # as they were given
+        assert isinstance(size, tuple)  # the keys of runs_of are the sizes
         parts.append(_canoe_part([files[place] for place in kept[run]], size, times[kept[run]], poses, kept[run]))
     facts: Facts = {"pictures": len(files), "rows": sizes[0][0], "columns": sizes[0][1]}
     assumed = f"the window 0..{RANGE_MAX:g} m and the coding amplitude^0.5 are assumed: the files do not tell them"
@@ -118,12 +126,12 @@ def read_canoe(path: Path) -> Recording:
 
 
 def _time_us(path: Path) -> int:
-    """Return the time that a picture's name tells [us since 1970]; 0 where it tells none."""
+    """Return the time in the name of a picture [us since 1970]; 0 if there is none."""
     return int(path.stem) if len(path.stem) == 16 and path.stem.isascii() and path.stem.isdigit() else 0
 
 
 def _canoe_part(files: list[Path], size: tuple[int, int], times: Array, poses: Array | None, places: Index) -> Part:
-    """Return the pictures of one size; their bearings are those of the first."""
+    """Return a part of pictures of one size; their bearings are those of the first picture."""
     if size[0] < HEAD_ROWS + 2:
         raise MitsonarError(f"{files[0]} has {size[0]:,} rows: {HEAD_ROWS} of bearings and range bins are needed")
     head = read_picture(files[0], size)[:HEAD_ROWS]
@@ -152,7 +160,7 @@ def _canoe_part(files: list[Path], size: tuple[int, int], times: Array, poses: A
 
 @dataclass(frozen=True)
 class _Png:
-    """Pictures below their rows of bearings, as images."""
+    """Function that reads the images of a part of CANOE, without their rows of bearings."""
 
     files: tuple[Path, ...]
     size: tuple[int, int]
@@ -160,7 +168,7 @@ class _Png:
     rises: bool
 
     def __call__(self, index: Index) -> Pixels:
-        """Return ``(n, bins, beams)`` uint8, column 0 most to port."""
+        """Return images ``(n, bins, beams)`` uint8, column 0 farthest to port."""
         images = np.zeros((len(index), self.size[0] - HEAD_ROWS, self.size[1]), np.uint8)
         for place, number in enumerate(index):
             picture = read_picture(self.files[number], self.size)
@@ -171,15 +179,15 @@ class _Png:
 
 
 def bearings_in(head: Grey, source: str) -> Array:
-    """Return the bearings ``(columns,)`` [deg] in two rows of bytes, in whichever order of bytes they rise or fall.
+    """Decode the bearings ``(columns,)`` [deg] in two rows of bytes, in the byte order in which they rise or fall.
 
     Raises:
-        MitsonarError: no order gives bearings that can be.
+        MitsonarError: if no byte order gives plausible bearings.
     """
     if head.dtype != np.uint8:
         raise MitsonarError(f"{source} has more than 8 bits a pixel: its bearings are bytes")
-    columns = np.ascontiguousarray(head.T).astype(np.uint8)  # low and high byte of each column, one above the other
-    along = np.ascontiguousarray(head).reshape(-1, 2)  # one beside the other, the first half of the columns first
+    columns = np.ascontiguousarray(head.T).astype(np.uint8)  # the two bytes of a bearing are above one another
+    along = np.ascontiguousarray(head).reshape(-1, 2)  # they are side by side; row 0 holds the first half of the columns
     for pairs in (columns, along):
         for order in ("<i2", ">i2"):
             degrees = np.ascontiguousarray(pairs).view(order).ravel() * 0.01
@@ -190,18 +198,20 @@ def bearings_in(head: Grey, source: str) -> Array:
 
 
 def _canoe_poses(path: Path, stamps: NDArray[np.int64]) -> tuple[Array | None, list[str]]:
-    """Return the poses ``(pictures, 6)``, nan where a picture has none, and sentences on what was found."""
+    """Return the poses ``(pictures, 6)``, nan for pictures without one, and sentences on why poses are unknown."""
     if not path.is_file():
         return None, [f"there is no {POSES}: poses are not known"]
     table = CsvTable(path)
     if len(table.names) < POSE_COLUMNS:
         raise MitsonarError(f"{path} has {len(table.names)} columns: {POSE_COLUMNS} are needed")
+    # 1. Match rows and pictures by time, and drop rows with implausible values.
     rows = {int(time): row for row, time in enumerate(table.whole_at(0))}
     values = table.columns_at(range(1, POSE_COLUMNS))
     fine = np.isfinite(values).all(axis=1) & (np.abs(values).max(axis=1) < 1e9)
     found = np.array([row if (row := rows.get(int(time), -1)) >= 0 and fine[row] else -1 for time in stamps], dtype=np.intp)
     if (found >= 0).sum() < max(2, len(stamps) // 2):
         return None, [f"left out: {POSES}, which has poses of {(found >= 0).sum():,} of {counted(len(stamps), 'picture')}"]
+    # 2. Determine which rotation the angles describe, and which of its axes are starboard, forward and up.
     values = values[found[found >= 0]]
     rotation = _to_world(values)
     body = None if rotation is None else _body(rotation, values[:, 12:15])
@@ -214,10 +224,10 @@ def _canoe_poses(path: Path, stamps: NDArray[np.int64]) -> tuple[Array | None, l
 
 
 def _to_world(values: Array) -> Rotation | None:
-    """Return the rotations from sensor to world; None where the velocities in both contradict them.
+    """Return the rotations from sensor to world; None if the velocities in both frames contradict them.
 
-    The reference multiplies passive rotations, C1(r) C2(p) C3(y). Whether its product or the inverse turns the sensor's
-    velocity into the world's is tested.
+    The reference multiplies passive rotations, C1(r) C2(p) C3(y). The velocities decide whether this product or its inverse
+    rotates the sensor velocity to the world velocity.
     """
     world, own = values[:, 6:9], values[:, 12:15]
     product = Rotation.from_euler("XYZ", -values[:, 3:6])
@@ -234,11 +244,11 @@ def _to_world(values: Array) -> Rotation | None:
 
 
 def _body(rotation: Rotation, velocity: Array) -> Rotation | None:
-    """Return starboard, forward and up in the sensor's axes; None where they cannot be told.
+    """Return starboard, forward and up in the sensor's axes, as columns; None if they cannot be determined.
 
     Args:
-        rotation: from sensor to world.
-        velocity: in the sensor's axes ``(pictures, 3)`` [m/s].
+        rotation: rotations from sensor to world.
+        velocity: velocities in the sensor's axes ``(pictures, 3)`` [m/s].
     """
     upright = rotation.as_matrix()[:, 2, :].mean(axis=0)
     vertical = int(np.abs(upright).argmax())
@@ -252,18 +262,7 @@ def _body(rotation: Rotation, velocity: Array) -> Rotation | None:
     return Rotation.from_matrix(np.column_stack([np.cross(forward, up), forward, up]))
 
 
-# ---------------- Folders of the UXO data set (DFKI): raw ARIS samples as PGM, headers and poses of the rotator as CSV
-# Source of the layout: scripts of the data set, github.com/dfki-ric/uxo-dataset2024 (``scripts/release_1_export.py``,
-# ``common/aris_definitions.py``, ``common/tf_statics.yaml``). No recording was at hand when this was written.
-#
-# | file | content | |---|---| | ``aris_raw/NNNN.pgm`` | samples x beams as the sonar recorded them, beam 0 most to
-# starboard; NNNN is the frame's number | | ``aris_frame_meta.csv`` | the header of each frame, columns by the names of
-# the ARIS SDK | | ``ar3.csv`` | pose of the rotator that carries the sonar: ``aris_frame_idx``, ``pos.x`` .., ``rot.x``
-# .. ``rot.w`` | | ``gantry.csv`` | position of the crane, ``aris_frame_idx, x, y, z``; not used beside ``ar3.csv`` | |
-# ``aris_file_meta.yaml`` | the header of the file; not used, since the headers of the frames tell all of it |
-#
-# Axes of the rotator are forward, starboard, down, by the place of the camera on it; the world's third axis is up. The
-# sonar is 0.109 m behind the rotator's axis.
+# ---------------- UXO data set (DFKI)
 
 
 TABLE, IMAGES, ROTATOR = "aris_frame_meta.csv", "aris_raw", "ar3.csv"
@@ -277,7 +276,7 @@ NEEDED = {
     "sound_speed": "SoundSpeed",
     "samples": "SamplesPerBeam",
 }
-"""Fields of a header and their columns, which must be there."""
+"""Columns of the required fields of a header."""
 
 OPTIONAL = {
     "gain_db": ("ReceiverGain", 0.0),
@@ -294,32 +293,47 @@ OPTIONAL = {
     "system": ("TheSystemType", 1.0),
     "serial": ("SonarSerialNumber", 0.0),
 }
-"""Fields of a header, their columns, and what counts where a column is missing: an ARIS 3000 with its small lens."""
+"""Columns and default values of the optional fields of a header; the defaults are an ARIS 3000 with its small lens."""
 
 LIMITS = {"samples": (1, 65_536), "sample_period_us": (1, 1e6), "start_delay_us": (0, 1e8), "sound_speed": (1000, 2000)}
-"""What a header may say, as in ARIS files."""
+"""Plausible values of a header, as in ARIS files."""
 
 SONAR_AT = (-0.108725, 0.0, 0.0)
-"""Place of the sonar in the rotator's axes [m]."""
+"""Position of the sonar in the rotator's axes [m]."""
 
 FORWARD_STARBOARD_DOWN = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Starboard, forward and up in the rotator's axes, as columns."""
 
 
 def is_uxo(path: Path, first: bytes) -> bool:
-    """Return whether a path is a recording's folder of the UXO data set."""
+    """Return whether a path is the folder of a recording of the UXO data set."""
     return not first and (path / TABLE).is_file() and (path / IMAGES).is_dir()
 
 
 def read_uxo(path: Path) -> Recording:
     """Open a recording of the UXO data set; its PGM files are read on demand.
 
-    Ranges and beams are those of an ARIS file with the same headers. Poses are of the sonar, in the world of the tank, where
-    ``ar3.csv`` has one for each frame. Pictures without a header, and headers without a picture, are left out.
+    Ranges and beams are those of an ARIS file with the same headers. Poses are those of the sonar in the world frame of the
+    tank, if ``ar3.csv`` has one for each frame. Pictures without a header and headers without a picture are left out.
+
+    Source of the layout: scripts of the data set, github.com/dfki-ric/uxo-dataset2024 (``scripts/release_1_export.py``,
+    ``common/aris_definitions.py``, ``common/tf_statics.yaml``).
+
+    | file | content |
+    |---|---|
+    | ``aris_raw/NNNN.pgm`` | samples x beams as recorded by the sonar, beam 0 farthest to starboard; NNNN: frame number |
+    | ``aris_frame_meta.csv`` | the header of each frame; columns are named as in the ARIS SDK |
+    | ``ar3.csv`` | pose of the rotator that carries the sonar: ``aris_frame_idx``, ``pos.x`` .., ``rot.x`` .. ``rot.w`` |
+    | ``gantry.csv`` | position of the crane, ``aris_frame_idx, x, y, z``; not used in addition to ``ar3.csv`` |
+    | ``aris_file_meta.yaml`` | the header of the file; not used, since the frame headers contain all of it |
+
+    The axes of the rotator are forward, starboard, down, according to the position of the camera on it. The third axis of
+    the world points up. The sonar is 0.109 m behind the axis of the rotator.
 
     Raises:
-        MitsonarError: a table that lacks a column, no frame that can be read.
+        MitsonarError: if the table lacks a column, or no frame can be read.
     """
+    # 1. Find the frames that have both a plausible header and a complete picture.
     table = CsvTable(path / TABLE)
     headers = _headers(table)
     files = {int(one.stem): one for one in (path / IMAGES).glob("*.pgm") if one.stem.isascii() and one.stem.isdigit()}
@@ -333,6 +347,7 @@ def read_uxo(path: Path) -> Recording:
     extra = len(files) - len(set(files) & {int(index) for index in headers["index"]})
     if extra:
         notes.append(f"left out: {counted(extra, 'picture')} without a row in {TABLE}")
+    # 2. Sort them by time, assign poses, and make a part of each run of frames with the same geometry.
     usable = whole & there
     kept, sorting = in_time_order(np.where(usable, headers["time_us"] * 1e-6, np.nan), headers["index"])
     sorting = [note for note in sorting if "no valid time" not in note]
@@ -346,7 +361,7 @@ def read_uxo(path: Path) -> Recording:
 
 
 def _headers(table: CsvTable) -> Header:
-    """Return the rows of the table as headers of ARIS frames; numbers that are none become 0."""
+    """Return the rows of the table as headers of ARIS frames; invalid integers become 0, invalid floats nan."""
     headers: Header = np.zeros(len(table), dtype=[(name, FRAME[name]) for name in FRAME.names or ()])
     for name, column in NEEDED.items():
         if headers.dtype[name].kind == "f":
@@ -364,7 +379,7 @@ def _headers(table: CsvTable) -> Header:
 
 
 def _whole(headers: Header) -> NDArray[np.bool_]:
-    """Return which headers can be ``(frames,)``."""
+    """Return which headers ``(frames,)`` are plausible."""
     whole = np.isin(headers["ping_mode"], list(BEAMS)) & np.isin(headers["system"], list(KINDS)) & (headers["time_us"] > 0)
     for name, (low, high) in LIMITS.items():
         whole &= (headers[name] >= low) & (headers[name] <= high)
@@ -372,7 +387,7 @@ def _whole(headers: Header) -> NDArray[np.bool_]:
 
 
 def _keys(headers: Header, kept: Index) -> list[tuple[int, tuple[float, ...]]]:
-    """Return the places of the kept frames with what their geometry follows from."""
+    """Return the indices of the remaining frames, each with the values that determine its geometry."""
     return list(zip(map(int, kept), windows_of(headers[kept]), strict=True))
 
 
@@ -392,13 +407,13 @@ def _uxo_part(mine: Header, files: dict[int, Path], poses: Array | None) -> Part
 
 @dataclass(frozen=True)
 class _Pgm:
-    """PGM files of samples as images."""
+    """Function that reads the images of a part of UXO."""
 
     paths: tuple[Path, ...]
     shape: tuple[int, int]
 
     def __call__(self, index: Index) -> Pixels:
-        """Return ``(n, bins, beams)`` uint8, column 0 most to port."""
+        """Return images ``(n, bins, beams)`` uint8, column 0 farthest to port."""
         images = np.zeros((len(index), *self.shape), np.uint8)
         for place, number in enumerate(index):
             picture = read_picture(self.paths[number], self.shape)
@@ -409,7 +424,7 @@ class _Pgm:
 
 
 def _uxo_poses(path: Path, index: NDArray[np.integer]) -> tuple[Array | None, list[str]]:
-    """Return the poses ``(frames, 6)`` of the sonar by the rotator's, and a sentence where they are not known."""
+    """Return the poses of the sonar ``(frames, 6)`` from those of the rotator, or None and a sentence on why."""
     if not path.is_file():
         return None, [f"there is no {ROTATOR}: poses are not known"]
     table = CsvTable(path)
@@ -426,33 +441,22 @@ def _uxo_poses(path: Path, index: NDArray[np.integer]) -> tuple[Array | None, li
     return poses_from(position[found] + rotation.apply(SONAR_AT), rotation * FORWARD_STARBOARD_DOWN), []
 
 
-# ---------------- Views as neusis and other acoustic radiance fields store them: a pickle a view, and a JSON file of
-# the sonar
-# Source of the layout: github.com/rpl-cmu/neusis (``load_data.py``, ``helpers.py``), whose views HoloOcean made.
-#
-# | file | content |
-# |---|---|
-# | ``Data/*.pkl`` | a table with ``ImagingSonar`` (bins x beams) and ``PoseSensor`` (4 x 4, sensor to world) |
-# | ``Config.json`` | of a sensor ``ImagingSonar``: ``Azimuth``, ``Elevation`` [deg], ``RangeMin``, ``RangeMax`` [m] |
-#
-# Row 0 is the nearest range. Column 0 has the bearing -Azimuth / 2 about the sensor's third axis. That axis is up, and the
-# first one forward, so column 0 is the one most to starboard. Views have no times: they follow one another by name, ten a
-# second. Levels are taken as linear; where a value exceeds 1, all are divided by the largest one.
+# ---------------- Views of neusis
 
 
 IMAGE, POSE = "ImagingSonar", "PoseSensor"
 
 RATE_HZ = 10.0
-"""Views a second: they have no times."""
+"""Assumed frame rate of views, which have no times [Hz]."""
 
 SHAPE_LIMIT = 2**25
-"""Cells of a view, at most."""
+"""Maximum number of cells of a view."""
 
 FORWARD_PORT_UP = Rotation.from_matrix([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 """Starboard, forward and up in the sensor's axes, as columns."""
 
 ORTHOGONAL = 1e-3
-"""Largest error of a rotation matrix."""
+"""Largest tolerated error of the orthogonality of a rotation matrix."""
 
 
 def is_neusis(path: Path, first: bytes) -> bool:
@@ -461,10 +465,24 @@ def is_neusis(path: Path, first: bytes) -> bool:
 
 
 def read_neusis(path: Path) -> Recording:
-    """Open a folder of views. Each is read once for its pose and largest value, and again when it is asked for.
+    """Open a folder of views as stored by neusis and other acoustic radiance fields: pickles, and a JSON file of the sonar.
+
+    Each view is read once for its pose and largest value, and again on demand.
+
+    Source of the layout: github.com/rpl-cmu/neusis (``load_data.py``, ``helpers.py``), whose views come from HoloOcean.
+
+    | file | content |
+    |---|---|
+    | ``Data/*.pkl`` | a dictionary with ``ImagingSonar`` (bins x beams) and ``PoseSensor`` (4 x 4, sensor to world) |
+    | ``Config.json`` | of a sensor ``ImagingSonar``: ``Azimuth``, ``Elevation`` [deg], ``RangeMin``, ``RangeMax`` [m] |
+
+    Row 0 is the nearest range. Column 0 has the bearing -Azimuth / 2 about the sensor's third axis. That axis points up and
+    the first one forward, so that column 0 is the one farthest to starboard. Views have no times: they are ordered by name
+    and assumed to be recorded at 10 Hz. Levels are assumed to be linear. If a value exceeds 1, all values are divided by the
+    largest.
 
     Raises:
-        MitsonarError: no configuration, no view that can be read, views of several sizes, or a pose that is none.
+        MitsonarError: if there is no configuration or no readable view, views differ in size, or a pose is invalid.
     """
     setting = _setting(path / "Config.json")
     files = sorted((path / "Data").glob("*.pkl"), key=lambda one: naturally(one.name))
@@ -506,14 +524,14 @@ def read_neusis(path: Path) -> Recording:
 
 @dataclass(frozen=True)
 class _Views:
-    """Views as images."""
+    """Function that reads the images of views."""
 
     files: tuple[Path, ...]
     shape: tuple[int, int]
     largest: float
 
     def __call__(self, index: NDArray[np.intp]) -> Pixels:
-        """Return ``(n, bins, beams)`` float32 in 0..1, column 0 most to port."""
+        """Return images ``(n, bins, beams)`` float32 in 0..1, column 0 farthest to port."""
         images = np.zeros((len(index), *self.shape), np.float32)
         for place, number in enumerate(index):
             image, _ = _view(self.files[number])
@@ -547,7 +565,7 @@ def _view(path: Path) -> tuple[FileArray, Array]:
 
 
 def _setting(path: Path) -> dict[str, float]:
-    """Return field of view [deg] and window [m] of the imaging sonar in a configuration of HoloOcean."""
+    """Return the field of view [deg] and the window [m] of the imaging sonar in a configuration of HoloOcean."""
     table = read_json(path)
     agents = table.get("agents")
     first: PlainValue = agents[0] if isinstance(agents, list) and agents and isinstance(agents[0], dict) else {}
@@ -560,26 +578,23 @@ def _setting(path: Path) -> dict[str, float]:
     raise MitsonarError(f"{path} holds no sensor of type {IMAGE} with a configuration: give a Config.json of HoloOcean")
 
 
-# ---------------- Pickles that hold tables of NumPy arrays, read without running anything that they name
-# Pickles are programs. This reader knows the few names that an array consists of, and answers each with an object that
-# only remembers what it is given. Any other name is refused. Arrays are made of the remembered bytes after a check of
-# their sizes.
+# ---------------- Safe reading of pickled arrays
 
 
 LARGEST = 2**30
-"""Bytes of a pickle, at most."""
+"""Maximum size of a pickle [bytes]."""
 
 MOST_DIMENSIONS = 8
 
 NUMBERS = "biuf"
-"""Kinds of NumPy's types that are read."""
+"""Supported kinds of NumPy type."""
 
 Remembered = Any
-"""What a pickle gives: numbers, texts, bytes, tuples, lists, tables, and the objects of this module."""
+"""Content of a pickle: numbers, strings, bytes, tuples, lists, dictionaries, and the recording objects below."""
 
 
 class _Remembers:
-    """An object of a pickle: what it was made with, and the state that it was given."""
+    """A stand-in for an object of a pickle, which only records its constructor arguments and its state."""
 
     def __init__(self, *made_with: Remembered) -> None:
         self.made_with = made_with
@@ -590,23 +605,23 @@ class _Remembers:
 
 
 class _Array(_Remembers):
-    """An array: its state is version, shape, type, Fortran order, bytes."""
+    """An array; its state is version, shape, type, Fortran order, bytes."""
 
 
 class _Kind(_Remembers):
-    """A type: made with its name; its state begins with version and order of bytes."""
+    """A NumPy type, constructed from its name; its state begins with version and byte order."""
 
 
 class _Scalar(_Remembers):
-    """A number of NumPy: made with its type and bytes."""
+    """A NumPy scalar, constructed from its type and bytes."""
 
 
 class _Class(_Remembers):
-    """A class that is only named."""
+    """A class that is only referred to by name."""
 
 
 def _encode(text: Remembered, coding: Remembered) -> bytes:
-    """Return bytes that old pickles write as text of Latin 1."""
+    """Return bytes that old pickles store as a Latin 1 string."""
     if not isinstance(text, str) or coding not in ("latin1", "latin-1"):
         raise pickle.UnpicklingError("bytes that are no text of Latin 1")
     return text.encode("latin1")
@@ -626,31 +641,31 @@ KNOWN: dict[tuple[str, str], Any] = {
     ("numpy", "dtype"): _Kind,
     ("_codecs", "encode"): _encode,
 }
-"""Names that a pickle may say, and what answers them."""
+"""Names that a pickle may contain, and the stand-ins for them."""
 
 
-class _Reader(pickle._Unpickler):  # the one in Python, whose memory follows the file's size
-    """Unpickles known names only, and gives states to the objects of this module only."""
+class _Reader(pickle._Unpickler):  # the Python implementation, whose memory use is bounded by the file size
+    """Unpickler that accepts known names only, and sets the state of stand-ins only."""
 
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
     stack: list[Any]
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return what answers a name.
+        """Return the stand-in for a name.
 
         Raises:
-            UnpicklingError: another name.
+            UnpicklingError: if the name is not known.
         """
         if (module, name) not in KNOWN:
             raise pickle.UnpicklingError(f"it names {module[:60]}.{name[:60]}, which is no part of an array")
         return KNOWN[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
-        """Refuse what lies outside of the file."""
+        """Reject references to objects outside the file."""
         raise pickle.UnpicklingError("it refers to another file")
 
     def load_build(self) -> None:
-        """Give a state to the object on the stack."""
+        """Set the state of the object on the stack, which must be a stand-in."""
         if not isinstance(self.stack[-2], _Remembers):
             raise pickle.UnpicklingError("it changes something that is no array")
         state = self.stack.pop()
@@ -660,10 +675,14 @@ class _Reader(pickle._Unpickler):  # the one in Python, whose memory follows the
 
 
 def read_pickled_arrays(path: Path) -> dict[str, FileArray]:
-    """Read the arrays and numbers of the table in a pickle, by name; what is neither is left out.
+    """Read the arrays and numbers of a pickled dictionary, keyed by name; other values are left out.
+
+    Pickles are programs, but nothing that the file names is executed. Only the few names that make up an array are accepted,
+    and replaced by objects that record what they are given. Arrays are built from the recorded bytes after their sizes have
+    been checked.
 
     Raises:
-        MitsonarError: no such file, no table, or a pickle that names anything but NumPy's arrays.
+        MitsonarError: if the file does not exist, holds no dictionary, or refers to anything other than NumPy arrays.
     """
     content = read_bytes(path, "pickle", LARGEST)
     try:
@@ -677,7 +696,7 @@ def read_pickled_arrays(path: Path) -> dict[str, FileArray]:
 
 
 def _array(value: Remembered) -> FileArray | None:
-    """Return the array that a value stands for; None where it is none."""
+    """Return the array that a value of a pickle represents; None if it represents none."""
     if isinstance(value, bool | int | float):
         return np.asarray(value, dtype=float) if abs(value) < 1e300 or value != value else None
     if isinstance(value, _Scalar):
@@ -685,7 +704,7 @@ def _array(value: Remembered) -> FileArray | None:
         return _from_bytes(content, kind, (), "C")
     if not isinstance(value, _Array):
         return None
-    if value.state is None:  # _frombuffer: bytes, type, shape, order
+    if value.state is None:  # constructed by _frombuffer: bytes, type, shape, order
         content, kind, shape, order = (*value.made_with, None, None, None, None)[:4]
         return _from_bytes(content, kind, shape, order)
     if not isinstance(value.state, tuple) or len(value.state) != 5:
@@ -695,7 +714,7 @@ def _array(value: Remembered) -> FileArray | None:
 
 
 def _from_bytes(content: Remembered, kind: Remembered, shape: Remembered, order: Remembered) -> FileArray:
-    """Make an array of bytes, after its type and shape are checked against their number."""
+    """Build an array from bytes, after its type and shape have been checked against their number."""
     if not isinstance(kind, _Kind) or not kind.made_with or not isinstance(kind.made_with[0], str):
         raise ValueError("an array has a type that cannot be")
     name = kind.made_with[0]

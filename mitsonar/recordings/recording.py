@@ -1,4 +1,4 @@
-"""The currency of the readers: a recording of one sonar, in parts of one geometry each, whose pixels are read on demand."""
+"""What does every reader return? A recording of one sonar, in parts of constant geometry, with pixels read on demand."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ Pixels = NDArray[np.generic]
 """Images ``(n, bins, beams)``: uint8 in 0..255, or float32 in 0..1."""
 
 Facts: TypeAlias = dict[str, Any]
-"""Values of a file's headers by name: numbers, texts, lists of them."""
+"""Header values of a file, keyed by name: numbers, strings and lists of them."""
 
 CHUNK_BYTES = 8 * 2**20
-"""Approximate size of the pixels that are read at a time [bytes]."""
+"""Approximate amount of pixel data that is read at a time [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,14 @@ class Part:
     """Consecutive frames of one geometry: one window, one set of beams, one coding.
 
     Attributes:
-        like: no frames, but all that is the same for each of them: sonar, ranges, bearings, level.
-        time_s: of the frames ``(frames,)`` [s], rising. Seconds since 1970 where the file tells the date.
-        images: reads the frames of given numbers ``(n,)``: ``(n, bins, beams)``, column 0 most to port.
-        poses: x, y, z [m], pitch, roll, heading [rad] of the sonar ``(frames, 6)``, where known.
-        attitude_rad: pitch, roll, heading [rad] ``(frames, 3)`` by the sonar's own sensors; nan where unknown.
-        height_m: over the ground ``(frames,)``, where known.
-        gain_db: receiver gain of each frame ``(frames,)`` [dB], where known.
+        like: an empty sequence of frames that holds everything they share: sonar, ranges, bearings and level.
+        time_s: frame times ``(frames,)`` [s], increasing. Seconds since 1970 if the file records the date.
+        images: function that reads the frames with the given indices ``(n,)`` and returns ``(n, bins, beams)``, where
+            column 0 is farthest to port.
+        poses: x, y, z [m], pitch, roll, heading [rad] of the sonar ``(frames, 6)``, if known.
+        attitude_rad: pitch, roll, heading [rad] ``(frames, 3)`` measured by the sonar's sensors; nan where unknown.
+        height_m: height above the ground ``(frames,)`` [m], if known.
+        gain_db: receiver gain of each frame ``(frames,)`` [dB], if known.
     """
 
     like: SonarFrames
@@ -70,10 +71,10 @@ class Part:
         return len(self.time_s)
 
     def read(self, index: ArrayLike) -> SonarFrames:
-        """Read frames of these numbers ``(n,)``.
+        """Read the frames with the given indices ``(n,)``.
 
         Raises:
-            MitsonarError: frames that are not there, or that cannot be read.
+            MitsonarError: if a frame does not exist or cannot be read.
         """
         chosen = np.asarray(index, dtype=np.intp)
         beyond = chosen[(chosen < 0) | (chosen >= len(self))]
@@ -84,10 +85,14 @@ class Part:
         return replace(self.like, image=self.images(chosen), time_s=self.time_s[chosen], **known)
 
     def cropped(self, bins: tuple[int, int] | None, beams: tuple[int, int] | None) -> Part:
-        """Return the part with these bins and beams only, from the first of a pair to before the second; None: all.
+        """Return the part restricted to half-open intervals of bins and beams.
+
+        Args:
+            bins: first bin and the bin after the last one; None keeps all bins.
+            beams: first beam and the beam after the last one; None keeps all beams.
 
         Raises:
-            MitsonarError: fewer than two of either, or some that are not there.
+            MitsonarError: if an interval holds fewer than two bins or beams, or exceeds those of the part.
         """
         rows, columns = (
             _within(what, span, len(axis))
@@ -107,11 +112,11 @@ class Part:
         return replace(self, like=like, **self._read_within(rows, columns))
 
     def _read_within(self, rows: slice, columns: slice) -> dict[str, Any]:
-        """Return the fields that read pixels, of these bins and beams."""
+        """Return replacements for the fields that read pixels, restricted to these bins and beams."""
         return {"images": lambda index: self.images(index)[:, rows, columns]}
 
     def chunks(self) -> Iterator[SonarFrames]:
-        """Read all frames, some at a time, so that memory does not grow with the file."""
+        """Read all frames in chunks, so that memory use does not grow with the file."""
         cells = max(1, len(self.like.range_m) * len(self.like.bearing_rad))
         count = max(1, CHUNK_BYTES // (4 * cells))
         for start in range(0, len(self), count):
@@ -119,10 +124,10 @@ class Part:
 
 
 def _within(what: str, span: tuple[int, int] | None, count: int) -> slice:
-    """Return the slice of a span of bins or beams.
+    """Return a half-open interval of bins or beams as a slice.
 
     Raises:
-        MitsonarError: it holds fewer than two, or some that are not there.
+        MitsonarError: if the interval holds fewer than two of them, or exceeds ``count``.
     """
     first, end = (0, count) if span is None else span
     if not (0 <= first < end - 1 and end <= count):
@@ -135,13 +140,13 @@ def _within(what: str, span: tuple[int, int] | None, count: int) -> slice:
 
 @dataclass(frozen=True)
 class Recording:
-    """A file of a real sonar, or a folder of one.
+    """A recording of a real sonar: a file or a folder.
 
     Attributes:
-        name: of the file.
-        format: in words: ``ARIS 5 (.aris)``.
-        parts: in the order of time; one where neither window nor beams change.
-        facts: what the headers tell, by name.
+        name: name of the file.
+        format: readable name of the format, such as ``ARIS 5 (.aris)``.
+        parts: parts in chronological order; a single one if neither window nor beams change.
+        facts: header values, keyed by name.
         notes: sentences on what was left out, sorted or assumed.
     """
 
@@ -156,19 +161,19 @@ class Recording:
             raise MitsonarError(f"{self.name} holds no frame that can be read: the file is empty or damaged")
 
     def __len__(self) -> int:
-        """Return the number of frames of all parts."""
+        """Return the number of frames in all parts."""
         return sum(len(part) for part in self.parts)
 
     @property
     def longest(self) -> int:
-        """Return the number of the longest part; of several, the first."""
+        """Return the index of the longest part; the first one if several are equally long."""
         return int(np.argmax([len(part) for part in self.parts]))
 
     def part(self, number: int | None = None) -> Part:
-        """Return a part by its number; default: the longest.
+        """Return a part by its index; default: the longest.
 
         Raises:
-            MitsonarError: no such part.
+            MitsonarError: if there is no such part.
         """
         if number is not None and not 0 <= number < len(self.parts):
             raise MitsonarError(f"{self.name} has no part {number}: it has {len(self.parts):,}, numbered from 0")
@@ -176,14 +181,14 @@ class Recording:
 
 
 def in_time_order(time_s: ArrayLike, number: ArrayLike | None = None) -> tuple[Index, list[str]]:
-    """Sort frames by time and drop repeated ones.
+    """Sort frames by time, and drop those without a valid time or with the time of the frame before.
 
     Args:
-        time_s: of the frames ``(frames,)`` [s].
-        number: that the sonar gave each frame ``(frames,)``, where known. It tells repeated from simultaneous frames.
+        time_s: frame times ``(frames,)`` [s].
+        number: number that the sonar gave each frame ``(frames,)``, if known. Gaps in it are reported as missing frames.
 
     Returns:
-        The places of the kept frames, times rising, and sentences on what was sorted, dropped or is missing.
+        The indices of the remaining frames in order of time, and sentences on what was sorted, dropped or is missing.
     """
     time = np.asarray(time_s, dtype=float)
     known = np.isfinite(time)
@@ -203,7 +208,10 @@ def in_time_order(time_s: ArrayLike, number: ArrayLike | None = None) -> tuple[I
 
 
 def runs_of(keys: Sequence[Hashable]) -> list[tuple[Hashable, Index]]:
-    """Return each run of equal keys with the places of its members: frames of one geometry belong to one part."""
+    """Return each run of equal keys with the indices of its members.
+
+    Readers use the geometry of each frame as its key, so that each run becomes a part.
+    """
     runs: list[tuple[Hashable, list[int]]] = []
     for place, key in enumerate(keys):
         if not runs or runs[-1][0] != key:
@@ -212,26 +220,25 @@ def runs_of(keys: Sequence[Hashable]) -> list[tuple[Hashable, Index]]:
     return [(key, np.asarray(places, dtype=np.intp)) for key, places in runs]
 
 
-# ---------------- Files of pings, mapped into memory: bytes are read on demand, and sizes are checked before they are
-# believed
+# ---------------- Memory-mapped files of equally sized frames
 
 
 Bytes = NDArray[np.uint8]
 
 Header = NDArray[Any]
-"""A structured array: fields of a header by name."""
+"""A structured array with the fields of a header."""
 
 
 def mapped(path: str | Path, what: str, least: int = 1) -> Bytes:
-    """Map a file into memory, read only.
+    """Map a file into memory read-only, so that its bytes are read on demand.
 
     Args:
-        path: of the file.
-        what: kind of file, for errors.
-        least: bytes that it must have.
+        path: path of the file.
+        what: kind of file, for error messages.
+        least: minimum size of the file [bytes].
 
     Raises:
-        MitsonarError: no such file, no file, or too short.
+        MitsonarError: if the path does not exist, is not a regular file, is too short or cannot be read.
     """
     path = Path(path)
     if not os.path.isfile(path):
@@ -248,7 +255,7 @@ def mapped(path: str | Path, what: str, least: int = 1) -> Bytes:
 
 
 def layout(fields: Mapping[str, tuple[int, str]], size: int) -> np.dtype[np.void]:
-    """Return the type of a header of ``size`` bytes with fields at byte offsets, by name: ``(offset, NumPy's type)``."""
+    """Return the structured type of a header of ``size`` bytes, from ``(byte offset, NumPy type)`` of each field."""
     offsets = [offset for offset, _ in fields.values()]
     formats = [kind for _, kind in fields.values()]
     table: Any = {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": size}
@@ -258,13 +265,13 @@ def layout(fields: Mapping[str, tuple[int, str]], size: int) -> np.dtype[np.void
 
 @dataclass(frozen=True)
 class EqualFrames:
-    """Frames of one size, one after the other: a header and samples each.
+    """Consecutive frames of equal size, each a header followed by samples.
 
     Attributes:
         data: the whole file.
         start: offset of the first frame [bytes].
-        header: type of a frame's header.
-        samples: bytes of a frame's samples.
+        header: structured type of a frame's header.
+        samples: size of a frame's samples [bytes].
     """
 
     data: Bytes
@@ -274,29 +281,29 @@ class EqualFrames:
 
     @property
     def stride(self) -> int:
-        """Return the size of a frame with its header [bytes]."""
+        """Return the size of a frame including its header [bytes]."""
         return self.header.itemsize + self.samples
 
     def __len__(self) -> int:
-        """Return the number of whole frames; the file's size tells it, not its header."""
+        """Return the number of whole frames, computed from the size of the file rather than read from its header."""
         return max(0, (len(self.data) - self.start) // self.stride)
 
     @property
     def left_over(self) -> int:
-        """Return the bytes behind the last whole frame."""
+        """Return the number of bytes after the last whole frame."""
         return max(0, len(self.data) - self.start - len(self) * self.stride)
 
     def headers(self) -> Header:
-        """Return the headers ``(frames,)``: a view into the file."""
+        """Return the headers ``(frames,)`` as a view into the file."""
         return np.ndarray((len(self),), self.header, self.data, self.start, (self.stride,))
 
     def table(self) -> Header:
-        """Return the headers ``(frames,)`` in memory, their known fields only."""
+        """Return a copy of the headers ``(frames,)`` that holds only the known fields."""
         names = self.header.names or ()
         return self.headers().astype([(name, self.header[name]) for name in names])
 
     def read(self, index: NDArray[np.intp], shape: tuple[int, int]) -> Bytes:
-        """Return the samples of frames ``(n, *shape)``, copied."""
+        """Return a copy of the samples of the given frames ``(n, *shape)``."""
         begin = self.start + self.header.itemsize + index.astype(np.int64) * self.stride
         return (
             np.stack([self.data[at : at + self.samples].reshape(shape) for at in begin])

@@ -1,4 +1,4 @@
-"""ROS bags: topics and raw messages of ROS 1 bags, ROS 2 bags and MCAP files, read on demand (by ``rosbags``)."""
+"""How are messages in ROS bags accessed and defined? ROS 1 bags, ROS 2 bags and MCAP files, read by ``rosbags``."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ __all__ = [
 
 
 Message: TypeAlias = Any
-"""A decoded message; its definition, which stands in the bag, says which fields it has."""
+"""A decoded message; its definition in the bag determines its fields."""
 
 ROS1 = b"#ROSBAG V"
 MCAP = b"\x89MCAP0\r\n"
 SQLITE = b"SQLite format 3\x00"
 
 ENDS = {ROS1: ".bag", MCAP: ".mcap", SQLITE: ".db3"}
-"""First bytes of bags of one file, and how their names end."""
+"""Required suffixes of single-file bags, keyed by their first bytes."""
 
 
 REPAIRS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
-"""What makes a bag whole that a recorder has not closed, by the end of its name."""
+"""Commands that repair a bag that its recorder did not close, keyed by suffix."""
 
 
 class Topic(NamedTuple):
-    """A topic: its name, its type (``sensor_msgs/msg/Image``) and its number of messages."""
+    """A topic: its name, its message type (such as ``sensor_msgs/msg/Image``) and its number of messages."""
 
     name: str
     kind: str
@@ -78,10 +78,10 @@ def _is_ros2_folder(path: Path) -> bool:
 
 
 class BagFile:
-    """A bag. It is opened when it is first read, also in another process that it is sent to.
+    """A ROS bag, opened when it is first read; a copy sent to another process opens the file again.
 
     Raises:
-        MitsonarError: it is damaged, or its name does not end as its format demands.
+        MitsonarError: if the bag is damaged, or its suffix is not the one that its format requires.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -89,16 +89,16 @@ class BagFile:
         self._reader: AnyReader | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the path only: an open file stays in its process."""
+        """Return the state without the open file, which stays in its process."""
         return {"path": self.path, "_reader": None}
 
     @property
     def is_ros1(self) -> bool:
-        """Return whether it is a bag of ROS 1."""
+        """Return whether this is a ROS 1 bag."""
         return self.path.suffix == ".bag"
 
     def topics(self) -> list[Topic]:
-        """Return all topics."""
+        """Return all topics, sorted by name."""
         with self._readable():
             found = self._open().topics
             return [Topic(name, one.msgtype or "several types", one.msgcount) for name, one in sorted(found.items())]
@@ -107,9 +107,9 @@ class BagFile:
         """Read the raw messages of a topic in the order in which they were received.
 
         Args:
-            topic: its name.
-            start: time of reception from which they are read [ns].
-            stop: time of reception before which they are read [ns].
+            topic: name of the topic.
+            start: earliest time of reception, inclusive [ns]; default: no limit.
+            stop: latest time of reception, exclusive [ns]; default: no limit.
 
         Yields:
             Time of reception [ns] and bytes of each message.
@@ -120,7 +120,7 @@ class BagFile:
                 yield time, bytes(raw)
 
     def decode(self, raw: bytes, kind: str) -> Message:
-        """Decode a message of a type."""
+        """Decode a raw message of the given type."""
         with self._readable():
             return self._open().deserialize(raw, kind)
 
@@ -141,7 +141,7 @@ class BagFile:
         return reader
 
     def _check_name(self) -> None:
-        """Check that the name ends as the content demands: ``rosbags`` tells formats by the name."""
+        """Check that the suffix matches the content, because ``rosbags`` recognises formats by the suffix."""
         if self.path.is_dir():
             return
         with self.path.open("rb") as file:
@@ -152,7 +152,7 @@ class BagFile:
 
     @contextmanager
     def _readable(self) -> Iterator[None]:
-        """Turn whatever a damaged bag leads to into one sentence."""
+        """Convert any exception that a damaged bag causes to a MitsonarError of one sentence."""
         try:
             yield
         except (MitsonarError, GeneratorExit):
@@ -166,29 +166,28 @@ class BagFile:
             ) from None
 
 
-# ---------------- Definitions of the ROS messages of sonars, for bags that lack them and for files that are written
-# Names, types and order of the fields are those of the public definitions. ``tests/recordings/test_ros_bag.py``
-# compares their MD5 sums with the published ones. Sources:
+# ---------------- Definitions of sonar messages
+# They serve bags that lack definitions, and files that mitsonar writes. Names, types and order of the fields are those of
+# the public definitions; ``tests/recordings/test_ros_bag.py`` compares their MD5 sums with the published ones. Sources:
 #
 # - ``marine_acoustic_msgs``: apl-ocean-engineering/marine_msgs (BSD-3-Clause), ``ProjectedSonarImage``, ``PingInfo``,
 #   ``SonarImageData``. The older package ``acoustic_msgs`` has the same messages.
-# - ``sonar_oculus``: MarineRoboticsGroup/sonar_oculus, ``OculusPing``, ``OculusFire``, as the pings of BlueROVs with an
-#   Oculus
-#   are recorded. Older versions hold a ``sensor_msgs/Image``; their bags bring the definition along.
+# - ``sonar_oculus``: MarineRoboticsGroup/sonar_oculus, ``OculusPing``, ``OculusFire``, in which pings of BlueROVs with an
+#   Oculus are recorded. Older versions hold a ``sensor_msgs/Image``; their bags contain the definition.
 # - ``tf2_msgs``: ros/geometry2 (BSD-3-Clause), ``TFMessage``, which ``rosbags`` lacks for ROS 1.
 
 
 PROJECTED = ("marine_acoustic_msgs/msg/ProjectedSonarImage", "acoustic_msgs/msg/ProjectedSonarImage")
-"""Types of polar images with directions of beams and ranges of bins."""
+"""Types of polar images that hold beam directions and bin ranges."""
 
 OCULUS = ("sonar_oculus/msg/OculusPing",)
 """Types of polar images of an Oculus."""
 
 FANS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-"""Types of pictures. They are fans in metres only by a geometry that the user gives."""
+"""Types of pictures, which only a geometry given by the user turns into metric fans."""
 
 DTYPES = {0: "u1", 1: "i1", 2: "u2", 3: "i2", 4: "u4", 5: "i4", 6: "u8", 7: "i8", 8: "f4", 9: "f8"}
-"""NumPy's letters for the numbers in ``SonarImageData.dtype``."""
+"""NumPy type codes, keyed by the value of ``SonarImageData.dtype``."""
 
 PING_INFO = """
 float32 frequency
@@ -264,12 +263,12 @@ DEFINITIONS = {
     "sonar_oculus/msg/OculusPing": OCULUS_PING,
     "tf2_msgs/msg/TFMessage": TRANSFORMS,
 }
-"""Text of each definition by its type."""
+"""Text of each definition, keyed by message type."""
 
 
 @cache
 def ros1_types() -> Typestore:
-    """Return the types of ROS 1 (Noetic) with those of sonars."""
+    """Return the message types of ROS 1 (Noetic), extended by those of sonars."""
     from rosbags.typesys import Stores
 
     return _with_sonars(Stores.ROS1_NOETIC)
@@ -277,7 +276,7 @@ def ros1_types() -> Typestore:
 
 @cache
 def ros2_types() -> Typestore:
-    """Return the types of ROS 2 (Humble) with those of sonars."""
+    """Return the message types of ROS 2 (Humble), extended by those of sonars."""
     from rosbags.typesys import Stores
 
     return _with_sonars(Stores.ROS2_HUMBLE)
@@ -293,28 +292,30 @@ def _with_sonars(store: object) -> Typestore:
 
 
 def short(kind: str) -> str:
-    """Return the name of a type as ROS 1 writes it: ``sensor_msgs/Image``."""
+    """Return the name of a type in the notation of ROS 1: ``sensor_msgs/Image``."""
     return kind.replace("/msg/", "/")
 
 
-# ---------------- What ROS messages cannot tell of frames, as a metadata record of an MCAP file: sonar, axes and coding
+# ---------------- Metadata record of an MCAP file
+# The record holds what ROS messages cannot: the sonar, its exact axes, and the coding of samples.
 
 
 RECORD = "mitsonar"
-"""Name of the record."""
+"""Name of the metadata record."""
 
 WRITTEN = "/sonar/image"
-"""Topic of the images that it describes."""
+"""Topic of the images that the record describes."""
 
 FIELDS = ("sonar", "level", "level_scale", "range_m", "bearing_rad")
 
 
 def metadata_of(frames: SonarFrames, span_db: float | None = None) -> dict[str, str]:
-    """Return the record of frames: JSON texts by name.
+    """Return the metadata record of frames: JSON strings, keyed by name.
 
     Args:
-        frames: of the file.
-        span_db: over which samples are dB of linear levels; None: samples are values in the coding of the frames.
+        frames: frames of the file.
+        span_db: dynamic range over which samples encode linear levels in dB [dB]; None if samples are values in the coding
+            of the frames.
     """
     table = {
         "sonar": frames.sonar.model_dump(),
@@ -329,7 +330,7 @@ def metadata_of(frames: SonarFrames, span_db: float | None = None) -> dict[str, 
 
 
 def _in_words(frames: SonarFrames, span_db: float | None) -> str:
-    """Return how samples become levels relative to full scale."""
+    """Describe in words how samples are converted to levels relative to full scale."""
     value, sonar = "sample / 255" if frames.image.dtype == np.uint8 else "sample", frames.sonar
     zero = "0 is no echo; "
     if span_db is not None or frames.level == "dB":
@@ -344,16 +345,17 @@ def _in_words(frames: SonarFrames, span_db: float | None) -> str:
 
 
 def frames_like(path: Path, images: np.dtype[np.generic]) -> tuple[SonarFrames, float | None] | None:
-    """Return frames without images as the record of a file describes them, and the span of their samples.
-
-    The span [dB] is None where samples are the values of the images. Without a record the answer is None.
+    """Return empty frames as described by the metadata record of a file, and the dynamic range of their samples.
 
     Args:
-        path: of an ``.mcap``.
+        path: path of an ``.mcap`` file.
         images: type of the images.
 
+    Returns:
+        The frames and the dynamic range [dB], which is None if samples are the values of the images. None without a record.
+
     Raises:
-        MitsonarError: a damaged record.
+        MitsonarError: if the record is damaged.
     """
     record = _record_in(path)
     if record is None:
@@ -377,7 +379,7 @@ def frames_like(path: Path, images: np.dtype[np.generic]) -> tuple[SonarFrames, 
 
 
 def _record_in(path: Path) -> dict[str, str] | None:
-    """Return mitsonar's metadata record of a file."""
+    """Return mitsonar's metadata record of a file; None if it has none."""
     try:
         from mcap.reader import make_reader
     except ModuleNotFoundError as error:

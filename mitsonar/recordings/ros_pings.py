@@ -1,4 +1,4 @@
-"""Messages of sonars as images: geometry, coding and samples of ``ProjectedSonarImage`` and ``OculusPing``."""
+"""How do sonar messages become images? Geometry, coding and samples of ``ProjectedSonarImage`` and ``OculusPing``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Index = NDArray[np.intp]
 Samples = NDArray[np.generic]
 
 RED, GREEN, BLUE = 0.299, 0.587, 0.114
-"""Weights of colours in the luminance (ITU-R BT.601)."""
+"""Weights of the colours in luminance (ITU-R BT.601)."""
 
 CHANNELS = {
     "mono8": (1.0,),
@@ -30,10 +30,10 @@ CHANNELS = {
     "rgba8": (RED, GREEN, BLUE, 0.0),
     "bgra8": (BLUE, GREEN, RED, 0.0),
 }
-"""Encodings of ``sensor_msgs/Image`` that are read: the weight of each channel."""
+"""Channel weights of the supported encodings of ``sensor_msgs/Image``."""
 
 SAME_RANGE = 0.002
-"""Relative change of ranges up to which a window counts as the same: the sound speed drifts."""
+"""Relative change of ranges, caused by drift of the sound speed, up to which a window counts as the same."""
 
 SAME_BEARING = 1e-4
 """Change of a bearing up to which it counts as the same [rad]."""
@@ -42,31 +42,31 @@ CENTIDEGREE = math.pi / 18_000
 """Unit of the bearings of an Oculus [rad]."""
 
 FORWARD_LEFT_UP: Array = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-"""Starboard, forward and up in axes forward, left, up (REP 103), as columns."""
+"""Starboard, forward and up in the axes forward, left, up (REP 103), as columns."""
 
 LONGEST = 1e6
-"""Length of a direction, at most: drivers write unit vectors."""
+"""Largest plausible component of a beam direction; drivers write unit vectors."""
 
 CLEARLY = 0.05
-"""By how much a correlation must exceed the other one to decide on the order of samples."""
+"""Difference between two correlations that is required to decide on the order of samples."""
 
 
 @dataclass(frozen=True)
 class PingLayout:
-    """What a message tells of its image, besides the samples.
+    """Geometry and coding of the image in a message, without its samples.
 
     Attributes:
         range_m: centres of the bins ``(bins,)`` [m].
-        bearing_rad: axes of the beams ``(beams,)`` [rad], rising, starboard positive.
-        order: columns of the message in the order of the bearings ``(beams,)``.
-        dtype: of the samples, as NumPy names it.
+        bearing_rad: bearings of the beam axes ``(beams,)`` [rad], increasing, starboard positive.
+        order: columns of the message in order of bearing ``(beams,)``.
+        dtype: NumPy name of the sample type.
         axes: starboard, forward and up in the axes of the message's frame, as columns ``(3, 3)``.
-        frame_id: of the message.
-        frequency_hz: carrier; 0 where unknown.
-        sound_speed: m/s; 0 where unknown.
-        elevation_rad: opening over elevation; 0 where unknown.
-        beam_width_rad: of one beam; 0 where unknown.
-        gamma: value = amplitude^gamma.
+        frame_id: coordinate frame of the message.
+        frequency_hz: carrier [Hz]; 0 if unknown.
+        sound_speed: sound speed [m/s]; 0 if unknown.
+        elevation_rad: elevation aperture [rad]; 0 if unknown.
+        beam_width_rad: width of one beam [rad]; 0 if unknown.
+        gamma: exponent of the coding: value = amplitude^gamma.
     """
 
     range_m: Array
@@ -87,7 +87,7 @@ class PingLayout:
         return len(self.range_m) * len(self.bearing_rad)
 
     def resembles(self, other: PingLayout) -> bool:
-        """Return whether frames of both belong to one part."""
+        """Return whether frames of both layouts belong to the same part."""
         return (
             self.range_m.shape == other.range_m.shape
             and self.bearing_rad.shape == other.bearing_rad.shape
@@ -102,7 +102,7 @@ def layout_of(message: Message, kind: str) -> PingLayout:
     """Return the layout of a message.
 
     Raises:
-        ValueError: sizes or numbers that contradict each other; the message is damaged.
+        ValueError: if sizes or numbers are inconsistent, because the message is damaged.
     """
     layout = _projected(message) if kind in PROJECTED else _oculus(message)
     rising = np.all(np.diff(layout.range_m) > 0) and np.all(np.diff(layout.bearing_rad) > 0)
@@ -114,16 +114,16 @@ def layout_of(message: Message, kind: str) -> PingLayout:
 
 
 def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: bool = False) -> Samples:
-    """Return the samples of a message as they are stored ``(bins, beams)``, column 0 most to port.
+    """Return the samples of a message ``(bins, beams)`` in their stored type, column 0 farthest to port.
 
     Args:
-        message: decoded.
-        kind: its type.
-        layout: of the message, or of one like it.
-        beam_major: whether all ranges of a beam follow each other. Drivers write all beams of a range.
+        message: decoded message.
+        kind: type of the message.
+        layout: layout of the message, or of one that resembles it.
+        beam_major: whether the samples of a beam are contiguous; drivers write those of a range contiguously.
 
     Raises:
-        ValueError: samples that are not as many as the layout says, or a picture that cannot be decoded.
+        ValueError: if the number of samples does not match the layout, or a picture cannot be decoded.
     """
     shape = (len(layout.range_m), len(layout.bearing_rad))
     if kind in PROJECTED:
@@ -139,15 +139,15 @@ def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: b
 
 
 def is_beam_major(flat: Sequence[Samples], bins: int, beams: int) -> bool:
-    """Return whether samples are in the order of beams, by how they correlate.
+    """Return whether the samples of a beam are contiguous, judged by their correlation.
 
-    The definition of ``SonarImageData`` speaks of beams after one another. The drivers of Oculus sonars and the simulators
-    that were seen write ranges after one another. The number of samples is the same. But neighbours resemble each other:
-    they are ``beams`` samples apart in the order of ranges, and ``bins`` samples apart in the order of beams. Where that
-    does not decide, as with as many bins as beams, it is the order of the drivers.
+    The definition of ``SonarImageData`` speaks of one beam after another. The drivers of Oculus sonars, and the simulators
+    whose files were available, write one range after another. The number of samples is the same for both. Neighbours are
+    correlated, however: they are ``beams`` samples apart if written by range, and ``bins`` samples apart if written by beam.
+    If that does not decide, for instance because there are as many bins as beams, the order of the drivers is assumed.
 
     Args:
-        flat: samples of some frames as they are stored, each ``(bins * beams,)``.
+        flat: stored samples of several frames, each ``(bins * beams,)``.
         bins: number of ranges.
         beams: number of beams.
     """
@@ -159,7 +159,7 @@ def is_beam_major(flat: Sequence[Samples], bins: int, beams: int) -> bool:
 
 
 def _correlation(values: Samples, lag: int) -> float:
-    """Return the correlation of values with those ``lag`` places later; 0 where they are all the same."""
+    """Return the correlation of values with those ``lag`` places later; 0 if they are constant."""
     known = np.nan_to_num(values.astype(np.float64), posinf=0, neginf=0)
     first, second = known[:-lag] - known[:-lag].mean(), known[lag:] - known[lag:].mean()
     power = math.sqrt(float(first @ first) * float(second @ second))
@@ -190,10 +190,10 @@ def _projected(message: Message) -> PingLayout:
 
 
 def _bearings(vectors: Array) -> tuple[Array, Array]:
-    """Return the bearings of directions ``(beams, 3)`` [rad], and starboard, forward, up in their axes.
+    """Return the bearings of beam directions ``(beams, 3)`` [rad], and starboard, forward and up in their axes as columns.
 
-    Forward is the axis z, as the definition says, or the axis x, as in Gazebo. To port is the axis y in both: so write the
-    driver of the Oculus (y = -sin) and Gazebo (REP 103), and so does ``sonar_image_proc`` draw.
+    Forward is the z axis, as the definition states, or the x axis, as in Gazebo. The y axis points to port in both: the
+    driver of the Oculus (y = -sin) and Gazebo (REP 103) write it so, and ``sonar_image_proc`` draws it so.
     """
     if not len(vectors) or not (np.abs(vectors) < LONGEST).all() or not (np.abs(vectors).max(axis=1) > 0).all():
         raise ValueError("directions of beams are none, or not finite")
@@ -205,7 +205,7 @@ def _bearings(vectors: Array) -> tuple[Array, Array]:
 
 
 def _oculus(message: Message) -> PingLayout:
-    """Return the layout of an ``OculusPing``; its frame counts as forward, left, up (REP 103)."""
+    """Return the layout of an ``OculusPing``; its frame is assumed to be forward, left, up (REP 103)."""
     bearing = np.asarray(message.bearings, dtype=float) * CENTIDEGREE
     if len(bearing) != int(message.num_beams):
         raise ValueError("bearings are not as many as beams")
@@ -233,7 +233,7 @@ def picture_of(picture: Message) -> NDArray[np.uint8]:
     """Return the grey values ``(rows, columns)`` of a ``sensor_msgs/Image`` or ``CompressedImage``.
 
     Raises:
-        ValueError: it cannot be decoded, or its samples are not as many as it says.
+        ValueError: if the picture cannot be decoded, or its number of samples does not match its size.
     """
     data = np.asarray(picture.data, np.uint8)
     if hasattr(picture, "format"):
@@ -257,13 +257,13 @@ def picture_of(picture: Message) -> NDArray[np.uint8]:
 
 
 def _amount(value: object) -> float:
-    """Return a number above 0; 0 where it is none."""
+    """Return a value as a number if it is finite and positive, otherwise 0."""
     number = float(value)  # type: ignore[arg-type]
     return number if math.isfinite(number) and number > 0 else 0.0
 
 
 def _middle(values: object) -> float:
-    """Return the median of the numbers above 0; 0 where there are none."""
+    """Return the median of the angles between 0 and 2 pi [rad]; 0 if there are none."""
     known = np.asarray(values, dtype=float)
     known = known[np.isfinite(known) & (known > 0) & (known < 2 * math.pi)]
     return float(np.median(known)) if len(known) else 0.0

@@ -1,4 +1,4 @@
-"""ROS bags: ROS 1 (.bag), ROS 2 (a folder, .db3 or .mcap), with ``ProjectedSonarImage`` or ``OculusPing``."""
+"""How is a recording in a ROS bag read? ROS 1 (.bag) and ROS 2 (a folder, .db3 or .mcap), sonar images or pictures."""
 
 from __future__ import annotations
 
@@ -26,31 +26,34 @@ Index = NDArray[np.intp]
 Samples = NDArray[np.generic]
 
 ELEVATION_DEG = 20.0
-"""Opening over elevation where the bag does not tell it [deg]; that of an Oculus M750d, M1200d at the low frequency."""
+"""Elevation aperture if the bag holds none [deg]; that of an Oculus M750d, and of an M1200d at its low frequency."""
 
 TRIED = 8
-"""Frames by which the order of samples is found."""
+"""Maximum number of frames from which the order of samples is determined."""
 
 LATER_S = 86_400.0
-"""Largest delay between a message's own time and its reception that counts as one [s]."""
+"""Largest difference between the times of header and reception that is reported as a delay [s]."""
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: str | None = None) -> Recording:
     """Open the recording of a sonar in a ROS bag; pixels are read on demand.
 
-    Times are those in the headers of the messages; where they are all 0, or all the same, those of reception. Values count
-    as amplitudes. Poses are those of the bag, where they are unambiguous (:mod:`mitsonar.recordings.ros_topics`). A file
-    that mitsonar wrote states its sonar and coding (:mod:`mitsonar.recordings.ros_messages`).
+    Times are those in the headers of the messages, or those of reception if the header times are all 0 or all equal. Values
+    are assumed to be amplitudes. Poses are those of the bag if they are unambiguous
+    (:mod:`mitsonar.recordings.ros_topics`). A file that mitsonar wrote contains its sonar and coding
+    (:mod:`mitsonar.recordings.ros_messages`).
 
     Args:
-        path: of a ``.bag``, ``.mcap`` or ``.db3``, or of the folder of a ROS 2 bag.
-        geometry: a geometry file, for topics of pictures; images of sonars tell their geometry themselves.
-        topic: of the sonar, or of pictures; default: the only one of a sonar, or with a geometry the only one of pictures.
+        path: path of a ``.bag``, ``.mcap`` or ``.db3`` file, or of the folder of a ROS 2 bag.
+        geometry: a geometry file, for topics of pictures; sonar images contain their geometry.
+        topic: topic of the sonar or of the pictures; default: the only sonar topic, or with a geometry the only topic of
+            pictures.
 
     Raises:
-        MitsonarError: damaged, no topic of a sonar, or several and none chosen.
+        MitsonarError: if the bag is damaged, has no sonar topic, or has several of which none is chosen.
     """
+    # 1. Choose the topic, and scan its messages once.
     bag = BagFile(path)
     chosen = sonar_topic(bag, topic, FANS if geometry is not None else (*PROJECTED, *OCULUS))
     if chosen.kind in FANS:
@@ -61,6 +64,7 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     scan.read()
     if not scan.layouts:
         raise MitsonarError(f"{path}: no message of {chosen.name} can be read: {scan.reason or 'there is none'}")
+    # 2. Determine what all parts share: order of time, coding, poses, and the metadata of a file written by mitsonar.
     kept, notes = in_time_order(scan.frame_times())
     notes = [*scan.notes(), *notes]
     coding = _coding(scan, kept, notes)
@@ -69,6 +73,7 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     times = scan.frame_times()[kept]
     motion = motion_in(bag, layout.frame_id, layout.axes, times)
     written = _as_written(scan, layout, coding)
+    # 3. Make a part of each run of frames with the same layout.
     parts = []
     for number, run in runs_of(numbers.tolist()):
         part = _part(scan, kept[run], scan.layouts[int(str(number))], coding)
@@ -85,15 +90,15 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
 
 
 def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (*PROJECTED, *OCULUS)) -> Topic:
-    """Return the topic of the sonar: the one that is named, or the only one of some types.
+    """Return the topic of the sonar: the one with the given name, or the only one of the given types.
 
     Args:
-        bag: with the topics.
-        topic: its name.
-        kinds: types among which the only one is found.
+        bag: bag with the topics.
+        topic: name of the topic; None selects the only one.
+        kinds: message types among which the only topic is searched for.
 
     Raises:
-        MitsonarError: no such topic, of a type that cannot be read, or several.
+        MitsonarError: if there is no such topic or there are several, or the type of the named one is not supported.
     """
     there = bag.topics()
     readable = [one for one in there if one.kind in (*PROJECTED, *OCULUS, *FANS) and one.messages]
@@ -121,22 +126,22 @@ def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (
 
 
 def _words(*kinds: str) -> str:
-    """Return the names of types for a sentence."""
+    """Return the names of types as part of a sentence."""
     return " or ".join(short(one) for one in kinds if not one.startswith("acoustic_msgs"))
 
 
 class Coding(NamedTuple):
-    """How samples become pixels: their order, and what floats are divided by."""
+    """Conversion of samples to pixels: whether those of a beam are contiguous, and the divisor of floats."""
 
     beam_major: bool
     scale: float
 
 
 def _coding(scan: TopicScan, kept: Index, notes: list[str]) -> Coding:
-    """Return how the samples of a recording become pixels, and add notes on it.
+    """Return how samples are converted to pixels, and append sentences on it to ``notes``.
 
     Raises:
-        MitsonarError: floats below 0.
+        MitsonarError: if samples are floats below 0.
     """
     if scan.low < 0:
         raise MitsonarError(
@@ -159,14 +164,14 @@ def _coding(scan: TopicScan, kept: Index, notes: list[str]) -> Coding:
 
 
 def _part(scan: TopicScan, places: Index, layout: PingLayout, coding: Coding) -> Part:
-    """Return the frames of one layout."""
+    """Return a part whose frames have the same layout."""
     time_s = scan.frame_times()[places]
     return Part(_like(layout, time_s, scan.topic.name), time_s, _Frames(scan, places, layout, coding))
 
 
 @dataclass(frozen=True)
 class _Levels:
-    """Linear levels of samples that are dB over a span."""
+    """Function that reads images, and converts samples in dB over a dynamic range to linear levels."""
 
     samples: Callable[[Index], Pixels]
     span_db: float
@@ -179,9 +184,10 @@ class _Levels:
 
 
 def _as_written(scan: TopicScan, layout: PingLayout, coding: Coding) -> tuple[SonarFrames, float | None] | None:
-    """Return frames without images as mitsonar wrote them, and the span of samples that are dB [dB].
+    """Return empty frames with the geometry and coding that mitsonar wrote, and the dynamic range of samples [dB].
 
-    None where the bag is not its file, or other images are read.
+    The dynamic range is None if samples are the values of the images. The result is None if mitsonar did not write the bag,
+    or if its record does not describe the images of this topic.
     """
     path = scan.bag.path
     if path.suffix != ".mcap" or scan.topic.name != WRITTEN or len(scan.layouts) > 1 or coding != Coding(False, 1.0):
@@ -197,7 +203,7 @@ def _as_written(scan: TopicScan, layout: PingLayout, coding: Coding) -> tuple[So
 
 @dataclass(frozen=True)
 class _Frames:
-    """The pixels of a part's frames."""
+    """Function that reads the images of a part."""
 
     scan: TopicScan
     places: Index
@@ -206,7 +212,7 @@ class _Frames:
 
     @np.errstate(over="ignore", invalid="ignore")
     def __call__(self, index: Index) -> Pixels:
-        """Return ``(n, bins, beams)``, uint8 or float32."""
+        """Return images ``(n, bins, beams)``, uint8 or float32, column 0 farthest to port."""
         wanted = self.places[index]
         shape = (len(index), len(self.layout.range_m), len(self.layout.bearing_rad))
         image = np.zeros(shape, np.uint8 if _is_uint8(self.layout) else np.float32)
@@ -226,7 +232,7 @@ def _is_uint8(layout: PingLayout) -> bool:
 
 
 def _values(raw: Samples, scale: float) -> Pixels:
-    """Return samples as uint8, or as float32 in 0..1."""
+    """Convert samples to float32 in 0..1; uint8 samples are returned unchanged."""
     if raw.dtype == np.uint8:
         return raw
     if raw.dtype.kind == "f":
@@ -237,7 +243,7 @@ def _values(raw: Samples, scale: float) -> Pixels:
 
 
 def _like(layout: PingLayout, time_s: Array, name: str) -> SonarFrames:
-    """Return frames without images: the geometry of a part."""
+    """Return empty frames with the geometry of a part."""
     bins, beams = len(layout.range_m), len(layout.bearing_rad)
     steps = np.diff(layout.range_m) if bins > 1 else np.array([min(0.01, layout.range_m[0])])
     across = np.diff(layout.bearing_rad).mean() if beams > 1 else layout.beam_width_rad or math.radians(1)
@@ -267,13 +273,13 @@ def _like(layout: PingLayout, time_s: Array, name: str) -> SonarFrames:
 
 
 def _rate(time_s: Array) -> float:
-    """Return the frames a second [Hz], by the times."""
+    """Return the frame rate [Hz], computed from the times."""
     steps = np.diff(time_s)
     return float(np.clip(1 / np.median(steps), 1e-3, 1e6)) if len(steps) else 10.0
 
 
 def _facts(scan: TopicScan, kept: Index) -> Facts:
-    """Return what the bag tells, by name."""
+    """Return values that the bag holds, keyed by name."""
     first = scan.layouts[scan.numbers[int(kept[0])]]
     facts: Facts = {
         "topic": scan.topic.name,

@@ -1,4 +1,4 @@
-"""Poses, attitudes and heights of a sonar by other topics of its ROS bag, in mitsonar's convention."""
+"""What do the topics of a ROS bag hold? Motion of the sonar in mitsonar's convention, sonar messages, and pictures."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ RANGE = "sensor_msgs/msg/Range"
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
 MOST_LINKS = 32
-"""Transforms between a sonar and the world, at most."""
+"""Maximum number of transforms between a sonar and the world."""
 
 BEYOND_S = 0.25
-"""Time before the first and after the last pose in which that pose is held [s]."""
+"""Time before the first pose and after the last one for which that pose is held constant [s]."""
 
 FARTHEST_M = 1e8
-"""Largest coordinate of a position that counts [m]."""
+"""Largest plausible coordinate of a position [m]."""
 
 NOT_UNIT = 0.1
-"""By how much the length of a quaternion may differ from 1."""
+"""Tolerated deviation of the norm of a quaternion from 1."""
 
 LARGEST_GAP_S = 2.0
 """Longest time between two poses over which poses are interpolated [s]."""
@@ -53,14 +53,14 @@ LARGEST_GAP_S = 2.0
 
 @dataclass(frozen=True)
 class Motion:
-    """What other topics tell of a sonar at the times of its frames; None where they do not.
+    """Motion of a sonar at the times of its frames, from other topics; None where these do not contain it.
 
     Attributes:
-        poses: ``(frames, 6)`` [m, rad].
-        attitude_rad: pitch, roll, heading by an IMU ``(frames, 3)``.
-        height_m: by an altimeter ``(frames,)``; nan where unknown.
-        notes: sentences on what is assumed of the poses, or why there are none.
-        origin: topic or transforms of the poses, and the world, in words.
+        poses: poses ``(frames, 6)`` [m, rad].
+        attitude_rad: pitch, roll, heading measured by an IMU ``(frames, 3)`` [rad].
+        height_m: height measured by an altimeter ``(frames,)`` [m]; nan where unknown.
+        notes: sentences on what is assumed about the poses, or why there are none.
+        origin: description of the topic or transforms of the poses, and of the world frame.
     """
 
     poses: Array | None = None
@@ -76,9 +76,9 @@ class Link:
 
     Attributes:
         parent: name of the parent frame.
-        numbers: time [s], position [m] and quaternion x, y, z, w of each.
-        fixed: whether it never changes.
-        topic: where it is from.
+        topic: topic that contains the transforms.
+        fixed: whether the transform is constant.
+        numbers: time [s], position [m] and quaternion x, y, z, w of each transform, one after another.
     """
 
     parent: str
@@ -87,7 +87,8 @@ class Link:
     numbers: array[float] = field(default_factory=lambda: array("d"))
 
     def at(self, time_s: Array) -> tuple[Array, Rotation] | None:
-        """Return positions ``(n, 3)`` and rotations at these times; None where a time lies beyond what is known."""
+        """Return positions ``(n, 3)`` [m] and rotations at the given times; None if the transforms do not cover them."""
+        # 1. Drop implausible transforms, and sort the others by time without duplicates.
         table = np.array(self.numbers).reshape(-1, 8)
         table = table[np.isfinite(table).all(axis=1) & (np.abs(table[:, 1:4]) < FARTHEST_M).all(axis=1)]
         table = table[(np.abs(table[:, 4:]) < 2).all(axis=1)]
@@ -95,27 +96,30 @@ class Link:
         table = table[np.unique(table[:, 0], return_index=True)[1]]
         if not len(table):
             return None
+        # 2. Use a fixed transform at all times. A single one that may change is not enough.
         if self.fixed or len(table) == 1:
             last = np.repeat(table[-1:], len(time_s), axis=0)
             return (last[:, 1:4], Rotation.from_quat(last[:, 4:])) if self.fixed else None
+        # 3. Reject times that are too far outside the covered interval, or too far from a transform within it.
         known = table[:, 0]
         held = np.clip(time_s, known[0], known[-1])
         after = np.clip(np.searchsorted(known, held), 1, len(known) - 1)
         near = np.minimum(held - known[after - 1], known[after] - held)
         if np.abs(held - time_s).max() > BEYOND_S or (near > LARGEST_GAP_S / 2).any():
             return None
+        # 4. Interpolate positions linearly, and rotations on the sphere.
         place = np.column_stack([np.interp(held, known, axis) for axis in table[:, 1:4].T])
         return place, Slerp(known, Rotation.from_quat(table[:, 4:]))(held)
 
 
 def motion_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion:
-    """Return poses, attitudes and heights of a sonar by the other topics of its bag.
+    """Return the poses, attitudes and heights of a sonar from the other topics of its bag.
 
     Args:
-        bag: with the topics.
-        frame_id: frame of the sonar's messages.
-        axes: starboard, forward and up of the sonar in that frame ``(3, 3)``.
-        time_s: of the frames ``(frames,)``.
+        bag: bag with the topics.
+        frame_id: coordinate frame of the sonar's messages.
+        axes: starboard, forward and up of the sonar in that frame, as columns ``(3, 3)``.
+        time_s: frame times ``(frames,)`` [s].
     """
     topics = [one for one in bag.topics() if one.messages]
     others = _Others(bag, topics, _transforms(bag, topics), _plain(frame_id), axes, time_s)
@@ -123,7 +127,7 @@ def motion_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion
 
 
 def with_motion(part: Part, motion: Motion, places: Index) -> Part:
-    """Return a part with what is known of the motion of its frames, which are at these places ``(n,)``."""
+    """Return a part with the known motion of its frames, which have the indices ``places`` ``(n,)`` in ``motion``."""
     return replace(
         part,
         poses=part.poses if motion.poses is None else motion.poses[places],
@@ -134,7 +138,7 @@ def with_motion(part: Part, motion: Motion, places: Index) -> Part:
 
 @dataclass(frozen=True)
 class _Others:
-    """The other topics of a bag, and what is asked of them, as in :func:`motion_in`."""
+    """The topics of a bag and the request of :func:`motion_in`."""
 
     bag: BagFile
     topics: list[Topic]
@@ -144,11 +148,12 @@ class _Others:
     time_s: Array
 
     def poses(self) -> Motion:
-        """Return the poses of the sonar by the transforms, or else the odometry or the poses.
+        """Return the poses of the sonar from transforms, or else from a topic of odometry or poses.
 
-        Transforms (TF) that lead from the sonar's frame to a world come first. Next is the only odometry: its child frame
-        must lead to the sonar's by fixed transforms, or it counts as the sonar's, which a note says. The only topic of poses
-        counts as the sonar's. Several of a kind are ambiguous: then there are no poses, and a note names them.
+        Transforms (TF) from the sonar's frame to a world frame take precedence. Next comes the only topic of odometry. If no
+        fixed transforms connect its child frame with the sonar's, it is assumed to be that of the sonar, which a note
+        reports. Last comes the only topic of poses, which is assumed to be that of the sonar. Several topics of a kind are
+        ambiguous: then there are no poses, and a note lists the topics.
         """
         chain = _chain(self.links, self.frame)
         if chain and any(not one.fixed for one in chain):
@@ -165,9 +170,9 @@ class _Others:
         return replace(moved, notes=notes if moved.poses is not None else moved.notes)
 
     def attitude(self) -> Array | None:
-        """Return pitch, roll and heading of the sonar ``(frames, 3)`` [rad] by the only IMU; None without one.
+        """Return pitch, roll and heading of the sonar ``(frames, 3)`` [rad] measured by the only IMU; None without one.
 
-        Fixed transforms must lead from the sonar's frame to that of the IMU. Its orientation is relative to east, north, up
+        Fixed transforms must connect the sonar's frame with that of the IMU. Its orientation is relative to east, north, up
         (REP 145).
         """
         these = [one for one in self.topics if one.kind == IMU]
@@ -186,9 +191,9 @@ class _Others:
         return None if found is None else found[:, 3:]
 
     def heights(self) -> Array | None:
-        """Return heights over the ground ``(frames,)`` [m] by the only altimeter; nan where unknown, None without one.
+        """Return heights above the ground ``(frames,)`` [m] by the only altimeter; nan where unknown, None without one.
 
-        A topic is one of an altimeter where it holds ``sensor_msgs/Range`` and its name holds ``alti``.
+        A topic belongs to an altimeter if its type is ``sensor_msgs/Range`` and its name contains ``alti``.
         """
         these = [one for one in self.topics if one.kind == RANGE and "alti" in one.name.lower()]
         if len(these) != 1:
@@ -197,6 +202,8 @@ class _Others:
         for _, raw in self.bag.messages(these[0].name):
             message = self.bag.decode(raw, RANGE)
             numbers.extend((_seconds(message), float(message.range)))
+        # Interpolate linearly, but only near a measurement. Implausible measurements become nan, and so do heights that
+        # are interpolated from them.
         table = np.array(numbers).reshape(-1, 2)
         table = table[np.argsort(table[:, 0], kind="stable")]
         after = np.clip(np.searchsorted(table[:, 0], self.time_s), 1, max(1, len(table) - 1))
@@ -208,7 +215,10 @@ class _Others:
 
 
 def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> Motion:
-    """Return the poses along links from the sonar to the world."""
+    """Return the poses that result from a chain of links from the sonar to the world.
+
+    A world frame whose name ends with ``ned`` is converted from north, east, down.
+    """
     place, turn = np.zeros((len(times), 3)), Rotation.from_matrix(np.repeat(axes[None], len(times), axis=0))
     for link in chain:
         here = link.at(times)
@@ -223,7 +233,7 @@ def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> Mot
 
 
 def _only(bag: BagFile, topics: Sequence[Topic]) -> tuple[tuple[str, Link] | None, tuple[str, ...]]:
-    """Return child frame and transforms of the only topic of odometry, or else of poses; or why there is none."""
+    """Return child frame and transforms of the only topic of odometry, or else of poses; or None and notes on why."""
     for kinds, what in (((ODOMETRY,), "odometry"), (POSES, "poses")):
         these = [one for one in topics if one.kind in kinds]
         if len(these) > 1:
@@ -235,7 +245,7 @@ def _only(bag: BagFile, topics: Sequence[Topic]) -> tuple[tuple[str, Link] | Non
 
 
 def _stamped(bag: BagFile, topic: Topic) -> tuple[str, Link]:
-    """Return the child frame and the transforms of a topic of odometry or poses."""
+    """Return the child frame (empty for poses) and the transforms of a topic of odometry or poses."""
     child, link = "", Link("", topic.name)
     for _, raw in bag.messages(topic.name):
         message = bag.decode(raw, topic.kind)
@@ -247,7 +257,7 @@ def _stamped(bag: BagFile, topic: Topic) -> tuple[str, Link]:
 
 
 def _transforms(bag: BagFile, topics: Sequence[Topic]) -> dict[str, Link]:
-    """Return the transforms of the bag by child frame."""
+    """Return the transforms of the bag, keyed by child frame."""
     links: dict[str, Link] = {}
     for topic in topics:
         if topic.kind not in (TRANSFORMS, OLD_TRANSFORMS):
@@ -264,7 +274,7 @@ def _transforms(bag: BagFile, topics: Sequence[Topic]) -> dict[str, Link]:
 
 
 def _chain(links: dict[str, Link], frame: str) -> list[Link]:
-    """Return the links from a frame upwards to its root; none where they go in a circle."""
+    """Return the links from a frame up to its root; an empty list if they are cyclic or more than ``MOST_LINKS``."""
     chain: list[Link] = []
     while frame in links:
         chain.append(links[frame])
@@ -275,7 +285,7 @@ def _chain(links: dict[str, Link], frame: str) -> list[Link]:
 
 
 def _between(links: dict[str, Link], frame: str, wanted: str) -> list[Link] | None:
-    """Return the fixed links from a frame up to another one; None where they do not lead there."""
+    """Return the fixed links from a frame up to another frame; None if these do not connect the two."""
     if frame == wanted:
         return []
     names = list(_parents(links, frame))
@@ -286,13 +296,13 @@ def _between(links: dict[str, Link], frame: str, wanted: str) -> list[Link] | No
 
 
 def _parents(links: dict[str, Link], frame: str) -> Iterator[str]:
-    """Yield the parents of a frame, the nearest first."""
+    """Yield the ancestors of a frame, nearest first."""
     for link in _chain(links, frame):
         yield link.parent
 
 
 def _plain(name: object) -> str:
-    """Return the name of a frame without the slash with which ROS 1 may begin it."""
+    """Return the name of a frame without the leading slash that it may have in ROS 1."""
     return str(name).lstrip("/")
 
 
@@ -303,38 +313,37 @@ def _seconds(message: Message) -> float:
 
 
 def _numbers(vector: Message) -> tuple[float, ...]:
-    """Return x, y, z, and w where there is one."""
+    """Return the components x, y, z, and w if present."""
     return tuple(float(getattr(vector, name)) for name in ("x", "y", "z", "w") if hasattr(vector, name))
 
 
-# ---------------- One pass through a topic of a sonar: times, layouts and places of its messages, by which single
-# ones are read again
+# ---------------- Scan of a topic
 
 
 STAMP = 12
-"""Bytes of a message up to the end of its time: of ROS 1 after a count, of ROS 2 after four bytes on the encoding."""
+"""Size of a message up to the end of its time stamp [bytes], which follows a counter (ROS 1) or encoding bytes (ROS 2)."""
 
 NEAR = 8
-"""Frames between two that are wanted which are read rather than skipped."""
+"""Largest distance between two requested frames up to which those in between are read rather than skipped."""
 
 
 @dataclass
 class TopicScan:
-    """What one pass through a topic tells of its messages; memory grows by some tens of bytes a message.
+    """Index of the messages of a topic, built in one pass; memory grows by some tens of bytes per message.
 
     Attributes:
-        bag: with the topic.
-        topic: of the sonar.
-        received: time of reception of each message that can be read [ns].
-        nth: its number among those received at the same time.
-        stamps: time in its header [s].
-        numbers: of its layout.
-        layouts: that differ.
-        lost: messages that cannot be read.
-        reason: why the first of them cannot.
-        low: least sample, where samples are floats.
-        high: greatest sample, where samples are floats.
-        gaps: whether floats are not finite.
+        bag: bag with the topic.
+        topic: topic of the sonar.
+        received: time of reception of each readable message [ns].
+        nth: index of each message among those received at the same time.
+        stamps: time in the header of each message [s].
+        numbers: index of the layout of each message.
+        layouts: distinct layouts.
+        lost: number of unreadable messages.
+        reason: why the first of them is unreadable.
+        low: smallest sample, if samples are floats.
+        high: largest sample, if samples are floats.
+        gaps: whether some float samples are not finite.
     """
 
     bag: BagFile
@@ -351,7 +360,7 @@ class TopicScan:
     gaps: bool = False
 
     def read(self) -> None:
-        """Read all messages once. A message whose bytes before the samples were met before is not decoded again."""
+        """Read all messages once; a message is not decoded if another one had the same bytes ahead of its samples."""
         known: dict[bytes, int] = {}
         heads: dict[int, int] = {}
         last, count = -1, 0
@@ -369,9 +378,16 @@ class TopicScan:
             self.numbers.append(number)
 
     def _number(self, raw: bytes, known: dict[bytes, int], heads: dict[int, int]) -> int:
-        """Return the number of a message's layout; pictures have none."""
+        """Return the index of a message's layout; 0 for pictures, which have none.
+
+        Args:
+            raw: bytes of the message.
+            known: layout index by the digest of the bytes between time stamp and samples; is extended.
+            heads: offset of the samples by size of the message [bytes]; is extended.
+        """
         if self.topic.kind in FANS:
             return 0
+        # 1. Look the layout up by the bytes ahead of the samples, which saves decoding the message.
         head = heads.get(len(raw))
         if head is not None:
             number = known.get(_digest(raw[STAMP:head]))
@@ -379,11 +395,13 @@ class TopicScan:
                 layout = self.layouts[number]
                 self._measure(raw[head : head + layout.cells * np.dtype(layout.dtype).itemsize], number)
                 return number
+        # 2. Decode the message, and find a layout that resembles its own.
         message = self.bag.decode(raw, self.topic.kind)
         layout = layout_of(message, self.topic.kind)
         number = next((at for at, one in enumerate(self.layouts) if one.resembles(layout)), len(self.layouts))
         if number == len(self.layouts):
             self.layouts.append(layout)
+        # 3. Remember the bytes ahead of the samples for the messages that follow.
         if self.topic.kind in PROJECTED:
             samples = np.asarray(message.image.data, np.uint8).tobytes()
             self._measure(samples, number)
@@ -394,7 +412,7 @@ class TopicScan:
         return number
 
     def _measure(self, samples: bytes, number: int) -> None:
-        """Note the least and the greatest of samples that are floats."""
+        """Update the minimum and maximum of float samples, and whether all are finite."""
         kind = np.dtype(self.layouts[number].dtype)
         if kind.kind == "f" and samples:
             values = np.frombuffer(samples, kind)
@@ -404,7 +422,7 @@ class TopicScan:
                 self.low, self.high = min(self.low, float(finite.min())), max(self.high, float(finite.max()))
 
     def frame_times(self) -> Array:
-        """Return the times of the frames ``(frames,)`` [s]: of the headers, or of reception."""
+        """Return the times of the frames ``(frames,)`` [s]: those of the headers, or of reception if headers have none."""
         if not self._is_stamped():
             return np.array(self.received, dtype=float) * 1e-9
         stamps = np.array(self.stamps)
@@ -425,7 +443,7 @@ class TopicScan:
         return notes
 
     def frames(self, places: Index) -> Iterator[tuple[int, Message]]:
-        """Read and decode the messages at these places, in rising order; yield place and message."""
+        """Read and decode the messages with the given indices; yield index and message in increasing order."""
         wanted = np.unique(places)
         if not len(wanted):
             return
@@ -441,16 +459,19 @@ class TopicScan:
 
 
 def _stamp(raw: bytes, ros1: bool) -> float:
-    """Return the time in the header with which a message begins [s]."""
+    """Return the time in the header at the beginning of a raw message [s]; 0 if the message is too short."""
     if len(raw) < STAMP:
         return 0.0
     order = "<" if ros1 or raw[1] & 1 else ">"
     seconds, nanoseconds = struct.unpack(f"{order}{'I' if ros1 else 'i'}I", raw[4:STAMP])
-    return float((seconds * 10**9 + nanoseconds) / 10**9)  # rounded once: times come back as they were written
+    return float((seconds * 10**9 + nanoseconds) / 10**9)  # a single rounding, so that written times are restored exactly
 
 
 def _head_of(raw: bytes, samples: bytes) -> int | None:
-    """Return where the samples begin that end a message; up to three bytes may fill it up."""
+    """Return the offset of the samples at the end of a message; None if they are not there.
+
+    Up to three bytes of padding may follow the samples.
+    """
     for filled in range(4):
         head = len(raw) - len(samples) - filled
         if (
@@ -466,21 +487,21 @@ def _digest(head: bytes) -> bytes:
     return hashlib.blake2b(head, digest_size=16).digest()
 
 
-# ---------------- Pictures in ROS bags, ``sensor_msgs/Image`` and ``CompressedImage``, as recordings by a geometry file
+# ---------------- Topics of pictures
 
 
 def read_ros_pictures(bag: BagFile, topic: Topic, geometry: Path | None) -> Recording:
     """Open a topic of pictures; they are read on demand.
 
-    Poses are those of the bag. The frame of the pictures counts as forward, left, up (REP 103).
+    Poses are those of the bag. The frame of the pictures is assumed to be forward, left, up (REP 103).
 
     Args:
-        bag: with the topic.
-        topic: of type ``sensor_msgs/Image`` or ``sensor_msgs/CompressedImage``.
-        geometry: a geometry file; default: ``FILE.yaml`` or ``geometry.yaml`` beside the bag.
+        bag: bag with the topic.
+        topic: topic of type ``sensor_msgs/Image`` or ``sensor_msgs/CompressedImage``.
+        geometry: a geometry file; default: ``FILE.yaml`` or ``geometry.yaml`` next to the bag.
 
     Raises:
-        MitsonarError: no geometry, no picture that can be read, or a geometry that does not fit the pictures.
+        MitsonarError: if there is no geometry or no readable picture, or the geometry does not fit the pictures.
     """
     told, told_by = geometry_for(bag.path, geometry)
     scan = TopicScan(bag, topic)
@@ -522,7 +543,7 @@ def read_ros_pictures(bag: BagFile, topic: Topic, geometry: Path | None) -> Reco
 
 
 def _with_poses(recording: Recording, bag: BagFile, frame_id: str) -> Recording:
-    """Return the recording with what other topics of the bag tell of the sonar."""
+    """Return the recording with the motion of the sonar from other topics of the bag."""
     part = recording.parts[0]
     motion = motion_in(bag, frame_id, FORWARD_LEFT_UP, part.time_s)
     part = with_motion(part, motion, np.arange(len(part)))

@@ -1,6 +1,11 @@
-"""ARIS files (``.aris``, DDF 5) of Sound Metrics: header, frames, range axis by delay and period, beams by table.
+"""How are files of Sound Metrics read? ARIS (``.aris``, DDF 5) and DIDSON (``.ddf``, DDF 3 and 4).
 
-Source of the layout: Sound Metrics, aris-file-sdk and aris-integration-sdk (MIT).
+Source of the layout and the beam angles of ARIS: Sound Metrics, aris-file-sdk and aris-integration-sdk (MIT).
+
+Sources of the layout of DIDSON: public readers of such files, the MATLAB reader of Sound Metrics as they quote it, and the
+description of the format by Echoview. No real DIDSON file was available: the reader was tested on files that its tests
+write by this description, not on a recording. The authors of hydroformats (Apache-2.0) report that ten recordings of
+version 3 have headers of these sizes, this clock, and a sound speed at this offset.
 """
 
 from __future__ import annotations
@@ -60,8 +65,7 @@ __all__ = [
 ]
 
 
-# ---------------- What the headers of Sound Metrics' sonars tell of their motion: attitude by the compass, height,
-# place on the earth
+# ---------------- Attitude, height and position from frame headers
 
 
 Array = NDArray[np.float64]
@@ -70,20 +74,20 @@ MOTION = {
     "depth_m": (128, "<f4"), "altitude_m": (132, "<f4"), "heading_deg": (160, "<f4"), "pitch_deg": (164, "<f4"),
     "roll_deg": (168, "<f4"), "latitude_deg": (172, "<f8"), "longitude_deg": (180, "<f8"),
 }  # fmt: skip
-"""Fields of a frame's header in DIDSON and ARIS files alike: offset [bytes] and type."""
+"""Fields common to the frame headers of DIDSON and ARIS files: offset [bytes] and type."""
 
 EARTH_M = 6_371_008.8
 """Mean radius of the earth [m]."""
 
 DEEPEST_M = 1.2e4
 HIGHEST_M = 1e4
-"""What is believed of a depth and of a height over the ground [m]."""
+"""Largest plausible depth, and largest plausible height above the ground [m]."""
 
 
 def attitude_of(headers: Header) -> Array | None:
-    """Return pitch, roll, heading ``(frames, 3)`` [rad] by the compass; None where it tells nothing, nan where it cannot be.
+    """Return pitch, roll, heading ``(frames, 3)`` [rad] of the compass; None if all are zero, nan where implausible.
 
-    The compass counts upward pitch as positive, poses count downward pitch so.
+    Pitch is positive upwards in the compass, but positive downwards in the result, as in poses.
     """
     degrees = np.stack([-headers["pitch_deg"], headers["roll_deg"], headers["heading_deg"]], axis=1).astype(float)
     attitude = np.radians(np.where(np.abs(degrees) <= 360, degrees, np.nan))
@@ -91,14 +95,17 @@ def attitude_of(headers: Header) -> Array | None:
 
 
 def height_of(headers: Header) -> Array | None:
-    """Return the height over the ground ``(frames,)`` [m] where the vehicle filled it in; None where it did not."""
+    """Return the height above the ground ``(frames,)`` [m], nan where unknown; None if the vehicle never filled it in."""
     altitude_m = headers["altitude_m"].astype(float)
     known = np.isfinite(altitude_m) & (altitude_m > 0) & (altitude_m < HIGHEST_M)
     return np.where(known, altitude_m, np.nan) if known.any() else None
 
 
 def poses_of(headers: Header, attitude_rad: Array | None) -> Array | None:
-    """Return poses ``(frames, 6)`` by latitude and longitude; None where a frame lacks them, or its attitude."""
+    """Return poses ``(frames, 6)`` computed from latitude and longitude; None if a frame lacks these or its attitude.
+
+    Positions are metres east and north of the first frame, and the negative depth.
+    """
     latitude, longitude = np.radians(headers["latitude_deg"]), np.radians(headers["longitude_deg"])
     known = (np.abs(latitude) < np.pi / 2) & (np.abs(longitude) <= np.pi) & ((latitude != 0) | (longitude != 0))
     if attitude_rad is None or not known.all() or not np.isfinite(attitude_rad).all():
@@ -109,7 +116,7 @@ def poses_of(headers: Header, attitude_rad: Array | None) -> Array | None:
     return np.column_stack([east, north, -np.where(np.abs(depth) < DEEPEST_M, depth, 0.0), attitude_rad])
 
 
-# ---------------- aris
+# ---------------- ARIS files
 
 
 SIGNATURE = b"DDF\x05"
@@ -137,28 +144,28 @@ BEAMS = (
     | dict.fromkeys((6, 7, 8), 64)
     | dict.fromkeys(range(9, 13), 128)
 )
-"""Beams of each ping mode."""
+"""Number of beams of each ping mode."""
 
 PINGS = {1: 3, 3: 6, 6: 4, 9: 8}
-"""Pings of a frame in transmission order, by ping mode."""
+"""Number of pings of a frame in transmission order, by ping mode."""
 
 CHANNELS = (10, 2, 14, 6, 8, 0, 12, 4, 11, 3, 15, 7, 9, 1, 13, 5)
-"""Group of beams that each channel of the receiver belongs to, in transmission order."""
+"""Beam group of each receiver channel, in transmission order."""
 
 ARIS_CODING_DB = 80.0
-"""Span of the values 0..255 [dB]."""
+"""Dynamic range of the values 0..255 [dB]."""
 
 MOST_SAMPLES = 65_536
 ARIS_LEAST_SPEED, ARIS_MOST_SPEED = 1000.0, 2000.0
 LONGEST_M = 1e4
-"""What a header may say: samples of a beam, sound speed [m/s], end of the window [m]."""
+"""Plausible values of a header: maximum samples per beam, sound speed [m/s], maximum end of the window [m]."""
 
 SAME_SPEED = 0.002
 """Relative change of the sound speed up to which a window counts as the same."""
 
 
 class Kind(NamedTuple):
-    """A type of ARIS: its name, carriers low and high [Hz], and opening over elevation [deg] (data sheets)."""
+    """A model of ARIS: its name, low and high carrier [Hz], and elevation aperture [deg] (data sheets)."""
 
     name: str
     low_hz: float
@@ -171,21 +178,21 @@ KINDS = {
     1: Kind("3000", 1.8e6, 3.0e6, 15.0),
     2: Kind("1200", 0.7e6, 1.2e6, 14.0),
 }
-"""By the number in the header."""
+"""ARIS models, keyed by the system number in the header."""
 
 TELEPHOTO_ELEVATION_DEG = 3.0
-"""Opening over elevation with the large lens [deg]; ours, no source was seen."""
+"""Elevation aperture with the large lens [deg]; an assumption of mitsonar without a source."""
 
 
 def read_aris(path: str | Path) -> Recording:
     """Open an ARIS recording; pixels are read on demand.
 
-    Ranges are ``start delay`` and ``sample period`` times half the sound speed: sample i lies at r0 + i dr. Values 0..255
-    stand for 0..80 dB. Attitude is that of the sonar's compass; pitch > 0 points down. Where the file holds latitudes and
-    longitudes, poses are metres east and north of the first frame.
+    Sample i lies at range r0 + i dr, where r0 and dr are ``start delay`` and ``sample period`` times half the sound speed.
+    Values 0..255 represent 0..80 dB. Attitude is that of the sonar's compass; pitch > 0 points down. If the file holds
+    latitudes and longitudes, positions are metres east and north of the first frame.
 
     Raises:
-        MitsonarError: no such file, another format, or no frame that can be read.
+        MitsonarError: if the file does not exist, has another format, or holds no readable frame.
     """
     data = mapped(path, "an ARIS file", FILE_HEADER + FRAME.itemsize)
     name = str(path)
@@ -202,7 +209,7 @@ def read_aris(path: str | Path) -> Recording:
 
 
 def _aris_frames(data: Bytes, name: str) -> tuple[EqualFrames, int]:
-    """Return the frames and the number of beams, by the first header."""
+    """Return the frames and the number of beams, as given by the first frame header."""
     first = np.frombuffer(data[FILE_HEADER : FILE_HEADER + FRAME.itemsize].tobytes(), FRAME)[0]
     mode, samples = int(first["ping_mode"]), int(first["samples"])
     if mode not in BEAMS or not 0 < samples <= MOST_SAMPLES:
@@ -217,7 +224,7 @@ def _aris_frames(data: Bytes, name: str) -> tuple[EqualFrames, int]:
 
 
 def _whole(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], list[str]]:
-    """Return which frames have a header that can be, and sentences on the others."""
+    """Return which frames have a plausible header, and sentences on the others."""
     first, told = headers[0], headers["sound_speed"].astype(float)
     speed = np.where((told > ARIS_LEAST_SPEED) & (told < ARIS_MOST_SPEED), told, np.nan)
     whole = (headers["signature"] == SIGNATURE) & (headers["ping_mode"] == first["ping_mode"])
@@ -227,7 +234,7 @@ def _whole(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], lis
         (headers["sample_period_us"] > 0) & (end_us * 1e-6 * speed / 2 < LONGEST_M) & np.isin(headers["system"], list(KINDS))
     )
     tabled = whole & _tabled(headers)
-    whole = tabled if tabled.any() else whole  # where all frames lack a table, the error says which
+    whole = tabled if tabled.any() else whole  # if all frames lack a table, a later error names the missing one
     notes = []
     if not whole.all():
         notes.append(f"left out: {counted(int((~whole).sum()), 'frame')} with a damaged header")
@@ -246,7 +253,7 @@ def _tabled(headers: Header) -> NDArray[np.bool_]:
 
 
 def windows_of(headers: Header) -> list[tuple[float, ...]]:
-    """Return what the geometry of each frame follows from; small drifts of the sound speed count as none."""
+    """Return the values that determine the geometry of each frame; small drifts of the sound speed are ignored."""
     names = ("start_delay_us", "sample_period_us", "large_lens", "system", "high_frequency")
     keys, speed = [], 0.0
     for header in headers:
@@ -274,7 +281,7 @@ def _aris_part(frames: EqualFrames, headers: Header, places: NDArray[np.intp], b
 
 @dataclass(frozen=True)
 class _ArisSamples:
-    """The samples of a part's frames, as images."""
+    """Function that reads the images of a part of an ARIS file."""
 
     frames: EqualFrames
     places: NDArray[np.intp]
@@ -284,7 +291,7 @@ class _ArisSamples:
     reordered: bool
 
     def __call__(self, index: NDArray[np.intp]) -> Bytes:
-        """Return ``(n, bins, beams)``, column 0 most to port."""
+        """Return images ``(n, bins, beams)``, column 0 farthest to port."""
         raw = self.frames.read(self.places[index], (self.samples, self.beams))
         if not self.reordered:
             flags = self.frames.headers()["reordered"][self.places[index]]
@@ -293,12 +300,12 @@ class _ArisSamples:
 
 
 def in_beam_order(samples: Bytes, mode: int) -> Bytes:
-    """Return a frame ``(samples, beams)`` of a live stream in the order of its beams.
+    """Reorder a frame ``(samples, beams)`` of a live stream by beam.
 
     A live stream holds pings x samples x 16 channels. Channel c of ping p is beam ``CHANNELS[c] * pings + p``.
 
     Raises:
-        MitsonarError: a ping mode whose order is not known.
+        MitsonarError: if the order of the ping mode is not known.
     """
     if mode not in PINGS:
         known = ", ".join(str(one) for one in PINGS)
@@ -314,7 +321,7 @@ def in_beam_order(samples: Bytes, mode: int) -> Bytes:
 
 
 def like_of(headers: Header, samples: int, beams: int) -> SonarFrames:
-    """Return frames without images: the geometry of a part."""
+    """Return empty frames with the geometry of a part of an ARIS file."""
     first = headers[0]
     kind = KINDS[int(first["system"])]
     lens = bool(first["large_lens"])
@@ -348,7 +355,7 @@ def like_of(headers: Header, samples: int, beams: int) -> SonarFrames:
 
 
 def _rate(headers: Header) -> float:
-    """Return the frames a second: as stated, or by the times."""
+    """Return the frame rate [Hz]: as stated in the header, or computed from the times."""
     stated = float(headers["frame_rate_hz"][0])
     if math.isfinite(stated) and 0 < stated < 1e3:
         return stated
@@ -357,7 +364,7 @@ def _rate(headers: Header) -> float:
 
 
 def facts_of(headers: Header, beams: int) -> Facts:
-    """Return what the headers tell, by name."""
+    """Return header values of an ARIS file, keyed by name."""
     if not len(headers):
         return {}
     first = headers[0]
@@ -374,28 +381,24 @@ def facts_of(headers: Header, beams: int) -> Facts:
     facts: Facts = {"system": f"ARIS {KINDS[int(first['system'])].name}", "beams": beams}
     facts |= {name: int(first[name]) for name in names} | {"gain_db": int(first["gain_db"])}
     facts["sound_speed"] = float(first["sound_speed"])
-    known = headers["temperature_c"][np.isfinite(headers["temperature_c"])]  # attitude is in the frames, in our signs
+    known = headers["temperature_c"][np.isfinite(headers["temperature_c"])]  # the frames hold the attitude
     if len(known):
         facts["temperature_c"] = [float(known.min()), float(known.max())]
     return facts
 
 
 def notes_of(headers: Header) -> list[str]:
-    """Return sentences on what changes inside the file."""
+    """Return sentences on what changes within the file."""
     gains = np.unique(headers["gain_db"])
     return [f"the receiver's gain changes between {gains[0]} and {gains[-1]} dB"] if len(gains) > 1 else []
 
 
-# ---------------- DIDSON files (``.ddf``, DDF 3 and 4) of Sound Metrics: frames, range axis by timing, beams of the lens
-# Source: public readers of such files, Sound Metrics' MATLAB reader as they quote it, and what Echoview says of the
-# format. No real file was at hand: the reader was tested on files that its tests write by this description, not on a
-# recording. The authors of hydroformats (Apache-2.0) report that ten recordings of version 3 have headers of these
-# sizes, this clock, and a sound speed at this place.
+# ---------------- DIDSON files
 
 Index = NDArray[np.intp]
 
 SIGNATURES = {b"DDF\x03": 3, b"DDF\x04": 4}
-"""First four bytes of a file and version."""
+"""Versions, keyed by the first four bytes of a file."""
 
 FILE = layout(
     {
@@ -406,7 +409,7 @@ FILE = layout(
     },
     512,
 )  # fmt: skip
-"""Fields of the file's header: offset [bytes] and type."""
+"""Fields of the file header: offset [bytes] and type."""
 
 COMMON = MOTION | {
     "index": (0, "<u4"), "time_s": (4, "<u4"), "signature": (12, "S4"), "year": (20, "<u4"), "month": (24, "<u4"),
@@ -415,16 +418,16 @@ COMMON = MOTION | {
 }  # fmt: skip
 
 FRAME_HEADER = {3: layout(COMMON, 256), 4: layout(COMMON, 1024)}
-"""Fields of a frame's header by version."""
+"""Structured types of a frame header, keyed by version."""
 
 FILE_HEADERS = {3: (512,), 4: (1024, 512)}
-"""Sizes of the file's header [bytes] by version. Readers disagree on version 4: the frames' signature decides."""
+"""Sizes of the file header [bytes] by version. Readers disagree on version 4: the signature of the frames decides."""
 
 CLASSIC, LONG_RANGE = 1, 2
 """Bits of a frame's configuration: classic windows instead of extended ones; DIDSON-LR instead of DIDSON-S."""
 
 LAST_CLASSIC, LONG_RANGE_SERIAL = 18, 15
-"""Serial numbers up to which windows are classic whatever the configuration says; the one of a long-range sonar."""
+"""Last serial number whose windows are classic whatever the configuration states; serial number of a long-range sonar."""
 
 LENGTHS_M = {
     0: (1.25, 2.5, 5.0, 10.0, 20.0, 40.0),
@@ -432,59 +435,60 @@ LENGTHS_M = {
     LONG_RANGE: (2.5, 5.0, 10.0, 20.0, 40.0, 80.0),
     LONG_RANGE | CLASSIC: (2.25, 4.5, 9.0, 18.0, 36.0, 72.0),
 }
-"""Nominal lengths of windows [m] by configuration; code 0 is the first at high frequency, the third at low."""
+"""Nominal window lengths [m] by configuration; code 0 is the first at high frequency, and the third at low frequency."""
 
 STEPS_M = {0: 0.42, CLASSIC: 0.375}
-"""Nominal step of the window's start [m] at high frequency, extended and classic; twice as much at low."""
+"""Nominal step of the window start [m] at high frequency, extended and classic; twice as much at low frequency."""
 
 MOST_START, MOST_LENGTH = 31, 3
-"""Largest codes of a window's start and length."""
+"""Largest codes of the window start and length."""
 
 DELAY_S = {True: 0.512e-3, False: 0.572e-3}
-"""Time of one step of the window's start [s] at high frequency, for serial numbers up to 18 and above; twice that at low."""
+"""Time per step of the window start [s] at high frequency, for serials up to 18 and above; twice that at low frequency."""
 
 FREQUENCIES_HZ = {0: (1.1e6, 1.8e6), LONG_RANGE: (0.7e6, 1.2e6)}
 """Carriers at low and high frequency [Hz] (data sheets)."""
 
 NOMINAL_SPEED = 1500.0
-"""Sound speed where the file tells none [m/s]."""
+"""Sound speed if the file holds none [m/s]."""
 
 DIDSON_LEAST_SPEED, DIDSON_MOST_SPEED = 1300, 1700
-"""What is believed of a sound speed [m/s]."""
+"""Range of plausible sound speeds [m/s]."""
 
 DIDSON_CODING_DB = 90.0
-"""Span of the values 0..255 [dB]."""
+"""Dynamic range of the values 0..255 [dB]."""
 
 DIFFERS = 0.1
-"""Part of the nominal window by which the one by timing may differ without a note."""
+"""Relative difference between the window computed from timing and the nominal window beyond which a note is added."""
 
 CLOCK = {
     "year": (1970, 2200), "month": (1, 12), "day": (1, 31), "hour": (0, 23), "minute": (0, 59), "second": (0, 60),
     "hundredth": (0, 99),
 }  # fmt: skip
-"""Fields of the sonar's clock, and what is believed of them."""
+"""Fields of the sonar's clock, and their valid ranges."""
 
 LONGEST_TIE = 3.0
-"""Frames of one time are spread over the time to the next, at most so many times that of the frame rate."""
+"""Largest gap, in nominal frame periods per frame, over which frames with equal times are spread."""
 
 LENS = {48: (1.0, 0.0015, 1.3351), 96: (1.012, 0.0030, 2.6829)}
-"""Of the lens, by number of beams: beams from the axis = factor (cubic t^3 + linear t), t in degrees from the axis."""
+"""Lens model by number of beams: beams from the axis = factor (cubic t^3 + linear t), with t in degrees from the axis."""
 
 
 def read_didson(path: str | Path) -> Recording:
     """Open a DIDSON recording; pixels are read on demand.
 
-    The window of each frame follows from its own codes and from the timing: it begins at ``code * delay * c / 2``, and
-    sample n lies at (n + 1/2) ``c / (2 sample rate)`` from there. The file's sample rate belongs to the window's length in
-    its header; in frames of another length it changes in proportion. Without a sample rate the nominal lengths stand in.
-    A note says where timing and nominal window differ. The sound speed is that of the file, or 1500 m/s.
+    The window of each frame follows from the codes in its header and from the timing: it begins at ``code * delay * c / 2``,
+    and sample n lies at (n + 1/2) ``c / (2 sample rate)`` from there. The sample rate of the file belongs to the window
+    length in the file header; in frames of another length it changes in proportion. Without a sample rate, windows have
+    their nominal lengths. A note reports where the window computed from timing differs from the nominal one. The sound speed
+    is that of the file, or 1500 m/s.
 
-    Values 0..255 stand for 0..90 dB. Beam 0 is the one most to starboard, where ``reverse`` is not 0 the one most to port.
-    Attitude is that of the sonar's compass. Times are the sonar's clock, local time to 0.01 s; frames that share one are
-    spread evenly up to the next.
+    Values 0..255 represent 0..90 dB. Beam 0 is the one farthest to starboard, or farthest to port if ``reverse`` is not 0.
+    Attitude is that of the sonar's compass. Times are those of the sonar's clock, local time with a resolution of 0.01 s;
+    frames with equal times are spread evenly up to the next time.
 
     Raises:
-        MitsonarError: no such file, another format, or no frame that can be read.
+        MitsonarError: if the file does not exist, has another format, or holds no readable frame.
     """
     name = str(path)
     data = mapped(path, "a DIDSON file", FILE.itemsize)
@@ -511,7 +515,7 @@ def read_didson(path: str | Path) -> Recording:
 
 
 def _didson_frames(data: Bytes, head: np.void, version: int, name: str) -> EqualFrames:
-    """Return the frames, behind the header of the file whose size puts the signature into them."""
+    """Return the frames; the size of the file header is the one after which a frame with the signature begins."""
     beams, samples = int(head["beams"]), int(head["samples"])
     if beams not in LENS or not 0 < samples <= MOST_SAMPLES:
         raise MitsonarError(
@@ -529,7 +533,10 @@ def _didson_frames(data: Bytes, head: np.void, version: int, name: str) -> Equal
 
 
 def _times(headers: Header, head: np.void) -> tuple[Array, list[str]]:
-    """Return the times of the frames ``(frames,)`` [s] by the sonar's clock; by the frame rate where that never ran."""
+    """Return the times of the frames ``(frames,)`` [s] and notes on them.
+
+    Times are those of the sonar's clock, or computed from frame numbers and frame rate if that clock never ran.
+    """
     stated = int(head["frame_rate_hz"])
     rate = float(stated) if 0 < stated <= 100 else 10.0
     parts = {name: headers[name].astype(np.int64) for name in CLOCK}
@@ -547,15 +554,18 @@ def _times(headers: Header, head: np.void) -> tuple[Array, list[str]]:
 
 
 def _spread(time_s: Array, number: Index, period_s: float) -> tuple[Array, list[str]]:
-    """Return times ``(frames,)`` [s] with frames of one time, but of rising numbers, spread up to the time of the next."""
+    """Return times ``(frames,)`` [s] in which frames with equal times but rising numbers are spread up to the next time."""
+    # 1. Mark the first frame of each group. Equal times without a rising number are repeated frames, not a group.
     new = np.ones(len(time_s), dtype=bool)
     new[1:] = (np.diff(time_s) != 0) | (np.diff(number.astype(np.int64)) <= 0)
     if new.all():
         return time_s, []
+    # 2. Find the time to the next group; the nominal duration replaces it at the end of the file and where frames are lost.
     begin = np.flatnonzero(new)
     count = np.diff(begin, append=len(time_s))
     gap = np.append(np.diff(time_s[begin]), np.nan)
     gap = np.where((gap > 0) & (gap < LONGEST_TIE * period_s * count), gap, period_s * count)
+    # 3. Divide that time evenly among the frames of the group.
     group = np.cumsum(new) - 1
     part = (np.arange(len(time_s)) - begin[group]) / count[group]
     note = f"{counted(int((~new).sum()), 'frame')} with the clock of the one before: spread evenly up to the next"
@@ -564,7 +574,7 @@ def _spread(time_s: Array, number: Index, period_s: float) -> tuple[Array, list[
 
 @dataclass(frozen=True)
 class _Windows:
-    """How the windows of a file's frames follow from their codes."""
+    """Conversion of the window codes of a file's frames to metres."""
 
     head: np.void
 
@@ -582,21 +592,21 @@ class _Windows:
         return float(stated) if DIDSON_LEAST_SPEED <= stated <= DIDSON_MOST_SPEED else NOMINAL_SPEED
 
     def config(self, header: np.void) -> int:
-        """Return the configuration of a frame, which old sonars do not tell."""
+        """Return the configuration of a frame; for old sonars, which do not record it, it follows from the serial number."""
         told = int(header["config"]) & (CLASSIC | LONG_RANGE)
         told |= CLASSIC if self.old else 0
         return told | LONG_RANGE if int(self.head["serial"]) == LONG_RANGE_SERIAL else told
 
     def key(self, header: np.void) -> tuple[int, int, int]:
-        """Return what the geometry of a frame follows from."""
+        """Return the values that determine the geometry of a frame: start code, length code and configuration."""
         return int(header["start_code"]), int(header["length_code"]), self.config(header)
 
     def nominal(self, header: np.void) -> tuple[float, float]:
-        """Return start and length of a frame's window by the tables [m]."""
+        """Return the nominal start and length of a frame's window, as given by the tables [m]."""
         return nominal_window(*self.key(header), high=self.high)
 
     def timed(self, header: np.void) -> tuple[float, float]:
-        """Return start and length of a frame's window by the timing [m]."""
+        """Return the start and length of a frame's window, computed from the timing [m]."""
         start, code, config = self.key(header)
         begin = start * DELAY_S[self.old] * (1 if self.high else 2) * self.sound_speed / 2
         rate, samples = float(self.head["sample_rate_hz"]), int(self.head["samples"])
@@ -608,7 +618,7 @@ class _Windows:
         return begin, samples * self.sound_speed / (2 * rate) * length / whole
 
     def notes(self, headers: Header) -> list[str]:
-        """Return sentences on what is assumed, and on windows whose timing and tables differ."""
+        """Return at most ten sentences: on what is assumed, and on windows for which timing and tables disagree."""
         notes = []
         if not DIDSON_LEAST_SPEED <= int(self.head["sound_speed"]) <= DIDSON_MOST_SPEED:
             notes.append(f"the file tells no sound speed: {NOMINAL_SPEED:g} m/s is taken")
@@ -626,13 +636,13 @@ class _Windows:
 
 
 def nominal_window(start: int, code: int, config: int, *, high: bool) -> tuple[float, float]:
-    """Return start and length of a window by Sound Metrics' tables [m].
+    """Return the start and length of a window, as given by the tables of Sound Metrics [m].
 
     Args:
-        start: code of the window's start, 0 to 31.
-        code: code of its length, 0 to 3.
-        config: of the frame: 1 classic, 2 long range, or both, or 0.
-        high: at high frequency.
+        start: code of the window start, 0 to 31.
+        code: code of the window length, 0 to 3.
+        config: configuration bits of the frame: 1 classic, 2 long range, both, or 0.
+        high: whether the sonar operates at high frequency.
     """
     begin = start * STEPS_M[config & CLASSIC] * (1 if high else 2)
     return begin, LENGTHS_M[config][code + (0 if high else 2)]
@@ -640,17 +650,19 @@ def nominal_window(start: int, code: int, config: int, *, high: bool) -> tuple[f
 
 @cache
 def didson_bearings(beams: int) -> Array:
-    """Return the bearings of a DIDSON's beams ``(beams,)`` [rad], most to port first, starboard positive.
+    """Return the bearings of a DIDSON's beams ``(beams,)`` [rad], from port to starboard, starboard positive.
 
-    They follow the empirical polynomial of the lens, without its even terms: these shift the fan by 0.4 deg, to a side that
-    depends on how the reader that it comes from turns its images. Beams are not even: 0.37 deg apart in the middle and 0.22
-    at the sides, of 96. Beam tables of the ARIS 1800, which has the same number of beams and field of view, show the same
-    (0.35 and 0.21 deg), so that the polynomial was preferred to even beams of 0.3 deg.
+    They follow the empirical polynomial of the lens without its even terms. These would shift the fan by 0.4 deg, to a side
+    that depends on the image orientation of the reader from which the polynomial was taken. Beams are not evenly spaced: of
+    96 beams, those in the middle are 0.37 deg apart, those at the sides 0.22 deg. The beam tables of the ARIS 1800, which
+    has the same number of beams and field of view, show the same (0.35 and 0.21 deg). For this reason the polynomial is
+    preferred to an even spacing of 0.3 deg.
 
     Args:
-        beams: 48 or 96.
+        beams: number of beams, 48 or 96.
     """
     factor, cubic, linear = LENS[beams]
+    # The polynomial maps angle to beam number and increases monotonically: invert it by interpolation on a fine grid.
     angles = np.linspace(-20.0, 20.0, 40_001)
     degrees = np.interp(np.arange(beams) - (beams - 1) / 2, factor * (cubic * angles**3 + linear * angles), angles)
     return np.asarray(np.radians(degrees))
@@ -658,7 +670,7 @@ def didson_bearings(beams: int) -> Array:
 
 @dataclass(frozen=True)
 class _DidsonImages:
-    """The images of a part's frames."""
+    """Function that reads the images of a part of a DIDSON file."""
 
     frames: EqualFrames
     places: Index
@@ -666,7 +678,7 @@ class _DidsonImages:
     flipped: bool
 
     def __call__(self, index: Index) -> Bytes:
-        """Return ``(n, bins, beams)``, column 0 most to port."""
+        """Return images ``(n, bins, beams)``, column 0 farthest to port."""
         raw = self.frames.read(self.places[index], self.shape)
         return raw[:, :, ::-1] if self.flipped else raw
 
@@ -686,7 +698,7 @@ def _didson_part(frames: EqualFrames, headers: Header, places: Index, time_s: Ar
 
 
 def _didson_sonar(header: np.void, windows: _Windows, time_s: Array) -> SonarFrames:
-    """Return frames without images: the geometry of a part."""
+    """Return empty frames with the geometry of a part of a DIDSON file."""
     samples, beams = int(windows.head["samples"]), int(windows.head["beams"])
     start, length = windows.timed(header)
     bearings = didson_bearings(beams)
@@ -718,7 +730,7 @@ def _didson_sonar(header: np.void, windows: _Windows, time_s: Array) -> SonarFra
 
 
 def _facts(head: np.void, headers: Header, windows: _Windows) -> Facts:
-    """Return what the headers tell, by name."""
+    """Return header values of a DIDSON file, keyed by name."""
     if not len(headers):
         return {}
     names = ("high_frequency", "beams", "samples", "reverse", "serial")
@@ -730,7 +742,7 @@ def _facts(head: np.void, headers: Header, windows: _Windows) -> Facts:
     return facts | ({"sample_rate_hz": rate} if math.isfinite(rate) else {})
 
 
-# ---------------- Beam angles of ARIS sonars by lens and number of beams (Sound Metrics, aris-file-sdk, MIT)
+# ---------------- Beam angles of ARIS sonars
 
 
 TABLES = {
@@ -742,22 +754,23 @@ TABLES = {
     ("3000", 64): "aris3000_64",
     ("3000", 128): "aris3000_128",
 }
-"""Tables by lens or type of the sonar and number of beams."""
+"""Names of the beam tables, keyed by lens or model of the sonar and number of beams."""
 
 
 @cache
 def aris_bearings(kind: str, beams: int) -> NDArray[np.float64]:
-    """Return the bearings of an ARIS' beams ``(beams,)`` [rad], most to port first, starboard positive.
+    """Return the bearings of an ARIS sonar's beams ``(beams,)`` [rad], from port to starboard, starboard positive.
 
-    Beam 0 of a file is the one most to starboard, and of the table the one of the least angle. So the angle of a beam is
-    the negative one of its row, and the beams in falling order of their numbers are the table as it is, negated.
+    The tables are from aris-file-sdk (Sound Metrics, MIT). Beam 0 is the one farthest to starboard in a file, and the one
+    with the smallest angle in a table. The bearing of a beam is therefore the negative angle of its row, and bearings from
+    port to starboard are the negated table in reverse order.
 
     Args:
         kind: ``1200``, ``1800`` or ``3000``, or ``telephoto`` for any of them with the large lens.
         beams: number of beams.
 
     Raises:
-        MitsonarError: no table for them.
+        MitsonarError: if there is no table for them.
     """
     if (kind, beams) not in TABLES:
         known = ", ".join(f"{one} with {number}" for one, number in TABLES)

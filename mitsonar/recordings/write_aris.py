@@ -1,4 +1,4 @@
-"""Frames of any sonar, simulated or real, as an ARIS file (``.aris``, DDF 5), for programs that read such files."""
+"""How are frames written as an ARIS file (``.aris``, DDF 5)? Frames of any sonar, simulated or real, for other programs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 
-# ---------------- The axes of an ARIS file: which of the vendor's tables beams are, and ranges in whole microseconds
+# ---------------- Axes of an ARIS file
 
 
 Array = NDArray[np.float64]
@@ -56,12 +56,20 @@ Values = NDArray[np.float32] | NDArray[np.uint8]
 """Values 0..255 of images ``(n, bins, beams)``."""
 
 EXACT = 0.05
-"""Part of a sample by which the written range axis may differ from the frames' at any sample, without interpolation."""
+"""Largest deviation of the written range axis from that of the frames, in bins, up to which nothing is interpolated."""
 
 
 @dataclass(frozen=True)
 class ArisTable:
-    """A table of beams, and the fields of a header that name it."""
+    """A beam table of the vendor, and the header fields that select it.
+
+    Attributes:
+        beams: number of beams.
+        bearings: bearings ``(beams,)`` [rad], from port to starboard.
+        system: number of the ARIS model.
+        lens: 1 with the large lens, otherwise 0.
+        high: 1 at the high frequency, otherwise 0.
+    """
 
     beams: int
     bearings: Array
@@ -72,7 +80,15 @@ class ArisTable:
 
 @dataclass(frozen=True)
 class ArisWindow:
-    """A range axis in whole microseconds; ``exact``: it is the frames' own."""
+    """A range axis in whole microseconds.
+
+    Attributes:
+        delay_us: delay of the first sample [us].
+        period_us: sample period [us].
+        samples: number of samples.
+        sound_speed: sound speed [m/s].
+        exact: whether the axis is that of the frames, so that nothing is interpolated.
+    """
 
     delay_us: int
     period_us: int
@@ -82,7 +98,7 @@ class ArisWindow:
 
     @property
     def step_m(self) -> float:
-        """Return the length of a sample [m]."""
+        """Return the range step between samples [m]."""
         return self.period_us * 1e-6 * self.sound_speed / 2
 
     @property
@@ -92,7 +108,14 @@ class ArisWindow:
 
 
 def interpolated(values: NDArray[Any], have: Array, want: Array, *, axis: int) -> NDArray[np.float32]:
-    """Return values at other places of an axis, linearly; 0 beyond its ends by more than half a step."""
+    """Interpolate values linearly along an axis; the result is 0 more than half a step beyond its ends.
+
+    Args:
+        values: images ``(n, bins, beams)``.
+        have: coordinates of the values along the axis, increasing.
+        want: coordinates of the result.
+        axis: number of the axis.
+    """
     place = np.interp(want, have, np.arange(len(have)))
     low = np.clip(place.astype(np.intp), 0, max(0, len(have) - 2))
     shape = [1, 1, 1]
@@ -107,12 +130,22 @@ def interpolated(values: NDArray[Any], have: Array, want: Array, *, axis: int) -
 
 
 def half_spacing(bearings: Array) -> float:
-    """Return half the mean angle between beams [rad]."""
+    """Return half the mean angle between beams [rad]; 0 for a single beam."""
     return float(np.diff(bearings).mean()) / 2 if len(bearings) > 1 else 0.0
 
 
 def table_of(bearings: Array, sonar: Sonar, beams: int | None) -> tuple[ArisTable, float]:
-    """Return the table that is nearest to the beams, and by how much it moves them, at most [rad]."""
+    """Return the beam table nearest to the given bearings, and its largest deviation from them [rad].
+
+    Args:
+        bearings: bearings of the frames ``(beams,)`` [rad].
+        sonar: sonar of the frames; its name and carrier decide between equally near tables.
+        beams: number of beams to interpolate to; None keeps that of the frames. If it differs from theirs, only the
+            outermost bearings are compared.
+
+    Raises:
+        MitsonarError: if there is no table with this number of beams, or none is near enough without interpolation.
+    """
     numbers = sorted(set(BEAMS.values()))
     count = len(bearings) if beams is None else beams
     fan = f"{len(bearings)} beams from {np.degrees(bearings[0]):.4g} to {np.degrees(bearings[-1]):.4g} deg"
@@ -139,7 +172,7 @@ def table_of(bearings: Array, sonar: Sonar, beams: int | None) -> tuple[ArisTabl
 
 
 def _named(kind: str, beams: int, sonar: Sonar) -> ArisTable:
-    """Return a table with the type of sonar, of those that have it, and the carrier that are nearest to a sonar's."""
+    """Return a table with the ARIS model and frequency, among those that use it, that are nearest to the given sonar."""
     systems = [one for one in KINDS if kind in ("telephoto", KINDS[one].name)]
     choices = [(system, high) for system in systems for high in (1, 0)]
     chosen = min(choices, key=lambda one: (sonar.name != f"aris{KINDS[one[0]].name}", _apart(one[0], one[1], sonar)))
@@ -147,19 +180,28 @@ def _named(kind: str, beams: int, sonar: Sonar) -> ArisTable:
 
 
 def _apart(system: int, high: int, sonar: Sonar) -> float:
-    """Return how far the carrier of a type of ARIS is from a sonar's [Hz]; 0 where the sonar tells none."""
+    """Return the distance between the carriers of an ARIS model and a sonar [Hz]; 0 if that of the sonar is unknown."""
     carrier = KINDS[system].high_hz if high else KINDS[system].low_hz
     return abs(carrier - sonar.frequency_hz) if sonar.frequency_hz else 0.0
 
 
 def window_of(range_m: Array, sound_speed: float) -> ArisWindow:
-    """Return the range axis in whole microseconds: the frames' own where that is one, else the next finer one."""
+    """Return a range axis in whole microseconds: that of the frames if possible, otherwise the next finer one.
+
+    Args:
+        range_m: ranges of the frames ``(bins,)`` [m].
+        sound_speed: sound speed [m/s].
+
+    Raises:
+        MitsonarError: if the format cannot hold the sound speed or the window.
+    """
     if not LEAST_SPEED < sound_speed < MOST_SPEED:
         raise MitsonarError(
             f"an ARIS file holds sound speeds of {LEAST_SPEED:g} to {MOST_SPEED:g} m/s: got {sound_speed:g}; give others"
         )
     speed = float(np.float32(sound_speed))
     bins = len(range_m)
+    # 1. Round delay and period to whole microseconds, and compare the resulting axis with that of the frames.
     step = (range_m[-1] - range_m[0]) / (bins - 1) if bins > 1 else speed * 1e-6
     period, delay = step * 2e6 / speed, range_m[0] * 2e6 / speed
     whole = max(1, round(period))
@@ -167,6 +209,7 @@ def window_of(range_m: Array, sound_speed: float) -> ArisWindow:
     if np.abs(axis - range_m).max() < EXACT * step:
         made = ArisWindow(round(delay), whole, bins, speed, exact=True)
     else:
+        # 2. If they differ, shorten the period, so that interpolation loses no resolution, and cover the same window.
         finer = max(1, int(period + 1e-6))
         samples = int((range_m[-1] * 2e6 / speed - round(delay)) / finer + 1e-6) + 1
         made = ArisWindow(round(delay), finer, samples, speed, exact=False)
@@ -178,7 +221,7 @@ def window_of(range_m: Array, sound_speed: float) -> ArisWindow:
     return made
 
 
-# ---------------- aris writer
+# ---------------- Writer
 
 
 FILE = layout(
@@ -189,23 +232,23 @@ FILE = layout(
     },
     1024,
 )  # fmt: skip
-"""Fields of the file's header that are filled in: offset [bytes] and type."""
+"""Fields of the file header that are filled in: offset [bytes] and type."""
 
 MODES = {48: 1, 96: 3, 64: 6, 128: 9}
-"""A ping mode for each number of beams."""
+"""Ping mode that is written for each number of beams."""
 
 SALINITIES = (0, 15, 35)
-"""Salinities that a header may state [parts per thousand]: fresh, brackish, sea."""
+"""Salinities that a header may hold [parts per thousand]: fresh, brackish and sea water."""
 
 ORIGIN_DEG = (0.0, -30.0)
-"""Latitude and longitude [deg] that stand for x = y = 0, where the user gives none: in the open Atlantic, on the equator."""
+"""Default latitude and longitude of x = y = 0 [deg]: in the open Atlantic, on the equator."""
 
 LATEST_S = 2.0**53 / 1e6
-"""Latest time that whole microseconds stand for exactly [s]."""
+"""Latest time that a float represents exactly in whole microseconds [s]."""
 
 
 class WrittenAris(NamedTuple):
-    """What was written: the file, its number of frames, and sentences on what had to be changed."""
+    """Report of a written file: its path, its number of frames, and sentences on what had to be changed."""
 
     path: Path
     frames: int
@@ -219,22 +262,22 @@ def write_aris(
     beams: int | None = None,
     origin_deg: tuple[float, float] = ORIGIN_DEG,
 ) -> WrittenAris:
-    """Write frames as an ARIS file, which appears whole or not at all.
+    """Write frames as an ARIS file, which is either complete or absent.
 
-    Values become 0..255 over 80 dB below full scale: 8-bit values of that coding are kept to the bit, those of others go
-    through their levels. An ARIS file holds no bearings: the beams are those of the vendor's table that is nearest. Ranges
-    are a delay and a period in whole microseconds: frames with other ranges are interpolated along them. Attitude goes into
-    the fields of the compass, and the path, where poses are known, into those of a GPS receiver and of the depth. A compass
-    that tells nothing but zeros counts as none.
+    Values become 0..255 over 80 dB below full scale. 8-bit values in that coding are preserved exactly; others are converted
+    from their levels. An ARIS file holds no bearings: beams are those of the nearest table of the vendor. Ranges consist of
+    a delay and a period in whole microseconds; frames with other ranges are interpolated along range. Attitude is written to
+    the fields of the compass. The path, if poses are known, is written to the fields of the GPS receiver and of the depth.
+    On reading, a compass with nothing but zeros counts as missing.
 
     Args:
-        path: of the file; it ends in ``.aris`` and must not exist.
-        frames: all of them, or some at a time in the order of time, of one geometry.
-        beams: number of beams to interpolate to, 48, 64, 96 or 128; default: the frames' own, which must fit a table.
+        path: path of the file; it must end in ``.aris`` and must not exist.
+        frames: all frames, or chunks of them in order of time, of one geometry.
+        beams: number of beams to interpolate to, 48, 64, 96 or 128; default: that of the frames, which must fit a table.
         origin_deg: latitude and longitude of x = y = 0 [deg].
 
     Raises:
-        MitsonarError: a file that exists, no frames, beams or times that such a file cannot hold.
+        MitsonarError: if the file exists, there are no frames, or the format cannot hold their beams, ranges or times.
     """
     path = Path(path)
     if path.suffix.lower() != ".aris":
@@ -262,14 +305,14 @@ def write_aris(
 
 
 def _pieces(frames: SonarFrames) -> Iterator[SonarFrames]:
-    """Return frames some at a time."""
+    """Yield frames in chunks of about ``CHUNK_BYTES``."""
     count = max(1, CHUNK_BYTES // max(1, 4 * frames.image[:1].size))
     for start in range(0, len(frames), count):
         yield frames.select(slice(start, start + count))
 
 
 class _Writer:
-    """Writes frames as they come; the first ones decide on the form of all."""
+    """Incremental writer of frames; the first chunk determines the form of the file."""
 
     def __init__(self, file: IO[bytes], beams: int | None, origin_deg: tuple[float, float]) -> None:
         self.file, self.beams, self.origin_deg = file, beams, origin_deg
@@ -278,7 +321,7 @@ class _Writer:
         self.first_latitude = origin_deg[0]
 
     def add(self, frames: SonarFrames) -> None:
-        """Write frames behind those that were written."""
+        """Append frames to the file."""
         if not len(frames):
             return
         if self.form is None:
@@ -294,11 +337,11 @@ class _Writer:
         self._place(heads, frames)
         for head, image in zip(heads, codes, strict=True):
             self.file.write(head.tobytes())
-            self.file.write(image[:, ::-1].tobytes())  # beam 0 is the one most to starboard
+            self.file.write(image[:, ::-1].tobytes())  # beam 0 is the one farthest to starboard
         self.count += len(frames)
 
     def finish(self) -> None:
-        """Write the header of the file, now that the number of frames is known."""
+        """Write the file header, which requires the final number of frames."""
         if self.form is None:
             raise MitsonarError("there are no frames to write")
         head = np.zeros(1, FILE)
@@ -333,7 +376,7 @@ class _Writer:
         return time_us
 
     def _codes(self, frames: SonarFrames) -> Values:
-        """Return values 0..255 over 80 dB like the image: as they are, or from their levels."""
+        """Return values 0..255 over 80 dB ``(n, bins, beams)``: unchanged if they have that coding, or from their levels."""
         if frames.level == "dB" and frames.sonar.coding_db == CODING_DB:
             return frames.image if frames.image.dtype == np.uint8 else np.clip(frames.image, 0, 1) * np.float32(255)
         level = frames.to_linear().image
@@ -345,7 +388,7 @@ class _Writer:
         return np.where(there, np.clip(codes, 0, 255), np.float32(0))
 
     def _place(self, heads: Header, frames: SonarFrames) -> None:
-        """Fill in latitude, longitude and depth, where poses are known."""
+        """Fill in latitude, longitude and depth if poses are known."""
         if frames.poses is None:
             return
         east, north, up = frames.poses[:, :3].T
@@ -363,7 +406,15 @@ class _Writer:
 
 @dataclass(frozen=True)
 class _Form:
-    """How frames of one geometry become those of an ARIS file."""
+    """Conversion of frames of one geometry to those of an ARIS file.
+
+    Attributes:
+        like: empty frames with the geometry.
+        table: beam table of the file.
+        window: range axis of the file.
+        turned: whether images are interpolated over bearing.
+        notes: sentences on what had to be changed.
+    """
 
     like: SonarFrames
     table: ArisTable
@@ -372,7 +423,7 @@ class _Form:
     notes: tuple[str, ...]
 
     def fits(self, frames: SonarFrames) -> bool:
-        """Return whether other frames have the same geometry."""
+        """Return whether frames have the same geometry."""
         same = (frames.range_m.shape, frames.bearing_rad.shape) == (self.like.range_m.shape, self.like.bearing_rad.shape)
         return (
             same
@@ -381,7 +432,7 @@ class _Form:
         )
 
     def image(self, codes: Values) -> Bytes:
-        """Return values ``(n, samples, beams)`` on the axes of the file; interpolated only where these are others."""
+        """Return values ``(n, samples, beams)`` on the axes of the file, interpolated only along axes that differ."""
         if not self.window.exact:
             wanted = self.window.start_m + np.arange(self.window.samples, dtype=np.float64) * self.window.step_m
             codes = interpolated(codes, self.like.range_m, wanted, axis=1)
@@ -414,10 +465,10 @@ class _Form:
 
 
 def _form_of(frames: SonarFrames, beams: int | None) -> _Form:
-    """Decide on the table of beams and on the range axis.
+    """Choose the beam table and the range axis for frames.
 
     Raises:
-        MitsonarError: beams that fit no table, a sound speed or a window that the format cannot hold.
+        MitsonarError: if beams fit no table, or the format cannot hold the sound speed or the window.
     """
     if min(len(frames.range_m), len(frames.bearing_rad)) < 2:
         raise MitsonarError("frames of an ARIS file have 2 bins and 2 beams at least: give an image, not a profile")

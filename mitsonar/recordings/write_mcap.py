@@ -1,4 +1,4 @@
-"""Sonar frames as an MCAP file of ROS 2 messages, for Foxglove, RViz and ``ros2 bag play``."""
+"""How are sonar frames written as an MCAP file? As ROS 2 messages, for Foxglove, RViz and ``ros2 bag play``."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ __all__ = ["BODY", "SENSOR", "SPAN_DB", "TOPICS", "WORLD", "Encoded", "FrameEnco
 
 
 SPAN_DB = 80.0
-"""Levels from full scale down that 8 bits hold of linear images [dB]; a step is 0.31 dB."""
+"""Dynamic range below full scale that 8-bit samples of linear images cover [dB]; a step is 0.31 dB."""
 
 CHUNK_BYTES = 4 * 2**20
-"""Size of the pieces that are compressed at a time [bytes]."""
+"""Size of the chunks that are compressed separately [bytes]."""
 
 
 def write_mcap(
@@ -47,32 +47,34 @@ def write_mcap(
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> int:
-    """Write frames of one sonar as MCAP (profile ``ros2``, CDR, chunks in Zstandard); the file is whole or absent.
+    """Write frames of one sonar as MCAP (profile ``ros2``, CDR, Zstandard chunks); the file is complete or absent.
 
-    Topics: ``/sonar/image`` (``marine_acoustic_msgs/ProjectedSonarImage``), ``/sonar/fan/compressed``
-    (``sensor_msgs/CompressedImage``). With poses ``/sonar/odometry`` (``nav_msgs/Odometry``) and ``/tf``, with attitudes
-    ``/sonar/imu`` (``sensor_msgs/Imu``), with heights ``/sonar/altitude`` (``sensor_msgs/Range``). Times in headers are
-    those of the frames.
+    Topics are ``/sonar/image`` (``marine_acoustic_msgs/ProjectedSonarImage``) and ``/sonar/fan/compressed``
+    (``sensor_msgs/CompressedImage``); with poses also ``/sonar/odometry`` (``nav_msgs/Odometry``) and ``/tf``, with
+    attitudes ``/sonar/imu`` (``sensor_msgs/Imu``), with heights ``/sonar/altitude`` (``sensor_msgs/Range``). Times in
+    headers are those of the frames.
 
-    Samples are 8 bit: values in the codings dB and gamma times 255, linear levels as dB over
+    Samples have 8 bits. Values in the codings dB and gamma are multiplied by 255. Linear levels are stored in dB over
     :data:`~mitsonar.recordings.write_mcap.SPAN_DB`, which
-    :func:`~mitsonar.recordings.open.open_recording` turns into levels again. A metadata record holds the sonar,
-    exact ranges and bearings, the coding, and how samples become levels, in words.
+    :func:`~mitsonar.recordings.open.open_recording` converts back to levels. A metadata record holds the sonar, exact ranges
+    and bearings, the coding, and a description of how samples are converted to levels.
 
     Args:
-        chunks: the frames, some at a time, of one geometry; the first say which arrays all have.
-        path: of the file; its name ends with ``.mcap``.
-        picture: format of the fans: ``jpeg``, or the larger ``png``.
-        full: samples as they are, float32 or uint8, bit for bit, and with labels.
-        labels: ``/sonar/points`` (``sensor_msgs/PointCloud2``) of frames with elevations, about as large as all else.
-        overwrite: replace a file that is there.
-        progress: called with how many more frames are written.
+        chunks: frames of one geometry in chunks; the first chunk determines which arrays all of them must have.
+        path: path of the file; its name must end with ``.mcap``.
+        picture: format of the fans: ``jpeg``, or ``png``, which is larger.
+        full: whether to write samples exactly as they are, float32 or uint8, and labels.
+        labels: whether to write ``/sonar/points`` (``sensor_msgs/PointCloud2``) of frames with elevations, which is about as
+            large as all other topics together.
+        overwrite: whether to replace an existing file.
+        progress: function that is called with the number of newly written frames.
 
     Returns:
         The number of frames.
 
     Raises:
-        MitsonarError: a file that is there, a name that ends otherwise, no frames, or times that ROS cannot hold.
+        MitsonarError: if the file exists, its name has another suffix, there are no frames, or ROS cannot represent their
+            times.
     """
     path = Path(path)
     if path.suffix != ".mcap":
@@ -103,7 +105,7 @@ def _writer(file: object) -> Writer:
 
 
 def _reduced(frames: SonarFrames, full: bool, labels: bool, span_db: list[float]) -> SonarFrames:
-    """Return frames as they are written; ``span_db`` gets the span where linear levels became dB."""
+    """Return frames with the samples and arrays that are written; ``span_db`` is set if linear levels become dB."""
     if full:
         return frames
     if not labels:
@@ -122,7 +124,7 @@ def _reduced(frames: SonarFrames, full: bool, labels: bool, span_db: list[float]
 def _write(
     writer: Writer, chunks: Iterator[SonarFrames], picture: str, span_db: list[float], progress: Callable[[int], None]
 ) -> int:
-    """Write all frames and return their number."""
+    """Write all frames, and return their number."""
     first = next((one for one in chunks if len(one)), None)
     if first is None:
         raise MitsonarError("there are no frames to write")
@@ -144,10 +146,10 @@ def _write(
 
 
 def _all(first: SonarFrames, rest: Iterator[SonarFrames]) -> Iterator[SonarFrames]:
-    """Yield the first chunk and the others.
+    """Yield the first chunk and all others.
 
     Raises:
-        MitsonarError: frames of another geometry, or with other arrays.
+        MitsonarError: if frames have another geometry or other arrays.
     """
     yield first
     for one in rest:
@@ -157,12 +159,12 @@ def _all(first: SonarFrames, rest: Iterator[SonarFrames]) -> Iterator[SonarFrame
 
 
 def _known(frames: SonarFrames) -> list[bool]:
-    """Return which arrays frames have."""
+    """Return which optional arrays frames have."""
     return [getattr(frames, name) is not None for name in PER_FRAME]
 
 
 def _channels(writer: Writer, encoder: FrameEncoder) -> dict[str, int]:
-    """Register types and topics; return the number of each topic."""
+    """Register types and topics, and return the channel number of each topic."""
     schemas: dict[str, int] = {}
     channels = {}
     for topic in encoder.topics:
@@ -174,7 +176,7 @@ def _channels(writer: Writer, encoder: FrameEncoder) -> dict[str, int]:
 
 
 def _quality(topic: str) -> dict[str, str]:
-    """Return the channel's metadata: fixed transforms are kept for subscribers that come later."""
+    """Return the metadata of a channel: fixed transforms are latched for late subscribers."""
     if topic != "/tf_static":
         return {}
     ever = "{sec: 9223372036, nsec: 854775807}"
@@ -188,21 +190,21 @@ def _add(writer: Writer, channels: dict[str, int], message: Encoded, sequence: i
     writer.add_message(channels[message.topic], message.time_ns, message.data, message.time_ns, sequence)
 
 
-# ---------------- Sonar frames as ROS 2 messages (CDR): polar image, fan, points, odometry and transforms
+# ---------------- Encoding of frames as ROS 2 messages
 # | frame | axes | parent |
 # |---|---|---|
 # | ``map`` | east, north, up (REP 103) | |
-# | ``sonar_link`` | forward, left, up (REP 103) | ``map``: the pose of the sonar |
-# | ``sonar`` | down, left, forward: as drivers write ``ProjectedSonarImage`` | ``sonar_link``, fixed |
+# | ``sonar_link`` | forward, left, up (REP 103) | ``map``, by the pose of the sonar |
+# | ``sonar`` | down, left, forward, as drivers write ``ProjectedSonarImage`` | ``sonar_link``, fixed |
 
 
 Array = NDArray[np.float64]
 
 RosObject: TypeAlias = Any
-"""An object of a message type that ``rosbags`` made."""
+"""An instance of a message type created by ``rosbags``."""
 
 WORLD, BODY, SENSOR = "map", "sonar_link", "sonar"
-"""Names of the frames."""
+"""Names of the coordinate frames."""
 
 TOPICS = {
     WRITTEN: PROJECTED[0],
@@ -214,23 +216,23 @@ TOPICS = {
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
 }
-"""Topics that a run may become, with their types."""
+"""Topics that may be written, with their types."""
 
 LARGEST_FAN = 800
-"""Rows of a fan, at most."""
+"""Maximum number of rows of a fan."""
 
 PICTURES = {"png": ("PNG", {"compress_level": 3}), "jpeg": ("JPEG", {"quality": 92})}
-"""Formats of fans: Pillow's name and options."""
+"""Formats of fans: name and options in Pillow."""
 
 UINT8, FLOAT32 = 0, 8
-"""Numbers of types of samples in ``SonarImageData``."""
+"""Codes of sample types in ``SonarImageData``."""
 
 POINT_TYPES = {np.dtype(np.float32): 7, np.dtype(np.int32): 5}
-"""Numbers of types of fields in ``PointField``."""
+"""Codes of field types in ``PointField``."""
 
 
 class Encoded(NamedTuple):
-    """A message: its topic, time [ns] and bytes."""
+    """An encoded message: its topic, time [ns] and bytes."""
 
     topic: str
     time_ns: int
@@ -238,14 +240,14 @@ class Encoded(NamedTuple):
 
 
 class FrameEncoder:
-    """Encodes frames of one sonar.
+    """Encoder of frames of one sonar as ROS 2 messages (CDR).
 
     Args:
-        like: frames with the sonar, ranges, bearings, level and arrays of all frames that follow; its images are not read.
+        like: frames with the sonar, ranges, bearings, level and arrays of all frames to encode; its images are not read.
         picture: format of the fans, ``png`` or ``jpeg``.
 
     Raises:
-        MitsonarError: an unknown format.
+        MitsonarError: if the format is unknown.
     """
 
     def __init__(self, like: SonarFrames, picture: str = "png") -> None:
@@ -255,7 +257,7 @@ class FrameEncoder:
 
     @property
     def topics(self) -> list[str]:
-        """Return the topics that these frames become."""
+        """Return the topics to which frames are encoded."""
         needs = {
             "/sonar/points": self.like.elevation_rad,
             "/sonar/odometry": self.like.poses,
@@ -267,11 +269,11 @@ class FrameEncoder:
         return [name for name in TOPICS if name not in absent]
 
     def definition(self, topic: str) -> str:
-        """Return the definition of a topic's type, with those of its parts."""
+        """Return the definition of a topic's message type, including those of its nested types."""
         return self.types.generate_msgdef(TOPICS[topic], ros_version=2)[0]
 
     def messages(self, frames: SonarFrames) -> Iterator[Encoded]:
-        """Encode frames, in the order of time."""
+        """Encode frames, and yield their messages in order of time."""
         time_s = frames.time_s if frames.time_s.ndim == 1 else frames.time_s.mean(axis=1)
         for index, time in enumerate(nanoseconds(time_s)):
             yield self._encoded(WRITTEN, time, self._image(frames, index, time))
@@ -288,7 +290,7 @@ class FrameEncoder:
                 yield self._encoded("/sonar/odometry", time, self._odometry(time, place, turn))
 
     def fixed(self, time: int) -> Encoded:
-        """Encode the transform from the messages' frame to the sonar's body."""
+        """Encode the fixed transform from the frame ``sonar`` to the frame ``sonar_link``."""
         turn = Rotation.from_matrix([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
         return self._encoded("/tf_static", time, self._transform(BODY, SENSOR, time, np.zeros(3), turn))
 
@@ -296,7 +298,7 @@ class FrameEncoder:
         return Encoded(topic, time, bytes(self.types.serialize_cdr(message, TOPICS[topic], little_endian=True)))
 
     def _make(self, kind: str, **fields: RosObject) -> RosObject:
-        """Make a message of a type."""
+        """Create a message of the given type."""
         package, _, name = kind.partition("/")
         return self.types.types[f"{package}/msg/{name}"](**fields)
 
@@ -311,7 +313,7 @@ class FrameEncoder:
 
     @cached_property
     def _directions(self) -> list[RosObject]:
-        """Axes of the beams in the frame ``sonar``: y to port, z forward."""
+        """Directions of the beam axes in the frame ``sonar``: y to port, z forward."""
         bearing = self.like.bearing_rad
         axes = np.stack([np.zeros_like(bearing), -np.sin(bearing), np.cos(bearing)], axis=-1)
         return [self._vector(one) for one in axes]
@@ -328,7 +330,7 @@ class FrameEncoder:
         )
 
     def _image(self, frames: SonarFrames, index: int, time: int) -> RosObject:
-        """Return a polar image; all beams of a range follow each other, as drivers write them."""
+        """Return a polar image; the samples of a range are contiguous, as drivers write them."""
         image = frames.image[index]
         image = image if image.dtype == np.uint8 else image.astype("<f4")
         data = self._make(
@@ -353,7 +355,7 @@ class FrameEncoder:
         return cartesian_map(self.like.range_m, self.like.bearing_rad, rows=rows)
 
     def _fan(self, frames: SonarFrames, index: int, time: int) -> RosObject:
-        """Return a picture of a fan: forward up, starboard right, 0 outside."""
+        """Return a picture of the fan: forward is up, starboard is right, and pixels outside are 0."""
         fan = to_uint8(np.asarray(self._map.apply(to_float32(frames.image[index]))))
         buffer = io.BytesIO()
         name, options = PICTURES[self.picture]
@@ -366,7 +368,7 @@ class FrameEncoder:
         )
 
     def _points(self, frames: SonarFrames, index: int, time: int) -> RosObject:
-        """Return the places of the strongest echoes, with value and labels."""
+        """Return the positions of the cells with a known elevation and an echo as a point cloud, with value and labels."""
         assert frames.elevation_rad is not None
         image, elevation = frames.image[index], frames.elevation_rad[index]
         rows, columns = np.nonzero(np.isfinite(elevation) & (image > 0))
@@ -380,7 +382,7 @@ class FrameEncoder:
         return self._cloud(table, time)
 
     def _cloud(self, table: dict[str, NDArray[Any]], time: int) -> RosObject:
-        """Return points with these fields ``(points,)``."""
+        """Return a point cloud with the given fields, each ``(points,)``."""
         kind = np.dtype([(name, one.dtype.newbyteorder("<")) for name, one in table.items()])
         points = np.zeros(len(table["x"]), kind)
         for name, one in table.items():
@@ -415,7 +417,7 @@ class FrameEncoder:
         return self._make("tf2_msgs/TFMessage", transforms=[one])
 
     def _odometry(self, time: int, place: Array, turn: Rotation) -> RosObject:
-        """Return the true pose; the twist is not known, which a covariance of -1 says."""
+        """Return the pose of the sonar as odometry; a covariance of -1 marks the twist as unknown."""
         zero, unknown = np.zeros(3), np.zeros(36)
         unknown[0] = -1
         pose = self._make(
@@ -433,7 +435,7 @@ class FrameEncoder:
         )
 
     def _imu(self, attitude: Array, time: int) -> RosObject:
-        """Return pitch, roll, heading ``(3,)`` as the orientation of an IMU; rates are not known, which -1 says."""
+        """Return pitch, roll, heading ``(3,)`` [rad] as the orientation of an IMU; a covariance of -1 marks unknowns."""
         known = bool(np.isfinite(attitude).all())
         _, turn = _ros_pose(np.concatenate([np.zeros(3), np.where(np.isfinite(attitude), attitude, 0)]))
         unknown = np.zeros(9)
@@ -450,7 +452,7 @@ class FrameEncoder:
         )
 
     def _altitude(self, height_m: float, time: int) -> RosObject:
-        """Return the height over the ground as an altimeter measures it; infinite where nothing is below (REP 117)."""
+        """Return the height above the ground [m] as a range of an altimeter; infinite if unknown (REP 117)."""
         return self._make(
             "sensor_msgs/Range",
             header=self._header(time, BODY),
@@ -463,10 +465,12 @@ class FrameEncoder:
 
 
 def nanoseconds(time_s: Array) -> list[int]:
-    """Return times as whole nanoseconds ``(n,)``. Those that are whole, or dates since 1970, come back to the bit.
+    """Return times ``(n,)`` [s] as whole nanoseconds.
+
+    Whole seconds, and dates since 1970, are restored exactly on reading.
 
     Raises:
-        MitsonarError: times that ROS cannot hold.
+        MitsonarError: if ROS cannot represent the times.
     """
     if not (np.isfinite(time_s).all() and (time_s >= 0).all() and (time_s < 2**31).all()):
         raise MitsonarError("frame times must lie in 0..2^31 s for ROS: write the frames with other times")
@@ -475,6 +479,6 @@ def nanoseconds(time_s: Array) -> list[int]:
 
 
 def _ros_pose(pose: Array) -> tuple[Array, Rotation]:
-    """Return position and rotation of a pose ``(6,)`` in the convention of ROS."""
+    """Return the position and rotation of a pose ``(6,)`` in the convention of ROS."""
     place, turn = CONVENTIONS["ros-enu"].from_ours(pose[None, :3], vehicle_rotation(pose))
     return place[0], turn[0]

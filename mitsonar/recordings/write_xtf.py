@@ -1,7 +1,7 @@
-"""A side-scan's echogram as an XTF file (Triton's eXtended Triton Format), for programs that read such files.
+"""How is a side-scan echogram written as an XTF file? In the eXtended Triton Format, for programs that read such files.
 
-Layout: Triton Imaging, eXtended Triton Format (XTF), revision 42: a header of 1,024 bytes, then a record for each ping with
-256 bytes of its own and 64 before the samples of each channel.
+Source of the layout: Triton Imaging, eXtended Triton Format (XTF), revision 42. A file header of 1,024 bytes is followed by
+a record per ping: a ping header of 256 bytes, then for each channel a header of 64 bytes and its samples.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CHANNEL = layout(
     },
     128,
 )  # fmt: skip
-"""What the file's header says of a channel: offset [bytes] and type."""
+"""Fields that describe a channel in the file header: offset [bytes] and type."""
 
 FILE = layout(
     {
@@ -37,7 +37,7 @@ FILE = layout(
     },
     256,
 )  # fmt: skip
-"""The file's header, before six channels."""
+"""Fields of the file header ahead of its six channel descriptions: offset [bytes] and type."""
 
 PING = layout(
     {
@@ -51,7 +51,7 @@ PING = layout(
     },
     256,
 )  # fmt: skip
-"""The header of a ping."""
+"""Fields of a ping header: offset [bytes] and type."""
 
 PING_CHANNEL = layout(
     {
@@ -60,27 +60,27 @@ PING_CHANNEL = layout(
     },
     64,
 )  # fmt: skip
-"""What stands before the samples of a channel."""
+"""Fields of the header ahead of a channel's samples: offset [bytes] and type."""
 
 FULL_COUNT = 32767
-"""Count of the largest amplitude: readers take two bytes with a sign or without."""
+"""Count of the largest amplitude; readers may interpret two bytes as signed or unsigned."""
 
 PORT, STARBOARD = 1, 2
 METRES = 0
 KNOTS = 3600 / 1852
 PAD = 64
-"""The bytes of a record are a multiple of this."""
+"""The size of a record is a multiple of this [bytes]."""
 
 
 def write_xtf(path: str | Path, echogram: Echogram) -> None:
-    """Write a side-scan's echogram, whole or absent.
+    """Write the echogram of a side-scan sonar; the file is complete or absent.
 
-    Samples are amplitudes, the largest of the file as 32,767 counts. Those of port run from the outermost bin inwards, as
-    XTF has them. Places are metres, east and north. Heights over the ground are those of the echogram. Times count
-    from 1970.
+    Samples are amplitudes, scaled so that the largest of the file has 32,767 counts. Port samples run from the outermost bin
+    inwards, as XTF requires. Positions are metres, east and north. Heights above the ground are those of the echogram. Times
+    count from 1970.
 
     Raises:
-        MitsonarError: not a side-scan's echogram.
+        MitsonarError: if the echogram is not that of a side-scan sonar.
     """
     sounder = echogram.sounder
     if sounder.kind != "sidescan":
@@ -102,7 +102,7 @@ def write_xtf(path: str | Path, echogram: Echogram) -> None:
 
 
 def _file_header(echogram: Echogram, name: str) -> bytes:
-    """Return the header of the file with what it says of its channels."""
+    """Return the file header, including the descriptions of its channels."""
     sounder, fan = echogram.sounder, echogram.sounder.fan
     header = np.zeros((), FILE)
     header["format"], header["system"], header["program"], header["version"] = 0x7B, 1, b"mitsonar", b"1"
@@ -145,7 +145,7 @@ def _ping_headers(echogram: Echogram) -> Header:
 
 
 def _channel_headers(echogram: Echogram) -> Header:
-    """Return what stands before the samples of port and starboard ``(2,)``."""
+    """Return the headers ahead of the samples of port and starboard ``(2,)``."""
     fan = echogram.sounder.fan
     header = np.zeros(2, PING_CHANNEL)
     header["channel"] = [0, 1]
