@@ -1,4 +1,4 @@
-"""The benchmark: all estimators on the same pairs, also with wrong inputs, and the Cramer-Rao lower bound."""
+"""How estimators are compared: errors on the same pairs, also with wrong inputs, and the Cramer-Rao lower bound."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 Samples = SonarPairs | ImpulseSamples
-"""The samples of a data set that estimators are compared on."""
+"""The samples of a data set on which estimators are compared."""
 
 VARIATIONS: dict[str, str] = {
     "as told": "height, pitch, roll and sound speed are right",
@@ -82,7 +82,7 @@ VARIATIONS: dict[str, str] = {
     "heave 5 mm": "the sonar rises or sinks by 5 mm between the pings (rendered again)",
     "jitter": "rays move within their cells, anew each ping (rendered again)",
 }
-"""What each variation changes: half of the pairs one way and half the other."""
+"""Description of each variation; half of the pairs change in one direction, half in the other."""
 
 HEAVE_M = 0.005
 
@@ -94,8 +94,8 @@ class Answers:
     Attributes:
         motion: sideways, forward [m], yaw [rad] ``(n, 3)``.
         valid: whether the estimate is valid ``(n,)``.
-        covariance: ``(n, 3, 3)`` [m, m, rad], nan where there is none.
-        ms: processor time of each estimate, all threads ``(n,)`` [ms]; nan before it is made.
+        covariance: ``(n, 3, 3)`` [m, m, rad]; nan where there is none.
+        ms: processor time of each estimate, all threads ``(n,)`` [ms]; nan if the pair has not been estimated.
     """
 
     motion: Array
@@ -105,13 +105,13 @@ class Answers:
 
     @classmethod
     def unasked(cls, count: int) -> Answers:
-        """Return room for ``count`` estimates, none of which is made yet."""
+        """Return an empty table for ``count`` estimates."""
         nan = np.full((count, 3, 3), np.nan)
         return cls(np.zeros((count, 3)), np.zeros(count, dtype=bool), nan, np.full(count, np.nan))
 
     @property
     def asked(self) -> NDArray[np.bool_]:
-        """Return which estimates are made ``(n,)``."""
+        """Return which pairs have been estimated ``(n,)``."""
         return np.isfinite(self.ms)
 
     def ask(self, index: int, estimator: AnyEstimator, frames: Record) -> None:
@@ -124,17 +124,17 @@ class Answers:
             self.covariance[index] = estimate.covariance
 
     def arrays(self, prefix: str) -> dict[str, NDArray[np.generic]]:
-        """Return all arrays by name, to be stored."""
+        """Return all arrays by name, for storage."""
         return {f"{prefix}/{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
     def from_arrays(cls, table: Mapping[str, NDArray[np.generic]], prefix: str) -> Answers:
-        """Restore what :meth:`arrays` returned."""
+        """Restore the estimates from the arrays of :meth:`arrays`."""
         return cls(*(np.array(table[f"{prefix}/{field.name}"]) for field in fields(cls)))
 
 
 def chosen(count: int, pairs: int | None, seed: int) -> list[int]:
-    """Return numbers of samples: all, or some at random, in order."""
+    """Return sample numbers in increasing order: all, or a random choice of ``pairs``."""
     if pairs is None or pairs >= count:
         return list(range(count))
     return sorted(np.random.default_rng([seed, 11]).choice(count, pairs, replace=False).tolist())
@@ -204,14 +204,14 @@ def answers_of(
     """Estimate the same pairs with all estimators, one pair after another.
 
     Args:
-        estimators: by name.
-        pairs: of a store.
-        numbers: of the samples.
-        variation: of :data:`VARIATIONS`.
+        estimators: estimators by name.
+        pairs: samples of a store.
+        numbers: numbers of the samples to estimate.
+        variation: one of :data:`VARIATIONS`.
         known: estimates of an interrupted run; only the missing ones are made.
-        keep: called every so many pairs, and at the end, with all estimates.
-        keep_every: how many.
-        progress: called with how many pairs are done since the last call.
+        keep: called with all estimates after every ``keep_every`` pairs and at the end.
+        keep_every: number of pairs between calls of ``keep``.
+        progress: called with the number of pairs finished since the last call.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -253,7 +253,7 @@ def with_prior(answers: Answers, largest: Array) -> Answers:
     """Combine estimates with the prior that networks learn: motions uniform in a box, here a Gaussian of equal variance.
 
     Args:
-        answers: with covariances.
+        answers: estimates with covariances.
         largest: half the edges of the box ``(3,)`` [m, m, rad].
     """
     prior = np.diag(largest**2 / 3)
@@ -296,14 +296,14 @@ class BenchmarkRow:
     """One method in a table.
 
     Attributes:
-        method: its name.
-        inputs: that it needs.
+        method: name of the method.
+        inputs: inputs that it needs.
         errors: see :class:`mitsonar.motion.errors.MotionErrors`.
         ms: median processor time of the valid pairs, all threads [ms].
-        over_limit: RMSE over the bound ``(3,)``; nan where there is none.
-        over_reference: RMSE less that of the reference method ``(3,)`` [mm, mm, deg].
+        over_limit: RMSE divided by the bound ``(3,)``; nan where there is none.
+        over_reference: RMSE minus that of the reference method ``(3,)`` [mm, mm, deg].
         over_reference_low: lower end of its paired 95 % interval.
-        over_reference_high: upper end of the same.
+        over_reference_high: upper end of its paired 95 % interval.
     """
 
     method: str
@@ -316,7 +316,7 @@ class BenchmarkRow:
     over_reference_high: Array
 
     def plain(self) -> PlainTable:
-        """Return numbers and texts only, for JSON: nan becomes None."""
+        """Return the row as a JSON object of numbers and strings: nan becomes None."""
 
         def value(one: object) -> object:
             if isinstance(one, np.ndarray):
@@ -338,16 +338,16 @@ def rows_of(
     limit: Array | None = None,
     reference: str | None = None,
 ) -> list[BenchmarkRow]:
-    """Return a row for each method, all on the same pairs: errors of motion, invalid estimates count as zero motion.
+    """Return the errors of each method on the same pairs; invalid estimates count as zero motion.
 
     Args:
-        answers: by method.
-        inputs: by method.
+        answers: estimates by method.
+        inputs: required inputs by method.
         truth: motions ``(n, 3)`` [m, m, rad].
-        resamples: of :func:`mitsonar.motion.errors.cluster_resamples`; the same for all, so that
-            differences are paired.
-        limit: standard deviations ``(3,)`` [m, m, rad].
-        reference: the method that others are compared with; default: the last.
+        resamples: from :func:`mitsonar.motion.errors.cluster_resamples`; the same for all methods, so that differences are
+            paired.
+        limit: standard deviations of the bound ``(3,)`` [m, m, rad].
+        reference: the method with which others are compared; default: the last.
     """
     bound = np.full(3, np.nan) if limit is None else in_units(limit)
     reference = reference or list(answers)[-1]
@@ -359,6 +359,7 @@ def rows_of(
     rows = []
     for name, one in answers.items():
         errors = motion_errors(one.motion, truth, one.valid, one.covariance, resamples)
+        # the same resamples for both methods give a paired interval of their difference
         drawn = [np.sqrt(table[resamples].mean(axis=1)) for table in (squares(one), against)]
         low, high = np.percentile(drawn[0] - drawn[1], [2.5, 97.5], axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -369,30 +370,30 @@ def rows_of(
     return rows
 
 
-# ---------------- Tables of a comparison or an evaluation as Markdown
+# ---------------- Tables
 
 
 FEWEST_SCENES = 10
-"""Fewest scenes for clustered intervals; with fewer they are much too narrow."""
+"""Smallest number of scenes for clustered intervals; with fewer they are much too narrow."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What a comparison of estimators found. Printed, it is its tables as Markdown, which a notebook shows as tables.
+    """The result of a comparison of estimators. Its string is its tables as Markdown, which a notebook renders.
 
     Attributes:
-        report: the content of ``table.json``: the settings; ``notes``, sentences that the reader needs; ``tables``, one a
-            level of noise and variation; their ``rows`` are :class:`~mitsonar.estimation.compare.BenchmarkRow` as JSON.
+        report: the content of ``table.json``: the settings; ``notes``, sentences for the reader; ``tables``, one per level
+            of noise and variation, whose ``rows`` are :class:`~mitsonar.estimation.compare.BenchmarkRow` as JSON.
     """
 
     report: PlainTable
 
     @property
     def rows(self) -> list[PlainTable]:
-        """Return a row for each method, level of noise and variation: ``noise``, ``variation``, and numbers and texts.
+        """Return a row for each method, level of noise and variation: ``noise``, ``variation``, and numbers and strings.
 
-        What has three numbers, sideways and forward [mm] and yaw [deg], is three entries: ``rmse_sideways_mm`` ... None
-        where a number is not known.
+        Values with three components, sideways and forward [mm] and yaw [deg], become three entries: ``rmse_sideways_mm`` ...
+        Unknown numbers are None.
         """
         return [
             {"noise": table["noise"], "variation": table["variation"], **_flat(row)}
@@ -402,16 +403,16 @@ class Comparison:
 
     @property
     def notes(self) -> list[str]:
-        """Return sentences that the reader needs."""
+        """Return the notes, sentences for the reader."""
         return list(self.report["notes"])
 
     def columns(self) -> dict[str, list[object]]:
-        """Return the columns of :attr:`rows` by name, as ``pandas.DataFrame`` takes them."""
+        """Return the columns of :attr:`rows` by name, as ``pandas.DataFrame`` accepts them."""
         rows = self.rows
         return {name: [row[name] for row in rows] for name in rows[0]}
 
     def to_markdown(self) -> str:
-        """Return the tables as ``mitsonar compare`` prints them."""
+        """Return the tables as printed by ``mitsonar compare``."""
         report = self.report
         head = (
             f"{report['data']}: {counted(report['pairs'], 'pair')} of {counted(report['scenes'], 'scene')}, "
@@ -420,7 +421,7 @@ class Comparison:
         return "\n".join([head, *(line for table in report["tables"] for line in table_lines(table))])
 
     def to_csv(self, path: str | Path | None = None) -> str:
-        """Return :attr:`rows` as CSV, and write it to a file if one is given."""
+        """Return :attr:`rows` as CSV; also write it to ``path`` if given."""
         text, rows = io.StringIO(), self.rows
         writer = csv.DictWriter(text, rows[0], lineterminator="\n")
         writer.writeheader()
@@ -437,7 +438,7 @@ class Comparison:
 
 
 def _flat(row: PlainTable) -> PlainTable:
-    """Return a row with an entry for each number."""
+    """Return a row with a separate entry for each number."""
     flat: PlainTable = {}
     for name, value in row.items():
         if isinstance(value, list):
@@ -449,7 +450,7 @@ def _flat(row: PlainTable) -> PlainTable:
 
 
 UNITLESS = ("slope", "skill", "over_limit")
-"""Entries of a row that have no unit."""
+"""Entries of a row without a unit."""
 
 
 def table_lines(table: PlainTable) -> list[str]:
@@ -471,7 +472,7 @@ def table_lines(table: PlainTable) -> list[str]:
 
 
 Cells = Mapping[str, Callable[[PlainTable], str]]
-"""The text of a column, of a row."""
+"""Functions that format the cells of a row, by column."""
 
 
 def markdown(rows: list[PlainTable], columns: Sequence[str], texts: Cells | None = None) -> list[str]:
@@ -519,7 +520,7 @@ CELLS: Cells = {
     "ms": lambda row: f"{row['ms']:.1f}",
     "inputs": lambda row: str(row["inputs"]),
 }
-"""Those of a comparison or an evaluation."""
+"""Columns of a comparison or an evaluation."""
 
 COLUMNS = (
     *("method", "RMSE", "95 % interval", "median", "95 %", "slope", "large", "fail", "skill", "/ limit (rays)", "nees"),
@@ -527,18 +528,18 @@ COLUMNS = (
 )
 
 
-# ---------------- A comparison: many estimators on the same pairs of a data set, with their errors side by side
+# ---------------- The comparison
 
 Begin = Callable[[str, int], AbstractContextManager[Callable[[int], object]]]
-"""Called with what begins and how many pairs it has; while it is open, its value is called with how many more are done."""
+"""Context manager of a stage, given its name and number of pairs; yields a function that reports newly finished pairs."""
 
 
 Estimators: TypeAlias = str | Sequence[EstimatorLike] | Mapping[str, EstimatorLike] | None
-"""Estimators of a comparison: a text with commas, a list, or by the names of their rows."""
+"""Estimators of a comparison: a comma-separated string, a list, or a mapping from row names."""
 
 
 class _Asked(NamedTuple):
-    """What is compared, beside data and estimators; see :func:`compare`."""
+    """Settings of a comparison, besides data and estimators; see :func:`compare`."""
 
     noise: str
     part: str | None
@@ -557,13 +558,13 @@ class Bench:
     """The estimators, and the pairs that all of them estimate.
 
     Attributes:
-        methods: by name.
-        levels: noise models by name; None where the name is a ratio of signal to noise.
-        samples: by level of noise, the same pairs in each.
-        numbers: of the samples that are estimated.
+        methods: estimators by name.
+        levels: noise models by name; None where the name is a signal-to-noise ratio.
+        samples: samples by level of noise, the same pairs in each.
+        numbers: numbers of the samples to estimate.
         truth: motions of the sonar ``(n, 3)`` [m, m, rad].
-        scenes: number of each pair's scene ``(n,)``.
-        learnt: by network, the number of pairs that its training has seen.
+        scenes: scene number of each pair ``(n,)``.
+        learnt: number of pairs that a network has seen in training, by network.
     """
 
     methods: dict[str, AnyEstimator]
@@ -601,19 +602,19 @@ def compare(
 
     Args:
         data: path or URL of a data set.
-        estimators: what :func:`~mitsonar.estimation.named.create_estimator` takes: one text with commas between
-            them, a list, or a dictionary by the names of the rows; default: all that need no training.
-        noise: levels, commas between them, or ``;``.
-        part: of the data set; default: the one that training does not use.
-        split: ``sequence``, ``scene`` or ``sample``; default: that with which networks among the estimators were trained on
-            this data set, else the data set's own.
-        pairs: at most so many; default: all.
+        estimators: what :func:`~mitsonar.estimation.named.create_estimator` accepts: one comma-separated string, a list,
+            or a dictionary from row names; default: all that need no training.
+        noise: levels of noise, separated by commas, or by ``;``.
+        part: part of the data set; default: the one that training does not use.
+        split: ``sequence``, ``scene`` or ``sample``; default: the split with which networks among the estimators were
+            trained on this data set, else that of the data set.
+        pairs: largest number of pairs; default: all.
         perturb: add rows in which estimators get wrong inputs.
         jitter: add a row with jittered rays.
-        prior: add rows with the prior of the size of motions.
-        limit: pairs over which the Cramer-Rao lower bound is computed; 0: none.
-        reference: the method that others are compared with; default: the last.
-        seed: of noise, choice of pairs and bootstrap.
+        prior: add rows that use the prior of the size of motions.
+        limit: number of pairs over which the Cramer-Rao lower bound is computed; 0: no bound.
+        reference: the method with which others are compared; default: the last.
+        seed: seed of noise, choice of pairs and bootstrap.
         out: folder for estimates, ``table.md`` and ``table.json``; an interrupted comparison in it resumes.
         begin: called with each stage, for progress.
 
@@ -662,14 +663,14 @@ def compare(
     return Comparison(report)
 
 
-# ---------------------------------------------------------------- what is asked
+# ---------------- Samples, methods and settings
 
 
 def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
     """Open the samples and create the estimators.
 
     Raises:
-        MitsonarError: unknown names, options that are not for these data, too few pairs.
+        MitsonarError: unknown names, options that do not apply to these data, or too few pairs.
     """
     recipe = DataStore.open(data).recipe
     modality = modality_of(recipe)
@@ -698,7 +699,7 @@ def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
     if asked.jitter and first.recipe.instrument.jittered:
         raise MitsonarError(f"the rays of this data set move already: {jitter} is for Almanza-Medina's model")
     numbers = chosen(len(first), asked.pairs, asked.seed)
-    # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
+    # motion of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
     pose = first.chosen.pose
     truth = np.array([motions(pose[first.frame_numbers(number)][[0, -1]])[0] for number in numbers])
     learnt = {
@@ -709,10 +710,10 @@ def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
 
 
 def _split(asked: str | None, methods: Mapping[str, AnyEstimator], recipe: Recipe) -> Split:
-    """Return the split that is asked for, or that of the networks which were trained on this data set, or the data set's.
+    """Return the requested split, else that of the networks trained on this data set, else that of the data set.
 
     Raises:
-        MitsonarError: an unknown split, or networks of different ones.
+        MitsonarError: an unknown split, or networks trained on different ones.
     """
     if asked is not None:
         return split_for(asked, recipe)
@@ -728,12 +729,12 @@ def _split(asked: str | None, methods: Mapping[str, AnyEstimator], recipe: Recip
 
 
 def _checkpoints(methods: Mapping[str, AnyEstimator]) -> dict[str, tuple[Checkpoint, ...]]:
-    """Return the checkpoints of those estimators that have some."""
+    """Return the checkpoints of the estimators that have any."""
     return {name: getattr(one, "checkpoints") for name, one in methods.items() if hasattr(one, "checkpoints")}  # noqa: B009
 
 
 def _methods(estimators: str | Sequence[EstimatorLike] | Mapping[str, EstimatorLike]) -> dict[str, AnyEstimator]:
-    """Create the estimators by the names of their rows: texts as they are, others by their classes."""
+    """Create the estimators by row name: strings name themselves, other estimators are named by their classes."""
     if isinstance(estimators, Mapping):
         return {name: create_estimator(one) for name, one in estimators.items()}
     if isinstance(estimators, str):
@@ -748,7 +749,7 @@ def _methods(estimators: str | Sequence[EstimatorLike] | Mapping[str, EstimatorL
 
 
 def _name_of(estimator: EstimatorLike) -> str:
-    """Return the name of a row: a text as it is, the class of anything else, be it wrapped or not."""
+    """Return the row name of an estimator: a string as it is, the class of anything else, wrapped or not."""
     if isinstance(estimator, OwnEstimator):
         return estimator.path
     if isinstance(estimator, str | os.PathLike):
@@ -757,7 +758,7 @@ def _name_of(estimator: EstimatorLike) -> str:
 
 
 def _settings(bench: Bench, asked: _Asked) -> PlainTable:
-    """Return what decides the estimates; levels of noise may be added later."""
+    """Return the settings that determine the estimates; levels of noise may be added later."""
     chosen_of, recipe = bench.first.chosen, bench.first.recipe
     recipe_text = json.dumps(recipe.model_dump(), default=str)
     networks = {name: method.digest for name, method in bench.methods.items() if method.digest}
@@ -778,15 +779,15 @@ def _variations(asked: _Asked) -> list[str]:
 
 
 def _key(level: str, model: NoiseModel | None) -> str:
-    """Name a level of noise by its content: a file of the same name may change. A ratio needs no more."""
+    """Return a name for a level of noise that includes its content, since a file may change; a ratio needs none."""
     return level if model is None else f"{level} {digest(model.model_dump_json())[:8]}"
 
 
-# ---------------------------------------------------------------- what is found
+# ---------------- Bounds and tables of errors
 
 
 def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Begin) -> dict[str, Array]:
-    """Return the bound by model of the noise, over some pairs; empty if not asked for, for responses and recorded frames."""
+    """Return the bound by law over some pairs; empty if not requested, and for responses and recorded frames."""
     model, samples = bench.levels[level], bench.samples[level]
     if not limit or model is None or isinstance(samples, ImpulseSamples) or samples.recipe.recorded is not None:
         return {}
@@ -802,7 +803,7 @@ def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Beg
 def _table(
     bench: Bench, asked: _Asked, level: str, variation: str, answers: dict[str, Answers], bounds: dict[str, Array]
 ) -> PlainTable:
-    """Return the errors of all methods, as JSON can hold them."""
+    """Return the errors of all methods as a JSON object."""
     found = dict(answers)
     if asked.prior:
         flight = bench.first.recipe.flight
@@ -833,7 +834,7 @@ def _finite(values: Array) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
-# ---------------- Estimates of a comparison on disk, written as they come, so that an interrupted comparison resumes
+# ---------------- Estimates on disk
 
 
 COMPARISON = RunKind(
@@ -847,17 +848,17 @@ COMPARISON = RunKind(
 
 
 class AnswerFolder:
-    """The store of a comparison without a folder: it keeps nothing."""
+    """The store of a comparison without a folder: it stores nothing."""
 
     def load(self, level: str, variation: str, methods: Mapping[str, AnyEstimator], count: int) -> dict[str, Answers] | None:
-        """Return the estimates of an earlier run of ``count`` pairs; None where there are none."""
+        """Return the estimates of an earlier run of ``count`` pairs; None if there are none."""
         return None
 
     def keep(self, level: str, variation: str, answers: dict[str, Answers]) -> None:
         """Store all estimates made so far."""
 
     def load_bounds(self, level: str, count: int) -> dict[str, Array] | None:
-        """Return the bounds of an earlier run; None where there are none."""
+        """Return the bounds of an earlier run; None if there are none."""
         return None
 
     def keep_bounds(self, level: str, count: int, bounds: dict[str, Array]) -> None:
@@ -868,7 +869,7 @@ class AnswerFolder:
 
 
 class AnswersOnDisk(AnswerFolder):
-    """A folder of estimates.
+    """A folder of estimates, written as they are made, so that an interrupted comparison resumes.
 
     Args:
         run: the folder.
@@ -881,7 +882,7 @@ class AnswersOnDisk(AnswerFolder):
         return self.run.path / (re.sub(r"[^\w.-]+", "-", name.replace("%", "percent")) + ending)
 
     def load(self, level: str, variation: str, methods: Mapping[str, AnyEstimator], count: int) -> dict[str, Answers] | None:
-        """Return the estimates of an earlier run of ``count`` pairs; None where there are none.
+        """Return the estimates of an earlier run of ``count`` pairs; None if there are none.
 
         Raises:
             MitsonarError: the file is damaged.
@@ -895,7 +896,7 @@ class AnswersOnDisk(AnswerFolder):
             if any(len(values) != count for one in found.values() for values in vars(one).values()):
                 raise ValueError("it holds other numbers of pairs")
             return found
-        except Exception as error:  # a damaged zip may raise anything
+        except Exception as error:  # a damaged zip may raise any exception
             raise MitsonarError(f"{path} is damaged ({error}): remove it, it is made again") from None
 
     def keep(self, level: str, variation: str, answers: dict[str, Answers]) -> None:
@@ -908,7 +909,7 @@ class AnswersOnDisk(AnswerFolder):
         write_whole(self._path(f"answers {level} {variation}", ".npz"), buffer.getvalue())
 
     def load_bounds(self, level: str, count: int) -> dict[str, Array] | None:
-        """Return the bounds of an earlier run; None where there are none.
+        """Return the bounds of an earlier run; None if there are none.
 
         Raises:
             MitsonarError: the file is damaged.
@@ -938,7 +939,7 @@ class AnswersOnDisk(AnswerFolder):
 
 
 def kept_answers(out: str | Path | None, settings: PlainTable) -> AnswerFolder:
-    """Open the store of a comparison: a folder, new or to be resumed, or none.
+    """Open the store of a comparison: a folder, new or resumed, or none.
 
     Raises:
         MitsonarError: the folder holds something else, or another comparison.

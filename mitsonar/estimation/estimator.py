@@ -1,4 +1,7 @@
-"""The estimator protocol: consecutive records in; motion, covariance and validity out."""
+"""What an estimator takes and returns, and when its estimate is rejected.
+
+An estimator takes consecutive records and returns the motion, its covariance and whether it is valid.
+"""
 
 from __future__ import annotations
 
@@ -44,62 +47,63 @@ __all__ = [
 
 
 INPUTS = "pitch; height where no first echoes show"
-"""Inputs of methods that know the geometry, beside the images; see :mod:`mitsonar.geometry.ground`."""
+"""Inputs of methods that use the geometry, besides the images; see :mod:`mitsonar.geometry.ground`."""
 
 FEWEST_CELLS = 8
-"""Fewest bins and beams of an image that can be registered."""
+"""Smallest number of bins and of beams of an image that can be registered."""
 
 LEAST_CORRELATION = 8.0
-"""Least correlation of registered frames, in standard deviations for independent noise in as many cells."""
+"""Smallest valid correlation of registered frames, in standard deviations for independent noise in as many cells."""
 
 LEAST_AT_BEST = 0.3
-"""Least correlation of registered frames: a maximum among noise reaches 0.1 to 0.2."""
+"""Smallest valid correlation of registered frames: a maximum among noise reaches 0.1 to 0.2."""
 
 LEAST_EXCESS = 5.0
-"""Least excess, in the same standard deviations, of frames that correlate by less: noise hides what they have in common.
+"""Smallest excess of frames that correlate by less, in the same standard deviations: noise hides their common content.
 
-Frames of two places of a hull reach 4.1 in high noise, 120 pairs.
+Frames of two different places of a hull reach 4.1 in high noise (120 pairs).
 """
 
 LEAST_OVER_SCATTER = 4.0
-"""Least excess over noise and the scatter of displaced frames together.
+"""Smallest ratio of the excess to noise and the scatter of displaced frames combined.
 
-A few large rocks scatter more than noise does: frames of two places of a rocky field reach 6.3 in noise alone, 3.9 here.
+A few large rocks scatter more than noise does: frames of two different places of a rocky field reach 6.3 relative to
+noise alone, and 3.9 here.
 """
 
 AMBIGUOUS = 12.0
 """Excess, in the same standard deviations, at which noise doubles the covariance; see :func:`ambiguity`."""
 
 FEWEST_BLOCKS = 8.0
-"""Fewest blocks of a frame that share the matched energy: a single object is too little, its height is not known."""
+"""Smallest number of blocks that share the matched energy: one object is not enough, since its height is unknown."""
 
 
 LARGEST_REUSED = 2**24
-"""Bytes of the largest arrays whose memory is kept."""
+"""Size of the largest arrays whose memory is reused [bytes]."""
 
 Options = dict[str, Any]
-"""Options of an estimator by name."""
+"""Options of an estimator, by name."""
 
 PlainTable = dict[str, Any]
-"""What JSON holds, by key: texts, numbers, lists, tables and None."""
+"""A JSON object: strings, numbers, lists, nested objects and None, by key."""
 
 Real = NDArray[np.integer | np.floating]
 """An array of real numbers."""
 
 Record = SonarFrames | ViewFrames | ImpulseResponses
-"""What an estimator may consume."""
+"""A record that an estimator may consume."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimate of a motion between two frames.
+    """The estimated motion between two frames.
 
     Attributes:
         motion: sideways, forward [m], yaw [rad] (Almanza-Medina, eq. 3.4); zero where nothing can be estimated.
-        covariance: of the motion ``(3, 3)`` [m, m, rad], where the estimator knows it.
+        covariance: of the motion ``(3, 3)`` [m, m, rad]; None where the estimator does not know it.
         valid: False where the motion must not be used.
-        reason: of a rejection.
-        about: further results: correlation, iterations, candidates ...
+        reason: why the estimate was rejected; empty if it is valid.
+        about: further results, such as correlation, iterations and candidates.
     """
 
     motion: Motion
@@ -116,7 +120,7 @@ class Estimate:
 
     @property
     def _deviations(self) -> str:
-        """Return the standard deviations in words, where they are known."""
+        """Return the standard deviations as text; empty where they are unknown."""
         if self.covariance is None:
             return ""
         sideways, forward, yaw = np.sqrt(np.diag(self.covariance))
@@ -124,7 +128,7 @@ class Estimate:
 
 
 def rejected(reason: str) -> Estimate:
-    """Return no motion, with the reason of the rejection."""
+    """Return a rejected estimate of zero motion, with the reason."""
     return Estimate(Motion(0.0, 0.0, 0.0), None, False, reason)
 
 
@@ -132,47 +136,47 @@ Record_contra = TypeVar("Record_contra", contravariant=True)
 
 
 class Estimator(Protocol[Record_contra]):
-    """Estimates the motion from the first to the last of consecutive frames, views or impulse responses.
+    """Interface of an estimator of the motion from the first to the last of consecutive records.
 
     Attributes:
-        consumes: the class of the records: ``SonarFrames``, ``ViewFrames`` or ``ImpulseResponses``; ``object`` for any.
-        inputs: what it needs beside them: ``nothing``, ``height and pitch`` ...
-        digest: of the weights of a trained one; empty for the others.
+        consumes: class of the records: ``SonarFrames``, ``ViewFrames`` or ``ImpulseResponses``; ``object`` for any.
+        inputs: what it needs besides the records, e.g. ``nothing`` or ``height and pitch``.
+        digest: digest of the weights of a trained estimator; empty for the others.
     """
 
     @property
     def consumes(self) -> type:
-        """Return the class of the records that it reads; ``object`` for any."""
+        """Return the class of the records it consumes; ``object`` for any."""
 
     @property
     def inputs(self) -> str:
-        """Return what it needs beside the records, in words."""
+        """Return what it needs besides the records, as text."""
 
     @property
     def digest(self) -> str:
-        """Return the digest of the weights of a trained one; empty for the others."""
+        """Return the digest of the weights of a trained estimator; empty for the others."""
 
     def estimate(self, records: Record_contra, /, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion from the first to the last record.
 
         Args:
-            records: consecutive ones.
-            prior: what is expected of the motion before; an estimator that searches from no motion ignores it.
+            records: consecutive records.
+            prior: the expected motion; an estimator that always searches from zero motion ignores it.
 
         Raises:
-            MitsonarError: too few or too many records, or records without what the estimator needs.
+            MitsonarError: too few or too many records, or records that lack what the estimator needs.
         """
 
 
 AnyEstimator = Estimator[Any]
-"""An estimator, whatever records it consumes."""
+"""An estimator of any kind of record."""
 
 
 def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the two images as float32 in 0..1, as :meth:`SonarFrames.matching_values` has them.
+    """Return the two images as float32 in 0..1, as given by :meth:`SonarFrames.matching_values`.
 
     Raises:
-        MitsonarError: not two frames, too few bins or beams, axes that do not rise, values not finite.
+        MitsonarError: not two frames, too few bins or beams, axes that do not increase, values that are not finite.
     """
     if len(frames) != 2:
         raise MitsonarError(f"an estimator takes two frames: got {len(frames)}")
@@ -193,20 +197,20 @@ def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.flo
 
 
 def reuse_freed_memory() -> None:
-    """Have glibc keep freed arrays for the next ones: after one of this size was freed, it gives none back to the system.
+    """Make glibc reuse freed arrays: once an array of this size was freed, it returns no memory to the system.
 
-    Images are made and freed by the hundred a pair; fresh pages took a fifth of the time of ``direct``.
+    A pair of frames allocates and frees images by the hundred; fresh pages took a fifth of the time of ``direct``.
     """
     np.empty(LARGEST_REUSED, dtype=np.uint8)
 
 
 def blank(image: NDArray[np.float32]) -> bool:
-    """Return whether all pixels are the same."""
+    """Return whether all pixels are equal."""
     return bool(image.size == 0 or image.min() == image.max())
 
 
 def correlation_of(first: Real, second: Real) -> float:
-    """Return the correlation coefficient of two arrays of one shape; 0 where either is constant or empty."""
+    """Return the correlation coefficient of two arrays of equal shape; 0 if either is constant or empty."""
     if not first.size:
         return 0.0
     a, b = first - first.mean(), second - second.mean()
@@ -215,23 +219,26 @@ def correlation_of(first: Real, second: Real) -> float:
 
 
 class Excess(NamedTuple):
-    """By how much two frames correlate more than displaced ones, and the standard deviation of those: few rocks scatter."""
+    """How much more two frames correlate than displaced ones, and the standard deviation of the latter.
+
+    The scatter is large where the frames show only a few rocks.
+    """
 
     mean: float = 0.0
     scatter: float = 0.0
 
 
 UNMEASURED = Excess()
-"""The excess of frames of which none was measured."""
+"""Excess of frames for which none was measured."""
 
 
 def correlation_rejection(correlation: float, independent: float, excess: Excess = UNMEASURED) -> str:
-    """Return why registered frames correlate too little; empty where they correlate enough.
+    """Return why the correlation of registered frames is too low; empty if it suffices.
 
     Args:
-        correlation: of the frames as matched.
+        correlation: of the matched frames.
         independent: number of cells with independent noise.
-        excess: of :func:`correlation_excess`, where it was measured.
+        excess: result of :func:`correlation_excess`, if it was measured.
     """
     if correlation >= max(LEAST_AT_BEST, LEAST_CORRELATION / np.sqrt(independent)) or stands_out(independent, excess):
         return ""
@@ -239,26 +246,26 @@ def correlation_rejection(correlation: float, independent: float, excess: Excess
 
 
 def stands_out(independent: float, excess: Excess) -> bool:
-    """Return whether registered frames correlate by far more than displaced ones do.
+    """Return whether registered frames correlate far more than displaced ones do.
 
     Args:
         independent: number of cells with independent noise.
-        excess: of :func:`correlation_excess`.
+        excess: result of :func:`correlation_excess`.
     """
     noise = 1 / np.sqrt(independent)
     return bool(excess.mean >= max(LEAST_EXCESS * noise, LEAST_OVER_SCATTER * np.hypot(noise, excess.scatter)))
 
 
 def correlation_excess(first: Real, second: Real, inside: NDArray[np.bool_], aside: int) -> Excess:
-    """Return by how much two registered images correlate more than with one of them displaced across the beams.
+    """Return how much more two registered images correlate than with one of them displaced across the beams.
 
-    What the lighting alone correlates is alike in all beams, and counts on neither side.
+    Correlation that comes from the lighting alone is the same in all beams, so it cancels.
 
     Args:
-        first: one ``(rows, columns)``.
-        second: the other, registered to it.
+        first: image ``(rows, columns)``.
+        second: the other image, registered to the first.
         inside: which pixels count.
-        aside: the least displacement [columns]; once and twice as many are taken, to either side.
+        aside: smallest displacement [columns]; once and twice this displacement are used, to both sides.
     """
     others: list[float] = []
     for shift in (-2 * aside, -aside, aside, 2 * aside):
@@ -270,10 +277,11 @@ def correlation_excess(first: Real, second: Real, inside: NDArray[np.bool_], asi
 
 
 def ambiguity(excess: float, independent: float) -> float:
-    """Return the factor of the covariance where a match hardly stands out: noise makes curvature of its own.
+    """Return the factor by which the covariance grows where a match hardly stands out.
 
-    Without it, squared errors of ``direct`` on hulls in high noise were 5.0 times the covariance at an excess of 6 to 8
-    standard deviations, 2.6 times at 10 to 14, 1.3 times at 14 to 30 and 1.2 times beyond.
+    There, noise adds curvature that the covariance does not account for. Without this factor, squared errors of ``direct``
+    on hulls in high noise were 5.0 times the covariance at an excess of 6 to 8 standard deviations, 2.6 times at 10 to 14,
+    1.3 times at 14 to 30 and 1.2 times beyond.
 
     Args:
         excess: mean of :func:`correlation_excess`.
@@ -283,29 +291,29 @@ def ambiguity(excess: float, independent: float) -> float:
 
 
 def spread_of(shares: NDArray[np.floating]) -> float:
-    """Return the effective number of blocks, from the energy of each. A few bright ones do not hide many faint."""
+    """Return the effective number of blocks, given the energy of each; a few bright blocks do not hide many faint ones."""
     amplitude = np.sqrt(np.maximum(shares, 0))
     energy = float((amplitude**2).sum())
     return float(amplitude.sum()) ** 2 / energy if energy > 0 else 0.0
 
 
 def without_slow(image: Real, block: int) -> Real:
-    """Remove what varies slowly over blocks of this edge [pixels]: it belongs to the sonar's lighting, not to the ground."""
+    """Remove what varies slowly over blocks of this edge [pixels]: it comes from the lighting, not from the ground."""
     return np.asarray(image - cv2.blur(image, (block // 2, block // 2)))
 
 
 def matching_rejection(
     first: Real, second: Real, inside: NDArray[np.bool_], *, alike: float, block: int = 32, aside: int = 0
 ) -> str:
-    """Return why two registered images ``(rows, columns)`` do not match; empty where they do.
+    """Return why two registered images ``(rows, columns)`` do not match; empty if they do.
 
     Args:
-        first: one.
-        second: the other, registered to it.
+        first: image ``(rows, columns)``.
+        second: the other image, registered to the first.
         inside: which pixels count.
         alike: number of neighbouring pixels that count as one, since the images are smooth.
         block: edge of the blocks over which the matched energy must be spread [pixels].
-        aside: displacement with which a low correlation is compared, see :func:`correlation_excess`; 0: with none.
+        aside: displacement against which a low correlation is compared, see :func:`correlation_excess`; 0: no comparison.
     """
     count = int(inside.sum())
     if count < alike:
@@ -323,22 +331,23 @@ def matching_rejection(
     return ""
 
 
-# ---------------- Estimates are held against what was expected: a motion that a prior all but excludes is rejected
+# ---------------- Check against the prior
 
 
 LARGEST_SQUARE = 21.1
-"""Chi-square of three numbers that one right estimate in ten thousand exceeds."""
+"""Quantile 0.9999 of chi-square with three degrees of freedom: one correct estimate in ten thousand exceeds it."""
 
 
 def prior_rejection(motion: Motion, covariance: NDArray[np.float64] | None, prior: MotionPrior | None) -> str:
-    """Return why a motion contradicts its prior; empty where it does not, or where there is no prior.
+    """Return why a motion contradicts its prior; empty if it does not, or if there is no prior.
 
-    The squared distance is measured by the sum of both covariances, and compared with chi-square of three numbers at 0.9999.
+    The squared Mahalanobis distance under the sum of both covariances is compared with the 0.9999 quantile of chi-square
+    with three degrees of freedom.
 
     Args:
         motion: estimated from the frames alone.
-        covariance: of it ``(3, 3)`` [m, m, rad]; None: unknown, and not counted.
-        prior: what was expected.
+        covariance: of the motion ``(3, 3)`` [m, m, rad]; None: unknown, and taken as zero.
+        prior: the expected motion.
     """
     if prior is None:
         return ""
@@ -346,7 +355,7 @@ def prior_rejection(motion: Motion, covariance: NDArray[np.float64] | None, prio
     together = prior.covariance if covariance is None else prior.covariance + covariance
     std = np.sqrt(np.diag(together))
     std[std == 0] = 1
-    scaled = apart / std  # else a component of large variance makes the solver drop the others
+    scaled = apart / std  # otherwise the solver drops all but a component of large variance
     square = float(scaled @ np.linalg.lstsq(together / np.outer(std, std), scaled, rcond=None)[0])
     if square <= LARGEST_SQUARE:
         return ""

@@ -1,4 +1,4 @@
-"""The estimator ``cfar-gicp``: points by cell-averaging CFAR on the ground plane, registered by small_gicp."""
+"""How methods outside mitsonar become estimators: optional packages, and classes of the user."""
 
 from __future__ import annotations
 
@@ -43,24 +43,26 @@ __all__ = [
 
 
 GUARD, TRAINING = 4, 20
-"""Bins on either side of a cell that are left out, and to which the mean of its surroundings reaches beyond them."""
+"""Bins on either side of a cell that are left out, and bins beyond them over which the mean of its surroundings extends."""
 
 SMOOTH = (3, 5)
-"""Beams and bins over which levels are averaged before detection, so that a point is an echo and no grain."""
+"""Beams and bins over which levels are averaged before detection, so that a point is an echo rather than grain."""
 
 NEIGHBOURS_M, VOXEL_M = (0.3, 0.1), 0.01
-"""Largest distance of points that correspond, far then near, and edge of the cells in which points are joined [m]."""
+"""Largest distance of corresponding points, far then near, and edge of the cells in which points are merged [m]."""
 
 FEWEST = 30
-"""Fewest points of a frame that are registered."""
+"""Smallest number of points of a frame that can be registered."""
 
 
 @dataclass(frozen=True)
 class CfarGicp:
-    """Detections above the mean of their surroundings in range, as points of level ground.
+    """The estimator ``cfar-gicp``: cell-averaging CFAR detections on the ground plane, registered by small_gicp.
+
+    A detection is a cell above the mean of its surroundings in range, as a point of level ground.
 
     Args:
-        threshold: level over the mean of the surroundings at which a cell is a detection.
+        threshold: ratio of the level to the mean of the surroundings at which a cell is a detection.
 
     Raises:
         MitsonarError: small_gicp is not installed.
@@ -76,10 +78,10 @@ class CfarGicp:
         package("small_gicp")
 
     def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
-        """Estimate the motion; a prior is where the registration begins.
+        """Estimate the motion; the registration starts from the prior.
 
         Raises:
-            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+            MitsonarError: invalid frames, see :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
         """
         images = two_frames(frames)
         attitude = attitude_of(frames, "cfar-gicp", None, None)
@@ -103,6 +105,7 @@ class CfarGicp:
     def _points(self, image: NDArray[np.float32], frames: SonarFrames, attitude: Attitude) -> NDArray[np.float64]:
         """Return detections as points ``(n, 3)`` [m]: starboard, forward, 0."""
         level = cv2.blur(image, SMOOTH)
+        # mean of the training cells: the wide window without the guard cells
         wide, narrow = (2 * (GUARD + TRAINING) + 1, 2 * GUARD + 1)
         sums = [count * cv2.blur(image, (1, count)) for count in (wide, narrow)]
         around = (sums[0] - sums[1]) / (wide - narrow)
@@ -128,7 +131,7 @@ def _motion_of(to_first: NDArray[np.float64]) -> Motion:
     return Motion(float(sideways), float(forward), yaw)
 
 
-# ---------------- The estimator ``fourier-mellin``: log-polar spectra and phase correlation by the package fourier-mellin
+# ---------------- The estimator fourier-mellin
 
 
 INSTALL = "pip install --no-deps fourier-mellin (its dependency opencv-python would replace opencv-python-headless)"
@@ -136,9 +139,10 @@ INSTALL = "pip install --no-deps fourier-mellin (its dependency opencv-python wo
 
 @dataclass(frozen=True)
 class FourierMellin:
-    """Rotation, scale and translation of the frames as seen from above; the scale is dropped.
+    """The estimator ``fourier-mellin``: log-polar spectra and phase correlation by the package fourier-mellin.
 
-    The package takes squares, and is misled by borders: the pictures fall to 0 there, within a square of twice their edge.
+    It finds rotation, scale and translation of the frames as seen from above; the scale is dropped. The package takes square
+    images and is misled by borders, so the images fall to 0 at their borders, within a square of twice their edge.
 
     Raises:
         MitsonarError: fourier-mellin is not installed.
@@ -152,10 +156,10 @@ class FourierMellin:
         package("fourier_mellin", INSTALL)
 
     def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
-        """Estimate the motion; the prior is not used.
+        """Estimate the motion; the prior is ignored.
 
         Raises:
-            MitsonarError: as :func:`mitsonar.estimation.external.ground_pair` does.
+            MitsonarError: as for :func:`mitsonar.estimation.external.ground_pair`.
         """
         pair = ground_pair(frames, "fourier-mellin")
         if pair.reason:
@@ -165,13 +169,13 @@ class FourierMellin:
         found = package("fourier_mellin", INSTALL).FourierMellin(images[0]).register_image(images[1])
         middle = (len(images[0]) - 1) / 2
         warp = np.array(cv2.getRotationMatrix2D((middle, middle), found.rotation, 1.0), dtype=float)
-        warp[:, 2] += found.x, -found.y  # it counts rows upwards
+        warp[:, 2] += found.x, -found.y  # the package counts rows upwards
         warp[:, 2] += warp[:, :2] @ np.array(corner) - np.array(corner)
         return pair.estimate(warp)
 
 
 def _square(shape: tuple[int, ...]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """Return by how much a picture is padded before and after, rows then columns, and the column and row of its corner."""
+    """Return the padding of an image before and after, rows then columns, and the column and row of its corner."""
     edge = 2 * max(shape)
     before = [(edge - size) // 2 for size in shape]
     around = [(first, edge - size - first) for first, size in zip(before, shape, strict=True)]
@@ -179,34 +183,33 @@ def _square(shape: tuple[int, ...]) -> tuple[list[tuple[int, int]], tuple[int, i
 
 
 def _tapered(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a picture less its mean, that falls to 0 at its border."""
+    """Return an image minus its mean that falls to 0 at its border."""
     window = cv2.createHanningWindow(image.shape[::-1], cv2.CV_32F)
     return np.asarray((image - image.mean()) * window, dtype=np.float32)
 
 
-# ---------------- Two frames as pictures of the ground without a border, for packages that register pictures and know
-# no mask
+# ---------------- Frames as images of the ground without border
 
 
 Picture = NDArray[np.float32]
 
 PIXEL = 0.5
-"""Edge of a pixel, in distances of neighbouring beams at the middle of the window."""
+"""Edge of a pixel relative to the beam spacing at the middle of the window."""
 
 SMALLEST = 32
-"""Rows and columns that a picture must have to be registered."""
+"""Smallest number of rows and columns of an image that can be registered."""
 
 
 @dataclass(frozen=True)
 class GroundPair:
-    """Two frames seen from above, cut to a rectangle that the fan fills.
+    """Two frames seen from above, cut to a rectangle that the fan fills, for packages that cannot mask images.
 
     Attributes:
-        first: picture of the first frame ``(rows, columns)``, row 0 farthest forward; empty where nothing is left.
-        second: of the second.
-        view: the pictures are a part of it.
+        first: image of the first frame ``(rows, columns)``, row 0 farthest forward; empty where nothing is left.
+        second: image of the second frame.
+        view: the view of which the images are a part.
         corner: column and row in the view of pixel (0, 0).
-        reason: why the pair cannot be registered; empty where it can.
+        reason: why the pair cannot be registered; empty if it can.
     """
 
     first: Picture
@@ -216,13 +219,13 @@ class GroundPair:
     reason: str
 
     def motion(self, warp: NDArray[np.floating]) -> Motion:
-        """Return the motion of the warp ``(2, 3)`` that takes pixels (column, row) of the first picture to the second."""
+        """Return the motion of the warp ``(2, 3)`` that takes pixels (column, row) of the first image to the second."""
         whole = np.array(warp, dtype=float)
         whole[:, 2] += np.array(self.corner) - whole[:, :2] @ np.array(self.corner)
         return self.view.motion(whole)
 
     def estimate(self, warp: NDArray[np.floating]) -> Estimate:
-        """Return the estimate of such a warp; reject one that takes the pictures half apart."""
+        """Return the estimate of such a warp; reject one that displaces the images by half their size or more."""
         rows, columns = self.first.shape
         corners = np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]], dtype=float)
         moved = np.abs(corners @ warp[:, :2].T + warp[:, 2] - corners)
@@ -232,14 +235,14 @@ class GroundPair:
 
 
 def ground_pair(frames: SonarFrames, name: str) -> GroundPair:
-    """Draw two frames as pictures of level ground.
+    """Project two frames to images of level ground.
 
     Args:
-        frames: two of them.
-        name: of the estimator, for errors.
+        frames: two frames.
+        name: name of the estimator, for errors.
 
     Raises:
-        MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+        MitsonarError: invalid frames, see :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
     """
     images = two_frames(frames)
     attitude = attitude_of(frames, name, None, None)
@@ -253,7 +256,7 @@ def ground_pair(frames: SonarFrames, name: str) -> GroundPair:
 
 
 def _filled_rectangle(inside: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Return rows and columns of the largest rectangle about the middle column that lies inside; empty where none does."""
+    """Return rows and columns of the largest rectangle inside, centred on the middle column; empty if there is none."""
     best, area = (slice(0, 0), slice(0, 0)), 0
     middle = inside.shape[1] // 2
     for half in range(1, middle + 1):
@@ -267,14 +270,14 @@ def _filled_rectangle(inside: NDArray[np.bool_]) -> tuple[slice, slice]:
 
 
 def package(name: str, install: str = "") -> ModuleType:
-    """Import a package that mitsonar does not need.
+    """Import an optional package.
 
     Args:
-        name: of the module.
+        name: name of the module.
         install: how to install it, where no extra of mitsonar does.
 
     Raises:
-        MitsonarError: it is not installed; the sentence says what to do.
+        MitsonarError: it is not installed; the message explains how to install it.
     """
     try:
         return importlib.import_module(name)
@@ -284,12 +287,11 @@ def package(name: str, install: str = "") -> ModuleType:
         raise explain_missing(error) from None
 
 
-# ---------------- Anybody's method as an estimator: an object with ``estimate(frames)``, a class of such objects, or
-# a network of torch
+# ---------------- Estimators of the user
 
 
 AnyObject = Any
-"""An instance of somebody's class, or the class."""
+"""An instance of a user's class, or the class."""
 
 PATH = re.compile(r"([A-Za-z_][\w.]*:[A-Za-z_]\w*)((?::.*)?)", flags=re.DOTALL)
 
@@ -304,14 +306,14 @@ class HasEstimate(Protocol):
 
 @dataclass(init=False, eq=False)
 class OwnEstimator:
-    """An estimator that is an object of the user's own.
+    """An estimator that wraps an object of the user.
 
     Args:
         path: its name in messages and files: ``my_module:MyEstimator``, or that of its class.
         made: the object. ``estimate`` takes records, and a ``prior`` if it has an argument of that name. Attributes
-            ``consumes``, ``inputs`` and ``digest`` count where it has them, as in
+            ``consumes``, ``inputs`` and ``digest`` are used if present, as in
             :class:`~mitsonar.estimation.estimator.Estimator`; otherwise it consumes ``SonarFrames``.
-        again: makes the object in another process, where it need not be picklable.
+        again: recreates the object in another process, where it need not be picklable.
 
     Raises:
         MitsonarError: an object without a method ``estimate`` that takes records only, or records and a prior.
@@ -336,7 +338,7 @@ class OwnEstimator:
         self._takes_prior = _takes_prior(path, estimate)
 
     def __reduce__(self) -> tuple[Callable[..., OwnEstimator], tuple[object, ...]]:
-        """Return what another process makes it of."""
+        """Return how another process recreates the estimator."""
         if self._again is not None:
             return self._again, ()
         try:
@@ -348,7 +350,7 @@ class OwnEstimator:
             ) from error
 
     def estimate(self, records: AnyObject, /, prior: MotionPrior | None = None) -> Estimate:
-        """Estimate the motion by the object, which gets the prior where it takes one.
+        """Estimate the motion by the object, which gets the prior if it takes one.
 
         Raises:
             MitsonarError: it raises an error, or returns no :class:`~mitsonar.estimation.estimator.Estimate`.
@@ -377,16 +379,16 @@ class OwnEstimator:
 
 
 def own_estimator(made: AnyObject, options: Options, again: _FromText | None = None, name: str = "") -> OwnEstimator:
-    """Return an object of the user's own, or a network of torch, as an estimator.
+    """Return an object of the user, or a PyTorch network, as an estimator.
 
     Args:
         made: the object.
-        options: only a network takes one: see :class:`~mitsonar.estimation.learned.OwnNetwork`.
-        again: makes it in another process.
-        name: in messages; default: that of its class.
+        options: options, which only a network takes: see :class:`~mitsonar.estimation.learned.OwnNetwork`.
+        again: recreates it in another process.
+        name: its name in messages; default: that of its class.
 
     Raises:
-        MitsonarError: an object that is none of both, or options that it does not take.
+        MitsonarError: an object that is neither, or options that it does not take.
     """
     name = name or type(made).__name__
     if not hasattr(made, "estimate") and _is_network(made):
@@ -399,16 +401,16 @@ def own_estimator(made: AnyObject, options: Options, again: _FromText | None = N
 
 
 def own_class(text: str, options: Options) -> OwnEstimator | None:
-    """Return the estimator that a text names: ``my_module:MyEstimator``, with ``:key=value`` or not.
+    """Return the estimator that a string names: ``my_module:MyEstimator``, optionally with ``:key=value``.
 
-    The module lies in the current folder or is installed. Values are numbers, true, false, or texts.
+    The module lies in the current folder or is installed. Values are numbers, true, false, or strings.
 
     Returns:
-        The estimator; None where the text is not of that form.
+        The estimator; None if the string is not of that form.
 
     Raises:
-        MitsonarError: no such module or class, one without ``estimate``, one that cannot be imported or created, an option
-            that it does not take.
+        MitsonarError: no such module or class, one without ``estimate``, one that cannot be imported or created, or an
+            option that it does not take.
     """
     found = PATH.fullmatch(text)
     if found is None:
@@ -423,20 +425,20 @@ def own_class(text: str, options: Options) -> OwnEstimator | None:
 
 
 def checked_options(name: str, options: Options, made: Callable[..., object], but: int = 0) -> Options:
-    """Return the options after a check of their names.
+    """Check the names of options, and return the options.
 
     Args:
-        name: of the estimator, for the message.
-        options: by name.
-        made: what takes them.
-        but: how many of its first arguments are no options.
+        name: name of the estimator, for the message.
+        options: options by name.
+        made: the function or class that takes them.
+        but: number of its first arguments that are not options.
 
     Raises:
         MitsonarError: an option that it does not take.
     """
     try:
         parameters = list(inspect.signature(made).parameters.values())[but:]
-    except (TypeError, ValueError):  # made in C, without a signature
+    except (TypeError, ValueError):  # implemented in C, without a signature
         return options
     if any(one.kind is one.VAR_KEYWORD for one in parameters):
         return options
@@ -449,12 +451,12 @@ def checked_options(name: str, options: Options, made: Callable[..., object], bu
 
 @dataclass(frozen=True)
 class _FromText:
-    """Makes the estimator that a text names, here and in other processes.
+    """Creates the estimator that a string names, in this and in other processes.
 
     Attributes:
         path: ``my_module:MyEstimator``.
-        folder: where its module may lie.
-        options: of the class.
+        folder: folder that may contain its module.
+        options: options of the class.
     """
 
     path: str
@@ -483,10 +485,10 @@ class _FromText:
 
 
 def created(found: Callable[..., object], options: Options, name: str) -> AnyObject:
-    """Return an instance of a class of the user's own.
+    """Return an instance of a user's class.
 
     Raises:
-        MitsonarError: it cannot be created of these options.
+        MitsonarError: it cannot be created with these options.
     """
     checked_options(name, options, found)
     words = ", ".join(f"{key}={value!r}" for key, value in options.items())
@@ -502,7 +504,7 @@ def _unpickled(path: str, content: bytes) -> OwnEstimator:
 
 
 def _is_network(made: AnyObject) -> bool:
-    """Return whether it is a network of torch, which is not loaded for that: whoever has a network has loaded it."""
+    """Return whether an object is a PyTorch network, without importing torch: a network's owner has already done so."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(made, torch.nn.Module)
 
@@ -511,7 +513,7 @@ def _takes_prior(path: str, estimate: Callable[..., object]) -> bool:
     """Return whether a method ``estimate`` has an argument ``prior``.
 
     Raises:
-        MitsonarError: it needs others.
+        MitsonarError: it needs other arguments.
     """
     try:
         signature = inspect.signature(estimate)
@@ -528,7 +530,7 @@ def _takes_prior(path: str, estimate: Callable[..., object]) -> bool:
 
 
 def _value(text: str) -> bool | int | float | str:
-    """Return the value that a word of the command line stands for."""
+    """Return the value of a word of the command line: a truth value, a number or a string."""
     if text in ("true", "false"):
         return text == "true"
     for kind in (int, float):
@@ -539,12 +541,12 @@ def _value(text: str) -> bool | int | float | str:
 
 @contextmanager
 def _importable(folder: str) -> Iterator[None]:
-    """Let modules of a folder be imported."""
+    """Allow imports of modules from a folder."""
     sys.path.insert(0, folder)
     try:
         yield
     finally:
-        with suppress(ValueError):  # a module may have changed the search path itself
+        with suppress(ValueError):  # a module may have changed the search path
             sys.path.remove(folder)
 
 
@@ -552,13 +554,14 @@ def _words_of(error: Exception) -> str:
     return f"{type(error).__name__} ({error})"
 
 
-# ---------------- The estimator ``stackreg``: rigid registration of pictures by pystackreg (Thevenaz, Ruttimann and
-# Unser, 1998)
+# ---------------- The estimator stackreg
 
 
 @dataclass(frozen=True)
 class StackReg:
-    """Least squares over a pyramid of the frames as seen from above.
+    """The estimator ``stackreg``: rigid registration by pystackreg (Thevenaz, Ruttimann and Unser, 1998).
+
+    It is least squares over a pyramid of the frames as seen from above.
 
     Raises:
         MitsonarError: pystackreg is not installed.
@@ -572,10 +575,10 @@ class StackReg:
         package("pystackreg")
 
     def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
-        """Estimate the motion; the prior is not used.
+        """Estimate the motion; the prior is ignored.
 
         Raises:
-            MitsonarError: as :func:`mitsonar.estimation.external.ground_pair` does.
+            MitsonarError: as for :func:`mitsonar.estimation.external.ground_pair`.
         """
         pair = ground_pair(frames, "stackreg")
         if pair.reason:

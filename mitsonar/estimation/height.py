@@ -1,4 +1,4 @@
-"""Height estimators: one frame in, the height over the ground out. ``direct`` fits first return and fall-off of levels."""
+"""How the height over the ground is estimated from one frame, directly or by a trained network."""
 
 from __future__ import annotations
 
@@ -37,40 +37,43 @@ Above = SonarFrames | ViewFrames
 """One frame, or one ping of several views."""
 
 CANDIDATES = 400
-"""Number of heights that are tried first, at equal ratios."""
+"""Number of heights of the initial search, spaced geometrically."""
 
 PARTS = 40
-"""Number of heights between such ends into which a profile is resolved."""
+"""Number of heights into which a profile is resolved in one pass."""
 
 PASSES = (((0.75, 1.2), 0.75), ((0.75, 1.1), 0.7))
-"""Ends of these heights, as parts of the height found before, and the part of the ground's echo that comes from above the
-floor: tops and flanks of what stands on it. Noise spreads parts to all heights, so that the second pass has a lower end
-above. On rocky fields from 1 to 10 m and hulls, without noise and with much, these err least."""
+"""Passes of :class:`DirectHeight`.
+
+Each holds the ends of the heights, as fractions of the previous estimate, and the fraction of the ground's echo that comes
+from above the floor: tops and flanks of objects on it. Noise spreads fractions over all heights, so the second pass
+ends at a lower height. These values err least on rocky fields from 1 to 10 m and on hulls, without noise and in high noise.
+"""
 
 SPREAD = 0.1
 """Distance of the quantiles, to either side, that give the standard deviation."""
 
 KEPT = 16
-"""Attitudes, to a milliradian, whose profiles of level ground are kept."""
+"""Number of attitudes, to a milliradian, whose profiles of level ground are cached."""
 
 FINEST = 0.01
-"""Least standard deviation, as part of the height."""
+"""Smallest standard deviation, as a fraction of the height."""
 
 LEAST = 0.5
-"""Least correlation of a profile with the fitted ground for a valid height."""
+"""Smallest correlation of a profile with the fitted ground for a valid height."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class HeightEstimate:
-    """The estimate of a height from one frame.
+    """The estimated height from one frame.
 
     Attributes:
-        height_m: of the sonar over the ground; nan where nothing can be estimated.
+        height_m: height of the sonar over the ground; nan where nothing can be estimated.
         std_m: its standard deviation; nan where unknown.
         valid: False where the height must not be used.
-        reason: of a rejection.
+        reason: why the estimate was rejected; empty if it is valid.
     """
 
     height_m: float
@@ -80,17 +83,17 @@ class HeightEstimate:
 
 
 class HeightEstimator(Protocol):
-    """Estimates the height from one frame.
+    """Interface of an estimator of the height from one frame.
 
     Attributes:
-        inputs: what it needs beside the frame.
+        inputs: what it needs besides the frame.
     """
 
     inputs: str
 
     @property
     def views(self) -> tuple[str, ...] | None:
-        """Return the views that it reads; None: a single image."""
+        """Return the views it reads; None: a single image."""
 
     @property
     def kind(self) -> str:
@@ -100,7 +103,7 @@ class HeightEstimator(Protocol):
         """Estimate the height of one frame.
 
         Raises:
-            MitsonarError: not one frame, or one without what the estimator needs.
+            MitsonarError: not one frame, or a frame that lacks what the estimator needs.
         """
 
 
@@ -109,11 +112,11 @@ class DirectHeight:
     """Fits the height at which level ground has the range profile of the frame: first echo and fall-off of levels.
 
     Objects on the ground look like ground nearer to the sonar. The profile is therefore resolved into ground at many heights
-    (non-negative least squares, with an even background for noise), and the floor is a high quantile of them. Only the sum
+    (non-negative least squares, with a uniform background for noise), and the floor is a high quantile of them. Only the sum
     over beams is used, so that a frame and its vector give the same height.
 
     Attributes:
-        pitch_rad: of the sonar; None: that of the frames.
+        pitch_rad: pitch of the sonar; None: that of the frames.
         views: see :class:`HeightEstimator`.
     """
 
@@ -137,10 +140,12 @@ class DirectHeight:
             return HeightEstimate(np.nan, np.nan, False, reason)
         floor = self._floor_of(frame, sonar)
         edges = np.linspace(sonar.range_min, sonar.range_max, len(profile) + 1)
+        # initial search: the height whose ground correlates best with the profile
         guess = _nearest_alike(profile, floor, edges)
         if guess is None:
             return HeightEstimate(np.nan, np.nan, False, "the window shows no ground")
         height = guess
+        # resolve the profile into ground at heights around the estimate; the floor is a high quantile of them
         for around, lowest in PASSES:
             heights = height * np.geomspace(*around, PARTS)
             ground = floor.at(heights, edges).T
@@ -149,6 +154,7 @@ class DirectHeight:
                 return HeightEstimate(np.nan, np.nan, False, "the levels along range are not those of ground")
             share = np.cumsum(part) / part.sum()
             low, height, high = np.interp([lowest - SPREAD, lowest, lowest + SPREAD], share, heights)
+        # accept the height only if the sum of these grounds resembles the profile
         alike = float(np.corrcoef(ground @ part, profile)[0, 1])
         std = float(max((high - low) / 2, FINEST * height))
         if not alike >= LEAST:
@@ -176,7 +182,7 @@ def profile_of(frame: Above) -> tuple[Array, Sonar]:
     """Return the levels along range ``(bins,)``, summed over beams and views, and the sonar.
 
     Raises:
-        MitsonarError: not one frame, levels that are not linear or not finite.
+        MitsonarError: not one frame, or levels that are not linear or not finite.
     """
     if len(frame) != 1:
         raise MitsonarError(f"a height is that of one frame: got {len(frame)}")
@@ -198,15 +204,15 @@ def _finite(profile: Array) -> Array:
 
 
 def rejection_of_profile(profile: Array) -> str:
-    """Return why a profile shows nothing; empty where it shows something."""
+    """Return why a profile holds no information; empty if it does."""
     return "" if np.ptp(profile) > 0 else "nothing in the frame to tell a height from"
 
 
 def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
-    """Return how often each ray is in the sum of the views; None where all are equal.
+    """Return how often each ray counts in the sum of the views; None if all count equally.
 
     Raises:
-        MitsonarError: receivers of a bistatic sonar, whose ranges are others.
+        MitsonarError: receivers of a bistatic sonar, which measure different ranges.
     """
     if views in ((), (Whole.name,)):
         return None
@@ -221,13 +227,13 @@ def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
 
 
 def _resolved(ground: Array, profile: Array) -> Array:
-    """Return the part of a profile that is ground at each height ``(heights,)``, beside an even background."""
+    """Return the fraction of a profile that is ground at each height ``(heights,)``, besides a uniform background."""
     even = np.full((len(profile), 1), 1 / len(profile))
     return np.asarray(nnls(np.hstack([ground, even]), profile / profile.max())[0][:-1])
 
 
 def _nearest_alike(profile: Array, floor: FloorProfile, edges: Array) -> float | None:
-    """Return the height whose ground correlates best with a profile; None where no height shows ground in the window."""
+    """Return the height whose ground correlates best with a profile; None if no height shows ground in the window."""
     heights = np.geomspace(max(edges[0], edges[-1] / 1e3) / floor.farthest, edges[-1] / floor.nearest, CANDIDATES)
     ground = floor.at(heights, edges)
     ground -= ground.mean(axis=1, keepdims=True)
@@ -239,27 +245,29 @@ def _nearest_alike(profile: Array, floor: FloorProfile, edges: Array) -> float |
     return float(heights[lit][int(alike.argmax())])
 
 
-# ---------------- The range profile of level ground at any height: first return and fall-off of levels
+# ---------------- Range profile of level ground
 
 
 MANY = 256
-"""Most beams, and rays of a beam, that are used."""
+"""Largest number of beams, and of rays per beam, that are used."""
 
 FARTHEST = 40.0
-"""Largest range over height of the ground."""
+"""Largest ratio of range to height of the ground."""
 
 
 class FloorProfile:
     """The range profile of level ground of constant reflectivity, as a curve over range / height.
 
-    Levels are those of :func:`mitsonar.acoustics.levels.level`: a ray's cosine in the ``thesis`` model; cosine, solid
-    angle, spreading and gain in ``physical``.
+    It holds the first return and the fall-off of levels at any height. Levels are those of
+    :func:`mitsonar.acoustics.levels.level`: a ray's cosine in the ``thesis`` model; cosine, solid angle, spreading and gain
+    in ``physical``.
 
     Args:
         sonar: the instrument.
-        pitch_rad: of it, > 0 looks down.
-        roll_rad: of it.
-        weight: of its rays in the profile ``(rays_per_beam, beams)``, rows from the highest elevation down; None: all alike.
+        pitch_rad: pitch of the sonar, > 0 looks down.
+        roll_rad: roll of the sonar.
+        weight: weight of its rays in the profile ``(rays_per_beam, beams)``, rows from the highest elevation down; None: all
+            equal.
 
     Raises:
         MitsonarError: no ray meets the ground.
@@ -267,14 +275,17 @@ class FloorProfile:
 
     def __init__(self, sonar: Sonar, pitch_rad: float, roll_rad: float = 0.0, weight: Array | None = None) -> None:
         self.sonar, self.pitch_rad, self.roll_rad = sonar, pitch_rad, roll_rad
+        # directions of a subset of rays, and the downward component of each
         rows, beams = (np.unique(np.linspace(0, n - 1, min(n, MANY)).astype(int)) for n in (self._rows, sonar.beams))
         elevation = (0.5 - (rows + 0.5) / self._rows) * np.radians(sonar.elevation_fov_deg)
         bearing = sonar.bearing_rad[beams]
         rays = directions(sonar.bearing, bearing[None, :], elevation[:, None])
         down = -(vehicle_rotation(Pose(0, 0, 0, pitch_rad, roll_rad, 0)).apply(rays.reshape(-1, 3))[:, 2])
+        # weight of each ray: views, and in the physical model its solid angle
         part = np.ones(rays.shape[:2]) if weight is None else weight[np.ix_(rows, beams)]
         angle = elevation[:, None] if sonar.bearing == "azimuth" else bearing[None, :]
         part = part * (1.0 if sonar.model == "thesis" else np.cos(angle))
+        # rays that meet the ground, nearest first
         meets = (down > 1 / FARTHEST) & (part.ravel() > 0)
         if not meets.any():
             raise MitsonarError(f"at a pitch of {np.degrees(pitch_rad):g} deg the sonar sees no level ground")
@@ -287,45 +298,45 @@ class FloorProfile:
 
     @cached_property
     def _along(self) -> tuple[Array, Array]:
-        """Return the ranges of rays over the height, rising, and the sum of levels up to each."""
+        """Return range over height of the rays in increasing order, and the cumulative sum of their levels."""
         away = 1 / self._down
         gain = 1.0 if self.sonar.model == "thesis" else away ** (self.sonar.gain_exponent - 2)
         return away, np.cumsum(self._part * self._down * gain)
 
     @property
     def nearest(self) -> float:
-        """Return the range of the first return over the height."""
+        """Return the range of the first return divided by the height."""
         return float(self._along[0][0])
 
     @property
     def farthest(self) -> float:
-        """Return the range of the last return over the height."""
+        """Return the range of the last return divided by the height."""
         return float(self._along[0][-1])
 
     def at(self, height_m: float | Array, edges_m: Array) -> Array:
-        """Return the levels of the bins between edges ``(..., bins)`` at heights ``(...)`` [m]; their sum is 1 at most."""
+        """Return the levels of the bins between edges ``(..., bins)`` at heights ``(...)`` [m]; their sum is at most 1."""
         away, total = self._along
         ends = np.asarray(edges_m) / np.asarray(height_m, dtype=float)[..., None]
         return np.asarray(np.diff(np.interp(ends, away, total, left=0.0), axis=-1) / total[-1])
 
 
-# ---------------- The height estimator of a checkpoint: a network of one frame, or of one vector (Almanza-Medina, 4.5)
+# ---------------- Height estimator of a checkpoint
 
 
 BEYOND = 0.1
-"""Part of the interval of the heights of training by which a valid height may exceed it."""
+"""Margin beyond the heights of training within which a height is valid, as a fraction of their interval."""
 
 
 @dataclass(init=False, eq=False)
 class HeightNetwork(Trained):
-    """A trained network that estimates heights.
+    """A trained network of one frame, or of one vector, that estimates heights (Almanza-Medina, 4.5).
 
     Args:
-        checkpoint: of it; it must take one frame.
-        force: go on with another sonar than that of training.
+        checkpoint: of the network, which must take one frame.
+        force: accept a sonar other than that of training.
 
     Raises:
-        MitsonarError: a checkpoint of motions.
+        MitsonarError: a checkpoint that estimates motions.
     """
 
     instead: ClassVar[str] = "direct"
@@ -341,7 +352,7 @@ class HeightNetwork(Trained):
 
     @property
     def views(self) -> tuple[str, ...] | None:
-        """Return the names of the views that it reads; None: a single image."""
+        """Return the names of the views it reads; None: a single image."""
         views = tuple(self._checkpoint.arrangement["views"])
         return None if views == (Whole.name,) else views
 
@@ -349,7 +360,7 @@ class HeightNetwork(Trained):
         """Estimate the height; its standard deviation is that of validation.
 
         Raises:
-            MitsonarError: not one frame, other views or another sonar than those of training.
+            MitsonarError: not one frame, or views or a sonar other than those of training.
         """
         profile, _ = profile_of(frame)
         reason = rejection_of_profile(profile) or self._rejection_of_attitude(frame)
@@ -389,10 +400,10 @@ class HeightNetwork(Trained):
 
 
 def height_estimator_from(text: str) -> HeightEstimator:
-    """Create a height estimator from a text: ``direct``, a checkpoint or the folder of a training run, with options or not.
+    """Create a height estimator from ``direct``, a checkpoint or the folder of a training run, optionally with options.
 
     Raises:
-        MitsonarError: no such checkpoint, one of motions, an unknown option.
+        MitsonarError: a missing checkpoint, one that estimates motions, or an unknown option.
     """
     name, *words = text.split(":")
     if name == "direct":

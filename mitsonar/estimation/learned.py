@@ -1,4 +1,4 @@
-"""Several networks, each trained at a height of its own: the one that was trained nearest to the measured height answers."""
+"""How a trained network becomes an estimator: what it reads, which instrument it accepts, and when it is rejected."""
 
 from __future__ import annotations
 
@@ -78,18 +78,18 @@ __all__ = [
 
 @dataclass(eq=False)
 class HeightEnsemble:
-    """The network trained nearest to the height of the frames.
+    """An ensemble of networks trained at different heights; the one trained nearest to the measured height answers.
 
     Args:
         networks: two or more, all of one image or all of the same views.
 
     Attributes:
-        inputs: what it is given beside the images.
-        views: that all of them read; None: a single image.
+        inputs: what it needs besides the images.
+        views: the views that all networks read; None: a single image.
         kind: ``image`` or ``vector``.
 
     Raises:
-        MitsonarError: networks that read different things.
+        MitsonarError: networks that read different inputs.
     """
 
     networks: Sequence[AnyEstimator]
@@ -113,7 +113,7 @@ class HeightEnsemble:
 
     @property
     def consumes(self) -> type:
-        """Return the class of records that its networks read."""
+        """Return the class of the records that its networks read."""
         return ViewFrames if self.views else SonarFrames
 
     @property
@@ -122,10 +122,10 @@ class HeightEnsemble:
         return " ".join(one.digest for one in self.networks)
 
     def estimate(self, frames: SonarFrames | ViewFrames, prior: MotionPrior | None = None) -> Estimate:
-        """Estimate the motion with the chosen network.
+        """Estimate the motion with the network chosen by the height.
 
         Raises:
-            MitsonarError: frames without a height; as the network does.
+            MitsonarError: frames without a height, or the errors of the network.
         """
         known = None if frames.height_m is None else frames.height_m[np.isfinite(frames.height_m)]
         if known is None or not len(known):
@@ -137,7 +137,7 @@ class HeightEnsemble:
         return network.estimate(frames, prior)
 
     def chosen(self, height_m: float) -> ImageNetwork | ViewNetwork:
-        """Return the network whose heights of training are nearest in ratio; of several, that whose middle is nearest."""
+        """Return the network whose training heights are nearest in ratio; among several, that with the nearest middle."""
 
         def away(network: ImageNetwork | ViewNetwork) -> tuple[float, float]:
             low, high = network.heights
@@ -147,20 +147,21 @@ class HeightEnsemble:
         return min(self._members, key=away)
 
 
-# ---------------- A network of torch of the user's own as an estimator: frames become its input as they did in training
+# ---------------- Networks of the user
 
 
 class OwnNetwork:
-    """Estimates motions by any module whose output is labels of motions ``(batch, 3)``.
+    """Estimates motions with a PyTorch module whose output is labels of motions ``(batch, 3)``.
 
     Args:
-        network: takes images ``(batch, 2, bins, beams)`` float32 in 0..1, or what ``samples`` make of them. It is copied and
-            set to evaluation; what is learnt later does not count.
-        samples: on which it was trained, such as :class:`~mitsonar.datasets.samples.SonarPairs`. They say how frames
-            become its input, and decode its labels. Without them the labels are raw: sideways, forward [m], yaw [rad].
+        network: takes images ``(batch, 2, bins, beams)`` float32 in 0..1, or the inputs that ``samples`` produce. It is
+            copied and set to evaluation mode; later training has no effect.
+        samples: the samples on which it was trained, such as :class:`~mitsonar.datasets.samples.SonarPairs`. They define how
+            frames become its input, and decode its labels. Without them the labels are raw: sideways,
+            forward [m], yaw [rad].
 
     Raises:
-        MitsonarError: samples of other than two images of one view, or with the geometry of the ground.
+        MitsonarError: samples other than two images of one view, or with the geometry of the ground.
     """
 
     consumes = SonarFrames
@@ -184,14 +185,15 @@ class OwnNetwork:
             self._shape = (len(view.sonar.range_m), len(view.bearing_rad))
 
     def estimate(self, frames: SonarFrames) -> Estimate:
-        """Estimate the motion; its covariance is not known.
+        """Estimate the motion; its covariance is unknown.
 
         Raises:
-            MitsonarError: not two frames, frames of a size that the network does not take, an output that is no motion.
+            MitsonarError: not two frames, frames of a size that the network cannot take, or an output that is not a motion.
         """
         two_frames(frames)
         if self._shape is not None and frames.image.shape[1:] != self._shape:
             raise MitsonarError(f"the network was trained on images of {self._shape}: got {frames.image.shape[1:]}")
+        # prepare the frames as in training, on the device of the network
         like = next(self._network.parameters(), torch.empty(0))
         images = torch.from_numpy(np.ascontiguousarray(to_float32(frames.image)))[None].to(like.device)
         inputs: NetworkInput = images
@@ -199,6 +201,7 @@ class OwnNetwork:
             inputs = self._arrange({self._arrange.views[0]: images}, torch.arange(2, device=like.device)[None], 0)
         with torch.inference_mode(), one_thread():
             answer = answer_of(self._network, inputs)
+        # check the answer before it is decoded
         if not isinstance(answer, torch.Tensor) or answer.shape != (1, 3):
             got = f"a tensor of {tuple(answer.shape)}" if isinstance(answer, torch.Tensor) else type(answer).__name__
             raise MitsonarError(f"a network of motions must return labels (batch, 3): got {got} for a batch of one")
@@ -209,28 +212,27 @@ class OwnNetwork:
         return Estimate(Motion(*motion.tolist()))
 
 
-# ---------------- What all estimators that a checkpoint makes have in common: the network, its sonar, and rejections
-# that need no images
+# ---------------- Basis of all checkpoint estimators
 
 
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Ranges of the bins ``(bins,)`` [m] and bearings of the beams ``(beams,)`` [rad]."""
 
 NetworkInput = Tensor | tuple[Tensor | Ground, ...]
-"""What a network reads: a tensor, or a tuple of tensors and of the geometry of the ground."""
+"""Input of a network: a tensor, or a tuple of tensors and of the geometry of the ground."""
 
 BEYOND = 1.2
 """Factor by which a valid motion may exceed those of training."""
 
 HEIGHT_OFF, ANGLE_OFF_DEG = 0.1, 2.0
-"""How far height, as part of it, and pitch and roll may be from those that training has fixed."""
+"""Largest valid deviation of the height, as a fraction of it, and of pitch and roll from those fixed by training."""
 
 WINDOW_OFF = 0.02
-"""How far window and field of view may be from those of training, as part of them."""
+"""Largest relative deviation of window and field of view from those of training."""
 
 
 class TrainedInstrument(NamedTuple):
-    """The numbers of a sonar that a network knows from training."""
+    """The properties of a sonar that a network knows from training."""
 
     name: str
     bins: int
@@ -242,12 +244,12 @@ class TrainedInstrument(NamedTuple):
 
     @classmethod
     def of(cls, sonar: Sonar) -> TrainedInstrument:
-        """As the sonar says."""
+        """Return the properties of a sonar by its fields."""
         return cls.in_frames(sonar, sonar.range_m, sonar.bearing_rad)
 
     @classmethod
     def in_frames(cls, sonar: Sonar, range_m: NDArray[np.float64], bearing_rad: NDArray[np.float64]) -> TrainedInstrument:
-        """Of a sonar whose frames have these bins and beams."""
+        """Return the properties of a sonar whose frames have these bins and beams."""
         half = (range_m[-1] - range_m[0]) / max(1, len(range_m) - 1) / 2
         span = (bearing_rad[-1] - bearing_rad[0]) * len(bearing_rad) / max(1, len(bearing_rad) - 1)
         window = (float(range_m[0] - half), float(range_m[-1] + half))
@@ -255,7 +257,7 @@ class TrainedInstrument(NamedTuple):
         return cls(sonar.name, *size, window, math.degrees(span), sonar.elevation_fov_deg, sonar.bearing)
 
     def unlike(self, other: TrainedInstrument) -> str:
-        """Return the numbers in which another differs: ``beams 128, not 96; ...``; empty where none does."""
+        """Return the properties in which another sonar differs: ``beams 128, not 96; ...``; empty if none does."""
         found = []
         for what in ("bins", "beams", "bearing"):
             if getattr(self, what) != getattr(other, what):
@@ -276,36 +278,36 @@ class Trained:
     """A network with its weights.
 
     Attributes:
-        digest: of the network.
-        force: go on with another sonar than that of training.
-        inputs: what it is given beside the images.
+        digest: digest of the network.
+        force: accept a sonar other than that of training.
+        inputs: what it needs besides the images.
     """
 
     digest: str
     force: bool
     instead: ClassVar[str] = "corrnet or direct"
-    """What serves other sonars."""
+    """Alternative for other sonars, named in error messages."""
 
     @property
     def checkpoints(self) -> tuple[Checkpoint, ...]:
-        """Return the checkpoint."""
+        """Return the checkpoint as a tuple of one."""
         return (self._checkpoint,)
 
     @property
     def heights(self) -> tuple[float, float]:
-        """Lowest and highest of training [m]."""
+        """Lowest and highest height of training [m]."""
         low, high = self._checkpoint.trained_at["height_m"]
         return float(low), float(high)
 
     def _take(self, checkpoint: Checkpoint) -> None:
-        """Keep the network out of the fields: files and comparisons of options need the digest only."""
+        """Store the network outside the fields: files and comparisons of options need only the digest."""
         self.digest, self.inputs = checkpoint.digest, inputs_of(checkpoint)
         self._checkpoint, self._network = checkpoint, checkpoint.build()
         self._trained = {view: TrainedInstrument.of(sonar) for view, sonar in checkpoint.sonars.items()}
         self._last: tuple[bytes, Arrangement] | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        """For other processes: torch would share its tensors through file descriptors."""
+        """Return the state for other processes, with the checkpoint as bytes: torch would share file descriptors."""
         return {**asdict(self), "content": self._checkpoint.to_bytes()}
 
     def __setstate__(self, state: dict[str, object]) -> None:
@@ -316,14 +318,14 @@ class Trained:
 
     @property
     def kind(self) -> str:
-        """``image`` or ``vector``, that it reads."""
+        """What it reads: ``image`` or ``vector``."""
         return str(self._checkpoint.arrangement["kind"])
 
     def _input_of_views(self, frames: ViewFrames) -> NetworkInput:
         """Return the input of the network from the pings of its views, a batch of one.
 
         Raises:
-            MitsonarError: views that are not there, or of another sonar than that of training.
+            MitsonarError: missing views, or views of a sonar other than that of training.
         """
         names = self._checkpoint.arrangement["views"]
         lacking = [view for view in names if view not in frames.values]
@@ -335,14 +337,14 @@ class Trained:
         for view in names:
             self._check_instrument(view, TrainedInstrument.of(frames.sonars[view]))
         values = {view: torch.from_numpy(np.asarray(frames.values[view])[None]) for view in names}
-        if frames.kind == "vector":  # noise has been drawn before
+        if frames.kind == "vector":  # the noise is already included
             values |= {f"nonzero_{view}": torch.zeros_like(one, dtype=torch.int32) for view, one in values.items()}
         axes = {view: (frames.sonars[view].range_m, frames.bearing_rad[view]) for view in names}
         inputs: NetworkInput = self._arranged(axes)(values, torch.arange(len(frames))[None], 0)
         return inputs
 
     def _check_instrument(self, view: str, has: TrainedInstrument) -> None:
-        """Refuse another sonar than that of training, unless it is forced."""
+        """Raise an error for a sonar other than that of training, unless forced."""
         unlike = self._trained[view].unlike(has) if view in self._trained and not self.force else ""
         if unlike:
             raise MitsonarError(
@@ -351,7 +353,7 @@ class Trained:
             )
 
     def _arranged(self, axes: dict[str, Axes]) -> Arrangement:
-        """From frames of these views to the network's input; kept, since it is that of the frames before."""
+        """Return the transform from frames of these views to the network's input; the last one is cached."""
         key = b"".join(axis.tobytes() for both in axes.values() for axis in both)
         if self._last is None or self._last[0] != key:
             words = self._checkpoint.arrangement
@@ -364,10 +366,10 @@ class Trained:
             self._last = key, made
         return self._last[1]
 
-    # ---------------------------------------------------------------- rejections
+    # ---------------- Rejections
 
     def _rejection_of_geometry(self, frames: SonarFrames | ViewFrames) -> str:
-        """Whether the sonar stood as in training, as far as the frames tell; networks that are given it need not."""
+        """Return why the geometry differs from training, as far as known; networks that take the geometry accept any."""
         if self._checkpoint.arrangement["ground"]:
             return ""
         trained_at = self._checkpoint.trained_at
@@ -375,14 +377,14 @@ class Trained:
         heights = [np.nanmean(frames.height_m)] if frames.height_m is not None and np.isfinite(frames.height_m).any() else []
         if (
             heights and frames.poses is not None and np.isfinite(frames.poses[:, 2]).all()
-        ):  # over z = 0: straight below there may be a rock
+        ):  # over z = 0, since there may be a rock straight below
             heights.append(frames.poses[:, 2].mean())
         if heights and not any(low * (1 - HEIGHT_OFF) <= height <= high * (1 + HEIGHT_OFF) for height in heights):
             return f"the sonar stood at {heights[0]:.2f} m: {self._checkpoint.fixed} are fixed by training"
         return self._rejection_of_attitude(frames)
 
     def _rejection_of_attitude(self, frames: SonarFrames | ViewFrames) -> str:
-        """Whether pitch and roll were those of training, as far as the frames tell."""
+        """Return why pitch or roll differ from those of training, if the frames hold them; empty if they do not."""
         trained_at = self._checkpoint.trained_at
         if frames.poses is not None:
             for name, column in (("pitch", 3), ("roll", 4)):
@@ -392,7 +394,7 @@ class Trained:
         return ""
 
     def _rejection_of_size(self, motion: Motion, start: Motion | None = None) -> str:
-        """Whether the answer, counted from the start of the iterations, is of the size that training had."""
+        """Return why the motion, relative to the start of the iterations, exceeds those of training; empty if not."""
         coder = self._checkpoint.coder
         middle, half = (coder.low + coder.high) / 2, (coder.high - coder.low) / 2
         off = (np.array(motion) - (np.zeros(3) if start is None else np.array(start)))[: len(half)]
@@ -407,12 +409,12 @@ class Trained:
 
 
 def inputs_of(checkpoint: Checkpoint) -> str:
-    """Return what a network needs beside the images, for tables."""
+    """Return what a network needs besides the images, for tables."""
     return INPUTS if checkpoint.arrangement["ground"] else f"nothing; {checkpoint.fixed} fixed by training"
 
 
 def answer_of(network: nn.Module, inputs: NetworkInput) -> Tensor | GaussianHead:
-    """Run a network; several inputs come as a tuple.
+    """Run a network; several inputs are passed as a tuple.
 
     Raises:
         MitsonarError: inputs of a size that it cannot take.
@@ -428,7 +430,7 @@ def answer_of(network: nn.Module, inputs: NetworkInput) -> Tensor | GaussianHead
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Torch computes with one thread: a pair is too small for more, and pairs are for the processes to share."""
+    """Limit torch to one thread: a pair is too small for more, and processes share the pairs."""
     had = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -437,43 +439,46 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(had)
 
 
-# ---------------- The estimator that a checkpoint is: a trained network between two frames and a motion, with checks
-# of the result
+# ---------------- Networks of two images
 
 
 Pair = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 SMOOTH = (2.0, 0.8)
-"""Standard deviations of the filter before frames are matched [bins, beams]."""
+"""Standard deviations of the filter applied before frames are matched [bins, beams]."""
 
 
 class Comparison(NamedTuple):
-    """How frames are compared that an answer has brought together: bins of a cell, smoothing [bins, beams]."""
+    """How frames registered by an answer are compared: bins per cell, smoothing [bins, beams]."""
 
     cell: int
     smoothing: tuple[float, float]
 
     @property
     def alike(self) -> float:
-        """Return how many neighbouring cells count as one."""
+        """Return the number of neighbouring cells that count as one."""
         return 4 * math.pi * math.hypot(self.smoothing[0] / self.cell, 12**-0.5) * self.smoothing[1]
 
 
 COMPARISONS = (Comparison(4, SMOOTH), Comparison(1, (0.7, 0.5)))
-"""The second only where the first finds nothing: fine texture shows in noise that hides what is coarse."""
+"""Comparisons of registered frames, coarse then fine.
+
+The second is used only if the first finds no match: fine texture remains visible in noise that hides coarse structure.
+"""
 
 BLOCK = 16
-"""Such cells and beams of the blocks over which what is matched must be spread."""
+"""Size in cells and beams of the blocks over which the matched energy must be spread."""
 
 NOISY = 0.83
-"""Correlation of matched frames below which noise shortens the network's steps, so that it goes on from its answer.
+"""Correlation of matched frames below which noise shortens the network's steps, so that it is run again from its answer.
 
-Without noise hulls have 0.84 and more, rocky fields 0.95; in high noise they have 0.82 and less, and 0.75 to 0.91. With 0.75
-six of 200 pairs of hulls in high noise stopped short: squared errors of 8 to 44 times the covariance.
+Without noise hulls have 0.84 and more, and rocky fields 0.95. In high noise hulls have 0.82 and less, and rocky fields
+0.75 to 0.91. With a limit of 0.75, six of 200 pairs of hulls in high noise stopped short, with squared errors of 8 to 44
+times the covariance.
 """
 
 OTHER_FAN = 1.5
-"""Fans so many times wider or narrower than that of training are reported."""
+"""Ratio to the fan of training, wider or narrower, beyond which a fan is reported."""
 
 FAR_MODEL = 4.0
 """Squared errors over the network's covariance for motions far beyond training, measured on rocky fields."""
@@ -481,17 +486,18 @@ FAR_MODEL = 4.0
 
 @dataclass(init=False, eq=False)
 class ImageNetwork(Trained):
-    """A trained network.
+    """A trained network that reads two frames of one view.
 
     Args:
-        checkpoint: of it; it must take two frames of one view.
-        force: go on with another sonar than that of training.
-        height_m: over the ground, where the window shows no first echoes; only for networks that know the geometry, as
-        pitch_rad: is, and
-        relief_m: mean height over the ground of what is seen.
+        checkpoint: of the network, which must take two frames of one view.
+        force: accept a sonar other than that of training.
+        height_m: height over the ground, used where the window shows no first echoes. This and the next two are only for
+            networks that take the geometry.
+        pitch_rad: pitch of the sonar.
+        relief_m: mean height of the visible surface over the ground.
 
     Raises:
-        MitsonarError: a checkpoint that needs something else than two frames of one view, that does not fit its network, or
+        MitsonarError: a checkpoint that needs anything other than two frames of one view, that does not fit its network, or
             whose geometry is fixed by training but given here.
     """
 
@@ -501,7 +507,7 @@ class ImageNetwork(Trained):
 
     @property
     def consumes(self) -> type:
-        """Return the class of records that it reads."""
+        """Return the class of the records it reads."""
         return SonarFrames
 
     def __init__(
@@ -520,7 +526,7 @@ class ImageNetwork(Trained):
         self._take(checkpoint)
 
     def _check_input(self, checkpoint: Checkpoint) -> None:
-        """Whether the network reads what an estimator has."""
+        """Raise an error if the network needs inputs that an estimator does not have."""
         words = checkpoint.arrangement
         if words["frames"] != 2 or len(words["views"]) != 1:
             raise MitsonarError(
@@ -532,19 +538,19 @@ class ImageNetwork(Trained):
     def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion and its covariance.
 
-        A network that is given the geometry begins at a prior, and else at no motion. Where that fails, and nothing tells
-        that the motion is near, :class:`~mitsonar.estimation.image.phase.Phase` finds the start. Other networks ignore a
-        prior.
+        A network that takes the geometry starts at a prior, or else at zero motion. If that fails, and the prior does not
+        show that the motion is near, :class:`~mitsonar.estimation.image.phase.Phase` finds the start. Other networks
+        ignore a prior.
 
         Args:
-            frames: two.
+            frames: two frames.
             prior: where to start; a motion that contradicts it is rejected.
 
         Returns:
             The estimate; ``start`` of ``about`` is ``zero``, ``prior`` or ``phase``.
 
         Raises:
-            MitsonarError: not two frames, another sonar than that of training, frames without what the network needs.
+            MitsonarError: not two frames, a sonar other than that of training, or frames that lack what the network needs.
         """
         images = two_frames(frames)
         for view in self._trained:
@@ -557,19 +563,22 @@ class ImageNetwork(Trained):
         if attitude is None:
             return self._from(frames, images, {}, None)
         ground = _batch({**ground_of(frames, attitude), **light_of(frames, attitude)})
+        # 1. estimate from the prior or from zero motion; run again where noise may have shortened the steps
         found = self._from(frames, images, ground, None if prior is None else prior.motion)
         if found.covariance is not None and _correlation_of_answer(images, ground, found.motion) < NOISY:
             found = self._again(frames, images, ground, found)
         found = self._judged(frames, found, prior, "zero" if prior is None else "prior", attitude, ground)
+        # 2. accept it if it is valid and the frames correlate, or if the prior leaves no far motion
         doubtful = found.valid and _correlation_of_answer(images, ground, found.motion) < LEAST_AT_BEST
         is_near = prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))
         if is_near or (found.valid and not doubtful):
             return found
+        # 3. otherwise let phase correlation find a far start
         elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
         if not elsewhere.valid or not self._rejection_of_size(elsewhere.motion):
-            return found  # a motion nearby has been looked for
+            return found  # the first estimate has already searched near motions
         second = self._from(frames, images, ground, elsewhere.motion)
-        if self._rejection_of_size(second.motion, elsewhere.motion):  # phase errs by more than training's motions
+        if self._rejection_of_size(second.motion, elsewhere.motion):  # the error of phase exceeds the motions of training
             second = self._from(frames, images, ground, second.motion)
         second = self._judged(frames, second, prior, "phase", attitude, ground)
         if doubtful and (not second.valid or _correlation_of_answer(images, ground, second.motion) < LEAST_AT_BEST):
@@ -585,10 +594,10 @@ class ImageNetwork(Trained):
         attitude: Attitude,
         ground: Ground,
     ) -> Estimate:
-        """Return an estimate that names its start, with the covariance of motions beyond training where it is one.
+        """Return an estimate with its final covariance and the name of its start, rejected if it contradicts a prior.
 
-        Heights less certain than those of training join it, and unknown heave, pitch and roll. It is rejected where it
-        contradicts a prior.
+        The covariance grows for motions beyond training, for heights less certain than those of training, and for unknown
+        heave, pitch and roll.
         """
         covariance = found.covariance
         if covariance is not None:
@@ -609,12 +618,12 @@ class ImageNetwork(Trained):
 
     @cached_property
     def _fan_deg(self) -> float:
-        """Return the field of view in azimuth of the data that trained the network [deg]."""
+        """Return the field of view in azimuth of the training data [deg]."""
         trained = sonar_from(dict(self._checkpoint.data_recipe["sonar"]))
         return TrainedInstrument.of(trained).azimuth_fov_deg
 
     def _untrained(self, frames: SonarFrames) -> dict[str, str]:
-        """Return what an estimate must report of frames unlike those of training, of a network that takes any sonar."""
+        """Return a note on frames unlike those of training, for a network that accepts any sonar."""
         found = []
         if frames.sonar.model == "coherent" and "coherent" not in self._checkpoint.model:
             found.append("speckle")
@@ -624,13 +633,14 @@ class ImageNetwork(Trained):
         return {"untrained": f"{self._checkpoint.network} was not trained for {' or '.join(found)}"} if found else {}
 
     def _from(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Estimate:
-        """Estimate the motion from a start of the network's iterations; None: no motion."""
+        """Estimate the motion from a start of the network's iterations; None: zero motion."""
         with torch.inference_mode(), one_thread():
             targets, covariances = self._checkpoint.decode(self._answer(frames, images, ground, start))
         if not np.isfinite(targets).all():
             return rejected("the network's answer is not finite")
         if targets.shape[1] != 3:
             raise MitsonarError(f"a motion has three numbers: this {self._checkpoint.network} says {targets.shape[1]}")
+        # check the answer: a valid covariance, the geometry and motions of training, and frames that match
         if covariances is not None and not _is_covariance(covariances[0]):
             return rejected("the network's covariance is not positive: images unlike those of its training")
         motion = Motion(*targets[0].tolist())
@@ -641,9 +651,10 @@ class ImageNetwork(Trained):
         return Estimate(motion, covariance, not reason, reason)
 
     def _again(self, frames: SonarFrames, images: Pair, ground: Ground, first: Estimate) -> Estimate:
-        """Estimate once more, from an answer that noise may have held back, and back from the second frame.
+        """Estimate again, starting from an answer that noise may have shortened, and also backwards from the second frame.
 
-        The mean of both ways counts. How far the answers go and how far they lie apart is not known better.
+        The result is the mean of both directions. The change by the second run and the difference of the directions enter
+        the covariance, since nothing better is known of these errors.
         """
         found = self._from(frames, images, ground, first.motion)
         if found.covariance is None:
@@ -659,7 +670,7 @@ class ImageNetwork(Trained):
         return Estimate(motion, covariance, not reason, reason, found.about)
 
     def _both_ways(self, frames: SonarFrames, images: Pair, there: Motion) -> tuple[Motion, NDArray[np.float64]]:
-        """Return the mean of a motion and of that from the second frame to the first, and how far they lie apart."""
+        """Return the mean of a motion and the one estimated from the second frame to the first, and their difference."""
         swapped = frames.select(np.array([1, 0]))
         attitude = self._attitude_of(swapped)
         if attitude is None or attitude.reason:
@@ -672,7 +683,7 @@ class ImageNetwork(Trained):
         return Motion(*(np.array(there) + apart / 2).tolist()), apart
 
     def _attitude_of(self, frames: SonarFrames) -> Attitude | None:
-        """Height and pitch, for a network that is given them."""
+        """Return the attitude, for a network that takes the geometry; None for others."""
         if not self._checkpoint.arrangement["ground"]:
             return None
         return attitude_of(frames, self._checkpoint.network, self.height_m, self.pitch_rad, self.relief_m)
@@ -683,23 +694,24 @@ class ImageNetwork(Trained):
         inputs = self._arrangement(frames)({view: torch.from_numpy(np.stack(images)[None])}, torch.arange(2)[None], 0)
         if not ground:
             return answer_of(self._network, inputs)
-        image = cast(Tensor, inputs)  # networks that are given the ground read one image
+        image = cast(Tensor, inputs)  # networks that take the ground read one image
         if start is None:
             return answer_of(self._network, (image, ground))
         return answer_of(self._network, (image, ground, torch.tensor([start], dtype=torch.float32)))
 
     def _arrangement(self, frames: SonarFrames) -> Arrangement:
-        """From the frames to the network's input."""
+        """Return the transform from the frames to the network's input."""
         (view,) = self._checkpoint.arrangement["views"]
         return self._arranged({view: (frames.range_m, frames.bearing_rad)})
 
-    # ---------------------------------------------------------------- rejections
+    # ---------------- Rejections
 
     def _rejection_of_match(self, frames: SonarFrames, images: Pair) -> str:
-        """Whether the frames show one place at all: they must be alike once shifted, as far as training's motions go."""
+        """Return why the frames do not show the same place: they must correlate at a shift within training's motions."""
         first, second = (smooth(image, Comparison(1, SMOOTH)) for image in images)
         size = first.shape
         rows, columns = (min(reach, length // 3) for reach, length in zip(self._reach(frames), size, strict=True))
+        # compare the middle of the second frame with the first at all these shifts
         middle = second[rows : size[0] - rows, columns : size[1] - columns]
         found = cv2.matchTemplate(without_slow(first, 32), without_slow(middle, 32), cv2.TM_CCOEFF_NORMED)
         row, column = np.unravel_index(int(found.argmax()), found.shape)
@@ -708,7 +720,7 @@ class ImageNetwork(Trained):
         return matching_rejection(there, middle, inside, alike=4 * math.pi * SMOOTH[0] * SMOOTH[1])
 
     def _reach(self, frames: SonarFrames) -> tuple[int, int]:
-        """How far an echo can move between frames in bins and in beams, by the motions of training."""
+        """Return how far an echo can move between frames in bins and in beams, by the motions of training."""
         coder = self._checkpoint.coder
         sideways, forward, yaw = BEYOND * np.maximum(np.abs(coder.low), np.abs(coder.high))
         bin_m, beam_rad = (float(np.median(np.diff(axis))) for axis in (frames.range_m, frames.bearing_rad))
@@ -723,7 +735,7 @@ def _batch(table: dict[str, NDArray[np.float32]]) -> Ground:
 
 
 def _by_height(ground: Ground, motion: Motion) -> NDArray[np.float64]:
-    """Return the derivative of an estimated motion by the height, as a part of it: other motions explain the same shifts."""
+    """Return the derivative of an estimated motion by the relative height: another motion explains the same shifts."""
     lit = ground["lit"][0].numpy() >= 0 if "lit" in ground else np.ones(ground["derivative"].shape[-2:], dtype=bool)
     here, lower = (ground[name][0].numpy()[..., lit] for name in ("derivative", "by_relief"))
     change = np.tensordot(np.array(motion), lower, axes=(0, 1))
@@ -731,7 +743,7 @@ def _by_height(ground: Ground, motion: Motion) -> NDArray[np.float64]:
 
 
 def _rejection_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
-    """Whether the frames are alike once the second is drawn where the answer takes what the first shows."""
+    """Return why the frames do not match once registered by the answer; empty if they do."""
     coarse, fine = COMPARISONS
     reason = _mismatch(images, ground, motion, coarse)
     if reason and _correlation_of_answer(images, ground, motion) < LEAST_AT_BEST:
@@ -740,13 +752,13 @@ def _rejection_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
 
 
 def _mismatch(images: Pair, ground: Ground, motion: Motion, comparison: Comparison) -> str:
-    """Return why the frames that an answer has brought together do not match; empty where they do."""
+    """Return why the frames registered by an answer do not match in one comparison; empty if they do."""
     first, second, inside = _brought_together(images, ground, motion, comparison)
     return matching_rejection(first, second, inside, alike=comparison.alike, block=BLOCK, aside=BLOCK // 2)
 
 
 def _correlation_of_answer(images: Pair, ground: Ground, motion: Motion) -> float:
-    """Return the correlation of the frames that an answer has brought together."""
+    """Return the correlation of the frames registered by an answer."""
     first, second, inside = _brought_together(images, ground, motion, COMPARISONS[0])
     return correlation_of(without_slow(first, BLOCK)[inside], without_slow(second, BLOCK)[inside])
 
@@ -754,7 +766,7 @@ def _correlation_of_answer(images: Pair, ground: Ground, motion: Motion) -> floa
 def _brought_together(
     images: Pair, ground: Ground, motion: Motion, comparison: Comparison
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the first frame, the second one drawn at its cells, and which cells both show."""
+    """Return the first frame, the second one resampled at its cells, and which cells both show."""
     rows, beams = images[0].shape[0] // comparison.cell, images[0].shape[1]
     means = (image[: rows * comparison.cell].reshape(rows, comparison.cell, beams).mean(axis=1) for image in images)
     first, second = (smooth(mean, comparison) for mean in means)
@@ -764,34 +776,33 @@ def _brought_together(
 
 
 def smooth(image: NDArray[np.float32], comparison: Comparison) -> NDArray[np.float32]:
-    """With less noise."""
+    """Return an image smoothed against noise."""
     bins, beams = comparison.smoothing
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=beams, sigmaY=bins / comparison.cell), dtype=np.float32)
 
 
 def _is_covariance(matrix: NDArray[np.float64]) -> bool:
-    """Return whether a matrix ``(3, 3)`` is finite, symmetric and not negative, as a series of motions asks."""
+    """Return whether a matrix ``(3, 3)`` is finite, symmetric and not negative, as a series of motions requires."""
     if not np.isfinite(matrix).all() or np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
         return False
     least, _, largest = np.linalg.eigvalsh(matrix)
     return bool(least >= -1e-9 * largest)
 
 
-# ---------------- The estimator that a checkpoint of impulse responses is: its measured taps in, the motion over all
-# its pings out
+# ---------------- Networks of impulse responses
 
 
 UNREAD = ("name", "frame_rate_hz", "seed")
-"""Fields of a channel sonar that do not change what a network reads; and ``rays`` of the model scatterers."""
+"""Fields of a channel sonar that do not affect a network's input; ``rays`` is one too, except for the model ``rays``."""
 
 
 @dataclass(init=False, eq=False)
 class ResponseNetwork(Trained):
-    """A trained network that reads impulse responses.
+    """A trained network that reads impulse responses and returns the motion over all their pings.
 
     Args:
-        checkpoint: of it.
-        force: go on with another instrument or model than that of training.
+        checkpoint: of the network.
+        force: accept an instrument or model other than that of training.
 
     Raises:
         MitsonarError: a checkpoint that does not fit its network.
@@ -801,7 +812,7 @@ class ResponseNetwork(Trained):
 
     @property
     def consumes(self) -> type:
-        """Return the class of records that it reads."""
+        """Return the class of the records it reads."""
         return ImpulseResponses
 
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
@@ -811,14 +822,14 @@ class ResponseNetwork(Trained):
     def estimate(self, responses: ImpulseResponses, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion from the first to the last ping, with the covariance of validation.
 
-        A network that was trained without turns answers that there is none, and with no variance, as ``likelihood`` does.
+        A network trained without turns returns zero yaw with zero variance, as ``likelihood`` does.
 
         Args:
             responses: as many pings as in training.
             prior: ignored: the network answers in the range of its training.
 
         Raises:
-            MitsonarError: another number of pings, or another instrument or model than that of training.
+            MitsonarError: another number of pings, or an instrument or model other than that of training.
         """
         count = self._checkpoint.arrangement["frames"]
         if len(responses) != count:
@@ -840,7 +851,7 @@ class ResponseNetwork(Trained):
 
     @property
     def _covariance(self) -> NDArray[np.float64] | None:
-        """Return the covariance of validation [m, m, rad] ``(3, 3)``; 0 of a turn that the network does not estimate."""
+        """Return the covariance of validation [m, m, rad] ``(3, 3)``; 0 for a turn that the network does not estimate."""
         rmse = self._checkpoint.rmse
         if rmse is None:
             return None
@@ -849,7 +860,7 @@ class ResponseNetwork(Trained):
         return np.diag(variances)
 
     def _check_channel(self, has: ChannelSonar) -> None:
-        """Refuse another instrument or model of echoes than that of training, unless it is forced."""
+        """Raise an error for an instrument or model of echoes other than that of training, unless forced."""
         trained = self._checkpoint.channel
         if trained is None or self.force:
             return
@@ -865,7 +876,7 @@ class ResponseNetwork(Trained):
             )
 
     def _rejection_of_height(self, responses: ImpulseResponses) -> str:
-        """Return why the height is not that of training; empty where it is, or where the responses do not hold it."""
+        """Return why the height is not that of training; empty if it is, or if the responses do not hold it."""
         low, high = self.heights
         if responses.height_m is None or not np.isfinite(responses.height_m).all():
             return ""
@@ -875,23 +886,25 @@ class ResponseNetwork(Trained):
         return f"the transmitter stood at {height:.2f} m: {self._checkpoint.fixed} are fixed by training"
 
 
-# ---------------- The estimator that a checkpoint of several views, or of vectors, is: portions of a looking-down
-# view, say
+# ---------------- Networks of several views or vectors
 
 
 ALIKE = 0.4
-"""Least correlation of two pings' profiles without what is slow in them, the median over the views: pairs of 20 mm from 10 m
-have 0.8 to 0.97 at 512 and 1024 levels, pings of different places less than 0.4 but for the vector of a whole view."""
+"""Smallest valid correlation of two pings' profiles without their slow variation, the median over the views.
+
+Pairs 20 mm apart from 10 m have 0.8 to 0.97 at 512 and 1024 levels. Pings of different places have less than 0.4, except
+for the vector of a whole view.
+"""
 
 SLOW = 4.0
-"""Standard deviation of the filter that tells what is slow [bins]."""
+"""Standard deviation of the filter that defines the slow variation [bins]."""
 
 FEW = 256
-"""Levels below which profiles of any two places are alike, and tell nothing."""
+"""Number of levels below which profiles of any two places are similar, so that they are not compared."""
 
 
 def reads_views(checkpoint: Checkpoint) -> bool:
-    """Whether a network is given several views, a portion of one, or vectors as a data set stores them."""
+    """Return whether a network takes several views, a portion of one, or vectors as a data set stores them."""
     words = checkpoint.arrangement
     vectors = words["kind"] == "vector" and not words.get("halves", False)
     return vectors or len(words["views"]) > 1 or words["views"][0] in SEGMENTS
@@ -902,18 +915,18 @@ class ViewNetwork(Trained):
     """A trained network that reads several views or their vectors.
 
     Args:
-        checkpoint: of it; it must take two frames.
-        force: go on with another sonar than that of training.
+        checkpoint: of the network, which must take two frames.
+        force: accept a sonar other than that of training.
 
     Raises:
-        MitsonarError: a checkpoint that needs something else than two frames, or that does not fit its network.
+        MitsonarError: a checkpoint that does not take two frames, or that does not fit its network.
     """
 
     instead: ClassVar[str] = "a network of that sonar's views"
 
     @property
     def consumes(self) -> type:
-        """Return the class of records that it reads."""
+        """Return the class of the records it reads."""
         return ViewFrames
 
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
@@ -927,7 +940,7 @@ class ViewNetwork(Trained):
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Return the names of the views that it reads."""
+        """Return the names of the views it reads."""
         return tuple(self._checkpoint.arrangement["views"])
 
     def estimate(self, records: Record, prior: MotionPrior | None = None) -> Estimate:
@@ -938,7 +951,7 @@ class ViewNetwork(Trained):
             prior: ignored: the network answers in the range of its training.
 
         Raises:
-            MitsonarError: not two pings of these views, another sonar than that of training.
+            MitsonarError: not two pings of these views, or a sonar other than that of training.
         """
         frames = self._checked_views(records)
         inputs = self._input_of_views(frames)
@@ -957,7 +970,7 @@ class ViewNetwork(Trained):
         return Estimate(motion, covariance, not reason, reason)
 
     def _checked_views(self, frames: Record) -> ViewFrames:
-        """Check that there are two pings of the views that it reads."""
+        """Check that there are two pings of the views it reads, and return them."""
         views = ", ".join(self.views)
         if not isinstance(frames, ViewFrames):
             raise MitsonarError(
@@ -970,7 +983,10 @@ class ViewNetwork(Trained):
 
 
 def _rejection_of_profiles(profiles: NDArray[np.float32]) -> str:
-    """Whether two pings ``(views, 2, bins)`` show one place: what varies quickly along range must be alike."""
+    """Return why two pings ``(views, 2, bins)`` do not show the same place; empty if they do.
+
+    Their quick variation along range must correlate.
+    """
     if profiles.shape[2] < FEW:
         return ""
     quick = profiles - gaussian_filter1d(profiles, SLOW, axis=2)

@@ -1,4 +1,4 @@
-"""The estimator ``zero``: always "no motion", the row that every table needs."""
+"""How an estimator is created from a name, a checkpoint or a user's class; and the estimator ``zero``."""
 
 from __future__ import annotations
 
@@ -54,27 +54,27 @@ __all__ = [
 
 
 CHECKS: dict[type, Callable[..., object]] = {SonarFrames: two_frames, ImpulseResponses: pings_of}
-"""The checks of the other estimators: what they reject, this one rejects."""
+"""The checks of the other estimators: ``zero`` rejects what they reject."""
 
 
 class Zero:
-    """Estimates no motion, whatever the records hold."""
+    """Always estimates zero motion, the baseline of every comparison."""
 
     consumes = object
     inputs = "nothing"
     digest = ""
 
     def estimate(self, records: Record, /, prior: MotionPrior | None = None) -> Estimate:
-        """Return no motion; a prior is ignored.
+        """Return zero motion; a prior is ignored.
 
         Raises:
-            MitsonarError: records that no other estimator takes.
+            MitsonarError: records that no other estimator accepts.
         """
         CHECKS.get(type(records), len)(records)
         return Estimate(Motion(0.0, 0.0, 0.0))
 
 
-# ---------------- All estimators by name
+# ---------------- Estimators by name
 
 
 ESTIMATORS: dict[str, type[AnyEstimator]] = {
@@ -86,47 +86,48 @@ ESTIMATORS: dict[str, type[AnyEstimator]] = {
     "correlation": Correlation,
     "likelihood": Likelihood,
 }
-"""Estimators without training, of sonar frames or of impulse responses: see ``consumes``."""
+"""Estimators without training, of sonar frames or impulse responses; see ``consumes``."""
 
 EXTERNAL: dict[str, type[AnyEstimator]] = {
     "cfar-gicp": CfarGicp,
     "fourier-mellin": FourierMellin,
     "stackreg": StackReg,
 }
-"""Estimators by packages that mitsonar does not need: the extra ``bench``."""
+"""Estimators from optional packages, installed by the extra ``bench``."""
 
 UNTRAINED = ESTIMATORS | EXTERNAL
 
 EstimatorLike: TypeAlias = "str | os.PathLike[str] | HasEstimate | type[HasEstimate] | nn.Module | type[nn.Module]"
-"""What :func:`create_estimator` makes an estimator of."""
+"""What :func:`create_estimator` accepts."""
 
 NAMES = (*UNTRAINED, *SHIPPED)
 
 
 def estimators_for(record: type) -> tuple[str, ...]:
-    """Return the names of the estimators that consume a class of records, such as ``SonarFrames``; no trained ones."""
+    """Return the names of the untrained estimators that consume a class of records, such as ``SonarFrames``."""
     return tuple(name for name, made in ESTIMATORS.items() if made.consumes in (record, object))
 
 
 def create_estimator(estimator: EstimatorLike, **options: object) -> AnyEstimator:
-    """Create an estimator: of mitsonar by name, of a checkpoint, or one of your own.
+    """Create an estimator from the name of a built-in one, a checkpoint, or a class of the user.
 
     Args:
         estimator: one of
 
-            - a name, ``direct``; a checkpoint or the folder of a training run, ``out/posenet``; a class of your own,
-              ``my_module:MyEstimator``. Options may follow, ``direct:height_m=2.5:pitch_deg=30``, angles as ``..._deg``. Of
-              several checkpoints with commas between them, the one trained nearest to the height of the frames is used;
+            - a name such as ``direct``; a checkpoint or the folder of a training run such as ``out/posenet``; or a class
+              of the user as ``my_module:MyEstimator``. Options may follow, with angles as ``..._deg``:
+              ``direct:height_m=2.5:pitch_deg=30``. Of several checkpoints separated by commas, the one trained nearest to
+              the height of the frames is used;
             - a class with a method ``estimate(frames)`` or ``estimate(frames, prior=None)`` that returns an
-              :class:`~mitsonar.estimation.estimator.Estimate`, or an object of it;
+              :class:`~mitsonar.estimation.estimator.Estimate`, or an instance of it;
             - a ``torch.nn.Module`` that takes images ``(batch, 2, bins, beams)`` in 0..1 and returns sideways, forward [m]
-              and yaw [rad] ``(batch, 3)``. With the option ``samples``, the ``SonarPairs`` of its training, it takes and
-              returns what it did there.
-        options: of the estimator, by the names of its arguments, angles as ``..._rad``.
+              and yaw [rad] ``(batch, 3)``. With the option ``samples``, the ``SonarPairs`` of its training, its inputs and
+              outputs are those of the training.
+        options: options of the estimator, by argument name, with angles as ``..._rad``.
 
     Raises:
-        MitsonarError: unknown name or option, no such checkpoint or one that cannot be used, no torch for it, a class that
-            cannot be created or has no ``estimate``.
+        MitsonarError: unknown name or option, a checkpoint that is missing or cannot be used, torch not installed, a class
+            that cannot be created or has no ``estimate``.
     """
     if isinstance(estimator, str):
         return _from_text(estimator, options)
@@ -142,12 +143,12 @@ def create_estimator(estimator: EstimatorLike, **options: object) -> AnyEstimato
 
 
 def _is_ours(kind: type) -> bool:
-    """Return whether a class is one of mitsonar's own."""
+    """Return whether a class belongs to mitsonar."""
     return kind.__module__.partition(".")[0] == "mitsonar"
 
 
 def _from_text(text: str, options: Options) -> AnyEstimator:
-    """Create the estimator that a text names; see :func:`create_estimator`."""
+    """Create the estimator that a string names; see :func:`create_estimator`."""
     if "," in text and not os.path.exists(text):
         return _nearest([part.strip() for part in text.split(",") if part.strip()], options)
     name, *words = text.split(":")
@@ -166,10 +167,10 @@ def _from_text(text: str, options: Options) -> AnyEstimator:
 
 
 def _made(name: str, made: Callable[..., AnyEstimator], options: Options) -> AnyEstimator:
-    """Create an estimator from options by the names of its arguments.
+    """Create an estimator from options keyed by argument name.
 
     Raises:
-        MitsonarError: an option that it does not take, or a value that is no number where one is needed.
+        MitsonarError: an unknown option, or a value that is not a number where one is needed.
     """
     for key, value in checked_options(name, options, made).items():
         kind = str(inspect.signature(made).parameters[key].annotation)
@@ -196,15 +197,15 @@ def _nearest(texts: list[str], options: Options) -> AnyEstimator:
 
 
 def _maker(name: str) -> Callable[..., AnyEstimator]:
-    """Return the function that creates the estimator of that name from options."""
+    """Return the function that creates the estimator of this name from options."""
     return UNTRAINED[name] if name in UNTRAINED else _trained(shipped_path(name))
 
 
 def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
-    """Return the function that creates an estimator of a checkpoint from options.
+    """Return the function that creates the estimator of a checkpoint from options.
 
     Raises:
-        MitsonarError: no torch, no such checkpoint or one that cannot be used.
+        MitsonarError: torch not installed, or a checkpoint that is missing or cannot be used.
     """
     checkpoint = load_checkpoint(path)
     from mitsonar.estimation.learned import ImageNetwork, ResponseNetwork, ViewNetwork, reads_views
@@ -215,7 +216,7 @@ def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
 
 
 def names_checkpoint(name: str) -> bool:
-    """Return whether a word of the command line is a path, not a name."""
+    """Return whether a word of the command line is a path rather than a name."""
     return "/" in name or "." in name or os.path.isdir(name)
 
 
@@ -223,7 +224,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     """Load a checkpoint.
 
     Raises:
-        MitsonarError: no torch, no such checkpoint or one that cannot be used.
+        MitsonarError: torch not installed, or a checkpoint that is missing or cannot be used.
     """
     try:
         from mitsonar.networks.checkpoint import Checkpoint
@@ -257,7 +258,7 @@ def options_from(name: str, words: list[str], made: Callable[..., object]) -> Op
 
 
 def _numbers(made: Callable[..., object]) -> dict[str, tuple[str, str]]:
-    """Return the options that are numbers or yes and no: by their name on the command line, with own name and type."""
+    """Return the numeric and boolean options: argument name and type, keyed by name on the command line."""
     parameters = inspect.signature(made).parameters.values()
     kinds = {one.name: str(one.annotation) for one in parameters}
     numbers = {name: kind for name, kind in kinds.items() if ("float" in kind or kind == "bool") and "tuple" not in kind}

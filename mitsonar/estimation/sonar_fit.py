@@ -1,4 +1,4 @@
-"""What a recording tells of its sonar: noise, water, coding, stripes, crosstalk, speckle, as the simulator reads it."""
+"""How a simulated sonar is fitted to a recording: noise, water, coding, stripes, crosstalk, speckle."""
 
 from __future__ import annotations
 
@@ -39,34 +39,35 @@ GEOMETRY = (
     "gain_exponent", "gain_absorption", "absorption_db_per_m", "temperature_c", "salinity_psu", "water_depth_m", "ph",
     "source_level_db", "frame_rate_hz",
 )  # fmt: skip
-"""Fields that the recording knows better than a named sonar."""
+"""Fields that are taken from the recording rather than from a named sonar."""
 
 LEAST_SHAPE = (96, 16)
-"""Least bins and beams of a frame."""
+"""Smallest number of bins and beams of a frame."""
 
 DARKEST, WITHIN = 2.0, 2.0
-"""Percentile of the windows' means that is noise, and the factor above it up to which windows are noise too."""
+"""Percentile of the windows' means that is noise, and the factor above it up to which windows count as noise."""
 
 STILL = 0.5
-"""Correlation of frames above which the darkest parts are no noise."""
+"""Correlation between frames above which the darkest parts are not noise."""
 
 FLAT_WINDOW, FLAT_ABOVE, MOST_CLIPPED = (64, 24), 10.0, 0.005
-"""Windows of the speckle's law: bins and beams, least ratio to the noise, most of their cells at full scale."""
+"""Windows from which the speckle law is fitted: bins and beams, smallest ratio to the noise, and the largest fraction of
+their cells at full scale."""
 
 STRUCTURED = 0.5
-"""Shape of the K law below which it is the scene's structure."""
+"""Shape of the K law below which the scene's structure contributes."""
 
 NEAR_RAYLEIGH = 0.02
 """Excess of the squared contrast below which intensities are exponential: a nu of 100."""
 
 GRAIN_PART, LEAST_WINDOWS = 20.0, 8
-"""Percentile of the windows' means below which the grain tells the coding, and the fewest windows."""
+"""Percentile of the windows' means below which the grain gives the coding, and the smallest number of windows."""
 
 FULL = 0.996
 """Value from which a cell may be clipped."""
 
 FACE, SLANT = 0.5, 0.5
-"""Where levels have no scale: reflectivity of what the brightest thousandth shows, and the squared cosine of its slant."""
+"""Assumptions where levels have no scale: reflectivity of the brightest thousandth, and the squared cosine of its slant."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +75,14 @@ class SonarFit:
     """A sonar fitted to a recording.
 
     Attributes:
-        sonar: of the model coherent, with the fitted fields.
-        noise_db: noise in a cell at the middle of the window, relative to full scale [dB]; None where it was not seen.
-        full_scale_db: level that full scale stands for, before the gain, as ``noise_level_db`` takes it.
-        bright_db: 99.9th percentile of the levels behind the near glow, relative to full scale [dB].
-        speckle_span_db: span of the coding dB by which grain of 5.57 dB has the spread of these values [dB]; None in others.
-        speckle_gamma: of value = amplitude^gamma, by the coefficient of variation of the values; None in dB.
-        glow_db: of the first bins over the trend behind them [dB].
+        sonar: sonar of the model coherent, with the fitted fields.
+        noise_db: noise in a cell at the middle of the window, relative to full scale [dB]; None if it was not seen.
+        full_scale_db: level of full scale, before the gain, in the units of ``noise_level_db``.
+        bright_db: 99.9th percentile of the levels beyond the near glow, relative to full scale [dB].
+        speckle_span_db: span of the coding dB at which grain of 5.57 dB has the spread of these values [dB]; None for other
+            codings.
+        speckle_gamma: exponent of value = amplitude^gamma, from the coefficient of variation of the values; None in dB.
+        glow_db: level of the first bins over the trend beyond them [dB].
         notes: sentences on what was assumed or not found.
     """
 
@@ -94,7 +96,7 @@ class SonarFit:
     notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """Return what was found, a line each, with units."""
+        """Return the results as lines of text, one per quantity, with units."""
         sonar = self.sonar
         noise = "not seen" if self.noise_db is None else f"{self.noise_db:.1f} dB at mid range"
         grain = (
@@ -129,8 +131,8 @@ class SonarFit:
         """Return the sonar's file: the fields that differ from their defaults.
 
         Args:
-            only: fields that it holds, also those that have their defaults; None: all that differ.
-            leave: fields that it does not hold.
+            only: fields to include, even if they have their defaults; None: all that differ.
+            leave: fields to leave out.
         """
         default, dumped = Sonar(), self.sonar.model_dump()
         if only is None:
@@ -143,7 +145,7 @@ class SonarFit:
 
 
 def _written(sonar: Sonar) -> set[str]:
-    """Return the fields that a file needs: numbers of rays follow from the quality."""
+    """Return the fields that a file needs; the numbers of rays follow from the quality."""
     return set(type(sonar).model_fields) - {"rays_per_beam", "rays_across"}
 
 
@@ -151,30 +153,34 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     """Fit a sonar of the model coherent to a recording.
 
     Args:
-        frames: of a real or simulated sonar, resting or slow; linear, dB or gamma.
-        base: what the recording does not tell: carrier, beam width, patterns; default: the sonar of the frames.
-        measure_coding: take the coding from the grain, instead of the one that the frames state. It assumes one look.
-        given: fields that are known, which replace those of the base.
+        frames: of a real or simulated sonar, at rest or slow; linear, dB or gamma.
+        base: source of what the recording does not show: carrier, beam width, patterns; default: the sonar of the frames.
+        measure_coding: take the coding from the grain instead of the one that the frames state. It assumes one look.
+        given: known fields, which replace those of the base.
 
     Raises:
-        MitsonarError: frames that are too small or empty; fields that the model coherent lacks.
+        MitsonarError: frames that are too small or empty, or fields that the model coherent lacks.
     """
     _check(frames)
+    # 1. geometry and coding from the frames, everything else from the base
     told = frames.sonar
     known = {name: getattr(told, name) for name in GEOMETRY}
     coded = {"coding": frames.level, "coding_db": told.coding_db, "coding_gamma": told.coding_gamma}
     sonar = (told if base is None else base).replace(**{"model": "coherent", **known, **coded, **given})
     value = np.asarray(frames.image, dtype=float) / (255 if frames.image.dtype.kind == "u" else 1)
     notes: list[str] = []
+    # 2. the grain of dark windows gives a coding; with it, values become intensities
     span, gamma = (_span(value), None) if frames.level == "dB" else (None, _gamma(value))
     sonar = _with_coding(sonar, span, gamma, measure_coding, notes)
     intensity = decoded(value, sonar)
     level = statistics.decibels(intensity, float(statistics.decibels(intensity[intensity > 0].min())) - 3)
+    # 3. intensities before the gain give the noise, and the contrast of bright windows the speckle
     flat = intensity / gain_of(sonar)[:, None]
     noise = _noise(flat, value, level, notes)
     nu = _nu(flat, value, noise or 0.0)
     if nu is not None and nu < STRUCTURED:
         notes.append(f"a speckle_nu of {nu:g} is more than a bottom's texture: objects and edges of the scene count in it")
+    # 4. a steady rise of quiet beams beside a strong echo is crosstalk, normalised by the beam pattern
     leak = statistics.leak_power(intensity[:, statistics.GLOW_BINS :], limit=float(decoded(FULL, sonar))) / _lobe_sum(sonar)
     fitted: dict[str, Any] = {
         **{"near_glow_db": 0.0, "near_glow_edge_db": 0.0, "near_glow_spread_db": 0.0, "near_glow_still": 0.0},
@@ -185,6 +191,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     }
     told_notes: list[str] = []
     full_scale_db = _full_scale_db(frames, sonar, flat, told_notes)
+    # 5. what exceeds the noise near the sonar is glow; what is new in every frame is volume
     if noise is not None:
         fitted |= _water(flat, level, noise, sonar, full_scale_db, notes)
         notes += told_notes
@@ -217,7 +224,7 @@ def _water(flat: Array, level: Array, noise: float, sonar: Sonar, full_scale_db:
 
 
 def _check(frames: SonarFrames) -> None:
-    """Refuse frames that tell nothing."""
+    """Raise an error for frames that are too small, or that do not vary."""
     shape = frames.image.shape
     if len(frames) == 0 or shape[1] < LEAST_SHAPE[0] or shape[2] < LEAST_SHAPE[1]:
         raise MitsonarError(
@@ -228,11 +235,11 @@ def _check(frames: SonarFrames) -> None:
         raise MitsonarError("a fit needs frames that vary: all cells have one value; give frames with echoes")
 
 
-# ---------------------------------------------------------------- coding
+# ---------------- Coding
 
 
 def _mode(values: Array) -> float:
-    """Return the half-sample mode: where values lie most densely, whatever their tails."""
+    """Return the half-sample mode: where values are densest, whatever their tails."""
     values = np.sort(values)
     while len(values) > 3:
         half = (len(values) + 1) // 2
@@ -244,8 +251,8 @@ def _mode(values: Array) -> float:
 def _grain_windows(value: Array) -> tuple[Array, Array]:
     """Return windows and their detrended values ``(windows, cells)`` from which a coding is measured.
 
-    These are the darkest ones in which hardly a cell has the least or the largest value: noise has grain of one law, which
-    texture of the bottom does not change.
+    These are the darkest ones in which hardly any cell has the smallest or the largest value: noise has grain of one law,
+    which the texture of the bottom does not change.
     """
     parts, rest = (statistics.window_values(one) for one in (value, statistics.detrended(value)))
     inside = ((parts > 0) & (parts < FULL)).mean(axis=1) > 1 - MOST_CLIPPED
@@ -257,7 +264,7 @@ def _grain_windows(value: Array) -> tuple[Array, Array]:
 
 
 def _span(value: Array) -> float:
-    """Return the span of the coding dB for which the grain of dark windows has 5.57 dB."""
+    """Return the span of the coding dB at which the grain of dark windows has 5.57 dB."""
     rest = _grain_windows(value)[1]
     return float(statistics.RAYLEIGH_DB / max(_mode(rest.std(axis=1, ddof=1)), 1e-3))
 
@@ -268,7 +275,7 @@ def _variation(gamma: float) -> float:
 
 
 def _gamma(value: Array) -> float:
-    """Return the gamma whose coefficient of variation dark windows have; 2 is linear."""
+    """Return the gamma that gives the coefficient of variation of dark windows; 2 is linear."""
     parts = _grain_windows(value)[0]
     mean = parts.mean(axis=1)
     found = _mode(parts.std(axis=1, ddof=1)[mean > 0] / mean[mean > 0])
@@ -279,7 +286,7 @@ def _gamma(value: Array) -> float:
 
 
 def _with_coding(sonar: Sonar, span: float | None, gamma: float | None, measure: bool, notes: list[str]) -> Sonar:
-    """Return the sonar with the coding that was measured, or a note where it is another than the stated one."""
+    """Return the sonar with the measured coding if requested; else add a note if it differs from the stated one."""
     if span is not None:
         stated, found, changed = sonar.coding_db, span, {"coding": "dB", "coding_db": round(span, 1)}
     else:
@@ -296,11 +303,11 @@ def _with_coding(sonar: Sonar, span: float | None, gamma: float | None, measure:
     return sonar
 
 
-# ---------------------------------------------------------------- levels
+# ---------------- Levels
 
 
 def _noise(flat: Array, value: Array, level: Array, notes: list[str]) -> float | None:
-    """Return the mean intensity of the darkest windows, if it can be noise: not below the coding, and new in each frame."""
+    """Return the mean intensity of the darkest windows; None if it is below the coding's floor, or not new in each frame."""
     beyond = slice(statistics.GLOW_BINS, None)
     parts = statistics.window_values(flat[:, beyond])
     mean = parts.mean(axis=1)
@@ -318,9 +325,9 @@ def _noise(flat: Array, value: Array, level: Array, notes: list[str]) -> float |
 
 
 def _full_scale_db(frames: SonarFrames, sonar: Sonar, flat: Array, notes: list[str]) -> float:
-    """Return the level that full scale stands for [dB re 1 uPa, or relative to the source], without the gain over range.
+    """Return the level of full scale [dB re 1 uPa, or relative to the source], without the gain over range.
 
-    Recordings without a scale get one: their brightest thousandth is taken for a face of reflectivity 0.5 at 45 deg.
+    Recordings without a scale get one by assuming that their brightest thousandth is a face of reflectivity 0.5 at 45 deg.
     """
     if frames.level_scale != 1.0:
         return float(10 * np.log10(frames.level_scale)) + sonar.source_level_db
@@ -338,10 +345,11 @@ def _full_scale_db(frames: SonarFrames, sonar: Sonar, flat: Array, notes: list[s
 
 
 def _nu(flat: Array, value: Array, noise: float) -> float | None:
-    """Return the shape of the K law in bright, flat windows; None where intensities are exponential or nothing is bright.
+    """Return the shape of the K law in bright, flat windows; None if intensities are exponential or nothing is bright.
 
-    Of a K law with noise N and signal S the mean square is 2 (S + N)^2 (1 + (S / (S + N))^2 / nu).
+    For a K law with noise N and signal S the mean square is 2 (S + N)^2 (1 + (S / (S + N))^2 / nu).
     """
+    # remove the trend along range, and keep bright windows without clipping
     smooth = ndimage.uniform_filter1d(flat.mean(axis=(0, 2)), statistics.WINDOW[0], mode="nearest")
     parts, levels = (statistics.window_values(one, FLAT_WINDOW) for one in (flat / smooth[:, None], flat))
     clipped = statistics.window_values(value >= FULL, FLAT_WINDOW).mean(axis=1)
@@ -349,13 +357,14 @@ def _nu(flat: Array, value: Array, noise: float) -> float | None:
     kept = (mean > (1 + FLAT_ABOVE) * noise) & (clipped <= MOST_CLIPPED) & (mean > 0)
     if not kept.any():
         return None
+    # excess of the squared contrast over that of exponential intensities, corrected for the noise
     excess = (parts[kept] ** 2).mean(axis=1) / (2 * parts[kept].mean(axis=1) ** 2) - 1
     found = float(np.median(excess * (mean[kept] / (mean[kept] - noise)) ** 2))
     return None if found < NEAR_RAYLEIGH else round(float(np.clip(1 / found, 0.1, 100)), 2)
 
 
 def _lobe_sum(sonar: Sonar) -> float:
-    """Return the power of the sum over beams over the sum of their powers, for a point and for speckle.
+    """Return the power of the sum over beams divided by the sum of their powers, for a point and for speckle.
 
     It is the squared integral of the pattern over that of its square, in beams.
     """
@@ -364,50 +373,51 @@ def _lobe_sum(sonar: Sonar) -> float:
     return float(np.trapezoid(sonar.aperture.pattern(u), u) ** 2 / sonar.aperture.equivalent_width / spacing)
 
 
-# ---------------- What a recording tells of the water: the glow near the sonar, and what drifts and scatters in every
-# ping anew
+# ---------------- Near glow and volume scattering
 
 
 FEWEST, WATER_WITHIN = 3, 0.25
-"""Bins of the shortest glow, and the part of the window in which it ends."""
+"""Number of bins of the shortest glow, and the fraction of the window within which it ends."""
 
 LEAST_FALL_DB, STEEPER = 10.0, 4.0
-"""What a glow falls by, and how many times more steeply than the profile behind it."""
+"""Smallest fall of a glow, and how many times steeper it is than the profile beyond it."""
 
 MOST_GLOW_DB = 120.0
 """Largest ``near_glow_db``."""
 
 GLOWING_DB, FEWEST_GLOWING = 10.0, 8
-"""Least glow of the bins that tell how beams differ [dB], and the fewest bins."""
+"""Smallest glow of the bins that show how beams differ [dB], and the smallest number of them."""
 
 CLEAR_DB, FEWEST_CELLS = 15.0, 64
-"""Least glow of the cells that tell what stays, so that noise takes 3 % at most, and the fewest cells."""
+"""Smallest glow of the cells that show what stays, so that noise contributes at most 3 %, and their smallest number."""
 
 NEW = 0.3
-"""Correlation of bright grain from frame to frame below which it is new."""
+"""Correlation of bright grain between frames below which it is new."""
 
 ABOVE = 3.0
-"""Least ratio of a bin's mean to the noise where volume is read."""
+"""Smallest ratio of a bin's mean to the noise where volume is measured."""
 
 UNEVEN_DB = 3.0
-"""Half the spread, 10th to 90th percentile, of the profile about that of noise and volume, above which it is no volume."""
+"""Largest deviation of a profile of volume from that of noise and volume: half the spread, 10th to 90th percentile."""
 
 
 def near_glow(flat: Array, noise: float, range_m: Array) -> tuple[float, float] | None:
-    """Return the noise at range 0 above the noise behind [dB], and the range at which it is gone [m]; None without glow.
+    """Return the noise at range 0 above the noise beyond [dB], and the range where it is gone [m]; None without glow.
 
-    Two straight lines in dB are fitted to the medians of the first quarter of the bins, from the
-    highest of the first :data:`~mitsonar.acoustics.statistics.GLOW_BINS` on. The first one is the glow.
+    Two straight lines in dB are fitted to the medians of the first quarter of the bins, starting at the highest of the first
+    :data:`~mitsonar.acoustics.statistics.GLOW_BINS`. The first line is the glow.
 
     Args:
         flat: intensities before the gain ``(frames, bins, beams)``.
-        noise: their mean where there is noise alone.
-        range_m: of the bins.
+        noise: mean of ``flat`` where there is only noise.
+        range_m: ranges of the bins.
     """
+    # profile relative to the noise: the median of exponential intensities is ln 2 times their mean
     excess = statistics.decibels(np.median(flat, axis=(0, 2)) / math.log(2) / noise)
     first = _first(excess)
     last = max(2 * FEWEST, round(len(excess) * WATER_WITHIN))
     at, excess = range_m[first : first + last], excess[first : first + last]
+    # two lines with the best break between them
     best: tuple[float, int, Array, Array] | None = None
     for end in range(FEWEST, last - FEWEST):
         lines = [np.polyfit(at[part], excess[part], 1) for part in (slice(end), slice(end, None))]
@@ -417,12 +427,13 @@ def near_glow(flat: Array, noise: float, range_m: Array) -> tuple[float, float] 
             best = missed, end, lines[0], lines[1]
     assert best is not None
     _, end, (slope, start), (behind, _) = best
+    # a glow falls far, and much more steeply than the profile beyond it
     fall = -slope * (at[end - 1] - at[0])
     if fall < LEAST_FALL_DB or -slope < STEEPER * abs(behind):
         return None
     if start <= MOST_GLOW_DB:
         return float(start), float(-start / slope)
-    middle = float(at[:end].mean())  # the line of 120 dB at range 0 through the middle of the glow
+    middle = float(at[:end].mean())  # a line from 120 dB at range 0 through the middle of the glow
     height = min(start + slope * middle, 0.95 * MOST_GLOW_DB)
     return MOST_GLOW_DB, middle / (1 - height / MOST_GLOW_DB)
 
@@ -437,26 +448,29 @@ def glow_by_beam(
 ) -> tuple[float, ...]:
     """Return how the near glow differs from beam to beam, and how much of it stays from ping to ping.
 
-    A beam's own glow is the median level of its bins over the line of all beams. Over the square of the bearing a straight
-    line is fitted to it. What is left, without the grain of so many bins, is the spread. The part that stays follows from
-    the correlation of consecutive frames' levels, which is Li2(c^2) / (pi^2 / 6) of complex Gaussian fields of coherence c.
+    The glow of a beam is the median level of its bins relative to the line of all beams. A straight line over the square of
+    the bearing is fitted to it. The remainder, minus the grain of that many bins, is the spread. The part that stays follows
+    from the correlation of consecutive frames' levels, which is Li2(c^2) / (pi^2 / 6) for complex Gaussian fields of
+    coherence c.
 
     Args:
         flat: intensities before the gain ``(frames, bins, beams)``.
-        noise: their mean where there is noise alone.
-        range_m: of the bins.
-        bearing_rad: of the beams.
-        glow: of :func:`near_glow`.
+        noise: mean of ``flat`` where there is only noise.
+        range_m: ranges of the bins.
+        bearing_rad: bearings of the beams.
+        glow: result of :func:`near_glow`.
 
     Returns:
         ``near_glow_edge_db``, ``near_glow_spread_db``, ``near_glow_still``; zeros where too few bins glow.
     """
+    # bins well within the glow
     line = glow[0] * (1 - range_m / glow[1])
     first = _first(statistics.decibels(np.median(flat, axis=(0, 2)) / math.log(2) / noise))
     at = np.arange(len(range_m))
     kept = (at >= first) & (line > GLOWING_DB)
     if kept.sum() < FEWEST_GLOWING:
         return 0.0, 0.0, 0.0
+    # level of each beam relative to the common line, and its robust trend over the squared bearing
     least = noise * 1e-3
     rest = statistics.decibels(np.maximum(flat[:, kept], least) / noise) - line[kept][None, :, None]
     own = np.median(rest, axis=(0, 1))
@@ -464,16 +478,17 @@ def glow_by_beam(
     found = optimize.least_squares(
         lambda x: x[0] - x[1] * square - own, (0.0, 0.0), loss="soft_l1", f_scale=statistics.RAYLEIGH_DB
     )
+    # spread of the beams about the trend, minus the grain of a median
     miss = own - found.x[0] + found.x[1] * square
     spread = 1.4826 * float(np.median(np.abs(miss - np.median(miss))))
     still = _stays(rest - own, line[kept][:, None] + own > CLEAR_DB)
-    frames = 1 + (len(flat) - 1) * (1 - still)  # what stays is one draw
-    grain = 1.57 * statistics.RAYLEIGH_DB**2 / (frames * kept.sum() / 2)  # of a median; neighbouring bins share grain
+    frames = 1 + (len(flat) - 1) * (1 - still)  # the part that stays is one draw
+    grain = 1.57 * statistics.RAYLEIGH_DB**2 / (frames * kept.sum() / 2)  # of a median, while neighbouring bins share grain
     return float(found.x[1]), math.sqrt(max(spread**2 - grain, 0.0)), still
 
 
 def _stays(grain_db: Array, clear: NDArray[np.bool_]) -> float:
-    """Return the coherence of consecutive frames by the correlation of their levels in the clear cells."""
+    """Return the coherence of consecutive frames from the correlation of their levels in the clear cells."""
     if len(grain_db) < 2 or clear.sum() < FEWEST_CELLS:
         return 0.0
     grain = grain_db[:, clear]
@@ -496,25 +511,29 @@ def moved_correlation(level_db: Array) -> float:
 def volume(flat: Array, level_db: Array, noise: float, sonar: Sonar, notes: list[str]) -> float | None:
     """Return the volume scattering strength relative to full scale at 1 m, in the units of ``flat`` [dB re 1/m].
 
-    Bright speckle that is new in every frame of a resting sonar is no surface. None where it is not new, where a shift finds
-    it again, so that the sonar moved, where the profile is not that of volume, or where nothing exceeds the noise.
+    Bright speckle that is new in every frame of a resting sonar does not come from a surface. The result is None if the
+    speckle is not new, if a shift finds it again, so that the sonar moved, if the profile is not that of volume, or if
+    nothing exceeds the noise.
 
     Args:
         flat: intensities before the gain ``(frames, bins, beams)``.
         level_db: levels of the frames.
-        noise: mean of ``flat`` where there is noise alone.
+        noise: mean of ``flat`` where there is only noise.
         sonar: gives beam width, field of view over elevation, absorption.
-        notes: sentences are added here.
+        notes: list to which sentences are added.
     """
+    # only speckle that is new in every frame, at any shift, can be volume
     if len(flat) < 2 or not float(statistics.correlation_by_level(level_db)[1][-3:].mean()) < NEW:
         return None
     if moved_correlation(level_db) > NEW:
         return None
+    # bins that exceed the noise, beyond the near glow
     echo = flat.mean(axis=(0, 2)) - noise
     kept = echo > (ABOVE - 1) * noise
     kept[: statistics.GLOW_BINS] = False
     if kept.sum() < statistics.WINDOW[0]:
         return None
+    # divide by the echo of volume of strength 1; check the profile of the whole window
     held = sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m / sonar.range_m**2 * loss_of(sonar)
     strength = statistics.decibels(echo[kept] / held[kept])
     found = float(np.median(strength))
@@ -528,8 +547,7 @@ def volume(flat: Array, level_db: Array, noise: float, sonar: Sonar, notes: list
     return found
 
 
-# ---------------- The instrument of a recording, as the simulator takes it: its window and bins, and a layout of its
-# beams
+# ---------------- Instrument of a recording
 
 
 Layout = Literal["even", "sine"]
@@ -538,21 +556,22 @@ NOISE_FIELDS = (
     *("noise_level_db", "volume_db", "near_glow_db", "near_glow_m", "near_glow_edge_db", "near_glow_spread_db"),
     *("near_glow_still", "stripes_db", "crosstalk_db", "speckle_nu", "speckle_patch_m"),
 )
-"""Fields of a sonar that are noise, water and grain, not the instrument's geometry."""
+"""Fields of a sonar that describe noise, water and grain, not the instrument's geometry."""
 
 TELLING = 0.1
-"""Distance of a beam from its place in the layout that the user is told of, as part of the beams' distance."""
+"""Deviation of a beam from its place in the layout above which a note is added, as a fraction of the beam spacing."""
 
 
 def as_instrument(frames: SonarFrames) -> tuple[SonarFrames, list[str]]:
-    """Return the frames with a sonar of their own axes, and sentences on what it cannot say.
+    """Return the frames with a simulator's sonar that has their axes, and sentences on what it cannot represent.
 
     Beams are laid out at even angles, or at even sines of them, whichever is nearer to the bearings of the frames. The
-    window begins half a bin before the first range and ends half a bin behind the last.
+    window begins half a bin before the first range and ends half a bin beyond the last.
     """
     bearings, ranges = frames.bearing_rad, frames.range_m
     count = len(bearings)
     middle = (bearings[0] + bearings[-1]) / 2
+    # try both layouts, and choose the one whose beams are nearest to the bearings
     layouts: dict[Layout, float] = {}
     for layout in ("even", "sine"):
         layouts[layout] = _opening(bearings - middle, layout)
@@ -582,7 +601,7 @@ def as_instrument(frames: SonarFrames) -> tuple[SonarFrames, list[str]]:
 
 
 def _opening(bearings: np.ndarray, layout: Layout) -> float:
-    """Return the field of view [rad] by which a layout's outermost beams are those of centred bearings ``(beams,)``."""
+    """Return the field of view [rad] at which a layout's outermost beams match those of centred bearings ``(beams,)``."""
     outer, count = float(np.abs(bearings[[0, -1]]).mean()), len(bearings)
     if layout == "even":
         return 2 * outer * count / (count - 1)

@@ -1,11 +1,11 @@
-"""The estimator ``correlation``, as in correlation velocity logs and displaced-phase-centre navigation.
+"""How the estimator ``correlation`` finds a motion, as correlation velocity logs and displaced-phase-centre navigation do.
 
 After a motion d of the vehicle towards level ground at incidence theta, its echo arrives earlier by 2 d sin(theta) / c. The
-taps of a receiver are rotated by 4 pi d sin(theta) / lambda from ping to ping; later taps are rotated more.
+taps of a receiver rotate by 4 pi d sin(theta) / lambda from ping to ping; later taps rotate more.
 
-Coarse: the motion whose phase-compensated products of taps have the largest sum over all receivers. The slope of the phase
-over delay resolves whole turns. Fine: the residual phases in short windows along delay, by weighted least squares. Motions
-across the axis of a receiver are not modelled, though they reduce the correlation.
+The coarse step finds the motion whose phase-compensated products of taps have the largest sum over all receivers. The slope
+of the phase over delay resolves whole turns. The fine step fits the residual phases in short windows along delay by weighted
+least squares. Motions across the axis of a receiver are not modelled, though they reduce the correlation.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 ACROSS = 41
-"""Number of angles across a beam that are averaged."""
+"""Number of angles across a beam over which directions are averaged."""
 
 STEP = 1 / 16
-"""Step of the motions that are tried [wavelengths]."""
+"""Step of the motions that are searched [wavelengths]."""
 
 WINDOW = 8
 """Number of taps whose products are averaged."""
 
 MOST_WAVES = 50.0
-"""Longest motion between pings that is tried, in both directions [wavelengths]."""
+"""Longest motion between pings that is searched, in both directions [wavelengths]."""
 
 LEAST = 4.0
-"""Least value of the largest sum, in standard deviations of the sum of unrelated pings."""
+"""Smallest valid maximum of the sum, in standard deviations of the sum of unrelated pings."""
 
 CLOSE = 0.9
-"""Part of the largest sum from which a second maximum makes the motion ambiguous."""
+"""Fraction of the largest sum from which a second maximum makes the motion ambiguous."""
 
 
 class Products(NamedTuple):
     """Products of consecutive pings of one receiver.
 
     Attributes:
-        product: of each tap of a ping with that of the next, conjugate, over all pairs ``(taps,)``.
-        energy: of both ``(taps,)``.
+        product: product of each tap of a ping with the conjugate of that of the next, summed over all pairs ``(taps,)``.
+        energy: energy of both pings ``(taps,)``.
         turn: phase by which taps rotate with a motion along the axis ``(taps,)`` [rad/m].
         look: direction of the axis of the receiver: to starboard, forward ``(2,)``.
     """
@@ -67,11 +67,11 @@ class Products(NamedTuple):
 
 @dataclass(frozen=True)
 class Correlation:
-    """Ping-to-ping correlation, coarse to fine; two degrees of freedom, the heading is taken to stay.
+    """Ping-to-ping correlation, coarse to fine, with two degrees of freedom; the heading is assumed constant.
 
     Args:
-        height_m: of the transmitter over the ground; default: that of the responses.
-        speed: the fastest that is searched along an axis [m/s].
+        height_m: height of the transmitter over the ground; default: that of the responses.
+        speed: highest speed along an axis that is searched [m/s].
     """
 
     height_m: float | None = None
@@ -85,7 +85,7 @@ class Correlation:
         """Estimate the motion; a prior is ignored: the search covers all motions up to ``speed``.
 
         Raises:
-            MitsonarError: records of :func:`mitsonar.estimation.channel.correlation.pings_of`, or no height.
+            MitsonarError: invalid records, see :func:`mitsonar.estimation.channel.correlation.pings_of`, or no height.
         """
         pings = pings_of(responses)
         height = assumed_height(responses, "correlation", self.height_m)
@@ -132,11 +132,13 @@ def _coarse(received: list[Products], reach: float, step: float) -> tuple[Array,
     sideways, forward = np.meshgrid(line, line, indexing="ij")
     total, spread = np.zeros(sideways.shape), 0.0
     far = np.linspace(-1.5 * reach, 1.5 * reach, 6 * math.ceil(reach / step) + 1)
+    # compensate each receiver for motions along its axis, and add its sums to the map of motions
     for one in received:
         weight = one.product / max(float(one.energy.sum()), 1e-300)
         sums = (np.exp(1j * far[:, None] * one.turn) @ weight).real
         total += np.interp(one.look[0] * sideways + one.look[1] * forward, far, sums)
         spread += float((np.abs(weight) ** 2).sum()) / 2
+    # compare the largest maximum with that of unrelated pings, and with the second
     peaks = np.argwhere((total == maximum_filter(total, size=5)) & (total > 0))
     if not len(peaks):
         return np.zeros(2), "the pings have nothing in common"
@@ -152,6 +154,7 @@ def _fine(received: list[Products], motion: Array) -> Array:
     """Refine a motion ``(2,)`` [m] by the residual phases."""
     for _ in range(3):
         information, pull = np.zeros((2, 2)), np.zeros(2)
+        # residual phase of each window, after the current motion is compensated
         for one in received:
             product = _windows(one.product * np.exp(1j * (one.look @ motion) * one.turn))
             energy = _windows(one.energy)
@@ -166,16 +169,16 @@ def _fine(received: list[Products], motion: Array) -> Array:
 
 
 def _windows(taps: NDArray[np.inexact]) -> NDArray[np.inexact]:
-    """Sum over neighbouring taps."""
+    """Sum over windows of neighbouring taps."""
     whole = len(taps) // WINDOW * WINDOW
     return np.asarray(taps[:whole].reshape(-1, WINDOW).sum(axis=1))
 
 
-# ---------------- Checks that all estimators of impulse responses share: of pings, reach and height
+# ---------------- Checks shared by all channel estimators
 
 
 UNEVEN = 0.01
-"""Part of an interval by which the time of a ping may deviate."""
+"""Largest deviation of the time between pings, as a fraction of it."""
 
 
 class Pings(NamedTuple):
@@ -183,8 +186,8 @@ class Pings(NamedTuple):
 
     Attributes:
         response: ``(pings, receivers, taps)`` complex128.
-        interval_s: from ping to ping [s].
-        silent: receivers without any echo in one ping or more.
+        interval_s: time from ping to ping [s].
+        silent: names of the receivers without any echo in at least one ping.
     """
 
     response: NDArray[np.complex128]
@@ -196,7 +199,7 @@ def pings_of(responses: ImpulseResponses) -> Pings:
     """Check responses and convert them to complex128.
 
     Raises:
-        MitsonarError: fewer than two pings, times that do not rise evenly, values that are not finite.
+        MitsonarError: fewer than two pings, times that do not increase evenly, or values that are not finite.
     """
     if len(responses) < 2:
         raise MitsonarError(f"an estimator of motion takes two pings or more: got {len(responses)}; give a longer run")
@@ -233,7 +236,7 @@ def assumed_height(responses: ImpulseResponses, name: str, height_m: float | Non
     """Return the height of the transmitter over the ground [m]: as given, or the mean of the responses' heights.
 
     Raises:
-        MitsonarError: neither is there, or it is not positive or beyond the instrument's range.
+        MitsonarError: no height, or one that is not positive or beyond the instrument's range.
     """
     if height_m is not None:
         height = height_m
@@ -249,18 +252,14 @@ def assumed_height(responses: ImpulseResponses, name: str, height_m: float | Non
     return height
 
 
-# ---------------- A wide band is divided into narrow ones
-# For unknown scatterers, frequencies farther apart than one over the spread of delays (some 100 Hz) are independent.
-# Parts of a band that do not overlap therefore hold independent information on the motion; each is a channel sonar of
-# its own carrier. The cost of a part grows with the cube of its taps: n parts cost n squared times less than the whole
-# band. Only the correlation across their edges is lost.
+# ---------------- Division of a wide band into narrow ones
 
 
 BAND_HZ = 4800.0
-"""Least bandwidth of a part [Hz]."""
+"""Smallest bandwidth of a part [Hz]."""
 
 FAINT = 1e-3
-"""Frequencies at which the whole band has a smaller amplitude are left out."""
+"""Relative amplitude of the whole band below which frequencies are left out."""
 
 
 class Band(NamedTuple):
@@ -268,8 +267,8 @@ class Band(NamedTuple):
 
     Attributes:
         sonar: an instrument of this part alone.
-        place: indices of its frequencies among those of the whole's measurement ``(taps,)``.
-        gain: from the whole's spectrum to the part's ``(taps,)``.
+        place: indices of its frequencies among those of the whole band's measurement ``(taps,)``.
+        gain: factor from the whole band's spectrum to that of the part ``(taps,)``.
     """
 
     sonar: ChannelSonar
@@ -282,13 +281,20 @@ class Band(NamedTuple):
 
 
 def bands_of(sonar: ChannelSonar, width_hz: float = BAND_HZ) -> list[Band]:
-    """Return the parts of an instrument's band: as many as are at least ``width_hz`` wide and sampled alike."""
+    """Divide an instrument's band into as many equally sampled parts as are at least ``width_hz`` wide.
+
+    For unknown scatterers, frequencies farther apart than one over the spread of delays (some 100 Hz) are independent. Parts
+    of a band that do not overlap therefore hold independent information on the motion; each is a channel sonar with a
+    separate carrier. The cost of a part grows with the cube of its taps: n parts cost n squared times less than the whole
+    band. Only the correlation across their edges is lost.
+    """
     count = max(1, int(sonar.bandwidth_hz / width_hz))
     while sonar.taps % count:
         count -= 1
     step, spacing = sonar.frequency_step_hz, (1 + sonar.rolloff) * sonar.bandwidth_hz / count
     found = []
     for number in range(count):
+        # the centre lies on the grid of frequencies, so that a part is a choice of the whole band's frequencies
         offset = step * round((number - (count - 1) / 2) * spacing / step)
         part = sonar.replace(
             carrier_hz=sonar.carrier_hz + offset,

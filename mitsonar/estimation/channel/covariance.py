@@ -1,4 +1,4 @@
-"""The covariance of impulse responses over level ground of unknown scatterers, for any motion between pings.
+"""How impulse responses over level ground of unknown scatterers covary, for any motion between pings.
 
 With independent unknown scatterers, the taps of all pings are a complex Gaussian vector of mean 0. Its covariance depends
 on the motion. It is an integral over the ground P of the responses of both pings to a scatterer there (Almanza-Medina,
@@ -6,9 +6,9 @@ eq. 5.15, for both):
 
     E[h_i(t) h_j(s)*] = S int a_i a_j exp(-j 2 pi f_c (D_i - D_j)) p(t - D_i) p(s - D_j) dP
 
-with delays D that include the motion of the receiver while sound travels (5.14, its exact root), amplitudes a by spreading,
-cosines and fields of view, and the pulse p. The ground is homogeneous: only the relative pose of both pings matters. Poses
-are therefore relative to the middle between both.
+The delays D include the motion of the receiver while sound travels (5.14, its exact root). The amplitudes a include
+spreading, cosines and fields of view; p is the pulse. The ground is homogeneous, so only the relative pose of the two pings
+matters. Poses are therefore relative to the midpoint between them.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ TAILS = 1.0
 """Taps before the first echo that are used, in pulses of 1 / F_d."""
 
 FAINTEST = 1e-4
-"""Power of the last taps that are used, as a part of the largest."""
+"""Power of the last taps that are used, as a fraction of the largest."""
 
 QUIET = 24.0
 """Length of silence after which a response may repeat, in pulses: their tails are then below 1e-5."""
 
 NODES = 4.0
-"""Points of the ground for each period of the integrand."""
+"""Points of the ground per period of the integrand."""
 
 PANEL = 12
-"""Points of a panel of Gauss-Legendre along the axis of a receiver."""
+"""Points of a Gauss-Legendre panel along the axis of a receiver."""
 
 MARGIN_M = 0.25
-"""Margin of the ground around the footprint of a receiver in the middle: receivers move, and have offsets."""
+"""Margin of the ground around the footprint of a receiver at the midpoint, since receivers move and have offsets."""
 
 MOST_POINTS = 400_000
 
@@ -62,8 +62,8 @@ class LinkResponse(NamedTuple):
     """Delay and amplitude of the echo of each point of the ground.
 
     Attributes:
-        delay: from the transmitter by the point to the receiver ``(points,)`` [s].
-        amplitude: of an echo whose strength is 1 ``(points,)``.
+        delay: from the transmitter via the point to the receiver ``(points,)`` [s].
+        amplitude: of an echo of unit strength ``(points,)``.
     """
 
     delay: Array
@@ -78,11 +78,12 @@ def link_response(
     Args:
         sonar: the instrument; its transmitter's field of view counts too.
         receiver: one of its receivers.
-        height_m: of the transmitter over the ground.
+        height_m: height of the transmitter over the ground.
         points: x, y ``(n, 2)`` [m].
         pose: x, y [m] and heading [rad] of the level vehicle when the ping was sent.
         velocity: over ground along x and y [m/s].
     """
+    # points relative to the transmitter and to the receiver, in the vehicle's axes
     x, y, heading = np.asarray(pose, dtype=float)
     cos, sin = math.cos(heading), math.sin(heading)
     to_starboard, forward, up = receiver.position
@@ -91,9 +92,11 @@ def link_response(
     sent = np.stack([starboard, ahead, np.full_like(east, -height_m)])
     received = sent - np.array([[to_starboard], [forward], [up]])
     there, back = np.sqrt((sent**2).sum(axis=0)), np.sqrt((received**2).sum(axis=0))
+    # the receiver moves while the sound travels
     speed = np.asarray(velocity, dtype=float)
     own = np.array([speed[0] * cos - speed[1] * sin, speed[0] * sin + speed[1] * cos, 0.0])
     delay = np.asarray(delay_exact(list(sent), list(received), list(own), sonar.sound_speed))
+    # amplitude: sensitivities, the cosines of incidence and reflection, and spreading
     amplitude = _sensitivity(sonar, None, sent / there) * _sensitivity(sonar, receiver, received / back)
     amplitude *= np.sqrt(height_m / there * (height_m + up) / back)
     if sonar.spreads:
@@ -121,9 +124,9 @@ class ResponseCovariance:
     Args:
         sonar: the instrument.
         receiver: one of its receivers.
-        height_m: of the transmitter over the ground.
-        interval_s: from ping to ping, in which the vehicle makes the motion.
-        reach_m: the longest motion; it sets the density of the points of the ground.
+        height_m: height of the transmitter over the ground.
+        interval_s: time between pings, in which the vehicle makes the motion.
+        reach_m: longest motion; it sets the density of the points of the ground.
     """
 
     sonar: ChannelSonar
@@ -134,7 +137,8 @@ class ResponseCovariance:
 
     @cached_property
     def nodes(self) -> Nodes:
-        """Return the points of the integral over the ground, relative to the middle between the pings."""
+        """Return the points of the integral over the ground, relative to the midpoint between the pings."""
+        # 1. panels along the axis: dense enough for the phase of the band and for the longest motion
         along, across = _extent(self.sonar, self.receiver, self.height_m)
         steep = np.abs(along).max() + MARGIN_M
         sine = steep / math.hypot(steep, self.height_m)
@@ -142,6 +146,7 @@ class ResponseCovariance:
         moves = 2 * self.reach_m / (self.sonar.wavelength_m * self.height_m)
         panels = math.ceil((along[-1] - along[0]) * (band * 2 * sine / self.sonar.sound_speed + moves) * NODES / PANEL)
         u, du = _panels(along[0], along[-1], panels, PANEL)
+        # 2. points across it, within the edges of the footprint
         low, high = (np.interp(u, along, edge) for edge in across)
         wide = (high - low).max()
         cycles = wide * (band * wide / (self.sonar.sound_speed * self.height_m) + moves)
@@ -154,6 +159,7 @@ class ResponseCovariance:
         w, dw = np.polynomial.legendre.leggauss(count)
         side = (low + high)[:, None] / 2 + (high - low)[:, None] / 2 * w
         area = du[:, None] * (high - low)[:, None] / 2 * dw
+        # 3. turn to the vehicle's axes, and keep the points received at the midpoint or at the longest motions
         turn = math.radians(self.receiver.field.heading_deg)
         u = np.broadcast_to(u[:, None], side.shape)
         x, y = u * math.sin(turn) + side * math.cos(turn), u * math.cos(turn) - side * math.sin(turn)
@@ -188,24 +194,24 @@ class ResponseCovariance:
         """Compute the echoes of the ground in both pings, ``lag`` intervals apart.
 
         Args:
-            motion: sideways, forward [m], yaw [rad] in one interval (eq. 3.4), and by how much the vehicle rises [m].
+            motion: sideways, forward [m], yaw [rad] in one interval (eq. 3.4), and the rise of the vehicle [m].
             lag: intervals between the pings.
         """
         sideways, forward, yaw, heave = _four(motion)
-        # eq. 3.4 counts along the new heading, which lies half the turn from that in the middle
+        # eq. 3.4 counts along the new heading, which differs by half the turn from that at the midpoint
         cos, sin = math.cos(yaw / 2), math.sin(yaw / 2)
         way = np.array([sideways * cos + forward * sin, forward * cos - sideways * sin])
         found = []
         for half in (-lag / 2, lag / 2):
             pose, height = (*(half * way), half * yaw), self.height_m + half * heave
-            velocity = _clockwise(way, half * yaw) / self.interval_s  # along the arc, whose chord the way is
+            velocity = _clockwise(way, half * yaw) / self.interval_s  # along the arc whose chord is the displacement
             found.append(link_response(self.sonar, self.receiver, height, self.nodes.points, pose, velocity))
         return found[0], found[1]
 
     def covariance(self, motion: ArrayLike, lag: float = 1.0) -> Complex:
         """Return E[h_i h_j*] of taps i of the earlier and j of the later ping ``(taps, taps)``; ``lag`` 0: of one ping.
 
-        The scatterers have a strength of 1 a square metre.
+        The scatterers have a strength of 1 per square metre.
         """
         first, second = self.link_responses(motion, lag)
         weight = self.nodes.area * first.amplitude * second.amplitude
@@ -253,13 +259,13 @@ def _clockwise(way: Array, turn: float) -> Array:
 
 
 def _four(motion: ArrayLike) -> Array:
-    """Return sideways, forward, yaw, rise of a motion that may lack the last."""
+    """Return sideways, forward, yaw and rise of a motion; a missing rise is 0."""
     given = np.asarray(motion, dtype=float)
     return np.append(given, 0.0) if len(given) == 3 else given
 
 
 def _panels(start: float, end: float, panels: int, nodes: int) -> tuple[Array, Array]:
-    """Return nodes and weights of Gauss-Legendre in ``panels`` parts."""
+    """Return nodes and weights of Gauss-Legendre quadrature in ``panels`` parts."""
     x, weight = np.polynomial.legendre.leggauss(nodes)
     edge = np.linspace(start, end, panels + 1)
     half = np.diff(edge)[:, None] / 2
@@ -268,6 +274,7 @@ def _panels(start: float, end: float, panels: int, nodes: int) -> tuple[Array, A
 
 def _extent(sonar: ChannelSonar, receiver: Hydrophone, height_m: float) -> tuple[Array, tuple[Array, Array]]:
     """Return the footprint of a receiver: positions along its axis ``(n,)``, and its two edges across ``(n,)`` each [m]."""
+    # which points of a grid in the receiver's axes it receives
     far = math.sqrt(max(sonar.range_max**2 - height_m**2, 0.0))
     step = height_m / 200
     line = np.arange(-far - step, far + 2 * step, step)
@@ -281,6 +288,7 @@ def _extent(sonar: ChannelSonar, receiver: Hydrophone, height_m: float) -> tuple
             f"receiver {receiver.name} hears no level ground {height_m:g} m below within {sonar.range_max:g} m: "
             "tilt it down, or raise range_max"
         )
+    # edges of each row that has such points, with a margin around
     rows = np.flatnonzero(received.any(axis=1))
     low = np.array([line[np.flatnonzero(received[row])[0]] for row in rows]) - MARGIN_M - step
     high = np.array([line[np.flatnonzero(received[row])[-1]] for row in rows]) + MARGIN_M + step
@@ -290,7 +298,7 @@ def _extent(sonar: ChannelSonar, receiver: Hydrophone, height_m: float) -> tuple
 
 
 def block_toeplitz(blocks: Sequence[Complex]) -> Complex:
-    """Assemble the covariance of all pings from those by lag, the earlier ping first."""
+    """Assemble the covariance of all pings from the covariances by lag, the earlier ping first."""
     count = range(len(blocks))
     whole = np.block([[blocks[j - i] if j >= i else blocks[i - j].conj().T for j in count] for i in count])
     return np.asarray((whole + whole.conj().T) / 2)

@@ -1,14 +1,13 @@
-"""The estimator ``likelihood``: the motion of maximum likelihood, for unknown scatterers.
+"""How the estimator ``likelihood`` finds the motion of maximum likelihood, for unknown scatterers.
 
-:mod:`mitsonar.estimation.channel.covariance` gives the covariance of the responses. Motions are first searched
-coarsely (:mod:`mitsonar.estimation.channel.likelihood`), then refined by scoring. With the covariance R, its derivative D
-and responses z of level s:
+:mod:`mitsonar.estimation.channel.covariance` gives the covariance of the responses. Motions are first searched coarsely
+(:class:`Search`), then refined by scoring. With the covariance R, its derivative D and responses z of level s:
 
     gradient = z* R^-1 D R^-1 z / s - tr R^-1 D,    information = tr R^-1 D R^-1 D.
 
-Of many pings the likelihood of each is conditioned on the few before it. Pairs of pings may fit several motions equally:
-across the axis of a beam only the loss of coherence shows, and not its side. The estimate is then the mean of the motions,
-weighted by their probability, with a covariance that spans them.
+For many pings the likelihood of each is conditioned on the few before it. Pairs of pings may fit several motions equally:
+across the axis of a beam only the loss of coherence is observable, not its side. The estimate is then the mean of the
+motions, weighted by their probability, with a covariance that spans them.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ SURE_PINGS = 3
 """Number of pings on which the next one is conditioned."""
 
 STEPS = 8
-"""Most steps of scoring; it ends when a step is below a fifth of a standard deviation."""
+"""Largest number of scoring steps; the iteration ends when a step is below a fifth of a standard deviation."""
 
 LEVEL = 0.05
 """Largest decrease of the log likelihood in a step."""
@@ -60,7 +59,7 @@ LONGEST = 3e-3
 """Longest step [m, rad]."""
 
 APART = 5.0
-"""Distance of two modes [standard deviations]; nearer ones are one mode."""
+"""Distance of two modes [standard deviations]; nearer ones count as one mode."""
 
 NEAR = 0.1
 """Distance [wavelengths] within which a start leads to a known mode."""
@@ -81,20 +80,20 @@ UNSURE = 0.15
 """Largest standard deviation of a valid motion [wavelengths]."""
 
 HOPELESS = 25.0
-"""Largest deficit of the log likelihood of a start against the best."""
+"""Largest deficit of the log likelihood of a start relative to the best."""
 
 LEAST_GAIN = 12.0
-"""Least excess of the log likelihood over that of unrelated pings."""
+"""Smallest excess of the log likelihood over that of unrelated pings."""
 
 
 class Mode(NamedTuple):
-    """A motion from ping to ping that fits better than those around it.
+    """A local maximum of the likelihood over motions from ping to ping.
 
     Attributes:
         motion: sideways, forward [m], yaw [rad], rise [m].
         covariance: of its free parameters ``(k, k)``.
         likelihood: its log likelihood.
-        noise: of the receivers, as parts of their power.
+        noise: noise of the receivers, as fractions of their power.
     """
 
     motion: Array
@@ -113,11 +112,11 @@ class Likelihood:
     """Estimates the motion of maximum likelihood.
 
     Args:
-        height_m: of the transmitter over the ground; default: that of the responses.
+        height_m: height of the transmitter over the ground; default: that of the responses.
         yaw: whether the vehicle may turn; otherwise its heading is constant.
         heave: whether it may rise or sink between pings.
-        speed: the fastest that is searched along an axis [m/s].
-        turn_rate: the fastest valid turn [rad/s].
+        speed: highest speed along an axis that is searched [m/s].
+        turn_rate: highest valid turn rate [rad/s].
         modes: number of motions of the search that are compared in full.
     """
 
@@ -135,11 +134,11 @@ class Likelihood:
     def estimate(self, responses: ImpulseResponses, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion and its covariance; a prior is ignored: the search covers all motions up to ``speed``.
 
-        Linear algebra uses one thread: its matrices have some 90 rows, for which threads wait for each other much longer
-        than they compute.
+        Linear algebra uses one thread: its matrices have some 90 rows, for which threads would wait for each other much
+        longer than they compute.
 
         Raises:
-            MitsonarError: records of :func:`mitsonar.estimation.channel.correlation.pings_of`, or no height.
+            MitsonarError: invalid records, see :func:`mitsonar.estimation.channel.correlation.pings_of`, or no height.
         """
         with threadpool_limits(1, "blas"):
             return self._estimate(responses)
@@ -175,14 +174,17 @@ class Likelihood:
     def _modes(self, receiver_bands: list[ReceiverBand], data: list[Complex], search: Search) -> list[Mode]:
         """Return the modes, the most probable first."""
         near = NEAR * receiver_bands[0].law.sonar.wavelength_m
+        # 1. refine the best motion of the search, then others along its less certain axis
         found = [refined(receiver_bands, data, np.array([*search.peaks()[0], 0.0, 0.0]), self.free, 1)]
         for number, start in enumerate(across_from(receiver_bands, data, search, found[0])[: self.modes + 1]):
             if number == 0 or all(np.abs(start - one.motion[:2]).max() > near for one in found):
                 mode = refined(receiver_bands, data, np.array([*start, 0.0, 0.0]), self.free, 1)
                 if all(_apart(mode, other) > APART for other in found):
                     found.append(mode)
+        # 2. add turns; their sign is hardly observable
         if self.yaw:
             found = self._turned(receiver_bands, data, found)
+        # 3. refine the probable modes again, conditioned on more pings
         depth = min(SURE_PINGS, len(data[0]) - 1)
         if depth > 1:
             best = max(one.mass for one in found)
@@ -190,7 +192,7 @@ class Likelihood:
         return sorted(found, key=lambda one: -one.mass)
 
     def _turned(self, receiver_bands: list[ReceiverBand], data: list[Complex], found: list[Mode]) -> list[Mode]:
-        """Add modes from initial turns to both sides: the loss of coherence hardly shows the sign of a turn."""
+        """Add modes from initial turns to both sides, since the loss of coherence hardly shows the sign of a turn."""
         all_ = list(found)
         for mode in found:
             for yaw in TURNS:
@@ -202,8 +204,9 @@ class Likelihood:
         return all_
 
     def _answer(self, found: list[Mode], alone: float, responses: ImpulseResponses, silent: tuple[str, ...]) -> Estimate:
-        """Return one estimate from several modes."""
+        """Combine several modes into one estimate."""
         intervals, wavelength_m = len(responses) - 1, responses.sonar.wavelength_m
+        # mean and covariance of the mixture of modes
         mass = np.array([one.mass for one in found])
         share = np.exp(mass - mass.max())
         share /= share.sum()
@@ -214,6 +217,7 @@ class Likelihood:
         for part, one in zip(share, found, strict=True):
             spread[np.ix_(free, free)] += part * one.covariance
             spread += part * np.outer(one.motion - mean, one.motion - mean)
+        # a motion must explain more than unrelated pings do
         gain = found[0].likelihood - alone
         listed = list(zip(share, found, strict=True)) if gain >= LEAST_GAIN else []
         about: PlainTable = {
@@ -223,6 +227,7 @@ class Likelihood:
             "gain": gain,
             "silent": silent,
         }
+        # reject unrelated pings, fast turns and ambiguous motions
         reason = ""
         if gain < LEAST_GAIN:
             reason = "the pings have nothing in common"
@@ -247,9 +252,11 @@ def _spread_of(mode: Mode, free: list[int], intervals: int) -> list[list[float]]
 def across_from(receiver_bands: list[ReceiverBand], data: list[Complex], search: Search, mode: Mode) -> Array:
     """Return motions ``(n, 2)`` that differ from a mode along its less certain axis and may fit as well.
 
-    The first is the mirrored motion, then come the most likely ones. Receivers along that axis have many maxima, which the
-    search has scored. For the others a motion is a loss of coherence: their likelihood is computed for a few motions.
+    The first is the mirrored motion, followed by the most likely ones. Receivers along that axis have many maxima, which the
+    search has scored. For the other receivers a motion appears as a loss of coherence, so their likelihood is computed for a
+    few motions.
     """
+    # likelihood along the less certain axis, summed over the receivers
     axis = int(np.diag(mode.covariance)[:2].argmax())
     total = np.zeros(len(search.line))
     few = np.linspace(search.line[0], search.line[-1], PLACES)
@@ -261,6 +268,7 @@ def across_from(receiver_bands: list[ReceiverBand], data: list[Complex], search:
                 [judged(receiver_band, z, _moved(mode.motion, axis, place), (), 1).likelihood for place in few]
             )
             total += PchipInterpolator(few, values)(search.line)
+    # its maxima that are not hopeless, best first
     peaks = np.flatnonzero(total == maximum_filter(total, size=5))
     peaks = peaks[(total > total.max() - HOPELESS)[peaks]]
     peaks = peaks[np.argsort(-total[peaks])]
@@ -309,10 +317,12 @@ def refined(receiver_bands: list[ReceiverBand], data: list[Complex], motion: Arr
 
     said = judge(motion)
     for _ in range(STEPS):
+        # scoring step from all receivers, limited in length
         total = sum(one.likelihood for one in said)
         information = sum((one.information for one in said), np.zeros((len(free),) * 2))
         step = np.linalg.lstsq(information, sum((one.gradient for one in said), np.zeros(len(free))), rcond=None)[0]
         step *= min(1.0, LONGEST / float(np.abs(step).max() + 1e-12))
+        # halve the step until the log likelihood decreases by less than LEVEL
         for _ in range(4):
             there = motion.copy()
             there[columns] += step
@@ -335,21 +345,21 @@ def refined(receiver_bands: list[ReceiverBand], data: list[Complex], motion: Arr
     )
 
 
-# ---------------- The likelihood of one motion by one receiver, with its gradient and information
+# ---------------- Likelihood of one motion by one receiver
 
 
 NOISE = np.logspace(-6, 1.5, 46)
-"""Variances of noise that are tried, as parts of the mean power; the error of the covariance integral lies below."""
+"""Candidate variances of noise, as fractions of the mean power; the error of the covariance integral lies below them."""
 
 
 class MotionScore(NamedTuple):
     """The log likelihood of a motion by one receiver.
 
     Attributes:
-        likelihood: its logarithm.
+        likelihood: log likelihood.
         gradient: by the free parameters of the motion ``(k,)``.
-        information: Fisher information of them ``(k, k)``.
-        noise: its variance, as a part of the mean power.
+        information: Fisher information of the free parameters ``(k, k)``.
+        noise: variance of the noise, as a fraction of the mean power.
     """
 
     likelihood: float
@@ -361,23 +371,27 @@ class MotionScore(NamedTuple):
 def judged(receiver_band: ReceiverBand, response: Complex, motion: Array, free: Sequence[int], depth: int) -> MotionScore:
     """Score a motion from ping to ping by the pings of one receiver ``(pings, taps)``.
 
-    Each ping is conditioned on ``depth`` pings before it. Level and variance of noise take their most likely values.
+    Each ping is conditioned on the ``depth`` pings before it. Level and variance of noise take their most likely values.
     """
+    # 1. covariances by lag, and their derivatives, in the axes of the receiver
     here, turn = receiver_band.turn @ motion, receiver_band.turn[np.ix_(free, free)]
     blocks = [receiver_band.law.slopes(here, lag, free if lag else ()) for lag in range(depth + 1)]
     taps = blocks[0].shape[1]
     power = float(np.diag(blocks[0][0]).real.mean())
+    # 2. conditioning: likelihood of the long runs minus that of the runs that are conditioned on
     runs = [
         _PingRuns.of(response, [block[0] for block in blocks[:pings]], sign) for pings, sign in ((depth + 1, 1), (depth, -1))
     ]
     parts = [part for part in runs if part is not None]
+    # 3. most likely level for each candidate variance of noise, then the most likely variance
     noise = NOISE * power
     energy = sum(part.sign * (part.power[:, None] / (part.size[:, None] + noise)).sum(axis=0) for part in parts)
-    there = energy > 0  # what is left of ping given ping may be nothing, where a motion fits not at all
+    there = energy > 0  # the conditional energy may vanish where a motion does not fit at all
     level = np.where(there, energy, 1.0) / response.size
     log = sum(part.sign * part.count * np.log(part.size[:, None] + noise).sum(axis=0) for part in parts)
     likelihood = np.where(there, -response.size * np.log(level) - log, -np.inf)
     best = int(likelihood.argmax())
+    # 4. gradient and information at these values
     gradient, information = np.zeros(len(free)), np.zeros((len(free),) * 2)
     for part in parts if free and there[best] else []:
         slopes = [
@@ -395,7 +409,7 @@ class _PingRuns:
 
     Attributes:
         sign: 1, or -1 for the pings that are conditioned on.
-        pings: number in a run.
+        pings: number of pings in a run.
         size: eigenvalues ``(n,)``.
         vectors: eigenvectors ``(n, n)``.
         inside: the runs as coefficients of the eigenvectors ``(n, runs)``.
@@ -409,7 +423,7 @@ class _PingRuns:
 
     @classmethod
     def of(cls, response: Complex, blocks: list[Complex], sign: int) -> _PingRuns | None:
-        """Collect all runs as long as there are blocks; those that are conditioned on begin with the second ping."""
+        """Collect all runs of as many pings as there are blocks; runs that are conditioned on begin with the second ping."""
         first = 0 if sign > 0 else 1
         last = len(response) - len(blocks) + (0 if sign > 0 else -1)
         if not blocks or last < first:
@@ -425,7 +439,7 @@ class _PingRuns:
 
     @property
     def power(self) -> Array:
-        """Return the power along each eigenvector, of all runs."""
+        """Return the power along each eigenvector, summed over all runs."""
         return np.asarray((np.abs(self.inside) ** 2).sum(axis=1))
 
     def score(self, slopes: list[Complex], noise: float, level: float) -> tuple[Array, Array]:
@@ -441,31 +455,27 @@ class _PingRuns:
         return np.array(gradient), np.array(information)
 
 
-# ---------------- The coarse search for a motion over all motions that a vehicle can make
-# The cross-covariance of two pings of a receiver is computed once for motions on a grid, along its axis and across.
-# Responses are first whitened in the strong directions of a single ping. There a hypothesis is a matrix C of the cross-
-# covariance, and its score for responses b_1, b_2 is 2 Re b_1* C b_2 - |C|^2: least squares of their products.
-
+# ---------------- Coarse search over all motions
 
 FLOOR = 1e-2
-"""Part of the mean power below which a direction of responses is not used."""
+"""Fraction of the mean power below which a direction of responses is not used."""
 
 ALONG, ACROSS = 7.5, 1.9
-"""Motions of the grid a wavelength, along the axis of a receiver and across."""
+"""Motions of the grid per wavelength, along the axis of a receiver and across."""
 
 FINE = 15.0
-"""Cells a wavelength of the map in which the scores of all receivers are added."""
+"""Cells per wavelength of the map in which the scores of all receivers are added."""
 
 PEAKS = 40
 """Number of maxima of the map that are used."""
 
 
 class ReceiverBand(NamedTuple):
-    """A receiver turned to face forward, so that receivers of one kind share what is computed.
+    """A receiver turned to face forward, so that receivers of one kind share computations.
 
     Attributes:
         law: covariance of its responses.
-        turn: from motions of the vehicle to motions in its axes ``(4, 4)``.
+        turn: matrix from motions of the vehicle to motions in the receiver's axes ``(4, 4)``.
         number: its index among the receivers of the sonar.
     """
 
@@ -512,12 +522,15 @@ def receiver_bands_of(sonar: ChannelSonar, height_m: float, interval_s: float, r
 
 @dataclass(frozen=True)
 class CovarianceTable:
-    """Cross-covariances of two pings for motions on a grid.
+    """Cross-covariances of two pings for motions on a grid along the axis of a receiver and across, computed once.
+
+    Responses are first whitened in the strong directions of a single ping. In these a hypothesis is a matrix C of the
+    cross-covariance, and its score for responses b_1, b_2 is 2 Re b_1* C b_2 - |C|^2: least squares of their products.
 
     Attributes:
         along: motions along the axis of the receiver ``(a,)`` [m].
-        across: across it ``(b,)`` [m].
-        basis: from taps to directions of equal strength ``(directions, taps)``.
+        across: motions across the axis ``(b,)`` [m].
+        basis: matrix from taps to directions of equal strength ``(directions, taps)``.
         shared: C of each motion ``(a, b, directions, directions)`` complex64.
     """
 
@@ -529,13 +542,14 @@ class CovarianceTable:
     @classmethod
     def of(cls, law: ResponseCovariance) -> Self:
         """Compute the table for all motions within the reach of the covariance."""
+        # whiten the strong directions of a single ping
         own = law.covariance((0, 0, 0), 0)
         power = float(np.diag(own).real.mean())
         size, vectors = np.linalg.eigh(own + FLOOR * power * np.eye(len(own)))
         strong = size > 2 * FLOOR * power
         basis = (vectors[:, strong] / np.sqrt(size[strong])).conj().T
         along, across = (_grid(law.reach_m, law.sonar.wavelength_m / parts) for parts in (ALONG, ACROSS))
-        # a receiver in the plane of its axis has the same covariance for motions to port and to starboard
+        # a receiver in the plane of its axis has equal covariances for motions to port and to starboard
         alike = law.receiver.position[0] == 0 and law.sonar.transmitter.shape == "all"
         shared = np.empty((len(along), len(across), len(basis), len(basis)), dtype=np.complex64)
         for i, j in np.ndindex(len(along), len(across)):
@@ -566,7 +580,7 @@ def _table_of(alone: ChannelSonar, height_m: float, interval_s: float, reach_m: 
 
 @dataclass(frozen=True)
 class Search:
-    """The scores of all receivers for all motions.
+    """The scores of all receivers for all motions that a vehicle can make.
 
     Attributes:
         line: motions along either axis, from ping to ping ``(n,)`` [m].

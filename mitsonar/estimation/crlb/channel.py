@@ -1,8 +1,8 @@
-"""The Cramer-Rao lower bound of motion from impulse responses of unknown ground.
+"""How well a motion can be known from impulse responses of unknown ground: the Cramer-Rao lower bound.
 
-Pings of unknown ground are Gaussian with the covariance R of :mod:`mitsonar.estimation.channel.covariance`. The
-Fisher information of the motion is tr(R^-1 R_a R^-1 R_b), added over receivers, whose fields of view hardly overlap. The
-bound is *local*: it does not include that another motion may fit as well.
+Pings of unknown ground are Gaussian with the covariance R of :mod:`mitsonar.estimation.channel.covariance`. The Fisher
+information of the motion is tr(R^-1 R_a R^-1 R_b), added over receivers, whose fields of view hardly overlap. The bound is
+*local*: it does not include that another motion may fit as well.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 NOISELESS_DB = 60.0
-"""What "without noise" counts as: below lies the error of the integral over the ground."""
+"""Signal-to-noise ratio that counts as "without noise": below lies the error of the integral over the ground."""
 
 STEP = 2e-4
-"""Of the differences over the whole motion [m, rad]."""
+"""Step of the differences over the whole motion [m, rad]."""
 
 UNKNOWN = 1e-9
-"""Axes whose information is so small a part of the other axes' cannot be observed."""
+"""Relative information of an axis, compared with the other axes, below which it cannot be observed."""
 
 
 def channel_crlb(
@@ -49,12 +49,12 @@ def channel_crlb(
 
     Args:
         sonar: the instrument.
-        height_m: of the transmitter over the ground.
+        height_m: height of the transmitter over the ground.
         motion: sideways, forward, yaw (and rise) from the first to the last ping.
-        pings: how many, at equal times.
-        span_s: from the first to the last [s].
+        pings: number of pings, evenly spaced in time.
+        span_s: time from the first to the last ping [s].
         snr_db: mean power of the taps that hold echoes over the variance of a tap's noise.
-        free: which of the four are not known.
+        free: which of the four parameters are unknown.
     """
     found = impulse_information(sonar, height_m, motion, pings=pings, span_s=span_s, snr_db=snr_db, free=free)
     scale = 1 / np.sqrt(np.maximum(np.diag(found), 1e-300))
@@ -92,7 +92,7 @@ def impulse_information(
 
 
 def _information(receiver_band: ReceiverBand, motion: Array, pings: int, noise: float, free: Sequence[int]) -> Array:
-    """Return the information of one receiver."""
+    """Return the information from one receiver."""
     whole = _covariance(receiver_band.law, receiver_band.turn @ motion, pings)
     power = float(np.diag(whole).real.mean())
     inverse = np.linalg.inv(whole + noise * power * np.eye(len(whole)))

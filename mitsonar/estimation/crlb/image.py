@@ -1,11 +1,12 @@
-"""The Cramer-Rao lower bound of motion estimation for a known scene, sonar and noise.
+"""How well any unbiased estimator can know a motion from images: the Cramer-Rao lower bound for a known scene.
 
 No unbiased estimator of the motion (sideways, forward, yaw) has a covariance below the inverse of the Fisher information
-F = J' W J: J how pixels change with the motion, W the information of a noisy pixel (:mod:`mitsonar.acoustics.noise`).
-The bound is that of an oracle, which owns the renderer and knows the scene, its height and the frames without noise.
+F = J' W J. J is the derivative of the pixels by the motion, W the information of a noisy pixel
+(:mod:`mitsonar.acoustics.noise`). The bound is that of an oracle that has the renderer and knows the scene, its height and
+the frames without noise.
 
-*One frame* is registered with that oracle: covariance 1 / F. *Two frames*, both noisy, of a known relief: twice that. It is
-optimistic, since a real estimator has to find the relief and the reflectivity of every cell in the same two frames.
+*One frame* is registered with that oracle: covariance 1 / F. *Two frames*, both noisy, of a known relief: twice that. The
+bound is optimistic, since a real estimator has to find the relief and the reflectivity of every cell in the same two frames.
 """
 
 from __future__ import annotations
@@ -77,19 +78,19 @@ VARIABLES = {
     "range_bins": "the window stays",
     "window": "both ends [m], 3.2..5.6; bins stay as many",
 }
-"""Numbers that a bound may be asked for many values of, and what stays the same."""
+"""Variables for which a bound can be computed over many values, with their meaning and what remains constant."""
 
 MOVING = ("height_m", "pitch_deg", "azimuth_fov_deg", "elevation_fov_deg")
-"""Those that move the floor out of the window."""
+"""Variables that move the floor out of the window."""
 
 
 class InformationTerms(NamedTuple):
-    """What values that change with the motion tell.
+    """Information about the motion from values that change with it.
 
     Attributes:
-        information: of each ``(n, ...)``.
-        jacobian: two estimates of what they depend on ``(2, n, 2, 3)``.
-        rays: variance of each by the rays of a ping, beyond what its law holds ``(n,)``.
+        information: of each value ``(n, ...)``.
+        jacobian: two estimates of the derivative of the parameters of the values ``(2, n, 2, 3)``.
+        rays: variance of each value by the rays of a ping, beyond what its law includes ``(n,)``.
     """
 
     information: Information
@@ -97,7 +98,7 @@ class InformationTerms(NamedTuple):
     rays: NDArray[np.float64]
 
     def bound(self, law: str) -> Bound | None:
-        """By one of :data:`LAWS`."""
+        """Return the bound by one of :data:`LAWS`; None where the information is unlimited."""
         if law == "pixel":
             weight = self.information.law
         else:
@@ -111,27 +112,27 @@ def bound(
 ) -> Bound | None:
     """Compute the bound of one view.
 
-    Without noise nothing but rounding stands between a pixel and its level. The exact law then tells the motion without
-    limit, and the answer is None; ``gaussian`` counts rounding as a variance of 1 / (12 255^2), as for pixels that noise of
-    their own dithers; ``rays`` adds the noise of the rays, from which no single ping is free. Vectors are not rounded, and
-    have no ``gaussian`` bound without noise either.
+    Without noise only rounding separates a pixel from its level. The exact law then gives unlimited information, and the
+    result is None. The law ``gaussian`` counts rounding as a variance of 1 / (12 255^2), as for pixels dithered by some
+    noise; ``rays`` adds the noise of the rays, which every single ping has. Vectors are not rounded, and have no
+    ``gaussian`` bound without noise either.
 
     Args:
-        derivative: of the view at a pose.
-        noise: of its pixels.
-        kind: of :data:`KINDS`.
-        law: of :data:`LAWS`.
-        greys: the largest grey value that pixels are stored with.
+        derivative: derivative of the view at a pose.
+        noise: noise of its pixels.
+        kind: one of :data:`KINDS`.
+        law: one of :data:`LAWS`.
+        greys: the largest grey value with which pixels are stored.
 
     Raises:
-        MitsonarError: unknown words.
+        MitsonarError: an unknown kind or law.
     """
     _check(kind, law)
     return _terms(derivative, noise, kind, greys).bound(law)
 
 
 def laws_of(sonar: Sonar) -> dict[str, str]:
-    """Return the laws that a sonar's pixels may have, by name, with what they mean; the last counts in comparisons."""
+    """Return the laws that apply to a sonar's pixels, with their meaning, by name; comparisons use the last one."""
     return SPECKLE_LAWS if sonar.model == "coherent" else LAWS
 
 
@@ -150,7 +151,7 @@ def _by_pixels(derivative: Derivative, noise: NoiseModel, greys: int) -> Informa
     changing = derivative.jacobian.any(axis=(0, 3, 4))
     level, filled = derivative.level[changing], derivative.filled[changing]
     told = information(noise, level, filled, greys=greys)
-    switching = level**2 * (1 / filled - 1)  # of echoes that are there or not: the law holds it
+    switching = level**2 * (1 / filled - 1)  # variance of echoes that are there or not, which the law includes
     rays = np.maximum(derivative.variance[changing] - switching, 0.0) * told.slope[:, 0] ** 2
     return InformationTerms(told, derivative.jacobian[:, changing].astype(float), rays)
 
@@ -162,7 +163,7 @@ def _by_sums(derivative: Derivative, noise: NoiseModel) -> InformationTerms:
     level, filled = derivative.level[changing], derivative.filled[changing]
     told = information_of_sums(noise, filled.sum(axis=1), filled.shape[1])
     by_filled = told.slope[:, 1:]
-    # no ray falls into two beams: variances of a row's pixels add up
+    # no ray falls into two beams, so the variances of a row's pixels add up
     rays = derivative.variance[changing] + (2 * by_filled * level + by_filled**2 * filled) * (1 - filled)
     return InformationTerms(told, jacobian[:, changing], np.maximum(rays.sum(axis=1), 0.0))
 
@@ -170,13 +171,13 @@ def _by_sums(derivative: Derivative, noise: NoiseModel) -> InformationTerms:
 def bounds_of_views(
     names: Sequence[str], views: Sequence[Derivative], noise: NoiseModel, *, apart: bool = True
 ) -> dict[tuple[str, str, str], Bound | None]:
-    """All bounds at one pose: (portion, kind, law) -> bound; of several views their sum too, as ``all views``.
+    """Compute all bounds at one pose, keyed by (portion, kind, law); several views also have their sum, as ``all views``.
 
     Args:
-        names: of the views.
+        names: names of the views.
         views: their derivatives.
-        noise: of their pixels.
-        apart: whether no two views hear the same rays; those that do have no sum.
+        noise: noise of their pixels.
+        apart: whether no two views receive the same rays; views that share rays have no sum.
     """
     found: dict[tuple[str, str, str], Bound | None] = {}
     for kind in KINDS:
@@ -192,15 +193,16 @@ def bounds_of_views(
 def bounds_at(
     simulator: Simulator, poses: ArrayLike, noise: NoiseModel, gain: float, *, pings: int | None = None
 ) -> Iterator[dict[tuple[str, str, str], Bound | None]]:
-    """:func:`bounds_of_views` at each pose.
+    """Compute :func:`bounds_of_views` at each pose.
 
     Args:
-        simulator: of the scene that the poses are in (of a data set: ``SceneRenderer(recipe, scene).simulator``).
-        poses: of the sonar ``(n, 6)``.
-        noise: of the pixels.
-        gain: that of the frames.
-        pings: of each half of the derivatives; default: 8, and four times as many, twice, where images leave it open whether
-            an axis can be observed.
+        simulator: simulator of the scene that contains the poses; for a data set
+            ``SceneRenderer(recipe, scene).simulator``.
+        poses: poses of the sonar ``(n, 6)``.
+        noise: noise of the pixels.
+        gain: gain of the frames.
+        pings: pings of each half of the derivatives; default: 8, then four times as many, twice, while images leave it
+            undecided whether an axis can be observed.
     """
     if simulator.coherent is not None:
         refuse_noise(noise, simulator.sonar)
@@ -236,26 +238,26 @@ def cramer_rao_bound(
     """Compute the least standard deviations of a motion at each pose (Cramer and Rao).
 
     Args:
-        simulator: of the scene that the poses are in.
-        poses: of the sonar ``(n, 6)`` [m, rad].
-        noise: of the pixels; without noise ask for the law ``rays``. The model ``coherent`` has its own: none.
-        gain: that of the frames.
-        view: which one; default: the only one, or all together where no two hear the same rays.
+        simulator: simulator of the scene that contains the poses.
+        poses: poses of the sonar ``(n, 6)`` [m, rad].
+        noise: noise of the pixels; without noise use the law ``rays``. The model ``coherent`` includes noise: give none.
+        gain: gain of the frames.
+        view: name of a view; default: the only one, or all together if no two receive the same rays.
         kind: ``image``, all pixels, or ``vector``, sums over the beams; the model ``coherent`` has images only.
         law: ``pixel``: the exact law of the noisy pixel, clipped and rounded to grey values; ``gaussian``: a Gaussian of the
-            same mean and variance; ``rays``: the same, with the noise of the rays of a single ping as further variance. Of
-            the model ``coherent`` ``ground``: the expected level is known, and the grain is new in each frame; ``grain``:
-            the scatterers are known as well. Default: ``pixel``, of the model ``coherent`` ``ground``.
-        frames: noisy ones, 1 or 2.
-        pings: of each half of the derivatives; default: 8, and four times as many, twice, where images leave it open whether
-            an axis can be observed.
+            same mean and variance; ``rays``: the same, with the noise of the rays of a single ping as further variance. For
+            the model ``coherent``, ``ground``: the expected level is known, and the grain is new in each frame; ``grain``:
+            the scatterers are known as well. Default: ``pixel``, or ``ground`` for the model ``coherent``.
+        frames: number of noisy frames, 1 or 2.
+        pings: pings of each half of the derivatives; default: 8, then four times as many, twice, while images leave it
+            undecided whether an axis can be observed.
 
     Returns:
-        Sideways, forward [m] and yaw [rad] ``(n, 3)``; 0 where nothing but rounding stands between a pixel and its level,
-        inf where an axis cannot be observed.
+        Sideways, forward [m] and yaw [rad] ``(n, 3)``; 0 where only rounding separates a pixel from its level, inf where an
+        axis cannot be observed.
 
     Raises:
-        MitsonarError: unknown words; several portions that overlap, and none named; noise of pixels with speckle.
+        MitsonarError: unknown names; several portions that overlap, and none named; noise of pixels with speckle.
     """
     speckle = simulator.coherent is not None
     law = law or ("ground" if speckle else "pixel")
@@ -270,27 +272,27 @@ def cramer_rao_bound(
     return np.array([np.zeros(3) if one is None else one.std(frames) for one in found]).reshape(-1, 3)
 
 
-# ---------------------------------------------------------------- what if
+# ---------------- Changed sonars and poses
 
 
 def varied(
     sonar: Sonar, poses: NDArray[np.float64], heights: NDArray[np.float64], name: str, value: float | tuple[float, float]
 ) -> tuple[Sonar, NDArray[np.float64]]:
-    """Sonar and poses with one number of :data:`VARIABLES` changed.
+    """Return sonar and poses with one of :data:`VARIABLES` changed.
 
-    The floor stays in the window: where height, pitch or a field of view change, both ends of the window move in the
-    proportion in which the nearest and the farthest range of the level floor in view do, and its bins become longer or
-    shorter with it. A window that is given itself stays as it is.
+    The floor stays in the window: if height, pitch or a field of view changes, both ends of the window move in the same
+    proportion as the nearest and the farthest range of the level floor in view, and its bins scale with it. A window that is
+    given explicitly is not changed.
 
     Args:
         sonar: the instrument.
-        poses: of the sonar ``(n, 6)``.
-        heights: over the ground ``(n,)`` [m].
-        name: of the number.
-        value: in the unit that its name says; of ``window`` both ends [m].
+        poses: poses of the sonar ``(n, 6)``.
+        heights: heights over the ground ``(n,)`` [m].
+        name: name of the variable.
+        value: in the unit given by its name; for ``window`` both ends [m].
 
     Raises:
-        MitsonarError: unknown name, a value outside its limits, a sonar that looks past the floor to the horizon.
+        MitsonarError: an unknown name, a value outside its limits, or a sonar that looks past the floor to the horizon.
     """
     if name not in VARIABLES:
         raise MitsonarError(f"unknown variable {name!r}: {nearest_names(name, VARIABLES)}")
@@ -298,6 +300,7 @@ def varied(
         near, far = value  # type: ignore[misc]
         return sonar.replace(range_min=near, range_max=far), poses
     changed, number = poses.copy(), float(value)  # type: ignore[arg-type]
+    # change the variable itself
     before = floor_ranges(sonar, float(heights.mean()), float(poses[:, 3].mean())) if name in MOVING else None
     height, other = heights, sonar
     if name == "height_m":
@@ -315,16 +318,17 @@ def varied(
         other = sonar.replace(**{name: round(number) if whole else number}, **width)
     if before is None:
         return other, changed
+    # scale the window with the range of the floor
     after = floor_ranges(other, float(height.mean()), float(changed[:, 3].mean()))
     near, far = (end * new / old for end, new, old in zip((sonar.range_min, sonar.range_max), after, before, strict=True))
     return other.replace(range_min=near, range_max=far), changed
 
 
 def floor_ranges(sonar: Sonar, height_m: float, pitch_rad: float) -> tuple[float, float]:
-    """Nearest and farthest range of a level floor in the field of view [m].
+    """Return the nearest and farthest range of a level floor in the field of view [m].
 
     Raises:
-        MitsonarError: part of it looks to the horizon.
+        MitsonarError: part of the field of view reaches the horizon.
     """
     half = sonar.bearing_rad[-1] + sonar.beam_width_rad / 2
     elevation = np.radians(sonar.elevation_fov_deg) / 2
@@ -339,11 +343,11 @@ def floor_ranges(sonar: Sonar, height_m: float, pitch_rad: float) -> tuple[float
     return height_m / float(down.max()), height_m / float(down.min())
 
 
-# ---------------- Fisher information of a motion, and the least covariance that follows from it
+# ---------------- Fisher information and least covariance
 
 
 SURE = 3.0
-"""A direction is observable in which the information exceeds so many of its standard errors."""
+"""Number of standard errors that the information of an observable direction exceeds."""
 
 
 @dataclass(frozen=True)
@@ -352,28 +356,31 @@ class Bound:
 
     Attributes:
         information: F ``(3, 3)`` of sideways, forward [1/m^2] and yaw [1/rad^2].
-        reason: covariance of the elements of F, from the noise of the rays that it was computed with ``(3, 3, 3, 3)``.
+        reason: covariance of the elements of F due to the noise of the rays in its computation ``(3, 3, 3, 3)``.
     """
 
     information: NDArray[np.float64]
     reason: NDArray[np.float64]
 
     def __add__(self, other: Bound) -> Bound:
-        """Of two independent images."""
+        """Return the bound of two independent images."""
         return Bound(self.information + other.information, self.reason + other.reason)
 
     def covariance(self, frames: int = 1) -> NDArray[np.float64]:
-        """Return the least covariance ``(3, 3)`` [m, m, rad]: of one frame against an oracle, or of two noisy frames.
+        """Return the least covariance ``(3, 3)`` [m, m, rad]: of one frame relative to an oracle, or of two noisy frames.
 
-        The pseudo-inverse where not all can be observed: the variance of an axis with a part in what cannot be is inf.
+        It is the pseudo-inverse where not everything can be observed. Axes that contribute to an unobservable direction have
+        infinite variance.
         """
         if frames not in (1, 2):
             raise MitsonarError(f"a bound is that of 1 or 2 noisy frames: got {frames}")
+        # scale F to a unit diagonal; keep the directions that exceed their errors
         diagonal = np.diag(self.information)
         scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
         size, axes = np.linalg.eigh(self.information * np.outer(scale, scale))
         known = size > np.maximum(SURE * self._error(axes * scale[:, None]), 1e-9)
         inverse = (axes[:, known] / size[known]) @ axes[:, known].T * np.outer(scale, scale)
+        # axes with a part in the other directions are unobservable
         lost = (axes[:, ~known] ** 2).sum(axis=1) > 1e-3
         inverse[lost, :] = inverse[:, lost] = 0
         inverse[lost, lost] = np.inf
@@ -385,7 +392,7 @@ class Bound:
 
     @property
     def relative_error(self) -> NDArray[np.float64]:
-        """Standard error of :meth:`std` as a part of it ``(3,)``; nan where an axis cannot be observed."""
+        """Relative standard error of :meth:`std` ``(3,)``; nan where an axis cannot be observed."""
         covariance = self.covariance()
         variance = np.diag(covariance)
         finite = np.where(np.isfinite(covariance), covariance, 0)
@@ -402,8 +409,9 @@ def fisher(jacobian: NDArray[np.float64], weight: NDArray[np.float64]) -> Bound:
     """Compute F = J1' W J2, made symmetric, and the covariance of its elements.
 
     Args:
-        jacobian: two independent estimates of how k numbers of n independent values change with the motion ``(2, n, k, 3)``.
-        weight: information of each value about its numbers ``(n, k, k)``.
+        jacobian: two independent estimates of the derivatives of k parameters of n independent values by the motion
+            ``(2, n, k, 3)``.
+        weight: information of each value about its parameters ``(n, k, k)``.
     """
     return fisher_by(jacobian, lambda values: weight @ values)
 
@@ -411,11 +419,11 @@ def fisher(jacobian: NDArray[np.float64], weight: NDArray[np.float64]) -> Bound:
 def fisher_by(jacobian: NDArray[np.float64], weigh: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Bound:
     """Compute F = J1' W J2 of values that need not be independent; see :func:`fisher`.
 
+    With M the mean and D half the difference of both estimates it is M' W M - D' W D, and the noise of M is as large as D.
+
     Args:
         jacobian: two independent estimates ``(2, n, k, 3)``.
         weigh: multiplies derivatives ``(n, k, 3)`` by the information of all values, W.
-
-    With M the mean and D half the difference of both it is M' W M - D' W D, and the noise of M is as large as D.
     """
     mean, half = jacobian.mean(axis=0), (jacobian[0] - jacobian[1]) / 2
     weighted = weigh(half)
@@ -429,28 +437,24 @@ def fisher_by(jacobian: NDArray[np.float64], weigh: Callable[[NDArray[np.float64
 
 
 def together(parts: Sequence[Bound | None]) -> Bound | None:
-    """Add the information of several views, whose noise is independent; None where one view alone has no bound."""
+    """Add the information of several views, whose noise is independent; None if any view has no bound."""
     known = [part for part in parts if part is not None]
     return sum(known[1:], known[0]) if len(known) == len(parts) else None
 
 
 def overall(stds: Iterable[ArrayLike]) -> NDArray[np.float64]:
-    """One number an axis for many poses ``(3,)``: the root of the mean variance, which an RMSE is to be compared with."""
+    """Return one number per axis for many poses ``(3,)``: the root of the mean variance, which is comparable to an RMSE."""
     return np.asarray(np.sqrt(np.mean(np.square(np.array(list(stds), dtype=float)), axis=0)))
 
 
-# ---------------- How scores of neighbouring cells covary, since array and pulse spread echoes and noise over some of
-# them
-# The information of n correlated values about a motion is J' W^1/2 C^-1 W^1/2 J: J how they change with it, W what each
-# tells, C the covariance of their standardised scores. It is what the best weighted sum of the scores can use. Parts of
-# C are products of a correlation over bins and one over beams.
+# ---------------- Covariance of the scores of cells
 
 
 Complex = NDArray[np.complex128]
 Floats = NDArray[np.float64]
 
 TOLERANCE, MOST_STEPS = 1e-5, 2000
-"""Relative residual at which the conjugate gradients end, and their steps at most."""
+"""Relative residual at which the conjugate gradients end, and their largest number of steps."""
 
 
 @dataclass(frozen=True)
@@ -466,7 +470,7 @@ class CellCorrelation:
     over_beams: Floats
 
     def __mul__(self, other: CellCorrelation) -> CellCorrelation:
-        """Multiply cell by cell."""
+        """Multiply element by element."""
         return CellCorrelation(csr_array(self.over_bins.multiply(other.over_bins)), self.over_beams * other.over_beams)
 
     def __matmul__(self, image: NDArray[Any]) -> NDArray[Any]:
@@ -476,11 +480,16 @@ class CellCorrelation:
 
 @dataclass(frozen=True)
 class ScoreCovariance:
-    """Covariance of the standardised scores of all cells: sums of Re(w_i* R_ij w_j), and a part that no two cells share.
+    """Covariance of the standardised scores of all cells: sums of Re(w_i* R_ij w_j), and an uncorrelated part.
+
+    Array and pulse spread echoes and noise over several cells, so the scores of neighbours are correlated. The information
+    of n correlated values about a motion is J' W^1/2 C^-1 W^1/2 J: J is their derivative by the motion, W their individual
+    information, C the covariance of their standardised scores. It is what the best weighted sum of the scores can use. Parts
+    of C are products of a correlation over bins and one over beams.
 
     Attributes:
         parts: weights w ``(bins, beams)`` with the correlation R.
-        own: variance that no two cells share ``(bins, beams)``, so that all have variance 1.
+        own: variance of each cell that is uncorrelated with others ``(bins, beams)``, so that all have variance 1.
     """
 
     parts: list[tuple[NDArray[Any], CellCorrelation]]
@@ -488,7 +497,7 @@ class ScoreCovariance:
 
     @classmethod
     def of(cls, parts: list[tuple[NDArray[Any], CellCorrelation]], shape: tuple[int, int]) -> ScoreCovariance:
-        """Add the part that makes all variances 1.
+        """Add the uncorrelated part that makes all variances 1.
 
         Args:
             parts: see the attribute.
@@ -509,7 +518,7 @@ class ScoreCovariance:
         """Return C^-1 of maps ``(k, bins, beams)``, by conjugate gradients.
 
         Raises:
-            MitsonarError: they do not converge.
+            MitsonarError: the iteration does not converge.
         """
         found, rest = np.zeros_like(values), values.copy()
         way, size = rest.copy(), np.einsum("kij,kij->k", rest, rest)
@@ -517,6 +526,7 @@ class ScoreCovariance:
         for _ in range(MOST_STEPS):
             if (size <= goal).all():
                 return found
+            # one step along the conjugate direction of each map; maps of zeros stay zero
             spread = self @ way
             along = np.einsum("kij,kij->k", way, spread)
             step = np.divide(size, along, out=np.zeros_like(size), where=along > 0)[:, None, None]
@@ -527,19 +537,7 @@ class ScoreCovariance:
         raise MitsonarError("the covariance of the cells cannot be inverted: give beams nearer to the width of the spacing")
 
 
-# ---------------- The Cramer-Rao lower bound of motion in the model ``coherent``, whose pixels are |s + n|: speckle
-# s, receiver's noise n
-# *Grain known*: an oracle owns the scatterers, so s is a function of the pose. A pixel has the Rice law
-# (:mod:`mitsonar.acoustics.speckle`), and what changes with the motion is |s|^2. Only amplitudes are observed: the
-# phase of s, which turns once in a quarter of a millimetre, tells nothing. Neighbouring cells share noise.
-#
-# *Ground known*: an oracle knows the expected level of every cell, as that of the other models does, but no scatterers:
-# each frame has grain of its own, as after a motion of more than the grain's size. An intensity is exponential; its
-# score is the intensity over its mean, and scores of two cells covary as the squared coherence of their fields.
-#
-# Both are what the best weighted sum of the scores of single pixels can use. `ground` is optimistic in two ways:
-# speckle correlates as on even ground, though a dark cell beside a bright one shows that one's grain; and patches of
-# ``speckle_nu``, which belong to the grain, are not in it.
+# ---------------- Bounds of the coherent model
 
 
 SPECKLE_LAWS: dict[str, str] = {
@@ -548,27 +546,42 @@ SPECKLE_LAWS: dict[str, str] = {
 }
 
 GRAIN_PINGS, GROUND_PINGS = 2, 4
-"""Places at which each half of the derivatives is taken: bounds vary by 1 to 3 %."""
+"""Number of places at which each half of the derivatives is taken: bounds vary by 1 to 3 %."""
 
 GRAIN_STEP = 1 / 8
-"""Step of the grain's derivatives, as a part of a bin (forward) and of a beam (sideways, yaw): a tenth of the grain."""
+"""Step of the grain's derivatives, as a fraction of a bin (forward) and of a beam (sideways, yaw): a tenth of the grain."""
 
 OTHER_RAYS: dict[str, Quality] = {"draft": "standard", "standard": "fine", "fine": "standard"}
 """Quality of the rays of the other half."""
 
 AGREEING = 0.5
-"""Echoes on which two sets of rays disagree by a larger part are left out: sharp edges, thin tops of rocks. So are expected
-levels that vary by a larger part from ping to ping of moving rays."""
+"""Relative deviation beyond which a value is left out.
+
+It applies to echoes on which two sets of rays disagree, such as sharp edges and thin tops of rocks, and to expected levels
+that vary from ping to ping of moving rays.
+"""
 
 GREYS = 255
 
 
 class SpeckleBounds:
-    """Bounds of one coherent sonar in one scene.
+    """Bounds of one sonar of the model ``coherent`` in one scene, whose pixels are |s + n|: speckle s, receiver noise n.
+
+    *Grain known*: an oracle has the scatterers, so s is a function of the pose. A pixel has the Rice law
+    (:mod:`mitsonar.acoustics.speckle`), and |s|^2 changes with the motion. Only amplitudes are observed: the phase of s,
+    which turns once in a quarter of a millimetre, gives no information. Neighbouring cells share noise.
+
+    *Ground known*: an oracle knows the expected level of every cell, as for the other models, but no scatterers. Each frame
+    has new grain, as after a motion of more than the grain's size. An intensity is exponential; its score is the intensity
+    over its mean, and the scores of two cells covary as the squared coherence of their fields.
+
+    Both bounds are what the best weighted sum of the scores of single pixels can use. ``ground`` is optimistic in two
+    respects: speckle correlates as on even ground, though a dark cell beside a bright one shows the grain of the bright one;
+    and it leaves out patches of ``speckle_nu``, which belong to the grain.
 
     Args:
         simulator: of the model ``coherent``.
-        gain: that of the frames.
+        gain: gain of the frames.
 
     Raises:
         MitsonarError: another model.
@@ -580,8 +593,9 @@ class SpeckleBounds:
         self.sonar, self.gain = simulator.sonar, gain
         self.imager = simulator.coherent
         self.halves = self.imager, self.imager.of_quality(OTHER_RAYS[self.sonar.quality])
-        mirrors = simulator.mirrors if self.sonar.bounces > 1 else None  # one reflection has no expected level of a mirror
+        mirrors = simulator.mirrors if self.sonar.bounces > 1 else None  # with one reflection a mirror has no expected level
         self.expected = Simulator(simulator.tracer.scene, expected_sonar(self.sonar), mirrors=mirrors)
+        # noise of the receiver and of the volume, which beams correlate differently
         noise, volume = self.imager.noise_powers()
         self.noise = np.broadcast_to((noise + volume)[:, None], (self.sonar.range_bins, self.sonar.beams))
         beams = self.imager.beam_correlations()
@@ -591,29 +605,31 @@ class SpeckleBounds:
         self.of_speckle = CellCorrelation(bins, beams[2])
 
     def at(self, poses: ArrayLike, *, pings: int | None = None) -> Iterator[dict[str, Bound]]:
-        """Bounds by law of :data:`SPECKLE_LAWS`, at each pose.
+        """Compute the bounds at each pose, keyed by :data:`SPECKLE_LAWS`.
 
         Args:
-            poses: of the sonar ``(n, 6)``.
-            pings: of each half of the derivatives; default: 2 for the grain, 4 for the ground.
+            poses: poses of the sonar ``(n, 6)``.
+            pings: pings of each half of the derivatives; default: 2 for the grain, 4 for the ground.
         """
         for number, pose in enumerate(np.atleast_2d(np.asarray(poses, dtype=float))):
             first = FIRST_PING + 32 * PINGS * number
             yield {"grain": self.grain(pose, pings).bound(), "ground": self.ground(pose, pings, first).bound()}
 
     def grain(self, pose: Floats, pings: int | None = None) -> CellScores:
-        """Return what cells tell of the motion where the scatterers are known.
+        """Return the information of cells about the motion if the scatterers are known.
 
-        Differences are those of the power of echoes, by two sets of rays.
+        The derivatives are those of the power of echoes, by two sets of rays.
 
         Args:
-            pose: of the sonar ``(6,)``.
+            pose: pose of the sonar ``(6,)``.
             pings: see :meth:`at`.
         """
+        # two independent estimates of the derivative, by two sets of rays
         step = np.array(step_for(self.sonar, GRAIN_STEP))
         jacobian = np.stack([_power_slopes(imager, pose, step, pings or GRAIN_PINGS) for imager in self.halves])
         echo, other = (imager.echoes(pose)[0].astype(np.complex128) for imager in self.halves)
         level = np.abs(echo) ** 2 + self.noise
+        # leave out clipped pixels and echoes on which the rays disagree; rounding adds variance
         scale = self.gain * self.imager.gain.astype(float)[:, None]
         slope = coding_slope(level * scale, self.sonar) * scale
         use = (slope > 0) & (np.abs(echo - other) < AGREEING * np.abs(echo + other) / 2)
@@ -621,20 +637,22 @@ class SpeckleBounds:
         return CellScores(jacobian, *grain_law(echo, self.noise, self.of_noise, rounding))
 
     def ground(self, pose: Floats, pings: int | None = None, first: int = FIRST_PING) -> CellScores:
-        """Return what cells tell of the motion where the expected level is known.
+        """Return the information of cells about the motion if the expected level is known.
 
-        Differences are those of the expected level, over level and noise.
+        The derivatives are those of the expected level, divided by the sum of level and noise.
 
         Args:
-            pose: of the sonar ``(6,)``.
+            pose: pose of the sonar ``(6,)``.
             pings: see :meth:`at`.
-            first: number of the first ping, of which the rays' jitter is a function.
+            first: number of the first ping, which determines the rays' jitter.
         """
+        # expected level and derivative, scaled well below clipping
         gain = 0.01 / float(next(self.expected.pings(pose[None], first=first)).levels.max())
         (derivative,) = next(differentiate(self.expected, pose, gain, pings=pings or GROUND_PINGS, first=first))
         level = derivative.level + self.noise * self.imager.gain[:, None] * gain
         known = (level > 0) & (derivative.variance < (AGREEING * level) ** 2)
         safe = np.where(known, level, 1)
+        # fractions of speckle and noise, whose products give the covariance of the scores
         echo = np.where(known, derivative.level, 0) / safe
         other = np.where(known, 1 - echo, 0.0)
         parts = [
@@ -647,11 +665,11 @@ class SpeckleBounds:
 
 
 class CellScores(NamedTuple):
-    """What the cells of a frame tell of the motion.
+    """Information of the cells of a frame about the motion.
 
     Attributes:
-        jacobian: two independent estimates of how the cells' numbers change with the motion ``(2, bins, beams, 3)``.
-        weight: Fisher information of each cell about its number ``(bins, beams)``.
+        jacobian: two independent estimates of the derivative of the cells' parameters by the motion ``(2, bins, beams, 3)``.
+        weight: Fisher information of each cell about its parameter ``(bins, beams)``.
         covariance: of the standardised scores.
     """
 
@@ -673,7 +691,7 @@ class CellScores(NamedTuple):
 def grain_law(
     echo: Complex, noise: Floats, shared: CellCorrelation, rounding: ArrayLike = 0.0
 ) -> tuple[Floats, ScoreCovariance]:
-    """Compute what amplitudes tell about the power of an echo whose noiseless field is known.
+    """Compute the information of amplitudes about the power of an echo whose noiseless field is known.
 
     Args:
         echo: the noiseless field ``(bins, beams)``.
@@ -689,13 +707,15 @@ def grain_law(
     """
     power = np.abs(echo) ** 2
     rounding = np.broadcast_to(np.asarray(rounding, dtype=float), power.shape)
+    # without noise only rounding limits the information
     if not (noise > 0).all():
         if not (rounding > 0).all():
             raise MitsonarError("without noise amplitudes tell the motion without limit: give the sonar noise_level_db")
         return 1 / rounding, ScoreCovariance([], np.ones(power.shape))
     variance = 1 / rician_information(power, noise)
     total = variance + rounding
-    kept = np.sqrt(variance / total)  # part of the score's standard deviation that is not rounding
+    kept = np.sqrt(variance / total)  # fraction of the score's standard deviation that is not rounding
+    # the score is a sum of terms in the noise, in its power and in its square, each with its correlation
     shares = score_shares(power, noise)
     turn = np.exp(1j * np.angle(echo))
     parts = [

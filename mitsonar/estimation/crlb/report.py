@@ -1,4 +1,4 @@
-"""Bounds of a subject as a report: JSON for programs, a table for people."""
+"""How bounds are computed for a scene or a data set and reported: JSON for programs, a table for people."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ __all__ = [
 
 
 Value = float | tuple[float, float]
-"""Of a variable: a number, or both ends of a window."""
+"""Value of a variable: a number, or both ends of a window."""
 
 Table = dict[tuple[str, str, str], list[Bound | None]]
-"""(portion, kind, law) -> a bound for each pose."""
+"""A bound for each pose, keyed by (portion, kind, law)."""
 
 UNITS = np.array([1e3, 1e3, np.degrees(1)])
 
@@ -54,14 +54,14 @@ def bounds_of_subject(
     pings: int | None,
     progress: Callable[[int], None],
 ) -> Table:
-    """Bounds at all poses, with sonar and poses changed.
+    """Compute the bounds at all poses, with changed sonar and poses.
 
     Args:
-        subject: what they are asked for.
-        noise: of the image.
-        changes: names of :data:`~mitsonar.estimation.crlb.image.VARIABLES` with values, one after another.
-        pings: of each half of the derivatives; None: as needed.
-        progress: called with how many poses are done.
+        subject: scenes, poses and sonar of the bounds.
+        noise: noise of the image.
+        changes: names of :data:`~mitsonar.estimation.crlb.image.VARIABLES` with values, applied one after another.
+        pings: pings of each half of the derivatives; None: as needed.
+        progress: called with the number of finished poses.
 
     Raises:
         MitsonarError: values that do not fit, or no echo at all.
@@ -85,7 +85,7 @@ def bounds_of_subject(
 
 
 def _gain(simulator: Simulator, poses: NDArray[np.float64]) -> float:
-    """Return the constant gain of all views of the first frames, as for a run."""
+    """Return the constant gain of all views from the first frames, as for a run."""
     batches = []
     for views in simulator.render_views(poses[:CALIBRATION_FRAMES]):
         flat = np.concatenate([pings.levels.reshape(len(pings), -1) for pings in views], axis=1)
@@ -96,16 +96,16 @@ def _gain(simulator: Simulator, poses: NDArray[np.float64]) -> float:
 
 
 def report_of(source: str, sonar: Sonar, noise: str, name: str | None, rows: list[tuple[Value | None, Table]]) -> PlainTable:
-    """Return the bounds as JSON can hold them.
+    """Return the bounds as a JSON object.
 
     Numbers are in mm and deg; they are null where there is no bound or the motion is not observable.
 
     Args:
         source: of scene or data.
-        sonar: tells the laws.
-        noise: of the pixels, by name.
-        name: of the variable, if any.
-        rows: value of the variable, with the bounds.
+        sonar: determines the laws.
+        noise: name of the noise of the pixels.
+        name: name of the variable, if any.
+        rows: values of the variable, each with the bounds.
     """
     found = []
     for value, table in rows:
@@ -135,7 +135,7 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def report_lines(report: PlainTable) -> list[str]:
-    """Return the table of least standard deviations as lines."""
+    """Return the table of least standard deviations as lines of text."""
     name = report["vary"]
     titles = [name] if name else []
     titles += ["portion", "data", "law", "one frame: mm / mm / deg", "two frames: mm / mm / deg", "poses"]
@@ -165,7 +165,7 @@ def _number(value: float | None, digits: int) -> str:
     return f"{value:.2g}" if 0 < value < 10 ** (1 - digits) else f"{value:.{digits}f}"
 
 
-# ---------------- What a bound is asked for: poses in one scene, or first poses of a data set's pairs
+# ---------------- Subjects: scenes and data sets
 
 
 @dataclass(frozen=True)
@@ -173,10 +173,10 @@ class Place:
     """A scene, and the poses in it.
 
     Attributes:
-        scene: Mitsuba's.
-        poses: of the sonar ``(n, 6)``.
-        heights: over the ground ``(n,)`` [m].
-        seed: of the scatterers here; None: the sonar's.
+        scene: the Mitsuba scene.
+        poses: poses of the sonar ``(n, 6)``.
+        heights: heights over the ground ``(n,)`` [m].
+        seed: seed of the scatterers here; None: that of the sonar.
     """
 
     scene: mi.Scene
@@ -187,15 +187,15 @@ class Place:
 
 @dataclass(frozen=True)
 class Subject:
-    """What a bound is asked for.
+    """Scenes, poses and sonar for which a bound is computed.
 
     Attributes:
         sonar: the instrument.
-        views: its views, made for a sonar; None where they cannot be made for another.
-        places: one after another, so that only one scene is in memory.
-        poses: in all of them.
-        gain: constant; None: set on the frames.
-        mirrors: of all scenes.
+        views: function that returns the views of a sonar; it may refuse any other than the instrument.
+        places: function that yields the places one after another, so that only one scene is in memory.
+        poses: number of poses in all places.
+        gain: constant gain; None: determined from the frames.
+        mirrors: mirrors of all scenes.
     """
 
     sonar: Sonar
@@ -209,14 +209,14 @@ class Subject:
 def subject_of_scene(
     scene: mi.Scene, sonar: Sonar, poses: NDArray[np.float64], *, segments: list[str], gain: float | None = None
 ) -> Subject:
-    """Poses in one scene.
+    """Return the subject of poses in one scene.
 
     Args:
-        scene: Mitsuba's.
+        scene: the Mitsuba scene.
         sonar: the instrument.
-        poses: of the sonar ``(n, 6)``.
+        poses: poses of the sonar ``(n, 6)``.
         segments: names of portions of a looking-down sonar's view; none: all of it.
-        gain: constant; None: set on the frames.
+        gain: constant gain; None: determined from the frames.
 
     Raises:
         MitsonarError: a pose over nothing.
@@ -231,14 +231,14 @@ def subject_of_scene(
 def subject_of_data(
     source: str, pairs: int, *, part: str | None = None, gain: float | None = None, seed: int | None = None
 ) -> Subject:
-    """First poses of pairs of a data set, scene by scene.
+    """Return the subject of the first poses of pairs of a data set, scene by scene.
 
     Args:
         source: path or URL.
-        pairs: how many, each of a sequence of its own.
-        part: of the data set; None: that which training does not see.
-        gain: constant; None: the data set's.
-        seed: of the rays; None: the data set's.
+        pairs: number of pairs, each from a different sequence.
+        part: part of the data set; None: the one that training does not see.
+        gain: constant gain; None: that of the data set.
+        seed: seed of the rays; None: that of the data set.
 
     Raises:
         MitsonarError: no pair, or no data set.

@@ -1,13 +1,14 @@
-"""The estimator ``direct``: photometric Gauss-Newton in native polar coordinates, over level ground.
+"""How the estimator ``direct`` registers two frames, over level ground and over relief.
 
-The exact geometry of a motion gives, for each cell of one frame, where the other frame shows the same ground. Each frame is
-drawn at the cells of the other, and both differences are used: where both frames are interpolated at once, a texture finer
-than a beam biases the estimate towards whole and half beams. The slopes of the mean of both frames, denoised, turn
-differences into motion. Single differences, and whole blocks that move on their own, have Cauchy weights: shadow edges and
-relief are outliers.
+It is photometric Gauss-Newton in native polar coordinates. The exact geometry of a motion gives, for each cell of one
+frame, where the other frame shows the same ground. Each frame is resampled at the cells of the other, and both differences
+are used: if both frames are interpolated at once, a texture finer than a beam biases the estimate towards whole and half
+beams. The slopes of the denoised mean of both frames turn differences into motion. Single differences, and whole blocks
+that move independently, have Cauchy weights: shadow edges and relief are outliers.
 
-It starts from no motion, or from a prior. Where that fails or hardly stands out, ``phase`` finds a start. Over far motions
-relief decides: there the heights of blocks are estimated, too (:mod:`mitsonar.estimation.image.direct`).
+The iteration starts from zero motion, or from a prior. Where that fails or the match hardly stands out, ``phase`` finds a
+start. Over far motions relief dominates the error, so the heights of blocks are estimated as well
+(:func:`registered_over_relief`).
 """
 
 from __future__ import annotations
@@ -69,44 +70,53 @@ LEVELS = (
     DirectLevel(4, (6.0, 1.5), (0.0, 0.0), 8),
     DirectLevel(1, (0.7, 0.5), (0.6, 0.4), 24),
 )
-"""Coarse to fine, for frames of linear levels: beams with hard edges."""
+"""Coarse to fine, for frames of linear levels, whose beams have hard edges."""
 
 LEVELS_CODED = (*LEVELS[:-1], DirectLevel(1, (0.5, 0.5), (0.6, 0.4), 24))
-"""For frames in decibels and other coded levels, whose beams and pulses overlap: these smooth by themselves.
+"""Coarse to fine, for frames in decibels and other coded levels: their overlapping beams and pulses smooth them already.
 
-Errors in speckle are 5 to 20 % smaller than with :data:`LEVELS`; those with hard edges would be 5 to 8 % larger. They would
-be smaller by another 5 % without what is as coarse as the illumination, but loops of a recording close at wrong places."""
+Errors in speckle are 5 to 20 % smaller than with :data:`LEVELS`; for beams with hard edges they would be 5 to 8 % larger.
+Removing content as coarse as the illumination would reduce them by another 5 %, but then loops of a recording close at
+wrong places.
+"""
 
 MODEL = 1.4
-"""Squared errors over the jackknife's covariance, measured at 60 places over rocky fields: 0.9 to 2.3 in speckle, 0.7 to 1.8
-in still texture, of six sonars."""
+"""Squared errors over the jackknife's covariance, measured at 60 places over rocky fields with six sonars.
+
+They range from 0.9 to 2.3 in speckle and from 0.7 to 1.8 in static texture.
+"""
 
 FAR_MODEL = 2.2
-"""Squared errors over the covariance of the blocks' pulls where their heights are estimated, measured on dives over rocky
-fields with a DIDSON, an ARIS and an Oculus, with speckle and without, 40 and 200 mm apart: 0.7 to 4.9, in the mean 2.2."""
+"""Squared errors over the covariance from the blocks' gradients, where block heights are estimated.
+
+Measured on dives over rocky fields with a DIDSON, an ARIS and an Oculus, with and without speckle, 40 and 200 mm apart:
+0.7 to 4.9, with a mean of 2.2.
+"""
 
 MOST_CELLS = 196_608
-"""Most cells that are registered, four times those of a DIDSON. Beams within their own width are averaged at no loss."""
+"""Largest number of cells registered, four times those of a DIDSON; averaging beams within their width loses nothing."""
 
 FARTHEST = np.array([0.15, 0.15, np.radians(3)])
-"""Farthest from its start that a motion is valid. Up to 100 mm and 2 deg it is always found; what is far beyond is noise."""
+"""Largest valid distance of a motion from its start. Up to 100 mm and 2 deg it is always found; far beyond is noise."""
 
 CLEARLY = 1.2
-"""Motions so many times farther than :data:`FAR` are far whatever the finest level would say."""
+"""Motions this many times farther than :data:`FAR` count as far, whatever the finest level would show."""
 
 FAR, FAR_RAD = 0.02, float(np.radians(1.5))
-"""Motions beyond this part of the height, or this turn, are far: relief decides, and ``phase`` finds those missed."""
+"""Motions beyond this fraction of the height, or this turn, are far: relief dominates, and ``phase`` finds missed ones."""
 
 GRAZING = 0.32
-"""Squared height over range of those fields: in a look that grazes more, relief moves less, as a plate from 0.3 m shows."""
+"""Squared ratio of height to range over rocky fields. Relief moves less at more grazing angles, as on a plate at 0.3 m."""
 
 HELD = np.array([0.05, 0.05, np.radians(1)])
-"""Standard deviation of a prior of no motion from the start: noise must not drive one where the frames tell little.
+"""Standard deviation of a prior that holds a motion at its start, so that noise cannot drive it where frames show little.
 
-Sideways and yaw are told apart by few beams; without it one pair in twenty of hulls in high noise went off by 0.1 m."""
+Few beams hardly separate sideways motion from yaw. Without this prior, one pair in twenty of hulls in high noise was
+off by 0.1 m.
+"""
 
 NEARBY = np.array([0.05, 0.05, np.radians(1)])
-"""Farthest from a start that the registration over relief reaches."""
+"""Largest distance from its start that the registration over relief reaches."""
 
 COVERED = 2.0
 """Standard deviations of its smoothing that a level reaches."""
@@ -117,7 +127,7 @@ LARGEST_STD = np.array([0.02, 0.02, np.radians(0.5)])
 
 @dataclass(frozen=True)
 class _Task:
-    """Two frames to be registered, and what is known of them."""
+    """Two frames to register, with the attitude and the prior."""
 
     frames: SonarFrames
     images: tuple[Floats, Floats]
@@ -126,7 +136,7 @@ class _Task:
 
     @property
     def relief_m(self) -> float:
-        """Height [m] from which relief, seen as steeply as rocky fields are, would move as it does here."""
+        """Height [m] from which relief would move as it does here if seen as steeply as on rocky fields."""
         middle_m = float(self.frames.range_m[[0, -1]].mean())
         return max(self.attitude.height_m, GRAZING * middle_m**2 / self.attitude.height_m)
 
@@ -136,15 +146,15 @@ class Direct:
     """Photometric registration with the exact geometry of the sonar over level ground.
 
     Args:
-        height_m: over the ground, where the window shows no first echoes; default: that of the frames.
+        height_m: height over the ground, used where the window shows no first echoes; default: that of the frames.
         pitch_rad: default: that of the frames.
-        relief_m: mean height of rocks and growth over the ground; default: from the first echoes, where the window shows
-            them, else 0. An unknown relief scales motions wrongly by about its part of the height.
-        heave_std_m: how far the sonar may have risen or sunk between the frames; 0: not at all.
-        levels: coarse to fine; default: :data:`LEVELS`, or :data:`LEVELS_CODED` for coded levels.
+        relief_m: mean height of rocks and growth over the ground; default: from the first echoes where the window shows
+            them, else 0. An unknown relief scales motions by an error of about its fraction of the height.
+        heave_std_m: standard deviation of the rise or fall of the sonar between the frames; 0: none.
+        levels: pyramid levels, coarse to fine; default: :data:`LEVELS`, or :data:`LEVELS_CODED` for coded levels.
 
     Raises:
-        MitsonarError: a height or a heave that is not positive.
+        MitsonarError: a height that is not positive, or a negative or infinite ``heave_std_m``.
     """
 
     height_m: float | None = None
@@ -165,19 +175,19 @@ class Direct:
             )
 
     def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
-        """Estimate the motion and its covariance; reject frames without anything to match.
+        """Estimate the motion and its covariance; reject frames that hold nothing to match.
 
         Args:
-            frames: two.
-            prior: where to start and how far to search; a motion that contradicts it is rejected. Default: it starts from no
-                motion. Where that finds none, or none that stands out, and nothing tells that the motion is near,
-                :class:`Phase` finds the start.
+            frames: two frames.
+            prior: where to start and how far to search; a motion that contradicts it is rejected. Default: start from zero
+                motion. If that finds no motion, or none that stands out, :class:`Phase` finds the start, unless the prior
+                shows that the motion is near.
 
         Returns:
             The estimate; ``start`` of ``about`` is ``zero``, ``prior`` or ``phase``.
 
         Raises:
-            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+            MitsonarError: invalid frames, see :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
         """
         images = two_frames(frames)
         attitude = attitude_of(frames, "direct", self.height_m, self.pitch_rad, self.relief_m)
@@ -186,20 +196,20 @@ class Direct:
         task = _Task(*_resolved(frames, images), attitude, prior)
         start = Motion(0.0, 0.0, 0.0) if prior is None else prior.motion
         found = self._from(task, start, "zero" if prior is None else "prior")
-        # light over even ground correlates at any motion: a match that hardly stands out may be far from the true one
+        # lighting over even ground correlates at any motion: a match that hardly stands out may be far from the true one
         if (found.valid and found.about.get("stands_out", True)) or (
             prior is not None and (3 * prior.std <= FARTHEST).all()
         ):
             return found
         elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
         if not elsewhere.valid or not is_far(elsewhere.motion, attitude.height_m):
-            return found  # a motion nearby has been looked for
+            return found  # the first registration has already searched near motions
         second = self._from(replace(task, prior=None), elsewhere.motion, "phase")
         reason = second.reason or prior_rejection(second.motion, second.covariance, prior)
         return replace(second, valid=not reason, reason=reason)
 
     def _from(self, task: _Task, start: Motion, named: str) -> Estimate:
-        """Register from a start: over level ground while the motion is near, over relief where it is far."""
+        """Register from a start: over level ground while the motion is near, over relief if it is far."""
         if self.heave_std_m:
             return self._over_level(task, start, named)
         if not is_far(start, task.relief_m):
@@ -221,7 +231,10 @@ class Direct:
     @overload
     def _over_level(self, task: _Task, start: Motion, named: str, *, until_far: bool) -> Estimate | Motion: ...
     def _over_level(self, task: _Task, start: Motion, named: str, *, until_far: bool = False) -> Estimate | Motion:
-        """Register from a start over level ground; ``until_far``: no finer than shows that the motion is clearly far."""
+        """Register from a start over level ground.
+
+        With ``until_far``, skip the finest level and return the motion alone if it is clearly far.
+        """
         v = np.zeros(4 if self.heave_std_m else 3)
         v[:3] = start
         std = HELD if task.prior is None else np.maximum(HELD, task.prior.std)
@@ -229,6 +242,7 @@ class Direct:
         fit = None
         levels, nodes = self._levels(task), GroundNodes(task.frames, task.attitude, heave=bool(self.heave_std_m))
         for number, level in enumerate(levels):
+            # coarse to fine; leave out levels too coarse for the frames, and the finest for a clearly far motion
             last = number + 1 == len(levels)
             if not last and not is_resolved(len(task.images[0]), level):
                 continue
@@ -245,7 +259,7 @@ class Direct:
         return self._judged(task, start, v[:3], fit, MODEL, {**about, "start": named})
 
     def _levels(self, task: _Task) -> tuple[DirectLevel, ...]:
-        """Return the levels that are needed: none that is coarser than one which reaches all that a prior leaves open."""
+        """Return the levels to run; skip those coarser than one that covers the uncertainty of the prior."""
         levels = self.levels or (LEVELS if task.frames.level == "linear" else LEVELS_CODED)
         if task.prior is None:
             return levels
@@ -261,11 +275,11 @@ class Direct:
         return levels[needed[-1] if needed else 0 :]
 
     def _over_relief(self, task: _Task, start: Motion, near: Motion, named: str) -> Estimate:
-        """Register over relief, from a motion that is near; the result counts from the start."""
+        """Register over relief from a nearby motion; the distance of the result is measured from ``start``."""
         found = registered_over_relief(task.images, task.frames, task.attitude, np.array(near))
         if found is None:
             return replace(rejected("nothing in the frames to match"), about={"start": named})
-        # far motions match the ground between rocks, too: rocks look different from elsewhere
+        # far motions also match the ground between rocks, since rocks look different from elsewhere
         std = float(np.hypot(task.attitude.height_std_m, task.attitude.tops_m))
         unsure = replace(task, attitude=replace(task.attitude, height_std_m=std))
         return self._judged(unsure, start, *found, FAR_MODEL, {"start": named})
@@ -273,7 +287,7 @@ class Direct:
     def _judged(
         self, task: _Task, start: Motion, v: NDArray[np.float64], fit: Fit, model: float, about: dict[str, object]
     ) -> Estimate:
-        """Return the estimate with its covariance, rejected where it must not be used."""
+        """Return the estimate with its covariance, rejected if it must not be used."""
         height = fit.by_height[:3] * task.attitude.height_std_m
         covariance = model * fit.covariance[:3, :3] + np.outer(height, height)
         motion = Motion(*(float(x) for x in v))
@@ -285,15 +299,15 @@ class Direct:
         if fit.excess != UNMEASURED:
             about["stands_out"] = stands_out(fit.independent, fit.excess)
         if task.attitude.first is not None:
-            first_m = task.attitude.first.height_m  # over ground that rises the motion has another one
+            first_m = task.attitude.first.height_m  # the motion uses a different height over rising ground
             about |= {"height_m": first_m, "height_std_m": STD_MEASURED * first_m}
         return Estimate(motion, covariance, not reason, reason, about)
 
 
 def _resolved(frames: SonarFrames, images: tuple[Floats, Floats]) -> tuple[SonarFrames, tuple[Floats, Floats]]:
-    """Return frames of at most :data:`MOST_CELLS` cells: the means of as many bins and beams as that takes.
+    """Reduce frames to at most :data:`MOST_CELLS` cells by averaging bins and beams.
 
-    Beams that are closer than their width are averaged first, then what has the more cells.
+    Beams closer together than their width are averaged first, then the axis with more cells.
     """
     bins, beams = images[0].shape
     width = float(np.median(np.diff(frames.bearing_rad))) / frames.sonar.beam_width_rad
@@ -313,12 +327,12 @@ def _resolved(frames: SonarFrames, images: tuple[Floats, Floats]) -> tuple[Sonar
 
 
 def is_far(motion: Motion, height_m: float) -> bool:
-    """Return whether relief decides over a motion, seen from this height [m]."""
+    """Return whether relief dominates the error of a motion seen from this height [m]."""
     return bool(np.hypot(motion.sideways, motion.forward) > FAR * height_m or abs(motion.yaw) > FAR_RAD)
 
 
 def _rejection(fit: Fit, covariance: NDArray[np.float64], off: NDArray[np.float64]) -> str:
-    """Return the reason of a rejection; empty for a valid estimate, which is so far off its start."""
+    """Return why an estimate is rejected, given its distance ``off`` from the start; empty if it is valid."""
     std = np.sqrt(np.diag(covariance))
     if not fit.converged:
         return "the iteration did not settle"
@@ -334,13 +348,7 @@ def _rejection(fit: Fit, covariance: NDArray[np.float64], off: NDArray[np.float6
     return ""
 
 
-# ---------------- Registration of far motions over relief: the height of each block of ground is estimated together
-# with the motion
-# A rock of 0.3 m, seen from 2.5 m, moves by 10 % less or more than level ground: 20 mm of a motion of 200 mm. Over
-# motions of 20 mm that is lost among the bins, over far ones it is most of the error. Each block of cells has a height
-# of its own, with a Gaussian prior; the heights are eliminated block by block (Schur complement), so that a step costs
-# as much as one without. Cells are left out one by one where the other frame does not show them: a turn of 6 deg hides
-# a fifth of a narrow fan.
+# ---------------- Far motions over relief
 
 Pair = tuple[Floats, Floats]
 
@@ -355,27 +363,37 @@ RELIEF_BLOCK = (32, 12)
 """Bins and beams that share one height."""
 
 RELIEF_STD = 0.048
-"""Standard deviation of a block's height, as part of the sonar's: 0.12 m at 2.5 m."""
+"""Standard deviation of a block's height, as a fraction of the sonar's: 0.12 m at 2.5 m."""
 
 ILLUMINATION = (12.0, 4.0)
-"""Bins and beams beyond which brightness belongs to the sonar, which moves, and not to the ground."""
+"""Bins and beams beyond which brightness variations come from the sonar, which moves, and not from the ground."""
 
 ALIKE = 20.0
-"""Residuals that count as one: those of a block err together where its ground is not as the model has it."""
+"""Residuals that count as one: those of a block err together where its ground deviates from the model."""
 
 SETTLED = np.array([3e-4, 3e-4, 6e-5])
-"""Steps below which an iteration ends [m, m, rad]: a fifth of what is left over relief."""
+"""Steps below which an iteration ends [m, m, rad]: a fifth of the error that remains over relief."""
 
 TALLEST_STEP = 0.06
-"""Largest change of a height in one iteration, as part of the sonar's."""
+"""Largest change of a height in one iteration, as a fraction of the sonar's height."""
 
 SMALL = (2e-3, 2e-3, 5e-4, 0.04)
-"""Steps of numerical derivatives [m, m, rad], and of the height as part of the sonar's: 0.1 m at 2.5 m."""
+"""Steps of numerical derivatives [m, m, rad], and of the height as a fraction of the sonar's: 0.1 m at 2.5 m."""
 
 
 class _Equations(NamedTuple):
-    """Normal equations of motion and heights: of the motion ``(3, 3)``, of both ``(3, blocks)``, of each block's height
-    ``(blocks,)``; what pulls the motion, by block ``(3, blocks)``, and each height ``(blocks,)``."""
+    """Normal equations of motion and block heights.
+
+    Attributes:
+        normal: of the motion ``(3, 3)``.
+        both: cross terms of motion and heights ``(3, blocks)``.
+        height: diagonal term of each block's height ``(blocks,)``.
+        pulls: gradient by the motion, from each block ``(3, blocks)``.
+        height_pull: gradient by each height ``(blocks,)``.
+        noise: variance of the residuals, times the number of residuals that count as one.
+        correlation: of the first frame and the second, resampled.
+        cells: number of cells used.
+    """
 
     normal: NDArray[np.float64]
     both: NDArray[np.float64]
@@ -387,26 +405,33 @@ class _Equations(NamedTuple):
     cells: int
 
     def without_heights(self, prior: float, off: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the normal matrix ``(3, 3)`` and pull ``(3,)`` of the motion alone.
+        """Return normal matrix ``(3, 3)`` and gradient ``(3,)`` of the motion; heights are eliminated (Schur complement).
 
         Args:
             prior: information of each height [1/m^2].
-            off: heights less their prior mean ``(blocks,)`` [m].
+            off: heights minus their prior mean ``(blocks,)`` [m].
         """
         held = self.height + self.noise * prior
         return self.normal - (self.both / held) @ self.both.T, self.pulls_alone(prior, off).sum(axis=1)
 
     def pulls_alone(self, prior: float, off: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what each block pulls the motion by, its height eliminated ``(3, blocks)``; see :meth:`without_heights`."""
+        """Return each block's gradient by the motion, its height eliminated ``(3, blocks)``; see :meth:`without_heights`."""
         pulled = (self.height_pull + self.noise * prior * off) / (self.height + self.noise * prior)
         return self.pulls - self.both * pulled
 
 
 class _Drawn(NamedTuple):
-    """One frame drawn at the cells of the other, each ``(bins, beams)``: levels before and after, which cells count, slopes
-    over bins and beams, derivatives of the residual by motion and height, the same with weights ``(4, bins, beams)``, noise.
+    """One frame resampled at the cells of the other, as maps ``(bins, beams)``.
 
-    ``shown`` is the row and column of each cell in the frame of the blocks; None: that is this frame.
+    Attributes:
+        before: levels of the first frame.
+        after: levels of the second frame.
+        inside: which cells count.
+        slopes: slopes over bins and over beams.
+        jacobian: derivatives of the residual by motion and height ``(4, bins, beams)``.
+        weighted: the same times the weights.
+        scale: standard deviation of the residuals.
+        shown: row and column of each cell in the frame to which the blocks belong; None: it is this frame.
     """
 
     before: Floats
@@ -420,7 +445,7 @@ class _Drawn(NamedTuple):
 
 
 class _ReliefLevel:
-    """One level: its frames and cells, and derivatives at the motion with which it begins."""
+    """One pyramid level: its frames, its cells, and the derivatives at the motion with which it begins."""
 
     def __init__(self, images: Pair, nodes: GroundNodes, v: NDArray[np.float64], level: DirectLevel) -> None:
         self.level = level
@@ -447,9 +472,9 @@ class _ReliefLevel:
         return np.stack(found)
 
     def _mean(self, frames: SonarFrames, attitude: Attitude) -> NDArray[np.float64]:
-        """Return the prior mean of the heights ``(blocks,)`` [m]: level ground, as far as the fan lights it.
+        """Return the prior mean of the heights ``(blocks,)`` [m]: level ground, as far as the fan illuminates it.
 
-        What answers before the fan meets level ground is above it, and what answers beyond is below.
+        Echoes from nearer than the fan meets level ground come from above it, and echoes from beyond come from below.
         """
         half = np.radians(frames.sonar.elevation_fov_deg) / 2
         middle = by_block(self.cells.grid.range_m[:, None], (self.block[0], 1)) / by_block(
@@ -465,7 +490,7 @@ class _ReliefLevel:
             return None
         one = sides[0]
         summed = (self._summed(side, side.after - side.before) for side in sides)
-        total = np.sum(list(summed), axis=0)  # motion by motion and by residual, height by motion, by itself and by residual
+        total = np.sum(list(summed), axis=0)  # motion-motion, motion-residual, height-motion, height-height, height-residual
         by_motion, both, height = total[:12].reshape(3, 4, -1), total[12:15], total[15:]
         correlation = correlation_of(one.before[one.inside], one.after[one.inside])
         normal, pulls = by_motion[:, :3].sum(axis=-1), by_motion[:, 3]
@@ -474,7 +499,7 @@ class _ReliefLevel:
         )
 
     def pulls_by_lean(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the derivatives of the pulls of motion and heights by how the frames lean ``(3, 4, blocks)``."""
+        """Return the derivatives of all gradients by the frames' differences of height, pitch, roll ``(3, 4, blocks)``."""
         sides, shifts = self._drawn(v, heights), self.cells.leaning_shift_of_cells(v)
         assert sides is not None
         sums = [
@@ -484,32 +509,35 @@ class _ReliefLevel:
         return np.stack(sums)[:, [3, 7, 11, 16]]
 
     def _drawn(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> list[_Drawn] | None:
-        """Return each frame drawn at the cells of the other; None where too few cells remain."""
+        """Resample each frame at the cells of the other; return None where too few cells remain."""
         relief = on_cells(heights.reshape(self.blocks), self.shape, self.block)
         scale, found = 0.0, []
         for back, derivatives in zip((False, True), self.sides, strict=True):
+            # displace the cells by the motion, then by the height of their block, which belongs to the first frame
             level_shift = self.cells.shift(v, back=back)
             lift = relief if not back else sampled(relief, *self._places(level_shift))
             row, column = self._places(level_shift + derivatives[3] * lift)
             inside = self._inside(row, column)
             if inside.sum() < FEWEST_CELLS:
                 return None
+            # both residuals are second minus first, so that they share one scale and one sign
             drawn = sampled(self.images[0 if back else 1], row, column)
             before, after = (drawn, self.images[1]) if back else (self.images[0], drawn)
             residual = after - before
             if not back:
                 scale = noise_of(residual[inside][::5])
+            # slopes of the mean of both frames times the derivatives of the displacement give the Jacobian
             weight = cauchy(residual, scale) * inside
             slopes = slopes_of((before + after) * np.float32(0.5), self.level, scale)
             jacobian = (slopes[0] * derivatives[:, 0] + slopes[1] * derivatives[:, 1]) * np.float32(-1 if back else 1)
-            shown = self._places(level_shift) if back else None  # heights are those of the first frame's blocks
+            shown = self._places(level_shift) if back else None  # blocks belong to the first frame
             found.append(_Drawn(before, after, inside, slopes, jacobian, jacobian * weight, scale, shown))
         return found
 
     def _summed(self, side: _Drawn, residual: Floats) -> NDArray[np.float64]:
         """Return sums over blocks ``(17, blocks)``: motion by motion, motion by residual, height by all."""
         jacobian, weighted, shown = side.jacobian, side.weighted, side.shown
-        pairs = [(weighted[k], other) for k in range(3) for other in jacobian[k:3]]  # the rest is symmetric
+        pairs = [(weighted[k], other) for k in range(3) for other in jacobian[k:3]]  # the other half is symmetric
         pairs += [(weighted[k], residual) for k in range(3)]
         pairs += [(weighted[3], other) for other in (*jacobian, residual)]
         if shown is None:
@@ -522,6 +550,7 @@ class _ReliefLevel:
             number = (place[0] * self.blocks[1] + place[1]).ravel()
             count = self.blocks[0] * self.blocks[1]
             sums = np.stack([np.bincount(number, (a * b).ravel(), minlength=count) for a, b in pairs])
+        # restore the full rows from the symmetric half
         return np.asarray(sums[[0, 1, 2, 6, 1, 3, 4, 7, 2, 4, 5, 8, *range(9, 14)]])
 
     def _places(self, shift: Floats) -> tuple[Floats, Floats]:
@@ -540,16 +569,22 @@ class _ReliefLevel:
 def registered_over_relief(
     images: Pair, frames: SonarFrames, attitude: Attitude, start: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], Fit] | None:
-    """Register two frames from a start that is near the motion; None where there is nothing to match.
+    """Register two frames over relief from a start near the motion; return None if there is nothing to match.
+
+    A rock of 0.3 m seen from 2.5 m moves 10 % more or less than level ground: 20 mm of a motion of 200 mm. Over motions of
+    20 mm that is lost among the bins; over far motions it is most of the error. Each block of cells therefore has a height
+    with a Gaussian prior. The heights are eliminated block by block (Schur complement), so that a step costs as much as one
+    without them. Cells are left out one by one where the other frame does not show them: a turn of 6 deg hides a fifth of a
+    narrow fan.
 
     Args:
         images: both frames ``(bins, beams)`` in 0..1.
-        frames: the same, with their axes.
-        attitude: of the sonar; its height is that over the mean of what is seen.
+        frames: the same frames, with their axes.
+        attitude: of the sonar; its height is that over the mean of the visible ground.
         start: sideways, forward [m], yaw [rad] ``(3,)``.
 
     Returns:
-        The motion ``(3,)`` and its fit, whose derivative by the height is that by the mean of the heights.
+        The motion ``(3,)`` and its fit, whose derivative by height is that by the mean of the heights.
     """
     v, heights, shape = np.asarray(start, dtype=np.float64), None, (0, 0)
     prior = 1 / (RELIEF_STD * attitude.height_m) ** 2
@@ -559,11 +594,13 @@ def registered_over_relief(
         if number + 1 < len(RELIEF_LEVELS) and not is_resolved(len(images[0]), level):
             continue
         at = _ReliefLevel(images, nodes, v, level)
+        # heights of the coarser level, resampled to the blocks of this one
         if heights is not None:
             table = heights.reshape(shape).astype(np.float32)
             heights = cv2.resize(table, at.blocks[::-1]).ravel().astype(np.float64)
         heights, shape = at.mean.copy() if heights is None else np.asarray(heights), at.blocks
         for _ in range(level.iterations):
+            # Gauss-Newton step of the motion with the heights eliminated
             found = at.equations(v, heights)
             if found is None:
                 return None
@@ -571,6 +608,7 @@ def registered_over_relief(
             if np.linalg.eigvalsh(normal)[0] <= 0:
                 return None
             step = -np.linalg.solve(normal, pull)
+            # back-substitute the heights; limit their change, since the slopes are valid over short distances only
             held = found.height + found.noise * prior
             change = -(found.height_pull + found.noise * prior * (heights - at.mean) + found.both.T @ step) / held
             most = TALLEST_STEP * attitude.height_m
@@ -593,14 +631,16 @@ def _assessed(
     *,
     converged: bool,
 ) -> Fit:
-    """Return the covariance, and how the motion depends on the mean height and on how the frames lean.
+    """Return the fit: covariance, and sensitivity to the mean height and to differences of height, pitch and roll.
 
-    The covariance is that of the blocks' pulls, which hold whatever errs together within a block: noise, speckle, relief.
+    The covariance is that of the blocks' gradients, which include all errors common to a block: noise, speckle, relief.
     """
+    # motion per gradient, with the heights eliminated; the change by each block gives the covariance
     normal, _ = found.without_heights(prior, off)
     undone = np.linalg.inv(normal)
     held = found.noise * prior
     each = undone @ found.pulls_alone(prior, off)
+    # these differences change the gradients of both motion and heights; eliminate the heights as above
     by_lean = np.zeros((3, 3))
     if leaning is not None:
         alone = leaning[:, :3] - found.both * (leaning[:, 3:] / (found.height + held))

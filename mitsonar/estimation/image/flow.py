@@ -1,23 +1,26 @@
-"""The estimator ``flow``: the deterministic method of Almanza-Medina's comparisons, after Henson and Zakharov
-("Attitude-trajectory estimation for forward-looking multibeam sonar based on acoustic image registration", IEEE Journal of
-Oceanic Engineering, 2019; Almanza-Medina, 1.2.3, 2.3, 3.4.8).
+"""How the estimator ``flow`` finds a motion from dense optical flow.
+
+It is the deterministic method of Almanza-Medina's comparisons, after Henson and Zakharov ("Attitude-trajectory estimation
+for forward-looking multibeam sonar based on acoustic image registration", IEEE Journal of Oceanic Engineering, 2019;
+Almanza-Medina, 1.2.3, 2.3, 3.4.8).
 
 1. Dense optical flow between the frames, in native (range, bearing), gives a displacement map.
 2. The best match among the displacement maps of modelled sensor motions gives sideways, forward and yaw.
 3. A weighted regularised spline joins the motions of a run: :mod:`mitsonar.mapping.series`.
 
-Almanza-Medina gives no further details. Chosen here:
+Almanza-Medina gives no further details. This implementation makes the following choices:
 
-- The flow is Lucas and Kanade's: least squares of brightness within windows, with the slopes of both frames' mean. A window
-  says how well it knows each direction, which weighs the match; flow that does not say so (Farnebäck's, DIS) measured worse.
-- Coarse to fine, and at each level round by round: the flow starts from the displacement map of the motion found so far.
-- The modelled map is exact: cells as points of level ground, moved and seen again. "Among a set of motions" is Gauss-Newton
-  on it with robust weights, which ends at the best of an endlessly fine set.
-- ``match="vector"`` is the paper's own shortcut: a displacement map is described by a small vector "derived from the
-  displacement distribution"; which, is unsaid: here the means in range and in bearing and the slope of the displacement in
-  range over bearing, without weights.
-- The height over what is seen comes from the first echoes, or from the frames; it is known only to ``height_std``,
-  and is a fourth unknown of the match: rocks stand above the ground that the height is measured to.
+- The flow is that of Lucas and Kanade: least squares of brightness within windows, with the slopes of both frames' mean.
+  Each window gives its information about each direction, which weights the match. Flow without such information
+  (Farnebäck's, DIS) gave larger errors.
+- It runs coarse to fine, in several rounds per level: the flow starts from the displacement map of the current motion.
+- The modelled map is exact: cells are points of level ground, moved and observed again. "Among a set of motions" is
+  Gauss-Newton on this map with robust weights, which finds the best of an infinitely fine set.
+- ``match="vector"`` is the paper's shortcut: a displacement map is described by a small vector "derived from the
+  displacement distribution". The paper does not specify it. Here it is the mean displacements in range and in bearing
+  and the slope of the displacement in range over bearing, without weights.
+- The height over the visible surface comes from the first echoes, or from the frames. It is known only to ``height_std``
+  and is a fourth unknown of the match: rocks rise above the ground to which the height is measured.
 """
 
 from __future__ import annotations
@@ -51,8 +54,7 @@ __all__ = [
 ]
 
 
-# ---------------- The windows of a level of optical flow, and the displacements that a motion gives them over level
-# ground
+# ---------------- Windows of a level, and their modelled displacements
 
 
 Floats = NDArray[np.float32]
@@ -60,8 +62,15 @@ Doubles = NDArray[np.float64]
 
 
 class FlowLevel(NamedTuple):
-    """One step from coarse to fine: every so many bins of frames smoothed over bins and beams (standard deviations); windows
-    of so many bins and beams; at most so many rounds of flow and match."""
+    """One level of the pyramid.
+
+    Attributes:
+        step: stride in bins.
+        bins: standard deviation of the smoothing over bins.
+        beams: standard deviation of the smoothing over beams.
+        window: size of the windows [bins, beams].
+        rounds: largest number of rounds of flow and match.
+    """
 
     step: int
     bins: float
@@ -71,16 +80,16 @@ class FlowLevel(NamedTuple):
 
 
 HIGHER = 0.02
-"""The step in height that the map's change is taken from, as a part of it."""
+"""Step in height for the numerical derivative of the map, as a fraction of the height."""
 
 
 @dataclass(frozen=True)
 class WindowGrid:
-    """The cells of a level's frames over the ground, and the windows over them.
+    """The cells of a level's frames on the ground, and the windows over them.
 
     Attributes:
-        ground: of the first frame.
-        other: of the second frame.
+        ground: geometry of the first frame.
+        other: geometry of the second frame.
         level: of the windows.
     """
 
@@ -95,13 +104,13 @@ class WindowGrid:
 
     @cached_property
     def window(self) -> tuple[int, int]:
-        """Size of the windows in this level's rows and columns."""
+        """Size of the windows in rows and columns of this level."""
         bins, beams = self.level.window
         return max(3, bins // self.level.step), beams
 
     @cached_property
     def centres(self) -> tuple[slice, slice]:
-        """The cells in the middle of the windows; these overlap by half."""
+        """The cells at the centres of the windows, which overlap by half."""
         rows, columns = (max(1, size // 2) for size in self.window)
         return slice(rows // 2, None, rows), slice(columns // 2, None, columns)
 
@@ -112,7 +121,7 @@ class WindowGrid:
 
     @cached_property
     def spacing(self) -> Doubles:
-        """Metres of a row and radians of a column at the centres ``(n, m, 2)``."""
+        """Metres per row and radians per column at the centres ``(n, m, 2)``."""
         steps = [np.gradient(axis) for axis in (self.ground.range_m, self.ground.bearing_rad)]
         return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1)[self.centres]
 
@@ -123,12 +132,12 @@ class WindowGrid:
 
     @cached_property
     def derivative(self) -> Doubles:
-        """Of the centres' displacement by the motion ``(n, m, 2, 3)``; zero where they show no ground."""
+        """Derivative of the centres' displacement by the motion ``(n, m, 2, 3)``; zero where they show no ground."""
         return np.nan_to_num(self.ground.derivative[self.centres])
 
     @cached_property
     def _higher(self) -> tuple[GroundGeometry, GroundGeometry]:
-        """The sonar of both frames :data:`HIGHER` times the height of the first further up."""
+        """Geometry of both frames with the sonar raised by :data:`HIGHER` times the height of the first."""
         ground, other = (replace(one, height_m=one.height_m + HIGHER * self.ground.height_m) for one in self._both)
         return ground, other
 
@@ -138,7 +147,7 @@ class WindowGrid:
 
     @cached_property
     def _higher_points(self) -> Doubles:
-        """Ground points of the centres, seen from there ``(n, m, 2)``."""
+        """Ground points of the centres, seen from the raised sonar ``(n, m, 2)``."""
         return self._higher[0].points[self.centres]
 
     def map(self, v: Doubles) -> Doubles:
@@ -146,7 +155,7 @@ class WindowGrid:
         return np.nan_to_num(np.stack(self.other.to_polar(moved(self.points, v)), axis=-1) - self.home)
 
     def by_height(self, v: Doubles) -> Doubles:
-        """How that map changes with the height, in parts of it ``(n, m, 2, 1)``."""
+        """Return the derivative of the map by the relative height ``(n, m, 2, 1)``."""
         map_there = np.stack(self._higher[1].to_polar(moved(self._higher_points, v)), axis=-1) - self.home
         return (np.nan_to_num(map_there - self.map(v)) / HIGHER)[..., None]
 
@@ -160,13 +169,13 @@ def window_grid(
     second: tuple[float, float, float],
     level: FlowLevel,
 ) -> WindowGrid:
-    """Return the windows of a level over level ground; of each frame height [m], pitch and roll [rad]."""
+    """Return the windows of a level over level ground, given height [m], pitch and roll [rad] of each frame."""
     ranges = np.array(range_m)[level.step // 2 :: level.step]
     ground, other = (GroundGeometry(ranges, np.array(bearing_rad), bearing, *pose) for pose in (first, second))
     return WindowGrid(ground, other, level)
 
 
-# ---------------- flow
+# ---------------- Flow and estimator
 
 
 LEVELS = (
@@ -176,10 +185,10 @@ LEVELS = (
 )
 
 LONGEST_STEP = np.array([0.06, 0.06, np.radians(1.2)])
-"""What one round may add [m, m, rad]: where the flow is wrong, it is wrong without limit."""
+"""Largest change in one round [m, m, rad]: wrong flow can be wrong without limit."""
 
 FAINT, QUIET = 1e-3, 0.1
-"""Parts of the mean structure and of the mean residual that are added to those of each window."""
+"""Fractions of the mean structure and of the mean residual that are added to those of each window."""
 
 LEAST_CORRELATION = 0.25
 FEWEST_BLOCKS = 4.0
@@ -188,12 +197,13 @@ MODEL = 1.6
 """Squared errors over the covariance of the match, measured on dives of six sonars over rocky fields: 0.9 to 3.2."""
 
 LARGEST_STD = np.array([0.02, 0.02, np.radians(0.5)])
-"""Limits of a valid estimate: correlation within windows of the registered frames; blocks that hold the structure; the part
-of the structure that lies twice as far from the axis in elevation as the field of view; standard deviations [m, m, rad]."""
+"""Limits of a valid estimate: correlation within windows of the registered frames; blocks that hold the structure; the
+fraction of the structure that lies twice as far from the axis in elevation as the field of view; standard deviations
+[m, m, rad]."""
 
 
 class _Fit(NamedTuple):
-    """Motion and covariance; the correlation of the frames as matched; the structure in each window; whether it settled."""
+    """Motion, covariance, correlation of the matched frames, structure in each window, and whether the rounds settled."""
 
     motion: Doubles
     covariance: Doubles | None
@@ -207,16 +217,17 @@ class Flow:
     """Registration by optical flow, with the exact geometry of the sonar over level ground.
 
     Args:
-        height_m: over the ground, where the window shows no first echoes; default: that of the frames.
+        height_m: height over the ground, used where the window shows no first echoes; default: that of the frames.
         pitch_rad: default: that of the frames.
-        relief_m: mean height over the ground of what is seen; default: from the first echoes, where the window shows them.
-        match: ``map``, each window by what it knows; or ``vector``, three means and slopes of all windows.
-        height_std: how well the height over what is seen is known, as part of it; 0: exactly; default: as
-            :func:`~mitsonar.geometry.ground.attitude_of` says. Only for ``map``.
-        levels: coarse to fine.
+        relief_m: mean height of the visible surface over the ground; default: from the first echoes, where the window
+            shows them.
+        match: ``map``, which weights each window by its information; or ``vector``, three means and slopes of all windows.
+        height_std: relative standard deviation of the height over the visible surface; 0: known exactly; default: from
+            :func:`~mitsonar.geometry.ground.attitude_of`. Only for ``map``.
+        levels: pyramid levels, coarse to fine.
 
     Raises:
-        MitsonarError: another match, a height not above 0, or a height_std below 0.
+        MitsonarError: unknown match, a height not above 0, or a height_std below 0.
     """
 
     height_m: float | None = None
@@ -239,10 +250,10 @@ class Flow:
             raise MitsonarError(f"height_std must be 0 or more, a part of the height: got {self.height_std:g}")
 
     def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
-        """Estimate the motion and its covariance; reject frames without anything to match. A prior is ignored.
+        """Estimate the motion and its covariance; reject frames that hold nothing to match. A prior is ignored.
 
         Raises:
-            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+            MitsonarError: invalid frames, see :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
         """
         first, second = two_frames(frames)
         attitude = attitude_of(frames, "flow", self.height_m, self.pitch_rad, self.relief_m)
@@ -265,7 +276,7 @@ class Flow:
         return Estimate(Motion(*(float(x) for x in v)), covariance, not reason, reason, about)
 
     def _register(self, first: Floats, second: Floats, grid: WindowGrid, start: Doubles, height_std: float) -> _Fit | None:
-        """Run rounds of flow and match from a start; None where there is nothing to match."""
+        """Run rounds of flow and match from a start; return None if there is nothing to match."""
         v, converged = start, False
         for _ in range(grid.level.rounds):
             warped, inside = _warped(second, grid, v)
@@ -285,13 +296,13 @@ class Flow:
 
 
 def _smoothed(image: Floats, level: FlowLevel) -> Floats:
-    """Every so many bins of the smoothed image."""
+    """Smooth an image and keep every ``step``-th bin of the level."""
     smooth = cv2.GaussianBlur(image, (0, 0), sigmaX=level.beams, sigmaY=level.bins)
     return np.ascontiguousarray(smooth[level.step // 2 :: level.step])
 
 
 def _warped(second: Floats, grid: WindowGrid, v: Doubles) -> tuple[Floats, Floats]:
-    """Draw the second frame at the cells of the first, for a motion; and 1 where it is known, else 0 ``(bins, beams)``."""
+    """Resample the second frame at the cells of the first; return it, and 1 where known, else 0 ``(bins, beams)``."""
     radius, bearing = grid.other.to_polar(moved(grid.cells, v))
     row, column = _place(radius, grid.ground.range_m), _place(bearing, grid.ground.bearing_rad)
     bins, beams = second.shape
@@ -302,7 +313,7 @@ def _warped(second: Floats, grid: WindowGrid, v: Doubles) -> tuple[Floats, Float
 
 
 def _place(value: Floats, axis: Doubles) -> Floats:
-    """Fractional index of values on a rising axis; beyond its ends -1 or its length."""
+    """Return the fractional index of values on an increasing axis; -1 or its length beyond the ends."""
     step = (axis[-1] - axis[0]) / (len(axis) - 1)
     if np.allclose(np.diff(axis), step, rtol=1e-6, atol=0):
         return np.asarray((value - np.float32(axis[0])) * np.float32(1 / step), dtype=np.float32)
@@ -310,7 +321,8 @@ def _place(value: Floats, axis: Doubles) -> Floats:
 
 
 def _flow(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid) -> WindowFlow:
-    """Lucas and Kanade's step in each window."""
+    """Compute the step of Lucas and Kanade in each window."""
+    # slopes of the mean of both frames, and sums of their products over each window
     (by_row, by_column), (row_there, column_there) = (_slopes(image, inside) for image in (first, warped))
     row, column = (by_row + row_there) / 2, (by_column + column_there) / 2
     change = (first - warped) * inside
@@ -318,10 +330,12 @@ def _flow(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid) -> Wi
         _in_windows(product, grid)
         for product in (row * row, row * column, column * column, row * change, column * change, change * change)
     )
+    # regularise faint windows, then solve for the displacement in cells
     faint = FAINT * (rows + columns).mean() + TINY
     known = grid.derivative.any(axis=(2, 3)) & (rows + columns > faint)
     tensor = _symmetric(rows + faint, cross, columns + faint)
     cells = np.linalg.solve(tensor, np.stack([right_row, right_column], axis=-1)[..., None])[..., 0]
+    # information free of noise: slopes of one frame times slopes of the other
     shared = _symmetric(
         *(
             _in_windows(product, grid)
@@ -332,13 +346,14 @@ def _flow(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid) -> Wi
             )
         )
     )
+    # normalise by the residual of each window, and convert cells to metres and radians
     per = known / (noise + QUIET * noise.mean() + TINY)
     scale = per[..., None, None] / (grid.spacing[..., :, None] * grid.spacing[..., None, :])
     return WindowFlow(cells * grid.spacing, _symmetric(rows, cross, columns) * scale, shared * scale)
 
 
 def _slopes(image: Floats, inside: Floats) -> tuple[Floats, Floats]:
-    """Central differences over rows and over columns, where the image is known."""
+    """Return central differences over rows and over columns, zero where the image is unknown."""
     difference = np.array([[-0.5, 0, 0.5]], dtype=np.float32)
     by_row, by_column = (np.asarray(cv2.filter2D(image, -1, kernel), np.float32) for kernel in (difference.T, difference))
     return by_row * inside, by_column * inside
@@ -351,12 +366,12 @@ def _in_windows(values: NDArray[np.floating], grid: WindowGrid) -> Doubles:
 
 
 def _symmetric(one: Doubles, cross: Doubles, other: Doubles) -> Doubles:
-    """Matrices ``(..., 2, 2)`` of their parts."""
+    """Return symmetric matrices ``(..., 2, 2)`` from their elements."""
     return np.stack([np.stack([one, cross], axis=-1), np.stack([cross, other], axis=-1)], axis=-2)
 
 
 def _correlation(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid) -> float:
-    """Of the frames as matched, within windows: what both have of shading over the whole image does not count."""
+    """Return the correlation of the matched frames within windows; shading common to the whole images does not count."""
     one, other = first * inside, warped * inside
     count = np.maximum(_in_windows(inside, grid), 1)
     mean, mean_there = _in_windows(one, grid), _in_windows(other, grid)
@@ -368,18 +383,18 @@ def _correlation(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid
 
 
 def _structure(flow: WindowFlow, grid: WindowGrid) -> Doubles:
-    """How much each window says of displacements, in cells, where both frames agree ``(n, m)``."""
+    """Return the information of each window about displacements, in cells, where both frames agree ``(n, m)``."""
     return np.asarray(np.maximum((np.diagonal(flow.shared, axis1=2, axis2=3) * grid.spacing**2).sum(axis=-1), 0))
 
 
 def _blocks(structure: Doubles) -> float:
-    """How many blocks hold the structure: their number if all hold as much, one if one holds all."""
+    """Return the effective number of blocks that hold the structure: all if equal, one if one holds everything."""
     each = in_blocks(structure)
     return float(each.sum() ** 2 / max(float((each**2).sum()), TINY))
 
 
 def _unseen(grid: WindowGrid, structure: Doubles, elevation_fov_deg: float) -> float:
-    """Return the part of the structure whose elevation is more than twice that of the field of view."""
+    """Return the fraction of the structure whose elevation is more than twice that of the field of view."""
     drop = np.full((*grid.points.shape[:2], 1), -grid.ground.height_m)
     up = np.concatenate([grid.points, drop], axis=-1) @ grid.ground.turn[:, 2]
     far = np.abs(up) > grid.home[..., 0] * np.sin(np.radians(min(elevation_fov_deg, 90.0)))
@@ -387,7 +402,7 @@ def _unseen(grid: WindowGrid, structure: Doubles, elevation_fov_deg: float) -> f
 
 
 def _rejection(fit: _Fit, blocks: float, unseen: float) -> str:
-    """Return the reason of a rejection; empty for a valid estimate."""
+    """Return why an estimate is rejected; empty if it is valid."""
     if fit.covariance is None:
         return "no motion matches better than those around it"
     std = np.sqrt(np.diag(fit.covariance))
@@ -404,28 +419,33 @@ def _rejection(fit: _Fit, blocks: float, unseen: float) -> str:
     return ""
 
 
-# ---------------- The motion whose modelled displacement map fits a measured one best
+# ---------------- Match with the modelled displacement maps
 
 
 TINY = 1e-20
-"""Keeps a division by zero finite."""
+"""Keeps divisions by zero finite."""
 
 STILL = np.array([1e-4, 1e-4, 3e-5])
 """Steps below which a level ends [m, m, rad]."""
 
 CAUCHY = 8.0
-"""Windows whose squared misfit is so many times the usual have half the weight."""
+"""Windows whose squared misfit is this many times the usual have half the weight."""
 
 SIZE = np.array([0.01, 0.01, 0.003])
-"""Motions of like size [m, m, rad]."""
+"""Motions of comparable effect [m, m, rad]."""
 
 BLOCK = 4
-"""Windows that overlap, and that show one rock, err alike: blocks of so many by so many count once."""
+"""Edge of the blocks of windows that count once: windows that overlap or show the same rock have correlated errors."""
 
 
 class WindowFlow(NamedTuple):
-    """In each window: displacement left over [m, rad] ``(n, m, 2)``; its information, and the same without what noise adds
-    to slopes ``(n, m, 2, 2)``."""
+    """Optical flow in each window.
+
+    Attributes:
+        displacement: remaining displacement [m, rad] ``(n, m, 2)``.
+        information: of the displacement ``(n, m, 2, 2)``.
+        shared: the same without the contribution of noise to the slopes ``(n, m, 2, 2)``.
+    """
 
     displacement: Doubles
     information: Doubles
@@ -433,16 +453,16 @@ class WindowFlow(NamedTuple):
 
 
 class MapMatch(NamedTuple):
-    """Motion, and its covariance, or None where the match is not a maximum."""
+    """A motion and its covariance; the covariance is None where the match is not a maximum."""
 
     motion: Doubles
     covariance: Doubles | None
 
 
 def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float) -> MapMatch | None:
-    """Weighted robust least squares between the displacement map and the exact map of a motion; None where that is singular.
+    """Fit the exact map of a motion to the displacement map by robust weighted least squares; return None if singular.
 
-    The unknowns are the motion and, unless ``height_std`` is 0, the height in parts of it.
+    The unknowns are the motion and, unless ``height_std`` is 0, the relative change of the height.
     """
     found = grid.map(v) + flow.displacement
     unknowns = grid.derivative if not height_std else np.concatenate([grid.derivative, grid.by_height(v)], axis=-1)
@@ -452,12 +472,15 @@ def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float)
     p = np.append(v, 0.0)[: unknowns.shape[-1]]
     prior = np.zeros(len(p))
     for _ in range(10):
+        # misfit of the windows, and its usual square
         misfit = found - grid.map(p[:3]) - (unknowns[..., 3:] @ p[3:])
         pull = (flow.information @ misfit[..., None])[..., 0]
         squared = np.maximum((misfit * pull).sum(axis=-1), 0)
         usual = float(np.median(squared[used])) / 1.39 + TINY  # the median of chi-square with 2 degrees of freedom
+        # the prior of the height in units of the misfit; robust weights of the windows
         prior[3:] = usual * BLOCK**2 / height_std**2 if height_std else 0.0
         weight = 1 / (1 + squared / (CAUCHY * usual))
+        # Gauss-Newton step
         scores = _apply(unknowns, pull) * weight[..., None]
         normal = _normal(unknowns, flow.information * weight[..., None, None]).sum(axis=(0, 1)) + np.diag(prior)
         if not _regular(normal):
@@ -466,7 +489,7 @@ def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float)
         p = p + step
         if (np.abs(step[:3]) < STILL / 10).all():
             break
-    # robust scores rise by the weight's square, over both directions; noise is in either frame's slopes, not in the shared
+    # robust scores rise by the squared weight over both directions; only the shared slopes are free of either frame's noise
     normals = _normal(unknowns, flow.shared * (weight * weight)[..., None, None])
     if not _regular(normals.sum(axis=(0, 1)) + np.diag(prior)):
         return MapMatch(p[:3], None)
@@ -474,7 +497,7 @@ def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float)
 
 
 def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | None:
-    """Fit the motion whose modelled map has the same three numbers as the measured one; None where that is singular.
+    """Fit the motion whose modelled map has the same three numbers as the measured one; return None if singular.
 
     They are the mean displacements in range and in bearing, and the slope of the displacement in range over bearing.
     """
@@ -485,7 +508,7 @@ def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | N
         return None
     aside = np.where(used, grid.home[..., 1] - grid.home[..., 1][used].mean(), 0.0)
     one, none = used.astype(float), np.zeros(used.shape)
-    # what each window adds to the vector: (n, m, 2, 3)
+    # contribution of each window to the vector: (n, m, 2, 3)
     summary = np.stack([np.stack([one, none, aside], axis=-1), np.stack([none, one, none], axis=-1)], axis=-2) / count
     slope = (np.swapaxes(summary, -1, -2) @ grid.derivative).sum(axis=(0, 1))
     if np.linalg.matrix_rank(slope * SIZE) < 3:
@@ -496,32 +519,34 @@ def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | N
         v = v + step
         if (np.abs(step) < STILL / 10).all():
             break
-    # noise in the slopes holds the flow back by this much
+    # noise in the slopes shortens the flow by this factor
     gain = np.linalg.pinv(flow.information, hermitian=True) @ flow.shared
     normals = np.swapaxes(summary, -1, -2) @ gain @ grid.derivative
     return MapMatch(v, _covariance(normals, scores, np.zeros(3), 0.0))
 
 
 def _apply(unknowns: Doubles, pull: Doubles) -> Doubles:
-    """Return the gradient by each unknown, of each window ``(n, m, unknowns)``."""
+    """Return the gradient by each unknown, for each window ``(n, m, unknowns)``."""
     return (np.swapaxes(unknowns, -1, -2) @ pull[..., None])[..., 0]
 
 
 def _normal(unknowns: Doubles, information: Doubles) -> Doubles:
-    """Unknowns' information from each window ``(n, m, unknowns, unknowns)``."""
+    """Return the information about the unknowns from each window ``(n, m, unknowns, unknowns)``."""
     return np.asarray(np.swapaxes(unknowns, -1, -2) @ (information @ unknowns))
 
 
 def _regular(normal: Doubles) -> bool:
-    """Whether normal equations can be solved and have a maximum."""
+    """Return whether normal equations can be solved and have a maximum."""
     size = np.sqrt(np.maximum(np.diag(normal), TINY))
     eigenvalues = np.linalg.eigvalsh(normal / np.outer(size, size))
     return bool(eigenvalues[0] > 1e-8 * eigenvalues[-1])
 
 
 def _covariance(normals: Doubles, scores: Doubles, prior: Doubles, height_std: float) -> Doubles | None:
-    """Of the motion ``(3, 3)``, from how it changes when one block of windows is left out (jackknife), and from what was
-    assumed of the height; None where one block alone decides."""
+    """Return the covariance of the motion ``(3, 3)``; None where one block alone decides.
+
+    It sums the changes when one block of windows is left out (jackknife) and the uncertainty of the assumed height.
+    """
     each, said = in_blocks(normals), in_blocks(scores)
     whole = each.sum(axis=0) + np.diag(prior)
     try:

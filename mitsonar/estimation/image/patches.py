@@ -1,6 +1,7 @@
-"""Patches of sonar images: chosen where they can be found again, and aligned with other frames (Lucas and Kanade, 1981).
+"""How patches of sonar images are chosen and aligned with other frames (Lucas and Kanade, 1981).
 
-Shadows move over the ground when the sonar moves. Pixels in shadow, and those at its edge, have no weight.
+Patches are chosen where they can be found again. Shadows move over the ground when the sonar moves, so pixels in shadow and
+at its edge have no weight.
 """
 
 from __future__ import annotations
@@ -20,45 +21,45 @@ Floats = NDArray[np.float32]
 Index = NDArray[np.intp]
 
 REACH = (8, 3)
-"""Bins and beams of a patch to each side of its middle."""
+"""Bins and beams of a patch to each side of its centre."""
 
 SMOOTHING = (1.0, 0.6)
 """Standard deviations by which frames are smoothed [bins, beams]."""
 
 CELL = (26, 8)
-"""Bins and beams in which one patch is chosen."""
+"""Bins and beams of a grid cell in which one patch is chosen."""
 
 SHADOW = 0.3
 AROUND = (25, 61)
-"""Level of a shadow, as part of the mean level around it [beams, bins]."""
+"""Level of a shadow, as a fraction of the mean level, and the surroundings [beams, bins] over which that mean is taken."""
 
 EDGE = (3, 7)
 """Beams and bins of the neighbourhood of a shadow that is left out."""
 
 LEAST_LIT = 0.5
-"""Least part of a patch's weight outside of shadows."""
+"""Smallest fraction of a patch's weight outside shadows."""
 
 BEAM = 2.0
-"""Slopes over beams count as over so many bins, where patches are chosen."""
+"""Number of bins that a beam counts as when slopes are compared to choose patches."""
 
 FAINTEST = 1e-6
-"""Least sum of squared slopes of a patch."""
+"""Smallest sum of squared slopes of a patch."""
 
 ROUNDS = 8
 LONGEST = np.array([2.0, 0.7])
 STILL = np.array([0.004, 0.002])
-"""Gauss-Newton iterations, the longest step of one and the step below which a patch is done [bins, beams]."""
+"""Gauss-Newton iterations, the longest step of one, and the step below which a patch is finished [bins, beams]."""
 
 ALIKE = 3.0
-"""Neighbouring pixels whose errors are alike."""
+"""Number of neighbouring pixels with correlated errors."""
 
 FLOOR = np.array([0.05, 0.04])
-"""Standard deviations of an alignment that no contrast falls below [bins, beams]: interpolation between cells."""
+"""Lower limit of an alignment's standard deviations at any contrast [bins, beams]: interpolation between cells."""
 
 ROWS, COLUMNS = (
     axis.ravel().astype(float) for axis in np.meshgrid(*(np.arange(-reach, reach + 1) for reach in REACH), indexing="ij")
 )
-"""Places of a patch's pixels beside its middle ``(pixels,)`` [bins, beams]."""
+"""Offsets of a patch's pixels from its centre ``(pixels,)`` [bins, beams]."""
 
 _TAPER = np.exp(-0.5 * ((ROWS / (0.7 * REACH[0])) ** 2 + (COLUMNS / (0.7 * REACH[1])) ** 2)).astype(np.float32)
 
@@ -79,17 +80,17 @@ class Patches(NamedTuple):
     weights: Floats
 
     def take(self, index: Index | NDArray[np.bool_]) -> Patches:
-        """Return some of the patches."""
+        """Return a subset of the patches."""
         return Patches(self.values[index], self.weights[index])
 
 
 class Alignment(NamedTuple):
-    """Where patches were found.
+    """Result of an alignment of patches.
 
     Attributes:
-        shift: beside where they were looked for ``(n, 2)`` [bins, beams].
+        shift: offset from the expected places ``(n, 2)`` [bins, beams].
         covariance: of the shift ``(n, 2, 2)``.
-        correlation: of patch and frame there ``(n,)``.
+        correlation: of patch and frame at the shifted place ``(n,)``.
     """
 
     shift: Array
@@ -110,19 +111,22 @@ def corners(image: PatchImage, taken: NDArray[np.bool_]) -> tuple[Index, Index]:
 
     Args:
         image: a frame.
-        taken: cells of the image ``(bins, beams)`` that have a patch already.
+        taken: cells of the image ``(bins, beams)`` that already have a patch.
 
     Returns:
-        Row and column of the patches' middles, each ``(n,)``.
+        Row and column of the patches' centres, each ``(n,)``.
     """
+    # smaller eigenvalue of the structure tensor: large where a patch is distinct in both directions
     by_bin, by_beam = image.by_bin * image.lit, image.by_beam * (image.lit / np.float32(BEAM))
     size = (0.7 * REACH[0], 0.7 * REACH[1])
     one, both, other = (blurred(product, *size) for product in (by_bin**2, by_bin * by_beam, by_beam**2))
     least = (one + other) / 2 - np.sqrt(((one - other) / 2) ** 2 + both**2)
+    # leave out patches that would reach beyond the image
     rows, columns = (int(length) // cell * cell for length, cell in zip(least.shape, CELL, strict=True))
     margin = [reach + 2 for reach in REACH]
     inside = np.zeros_like(least)
     inside[margin[0] : -margin[0], margin[1] : -margin[1]] = least[margin[0] : -margin[0], margin[1] : -margin[1]]
+    # best pixel of each grid cell, unless the cell is too faint or already has a patch
     tiles, full = (_tiles(table[:rows, :columns]) for table in (inside, taken))
     best = tiles.argmax(axis=1)
     chosen = (tiles[np.arange(len(tiles)), best] > FAINTEST) & ~full.any(axis=1)
@@ -136,12 +140,12 @@ def cut(image: PatchImage, row: Array, column: Array, weights: Floats | None = N
 
     Args:
         image: the frame.
-        row: of each pixel ``(n, pixels)``.
-        column: as above.
+        row: row of each pixel ``(n, pixels)``.
+        column: column of each pixel ``(n, pixels)``.
         weights: of patches that are renewed ``(n, pixels)``; None: from the shadows of this frame.
 
     Returns:
-        The patches, and which of them lie within the frame with enough light ``(n,)``.
+        The patches, and which of them lie within the frame and are lit enough ``(n,)``.
     """
     bins, beams = image.level.shape
     inside = (row.min(axis=1) > 1) & (row.max(axis=1) < bins - 2)
@@ -159,21 +163,24 @@ def align(image: PatchImage, patches: Patches, row: Array, column: Array) -> Ali
 
     Args:
         image: the frame.
-        patches: ``n`` of them.
-        row: where each pixel is expected in the frame ``(n, pixels)``.
-        column: as above.
+        patches: ``n`` patches.
+        row: expected row of each pixel in the frame ``(n, pixels)``.
+        column: expected column of each pixel in the frame ``(n, pixels)``.
     """
     count = len(row)
     shift, normal = np.zeros((count, 2)), np.tile(np.eye(2), (count, 1, 1))
     residual, correlation = np.ones(count), np.zeros(count)
     moving = np.arange(count)
     for _ in range(ROUNDS):
+        # sample the frame at the shifted places; centre levels and slopes, since the offset is free
         weights, template = patches.weights[moving], patches.values[moving]
         there = row[moving] + shift[moving, :1], column[moving] + shift[moving, 1:]
         level, deviation = _normalised(_sampled(image.level, *there), weights)
         by_bin, by_beam = (_centred(_sampled(slope, *there), weights) for slope in (image.by_bin, image.by_beam))
+        # residual after the best gain
         alike = (level * template * weights).sum(axis=1) / deviation[:, 0]
         rest = level - template * alike[:, None] * deviation
+        # Gauss-Newton step from the 2 x 2 normal equations of each patch
         aa, ab, bb = (
             (one * other * weights).sum(axis=1).astype(float)
             for one, other in ((by_bin, by_bin), (by_bin, by_beam), (by_beam, by_beam))
@@ -183,11 +190,13 @@ def align(image: PatchImage, patches: Patches, row: Array, column: Array) -> Ali
         step = np.stack([(bb * pull_a - ab * pull_b) / det, (aa * pull_b - ab * pull_a) / det], axis=1)
         step = np.clip(step, -LONGEST, LONGEST)
         shift[moving] += step
+        # keep what the covariance needs; patches that settled leave the iteration
         normal[moving] = np.stack([np.stack([aa, ab], axis=-1), np.stack([ab, bb], axis=-1)], axis=-2)
         residual[moving], correlation[moving] = (rest * rest * weights).sum(axis=1), alike
         moving = moving[(np.abs(step) > STILL).any(axis=1)]
         if not len(moving):
             break
+    # covariance from the residuals, for as many independent pixels as the weights leave
     independent = 1 / ((patches.weights**2).sum(axis=1) * ALIKE)
     covariance = np.linalg.inv(normal + 1e-9 * np.eye(2)) * (residual / independent)[:, None, None]
     return Alignment(shift, covariance + np.diag(FLOOR**2), correlation)
@@ -200,7 +209,7 @@ def _tiles(table: NDArray[np.generic]) -> NDArray[np.generic]:
 
 
 def _sampled(image: Floats, row: Array, column: Array) -> Floats:
-    """Interpolate between pixels by cubic polynomials: linear ones smooth what lies between beams."""
+    """Interpolate between pixels by cubic polynomials: linear ones smooth the content between beams."""
     if not row.size:
         return np.zeros(row.shape, dtype=np.float32)
     places = column.astype(np.float32), row.astype(np.float32)
@@ -212,7 +221,7 @@ def _centred(values: Floats, weights: Floats) -> Floats:
 
 
 def _normalised(values: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return values less their mean, and their standard deviations ``(n, 1)``."""
+    """Return values minus their mean, and their standard deviations ``(n, 1)``."""
     centred = _centred(values, weights)
     deviation = np.sqrt((centred * centred * weights).sum(axis=1, keepdims=True)) + np.float32(1e-6)
     return centred, np.asarray(deviation, dtype=np.float32)

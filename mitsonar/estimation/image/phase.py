@@ -1,7 +1,9 @@
-"""The estimator ``phase``: Fourier registration on the ground plane, rotation then translation.
+"""How the estimators ``phase`` and ``ecc`` register two frames projected to the ground plane.
 
-After Reddy and Chatterji (1996), as Hurtós et al. (2015) use it for forward-looking sonar: magnitudes of the spectra turn
-with the image and do not see its translation; what remains after the rotation is a translation, for phase correlation.
+``phase`` is Fourier registration, rotation then translation, after Reddy and Chatterji (1996) as Hurtós et al. (2015) use
+it for forward-looking sonar. Magnitudes of the spectra turn with the image and do not depend on its translation; after the
+rotation is removed, phase correlation finds the translation. ``ecc`` is OpenCV's enhanced correlation coefficient
+(Evangelidis and Psarakis, 2008).
 """
 
 from __future__ import annotations
@@ -26,26 +28,28 @@ __all__ = ["Ecc", "GroundView", "Phase", "fan_places"]
 Floats = NDArray[np.float32]
 
 CELL_M = 0.012
-"""Edge of a pixel of the ground [m], while the fan fits."""
+"""Edge of a ground pixel [m], as long as the fan fits."""
 
 MOST_CELLS = 512
-"""Pixels along the longer side of the fan; they are larger where it would have more."""
+"""Largest number of pixels along the longer side of the fan; a larger fan has larger pixels."""
 
 ANGLES = 720
 """Directions into which half a turn of a spectrum is divided."""
 
 BAND = (0.04, 0.25)
-"""Spatial frequencies that tell the rotation, in cycles a pixel of :data:`CELL_M`: below lies the fan's outline, above
-mostly noise."""
+"""Spatial frequencies from which the rotation is estimated, in cycles per pixel of :data:`CELL_M`.
+
+Below them lies the fan's outline, above them mostly noise.
+"""
 
 HIGHEST = 0.45
-"""Highest frequency of any picture, in its own pixels."""
+"""Highest usable frequency of any image, in cycles per pixel of that image."""
 
 LOW = 0.06
-"""Standard deviation of the frequencies whose phases are compared, in cycles a pixel of :data:`CELL_M`."""
+"""Standard deviation of the frequencies whose phases are compared, in cycles per pixel of :data:`CELL_M`."""
 
 ROUNDS = 3
-"""Rotation and translation, each found again after the frames have been brought together by what is known."""
+"""Rounds of rotation and translation, each after the frames have been aligned by the current motion."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +57,10 @@ class Phase:
     """Registration by phase correlation of the frames as seen from above.
 
     Args:
-        height_m: over the ground, where the window shows no first echoes; default: that of the frames.
+        height_m: height over the ground, used where the window shows no first echoes; default: that of the frames.
         pitch_rad: default: that of the frames.
-        relief_m: mean height over the ground of what is seen; default: from the first echoes, where the window shows them.
+        relief_m: mean height of the visible surface over the ground; default: from the first echoes, where the window
+            shows them.
     """
 
     height_m: float | None = None
@@ -67,10 +72,10 @@ class Phase:
     digest = ""
 
     def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
-        """Estimate the motion; reject frames without anything to match. A prior is ignored: all motions are searched.
+        """Estimate the motion; reject frames that hold nothing to match. A prior is ignored: all motions are searched.
 
         Raises:
-            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+            MitsonarError: invalid frames, see :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
         """
         images = two_frames(frames)
         attitude = attitude_of(frames, "phase", self.height_m, self.pitch_rad, self.relief_m)
@@ -80,14 +85,17 @@ class Phase:
             return rejected(attitude.reason or "nothing in the frames to match")
         if min(first.shape) < 32 or not view.inside.any():
             return rejected("the fan meets too little ground")
+        # the first frame stays fixed: its spectra serve all rounds
         window = _window(view.inside)
         fixed, motion = _windowed(first, window), Motion(0.0, 0.0, 0.0)
         larger = view.edge / CELL_M
         turn, shift = _PhaseCorrelation(_spectrum_by_angle(fixed, larger), LOW), _PhaseCorrelation(fixed, LOW * larger)
         for _ in range(ROUNDS):
+            # rotation first, since the spectra's magnitudes do not depend on the translation
             _, rows = turn.offset(_spectrum_by_angle(_windowed(_back(second, view, motion), window), larger))
             motion = _turned(motion, -rows * np.pi / ANGLES)
             motion = _shifted(motion, shift.offset(_windowed(_back(second, view, motion), window)), view)
+        # accept the motion only if the aligned frames match, away from the fan's outline
         matched = _back(second, view, motion)
         smooth = [cv2.GaussianBlur(image, (5, 5), 0) for image in (first, matched)]
         reason = matching_rejection(smooth[0], smooth[1], window > 0.3, alike=4 * np.pi * 1.1**2)
@@ -95,7 +103,7 @@ class Phase:
 
 
 def _window(inside: NDArray[np.bool_]) -> Floats:
-    """1 in the middle of the fan, falling to 0 at its outline ``(rows, columns)``."""
+    """Return a window that is 1 in the middle of the fan and falls to 0 at its outline ``(rows, columns)``."""
     padded = np.pad(inside.astype(np.uint8), 1)
     distance = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     return np.asarray(np.sin(np.pi / 2 * np.minimum(distance / (0.5 * distance.max() + 1e-9), 1)) ** 2, dtype=np.float32)
@@ -108,15 +116,15 @@ def _back(second: Floats, view: GroundView, motion: Motion) -> Floats:
 
 
 def _windowed(image: Floats, window: Floats) -> Floats:
-    """Less its mean, times the window."""
+    """Return the image minus its mean, times the window."""
     return np.asarray((image - np.average(image, weights=window)) * window, dtype=np.float32)
 
 
 def _spectrum_by_angle(image: Floats, larger: float) -> Floats:
-    """Logarithm of the spectrum's magnitude over half a turn ``(angles, frequencies)``, less the mean over angles.
+    """Return the log magnitude of the spectrum over half a turn ``(angles, frequencies)``, minus the mean over angles.
 
-    The frequencies are the same on the ground where pixels are so many times larger, as far as these show them. Pixels of a
-    fan of 40 m have 0.14 m; then the upper half of what they show is used.
+    The frequencies are the same on the ground if pixels are larger by the factor ``larger``, as far as these resolve them.
+    Pixels of a fan of 40 m have 0.14 m; then the upper half of the resolved frequencies is used.
     """
     band = min(larger * BAND[0], HIGHEST / 2), min(larger * BAND[1], HIGHEST)
     size = 2 * cv2.getOptimalDFTSize(max(image.shape))
@@ -129,7 +137,7 @@ def _spectrum_by_angle(image: Floats, larger: float) -> Floats:
 
 
 class _PhaseCorrelation:
-    """How far images lie off a first one, from the phases of their low frequencies alone; ``low`` in cycles a pixel."""
+    """Measures the offset of images from a first one, using the phases of frequencies below ``low`` [cycles per pixel]."""
 
     def __init__(self, first: Floats, low: float) -> None:
         self.shape = [cv2.getOptimalDFTSize(2 * size) for size in first.shape]
@@ -138,9 +146,11 @@ class _PhaseCorrelation:
         self.low = np.exp(-((frequency / low) ** 2) / 2)
 
     def offset(self, second: Floats) -> tuple[float, float]:
-        """Return columns and rows by which the second lies off the first."""
+        """Return columns and rows by which the second image is offset from the first."""
+        # whiten the cross spectrum, so that phases alone count; keep low frequencies
         cross = self.conjugate * np.fft.rfft2(second, self.shape)
         peak = np.fft.fftshift(np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-30) * self.low, self.shape))
+        # highest peak, refined by parabolas through the logarithms of its neighbours
         row, column = np.unravel_index(int(peak[1:-1, 1:-1].argmax()), (self.shape[0] - 2, self.shape[1] - 2))
         near = np.log(np.maximum(peak[row : row + 3, column : column + 3], 1e-12 * float(peak.max()) + 1e-300))
         rows, columns = (_summit(line) for line in (near[:, 1], near[1]))
@@ -148,13 +158,13 @@ class _PhaseCorrelation:
 
 
 def _summit(three: NDArray[np.float64]) -> float:
-    """Where the parabola through three values, the middle one the largest, has its summit."""
+    """Return the vertex of the parabola through three values, of which the middle one is the largest."""
     bend = three[0] - 2 * three[1] + three[2]
     return float(np.clip((three[0] - three[2]) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
 
 
 def _turned(motion: Motion, yaw: float) -> Motion:
-    """Compose a motion with a turn on the spot: its steps are now along the new heading."""
+    """Compose a motion with a turn in place: its translation is then along the new heading."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     sideways, forward = motion.sideways * cos - motion.forward * sin, motion.sideways * sin + motion.forward * cos
     return Motion(float(sideways), float(forward), motion.yaw + yaw)
@@ -167,15 +177,14 @@ def _shifted(motion: Motion, shift: tuple[float, float], view: GroundView) -> Mo
     return view.motion(warp)
 
 
-# ---------------- The estimator ``ecc``: OpenCV's enhanced correlation coefficient (Evangelidis and Psarakis, 2008)
-# on the ground plane
+# ---------------- The estimator ecc
 
 
 LEVELS = ((4, 9), (1, 5))
-"""Edge of a pixel in fine ones, and size of OpenCV's Gaussian filter, coarse to fine."""
+"""Edge of a pixel in fine pixels, and size of OpenCV's Gaussian filter, coarse to fine."""
 
 FINE = 0.43
-"""Edge of a fine pixel in distances of neighbouring beams at the middle of the window: 0.01 m with a DIDSON at 4.4 m."""
+"""Edge of a fine pixel relative to the beam spacing at the middle of the window: 0.01 m with a DIDSON at 4.4 m."""
 
 SETTLED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-5)
 
@@ -185,9 +194,9 @@ class Ecc:
     """Rigid registration of the frames as seen from above.
 
     Args:
-        height_m: over the ground, where the window shows no first echoes; default: that of the frames.
+        height_m: height over the ground, used where the window shows no first echoes; default: that of the frames.
         pitch_rad: default: that of the frames.
-        pixel_m: edge of a fine pixel [m]; default: 0.43 times the distance of beams at the middle of the window.
+        pixel_m: edge of a fine pixel [m]; default: 0.43 times the beam spacing at the middle of the window.
 
     Raises:
         MitsonarError: a pixel that is not positive.
@@ -216,7 +225,7 @@ class Ecc:
         """Estimate the motion; reject frames for which OpenCV finds none. A prior is ignored.
 
         Raises:
-            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+            MitsonarError: invalid frames, see :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
         """
         images = two_frames(frames)
         attitude = attitude_of(frames, "ecc", self.height_m, self.pitch_rad)
@@ -248,7 +257,7 @@ class Ecc:
         inside: NDArray[np.bool_],
         size: int,
     ) -> str:
-        """Return the reason of a rejection, from images smoothed as in OpenCV; empty for a valid match."""
+        """Return why a match is rejected, from images smoothed as in OpenCV; empty if it is valid."""
         smooth = [cv2.GaussianBlur(image, (size, size), 0) for image in (first, second)]
         back = cv2.warpAffine(smooth[1], warp, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
         seen = cv2.warpAffine(
@@ -258,11 +267,11 @@ class Ecc:
         return matching_rejection(smooth[0], back, edge, alike=4 * np.pi * (0.3 * ((size - 1) / 2 - 1) + 0.8) ** 2)
 
 
-# ---------------- Frames as seen from above: projected to the level ground, for methods that register maps
+# ---------------- Frames projected to level ground
 
 
 MOST_VIEW_CELLS = 2**20
-"""Of a view: a window of many metres gets larger cells."""
+"""Largest number of cells of a view: a window of many metres has larger cells."""
 
 
 @dataclass(frozen=True)
@@ -270,10 +279,10 @@ class GroundView:
     """The part of the ground that a fan shows, as an image: row 0 farthest forward, column 0 most to port.
 
     Args:
-        frames: whose cells are projected.
-        attitude: height over what is seen, pitch, roll.
+        frames: frames whose cells are projected.
+        attitude: height over the visible surface, pitch, roll.
         cell_m: edge of a pixel; larger where the view would have more than a million.
-        most_along: pixels along the longer side; they are larger where it would have more.
+        most_along: largest number of pixels along the longer side; pixels grow to keep within it.
     """
 
     frames: SonarFrames
@@ -294,7 +303,7 @@ class GroundView:
 
     @cached_property
     def reach(self) -> tuple[float, float, float, float]:
-        """Ground seen: starboard from, to, forward from, to [m]; all 0 where the fan meets no ground."""
+        """Extent of the visible ground: starboard from, to, forward from, to [m]; all 0 if the fan meets no ground."""
         f = self.frames
         few = (f.range_m[::8], f.bearing_rad[::4]), (f.range_m[[0, -1]], f.bearing_rad)
         geometries = [replace(self._geometry, range_m=ranges, bearing_rad=bearings) for ranges, bearings in few]
@@ -307,7 +316,7 @@ class GroundView:
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
-        """Ground of each pixel: starboard, forward [m] ``(rows, columns, 2)``."""
+        """Ground point of each pixel: starboard, forward [m] ``(rows, columns, 2)``."""
         left, right, near, far = self.reach
         x = np.arange(left, right, self.edge) + self.edge / 2
         y = np.arange(far, near, -self.edge) - self.edge / 2
@@ -321,19 +330,19 @@ class GroundView:
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """Pixels within the fans that the sonar can light, were the ground level ``(rows, columns)``.
+        """Pixels within the fans that the sonar would light on level ground ``(rows, columns)``.
 
-        What lies around them is dark in every frame: an outline that moves with the sonar.
+        The surroundings are dark in every frame and form an outline that moves with the sonar.
         """
         return np.asarray(np.all([lit for _, _, lit in self._pixel_positions], axis=0))
 
     def draw(self, image: Floats, number: int = 0) -> Floats:
-        """Draw the image ``(bins, beams)`` of a frame as seen from above ``(rows, columns)``; 0 outside the fan."""
+        """Project the image ``(bins, beams)`` of a frame to the view from above ``(rows, columns)``; 0 outside the fan."""
         row, column, _ = self._pixel_positions[number if self.attitude.apart else 0]
         if not row.size:
             return np.zeros((0, 0), dtype=np.float32)
         finer = self.edge / float(np.median(np.diff(self.frames.range_m)))
-        if finer > 1:  # bins are finer than pixels
+        if finer > 1:  # smooth bins that are finer than pixels
             border = cv2.BORDER_REPLICATE
             image = np.asarray(
                 cv2.GaussianBlur(image, (1, 0), sigmaX=1e-3, sigmaY=0.4 * finer, borderType=border), np.float32
@@ -341,7 +350,7 @@ class GroundView:
         return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), np.float32)
 
     def warp(self, motion: Motion) -> NDArray[np.float32]:
-        """Where a motion takes a pixel (column, row) of the first frame, as a matrix ``(2, 3)``."""
+        """Return the matrix ``(2, 3)`` that maps a pixel (column, row) of the first frame according to a motion."""
         corner = np.array([self.reach[0], self.reach[3]]) + self.edge / 2 * np.array([1, -1])
         pixels = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         there = moved(corner + pixels * [self.edge, -self.edge], motion)
@@ -362,8 +371,8 @@ def fan_places(
     """Find the cells of a frame that show points of the ground.
 
     Args:
-        ground: under the frame, with its ranges and bearings.
-        sonar: that received it: it lights what is within the opening of its beams.
+        ground: ground geometry of the frame, with its ranges and bearings.
+        sonar: the receiving sonar, which lights what is within the opening of its beams.
         points: starboard, forward [m] ``(..., 2)``.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Gauss-Newton between two frames in polar coordinates: the steps of ``direct``, coarse to fine, and what they are worth."""
+"""How ``direct`` registers two frames by Gauss-Newton in polar coordinates, and how it assesses the result."""
 
 from __future__ import annotations
 
@@ -51,49 +51,56 @@ STILL = np.array([3e-5, 3e-5, 6e-6])
 """Steps below which an iteration ends [m, m, rad]."""
 
 CAUCHY = 3.0
-"""Residuals of so many standard deviations have half the weight."""
+"""Residuals of this many standard deviations have half the weight."""
 
 TOGETHER = (3, 2)
-"""Patches within which residuals belong together: rocks and their shadows."""
+"""Patches within which residuals are correlated: rocks and their shadows."""
 
 AROUND = (3, 3)
-"""Patches along beams and bins around each that are looked at as a block."""
+"""Patches along beams and bins around each patch that are assessed as one block."""
 
 BLOCK_CAUCHY = 4.0
-"""Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
+"""Blocks have half the weight if their individual best shift explains this many times (squared) what it usually does."""
 
 NEGLIGIBLE = 0.1
-"""Standard deviations of the estimate below which a step left over is lost in the noise."""
+"""Standard deviations of the estimate below which a remaining step is lost in the noise."""
 
 ASIDE = 8
-"""Beams by which one frame is displaced to see how much the match stands out."""
+"""Beams by which one frame is displaced to measure how much the match stands out."""
 
 COARSE = 10.0
-"""How many times larger steps end the iteration of a level that another follows."""
+"""Factor on the step that ends the iteration of a level followed by a finer one."""
 
 REMEMBERED = 4
 LEVER_M = 4.0
 LONGEST = 4.0
 NEAR_M = 0.002
-"""Steps that are remembered for the next; metres that a turn is worth; how many times longer a step may get; how short it
-must be before."""
+"""Steps remembered for the acceleration; metres that a radian of turn counts as; largest lengthening of a step; and the
+largest step [m] that is accelerated."""
 
 FEWEST_CELLS = 500
-"""Fewest cells that are registered."""
+"""Smallest number of cells that can be registered."""
 
 FEWEST_ROWS = 24
-"""Fewest rows of a level that is not the last."""
+"""Smallest number of rows of a level that is not the last."""
 
 SAMPLED = (5, 3)
-"""The noise is measured in every so manieth bin and beam."""
+"""Stride in bins and beams of the cells from which the noise is measured."""
 
 
 class Fit(NamedTuple):
-    """The quality of a motion: covariance from the residuals, derivatives, correlation, sizes.
+    """Quality of an estimated motion.
 
-    ``by_height`` is the derivative by the height ``(3,)``, ``by_lean`` that by how far height, pitch and roll of the second
-    frame exceed those of the first ``(3, 3)``; their signs do not matter to a covariance. ``excess`` is how much the
-    correlation exceeds that of displaced frames.
+    Attributes:
+        converged: whether the iteration settled.
+        covariance: of the unknowns, from the residuals.
+        by_height: derivative of the motion by the height ``(3,)``.
+        by_lean: derivative of the motion by the excess of height, pitch and roll of the second frame over the first
+            ``(3, 3)``. The signs of both derivatives do not matter to a covariance.
+        correlation: of the registered frames.
+        independent: number of cells with independent noise.
+        blocks: effective number of blocks that share the information.
+        excess: how much the correlation exceeds that of displaced frames.
     """
 
     converged: bool
@@ -107,7 +114,7 @@ class Fit(NamedTuple):
 
 
 class Held(NamedTuple):
-    """What is known of the unknowns before: mean and standard deviation of each [m, m, rad, m]; infinite: nothing."""
+    """Gaussian prior of the unknowns: mean and standard deviation of each [m, m, rad, m]; infinite: no prior."""
 
     mean: Doubles
     std: Doubles
@@ -126,15 +133,15 @@ def register(
     last: bool,
     held: Held,
 ) -> tuple[Doubles, Fit | None] | None:
-    """Run Gauss-Newton from a start; None where there is nothing to match.
+    """Run Gauss-Newton from a start; return None if there is nothing to match.
 
     Args:
         pair: both frames at this level, smoothed.
         cells: of this level.
-        start: sideways, forward [m], yaw [rad], and heave [m] where it is unknown ``(3,)`` or ``(4,)``.
+        start: sideways, forward [m], yaw [rad], and heave [m] if it is unknown ``(3,)`` or ``(4,)``.
         level: smoothing and iterations.
-        last: whether it is the finest level: both ways are drawn, and the fit is assessed.
-        held: what is known of the unknowns before.
+        last: whether it is the finest level: frames are resampled in both directions, and the fit is assessed.
+        held: prior of the unknowns.
 
     Returns:
         The motion, and its fit at the finest level.
@@ -146,6 +153,7 @@ def register(
         at = _linearised(*pair, cells, v, level, margins, last=last)
         if at is None:
             return None
+        # the prior enters the normal equations in units of the residuals' noise
         weight = held.weight(at.scale, level)
         pull = at.pull + weight * (v - held.mean)
         step = np.asarray(-np.linalg.solve(at.normal + np.diag(weight), pull), dtype=np.float64)
@@ -155,22 +163,29 @@ def register(
             break
     if not last or at is None:
         return v, None
+    # a long step is acceptable if it is small against the uncertainty of the estimate
     fit = _fit(at, cells, v, level, held.weight(at.scale, level), converged)
     return v, fit if converged else fit._replace(converged=_is_small(step[:3], fit.covariance[:3, :3]))
 
 
 def _is_small(step: Doubles, covariance: Doubles) -> bool:
-    """Return whether a step is lost in the noise of the estimate ``(3, 3)``, however long it is."""
+    """Return whether a step is small against the covariance of the estimate ``(3, 3)``, whatever its length."""
     return bool(step @ np.linalg.lstsq(covariance, step, rcond=None)[0] < NEGLIGIBLE**2)
 
 
 class _Side(NamedTuple):
-    """One frame drawn at the cells of the other: residual, weights, and sums over patches.
+    """One frame resampled at the cells of the other: residual, weights, and sums over patches.
 
-    ``weight`` is that of single cells, 0 where they do not count ``(bins, beams)``; ``along`` and ``across`` are it times
-    the slopes along bins and beams; ``patches`` is that of each patch ``(patches,)``; ``slopes`` and ``pull`` are sums of
-    both weights times slope by slope, and times slope by residual: along bins, of both, along beams ``(3, patches)``; along
-    bins, beams ``(2, patches)``.
+    Attributes:
+        before: levels of the first frame ``(bins, beams)``.
+        after: levels of the second frame ``(bins, beams)``.
+        inner: cells that both frames show.
+        weight: weight of each cell, 0 where it does not count ``(bins, beams)``.
+        along: weight times the slope over bins.
+        across: weight times the slope over beams.
+        patches: weight of each patch ``(patches,)``.
+        slopes: sums of both weights times slope by slope: over bins, mixed, over beams ``(3, patches)``.
+        pull: sums of both weights times slope by residual: over bins, over beams ``(2, patches)``.
     """
 
     before: Floats
@@ -185,7 +200,7 @@ class _Side(NamedTuple):
 
 
 class _Linearisation(NamedTuple):
-    """Both sides at one motion, the noise of their differences, and the normal equations."""
+    """Both resampled frames at one motion, the noise of their differences, and the normal equations."""
 
     sides: list[_Side]
     scale: float
@@ -196,10 +211,12 @@ class _Linearisation(NamedTuple):
 def _linearised(
     first: Floats, second: Floats, cells: Cells, v: Doubles, level: DirectLevel, margins: Doubles, *, last: bool
 ) -> _Linearisation | None:
-    """Draw the second frame at the cells of the first, at the last level also the reverse; None where too little remains.
+    """Resample the second frame at the cells of the first and build the normal equations.
 
-    ``margins`` of both ways ``(2, 2)`` grow in place.
+    At the last level the reverse is added. Return None where too few cells remain. ``margins`` of both directions
+    ``(2, 2)`` grow in place.
     """
+    # resample in one direction, or in both so that the interpolation of either frame does not bias the motion
     pairs = []
     for back in (False, True) if last else (False,):
         there = cells.shift(v, back=back)
@@ -208,11 +225,13 @@ def _linearised(
             return None
         drawn = sampled(first if back else second, cells.row + there[0], cells.column + there[1])
         pairs.append((drawn, second, inner) if back else (first, drawn, inner))
+    # one scale for both directions, from the residuals of the first
     residuals = [after - before for before, after, _ in pairs]
     counted = residuals[0][pairs[0][2]]
     if counted.size < FEWEST_CELLS:
         return None
     scale = noise_of(counted[:: SAMPLED[0], :: SAMPLED[1]].ravel())
+    # weigh the residuals, then project the sums over patches onto the motion
     sides = [_side(*pair, residual, cells, level, scale, last=last) for pair, residual in zip(pairs, residuals, strict=True)]
     normal = np.sum([_by_motion(cells.derivative, side.slopes) for side in sides], axis=0)
     pull = np.sum([_flat(cells.derivative) @ side.pull.ravel() for side in sides], axis=0)
@@ -220,12 +239,12 @@ def _linearised(
 
 
 def noise_of(residual: Floats) -> float:
-    """Return the standard deviation of most residuals ``(cells,)``, by their median."""
+    """Return a robust standard deviation of residuals ``(cells,)``, from their median."""
     return max(1.4826 * median_of(np.abs(residual)), FAINTEST)
 
 
 def median_of(values: NDArray[np.floating]) -> float:
-    """Return the median ``(n,)``, of an even number the upper one: without the checks of ``np.median``."""
+    """Return the median of values ``(n,)``, the upper one of an even number; without the checks of ``np.median``."""
     return float(np.partition(values, len(values) // 2)[len(values) // 2])
 
 
@@ -242,20 +261,23 @@ def _side(
 ) -> _Side:
     """Weigh cells, and at the last level blocks; sum over patches."""
     along, across = slopes_of((before + after) * np.float32(0.5), level, scale)
+    # downweight outliers cell by cell; cells outside both images, or that show no ground, do not count
     weight = np.zeros_like(residual)
     weight[inner] = cauchy(residual[inner], scale)
     if cells.seen is not None:
         weight *= cells.seen
+    # sums over patches, within which the geometry is constant
     bins, beams = weight * along, weight * across
     products = (bins, along), (bins, across), (beams, across), (bins, residual), (beams, residual)
     sums = products_by_block(products, cells.patch)
+    # downweight whole patches whose surroundings move independently
     patches = _patch_weight(sums.reshape(5, *cells.patches)) if last else np.ones(sums.shape[1])
     sums *= patches
     return _Side(before, after, inner, weight, bins, beams, patches, sums[:3], sums[3:])
 
 
 def cauchy(residual: Floats, scale: float) -> Floats:
-    """Return weights of residuals whose noise has this standard deviation."""
+    """Return the Cauchy weights of residuals, given the standard deviation of their noise."""
     ratio = residual * np.float32(1 / (CAUCHY * scale))
     ratio *= ratio
     ratio += 1
@@ -263,38 +285,41 @@ def cauchy(residual: Floats, scale: float) -> Floats:
 
 
 def alike_cells(level: DirectLevel) -> float:
-    """Return how many cells count once: smoothed noise is alike in neighbours, as far as a smoothing kernel covers."""
+    """Return the number of cells that count as one, since a smoothing kernel correlates the noise of neighbours."""
     return float(4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28))
 
 
 def _by_motion(derivative: Doubles, slopes: Doubles) -> Doubles:
-    """Return how the pull changes with the motion ``(unknowns, unknowns)``, from sums of slopes by slopes."""
+    """Return the normal matrix ``(unknowns, unknowns)`` from sums of slope by slope."""
     return np.asarray(_flat(_information(derivative, slopes)) @ _flat(derivative).T)
 
 
 def _flat(values: Doubles) -> Doubles:
-    """Return values ``(n, 2 * patches)`` of ``(n, 2, patches)``."""
+    """Return values ``(n, 2 * patches)`` from ``(n, 2, patches)``."""
     return np.reshape(values, (len(values), -1))
 
 
 def _information(derivative: Doubles, slopes: Doubles) -> Doubles:
-    """Return derivatives ``(n, 2, patches)`` times sums of slopes by slopes: along bins, of both, along beams."""
+    """Return derivatives ``(n, 2, patches)`` times sums of slope by slope: over bins, mixed, over beams."""
     return np.asarray(derivative * slopes[::2] + derivative[:, ::-1] * slopes[1])
 
 
 def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held: Doubles, converged: bool) -> Fit:
-    """Assess the motion from slopes of one frame times those of the other, and from the pulls of blocks.
+    """Assess the motion from slopes of one frame times those of the other, and from the gradients of blocks.
 
-    These hold whatever errs together within a block: noise, speckle, relief, in both ways of drawing at once.
+    The gradients include all errors common to a block, in both directions of resampling: noise, speckle, relief.
     """
+    # curvature without the noise of the slopes, which is independent in the two frames
     informed = _information(cells.derivative, np.sum([_cross(side, cells, level) for side in at.sides], axis=0))
     true = _flat(informed) @ _flat(cells.derivative).T
-    # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
+    # exactly symmetric: sums of float32 are not, and a path refuses such covariances
     sound = true if np.linalg.eigvalsh(true)[0] > 0 else (at.normal + at.normal.T) / 2
     undone = np.linalg.inv(sound + np.diag(held))
+    # the jackknife over blocks gives the covariance of what the frames contribute
     each = _without_each(sound + np.diag(held), informed, at, cells)
-    # what is known before errs, too: where the frames tell nothing it is all that is known
+    # the error of the prior adds to it: where the frames hold no information, it is all there is
     known = undone * (alike_cells(level) * at.scale**2 * held) @ undone.T
+    # share of each block in the information, and sensitivity to the height and to differences of height, pitch and roll
     side = at.sides[0]
     both = [_information(cells.derivative, one.slopes) for one in at.sides]
     shares = _together((np.tensordot(undone, both[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
@@ -302,6 +327,7 @@ def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held:
         undone @ np.sum([_flat(one) @ _flat(shift).T for one in both], axis=0)
         for shift in (cells.lifted_shift(v)[None], cells.leaning_shift(v))
     )
+    # a match that hardly stands out from displaced ones has a larger covariance
     before, after = side.before[side.inner], side.after[side.inner]
     independent, excess = before.size / alike_cells(level), _excess(side, cells)
     return Fit(
@@ -317,9 +343,9 @@ def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held:
 
 
 def _without_each(whole: Doubles, informed: Doubles, at: _Linearisation, cells: Cells) -> Doubles:
-    """Return by how much the motion would change without each of the blocks ``(n, blocks)``: the jackknife.
+    """Return how much the motion would change without each of the blocks ``(n, blocks)``: the jackknife.
 
-    Blocks that hold much of the information pull little, since the motion follows them.
+    Blocks that hold much of the information have small gradients, since the motion follows them.
     """
     pulls = np.sum([(cells.derivative * side.pull).sum(axis=1) for side in at.sides], axis=0)
     parts = np.einsum("ikp,jkp->ijp", informed, cells.derivative)
@@ -329,19 +355,19 @@ def _without_each(whole: Doubles, informed: Doubles, at: _Linearisation, cells: 
 
 
 def _excess(side: _Side, cells: Cells) -> Excess:
-    """Return by how much the frames correlate more than displaced across the beams."""
+    """Return how much more the frames correlate than when displaced across the beams."""
     before, after = side.before[side.inner], side.after[side.inner]
     inside = np.ones(before.shape, dtype=bool) if cells.seen is None else cells.seen[side.inner] > 0
     return correlation_excess(before, after, inside, ASIDE)
 
 
 def is_resolved(bins: int, level: DirectLevel) -> bool:
-    """Return whether frames of so many bins leave a level enough rows."""
+    """Return whether frames with this number of bins leave enough rows at a level."""
     return bins >= FEWEST_ROWS * level.step
 
 
 def smoothed(image: Floats, level: DirectLevel) -> Floats:
-    """Every so many bins of the smoothed image."""
+    """Smooth an image and keep every ``step``-th bin of the level."""
     bins, beams = level.smoothing
     if level.step == 1:
         return blurred(image, bins, beams)
@@ -350,37 +376,39 @@ def smoothed(image: Floats, level: DirectLevel) -> Floats:
 
 @lru_cache(maxsize=16)
 def _smoothed_rows(bins: int, sigma: float, step: int) -> Floats:
-    """Return the weights of bins in every so manieth bin, smoothed ``(rows, bins)``: only those are computed."""
+    """Return the matrix that smooths bins and keeps every ``step``-th ``(rows, bins)``: only those are computed."""
     return np.ascontiguousarray(blurred(np.eye(bins, dtype=np.float32), sigma, 0)[step // 2 :: step])
 
 
 class _AndersonAcceleration:
-    """Anderson acceleration (1965): noise in the slopes shortens steps; the last steps show by how much."""
+    """Anderson acceleration (1965): noise in the slopes shortens steps, and the last steps show by how much."""
 
     def __init__(self) -> None:
         self.places: list[Doubles] = []
         self.steps: list[Doubles] = []
 
     def __call__(self, place: Doubles, step: Doubles) -> Doubles:
-        """Return an accelerated step; the given one where the last steps do not suffice."""
+        """Return an accelerated step; the given one if there are too few earlier steps."""
         lever = np.array([1, 1, LEVER_M, 1])[: len(step), None]
-        if np.linalg.norm(lever[:, 0] * step) > NEAR_M:  # too far for the last steps to tell much
+        if np.linalg.norm(lever[:, 0] * step) > NEAR_M:  # long steps predict little
             return step
         self.places.append(place)
         self.steps.append(step)
         if len(self.steps) < 2:
             return step
+        # extrapolate to where the remembered steps would vanish
         places, steps = (np.diff(np.array(values[-REMEMBERED:]), axis=0).T for values in (self.places, self.steps))
         past, *_ = np.linalg.lstsq(lever * steps, lever[:, 0] * step, rcond=1e-3)
         accelerated = np.asarray(step - (places + steps) @ past)
+        # limit the lengthening
         lengths = [float(np.linalg.norm(lever[:, 0] * one)) for one in (accelerated, step)]
         return accelerated if lengths[0] < LONGEST * lengths[1] else step
 
 
 def _inner(there: Floats, usable: slice, least: Doubles) -> tuple[slice, slice] | None:
-    """Return the cells that meet the ground and stay within both images; None where none does.
+    """Return the cells that meet the ground and stay within both images; None if there are none.
 
-    ``least`` are the margins so far ``(2,)``, which grow in place: cells that came and went would keep it from settling.
+    ``least`` are the margins so far ``(2,)``, which grow in place: cells that come and go would keep it from settling.
     """
     _, bins, beams = there.shape
     reach = np.array([max(one.max(), -one.min()) for one in there])
@@ -395,7 +423,7 @@ def _inner(there: Floats, usable: slice, least: Doubles) -> tuple[slice, slice] 
 
 
 def _singular(normal: Doubles) -> bool:
-    """Return whether some motion changes nothing."""
+    """Return whether some motion leaves the residuals unchanged."""
     size = np.sqrt(np.diag(normal))
     if not (size > 0).all():
         return True
@@ -404,11 +432,10 @@ def _singular(normal: Doubles) -> bool:
 
 
 def _cross(side: _Side, cells: Cells, level: DirectLevel) -> Doubles:
-    """Return how the pull changes with the slopes ``(3, patches)``, from slopes of one frame times slopes of the other,
-    whose noise is independent.
+    """Return sums of slopes of one frame times slopes of the other ``(3, patches)``, whose noise is independent.
 
     Outliers, whose weight falls as they grow, count with the derivative of weight times residual, which is negative: a
-    motion that the weights hold is known less well than the sum of the weights says.
+    motion determined by the weights is less certain than the sum of the weights suggests.
     """
     curvature = side.weight * (2 * side.weight - 1)
     (along, across), others = (central_differences(blurred(image, *level.slopes)) for image in (side.before, side.after))
@@ -419,37 +446,40 @@ def _cross(side: _Side, cells: Cells, level: DirectLevel) -> Doubles:
 
 
 def _patch_weight(sums: Doubles) -> Doubles:
-    """Return weights of patches ``(patches,)``: one whose surroundings move on their own shows relief, or a shadow.
+    """Return weights of patches ``(patches,)``: one whose surroundings move independently shows relief or a shadow.
 
-    The measure is the decrease of their squared differences by their own best shift (Lucas and Kanade, 1981). ``sums``: of
-    slopes by slopes and by residuals ``(5, rows, columns)``.
+    The measure is the decrease of their squared differences by their individual best shift (Lucas and Kanade, 1981).
+    ``sums`` are those of slope by slope and slope by residual ``(5, rows, columns)``.
     """
+    # sum over the surroundings of each patch
     around = np.array([cv2.boxFilter(one, -1, AROUND, normalize=False, borderType=cv2.BORDER_CONSTANT) for one in sums])
     aa, ab, bb, pull_a, pull_b = around.reshape(5, -1)
     holds = aa + bb > 0
     if not holds.any():
         return np.ones(aa.shape)
+    # regularise, then solve for the decrease by the best shift
     aa, bb = (one + 1e-3 * one[holds].mean() + 1e-12 for one in (aa, bb))
     decrease = (bb * pull_a**2 - 2 * ab * pull_a * pull_b + aa * pull_b**2) / (aa * bb - ab * ab)
+    # compare with the usual decrease, since noise alone causes some
     return np.asarray(1 / (1 + decrease / (BLOCK_CAUCHY**2 * median_of(decrease[holds]) + 1e-12)))
 
 
 def _together(values: Doubles, cells: Cells) -> Doubles:
-    """Sum values of patches ``(..., patches)`` over the blocks whose errors are alike ``(..., blocks)``."""
+    """Sum values of patches ``(..., patches)`` over the blocks whose errors are correlated ``(..., blocks)``."""
     return by_block(values.reshape(*values.shape[:-1], *cells.patches), TOGETHER)
 
 
-# ---------------- The cells of a frame over level ground, and how a motion shifts them
+# ---------------- Cells of a level
 
 
 class DirectLevel(NamedTuple):
-    """One step from coarse to fine.
+    """One level of the pyramid.
 
     Attributes:
-        step: every so many bins are used.
-        smoothing: of the frames, in bins and beams.
-        slopes: further smoothing of their mean, before its slopes are taken.
-        iterations: at most.
+        step: stride in bins.
+        smoothing: standard deviations of the smoothing of the frames [bins, beams].
+        slopes: further smoothing of their mean before its slopes are taken.
+        iterations: largest number of iterations.
     """
 
     step: int
@@ -459,21 +489,21 @@ class DirectLevel(NamedTuple):
 
 
 PATCH = (8, 4)
-"""Bins and beams that are summed first: the geometry is constant there."""
+"""Bins and beams of a patch, within which the geometry is constant; sums over patches come first."""
 
 FEWEST_PATCH_ROWS = 2
-"""Fewest rows of a patch of a coarse level."""
+"""Smallest number of rows of a patch at a coarse level."""
 
 
 class Cells:
-    """The cells of one level: where they are, and how they move with the sonar, in bins and beams.
+    """The cells of one level over level ground: where they are, and how a motion displaces them, in bins and beams.
 
     Attributes:
         patch: rows and columns of the patches over which cells are summed.
-        patches: number of them along rows and columns.
-        derivative: of the displacement of the patches' middles by motion (and heave) ``(3 or 4, 2, patches)``.
+        patches: number of patches along rows and columns.
+        derivative: of the displacement of the patches' centres by motion (and heave) ``(3 or 4, 2, patches)``.
         usable: rows that meet the ground.
-        seen: 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do.
+        seen: 1 where a cell shows ground to match, else 0 ``(bins, beams)``; None if all cells do.
     """
 
     def __init__(self, nodes: GroundNodes, level: DirectLevel) -> None:
@@ -486,7 +516,7 @@ class Cells:
         self.seen = self._seen(level)
 
     def _seen(self, level: DirectLevel) -> Floats | None:
-        """Return 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do."""
+        """Return 1 where a cell shows ground to match, else 0 ``(bins, beams)``; None if all cells do."""
         shown, masked = self.nodes.shown
         if shown[self.nodes.from_node[0].min() :].all():
             return None
@@ -503,34 +533,34 @@ class Cells:
         return np.asarray(self.grid.over_bins @ nodes.astype(np.float32) @ self.grid.over_beams)
 
     def _on_patches(self, nodes: Doubles) -> Doubles:
-        """Interpolate from the nodes to the middles of the patches ``(..., 2, patches)``, in bins and beams."""
+        """Interpolate from the nodes to the centres of the patches ``(..., 2, patches)``, in bins and beams."""
         middles = self.grid.over_rows @ nodes @ self.grid.over_columns
         return np.asarray(middles.reshape(*nodes.shape[:-2], -1))
 
     def shift(self, v: Doubles, *, back: bool = False, lift_m: float = 0.0) -> Floats:
         """Return the displacement of the ground of each cell ``(2, bins, beams)`` from the first frame to the second.
 
-        It is in bins and beams; ``back``: from the second frame to the first; ``lift_m``: of ground so much higher.
+        It is in bins and beams. ``back``: from the second frame to the first. ``lift_m``: for ground higher by this.
         """
         return self._on_all(self.nodes.shift(v, back=back, lift_m=lift_m))
 
     def lifted_shift(self, v: Doubles) -> Doubles:
-        """Return the derivative of :meth:`shift` by the height at the middles of the patches ``(2, patches)`` [1/m]."""
+        """Return the derivative of :meth:`shift` by the height at the centres of the patches ``(2, patches)`` [1/m]."""
         return self._on_patches(self.nodes.lifted_shift(v))
 
     def leaning_shift_of_cells(self, v: Doubles) -> list[Floats]:
-        """Return the derivatives of :meth:`shift` by how frames lean, each ``(2, bins, beams)``."""
+        """Return the derivatives of :meth:`shift` by height, pitch, roll differences, each ``(2, bins, beams)``."""
         return [self._on_all(nodes) for nodes in self.nodes.leaning_shift(v)]
 
     def leaning_shift(self, v: Doubles) -> Doubles:
-        """Return the derivatives of :meth:`shift` by how frames lean, in the middles of the patches ``(3, 2, patches)``."""
+        """Return the derivatives of :meth:`leaning_shift_of_cells` at the patch centres ``(3, 2, patches)``."""
         return self._on_patches(self.nodes.leaning_shift(v))
 
 
 class CellGrid(NamedTuple):
-    """Cells of every so many bins and their patches; splines from the nodes, in bins ``[0]`` and beams ``[1]``.
+    """Cells of a level and their patches, with splines from the nodes, in bins ``[0]`` and beams ``[1]``.
 
-    ``over_bins`` and ``over_beams`` lead to all cells, ``over_rows`` and ``over_columns`` to the middles of the patches.
+    ``over_bins`` and ``over_beams`` interpolate to all cells, ``over_rows`` and ``over_columns`` to the patch centres.
     """
 
     range_m: Doubles
@@ -547,14 +577,18 @@ class CellGrid(NamedTuple):
 
 @lru_cache(maxsize=16)
 def cell_grid(range_m: tuple[float, ...], bearing_rad: tuple[float, ...], step: int) -> CellGrid:
+    """Return the grid of a level; the result is cached."""
+    # cubic splines from the nodes to the cells, as matrices
     ranges, axes = np.array(range_m)[step // 2 :: step], np.array(bearing_rad)
     splines = [
         np.asarray(make_interp_spline(node, np.eye(len(node)), 3)(values))
         for node, values in zip(node_axes(np.array(range_m), axes), (ranges, axes), strict=True)
     ]
+    # divide by the spacing, so that displacements come out in bins and beams
     bin_m, beam_rad = (np.gradient(values)[:, None] for values in (ranges, axes))
     over_bins = np.stack([splines[0] / bin_m, splines[0]])
     over_beams = np.stack([splines[1].T, (splines[1] / beam_rad).T])
+    # patches, and the cells at their centres
     patch = max(FEWEST_PATCH_ROWS, PATCH[0] // step), PATCH[1]
     patches = cell_blocks((len(ranges), len(axes)), patch)
     rows, columns = (
@@ -575,30 +609,29 @@ def cell_grid(range_m: tuple[float, ...], bearing_rad: tuple[float, ...], step: 
     )
 
 
-# ---------------- Level ground at a few nodes of a frame, and how it moves with the sonar: what lies between them is
-# smooth
+# ---------------- Nodes on level ground
 
 
 NODES = (33, 17)
 """Nodes along range and bearing."""
 
 LEAN_STEP = 1e-4
-"""Step of heights [m], pitch and roll [rad] of a frame for numerical derivatives."""
+"""Step of height [m], pitch and roll [rad] of a frame for numerical derivatives."""
 
 HEIGHT_STEP = 0.05
-"""Step of the height for numerical derivatives, as a part of it."""
+"""Step of the height for numerical derivatives, as a fraction of it."""
 
 
 def node_axes(range_m: Doubles, bearing_rad: Doubles) -> tuple[Doubles, Doubles]:
-    """Return ranges [m] and bearings [rad] of the nodes: from the first to the last cell."""
+    """Return ranges [m] and bearings [rad] of the nodes, from the first to the last cell."""
     return np.linspace(range_m[0], range_m[-1], NODES[0]), np.linspace(bearing_rad[0], bearing_rad[-1], NODES[1])
 
 
 class GroundNodes:
-    """The nodes of a pair of frames, which all levels share.
+    """The nodes of a pair of frames, shared by all levels; between them the displacement is smooth.
 
     Args:
-        frames: whose axes they span.
+        frames: frames whose axes the nodes span.
         attitude: of the sonar.
         heave: whether the derivative has a fourth component, by the sonar's height.
 
@@ -616,7 +649,7 @@ class GroundNodes:
         self.derivative = self._derivative(self.ground)
 
     def _ground(self, number: int | None, lift_m: float = 0.0) -> GroundGeometry:
-        """Return the geometry of the nodes, of the frames' mean or of one frame, over ground raised by ``lift_m``."""
+        """Return the geometry of the nodes, for the mean pose or that of one frame, over ground raised by ``lift_m``."""
         attitude = self.attitude
         mean = attitude.height_m - lift_m, attitude.pitch_rad, attitude.roll_rad
         pose = mean if number is None else attitude.of_frame(number, lift_m)
@@ -629,13 +662,13 @@ class GroundNodes:
 
     @cached_property
     def _from_nodes_of_frames(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-        """Return the nodes of each frame whose values its nodes take."""
+        """Return, for each frame, the nodes from which its nodes take their values."""
         if not self.attitude.apart:
             return [self.from_node, self.from_node]
         return [nearest_known(np.asarray(np.isfinite(one.points).all(axis=-1))) for one in self._of_frames]
 
     def _derivative(self, ground: GroundGeometry) -> Doubles:
-        """Return the derivative by motion (and heave), that of the nearest node where a node meets no ground."""
+        """Return the derivative by motion (and heave), from the nearest valid node where a node meets no ground."""
         nodes = np.moveaxis(ground.derivative, (3, 2), (0, 1))
         if self.heave:
             nodes = np.concatenate([nodes, np.moveaxis(ground.derivative_by_height, 2, 0)[None]])
@@ -643,7 +676,7 @@ class GroundNodes:
 
     @cached_property
     def shown(self) -> tuple[NDArray[np.bool_], bool]:
-        """Return which nodes show ground to be matched ``(nodes, nodes)``, and whether the outline of the light is masked.
+        """Return which nodes show ground to match ``(nodes, nodes)``, and whether the outline of the light is masked.
 
         See :func:`mitsonar.geometry.ground.margin_of_light`.
         """
@@ -652,7 +685,7 @@ class GroundNodes:
 
     @cached_property
     def key(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return ranges and bearings of the frames' cells, to be looked up by."""
+        """Return ranges and bearings of the frames' cells, as a cache key."""
         return tuple(self.frames.range_m.tolist()), tuple(self.frames.bearing_rad.tolist())
 
     def shift(self, v: Doubles, *, back: bool, lift_m: float) -> Doubles:
@@ -670,16 +703,16 @@ class GroundNodes:
         return np.asarray(nodes[:, row, column], dtype=np.float64)
 
     def _between(self, ground: GroundGeometry, other: GroundGeometry, motion: Doubles | Motion) -> Doubles:
-        """Return the displacement of the ground of the nodes of one frame in another ``(2, nodes, nodes)``; nan off it."""
+        """Return the displacement of one frame's ground nodes in another ``(2, nodes, nodes)``; nan off the ground."""
         radius, bearing = other.to_polar(moved(ground.points, motion))
         return np.stack([radius - self.axes[0][:, None], bearing - self.axes[1]])
 
     def leaning_shift(self, v: Doubles) -> Doubles:
-        """Return the derivative of :meth:`shift` by what the second frame's height, pitch and roll exceed the first's.
+        """Return the derivative of :meth:`shift` by the excess of height, pitch and roll of the second frame.
 
         Returns:
-            Ranges [m] and bearings [rad] a metre of height, a radian of pitch and of roll ``(3, 2, nodes, nodes)``; 0 where
-            nothing is unknown.
+            Ranges [m] and bearings [rad] per metre of height and per radian of pitch and of roll ``(3, 2, nodes, nodes)``; 0
+            if nothing is unknown.
         """
         if not any(self.attitude.unsure):
             return np.zeros((3, *self.derivative.shape[1:]))
@@ -703,11 +736,11 @@ class GroundNodes:
         return (higher - lower) / (2 * change)
 
 
-# ---------------- Blocks of cells: whole groups of bins and beams, over which maps are summed
+# ---------------- Sums over blocks of cells
 
 
 def cell_blocks(shape: tuple[int, ...], block: tuple[int, int]) -> tuple[int, int]:
-    """Return the number of blocks along bins and beams; cells beyond the last whole block belong to it."""
+    """Return the number of blocks along bins and beams; the last block includes the cells beyond it."""
     return max(shape[-2] // block[0], 1), max(shape[-1] // block[1], 1)
 
 
@@ -720,12 +753,12 @@ def by_block(maps: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.f
 def products_by_block(pairs: Sequence[tuple[Floats, Floats]], block: tuple[int, int]) -> NDArray[np.float64]:
     """Sum products of two maps ``(bins, beams)`` over blocks ``(pairs, blocks)``."""
     shape = pairs[0][0].shape
-    product = np.empty(shape, dtype=np.float32)  # one for all: it stays in the processor's cache
+    product = np.empty(shape, dtype=np.float32)  # one buffer for all products stays in the processor's cache
     return _sums([_means(np.multiply(*pair, out=product), block) for pair in pairs], cell_blocks(shape, block), block)
 
 
 def _means(values: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.floating]:
-    """Average a map ``(bins, beams)`` over blocks; one that is not whole is filled with zeros ``(rows, columns)``."""
+    """Average a map ``(bins, beams)`` over blocks ``(rows, columns)``; incomplete blocks are padded with zeros."""
     over = [-(-size // edge) for size, edge in zip(values.shape, block, strict=True)]
     missing = [(0, count * edge - size) for count, edge, size in zip(over, block, values.shape, strict=True)]
     if any(after for _, after in missing):
@@ -735,7 +768,7 @@ def _means(values: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.f
 
 
 def _sums(means: list[NDArray[np.floating]], blocks: tuple[int, int], block: tuple[int, int]) -> NDArray[np.float64]:
-    """Sum over blocks from their means ``(maps, blocks)``; cells beyond the last whole block belong to it."""
+    """Sum over blocks from their means ``(maps, blocks)``; the last block includes the cells beyond it."""
     sums = np.multiply(means, block[0] * block[1], dtype=np.float64)
     rows, columns = blocks
     if sums.shape[1:] != blocks:
@@ -754,29 +787,29 @@ def on_cells(table: NDArray[np.float64], shape: tuple[int, ...], block: tuple[in
     return np.asarray(drawn, dtype=np.float32)
 
 
-# ---------------- Smoothed images, values between pixels, and slopes over bins and beams
+# ---------------- Smoothing, interpolation and slopes
 
 
 FAINTEST = 0.02
-"""Residuals of this size are never outliers: patterns of rays and interpolation reach it without any noise."""
+"""Residuals of this size are never outliers: ray patterns and interpolation reach it without any noise."""
 
 NEIGHBOURS = (3, 7)
-"""Beams and bins within which the slopes' variance is compared with the noise (Wiener's filter)."""
+"""Beams and bins within which the variance of the image is compared with the noise (Wiener's filter)."""
 
 
 def blurred(image: Floats, bins: float, beams: float) -> Floats:
-    """Smooth an image ``(bins, beams)`` by a Gaussian of these standard deviations [bins, beams]; 0, 0: not at all."""
+    """Smooth an image ``(bins, beams)`` by a Gaussian of these standard deviations [bins, beams]; 0, 0: no smoothing."""
     if not bins and not beams:
         return image
     size = tuple(2 * int(np.ceil(3 * sigma)) + 1 for sigma in (beams, bins))
-    least = 1e-3  # OpenCV takes 0 for the other one
+    least = 1e-3  # OpenCV replaces 0 by the other sigma
     return np.asarray(
         cv2.GaussianBlur(image, size, sigmaX=max(beams, least), sigmaY=max(bins, least), borderType=cv2.BORDER_REPLICATE)
     )
 
 
 def sampled(image: Floats, row: Floats, column: Floats) -> Floats:
-    """Interpolate an image between pixels, bilinear."""
+    """Interpolate an image bilinearly between pixels."""
     return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
