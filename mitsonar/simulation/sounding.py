@@ -127,7 +127,7 @@ class SounderSimulator:
         """Return the mean level of noise and volume after the gain ``(bins,)``; 0 if there is none."""
         fan, coherent = self.sounder.fan, self.simulator.coherent
         if coherent is not None:
-            return np.asarray(sum(coherent.noise_powers()) * coherent.gain, dtype=np.float64)
+            return np.asarray(sum(coherent.receiver.noise_powers()) * coherent.gain, dtype=np.float64)
         if fan.noise_level_db is None:
             return np.zeros(fan.range_bins)
         return np.asarray(10 ** ((fan.noise_level_db - fan.source_level_db) / 10) * gain_of(fan), dtype=np.float64)

@@ -337,13 +337,13 @@ def test_volume_reverberation_has_its_level(flat: mi.Scene) -> None:
     """Sv + 10 log of the cell's volume - 40 log R - 2 alpha R; new in each ping."""
     sonar = SONAR.replace(volume_db=-60.0, absorption_db_per_m=0.5)
     source = imager(flat, sonar)
-    made = (np.abs(np.stack([source.volume(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2))
+    made = (np.abs(np.stack([source.receiver.volume(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2))
     r = sonar.range_m
     cell = r**2 * sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m
     truth = -60 + 10 * np.log10(cell) - 40 * np.log10(r) - 2 * 0.5 * r
     assert np.abs(10 * np.log10(made) - truth).reshape(-1, 16).mean(axis=1).max() < 0.6
     assert 10 * np.log10(made).mean() == pytest.approx(truth.mean(), abs=0.1)
-    assert not np.array_equal(source.volume(0), source.volume(1))
+    assert not np.array_equal(source.receiver.volume(0), source.receiver.volume(1))
 
 
 def test_near_glow_falls_evenly_in_decibels(flat: mi.Scene) -> None:
@@ -367,16 +367,16 @@ GLOWING: dict[str, float] = {
 def test_near_glow_falls_from_the_middle_beam_outwards(flat: mi.Scene) -> None:
     """As the square of the sine of the bearing; the median beam keeps the level; each beam has its own by the seed."""
     sonar = SONAR.replace(**GLOWING, near_glow_edge_db=20.0)
-    seen = np.stack([imager(flat, sonar).noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
+    seen = np.stack([imager(flat, sonar).receiver.noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
     made = 10 * np.log10((np.abs(seen) ** 2).mean(axis=0))
     line = -120 + 60 * (1 - sonar.range_m[sonar.range_m < 0.4] / 0.8)
     square = (np.sin(sonar.bearing_rad) / np.sin(sonar.bearing_rad[-1])) ** 2
     np.testing.assert_allclose((made - line[:, None]).mean(axis=0), -20 * (square - 0.25), atol=0.4)
     spread = sonar.replace(near_glow_spread_db=5.0)
-    other = np.stack([imager(flat, spread).noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
+    other = np.stack([imager(flat, spread).receiver.noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
     own = (10 * np.log10((np.abs(other) ** 2).mean(axis=0)) - made).mean(axis=0)
     assert own.std() == pytest.approx(5, abs=1.2)
-    redrawn = imager(flat, spread.replace(seed=7)).noise(0)[sonar.range_m < 0.4]
+    redrawn = imager(flat, spread.replace(seed=7)).receiver.noise(0)[sonar.range_m < 0.4]
     assert np.corrcoef(np.log(np.abs(redrawn)).mean(axis=0), np.log(np.abs(other[0])).mean(axis=0))[0, 1] < 0.9
 
 
@@ -386,7 +386,7 @@ def test_a_part_of_the_near_glow_stays_and_its_power_is_kept(flat: mi.Scene) -> 
     sonar = SONAR.replace(**GLOWING)
     power = [np.zeros(0)] * 2
     for k, still in enumerate((0.0, 0.7)):
-        draws = np.stack([imager(flat, sonar.replace(near_glow_still=still)).noise(ping) for ping in range(24)])
+        draws = np.stack([imager(flat, sonar.replace(near_glow_still=still)).receiver.noise(ping) for ping in range(24)])
         power[k] = 10 * np.log10((np.abs(draws) ** 2).mean(axis=(0, 2)))
         for part, wanted in ((sonar.range_m < 0.4, still), (sonar.range_m > 0.8, 0.0)):
             grain = draws[:, part] / np.sqrt((np.abs(draws[:, part]) ** 2).mean(axis=(0, 2)))[None, :, None]

@@ -596,11 +596,11 @@ class SpeckleBounds:
         mirrors = simulator.mirrors if self.sonar.bounces > 1 else None  # with one reflection a mirror has no expected level
         self.expected = Simulator(simulator.tracer.scene, expected_sonar(self.sonar), mirrors=mirrors)
         # noise of the receiver and of the volume, which beams correlate differently
-        noise, volume = self.imager.noise_powers()
+        noise, volume = self.imager.receiver.noise_powers()
         self.noise = np.broadcast_to((noise + volume)[:, None], (self.sonar.range_bins, self.sonar.beams))
-        beams = self.imager.beam_correlations()
+        beams = self.imager.receiver.beam_correlations()
         share = float(volume.sum()) / max(float((noise + volume).sum()), 1e-300)
-        bins = self.imager.bin_correlation().astype(float)
+        bins = self.imager.receiver.bin_correlation().astype(float)
         self.of_noise = CellCorrelation(bins, (1 - share) * beams[0] + share * beams[1])
         self.of_speckle = CellCorrelation(bins, beams[2])
 

@@ -147,7 +147,7 @@ def grain_oracle(bounds: SpeckleBounds, draws: int) -> float:
     told = CellScores(told.jacobian, weight, covariance)  # amplitudes are not rounded here
     limit = told.bound()
     echo = bounds.imager.echoes(pose)[0]
-    amplitude = np.abs(np.array([echo + bounds.imager.noise(ping) for ping in range(draws)])).astype(float)
+    amplitude = np.abs(np.array([echo + bounds.imager.receiver.noise(ping) for ping in range(draws)])).astype(float)
     motion = np.tile(limit.std() * [2, -1, 1], (draws, 1))
     for _ in range(3):
         for frame in range(draws):

@@ -1,0 +1,214 @@
+"""How noise is added to a coherent ping: crosstalk of the beams, volume scattering, receiver noise with glow, stripes.
+
+:data:`PROCESSES` names what is added after the echoes, in the order of the instrument. A process is a function
+``process(receiver, image, ping, side) -> image`` of the complex image ``(bins, beams)``. Its draws are functions of (seed,
+ping, cell), so an image does not depend on the order in which pings are rendered.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from mitsonar.acoustics.noise import uniform
+from mitsonar.acoustics.water import loss_of
+from mitsonar.instruments.beams import series, shaded_sinc
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.simulation.beams import BeamFormer
+
+__all__ = ["PROCESSES", "ReceiverNoise", "with_crosstalk"]
+
+Image = NDArray[np.complex64]
+"""A complex image ``(bins, beams)``: amplitudes relative to the source at 1 m."""
+
+STRIPES, NOISE, VOLUME, GLOW = 0x57121, 0x6E6F6973, 0x766F6C75, 0x676C6F77
+"""Salts of the seed that make the draws of stripes, noise, volume and glow independent."""
+
+MEDIAN_SQUARE = 0.25
+"""Median of the squared bearing over evenly spaced beams, relative to the outermost beam."""
+
+SIDE_SALT = {0: 0, 1: 0x7570 << 32, -1: 0x646F << 32}
+"""Salts of the seed that make the noise of both sides of the elevation independent, keyed by side."""
+
+
+class ReceiverNoise:
+    """Noise of a receiver and of the water in front of it.
+
+    Args:
+        sonar: a sonar of the model ``coherent``.
+        former: its beamformer, whose aperture and pulse filter the noise as they filter echoes.
+    """
+
+    def __init__(self, sonar: Sonar, former: BeamFormer) -> None:
+        self.sonar, self.former = sonar, former
+        self._kept_waves: dict[int, NDArray[np.float32]] = {}
+
+    def add(self, image: NDArray[Any], ping: int, side: int = 0) -> Image:
+        """Apply all :data:`PROCESSES` to the echoes of one ping.
+
+        Args:
+            image: echoes ``(bins, beams)``.
+            ping: number of the ping, on which the noise depends.
+            side: side of the elevation: 0 for the whole view, +1 and -1 for portions.
+        """
+        for process in PROCESSES:
+            image = process(self, image, ping, side)
+        return np.asarray(image, dtype=np.complex64)
+
+    @cached_property
+    def stripes(self) -> NDArray[np.float32]:
+        """Return the amplitude gain of each beam ``(beams,)``, drawn from the seed."""
+        rng = np.random.default_rng([abs(self.sonar.seed), STRIPES])
+        return np.asarray(10 ** (rng.normal(0, self.sonar.stripes_db, self.sonar.beams) / 20), dtype=np.float32)
+
+    # ---------------- Noise and volume reverberation
+
+    def noise(self, ping: int, side: int = 0) -> NDArray[np.complex64]:
+        """Return the receiver noise of one ping ``(bins, beams)``: complex Gaussian, filtered as echoes are.
+
+        White noise from the water and the array elements passes the array, which correlates neighbouring beams, and the
+        matched filter. The noise may rise near the sonar (near glow). Each value is a function of (seed, ping, cell); the
+        part of the glow that is constant over pings is a function of (seed, cell).
+        """
+        sonar, amplitude, salt = self.sonar, self._noise_amplitude, SIDE_SALT[side]
+        if sonar.near_glow_still == 0 or sonar.near_glow_db == 0:
+            return self._white(ping, NOISE ^ salt, 1) * np.asarray(amplitude, np.float32)
+        # split the excess power of the glow into a part that is constant over pings and a part drawn for each ping
+        power = np.square(amplitude)
+        still = sonar.near_glow_still * power * (1 - 10 ** (-self._glow / 10))
+        new = self._white(ping, NOISE ^ salt, 1) * np.asarray(np.sqrt(power - still), np.float32)
+        stays = self._white(0, GLOW ^ salt, 1) * np.asarray(np.sqrt(still), np.float32)
+        return np.asarray(new + stays, dtype=np.complex64)
+
+    @cached_property
+    def _glow(self) -> NDArray[np.float64]:
+        """Return the excess of the noise near the sonar over that farther away ``(bins, 1)`` or ``(bins, beams)`` [dB]."""
+        sonar = self.sonar
+        fall = (sonar.near_glow_db * (1 - sonar.range_m / sonar.near_glow_m))[:, None]
+        if sonar.near_glow_db == 0 or (sonar.near_glow_edge_db == 0 and sonar.near_glow_spread_db == 0):
+            return np.asarray(np.maximum(0, fall), dtype=np.float64)
+        bearing = np.sin(sonar.bearing_rad) / np.sin(np.abs(sonar.bearing_rad).max())
+        drawn = np.random.default_rng([abs(sonar.seed), GLOW]).normal(0, sonar.near_glow_spread_db, sonar.beams)
+        return np.asarray(np.maximum(0, fall - sonar.near_glow_edge_db * (bearing**2 - MEDIAN_SQUARE) + drawn))
+
+    def volume(self, ping: int, side: int = 0) -> NDArray[np.complex64]:
+        """Return the volume reverberation of one ping ``(bins, beams)``, drawn anew for each ping.
+
+        Its power is Sv times the volume of the cell over R^4. One side of the elevation contains half of the volume.
+        """
+        amplitude = np.asarray(self._volume_amplitude * (math.sqrt(0.5) if side else 1), np.float32)
+        return self._white(ping, VOLUME ^ SIDE_SALT[side], 2) * amplitude[:, None]
+
+    def noise_powers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the mean powers of noise and of volume reverberation, two arrays ``(bins,)``; 0 where there is none.
+
+        Glow that differs from beam to beam is averaged over the beams.
+        """
+        sonar, none = self.sonar, np.zeros(self.sonar.range_bins)
+        noise = none if sonar.noise_level_db is None else np.square(self._noise_amplitude).mean(axis=1)
+        return noise, none if sonar.volume_db is None else np.square(self._volume_amplitude)
+
+    def beam_correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the beam correlations ``(beams, beams)`` of noise, volume reverberation, and speckle on even ground."""
+        noise, volume = (self._plane_waves(ways).astype(float) for ways in (1, 2))
+        lines = self.former.over_sine.T.astype(float)
+        return noise.T @ noise, volume.T @ volume, _correlation(lines.T @ lines)
+
+    def bin_correlation(self) -> csr_array[Any, Any]:
+        """Return the bin correlation ``(bins, bins)`` due to the pulse, the same for noise, volume and speckle."""
+        rows = self._noise_ranges.astype(float)
+        return csr_array(rows @ rows.T)
+
+    @cached_property
+    def _noise_amplitude(self) -> NDArray[np.float64]:
+        """Return the amplitude of the receiver noise including glow ``(bins, 1)`` or ``(bins, beams)``."""
+        sonar = self.sonar
+        assert sonar.noise_level_db is not None
+        return np.asarray(10 ** ((sonar.noise_level_db - sonar.source_level_db + self._glow) / 20), dtype=np.float64)
+
+    @cached_property
+    def _volume_amplitude(self) -> NDArray[np.float64]:
+        """Return the amplitude of the volume reverberation ``(bins,)``."""
+        sonar = self.sonar
+        assert sonar.volume_db is not None
+        volume = sonar.range_m**2 * sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m
+        power = 10 ** (sonar.volume_db / 10) * volume / sonar.range_m**4 * loss_of(sonar)
+        return np.asarray(np.sqrt(power), dtype=np.float64)
+
+    def _plane_waves(self, ways: int) -> NDArray[np.float32]:
+        """Return :meth:`_waves` from a cache."""
+        if ways not in self._kept_waves:
+            self._kept_waves[ways] = self._waves(ways)
+        return self._kept_waves[ways]
+
+    def _white(self, ping: int, salt: int, ways: int) -> NDArray[np.complex64]:
+        """Return complex Gaussian noise of unit power ``(bins, beams)``, filtered by the array and the matched filter."""
+        waves = self._plane_waves(ways)
+        shape = 1, self.former.ranges, len(waves)
+        first, second = uniform(shape, seed=self.sonar.seed ^ salt, frames=np.array([ping]), like=np.empty(0))
+        # 1. Draw complex Gaussian noise of every plane wave and range (Box-Muller), real and imaginary part side by side.
+        radius = np.sqrt(-np.log(first[0]))
+        white = np.concatenate([radius * np.cos(2 * math.pi * second[0]), radius * np.sin(2 * math.pi * second[0])], axis=1)
+        # 2. Apply the matched filter over range, then the array over plane waves.
+        filtered = self._noise_ranges @ white.astype(np.float32)
+        real, imag = (np.ascontiguousarray(part) @ waves for part in np.split(filtered, 2, axis=1))
+        return np.asarray(real + 1j * imag, dtype=np.complex64)
+
+    def _waves(self, ways: int) -> NDArray[np.float32]:
+        """Return the amplitude of plane waves in each beam ``(waves, beams)``, for a one-way or two-way pattern.
+
+        Waves are 1 / (ways x length) apart in sine, which resolves that pattern. Each beam has unit power.
+        """
+        length = self.former.aperture.length
+        reach = math.sin(math.radians(self.sonar.azimuth_fov_deg) / 2) + 4 / length
+        wave = np.arange(-reach, reach, 1 / (ways * length))
+        away = np.sin(self.sonar.bearing_rad)[:, None] - wave
+        amplitude = shaded_sinc(away * length, series(self.sonar.shading)) ** ways
+        amplitude /= np.sqrt(np.square(amplitude).sum(axis=1, keepdims=True))
+        return np.ascontiguousarray(amplitude.T, dtype=np.float32)
+
+    @cached_property
+    def _noise_ranges(self) -> csr_array[Any, Any]:
+        """Return the matched filter as a matrix ``(bins, ranges)`` with rows of unit power."""
+        rows = self.former.over_range
+        power = np.asarray(rows.multiply(rows).sum(axis=1)).ravel()
+        return csr_array(rows.multiply(1 / np.sqrt(power)[:, None]), dtype=np.float32)
+
+
+def _with_volume(receiver: ReceiverNoise, image: NDArray[Any], ping: int, side: int) -> NDArray[Any]:
+    return image if receiver.sonar.volume_db is None else image + receiver.volume(ping, side)
+
+
+def _with_noise(receiver: ReceiverNoise, image: NDArray[Any], ping: int, side: int) -> NDArray[Any]:
+    return image if receiver.sonar.noise_level_db is None else image + receiver.noise(ping, side)
+
+
+def _with_stripes(receiver: ReceiverNoise, image: NDArray[Any], ping: int, side: int) -> NDArray[Any]:
+    return image * receiver.stripes if receiver.sonar.stripes_db > 0 else image
+
+
+PROCESSES: tuple[Callable[[ReceiverNoise, NDArray[Any], int, int], NDArray[Any]], ...] = (
+    _with_volume,
+    _with_noise,
+    _with_stripes,
+)
+"""Processes that act on the echoes of a ping, in the order of the instrument."""
+
+
+def with_crosstalk(sonar: Sonar, image: NDArray[Any]) -> NDArray[Any]:
+    """Return echoes ``(bins, beams)`` with the sum of all beams, weighted by ``crosstalk_db``, added to each beam."""
+    if sonar.crosstalk_db is None:
+        return image
+    return image + np.float32(10 ** (sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
+
+
+def _correlation(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Convert a covariance matrix ``(n, n)`` to a correlation matrix."""
+    std = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / np.outer(std, std), dtype=np.float64)
