@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypedDict, Unpack
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import register
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -694,3 +695,10 @@ def _infos(moved: Transition, which: NDArray[np.bool_]) -> dict[str, Any]:
 def _masked(values: dict[str, Array], which: NDArray[np.bool_]) -> dict[str, Any]:
     """Return arrays by name, each with the mask of the vehicles that it holds for, as Gymnasium has it."""
     return values | {f"_{name}": which.copy() for name in values}
+
+
+register(
+    id="mitsonar/Sonar-v0",
+    entry_point="mitsonar.bridges.gymnasium:SonarEnv",
+    vector_entry_point="mitsonar.bridges.gymnasium:SonarVectorEnv",
+)

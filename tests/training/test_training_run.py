@@ -365,7 +365,7 @@ def test_a_part_of_the_data_is_its_first_frames(made: Path) -> None:
 
 KILLED = """
     import os, sys
-    from mitsonar.io import whole_files as files
+    from mitsonar.io import files
     from mitsonar.config.training import load_training_recipe
     from mitsonar.training.run import train
 
