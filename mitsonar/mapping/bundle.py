@@ -1,9 +1,9 @@
-"""Bundle adjustment: poses and landmarks that explain where the landmarks were received.
+"""How poses and landmarks are adjusted together to observed ranges and bearings (bundle adjustment).
 
-Range and bearing of a point do not tell its elevation. Several of them from different places do (Huang and Kaess, 2015).
-The landmarks are eliminated first (Schur complement), so that the cost is that of the poses. Landmarks lie on the ground or
-above it: their heights have an exponential law, of relief above the ground and of errors below it. It fixes the scale, which
-range and bearing alone tell badly.
+One range and bearing of a point do not determine its elevation; several from different places do (Huang and Kaess, 2015).
+Landmarks are eliminated first (Schur complement), so that the size of the equations is that of the poses. Landmarks lie on
+the ground or above it: their heights have an exponential distribution, of relief above the ground and of errors below it.
+This prior fixes the scale, which range and bearing alone determine poorly.
 """
 
 from __future__ import annotations
@@ -23,48 +23,49 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 PLANAR = np.array([0, 1, 5])
-"""Place of x, y and heading in a pose."""
+"""Indices of x, y and heading in a pose."""
 
 ROUNDS = 3
 STILL = 1e-6
-"""Gauss-Newton iterations at most, and the step below which they end [m, rad]."""
+"""Largest number of Gauss-Newton iterations, and the step below which they end [m, rad]."""
 
 OUTLYING = 4.0
-"""Squared errors, in covariances, of so much have half the weight."""
+"""Squared normalised error at which an observation has half the weight."""
 
 TRACK = 1.2
-"""Landmarks whose mean squared error is so many times the usual one have half the weight: what moves with a shadow."""
+"""Mean squared error, relative to the usual one, at which a landmark has half the weight: it may move with a shadow."""
 
 HARSH = 3
-"""Power by which landmarks that fit worse lose weight: 2 leaves sideways paths over rocks more drift, 4 forward ones."""
+"""Exponent of the weight loss of poorly fitting landmarks: with 2, sideways paths over rocks drift more; with 4, forward
+ones."""
 
 BELOW_M = 0.02
 """Mean of the errors of heights below the ground [m]."""
 
 UNKNOWN_M = 0.1
-"""Heights that the observations tell no better than this are held to the mean of the law too [m]: its mode is no mean."""
+"""Standard deviation beyond which an observed height is drawn to the mean of its distribution, not only to its mode [m]."""
 
 NEAREST_M = 0.01
-"""Heights nearer to the ground than this count as so far: the law has a corner there [m]."""
+"""Smallest distance from the ground in the prior of heights, which has a corner there [m]."""
 
 LARGEST = 50.0
-"""Squared error above which an observation says no more of its landmark."""
+"""Squared normalised error at which the contribution of an observation to the error of its landmark is capped."""
 
 LEAST_MEDIAN = 0.2
-"""Least usual error of the observations, in their covariances."""
+"""Lower bound of the usual squared normalised error of the observations."""
 
 LOOSE = 1e-6
-"""Information that every unknown has [1/m^2, 1/rad^2]."""
+"""Weak prior information on every unknown, against singular equations [1/m^2, 1/rad^2]."""
 
 
 class Observations(NamedTuple):
-    """Where landmarks were received.
+    """Observed ranges and bearings of landmarks.
 
     Attributes:
-        view: number of the pose ``(n,)``.
-        landmark: number of the landmark ``(n,)``.
+        view: index of the pose ``(n,)``.
+        landmark: index of the landmark ``(n,)``.
         polar: range [m] and bearing [rad] ``(n, 2)``.
-        covariance: of these ``(n, 2, 2)``.
+        covariance: covariance of range and bearing ``(n, 2, 2)``.
     """
 
     view: Index
@@ -73,7 +74,7 @@ class Observations(NamedTuple):
     covariance: Array
 
     def take(self, index: Index | NDArray[np.bool_]) -> Observations:
-        """Return some of the observations."""
+        """Return the selected observations."""
         return Observations(self.view[index], self.landmark[index], self.polar[index], self.covariance[index])
 
 
@@ -81,11 +82,11 @@ class Adjusted(NamedTuple):
     """Result of a bundle adjustment.
 
     Attributes:
-        poses: ``(k, 6)`` [m, rad].
-        points: of the landmarks ``(l, 3)`` [m].
-        point_covariance: ``(l, 3, 3)``, given the poses.
-        faults: mean squared error of each landmark, in those of the usual one ``(l,)``.
-        last_covariance: of x, y [m] and heading [rad] of the last pose, given those held ``(3, 3)``.
+        poses: adjusted poses ``(k, 6)`` [m, rad].
+        points: adjusted points of the landmarks ``(l, 3)`` [m].
+        point_covariance: covariances of the points, given the poses ``(l, 3, 3)``.
+        faults: mean squared error of each landmark, relative to the usual one ``(l,)``.
+        last_covariance: covariance of x, y [m] and heading [rad] of the last pose, given the fixed poses ``(3, 3)``.
     """
 
     poses: Array
@@ -96,7 +97,16 @@ class Adjusted(NamedTuple):
 
 
 class _Blocks(NamedTuple):
-    """The normal equations: of poses, of landmarks, and between them."""
+    """The blocks of the normal equations.
+
+    Attributes:
+        poses: matrix of the free poses ``(6 k, 6 k)``.
+        pull: right-hand side of the free poses ``(6 k,)``.
+        between: matrix between poses and landmarks ``(6 k, 3 l)``.
+        landmarks: diagonal blocks of the landmarks ``(l, 3, 3)``.
+        landmark_pull: right-hand side of the landmarks ``(l, 3)``.
+        faults: mean squared error of each landmark, relative to the usual one ``(l,)``.
+    """
 
     poses: Array
     pull: Array
@@ -107,12 +117,12 @@ class _Blocks(NamedTuple):
 
 
 def cauchy(squared: Array) -> Array:
-    """Return the weights of observations with these squared errors, in covariances."""
+    """Return the Cauchy weights of observations with these squared normalised errors."""
     return np.asarray(1 / (1 + squared / OUTLYING))
 
 
 def track_weight(faults: Array) -> Array:
-    """Return the weights of landmarks with these mean squared errors, in those of the usual one."""
+    """Return the weights of landmarks with these mean squared errors, relative to the usual one."""
     return np.asarray(1 / (1 + (faults / TRACK) ** HARSH))
 
 
@@ -126,55 +136,68 @@ def adjusted(
     bearing: Bearing,
     relief_m: float,
 ) -> Adjusted:
-    """Adjust poses and landmarks.
+    """Adjust poses and landmarks to observations by Gauss-Newton.
 
     Args:
-        poses: ``(k, 6)`` [m, rad].
-        held: so many poses from the first stay as they are.
-        told: heights [m], pitches and rolls [rad] of the others, as sensors tell them ``(k - held, 3)``.
+        poses: initial poses ``(k, 6)`` [m, rad].
+        held: number of poses, from the first, that stay fixed.
+        told: measured heights [m], pitches and rolls [rad] of the other poses ``(k - held, 3)``.
         attitude_std: standard deviations of these heights [m], pitches and rolls [rad] ``(3,)``.
-        points: of the landmarks ``(l, 3)``, in metres over the ground.
-        seen: observations of them.
+        points: initial points of the landmarks, with z as height over the ground ``(l, 3)`` [m].
+        seen: observations of the landmarks.
         bearing: kind of the bearings.
-        relief_m: mean height of what is seen over the ground.
+        relief_m: mean height of visible relief over the ground [m].
+
+    Returns:
+        The adjusted poses and points, with covariances.
 
     Raises:
-        LinAlgError: observations that do not suffice.
+        LinAlgError: the observations do not suffice.
     """
     found, place = poses.copy(), points.copy()
     for _ in range(ROUNDS):
+        # 1. normal equations of the observations, with the priors of heights and attitudes
         blocks = _normal_equations(found, held, place, seen, bearing)
         _add_heights(blocks, place[:, 2], relief_m)
         _add_attitudes(blocks, found[held:, 2:5], told, attitude_std)
+        # 2. eliminate the landmarks, whose blocks are independent of each other, and solve for the poses
         inverse = np.asarray(np.linalg.inv(blocks.landmarks), dtype=np.float64)
         crossed = _crossed(blocks.between, inverse)
         reduced = blocks.poses - crossed @ blocks.between.T
         factor = cho_factor(reduced)
         step = cho_solve(factor, blocks.pull - crossed @ blocks.landmark_pull.ravel())
+        # 3. substitute back for the landmarks
         rest = blocks.landmark_pull - (blocks.between.T @ step).reshape(-1, 3)
         found[held:] += step.reshape(-1, 6)
         place += np.einsum("lab,lb->la", inverse, rest)
         if np.abs(step).max() < STILL:
             break
+    # 4. marginal covariance of the last pose: the last block of the inverse
     last = cho_solve(factor, np.eye(len(reduced))[:, -6:])[-6:]
     return Adjusted(found, place, inverse, blocks.faults, last[np.ix_(PLANAR, PLANAR)])
 
 
 def _normal_equations(poses: Array, held: int, points: Array, seen: Observations, bearing: Bearing) -> _Blocks:
-    """Sum the observations, with weights that outliers lose."""
+    """Return the normal equations of the observations, with robust weights."""
+    # 1. errors of the observations, normalised by their covariances
     count, free = len(points), len(poses) - held
     projected = projection_of(points[seen.landmark], Views.of(poses).take(seen.view), bearing)
     error = seen.polar - projected.polar
     information = np.linalg.inv(seen.covariance)
     squared = np.einsum("ni,nij,nj->n", error, information, error)
+    # 2. mean squared error of each landmark, whose point takes 3 degrees of freedom of its observations; the median is the
+    # usual one
     times = np.bincount(seen.landmark, minlength=count)
     mean = np.bincount(seen.landmark, np.minimum(squared, LARGEST), minlength=count) / np.maximum(times - 1.5, 1) / 2
     usual = max(float(np.median(mean[times > 0])), LEAST_MEDIAN)
     faults = mean / usual
+    # 3. weights: outliers and poorly fitting landmarks lose weight, and the usual error scales all covariances
     information *= (cauchy(squared) * track_weight(faults)[seen.landmark] / usual)[:, None, None]
+    # 4. blocks of the landmarks
     of_point = projected.by_point.transpose(0, 2, 1) @ information
     landmarks = _summed(of_point @ projected.by_point, seen.landmark, count) + LOOSE * np.eye(3)
     landmark_pull = _summed((of_point @ error[:, :, None])[:, :, 0], seen.landmark, count)
+    # 5. blocks of the free poses, and between them and the landmarks; fixed poses only constrain landmarks
     moves = seen.view >= held
     view, landmark = seen.view[moves] - held, seen.landmark[moves]
     of_pose = projected.by_pose[moves].transpose(0, 2, 1) @ information[moves]
@@ -189,13 +212,17 @@ def _normal_equations(poses: Array, held: int, points: Array, seen: Observations
 
 
 def _crossed(between: Array, inverse: Array) -> Array:
-    """Multiply the blocks between poses and landmarks with the inverse of the landmarks' own."""
+    """Multiply the blocks between poses and landmarks by the inverse blocks of the landmarks."""
     rows = between.reshape(len(between), -1, 3)
     return np.asarray(np.einsum("pla,lab->plb", rows, inverse, optimize=True).reshape(between.shape))
 
 
 def _add_heights(blocks: _Blocks, height: Array, relief_m: float) -> None:
-    """Hold the heights ``(l,)`` of landmarks to their law: exponential above the ground, and below it."""
+    """Add the prior of the heights ``(l,)`` of landmarks: exponential above the ground and below it.
+
+    Where the observations hardly determine a height, the prior draws it to its mean instead of its mode, which is 0.
+    """
+    # weight of the exponential, from the variance given the poses; slope / |height| approximates it by a parabola (IRLS)
     variance = np.linalg.inv(blocks.landmarks)[:, 2, 2]
     known = UNKNOWN_M**2 / (UNKNOWN_M**2 + variance)
     law = known * np.where(height > 0, 1 / relief_m, 1 / BELOW_M) / np.maximum(np.abs(height), NEAREST_M)
@@ -205,7 +232,7 @@ def _add_heights(blocks: _Blocks, height: Array, relief_m: float) -> None:
 
 
 def _add_attitudes(blocks: _Blocks, attitudes: Array, told: Array, std: Array) -> None:
-    """Hold heights, pitches and rolls ``(poses, 3)`` to what sensors tell."""
+    """Add the measured heights, pitches and rolls ``(poses, 3)`` as a prior of the poses."""
     information, off = np.zeros(6), np.zeros((len(told), 6))
     information[2:5], off[:, 2:5] = 1 / std**2, told - attitudes
     blocks.poses[np.diag_indices(len(blocks.poses))] += np.tile(information, len(told))
@@ -213,7 +240,7 @@ def _add_attitudes(blocks: _Blocks, attitudes: Array, told: Array, std: Array) -
 
 
 def _summed(values: Array, group: Index, groups: int) -> Array:
-    """Sum rows of equal group ``(groups, ...)``."""
+    """Sum the rows of each group ``(groups, ...)``."""
     flat = values.reshape(len(values), -1)
     sums = np.stack([np.bincount(group, column, minlength=groups) for column in flat.T], axis=1)
     return np.asarray(sums.reshape(groups, *values.shape[1:]))

@@ -1,4 +1,4 @@
-"""The path of an odometry with other sensors and loops: a pose graph in place of plain composition."""
+"""How other sensors and loops enter the path of an odometry, by a pose graph in place of plain composition."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 DEFAULT_REACH_M = 3.0
-"""Horizontal distance to the ground that is seen, where it is not known [m]."""
+"""Horizontal distance to the middle of the ground in view, if it is not known [m]."""
 
 NOTHING = 1e-9
-"""Correlation of errors that do not depend on each other."""
+"""Correlation of errors that are independent of each other."""
 
 HALF_TOLD = 0.5
-"""A sensor tells a component whose standard deviation is below this part of that of unknown ones."""
+"""Fraction of the standard deviation of an unknown component below which a sensor counts as measuring the component."""
 
 
 @dataclass(frozen=True)
 class LoopTask:
-    """What a search for loops needs.
+    """Request for a search for loops.
 
     Attributes:
         estimator: registers two frames.
-        numbers: of the frames used ``(frames,)``.
+        numbers: numbers of the frames used ``(frames,)``.
         known: registrations of an earlier run.
-        keep: called with each new one.
+        keep: called with each new registration.
     """
 
     estimator: AnyEstimator
@@ -52,17 +52,17 @@ class LoopTask:
 
 @dataclass(frozen=True)
 class GraphPath:
-    """A path by a pose graph.
+    """A path computed by a pose graph.
 
     Attributes:
         path: poses at the times of the frames.
-        covariances: of x, y [m], heading [rad] ``(frames, 3, 3)``.
-        series: the motions of the path, with their covariances.
+        covariances: covariances of x, y [m], heading [rad] ``(frames, 3, 3)``.
+        series: motions of the path, with their covariances.
         sensors: names of the sensors that were used.
-        search: for loops; None where none was asked for.
-        kept: which loops of the search agree with all else ``(loops,)``.
-        end_moved_m: by how far loops moved the end of the path [m].
-        end_std_m: standard deviation of the position of the end before loops [m].
+        search: result of the search for loops; None if none was requested.
+        kept: whether each loop of the search agrees with all other measurements ``(loops,)``.
+        end_moved_m: distance by which loops moved the end of the path [m].
+        end_std_m: standard deviation of the position of the end without loops [m].
     """
 
     path: Trajectory
@@ -80,7 +80,7 @@ class GraphPath:
         return float(np.sqrt(np.trace(self.covariances[-1, :2, :2])))
 
     def rows(self, true: Trajectory | None) -> list[tuple[str, float, str]]:
-        """Return name, value and unit of what the graph adds to the results; ``true`` is the true path at the frames."""
+        """Return name, value and unit of the results that the graph adds; ``true`` is the true path at the frames."""
         rows: list[tuple[str, float, str]] = []
         if self.search is not None:
             out = len(self.kept) - int(self.kept.sum())
@@ -100,12 +100,14 @@ class GraphPath:
 
 
 def normalised_errors(path: Trajectory, covariances: Array, true: Trajectory) -> Array:
-    """Return the squared error of each pose but the first over its covariance, a third of it ``(frames - 1,)``.
+    """Return a third of the squared error of each pose but the first, normalised by its covariance ``(frames - 1,)``.
+
+    The expected value is 1 if the covariances are right.
 
     Args:
-        path: the estimated path.
-        covariances: of x, y [m], heading [rad] ``(frames, 3, 3)``.
-        true: the true path, at the same times.
+        path: estimated path.
+        covariances: covariances of x, y [m], heading [rad] ``(frames, 3, 3)``.
+        true: true path, at the same times.
     """
     off = (path.poses - true.poses)[1:, [0, 1, 5]]
     off[:, 2] = wrapped(off[:, 2])
@@ -114,17 +116,17 @@ def normalised_errors(path: Trajectory, covariances: Array, true: Trajectory) ->
 
 
 def errors_along(motions: Array, canvas: Canvas | None) -> CorrelatedErrors:
-    """Return how errors of consecutive motions ``(n, 3)`` depend on each other.
+    """Return the correlation of the errors of consecutive motions ``(n, 3)``.
 
     Args:
         motions: sideways, forward [m], yaw [rad].
-        canvas: the ground that frames show; None: not known how far ahead of the sonar.
+        canvas: ground that the frames show; None if its distance from the sonar is not known.
     """
     return _law_over(canvas).of(motions, DEFAULT_REACH_M if canvas is None else canvas.reach_m)
 
 
 def _law_over(canvas: Canvas | None) -> ErrorCorrelation:
-    """Return the law of errors over ground: without relief errors are noise, which no two pairs share."""
+    """Return the error model over this ground; without relief, errors are noise, independent from pair to pair."""
     return ErrorCorrelation(share=0.0) if canvas is not None and canvas.view.attitude.even else ErrorCorrelation()
 
 
@@ -142,23 +144,25 @@ def graph_path(
     """Compute the path that agrees best with estimated motions, sensors and loops.
 
     Args:
-        measured: the estimated motions, scaled; some may be invalid.
-        bridge: fills in invalid ones.
-        start: the first pose.
-        start_known: whether its heading is known; else a compass tells it.
-        sensors: of the vehicle.
-        loops: a search for loops; None: none.
-        source: of the frames, where they show ground: how far ahead of the sonar.
-        by_map: which motions are those of a map ``(motions,)``: its errors are not those of two frames. None: no map.
+        measured: estimated motions, scaled; some may be invalid.
+        bridge: fills in invalid motions.
+        start: first pose.
+        start_known: whether the heading of the first pose is known; otherwise a compass determines it, if there is one.
+        sensors: sensors of the vehicle, if any.
+        loops: request for a search for loops; None for none.
+        source: source of the frames if they show the ground, from which the distance of the ground is known.
+        by_map: whether each motion comes from a local map ``(motions,)``, whose errors are not correlated with those of
+            pairs of frames. None: no map.
 
     Raises:
-        MitsonarError: sensors that cover no frame, or motions that tell no covariance and are too few to estimate one.
+        MitsonarError: the sensors cover no frame, or the motions have no covariance and are too few to estimate one.
     """
+    # 1. the graph of motions and sensors, with errors correlated over the same ground
     canvas = None if source is None else canvas_of(source)
     errors = _law_over(canvas)
     graph = _graph(measured, bridge, start, start_known, sensors)
     correlated = errors_along(graph.chain.motions, canvas)
-    # motions left to the sensors say nothing of the errors of their neighbours
+    # 2. errors are independent next to motions that only sensors determine, and where the map begins or ends
     wide = np.diagonal(graph.chain.covariances, axis1=1, axis2=2) >= UNKNOWN_STD**2
     left = np.asarray(wide.all(axis=1), dtype=bool)
     apart = left[1:] | left[:-1]
@@ -166,6 +170,7 @@ def graph_path(
         apart |= by_map[1:] != by_map[:-1]
     onward = np.where(apart, NOTHING, correlated.onward)
     graph = replace(graph, correlated=correlated._replace(onward=onward))
+    # 3. solve without loops; its covariances guide the search for loops, with which the graph is solved again
     before = after = solved(graph)
     search = None
     if loops is not None:
@@ -179,7 +184,7 @@ def graph_path(
 
 
 def _closed(graph: PoseGraph, search: LoopSearch, before: GraphSolution) -> GraphSolution:
-    """Solve a graph with loops; stretches where most loops disagree with all else lose the others too."""
+    """Solve a graph with loops, leaving out all loops of a stretch where most disagree with the other measurements."""
     if not len(search.loops.first):
         return before
     after = solved(replace(graph, loops=search.loops))
@@ -230,13 +235,15 @@ def _graph(
     start_known: bool,
     sensors: VehicleSensors | None,
 ) -> PoseGraph:
-    """Put estimated motions and sensors together."""
+    """Assemble the pose graph of estimated motions and sensors."""
+    # 1. the chain of estimated motions, bridged, with covariances
     if measured.covariances is None:
         covariances = np.tile(np.diag(fit_noise(measured) ** 2), (len(measured), 1, 1))
         measured = replace(measured, covariances=covariances)
     whole = bridge(measured)
     assert whole.covariances is not None
     chain = PoseEdges.chain(whole.motions, whole.covariances.copy())
+    # 2. motions and headings of the sensors; where these suffice, a bridged motion must not count as a measurement
     others, bias, headings = PoseEdges.none(), None, Headings.none()
     if sensors is not None:
         told = sensors.motions(measured.time_s)
@@ -246,6 +253,7 @@ def _graph(
             others = PoseEdges(pair, pair + 1, motions, covariances)
         headings = sensors.headings(measured.time_s)
     bias = None if bias is None or not bias.any() else bias
+    # 3. initial guess; an unknown first heading begins near that of the compass, so that Gauss-Newton converges
     at_start, first = np.zeros((3, 3)), start
     poses = path_of(whole.motions, first, measured.time_s).poses[:, [0, 1, 5]]
     if headings.pose.size and not start_known:
@@ -256,7 +264,7 @@ def _graph(
 
 
 def _told(sensors: VehicleSensors, time_s: Array) -> NDArray[np.bool_]:
-    """Return which motions the sensors tell by themselves ``(frames - 1,)``."""
+    """Return whether the sensors alone determine each motion ``(frames - 1,)``."""
     priors = sensors.priors(time_s)
     if priors is None:
         return np.zeros(len(time_s) - 1, dtype=bool)

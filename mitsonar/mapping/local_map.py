@@ -1,9 +1,9 @@
-"""The local map: frames are registered to landmarks of the last metres, not to the last frame alone.
+"""How frames are registered to a map of landmarks of the last metres, instead of to the previous frame alone.
 
-Motions between two frames take the relief of the ground as one number, and the path drifts as long as the same rocks are in
-view. A map holds the height of each landmark, which many frames together tell. For each frame: predict its pose from the
-motion between two frames, register it to the landmarks, update the map where the sonar has moved on, and decide whether the
-answer is used.
+An estimator of motions between two frames describes the relief of the ground by one number, so that the path drifts as long
+as the same rocks are in view. A map holds the height of each landmark, which many frames together determine. :func:`mapped`
+takes each frame in turn. It predicts the pose from the motion between two frames, registers the frame to the landmarks,
+updates the map if the sonar has moved on, and decides whether to use the result.
 """
 
 from __future__ import annotations
@@ -44,8 +44,7 @@ __all__ = [
 ]
 
 
-# ---------------- Landmarks of a local map: points of the ground with the patches by which frames show them, and
-# their observations
+# ---------------- Landmarks
 
 
 Array = NDArray[np.float64]
@@ -54,26 +53,26 @@ Index = NDArray[np.intp]
 PIXELS = len(ROWS)
 
 ANCHOR = np.array([0.1, 0.08])
-"""Standard deviation of where a new landmark is [bins, beams]: the noise of its patch."""
+"""Standard deviation of the position of a new landmark [bins, beams], due to the noise of its patch."""
 
 LEAST_ALIKE = 0.75
 FARTHEST = np.array([8.0, 2.5])
-"""Least correlation of a patch that was found, and how far from where it was looked for [bins, beams]."""
+"""Smallest correlation at which a patch counts as found, and its largest distance from the prediction [bins, beams]."""
 
 EDGE = np.array([9.0, 2.4])
-"""Distance from the edge of the frame at which landmarks are looked for [bins, beams]."""
+"""Smallest distance from the edge of the frame at which landmarks are searched for [bins, beams]."""
 
 STALE = 0.92
-"""Correlation below which a patch is cut anew."""
+"""Correlation below which a patch is cut again from the current frame."""
 
 MISSED = 2
-"""Keyframes in which a landmark may be missed before it is given up."""
+"""Number of successive keyframes without a landmark after which it is dropped."""
 
 FAULTY = 8.0
-"""Mean squared error, in those of the usual one, beyond which a landmark is given up."""
+"""Mean squared error, relative to the usual one, beyond which a landmark is dropped."""
 
 BLOCKING = 4.0
-"""Landmarks worse than this keep their place for a while, so that the same shadow is not chosen again."""
+"""Mean squared error beyond which a landmark blocks its place for a while, so that the same shadow is not chosen again."""
 
 HEIGHT_STD_M = 0.3
 """Standard deviation of the height of a new landmark."""
@@ -81,14 +80,20 @@ HEIGHT_STD_M = 0.3
 
 @dataclass(frozen=True)
 class ImageAxes:
-    """Cells of the frames of a run: ranges [m] and bearings [rad] of their middles, and the kind of the bearings."""
+    """The cells of the frames of a run.
+
+    Attributes:
+        range_m: ranges of the centres of the cells ``(bins,)`` [m].
+        bearing_rad: bearings of the centres of the cells ``(beams,)`` [rad].
+        bearing: kind of the bearings.
+    """
 
     range_m: Array
     bearing_rad: Array
     bearing: Bearing
 
     def cells(self, polar: Array) -> Array:
-        """Return row and column ``(..., 2)`` of range and bearing; beyond the last cells by the spacing there."""
+        """Return row and column ``(..., 2)`` of range and bearing, extrapolated linearly beyond the last cells."""
         return np.stack([_place(polar[..., k], axis) for k, axis in enumerate(self._axes)], axis=-1)
 
     def polar(self, row: Array, column: Array) -> Array:
@@ -106,7 +111,14 @@ class ImageAxes:
 
 
 class Found(NamedTuple):
-    """Landmarks that a frame shows: number, range and bearing with covariance, correlation of the patch."""
+    """Landmarks that were found in a frame.
+
+    Attributes:
+        landmark: indices of the landmarks ``(n,)``.
+        polar: range [m] and bearing [rad] ``(n, 2)``.
+        covariance: covariances of range and bearing ``(n, 2, 2)``.
+        correlation: correlations of the patches with the frame ``(n,)``.
+    """
 
     landmark: Index
     polar: Array
@@ -114,7 +126,7 @@ class Found(NamedTuple):
     correlation: Array
 
     def take(self, index: Index | NDArray[np.bool_]) -> Found:
-        """Return some of them."""
+        """Return the selected landmarks."""
         return Found(self.landmark[index], self.polar[index], self.covariance[index], self.correlation[index])
 
 
@@ -124,18 +136,18 @@ def _empty(*shape: int) -> Array:
 
 @dataclass
 class Landmarks:
-    """A table of landmarks, of those in use and of those that still hold the map's poses.
+    """A table of landmarks: those in use, and those that still constrain the poses of the map.
 
     Attributes:
-        axes: of the frames.
-        points: in metres over the ground ``(l, 3)``.
-        covariance: of the points ``(l, 3, 3)``.
-        offsets: of the patch's pixels from the point, level ``(l, pixels, 2)`` [m].
-        patches: by which frames show them.
-        used: whether they are still looked for ``(l,)``.
-        faults: mean squared errors, in those of the usual one ``(l,)``.
-        missed: keyframes since they were found ``(l,)``.
-        born: keyframe in which they were chosen ``(l,)``.
+        axes: cells of the frames.
+        points: points, with z as height over the ground ``(l, 3)`` [m].
+        covariance: covariances of the points ``(l, 3, 3)``.
+        offsets: horizontal offsets of the pixels of each patch from the point ``(l, pixels, 2)`` [m].
+        patches: appearance of the landmarks in frames.
+        used: whether each landmark is still searched for ``(l,)``.
+        faults: mean squared errors, relative to the usual one ``(l,)``.
+        missed: number of keyframes since each landmark was found ``(l,)``.
+        born: keyframe in which each landmark was chosen ``(l,)``.
         seen: observations in keyframes.
     """
 
@@ -155,7 +167,8 @@ class Landmarks:
     )
 
     def find(self, image: PatchImage, view: Views) -> tuple[Found, int]:
-        """Find the landmarks in a frame that a view is expected to have taken; and count those that it should show."""
+        """Find the landmarks in a frame taken from an expected view; also return how many it should show."""
+        # 1. landmarks in use whose predicted place lies well inside the frame
         number = np.flatnonzero(self.used)
         if not len(number):
             return Found(number, _empty(2), _empty(2, 2), _empty()), 0
@@ -163,10 +176,12 @@ class Landmarks:
         place = self.axes.cells(middle)
         inside = (np.abs(place - self._middle) < self._half).all(axis=1)
         number, middle = number[inside], middle[inside]
+        # 2. predict every pixel of their patches, which accounts for the rotation and distortion of the view; align them
         pixels = np.concatenate([self.offsets[number], np.zeros((len(number), PIXELS, 1))], axis=2)
         cells = self.axes.cells(polar_of((self.points[number][:, None] + pixels).reshape(-1, 3), view, self.axes.bearing))
         cells = cells.reshape(len(number), PIXELS, 2)
         there = align(image, self.patches.take(number), cells[..., 0], cells[..., 1])
+        # 3. keep those that correlate well near the prediction, converted from cells to range and bearing
         good = (there.correlation > LEAST_ALIKE) & (np.abs(there.shift) < FARTHEST).all(axis=1)
         spacing = self.axes.spacing(middle)
         covariance = there.covariance * spacing[:, :, None] * spacing[:, None, :]
@@ -183,7 +198,7 @@ class Landmarks:
         return np.asarray(self._middle - EDGE)
 
     def observe(self, keyframe: int, found: Found) -> None:
-        """Keep what a keyframe shows; give up landmarks that it misses again."""
+        """Store the observations of a keyframe, and drop landmarks that were missed too often."""
         views = np.full(len(found.landmark), keyframe, dtype=np.intp)
         new = Observations(views, found.landmark, found.polar, found.covariance)
         self.seen = Observations(*(np.concatenate(pair) for pair in zip(self.seen, new, strict=True)))
@@ -192,11 +207,11 @@ class Landmarks:
         self.used &= self.missed < MISSED
 
     def give_up(self) -> None:
-        """Look for none of the landmarks any more: the map is begun anew."""
+        """Stop searching for all current landmarks, because the map restarts."""
         self.used[:] = False
 
     def renew(self, image: PatchImage, view: Views, found: Found) -> None:
-        """Cut the patches anew of landmarks that look otherwise than when they were chosen."""
+        """Cut new patches for landmarks whose appearance has changed since they were chosen."""
         old = found.take(found.correlation < STALE)
         if not len(old.landmark):
             return
@@ -209,7 +224,7 @@ class Landmarks:
         self.patches.values[number], self.offsets[number] = patches.values[good], offsets[good]
 
     def _offsets(self, middle: Array, row: Array, column: Array, height: Array, view: Views) -> Array:
-        """Return where the pixels of patches lie beside their middles, on level ground ``(n, pixels, 2)`` [m]."""
+        """Return the offsets of the pixels of patches from their centres, on level ground ``(n, pixels, 2)`` [m]."""
         rows = np.broadcast_to(row, (len(middle), PIXELS))
         pixels = self.axes.polar(rows, np.broadcast_to(column, rows.shape)).reshape(-1, 2)
         ground = points_at(pixels, np.repeat(height, PIXELS), view, self.axes.bearing).reshape(-1, PIXELS, 3)
@@ -219,21 +234,24 @@ class Landmarks:
         """Choose new landmarks where a keyframe shows none.
 
         Args:
-            image: of the keyframe.
-            view: that took it.
-            keyframe: its number.
-            height_m: of the new landmarks, until more frames show them.
+            image: image of the keyframe.
+            view: view from which it was taken.
+            keyframe: number of the keyframe.
+            height_m: initial height of the new landmarks over the ground [m], until more frames show them.
         """
+        # 1. corners away from existing landmarks, with the patches around them
         row, column = corners(image, self._taken(view, keyframe))
         polar = self.axes.polar(row.astype(float), column.astype(float))
         rows, columns = row[:, None] + ROWS, column[:, None] + COLUMNS
         patches, good = cut(image, rows, columns)
+        # 2. their points at the assumed height; those that cannot lie on that plane are left out
         height = np.full(len(row), height_m)
         points = points_at(polar, height, view, self.axes.bearing)
         offsets = self._offsets(polar, rows, columns, height, view)
         good &= np.isfinite(points).all(axis=1) & np.isfinite(offsets).all(axis=(1, 2))
         if not good.any():
             return
+        # 3. append them to every column of the table, with a first observation that anchors each
         points, polar = points[good], polar[good]
         noise = self.axes.spacing(polar) * ANCHOR
         covariance = noise[:, :, None] ** 2 * np.eye(2)
@@ -254,14 +272,14 @@ class Landmarks:
         self.seen = Observations(*(np.concatenate(pair) for pair in zip(self.seen, anchors, strict=True)))
 
     def _covariance_of_new(self, points: Array, view: Views, covariance: Array) -> Array:
-        """Return the covariance of new points: by range and bearing, and by the law of heights."""
+        """Return the covariance of new points, from range and bearing and from the prior of heights."""
         by_point = projection_of(points, view, self.axes.bearing).by_point
         information = by_point.transpose(0, 2, 1) @ np.linalg.inv(covariance) @ by_point
         information[:, 2, 2] += 1 / HEIGHT_STD_M**2
         return np.asarray(np.linalg.inv(information))
 
     def _taken(self, view: Views, keyframe: int) -> NDArray[np.bool_]:
-        """Return the cells ``(bins, beams)`` of landmarks that are in use, or that were found to be bad of late."""
+        """Return the cells ``(bins, beams)`` occupied by landmarks in use, or by landmarks that recently proved bad."""
         taken = np.zeros((len(self.axes.range_m), len(self.axes.bearing_rad)), dtype=bool)
         there = self.used | ((self.faults > BLOCKING) & (self.born > keyframe - 25))
         if there.any():
@@ -271,12 +289,12 @@ class Landmarks:
         return taken
 
     def refine(self, number: Index, points: Array, covariance: Array, faults: Array) -> None:
-        """Take what a bundle adjustment found for some landmarks; give up those that fit badly."""
+        """Update landmarks with the result of a bundle adjustment, and drop those that fit badly."""
         self.points[number], self.covariance[number], self.faults[number] = points, covariance, faults
         self.used[number] &= faults < FAULTY
 
     def forget(self, first_view: int) -> None:
-        """Drop landmarks that are not in use and that no keyframe from ``first_view`` on shows: memory stays constant."""
+        """Delete unused landmarks that no keyframe from ``first_view`` on shows, so that memory stays constant."""
         keep = self.used.copy()
         keep[self.seen.landmark[self.seen.view >= first_view]] = True
         if keep.all():
@@ -289,14 +307,15 @@ class Landmarks:
         self.patches = self.patches.take(keep)
 
     def holding(self, first_view: int, fewest: int, born: int) -> tuple[Index, Observations]:
-        """Return landmarks that hold the keyframes from ``first_view`` on: their numbers, and all observations of them.
+        """Return the landmarks that constrain the keyframes from ``first_view`` on, and all observations of them.
 
         Args:
-            first_view: of the keyframes.
-            fewest: keyframes that must show a landmark.
-            born: keyframe before which landmarks do not count: the map was begun anew there.
+            first_view: number of the first keyframe.
+            fewest: smallest number of keyframes that must show a landmark.
+            born: first keyframe whose landmarks count, because the map restarted there.
 
-        In these observations landmarks are numbered in this order.
+        Returns:
+            Indices of the landmarks ``(n,)``, and their observations, in which landmarks are numbered in this order.
         """
         times = np.bincount(self.seen.landmark, minlength=len(self.points))
         shown = np.zeros(len(self.points), dtype=bool)
@@ -309,82 +328,85 @@ class Landmarks:
 
 
 def _place(values: Array, axis: Array) -> Array:
-    """Return where values stand on an increasing axis, in cells; beyond its ends by the spacing there."""
+    """Return the fractional index of values on an increasing axis, extrapolated linearly beyond its ends."""
     cell = np.interp(values, axis, np.arange(len(axis), dtype=float))
     low, high = (values - axis[0]) / (axis[1] - axis[0]), (values - axis[-1]) / (axis[-1] - axis[-2]) + len(axis) - 1
     return np.asarray(np.where(values < axis[0], low, np.where(values > axis[-1], high, cell)))
 
 
 def _value(place: Array, axis: Array) -> Array:
-    """Return the value at a place on an axis, the inverse of :func:`_place`."""
+    """Return the value at a fractional index on an axis, the inverse of :func:`_place`."""
     value = np.interp(place, np.arange(len(axis), dtype=float), axis)
     low, high = axis[0] + place * (axis[1] - axis[0]), axis[-1] + (place - len(axis) + 1) * (axis[-1] - axis[-2])
     return np.asarray(np.where(place < 0, low, np.where(place > len(axis) - 1, high, value)))
 
 
-# ---------------- local map
+# ---------------- Local map
 
 
 USED = "used"
-"""What ``about["map"]`` of an estimate says where the map tells the motion; else it says why not."""
+"""Value of ``about["map"]`` of an estimate whose motion comes from the map; otherwise it holds the reason why not."""
 
 FRAMES_A_READ = 16
 
 WINDOW = 30
-"""Keyframes whose poses are adjusted."""
+"""Number of keyframes whose poses are adjusted."""
 
 KEPT = 60
-"""Keyframes whose observations are kept: older ones hold no landmark in view."""
+"""Number of keyframes whose observations are stored; older ones show no landmark still in view."""
 
 MOVED = np.array([10.0, 2.2])
-"""Median displacement of the landmarks since the last keyframe that makes another one [bins, beams]."""
+"""Median displacement of the landmarks since the last keyframe that triggers a new one [bins, beams]."""
 
 FEWEST_VIEWS = 3
-"""Keyframes that must show a landmark that is adjusted."""
+"""Smallest number of keyframes that must show a landmark for it to be adjusted."""
 
 LOST = 0.6
-"""Part of the landmarks of the last keyframe below which another one is made."""
+"""Fraction of the landmarks of the last keyframe below which a new keyframe is made."""
 
 LOST_STD = np.array([0.05, 0.05, np.radians(1)])
 """Standard deviations of a prediction without a valid motion [m, m, rad]."""
 
 WORST = 25.0
-"""Squared error beyond which a keyframe does not show a landmark."""
+"""Squared normalised error beyond which a landmark does not count as shown by a keyframe."""
 
 RELIEF_M = 0.1
 LEAST_RELIEF_M = 0.02
-"""Mean height of what is seen over the ground: where first echoes do not tell it, and at least [m]."""
+"""Mean height of visible relief over the ground [m]: if first echoes do not determine it, and its lower bound."""
 
 CONTRAST = 0.6
-"""Mean height of landmarks, as part of the height of the contrast by first echoes: these come from the tops."""
+"""Mean height of landmarks, as a fraction of the relief found by first echoes, which come from the tops."""
 
 ATTITUDE_STD = np.array([2e-4, np.radians(2e-3), np.radians(2e-3)])
-"""Standard deviations of heights [m], pitches and rolls [rad] that poses tell."""
+"""Standard deviations of height [m], pitch and roll [rad] from recorded poses."""
 
 ROUGH_STD = np.array([0.01, np.radians(0.3), np.radians(0.3)])
-"""The same where they are given for a whole run: heave and tilt are then estimated."""
+"""Standard deviations of height [m], pitch and roll [rad] without recorded poses: heave and tilt are then estimated."""
 
 HEIGHT_FRAMES = 401
-"""Frames among which the greatest heights are those over the ground, not over a rock."""
+"""Number of frames among which the largest heights are those over the ground, not over a rock."""
 
 SAFETY = 8.0
-"""Squared errors over the covariance of the map's normal equations, measured over rocks: the errors of patches are alike."""
+"""Ratio of actual to formal variance of the map, measured over rocks.
+
+The normal equations assume independent errors, but the errors of patches are correlated.
+"""
 
 
 @dataclass
 class _Map:
-    """The state that goes from frame to frame.
+    """The state of the map that is carried from frame to frame.
 
     Attributes:
-        landmarks: of the last metres.
-        attitude_std: of heights [m], pitches and rolls [rad] ``(3,)``.
-        keyframes: their number among the frames.
-        poses: of the keyframes ``(6,)`` each.
-        relief_m: mean height of what is seen over the ground.
-        told: heights, pitches and rolls of the keyframes, as sensors tell them ``(3,)`` each.
-        begun: first keyframe since the map was begun anew.
-        lean: height, pitch and roll of the last keyframe, less what was told ``(3,)``.
-        drift: covariance of x, y, heading that each keyframe adds ``(3, 3)`` each.
+        landmarks: landmarks of the last metres.
+        attitude_std: standard deviations of measured height [m], pitch and roll [rad] ``(3,)``.
+        keyframes: frame number of each keyframe.
+        poses: pose of each keyframe ``(6,)``.
+        told: measured height, pitch and roll of each keyframe ``(3,)``.
+        begun: first keyframe since the map was last restarted.
+        relief_m: mean height of visible relief over the ground [m].
+        lean: adjusted minus measured height, pitch and roll of the last keyframe ``(3,)``.
+        drift: covariance of x, y, heading that each keyframe adds ``(3, 3)``.
     """
 
     landmarks: Landmarks
@@ -404,23 +426,24 @@ def mapped(
     estimates: Sequence[Estimate],
     progress: Callable[[int], None] = lambda frames: None,
 ) -> list[Estimate]:
-    """Estimate the motions anew, with a map of the last metres.
+    """Estimate motions again, with a map of the last metres.
 
-    The time a frame is constant, and so is the memory but for the answer. The result is a function of the frames and the
-    estimates: a run that was stopped gives the same bits again.
+    The time per frame is constant, and so is the memory, apart from the result. The result depends only on the frames and
+    the estimates, so that an interrupted run gives bit-identical results when repeated.
 
     Args:
-        source: of the frames; it tells heights, and pitches or poses.
-        numbers: of the frames used ``(n,)``.
-        estimates: of each pair of consecutive frames: where a frame's landmarks are looked for.
-        progress: called with the number of frames that were added.
+        source: source of the frames, with heights and with pitches or poses.
+        numbers: numbers of the frames used ``(n,)``.
+        estimates: estimate of each pair of consecutive frames, which predicts where landmarks appear.
+        progress: called with the number of frames processed since the last call.
 
     Returns:
-        An estimate a motion; those that the map does not tell are as they were.
+        One estimate per motion; estimates that the map cannot replace keep their motions.
 
     Raises:
-        MitsonarError: no height over the ground, or no pitch.
+        MitsonarError: the height over the ground or the pitch is not known.
     """
+    # 1. predict, register and update, frame by frame; a lean found by the last adjustment applies to the next frame too
     attitudes, std = map_attitudes(source, numbers)
     state = _Map(Landmarks(_axes(source.like)), std)
     path, reasons = [attitudes[0]], [""]
@@ -433,13 +456,14 @@ def mapped(
             path.append(pose)
             reasons.append(answer.reason)
         progress(1)
+    # 2. apply the adjustments of keyframes, which later frames improved, to the frames between them
     corrected = _corrected(np.array(path), state)
     found = motions(corrected)
     drift = _drift_a_frame(state, len(path))
     return [_decided(one, found[k], reasons[k + 1], drift[k + 1], corrected[k + 1]) for k, one in enumerate(estimates)]
 
 
-# ---------------------------------------------------------------- predict
+# ---------------- Local map: prediction
 
 
 def _axes(like: SonarFrames) -> ImageAxes:
@@ -449,8 +473,10 @@ def _axes(like: SonarFrames) -> ImageAxes:
 def map_attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
     """Return height over the ground, pitch and roll of the frames, as poses ``(n, 6)``, and their standard deviations.
 
+    The standard deviations ``(3,)`` are of height [m], pitch and roll [rad].
+
     Raises:
-        MitsonarError: no height over the ground, or no pitch.
+        MitsonarError: the height over the ground or the pitch is not known.
     """
     table = np.zeros((len(numbers), 6))
     heights = None if source.height_m is None else source.height_m[numbers]
@@ -462,7 +488,7 @@ def map_attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
     heights = np.where(np.isfinite(heights), heights, np.nanmedian(heights))
     if source.poses is not None and np.isfinite(source.poses[numbers, 2:5]).all():
         poses = source.poses[numbers]
-        # an altimeter over a rock tells less than the height over the ground
+        # over a rock, an altimeter measures less than the height over the ground: a low percentile of the ground's z
         ground = percentile_filter(poses[:, 2] - heights, 5, size=min(HEIGHT_FRAMES, len(heights)), mode="nearest")
         table[:, 2:5] = poses[:, 2:5]
         table[:, 2] -= ground
@@ -483,7 +509,7 @@ def map_attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
 
 
 def _images(source: FrameSource, numbers: Index) -> Iterator[tuple[SonarFrames, PatchImage]]:
-    """Read the frames, one after another, some at a time."""
+    """Yield each frame with its image for patches; frames are read a few at a time."""
     for start in range(0, len(numbers), FRAMES_A_READ):
         frames = source.read(numbers[start : start + FRAMES_A_READ])
         values = frames.matching_values()
@@ -492,14 +518,14 @@ def _images(source: FrameSource, numbers: Index) -> Iterator[tuple[SonarFrames, 
 
 
 def _predicted(before: Array, estimate: Estimate, attitude: Array) -> Array:
-    """Return the pose after a motion, at the height and attitude that are told."""
+    """Return the pose after a motion, with the measured height, pitch and roll."""
     pose = np.array(compose(Pose.from_row(float(value) for value in before), estimate.motion))
     pose[2:5] = attitude[2:5]
     return pose
 
 
 def _spread(estimates: Sequence[Estimate], frame: int) -> Array:
-    """Return the covariance of starboard, forward and heading of the prediction of a frame ``(3, 3)``."""
+    """Return the covariance of the predicted starboard, forward and heading of a frame ``(3, 3)``."""
     if frame == 0:
         return np.diag(PAIR_STD**2)
     one = estimates[frame - 1]
@@ -509,7 +535,7 @@ def _spread(estimates: Sequence[Estimate], frame: int) -> Array:
     return np.asarray(known + np.diag(PAIR_STD**2))
 
 
-# ---------------------------------------------------------------- update
+# ---------------- Local map: update
 
 
 def _update(
@@ -520,22 +546,26 @@ def _update(
     answer: Registered,
     told: Array,
 ) -> Array:
-    """Make a keyframe where the sonar has moved on, adjust the last ones, and return the pose of the frame."""
+    """Add a keyframe if the sonar has moved on, adjust the last ones, and return the pose of the frame."""
+    # 1. a registered frame close to the last keyframe changes nothing; a frame that was not registered restarts the map
     if state.keyframes and not answer.reason and not _moved_on(state, answer):
         return answer.pose
     number, landmarks = len(state.keyframes), state.landmarks
     if answer.reason:
         landmarks.give_up()
         state.begun = number
+    # 2. the new keyframe, with the drift of the one before until it is adjusted
     state.keyframes.append(frame)
     state.poses.append(answer.pose.copy())
     state.told.append(told[2:5])
     state.drift.append(state.drift[-1] if state.drift else np.diag(PAIR_STD**2))
+    # 3. store its observations, and adjust the window of keyframes
     good = answer.found.take(answer.squared < WORST)
     if number and not answer.reason:
         landmarks.observe(number, good)
         landmarks.renew(image, Views.of(answer.pose), good)
         _adjust(state)
+    # 4. choose new landmarks where it shows none, and delete old ones
     state.relief_m = _relief(frames, state.poses[-1], state.relief_m)
     view = Views.of(state.poses[-1])
     landmarks.choose(image, view, number, _usual_height(state))
@@ -544,7 +574,7 @@ def _update(
 
 
 def _moved_on(state: _Map, answer: Registered) -> bool:
-    """Return whether the landmarks of the last keyframe have moved by much, or are lost."""
+    """Return whether the landmarks of the last keyframe have moved far, or many of them are lost."""
     number = answer.found.landmark
     if len(number) < max(FEWEST, LOST * int(state.landmarks.used.sum())):
         return bool(np.abs(answer.pose - state.poses[-1]).max() > 1e-6)
@@ -555,6 +585,7 @@ def _moved_on(state: _Map, answer: Registered) -> bool:
 
 def _adjust(state: _Map) -> None:
     """Adjust the last keyframes and the landmarks that they show."""
+    # 1. the keyframes of the window; the first one since the map restarted, and older ones that share landmarks, stay fixed
     last, landmarks = len(state.poses), state.landmarks
     first = max(state.begun + 1, last - WINDOW)
     number, seen = landmarks.holding(first, FEWEST_VIEWS, state.begun)
@@ -574,7 +605,8 @@ def _adjust(state: _Map) -> None:
             state.relief_m,
         )
     except LinAlgError:
-        return  # the keyframes stay as they were registered
+        return  # the keyframes keep their registered poses
+    # 2. take over the result
     landmarks.refine(number, new.points, new.point_covariance, new.faults)
     state.lean = new.poses[-1, 2:5] - state.told[-1]
     state.poses[first:] = list(new.poses[first - oldest :])
@@ -582,14 +614,15 @@ def _adjust(state: _Map) -> None:
 
 
 def _of_one(whole: Array, poses: Array) -> Array:
-    """Return the covariance of each of the motions between poses ``(k, 6)``, alike ones that add up to that of the last."""
+    """Return the covariance of one motion between poses ``(k, 6)``, of which equal ones add up to that of the last pose."""
+    # a heading error of an early motion moves the last pose by its lever arm: remove the mean effect, and divide the rest
     lever = (poses[-1, :2] - poses[:-1, :2]).mean(axis=0)
     back = np.array([[1, 0, -lever[1]], [0, 1, lever[0]], [0, 0, 1]])
     return np.asarray(back @ whole @ back.T / (len(poses) - 1))
 
 
 def _relief(frames: SonarFrames, pose: Array, before: float) -> float:
-    """Return the mean height of what is seen over the ground, by first echoes where there are any."""
+    """Return the mean height of visible relief over the ground [m], updated by first echoes if there are any."""
     attitude = attitude_of(frames, "the local map", float(pose[2]), float(pose[3]))
     if attitude.reason or attitude.first is None:
         return before
@@ -598,16 +631,19 @@ def _relief(frames: SonarFrames, pose: Array, before: float) -> float:
 
 
 def _usual_height(state: _Map) -> float:
-    """Return the height at which new landmarks are taken to lie."""
+    """Return the height that is assumed for new landmarks [m]: the median of well-fitting ones, if there are enough."""
     known = state.landmarks.used & (state.landmarks.faults < 1.0)
     return float(np.median(state.landmarks.points[known, 2])) if known.sum() >= 4 * FEWEST else state.relief_m
 
 
-# ---------------------------------------------------------------- decide
+# ---------------- Local map: decision
 
 
 def _corrected(path: Array, state: _Map) -> Array:
-    """Return the poses of all frames ``(n, 6)``: keyframes as adjusted last, and the frames between them carried along."""
+    """Return the poses of all frames ``(n, 6)``: keyframes as last adjusted, and the frames between moved with them.
+
+    A frame between two keyframes blends the corrections of both linearly.
+    """
     corrected = path.copy()
     for number, start in enumerate(state.keyframes):
         end = state.keyframes[number + 1] if number + 1 < len(state.keyframes) else len(path) - 1
@@ -621,7 +657,7 @@ def _corrected(path: Array, state: _Map) -> Array:
 
 
 def _drift_a_frame(state: _Map, frames: int) -> Array:
-    """Return the covariance of x, y, heading that each frame adds ``(frames, 3, 3)``: that of its keyframe, shared."""
+    """Return the covariance of x, y, heading that each frame adds ``(frames, 3, 3)``: an equal part of its keyframe's."""
     drift = np.zeros((frames, 3, 3))
     ends = [*state.keyframes[1:], frames - 1]
     for number, (start, end) in enumerate(zip(state.keyframes, ends, strict=True)):
@@ -631,7 +667,7 @@ def _drift_a_frame(state: _Map, frames: int) -> Array:
 
 
 def _carried(path: Array, old: Array, new: Array) -> Array:
-    """Move poses rigidly, in the plane, by what takes one pose to another."""
+    """Move poses ``(n, 6)`` rigidly in the plane, by the displacement from pose ``old`` to pose ``new``."""
     turn = new[5] - old[5]
     sin, cos = np.sin(turn), np.cos(turn)
     x, y = (path[:, :2] - old[:2]).T
@@ -642,7 +678,7 @@ def _carried(path: Array, old: Array, new: Array) -> Array:
 
 
 def _decided(estimate: Estimate, motion: Array, reason: str, drift: Array, pose: Array) -> Estimate:
-    """Return the map's answer, or the estimate where it has none."""
+    """Return an estimate with the motion of the map, or the original estimate with the reason why it is not used."""
     if reason:
         about = {**estimate.about, "map": reason}
         return replace(estimate, about=about)
@@ -651,34 +687,41 @@ def _decided(estimate: Estimate, motion: Array, reason: str, drift: Array, pose:
     return Estimate(Motion(*motion.tolist()), turn @ drift @ turn.T, True, "", {"map": USED})
 
 
-# ---------------- Registration of a frame to the landmarks of a local map
+# ---------------- Registration of a frame to landmarks
 
 
 FEWEST = 12
-"""Fewest landmarks by which a frame is registered."""
+"""Smallest number of landmarks with which a frame is registered."""
 
 LEAST_FOUND = 0.5
-"""Least part of the landmarks in view that a frame must show. Without noise it is nine tenths; with noise of pixels that
-hides the ground, a fifth."""
+"""Smallest fraction of the landmarks in view that a frame must show. The fraction is about 0.9 without noise, and 0.2 with
+pixel noise that hides the ground."""
 
 ROUNDS, STILL = 8, 1e-6
-"""Gauss-Newton iterations of a registration, and the step below which they end [m, rad]."""
+"""Largest number of Gauss-Newton iterations of a registration, and the step below which they end [m, rad]."""
 
 PAIR_SHARE = 0.1
 PAIR_STD = np.array([1e-3, 1e-3, np.radians(0.03)])
-"""Share of the information of the motion between two frames that counts: the map has seen the same frames; least standard
-deviations of that motion [m, m, rad]."""
+"""Fraction of the information of the motion between two frames that enters a registration, since the map has seen the same
+frames; and the smallest standard deviations of that motion [m, m, rad]."""
 
 GATE = 16.0
-"""Squared error, in covariances, beyond which a landmark is not where it was expected: noise that looks alike."""
+"""Squared normalised error beyond which a landmark is rejected as similar-looking noise."""
 
 ASTRAY = 25.0
-"""Squared distance, in covariances, of the map's pose from the prediction, beyond which the map is not believed."""
+"""Squared normalised distance of the registered pose from the prediction beyond which the registration is rejected."""
 
 
 @dataclass(frozen=True)
 class Registered:
-    """A frame's pose by the map, what it shows, its squared errors in covariances, and why it is not used."""
+    """Result of registering a frame to the map.
+
+    Attributes:
+        pose: pose of the frame ``(6,)`` [m, rad].
+        found: landmarks found in the frame.
+        squared: squared normalised error of each of them ``(n,)``.
+        reason: why the result is not used; empty if it is.
+    """
 
     pose: Array
     found: Found
@@ -687,14 +730,17 @@ class Registered:
 
 
 def registered(landmarks: Landmarks, image: PatchImage, expected: Array, spread: Array) -> Registered:
-    """Find the landmarks, and the pose from which the sonar receives them there.
+    """Find the landmarks in a frame, and the pose of the sonar that fits their places.
+
+    Only x, y and heading are estimated; height, pitch and roll stay as predicted.
 
     Args:
-        landmarks: of the map.
-        image: the frame.
-        expected: its pose as predicted ``(6,)``.
+        landmarks: landmarks of the map.
+        image: image of the frame.
+        expected: predicted pose ``(6,)`` [m, rad].
         spread: covariance of starboard, forward [m], heading [rad] of the prediction ``(3, 3)``.
     """
+    # 1. find the landmarks, and leave out those that the uncertainty of the prediction does not explain
     turn = np.eye(3)
     turn[:2, :2] = level_turn(expected[5])
     predicted = turn.T @ spread @ turn
@@ -705,6 +751,7 @@ def registered(landmarks: Landmarks, image: PatchImage, expected: Array, spread:
     if len(found.landmark) < needed:
         few = f"the map finds {len(found.landmark)} of {shown} landmarks, {needed} are needed"
         return Registered(pose, found, np.zeros(len(found.landmark)), few)
+    # 2. Gauss-Newton with robust weights, and with the prediction as a weak prior
     for _ in range(ROUNDS):
         at = _residuals(landmarks, found, pose, None)
         weight = cauchy(at.squared) * track_weight(landmarks.faults[found.landmark])
@@ -715,6 +762,7 @@ def registered(landmarks: Landmarks, image: PatchImage, expected: Array, spread:
         pose[PLANAR] += step
         if np.abs(step).max() < STILL:
             break
+    # 3. reject a pose that contradicts the prediction
     off = (pose - expected)[PLANAR]
     if off @ np.linalg.solve(predicted, off) > ASTRAY:
         return Registered(expected, found, at.squared, "the map and the motion between two frames contradict each other")
@@ -722,7 +770,14 @@ def registered(landmarks: Landmarks, image: PatchImage, expected: Array, spread:
 
 
 class _Residuals(NamedTuple):
-    """Of landmarks at a pose: errors ``(n, 2)``, inverse covariances, squares in covariances, derivatives by the pose."""
+    """Residuals of landmarks at a pose.
+
+    Attributes:
+        error: observed minus predicted range [m] and bearing [rad] ``(n, 2)``.
+        inverse: inverse covariances of the errors ``(n, 2, 2)``.
+        squared: squared normalised errors ``(n,)``.
+        by_pose: derivatives of the predictions by x, y, heading ``(n, 2, 3)``.
+    """
 
     error: Array
     inverse: Array
@@ -731,7 +786,7 @@ class _Residuals(NamedTuple):
 
 
 def _residuals(landmarks: Landmarks, found: Found, pose: Array, predicted: Array | None) -> _Residuals:
-    """Compare where landmarks were found with where a pose has them; with the covariance of the pose, where it is given."""
+    """Return the residuals of found landmarks at a pose, whose covariance ``predicted`` enters theirs if it is given."""
     projected = projection_of(landmarks.points[found.landmark], Views.of(pose), landmarks.axes.bearing)
     error, by_pose = found.polar - projected.polar, projected.by_pose[:, :, PLANAR]
     covariance = landmarks.covariance[found.landmark]
@@ -743,6 +798,6 @@ def _residuals(landmarks: Landmarks, found: Found, pose: Array, predicted: Array
 
 
 def level_turn(heading: float) -> Array:
-    """Return what turns x and y of the world into starboard and forward ``(2, 2)``."""
+    """Return the matrix that rotates world x, y into starboard, forward ``(2, 2)``."""
     sin, cos = np.sin(heading), np.cos(heading)
     return np.array([[cos, -sin], [sin, cos]])

@@ -1,4 +1,8 @@
-"""Appearance of the ground in frames, for finding places again: coarse views from above, and where two of them are alike."""
+"""How places that the sonar sees again are found and closed as loops.
+
+Frames are drawn as coarse views of the ground from above (:class:`Canvas`), and :func:`likenesses` correlates two of them.
+:func:`search_loops` uses them to find candidates along a path, and checks each by registration.
+"""
 
 from __future__ import annotations
 
@@ -41,37 +45,37 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 CELLS_A_REACH = 45
-"""Cells of a coarse view over the horizontal distance to its middle."""
+"""Number of cells of a coarse view per horizontal distance to its middle."""
 
 LOCAL = 4.0
-"""Standard deviation over which the level of a view is taken out [cells]: what is slower is light, not ground."""
+"""Standard deviation of the high-pass filter of a view [cells]: slower variation is illumination, not ground."""
 
 FEWEST_CELLS = 8
-"""Fewest rows and columns of a canvas."""
+"""Smallest number of rows and of columns of a canvas."""
 
 LEAST_OVERLAP = 0.35
-"""Least part of a view that another must show too."""
+"""Smallest fraction of a view that the other view must show too."""
 
 RIVAL_CELLS = 6
-"""Distance from the best shift at which another one counts as another place [cells]."""
+"""Distance from the best shift beyond which another shift counts as another place [cells]."""
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """The ground before the sonar on which all frames of a run are drawn, whatever their heights.
+    """The common grid of ground ahead of the sonar on which all frames of a run are drawn, whatever their heights.
 
     Attributes:
-        view: the frame that decides which ground that is, with cells of some centimetres.
+        view: view of the frame that defines this ground, with cells of some centimetres.
     """
 
     view: GroundView
 
     @classmethod
     def of(cls, frame: SonarFrames) -> Self | None:
-        """Make the canvas of a run from one of its frames; None where it shows no ground.
+        """Make the canvas of a run from one of its frames; return None if the frame shows no ground.
 
         Raises:
-            MitsonarError: no height or pitch.
+            MitsonarError: the frame has no height or pitch.
         """
         attitude = attitude_of(frame, "a search for loops", None, None)
         reach = GroundView(frame, attitude, 1.0).reach
@@ -83,23 +87,24 @@ class Canvas:
 
     @property
     def reach_m(self) -> float:
-        """Return the horizontal distance from the sonar to the middle of the ground that it sees [m]."""
+        """Return the horizontal distance from the sonar to the middle of the ground in view [m]."""
         return (self.view.reach[2] + self.view.reach[3]) / 2
 
     @property
     def extent_m(self) -> float:
-        """Return the shorter edge of the ground that it sees [m]."""
+        """Return the shorter edge of the ground in view [m]."""
         left, right, near, far = self.view.reach
         return min(right - left, far - near)
 
     @cached_property
     def shape(self) -> tuple[int, int]:
-        """Return the size of transforms in which a shifted view does not wrap around."""
+        """Return the size of the Fourier transforms, large enough that shifted views do not wrap around."""
         rows, columns, _ = self.view.points.shape
         return cv2.getOptimalDFTSize(2 * rows), cv2.getOptimalDFTSize(2 * columns)
 
     def draw(self, frame: SonarFrames) -> CoarseView | None:
-        """Draw one frame by its own height and attitude, without its light; None where it is known to show none."""
+        """Draw a frame by its height and attitude, without its illumination; None if unknown, or with too little ground."""
+        # 1. where each cell of the canvas lies in the frame; the height or attitude may be unknown
         try:
             own = attitude_of(frame, "a search for loops", None, None)
         except MitsonarError:
@@ -110,9 +115,11 @@ class Canvas:
         inside = shown.astype(np.float32)
         if inside.sum() < FEWEST_CELLS**2:
             return None
+        # 2. resample, smoothed to the size of a cell against aliasing
         bins = self.view.edge / float(np.median(np.diff(frame.range_m)))
         smooth = cv2.GaussianBlur(frame.matching_values()[0], (0, 0), sigmaX=0.5, sigmaY=max(0.4 * bins, 0.3))
         image = cv2.remap(np.asarray(smooth, dtype=np.float32), column, row, cv2.INTER_LINEAR)
+        # 3. subtract the local mean, which removes illumination, and normalise to unit variance
         weight = cv2.GaussianBlur(inside, (0, 0), LOCAL) + 1e-6
         image = np.asarray((image - cv2.GaussianBlur(image * inside, (0, 0), LOCAL) / weight) * inside, dtype=np.float32)
         spread = float(np.sqrt((image**2).sum() / inside.sum()))
@@ -121,12 +128,12 @@ class Canvas:
 
 @dataclass(frozen=True)
 class CoarseView:
-    """A frame as seen from above, without its light, in cells of some centimetres.
+    """A frame as seen from above, without its illumination, in cells of some centimetres.
 
     Attributes:
-        image: mean 0 where inside, 0 elsewhere ``(rows, columns)``.
+        image: normalised image, of mean 0 inside and 0 elsewhere ``(rows, columns)``.
         inside: 1 where the sonar sees ground, else 0 ``(rows, columns)``.
-        canvas: on which it is drawn.
+        canvas: canvas on which the frame is drawn.
     """
 
     image: Floats
@@ -135,29 +142,29 @@ class CoarseView:
 
     @cached_property
     def transforms(self) -> tuple[NDArray[np.complexfloating], ...]:
-        """Return the conjugate spectra of the image, its square and its inside."""
+        """Return the conjugate spectra of the image, of its square and of its mask ``inside``."""
         parts = (self.image, self.image * self.image, self.inside)
         return tuple(np.conj(np.fft.rfft2(part, self.canvas.shape)) for part in parts)
 
 
 class Likeness(NamedTuple):
-    """How alike two views are after a motion: their correlation where they overlap."""
+    """The correlation of two views where they overlap, after a motion between them."""
 
     motion: Motion
     correlation: float
 
 
 def likenesses(first: CoarseView, second: CoarseView, yaws: Array, expected: Array, window: Array) -> list[Likeness]:
-    """Return where two views are most alike: for each yaw the best shift, and the best one at another place.
+    """Return the motions at which two views correlate best, with the largest correlation first.
 
-    The most alike come first.
+    Each yaw contributes the best shift, and the best shift at another place.
 
     Args:
-        first: the earlier view.
-        second: the later one, on the same canvas.
-        yaws: turns that are tried [rad] ``(n,)``.
-        expected: sideways, forward [m] of the motion, around which is searched ``(2,)``.
-        window: half width of the search, sideways and forward [m] ``(2,)``; the larger counts.
+        first: earlier view.
+        second: later view, on the same canvas.
+        yaws: turns to try [rad] ``(n,)``.
+        expected: sideways, forward [m] of the expected motion, the centre of the search ``(2,)``.
+        window: half width of the search, sideways and forward [m] ``(2,)``; the larger one applies to both.
     """
     found = []
     for yaw in yaws:
@@ -167,9 +174,9 @@ def likenesses(first: CoarseView, second: CoarseView, yaws: Array, expected: Arr
 
 
 def _best_shifts(first: CoarseView, second: CoarseView, motion: Motion, window: Array) -> list[Likeness]:
-    """Return the best motions with the yaw of ``motion``, by the masked correlation of Padfield (2012) over all shifts."""
+    """Return the two best motions with the yaw of ``motion``, by masked correlation over all shifts (Padfield, 2012)."""
     canvas, reach = first.canvas, first.canvas.reach_m
-    # turned about its middle, a view stays on the canvas; shifts do the rest
+    # 1. turn the second view about its middle, so that it stays on the canvas; the correlation finds the shift
     turned = Motion(-reach * float(np.sin(motion.yaw)), reach * (float(np.cos(motion.yaw)) - 1), motion.yaw)
     warp = canvas.view.warp(turned)
     expected = np.linalg.solve(warp[:, :2], canvas.view.warp(motion)[:, 2] - warp[:, 2])
@@ -178,6 +185,7 @@ def _best_shifts(first: CoarseView, second: CoarseView, motion: Motion, window: 
     image, inside = (
         np.asarray(cv2.warpAffine(part, warp, size, flags=flags), dtype=np.float32) for part in (second.image, second.inside)
     )
+    # 2. sums over the overlap, at every shift: number of cells, product, sums and squares of both images
     spectra = [np.fft.rfft2(part, canvas.shape) for part in (image, image * image, inside)]
     one, squared, there = first.transforms
     overlap, product, own, others, own_squared, others_squared = (
@@ -191,14 +199,17 @@ def _best_shifts(first: CoarseView, second: CoarseView, motion: Motion, window: 
             (there, spectra[1]),
         )
     )
+    # 3. the correlation coefficient over the overlap
     count = np.maximum(overlap, 1.0)
     spread = np.maximum(own_squared - own**2 / count, 0) * np.maximum(others_squared - others**2 / count, 0)
     correlation = (product - own * others / count) / np.sqrt(spread + 1e-6 * count**2)
+    # 4. only shifts within the window, with enough overlap
     rows, columns = (np.fft.fftfreq(n, 1 / n) for n in canvas.shape)
     edge = canvas.view.edge
     farthest = max(float(np.max(window)) / edge, 1.0)
     allowed = (np.abs(rows - expected[1]) <= farthest)[:, None] & (np.abs(columns - expected[0]) <= farthest)[None]
     allowed = allowed & (overlap >= LEAST_OVERLAP * float(first.inside.sum()))
+    # 5. the best shift, then the best one away from it: the caller needs a rival to detect ambiguity
     found: list[Likeness] = []
     while allowed.any() and len(found) < 2:
         row, column = np.unravel_index(int(np.where(allowed, correlation, -2).argmax()), canvas.shape)
@@ -210,65 +221,65 @@ def _best_shifts(first: CoarseView, second: CoarseView, motion: Motion, window: 
     return found
 
 
-# ---------------- Loop closures: places that a sonar sees again, found by appearance and checked by registration
-# Keyframes are compared where the covariance of the path allows that they show the same ground. A candidate must be
-# alike enough, and more so than any other place that is possible. Then the estimator registers two frames from there. A
-# loop counts only if others beside it agree with it; the pose graph is the last check.
+# ---------------- Loop closure: search
 
 Index = NDArray[np.intp]
 
 SPACING = 0.07
-"""Way of the ground through the window from one keyframe to the next, as a part of the reach."""
+"""Displacement of the ground through the window from one keyframe to the next, as a fraction of the reach."""
 
 APART = 2.0
-"""Way between the two frames of a loop at least, in extents of the ground seen: nearer frames overlap as neighbours do."""
+"""Smallest distance travelled between the two frames of a loop, in extents of the ground in view.
+
+Closer frames overlap anyway, as neighbours do.
+"""
 
 GATE = 3.0
-"""Standard deviations of the path within which the same place is looked for."""
+"""Number of standard deviations of the path within which the same place is searched for."""
 
 MOST_COMPARED = 24
 WIDEST_TURN = np.radians(60)
 TURN_STEP = np.radians(3)
-"""Most keyframes with which one is compared, largest turn to either side, and step of the turns that are tried."""
+"""Largest number of keyframes to compare with one, largest turn to either side, and step between turns [rad]."""
 
 OVERLAP = 0.6
-"""Distance of the middles of the grounds seen, in extents, within which frames can be alike."""
+"""Largest distance between the middles of the ground in two views, in extents, at which the views can match."""
 
 LEAST_LIKE = 0.5
-"""Least correlation of two views of one place: those of other places reach 0.45 over rocks."""
+"""Smallest correlation of two views of one place; views of different places reach 0.45 over rocks."""
 
 RIVAL = 0.85
-"""A place whose correlation reaches this part of the best one's makes it ambiguous."""
+"""Fraction of the best correlation at which another place makes the match ambiguous."""
 
 SAME_PLACE = 0.12
-"""Distance within which two likenesses mean one place, as a part of the reach."""
+"""Distance within which two matches mean the same place, as a fraction of the reach."""
 
 ASTRAY_CELLS, ASTRAY_RAD = 3.0, np.radians(4)
-"""How far a registration may end from where appearance began it."""
+"""How far a registration may end from the motion found by appearance [cells, rad]."""
 
 WITNESS = 0.4
-"""Distance of a lone loop from a frame that is registered as its witness, in those of keyframes."""
+"""Distance from a lone loop to the frame that is registered to confirm it, in distances between keyframes."""
 
 NEIGHBOURS = 6
-"""Keyframes within which loops check each other."""
+"""Number of keyframes within which loops confirm each other."""
 
 AGREEING_STD, AGREEING_WAY, AGREEING_M = 3.0, 0.03, 0.005
-"""By how much two loops beside each other may differ: in standard deviations of both, of the way between them, and [m]."""
+"""Largest difference of two neighbouring loops: standard deviations of both, fraction of the distance between them, [m]."""
 
 KnownLoops = Mapping[tuple[int, int, Motion], Estimate]
 KeepLoop = Callable[[int, int, Motion, Estimate], None]
-"""Registrations by the numbers of their frames in the source, and the motion from which they begin."""
+"""Registrations, identified by the numbers of both frames in the source and by the initial motion."""
 
 
 @dataclass(frozen=True)
 class LoopSearch:
-    """What was found.
+    """Result of a search for loops.
 
     Attributes:
-        loops: frames of each loop, its motion and covariance.
-        group: number of the stretch of the path to which each loop belongs ``(loops,)``.
-        compared: pairs of keyframes whose views were compared.
-        rejected: candidates that did not become loops, by reason.
+        loops: frames of each loop, with its motion and covariance.
+        group: index of the stretch of the path to which each loop belongs ``(loops,)``.
+        compared: number of pairs of keyframes whose views were compared.
+        rejected: number of candidates that did not become loops, by reason.
     """
 
     loops: PoseEdges
@@ -277,13 +288,13 @@ class LoopSearch:
     rejected: Counter[str]
 
     def outvoted(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which loops belong to a stretch where fewer than two, or not most, were kept ``(loops,)``."""
+        """Return whether each loop is in a stretch where fewer than two loops, or no majority, were kept ``(loops,)``."""
         votes, voters = np.bincount(self.group, kept), np.bincount(self.group)
         return np.asarray(((votes < 2) | (2 * votes <= voters))[self.group])
 
 
 class _Candidate(NamedTuple):
-    """A later keyframe at an earlier frame: their numbers, and the motion between them by appearance."""
+    """A possible loop: an earlier frame, a later keyframe, and the motion between them by appearance."""
 
     first: int
     second: int
@@ -292,7 +303,16 @@ class _Candidate(NamedTuple):
 
 @dataclass(frozen=True)
 class _Searched:
-    """A path, its covariances, and the views of its keyframes."""
+    """A path with its covariances, keyframes and their views.
+
+    Attributes:
+        own: marginal covariances of the poses ``(frames, 3, 3)``.
+        solution: solution of the pose graph without loops.
+        keys: frames that are keyframes ``(keyframes,)``.
+        views: view of each keyframe that shows ground.
+        travelled: distance that the ground has moved through the window ``(frames,)`` [m].
+        canvas: canvas of all views.
+    """
 
     own: Array
     solution: GraphSolution
@@ -308,12 +328,12 @@ class _Searched:
 
     @property
     def reach(self) -> float:
-        """Return the horizontal distance from the sonar to the middle of the ground that it sees [m]."""
+        """Return the horizontal distance from the sonar to the middle of the ground in view [m]."""
         return self.canvas.reach_m
 
     @property
     def extent(self) -> float:
-        """Return the shorter edge of the ground that it sees [m]."""
+        """Return the shorter edge of the ground in view [m]."""
         return self.canvas.extent_m
 
     @property
@@ -323,7 +343,7 @@ class _Searched:
 
 
 def canvas_of(source: FrameSource) -> Canvas | None:
-    """Return the ground before the sonar on which frames are compared; None where no frame is known to show any."""
+    """Return the canvas on which the frames of a source are compared; None if none of five frames shows ground."""
     for number in np.unique(np.linspace(0, len(source) - 1, 5).astype(np.intp)):
         frame = source.read([number])
         try:
@@ -346,23 +366,29 @@ def search_loops(
     known: KnownLoops | None = None,
     keep: KeepLoop = lambda first, second, motion, estimate: None,
 ) -> LoopSearch:
-    """Search a path for loops.
+    """Search a path for loops, by appearance and registration.
+
+    Keyframes are compared if the covariance of the path allows that they show the same ground. A candidate must correlate
+    well enough, and better than any other possible place. The estimator then registers the two frames, starting from the
+    motion found by appearance. A loop counts only if a neighbouring loop agrees with it; the pose graph is the last check.
 
     Args:
-        source: of the frames.
-        estimator: registers two frames; it is given where appearance has them.
-        numbers: of the frames used ``(frames,)``.
-        solution: of the pose graph without loops.
-        errors: how errors over the same ground depend on each other: loops side by side count as fewer.
-        canvas: of :func:`canvas_of`.
+        source: source of the frames.
+        estimator: registers two frames, with the motion found by appearance as prior.
+        numbers: numbers of the frames used ``(frames,)``.
+        solution: solution of the pose graph without loops.
+        errors: correlation of errors over the same ground, by which neighbouring loops count as fewer.
+        canvas: canvas from :func:`canvas_of`.
         known: registrations of an earlier run.
-        keep: called with each new one.
+        keep: called with each new registration.
 
     Raises:
-        MitsonarError: frames that cannot be read, or that tell no height or pitch.
+        MitsonarError: frames cannot be read, or lack height or pitch.
     """
+    # 1. choose keyframes and draw their views
     searched = _searched(source, numbers, solution, canvas)
     register = _Register(source, estimator, numbers, searched, known or {}, keep)
+    # 2. for each keyframe: one unambiguous place by appearance, confirmed by registration
     rejected: Counter[str] = Counter()
     compared, found = 0, []
     for second in (int(one) for one in searched.keys if int(one) in searched.views):
@@ -374,16 +400,18 @@ def search_loops(
             reason = _astray(estimate, candidate.motion, searched)
             found += [] if reason else [(candidate, estimate)]
         rejected[reason] += bool(reason)
+    # 3. keep loops that a neighbour or a new witness confirms
     loops = [loop for one in found for loop in _with_witness(one, found, register)]
     rejected["no other loop beside it agrees"] += len(found) - sum(one in found for one in loops)
     edges = _edges(sorted(loops, key=lambda one: one[0].second), searched, errors)
+    # 4. group loops by stretches of the path, within which they later vote
     way = searched.travelled[edges.second]
     group = np.cumsum(np.diff(way, prepend=way[:1]) > NEIGHBOURS * SPACING * searched.reach).astype(np.intp)
     return LoopSearch(edges, group, compared, +rejected)
 
 
 def _searched(source: FrameSource, numbers: Index, solution: GraphSolution, canvas: Canvas) -> _Searched:
-    """Choose keyframes, and draw their views."""
+    """Choose keyframes at equal displacements of the ground in view, and draw their views."""
     poses, reach = solution.poses, canvas.reach_m
     moved = relative_motions(poses, np.arange(len(poses) - 1), np.arange(1, len(poses)))
     way = np.hypot(moved[:, 0] + reach * moved[:, 2], moved[:, 1])
@@ -396,25 +424,29 @@ def _searched(source: FrameSource, numbers: Index, solution: GraphSolution, canv
     return _Searched(own, solution, keys, views, travelled, canvas)
 
 
-# ---------------------------------------------------------------- appearance
+# ---------------- Loop closure: appearance
 
 
 def _alike(searched: _Searched, second: int) -> tuple[list[tuple[int, Likeness]], int]:
-    """Return the likenesses of a keyframe with earlier ones that may show the same ground, and how many were compared."""
+    """Return the matches of a keyframe with earlier ones that may show the same ground, and how many were compared."""
+    # 1. earlier keyframes far enough back along the path
     apart = searched.travelled[second] - searched.travelled[searched.keys] >= APART * searched.extent
     earlier = np.array(
         [key for key in searched.keys[apart & (searched.keys < second)] if int(key) in searched.views], np.intp
     )
     if not earlier.size:
         return [], 0
+    # 2. distance between the middles of the ground in both views, in the axes of the later frame, and its uncertainty
     motions, covariances = _relative(searched, earlier, second)
     middle = np.array([0.0, searched.reach])
     sin, cos = np.sin(motions[:, 2]), np.cos(motions[:, 2])
     off = np.column_stack([-sin, cos]) * middle[1] - motions[:, :2] - middle
     spread = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2) + searched.reach**2 * covariances[:, 2, 2])
+    # 3. those that may overlap within the uncertainty, the most probable first
     distance = np.linalg.norm(off, axis=1) - GATE * spread
     order = np.argsort(np.linalg.norm(off, axis=1) / (searched.extent + spread), kind="stable")
     chosen = order[distance[order] <= OVERLAP * searched.extent][:MOST_COMPARED]
+    # 4. correlate the views over the turns and shifts that the uncertainty allows
     found = []
     for place in chosen:
         std = np.sqrt(np.diag(covariances[place]))
@@ -427,13 +459,13 @@ def _alike(searched: _Searched, second: int) -> tuple[list[tuple[int, Likeness]]
 
 
 def _turns(expected: float, std: float) -> Array:
-    """Return the turns that are tried [rad]."""
+    """Return the turns to try [rad], within :data:`GATE` standard deviations of the expected one."""
     count = int(np.ceil(min(GATE * std, WIDEST_TURN) / TURN_STEP))
     return np.asarray(expected + TURN_STEP * np.arange(-count, count + 1))
 
 
 def _relative(searched: _Searched, first: Index, second: int) -> tuple[Array, Array]:
-    """Return the motions from earlier frames to a later one by the path ``(n, 3)``, and their covariances."""
+    """Return the motions from earlier frames to a later one along the path ``(n, 3)``, and their covariances."""
     cross = searched.solution.columns([second])[first, :, 0]
     others = np.full(len(first), second)
     by_first, by_second = motion_derivatives(searched.poses, first, others)
@@ -444,7 +476,7 @@ def _relative(searched: _Searched, first: Index, second: int) -> tuple[Array, Ar
 
 
 def _unambiguous(searched: _Searched, second: int, alike: list[tuple[int, Likeness]]) -> tuple[str, _Candidate | None]:
-    """Return the only place that a keyframe may be at; or why there is none, empty where none is alike."""
+    """Return the one candidate of a keyframe; or why there is none, with an empty reason if no view matches."""
     if not alike:
         return "", None
     first, best = max(alike, key=lambda one: one[1].correlation)
@@ -459,7 +491,8 @@ def _unambiguous(searched: _Searched, second: int, alike: list[tuple[int, Likene
 
 
 def _nearest(searched: _Searched, key: int, second: int, motion: Motion) -> _Candidate:
-    """Return the frame around a keyframe from which the motion is smallest."""
+    """Return the candidate from the frame near a keyframe for which the motion is smallest."""
+    # all frames within two keyframes: a smaller motion leaves more overlap for the registration
     place = int(np.searchsorted(searched.keys, key))
     begin, end = searched.keys[max(0, place - 2)], searched.keys[min(len(searched.keys) - 1, place + 2)]
     there = np.vstack([searched.poses[begin : end + 1], _composed(searched.poses[key], motion)])
@@ -470,22 +503,22 @@ def _nearest(searched: _Searched, key: int, second: int, motion: Motion) -> _Can
 
 
 def _composed(pose: Array, motion: Motion) -> Array:
-    """Return x, y, heading after a motion (eq. 3.4)."""
+    """Return x, y, heading of a pose after a motion (eq. 3.4)."""
     after = compose(Pose.from_row((pose[0], pose[1], 0.0, 0.0, 0.0, pose[2])), motion)
     return np.array([after.x, after.y, after.heading])
 
 
 def _middle_of(pose: Array, reach: float) -> Array:
-    """Return where the middle of the ground seen from a pose lies [m]."""
+    """Return x, y of the middle of the ground in view from a pose [m]."""
     return np.array([pose[0] + reach * np.sin(pose[2]), pose[1] + reach * np.cos(pose[2])])
 
 
-# ---------------------------------------------------------------- registration
+# ---------------- Loop closure: registration
 
 
 @dataclass(frozen=True)
 class _Register:
-    """Registers two frames from where appearance has them, or looks up what an earlier run found."""
+    """Registration of two frames from the motion found by appearance, or by looking up the result of an earlier run."""
 
     source: FrameSource
     estimator: AnyEstimator
@@ -506,7 +539,7 @@ class _Register:
 
 
 def _astray(estimate: Estimate, motion: Motion, searched: _Searched) -> str:
-    """Return why a registration is no loop; empty where it is one."""
+    """Return why a registration is rejected as a loop; empty if it is accepted."""
     if not estimate.valid:
         return "the registration is invalid"
     off = np.abs(np.asarray(estimate.motion) - np.asarray(motion))
@@ -518,7 +551,7 @@ _Found = tuple[_Candidate, Estimate]
 
 
 def _with_witness(one: _Found, found: list[_Found], register: _Register) -> list[_Found]:
-    """Return a loop if another beside it puts it at the same place; a lone one with a new one as its witness; or none."""
+    """Return a loop that a neighbour confirms; a lone loop together with a new one that confirms it; or nothing."""
     searched = register.searched
     beside = [other for other in found if other is not one and _is_beside(one, other, searched)]
     if any(_same_place(one, other, searched) for other in beside):
@@ -532,13 +565,13 @@ def _with_witness(one: _Found, found: list[_Found], register: _Register) -> list
 
 
 def _is_beside(one: _Found, other: _Found, searched: _Searched) -> bool:
-    """Return whether two loops are of neighbouring keyframes."""
+    """Return whether the later frames of two loops are neighbouring keyframes."""
     way = abs(searched.travelled[other[0].second] - searched.travelled[one[0].second])
     return bool(way <= NEIGHBOURS * SPACING * searched.reach)
 
 
 def _witnesses(one: _Found, searched: _Searched) -> list[_Candidate]:
-    """Return the same loop from later frames a little before and after, the smaller motion first."""
+    """Return candidates for the same loop from frames slightly before and after the later one, smaller motion first."""
     candidate, estimate = one
     there = _composed(searched.poses[candidate.first], estimate.motion)
     way, found = searched.travelled, []
@@ -552,13 +585,15 @@ def _witnesses(one: _Found, searched: _Searched) -> list[_Candidate]:
 
 
 def _same_place(one: _Found, other: _Found, searched: _Searched) -> bool:
-    """Return whether two loops agree: by the path between their later frames both lead to one pose."""
+    """Return whether two loops agree: with the path between their later frames, both predict the same pose."""
+    # 1. both predictions of the later frame of the second loop, and their difference
     poses = searched.poses
     by_one = _composed(poses[one[0].first], one[1].motion)
     by_other = _composed(poses[other[0].first], other[1].motion)
     onward = relative_motions(poses, [one[0].second], [other[0].second])[0]
     there = _composed(by_one, Motion(*onward.tolist()))
     off = np.abs(relative_motions(np.array([by_other, there]), [0], [1])[0])
+    # 2. the limit allows for the errors of both registrations and for the drift of the path between them
     variance = np.diag(_covariance_of(one[1], searched) + _covariance_of(other[1], searched))
     way = searched.travelled[[one[0].second, other[0].second]]
     limit = AGREEING_STD * np.sqrt([variance[:2].sum(), variance[2]])
@@ -567,19 +602,25 @@ def _same_place(one: _Found, other: _Found, searched: _Searched) -> bool:
 
 
 def _covariance_of(estimate: Estimate, searched: _Searched) -> Array:
-    """Return the covariance of a registration; that of its appearance where it tells none."""
+    """Return the covariance of a registration; without one, that of the match by appearance."""
     rough = np.diag([searched.cell**2, searched.cell**2, TURN_STEP**2])
     return rough if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float)
 
 
 def _edges(found: list[_Found], searched: _Searched, errors: ErrorCorrelation) -> PoseEdges:
-    """Return loops as edges. Errors of loops side by side are alike: they are made larger, so that their mean is honest."""
+    """Return loops as edges of a pose graph, whose errors are independent.
+
+    Errors of neighbouring loops are correlated. Their covariances are inflated, so that the covariance of their mean is
+    right.
+    """
     if not found:
         return PoseEdges.none()
     motions = np.array([one.motion for _, one in found], dtype=float)
     known = [_covariance_of(one, searched) for _, one in found]
+    # errors in proportion to the motion, which registrations do not report
     slopes = errors.of(np.vstack([motions, motions[:1]]), searched.reach).slope_std
     scaled = (motions**2) @ (slopes**2).T
+    # the mean of a first-order chain with correlation r has (1 + r) / (1 - r) times the variance of independent errors
     alike = errors.share * np.exp(-SPACING / errors.length)
     covariances = (1 + alike) / (1 - alike) * (np.array(known) + scaled[:, None] * np.eye(3))
     first, second = (np.array([place[k] for place, _ in found], dtype=np.intp) for k in (0, 1))

@@ -1,7 +1,7 @@
-"""The mosaic: frames and a path become a map of the level ground.
+"""How frames along a path become a mosaic, a map of the level ground.
 
 Each cell holds the mean level, its standard deviation over the frames, and the number of frames (Almanza-Medina, 2.3.3 and
-3.5.1; the blend ``weighted`` is our own).
+3.5.1; the blend ``weighted`` is an addition of mitsonar).
 """
 
 from __future__ import annotations
@@ -58,42 +58,43 @@ Floats = NDArray[np.float32]
 Blend = Literal["weighted", "centre"]
 
 CENTRE_BEAMS = 24
-"""Beams in the middle of the fan that Almanza-Medina draws (3.5.1)."""
+"""Number of beams in the middle of the fan that Almanza-Medina draws (3.5.1)."""
 
 MOST_CELLS = 2**25
-"""Largest number of cells by default: 58 x 58 m in cells of 10 mm, 20 bytes each."""
+"""Default largest number of cells: 58 x 58 m in cells of 10 mm, 20 bytes each."""
 
 SLACK = 0.25
-"""Part of its size by which a map grows at least, so that long runs do not copy it at every frame."""
+"""Smallest fraction of its size by which a map grows, so that long runs do not copy it at every frame."""
 
 LEAST_WEIGHT = 1e-3
-"""Smaller weights count as 0: bins at the outline are half in the dark, and may be the only ones of their cell."""
+"""Smaller weights count as 0: bins at the outline are only half insonified, and may be the only ones of their cell."""
 
 ONE_ALONE = 1e-3
-"""Part of a cell's weight W that W - sum w^2 / W must exceed for a standard deviation: float32 loses smaller ones."""
+"""Fraction of the weight W of a cell that W - sum w^2 / W must exceed for a standard deviation, given float32 precision."""
 
 
 class Mosaic:
-    """A map of the level plane below the sonar, to which frames are added. It grows where frames need it.
+    """A map of the level plane below the sonar, to which frames are added and which grows as they require.
 
-    Cells are squares. Their edges lie on whole multiples of ``cell_m`` in the world, so that maps of one cell size fit
-    together. A cell takes the value of each frame at its own (range, bearing), bilinear between the centres of bins and
-    beams, with the exact geometry over level ground (:class:`mitsonar.geometry.ground.GroundGeometry`). Only ground
-    within the window, the beams and the elevation field of view is updated. There a pixel of 0 counts: a shadow is dark.
-    Relief is not modelled: objects that rise from the ground are mapped too near.
+    Cells are squares. Their edges lie on whole multiples of ``cell_m`` in the world, so that maps of the same cell size fit
+    together. A cell takes the value of each frame at the range and bearing of its centre, interpolated bilinearly between
+    the centres of bins and beams, with the exact geometry over level ground
+    (:class:`mitsonar.geometry.ground.GroundGeometry`). Only ground within the range window, the beams and the elevation
+    field of view is updated. There a pixel of 0 counts, because a shadow is dark. Relief is not modelled: objects that rise
+    from the ground are mapped too near.
 
     Args:
         cell_m: edge of a cell [m].
-        blend: ``weighted``: all beams, with weights cos^2 that fall to 0 at the edges of the fan in bearing and in range;
-            ``centre``: the plain mean of the ``centre_beams`` in the middle (Almanza-Medina, 3.5.1).
-        centre_beams: for ``centre``.
+        blend: ``weighted`` uses all beams, with cos^2 weights that fall to 0 at the edges of the fan in bearing and in
+            range; ``centre`` is the plain mean of the ``centre_beams`` in the middle (Almanza-Medina, 3.5.1).
+        centre_beams: number of beams for ``centre``.
         most_cells: largest number of cells.
-        illumination: of :func:`mitsonar.mapping.mosaic.illumination` ``(bins, beams)``. Images are divided by it, so
+        illumination: result of :func:`mitsonar.mapping.mosaic.illumination` ``(bins, beams)``. Images are divided by it, so
             that the fall-off of the level with range neither shades the map nor adds to the standard deviation. Levels may
             then exceed 1.
 
     Raises:
-        MitsonarError: an argument outside its limits.
+        MitsonarError: an argument is outside its limits.
     """
 
     def __init__(
@@ -119,21 +120,21 @@ class Mosaic:
         self.cell_m, self.blend, self.centre_beams, self.most_cells = float(cell_m), blend, centre_beams, most_cells
         self.illumination = illumination
         self.frames = 0
-        """Frames added."""
+        """Number of frames added."""
         self.frames_without_ground = 0
-        """How many of them showed no ground: height unknown (nan), or ground beyond the window or the field of view."""
+        """Number of these that showed no ground: height unknown (nan), or ground outside the window or field of view."""
         self._box = Box(0, 0, 0, 0)
         self._sums = np.zeros((len(CellSums._fields), 0, 0), np.float32)
 
-    # ------------------------------------------------------------ frames in
+    # ---------------- Adding frames
 
     def reserve(self, frames: SonarFrames, poses: ArrayLike, height_m: ArrayLike) -> None:
-        """Allocate the map for all frames of a run before the first is read; of ``frames`` only the sonar is used.
+        """Allocate the map for all frames of a run before the first is read.
 
         Args:
-            frames: any frames of the run, one or more.
-            poses: of the sonar in the whole run ``(n, 6)`` [m, rad].
-            height_m: over the ground ``(n,)`` or one for all [m].
+            frames: one or more frames of the run, of which only the sonar is used.
+            poses: poses of the sonar in the whole run ``(n, 6)`` [m, rad].
+            height_m: height over the ground ``(n,)``, or one for all [m].
 
         Raises:
             MitsonarError: the map would exceed ``most_cells``.
@@ -157,12 +158,12 @@ class Mosaic:
 
         Args:
             frames: some frames of the run.
-            poses: of the sonar, one a frame ``(frames, 6)`` [m, rad]; default: those of the frames.
-            height_m: over the ground ``(frames,)`` or one for all [m]; default: those of the frames.
-            whole: frames that are added with all beams, whatever the blend ``(frames,)``, or one for all.
+            poses: pose of the sonar at each frame ``(frames, 6)`` [m, rad]; default: those of the frames.
+            height_m: height over the ground ``(frames,)``, or one for all [m]; default: those of the frames.
+            whole: whether each frame is added with all beams, whatever the blend ``(frames,)``, or one value for all.
 
         Raises:
-            MitsonarError: no poses or heights, numbers that do not fit, or a map beyond ``most_cells``.
+            MitsonarError: there are no poses or heights, their numbers do not fit, or the map would exceed ``most_cells``.
         """
         images = self._flat(levels_of(frames))
         table, heights = poses_and_heights(frames, poses, height_m)
@@ -189,6 +190,7 @@ class Mosaic:
 
     def _lay(self, image: Floats, fan: FrameFan, pose: Array) -> bool:
         """Add one image ``(bins, beams)``; return whether it showed any ground."""
+        # 1. the cells that the frame may show, and their range, bearing and weight
         box = self._footprint(fan, pose)
         if box is None:
             return False
@@ -198,6 +200,7 @@ class Mosaic:
         weight = self._weights(fan, points, radius, bearing)
         if not weight.any():
             return False
+        # 2. sample the image at the cells, smoothed where cells are larger than bins or beams, against aliasing
         rows, columns = fractional_index(radius, fan.ground.range_m), fractional_index(bearing, fan.ground.bearing_rad)
         image = band_limited(image, squared_span(rows, weight), squared_span(columns, weight))
         value = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
@@ -205,7 +208,7 @@ class Mosaic:
         return True
 
     def _points(self, box: Box, pose: Array) -> Floats:
-        """Return the centres of cells ``(rows, columns, 2)`` in the sonar's heading axes [m], as float32."""
+        """Return the centres of cells ``(rows, columns, 2)`` in the heading axes of the sonar [m], as float32."""
         x = (np.arange(box.west, box.east) + 0.5) * self.cell_m - pose[0]
         y = (np.arange(box.south, box.north) + 0.5) * self.cell_m - pose[1]
         about = np.stack(np.meshgrid(x.astype(np.float32), y.astype(np.float32)), axis=-1)
@@ -224,7 +227,7 @@ class Mosaic:
         return np.asarray(np.where(inside & (taper > LEAST_WEIGHT), taper, np.float32(0)))
 
     def _footprint(self, fan: FrameFan, pose: Array) -> Box | None:
-        """Return the box around the ground that a frame can show; None where there is none."""
+        """Return the box of cells around the ground that a frame can show; None if it shows none."""
         reach = ground_outline(fan)
         if reach is None:
             return None
@@ -234,10 +237,10 @@ class Mosaic:
         east, north = np.ceil((turned.max(axis=0) + margin) / self.cell_m).astype(int)
         return Box(int(south), int(north), int(west), int(east))
 
-    # ------------------------------------------------------------ the map
+    # ---------------- Map and statistics
 
     def _patch(self, box: Box) -> CellSums:
-        """Return the sums of some cells, not copied."""
+        """Return the sums of the cells of a box, as views."""
         south, west = box.south - self._box.south, box.west - self._box.west
         rows, columns = box.shape
         return CellSums(*self._sums[:, south : south + rows, west : west + columns])
@@ -276,7 +279,7 @@ class Mosaic:
 
     @property
     def covered(self) -> Box:
-        """Return the smallest box around all cells that frames show.
+        """Return the smallest box around all cells that any frame shows.
 
         Raises:
             MitsonarError: no frame shows ground.
@@ -289,7 +292,7 @@ class Mosaic:
         return Box(south + int(rows[0]), south + int(rows[-1]) + 1, west + int(columns[0]), west + int(columns[-1]) + 1)
 
     def check_not_empty(self) -> None:
-        """Raise a MitsonarError where no frame shows ground."""
+        """Raise a MitsonarError if no frame shows ground."""
         if self.frames == self.frames_without_ground:
             raise MitsonarError(self._empty())
 
@@ -299,23 +302,23 @@ class Mosaic:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Return the west, east, south and north edge of the arrays below [m] (matplotlib's ``extent``)."""
+        """Return the west, east, south and north edge of ``mean`` and the other arrays [m] (matplotlib's ``extent``)."""
         south, north, west, east = self.covered
         return west * self.cell_m, east * self.cell_m, south * self.cell_m, north * self.cell_m
 
     @property
     def mean(self) -> Floats:
-        """Return the mean level ``(rows, columns)`` in 0..1; row 0 northernmost, column 0 westernmost; nan where unknown."""
+        """Return the mean level ``(rows, columns)`` in 0..1; row 0 is northernmost, column 0 westernmost; nan: unknown."""
         found = self._north_up()
         return np.where(found.seen > 0, found.mean, np.float32(np.nan))
 
     @property
     def std(self) -> Floats:
-        """Return the standard deviation of the frames' levels in each cell, shaped as ``mean``.
+        """Return the standard deviation over the frames of the level in each cell, shaped as ``mean``.
 
-        It is nan where fewer than two frames show the cell, or where one has nearly all the weight (:data:`ONE_ALONE`).
-        The variance is unbiased: sum w (x - mean)^2 / (W - sum w^2 / W) with W = sum w. With equal weights that is over
-        n - 1.
+        It is nan if fewer than two frames show the cell, or if one of them has nearly all the weight (:data:`ONE_ALONE`).
+        The variance is unbiased: sum w (x - mean)^2 / (W - sum w^2 / W) with W = sum w. With equal weights this is
+        the usual division by n - 1.
         """
         found = self._north_up()
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -350,25 +353,26 @@ def build_mosaic(
 ) -> Mosaic:
     """Build the mosaic of a run, whose frames are read once, a chunk at a time.
 
-    With ``centre``, the first and the last frame are added whole (Almanza-Medina, 3.5.1).
+    With ``centre``, the first and the last frame are added with all beams (Almanza-Medina, 3.5.1).
 
     Args:
-        frames: of one sonar, all at once or in consecutive chunks.
-        poses: of the sonar in the whole run ``(n, 6)`` [m, rad]: an estimated path; default: those of the frames.
-        height_m: over the ground ``(n,)`` or one for all [m]; default: those of the frames.
+        frames: frames of one sonar, all at once or in consecutive chunks.
+        poses: poses of the sonar in the whole run ``(n, 6)`` [m, rad], such as an estimated path; default: those of the
+            frames.
+        height_m: height over the ground ``(n,)``, or one for all [m]; default: those of the frames.
         cell_m: edge of a cell [m].
-        blend: ``weighted``: all beams, with weights that fall to 0 at the edges of the fan; ``centre``: the plain mean of
-            the ``centre_beams`` in the middle.
-        centre_beams: for ``centre``.
+        blend: ``weighted`` uses all beams, with weights that fall to 0 at the edges of the fan; ``centre`` is the plain mean
+            of the ``centre_beams`` in the middle.
+        centre_beams: number of beams for ``centre``.
         most_cells: largest number of cells.
-        illumination: of :func:`mitsonar.mapping.mosaic.illumination` ``(bins, beams)``. Images are divided by it.
+        illumination: result of :func:`mitsonar.mapping.mosaic.illumination` ``(bins, beams)``, by which images are divided.
 
     Returns:
         The map; see :class:`mitsonar.mapping.mosaic.Mosaic`.
 
     Raises:
-        MitsonarError: frames without poses or height, or that do not fit;
-            more or fewer frames than poses; no frame that shows ground.
+        MitsonarError: frames lack poses or height or do not fit, the numbers of frames and poses differ, or no frame shows
+            ground.
     """
     mosaic = Mosaic(cell_m, blend, centre_beams=centre_beams, most_cells=most_cells, illumination=illumination)
     table = None if poses is None else checked_poses(poses)
@@ -395,7 +399,7 @@ def build_mosaic(
 
 
 def _check_enough(frames: int, poses: Array | None, heights: Array | None) -> None:
-    """Raise where there are more frames than poses or heights."""
+    """Raise a MitsonarError if there are more frames than poses or heights."""
     if poses is not None and frames > len(poses):
         raise MitsonarError(f"there are more frames than poses: got {len(poses):,} poses; give a pose for each frame")
     if heights is not None and heights.ndim and frames > len(heights):
@@ -403,14 +407,14 @@ def _check_enough(frames: int, poses: Array | None, heights: Array | None) -> No
 
 
 def _check_all_used(frames: int, poses: Array | None, heights: Array | None) -> None:
-    """Raise where there are more poses or heights than frames."""
+    """Raise a MitsonarError if there are more poses or heights than frames."""
     for name, given in (("poses", poses), ("heights", heights)):
         if given is not None and given.ndim and frames != len(given):
             raise MitsonarError(f"there are more {name} than frames: got {len(given):,} for {frames:,} frames")
 
 
 def _and_whether_last(chunks: Iterable[SonarFrames]) -> Iterator[tuple[SonarFrames, bool]]:
-    """Yield each chunk, and whether it is the last one; one is read ahead."""
+    """Yield each chunk and whether it is the last one, by reading one chunk ahead."""
     held = None
     for chunk in chunks:
         if held is not None:
@@ -420,11 +424,11 @@ def _and_whether_last(chunks: Iterable[SonarFrames]) -> Iterator[tuple[SonarFram
         yield held, True
 
 
-# ---------------- The cells of a map: the box that holds them, and the running sums of their levels
+# ---------------- Cells and their running sums
 
 
 class Box(NamedTuple):
-    """A box of cells, counted from the world's origin: the first and one past the last, northwards and eastwards."""
+    """A box of cells, numbered northwards and eastwards from the origin of the world; the ends are exclusive."""
 
     south: int
     north: int
@@ -438,7 +442,15 @@ class Box(NamedTuple):
 
 
 class CellSums(NamedTuple):
-    """Sums of each cell ``(rows, columns)``: mean, weighted squares about it, weight, squared weights, frames."""
+    """Running statistics of each cell, all ``(rows, columns)``.
+
+    Attributes:
+        mean: weighted mean level.
+        squares: weighted sum of squares about the mean.
+        weight: sum of weights.
+        weight2: sum of squared weights.
+        seen: number of frames.
+    """
 
     mean: Floats
     squares: Floats
@@ -448,7 +460,7 @@ class CellSums(NamedTuple):
 
 
 def accumulate(cells: CellSums, value: Floats, weight: Floats) -> None:
-    """Update the weighted mean and the squares about it in place (West 1979): no cancellation in float32."""
+    """Add values to the running statistics in place, without cancellation in float32 (West 1979)."""
     cells.weight[...] += weight
     before = value - cells.mean
     cells.mean[...] += before * (weight / np.maximum(cells.weight, np.float32(1e-30)))
@@ -458,13 +470,13 @@ def accumulate(cells: CellSums, value: Floats, weight: Floats) -> None:
 
 
 def box_around(boxes: Iterable[Box]) -> Box:
-    """Return the smallest box around boxes."""
+    """Return the smallest box around some boxes."""
     south, north, west, east = zip(*boxes, strict=True)
     return Box(min(south), max(north), min(west), max(east))
 
 
 def with_slack(old: Box, new: Box, slack: float) -> Box:
-    """Return the new box, enlarged on those sides where the old one had to grow."""
+    """Return the new box, enlarged by a fraction of the old one on those sides where the old one had to grow."""
     if not math.prod(old.shape):
         return new
     rows, columns = (math.ceil(slack * size) for size in old.shape)
@@ -476,11 +488,11 @@ def with_slack(old: Box, new: Box, slack: float) -> Box:
     )
 
 
-# ---------------- One frame over level ground: its checked levels, its fan, and the ground that the fan covers
+# ---------------- One frame over level ground
 
 
 RAYS = 33
-"""Rays over bearing, and over elevation, whose ends on the ground bound a footprint."""
+"""Number of rays over bearing, and over elevation, whose ends on the ground bound a footprint."""
 
 LONGEST_SIDE = 32_766
 """Longest side of an image or a patch [cells]: the limit of OpenCV's remap."""
@@ -488,7 +500,12 @@ LONGEST_SIDE = 32_766
 
 @dataclass(frozen=True)
 class FrameFan:
-    """The geometry of one frame over the ground, and half of its elevation field of view [rad]."""
+    """The fan of one frame over level ground.
+
+    Attributes:
+        ground: geometry of the frame over the ground.
+        half_elevation: half of the elevation field of view [rad].
+    """
 
     ground: GroundGeometry
     half_elevation: float
@@ -504,14 +521,14 @@ class FrameFan:
         return _ends(self.ground.bearing_rad)
 
 
-# ---------------------------------------------------------------- frames
+# ---------------- Checks of frames, poses and heights
 
 
 def levels_of(frames: SonarFrames) -> Floats:
     """Return the images ``(frames, bins, beams)`` as float32 in 0..1, as estimators match them.
 
     Raises:
-        MitsonarError: too few or too many bins or beams, axes that do not rise, pixels that are not finite.
+        MitsonarError: there are too few or too many bins or beams, an axis does not increase, or a pixel is not finite.
     """
     _, bins, beams = frames.image.shape
     if min(bins, beams) < 2 or max(bins, beams) > LONGEST_SIDE:
@@ -527,10 +544,10 @@ def levels_of(frames: SonarFrames) -> Floats:
 def poses_and_heights(
     frames: SonarFrames, poses: ArrayLike | None, height_m: ArrayLike | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return poses ``(frames, 6)`` and heights ``(frames,)``: as given, or those of the frames.
+    """Return poses ``(frames, 6)`` [m, rad] and heights ``(frames,)`` [m], as given, or else those of the frames.
 
     Raises:
-        MitsonarError: neither are there, or their number or values do not fit.
+        MitsonarError: there are none, or their number or values do not fit.
     """
     if poses is None and frames.poses is None:
         raise MitsonarError("the frames have no poses: give poses, such as those of an estimated path")
@@ -543,10 +560,10 @@ def poses_and_heights(
 
 
 def checked_heights(height_m: ArrayLike | None, count: int) -> NDArray[np.float64]:
-    """Return one height a frame ``(count,)`` [m]; nan where unknown.
+    """Return one height per frame ``(count,)`` [m]; nan where unknown.
 
     Raises:
-        MitsonarError: another number of heights, or a height that is not above 0.
+        MitsonarError: the number of heights does not fit, or a height is not above 0.
     """
     heights = np.asarray(height_m, dtype=float)
     if heights.shape not in ((), (count,)):
@@ -559,10 +576,10 @@ def checked_heights(height_m: ArrayLike | None, count: int) -> NDArray[np.float6
 
 
 def checked_poses(poses: ArrayLike | None) -> NDArray[np.float64]:
-    """Return poses ``(frames, 6)`` [m, rad].
+    """Return poses as an array ``(frames, 6)`` [m, rad].
 
     Raises:
-        MitsonarError: another shape, or a pose that is not finite.
+        MitsonarError: the shape does not fit, or a pose is not finite.
     """
     table = np.asarray(poses, dtype=float)
     if table.ndim != 2 or table.shape[1] != 6 or not np.isfinite(table).all():
@@ -570,7 +587,7 @@ def checked_poses(poses: ArrayLike | None) -> NDArray[np.float64]:
     return table
 
 
-# ---------------------------------------------------------------- geometry of one frame
+# ---------------- Geometry of one frame
 
 
 def fan_of(frames: SonarFrames, pose: NDArray[np.float64], height: float) -> FrameFan:
@@ -581,7 +598,7 @@ def fan_of(frames: SonarFrames, pose: NDArray[np.float64], height: float) -> Fra
 
 
 def middle_beams(fan: FrameFan, image: Floats, beams: int) -> tuple[FrameFan, Floats]:
-    """Return the fan and the image ``(bins, beams)`` of the beams in the middle alone."""
+    """Return the fan and the image ``(bins, beams)``, restricted to the beams in the middle."""
     first = max(0, (image.shape[1] - beams) // 2)
     middle = slice(first, first + beams)
     ground = replace(fan.ground, bearing_rad=fan.ground.bearing_rad[middle])
@@ -589,16 +606,18 @@ def middle_beams(fan: FrameFan, image: Floats, beams: int) -> tuple[FrameFan, Fl
 
 
 def ground_outline(fan: FrameFan) -> NDArray[np.float64] | None:
-    """Return ground points ``(n, 2)`` in heading axes around all that a frame can show; None where it shows no ground.
+    """Return points ``(n, 2)`` in heading axes [m] that enclose all ground a frame can show; None if it shows none.
 
     Rays that meet the ground beyond the far end of the window, or never, end where the window ends.
     """
     ground, far = fan.ground, fan.window[1]
     if not ground.height_m < far:  # nan too
         return None
+    # directions of rays over the sector and the elevation field of view, in level axes
     b, e = np.meshgrid(np.linspace(*fan.sector, RAYS), np.linspace(-1, 1, RAYS) * fan.half_elevation)
     x, y, z = np.moveaxis(directions(ground.bearing, b, e) @ ground.turn.T, -1, 0)
     level = np.maximum(np.hypot(x, y), 1e-12)
+    # horizontal distance at which each ray meets the ground, cut off at the far end of the window
     with np.errstate(divide="ignore"):
         meets = np.where(z < 0, ground.height_m * level / -z, np.inf)
     distance = np.minimum(meets, math.sqrt(far**2 - ground.height_m**2)) / level
@@ -606,43 +625,43 @@ def ground_outline(fan: FrameFan) -> NDArray[np.float64] | None:
 
 
 def _ends(centres: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the outer edges of cells with these centres, as wide as their neighbours."""
+    """Return the outer edges of cells with these centres; the first and last are as wide as their neighbours."""
     return float(1.5 * centres[0] - 0.5 * centres[1]), float(1.5 * centres[-1] - 0.5 * centres[-2])
 
 
 def from_middle(value: NDArray[np.floating], low: float, high: float) -> Floats:
-    """Return the distance from the middle of two ends, as a part of half their distance: 1 at either end."""
+    """Return the distance from the middle of an interval, relative to its half width: 1 at either end."""
     return np.asarray(np.abs(value - np.float32((low + high) / 2)) / np.float32((high - low) / 2), dtype=np.float32)
 
 
 def fractional_index(value: Floats, centres: NDArray[np.float64]) -> Floats:
-    """Return the fractional index of values among centres that rise."""
+    """Return the fractional index of values among increasing centres."""
     steps = np.diff(centres)
-    if np.allclose(steps, steps[0], rtol=1e-6, atol=0):  # ten times as fast
+    if np.allclose(steps, steps[0], rtol=1e-6, atol=0):  # even spacing is ten times as fast
         return np.asarray((value - np.float32(centres[0])) / np.float32(steps.mean()))
     return np.interp(value, centres, np.arange(centres.size)).astype(np.float32)
 
 
 def band_limited(image: Floats, bins2: float, beams2: float) -> Floats:
-    """Smooth an image as far as a cell of the map spans more than a bin or a beam, so that fine texture is averaged.
+    """Smooth an image where a cell of the map spans more than a bin or a beam, so that fine texture is averaged.
 
-    Variances add up: a square of w bins has w^2 / 12, of which each bin has 1 / 12 already.
+    Variances add: a box of w bins has variance w^2 / 12, of which each bin already contributes 1 / 12.
 
     Args:
-        image: ``(bins, beams)``.
+        image: image to smooth ``(bins, beams)``.
         bins2: squared width of a cell of the map in bins.
-        beams2: in beams.
+        beams2: squared width of a cell of the map in beams.
     """
     along, across = (math.sqrt(max(width2 - 1, 0) / 12) for width2 in (bins2, beams2))
     if max(along, across) == 0:
         return image
     kernel = (2 * math.ceil(3 * across) + 1, 2 * math.ceil(3 * along) + 1)
-    # a sigma of 0 would mean one that suits the kernel, which here is a single cell
+    # OpenCV replaces a sigma of 0 by one that suits the kernel; here the kernel is then a single cell, so any sigma does
     return np.asarray(cv2.GaussianBlur(image, kernel, across or 1.0, sigmaY=along or 1.0, borderType=cv2.BORDER_REPLICATE))
 
 
 def squared_span(indices: Floats, weight: Floats) -> float:
-    """Return the squared width of a cell of the map in bins or beams: the median over some cells that the frame shows."""
+    """Return the squared width of a cell of the map in bins or beams, as the median over some cells in view."""
     rows, columns = (slice(1, None, max(1, size // 16)) for size in indices.shape)
     before = slice(0, -1, rows.step), slice(0, -1, columns.step)
     here, seen = indices[rows, columns], weight[rows, columns] > 0
@@ -650,35 +669,36 @@ def squared_span(indices: Floats, weight: Floats) -> float:
     return float(np.median(squared[seen])) if seen.any() else 0.0
 
 
-# ---------------- The illumination of a sonar over even ground, from a sample of its frames
+# ---------------- Illumination
 
 
 ILLUMINATION_FRAMES = 20
-"""Frames, spread over a run, that suffice for its illumination. The correlation of the mosaic with the true reflectivity of
-the pattern's seabed is 0.789 with 20 frames, 0.788 with 300, and 0.381 without an illumination."""
+"""Number of frames, spread over a run, that suffice for its illumination. On the patterned seabed, the correlation of the
+mosaic with the true reflectivity is 0.789 with 20 frames, 0.788 with 300, and 0.381 without an illumination."""
 
 SMOOTH_ILLUMINATION = (1 / 32, 1 / 8)
-"""Standard deviations of its smoothing, in parts of the bins and of the beams: scenery goes, the pattern stays."""
+"""Standard deviations of its smoothing, as fractions of the numbers of bins and beams, which removes scenery only."""
 
 FAINTEST_ILLUMINATION = 0.05
-"""Smallest illumination, as a part of its mean; darker pixels are not raised further."""
+"""Smallest illumination, as a fraction of its mean; darker pixels are not amplified further."""
 
 
 def illumination(frames: SonarFrames, poses: ArrayLike | None = None, height_m: ArrayLike | None = None) -> Floats:
-    """Return how brightly each cell of the image is lit over even ground ``(bins, beams)``, with mean 1; 1 beyond ground.
+    """Estimate the illumination of each image cell over uniform ground ``(bins, beams)``, with mean 1; 1 beyond the ground.
 
-    It is the mean of frames that show different ground, smoothed within the lit part of the image. The height and the pitch
-    of the sonar must stay about the same. :data:`~mitsonar.mapping.mosaic.ILLUMINATION_FRAMES`
-    frames, spread over the run, suffice.
+    It is the mean of frames that show different ground, smoothed within the insonified part of the image. The height and
+    pitch of the sonar must stay about the same. :data:`~mitsonar.mapping.mosaic.ILLUMINATION_FRAMES` frames, spread over the
+    run, suffice.
 
     Args:
-        frames: a sample of the run.
-        poses: as in :meth:`~mitsonar.mapping.mosaic.Mosaic.add`.
-        height_m: as in :meth:`~mitsonar.mapping.mosaic.Mosaic.add`.
+        frames: sample of the frames of the run.
+        poses: see :meth:`~mitsonar.mapping.mosaic.Mosaic.add`.
+        height_m: see :meth:`~mitsonar.mapping.mosaic.Mosaic.add`.
 
     Raises:
-        MitsonarError: as :meth:`~mitsonar.mapping.mosaic.Mosaic.add`; the frames show no ground, or nothing.
+        MitsonarError: as for :meth:`~mitsonar.mapping.mosaic.Mosaic.add`; or the frames show no ground, or are blank.
     """
+    # 1. mean of the frames, and the part of the image that lies on the ground within the elevation field of view
     table, heights = poses_and_heights(frames, poses, height_m)
     mean = levels_of(frames).mean(axis=0)
     over_ground = np.isfinite(heights)
@@ -689,6 +709,7 @@ def illumination(frames: SonarFrames, poses: ArrayLike | None = None, height_m: 
     lit = np.abs(fan.ground.elevation(points)) <= fan.half_elevation
     if not mean[lit].any():
         raise MitsonarError("the frames show no lit ground: check height, pitch, window, and that they are not blank")
+    # 2. smooth within that part only (normalised convolution), scale to mean 1, and bound the amplification
     along, across = (part * size for part, size in zip(SMOOTH_ILLUMINATION, mean.shape, strict=True))
 
     def smooth(image: Floats) -> Floats:
@@ -701,14 +722,14 @@ def illumination(frames: SonarFrames, poses: ArrayLike | None = None, height_m: 
     return np.asarray(np.where(known, np.maximum(level, np.float32(FAINTEST_ILLUMINATION)), np.float32(1)))
 
 
-# ---------------- A mosaic as a GeoTIFF
+# ---------------- GeoTIFF
 
 
 def save_geotiff(path: str | Path, mosaic: Mosaic) -> None:
-    """Write a GeoTIFF: bands mean, std and count as float32, nan where unknown, in metres of the local world.
+    """Write a mosaic as a GeoTIFF with float32 bands mean, std and count, nan where unknown, in metres of the local world.
 
-    The reference system is a local engineering one: x east, y north, with no place on Earth (GeoTIFF 1.1: user-defined
-    model, linear unit metre).
+    The reference system is a local engineering system: x east, y north, without a position on Earth (GeoTIFF 1.1:
+    user-defined model, linear unit metre).
     """
     import tifffile
 

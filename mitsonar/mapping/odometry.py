@@ -1,8 +1,9 @@
-"""The odometry: frames and an estimator become a path.
+"""How the frames of a run become a path.
 
-The stages are: select the frames, estimate the motion of each pair of consecutive frames, resolve ambiguous motions, scale,
-bridge or smooth the motions, and compose them to a path (Almanza-Medina, eq. 3.4). With sensors or loops a pose graph takes
-the place of the composition.
+:func:`odometry` selects the frames, estimates the motion of each pair of consecutive frames, resolves ambiguous motions,
+scales, bridges or smooths the motions, and composes them into a path (Almanza-Medina, eq. 3.4). With vehicle sensors or loop
+closures, a pose graph replaces the composition. :func:`closure_of` measures quality without ground truth, and
+:func:`height_profile` collects the height of the sonar over the ground along the path.
 """
 
 from __future__ import annotations
@@ -62,26 +63,25 @@ __all__ = [
 ]
 
 
-# ---------------- Closure, a quality without truth: single motions composed, less the motion over all of them
-# estimated at once
+# ---------------- Closure: quality without ground truth
 
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 FEWEST = 2
-"""Loops from which errors are judged."""
+"""Smallest number of loops from which errors are estimated."""
 
 
 @dataclass(frozen=True)
 class Closure:
-    """Loops over ``steps`` motions: composed, less estimated at once.
+    """Residuals of short loops: ``steps`` single motions composed, minus the motion over all of them estimated at once.
 
     Attributes:
-        steps: motions of a loop.
-        residuals: sideways, forward [m], yaw [rad] that each loop leaves over ``(loops, 3)``.
-        factor: by which the covariances of single motions must be multiplied, so that they explain the residuals; at
-            least 1. nan where they are not known.
+        steps: number of motions per loop.
+        residuals: residual of each loop ``(loops, 3)``: sideways, forward [m], yaw [rad].
+        factor: factor by which the covariances of the single motions must be multiplied to explain the residuals; at least
+            1. nan if the covariances are not known.
     """
 
     steps: int
@@ -90,19 +90,19 @@ class Closure:
 
     @property
     def rms(self) -> Array:
-        """Return the root of the mean square of the residuals ``(3,)`` [m, m, rad]."""
+        """Return the root mean square of the residuals ``(3,)`` [m, m, rad]."""
         return np.asarray(np.sqrt((self.residuals**2).mean(axis=0)))
 
     @property
     def mean(self) -> Array:
-        """Return the mean of the residuals ``(3,)`` [m, m, rad]: single steps are too long or too short by it."""
+        """Return the mean of the residuals ``(3,)`` [m, m, rad]: the bias of the composed single steps."""
         return np.asarray(self.residuals.mean(axis=0))
 
     def honest(self, estimates: Sequence[Estimate]) -> list[Estimate]:
         """Return the estimates with covariances that explain the residuals.
 
-        Covariances are multiplied by the factor. Estimates without one get the mean square of the residuals, of which each
-        of the motions of a loop and the one over all of them hold an equal part.
+        Covariances are multiplied by ``factor``. An estimate without a covariance gets the mean square of the residuals
+        divided by ``steps + 1``: the single motions of a loop and the motion over all of them contribute equal parts.
         """
         share = np.diag((self.residuals**2).mean(axis=0) / (self.steps + 1))
         factor = self.factor if np.isfinite(self.factor) else 1.0
@@ -118,36 +118,40 @@ def closure_of(
     steps: int,
     progress: Callable[[int], None] = lambda pairs: None,
 ) -> Closure | None:
-    """Estimate motions over several steps at once, and compare them with the single steps composed.
+    """Compare composed single motions with motions that are estimated over several steps at once.
 
-    Loops follow one another without overlap, so that their errors are independent. Of a short run they overlap, so that
-    there are 16 of them, or as many as fit.
+    Loops follow one another without overlap, so that their errors are independent. In a short run they overlap to give 16
+    loops, or as many as fit.
 
     Args:
-        source: of the records.
-        estimator: the one of the single steps.
-        numbers: of the frames used ``(frames,)``.
-        estimates: of the single steps ``(frames - 1,)``.
-        steps: motions of a loop.
-        progress: called with the number of loops that were added, also of those left out.
+        source: source of the records.
+        estimator: estimator that produced the single steps.
+        numbers: numbers of the frames used ``(frames,)``.
+        estimates: estimates of the single steps ``(frames - 1,)``.
+        steps: number of motions per loop.
+        progress: called with the number of loops processed, including those that are skipped.
 
     Returns:
-        The closure; None where fewer than two loops have valid motions throughout.
+        The closure; None if fewer than two loops have valid motions throughout.
     """
     valid = np.array([one.valid for one in estimates], dtype=bool)
     residuals, explained = [], []
     for start in (int(one) for one in loop_starts(len(estimates), steps)):
+        # a loop with an invalid single motion has no composition to compare
         if not valid[start : start + steps].all():
             progress(1)
             continue
+        # estimate the motion from the first to the last frame of the loop directly
         ends = np.array([numbers[start], numbers[start + steps]])
         whole = estimate_motions(source, estimator, ends)[0]
         progress(1)
         if not whole.valid:
             continue
+        # residual: composed motion minus direct motion
         parts = list(estimates[start : start + steps])
         residual = _composed(np.array([one.motion for one in parts])) - np.asarray(whole.motion)
         residuals.append(residual)
+        # normalised squared residual per degree of freedom: 1 on average if the covariances are right
         covariances = [one.covariance for one in (*parts, whole) if one.covariance is not None]
         if len(covariances) == steps + 1:
             total = np.sum(np.array(covariances), axis=0)
@@ -159,13 +163,13 @@ def closure_of(
 
 
 def loop_starts(motions: int, steps: int) -> Index:
-    """Return the first motion of each loop over ``steps`` of so many motions."""
+    """Return the first motion of each loop of ``steps`` motions ``(loops,)``, in a run of ``motions`` motions."""
     stride = max(1, min(steps, (motions - steps) // 15 if motions > steps else 1))
     return np.arange(0, motions - steps + 1, stride, dtype=np.intp)
 
 
 def _composed(motions: Array) -> Array:
-    """Return the motion ``(3,)`` of consecutive motions ``(steps, 3)``, in axes of the last heading (eq. 3.4)."""
+    """Compose consecutive motions ``(steps, 3)`` to one motion ``(3,)`` in the axes of the last heading (eq. 3.4)."""
     heading = np.cumsum(motions[:, 2])
     turn = heading[-1] - heading
     sideways = motions[:, 0] * np.cos(turn) - motions[:, 1] * np.sin(turn)
@@ -173,27 +177,27 @@ def _composed(motions: Array) -> Array:
     return np.array([sideways.sum(), forward.sum(), heading[-1]])
 
 
-# ---------------- The height of the sonar over the ground along a path, by first echoes or an altimeter, and where
-# the ground lies
+# ---------------- Height over the ground along a path
 
 
 FIRST_ECHOES, ALTIMETER = "first echoes", "altimeter"
-"""What measured a height."""
+"""Possible sources of a measured height."""
 
 
 @dataclass(frozen=True)
 class HeightProfile:
-    """Heights along a path; nan where nothing measured them.
+    """Heights of the sonar over the ground along a path; nan where no height was measured.
 
     Attributes:
-        frames: their numbers in the source ``(frames,)``.
-        distance_m: horizontal way along the path ``(frames,)``.
-        places: x, y of the ground that was measured ``(frames, 2)`` [m]. First echoes come from ground ahead of the sonar.
-        height_m: of the sonar over that ground ``(frames,)``.
-        std_m: standard deviation of the height ``(frames,)``; nan for an altimeter, which tells none.
-        by: :data:`FIRST_ECHOES` or :data:`ALTIMETER` ``(frames,)``; empty where nothing measured it.
-        ground_z_m: z of that ground in the coordinates of the path ``(frames,)``; nan where z is not measured.
-        ground_depth_m: depth of that ground below the surface ``(frames,)``; nan without a depth sensor.
+        frames: frame numbers in the source ``(frames,)``.
+        distance_m: horizontal distance travelled along the path ``(frames,)`` [m].
+        places: x, y of the ground to which the height refers ``(frames, 2)`` [m]. First echoes come from ground ahead of
+            the sonar.
+        height_m: height of the sonar over that ground ``(frames,)`` [m].
+        std_m: standard deviation of the height ``(frames,)`` [m]; nan for an altimeter, which reports none.
+        by: :data:`FIRST_ECHOES` or :data:`ALTIMETER` ``(frames,)``; empty where no height was measured.
+        ground_z_m: z of that ground in the coordinates of the path ``(frames,)`` [m]; nan if z is not measured.
+        ground_depth_m: depth of that ground below the surface ``(frames,)`` [m]; nan without a depth sensor.
     """
 
     frames: Index
@@ -206,7 +210,7 @@ class HeightProfile:
     ground_depth_m: Array
 
     def csv(self) -> str:
-        """Return a table with a line a frame; cells are empty where nothing is known."""
+        """Return a CSV table with one line per frame; unknown values are empty cells."""
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\n")
         names = ["distance_m", "x_m", "y_m", "height_m", "height_std_m", "ground_z_m", "ground_depth_m"]
@@ -223,24 +227,28 @@ def height_profile(
 ) -> HeightProfile:
     """Collect the heights over the ground along a path.
 
-    First echoes count, where an estimator measured the height by them; else the heights that the frames tell. A height that
-    the user gave is no measurement.
+    A height that an estimator measured from first echoes takes precedence over the height recorded with the frame. A height
+    given by the user does not count as a measurement.
 
     Args:
-        source: of the records.
-        frames: numbers of those used ``(n,)``.
-        estimates: of each pair of them; ``about`` may hold ``height_m`` and ``height_std_m``, of first echoes.
-        sensors: of the vehicle.
+        source: source of the records.
+        frames: numbers of the frames used ``(n,)``.
+        estimates: estimate of each pair of consecutive frames; ``about`` may hold ``height_m`` and ``height_std_m``,
+            measured from first echoes.
+        sensors: sensors of the vehicle, if any.
         path: poses at the frames.
     """
+    # 1. heights: estimates belong to pairs, so each frame takes the mean of its two pairs; the altimeter fills the rest
     poses = path.poses
     height, std = (_at_frames(np.array([_told(one, name) for one in estimates])) for name in ("height_m", "height_std_m"))
     echoes = np.isfinite(height)
     altimeter = _altimeter(source, frames)
     height = np.where(echoes, height, altimeter)
+    # 2. the ground measured: straight below for an altimeter, where the steepest rays land for first echoes
     ahead = np.where(echoes, _ahead(source, frames, height), 0.0)
     places = poses[:, :2] + ahead[:, None] * np.column_stack([np.sin(poses[:, 5]), np.cos(poses[:, 5])])
     places[np.isnan(height)] = np.nan
+    # 3. z of the ground needs a measured z of the sonar: odometry alone keeps its height constant
     nothing = np.full(len(frames), np.nan)
     depth = None if sensors is None else sensors.depths(path.time_s)
     known = source.poses[frames, 2] if source.poses is not None else nothing if depth is None else poses[:, 2]
@@ -257,12 +265,12 @@ def height_profile(
 
 
 def _told(estimate: Estimate, name: str) -> float:
-    """Return a height that first echoes tell; nan where they tell none."""
+    """Return a value measured from first echoes, by its name in ``about``; nan if there is none."""
     return float(estimate.about[name]) if "height_std_m" in estimate.about else np.nan
 
 
 def _at_frames(of_pairs: Array) -> Array:
-    """Return the mean of what the pairs before and after each frame tell ``(frames,)``."""
+    """Return the mean of the finite values of the pairs before and after each frame ``(frames,)``."""
     both = np.stack([np.append(of_pairs, np.nan), np.append(np.nan, of_pairs)])
     known = np.isfinite(both)
     count = known.sum(axis=0)
@@ -270,7 +278,7 @@ def _at_frames(of_pairs: Array) -> Array:
 
 
 def _altimeter(source: Source, frames: Index) -> Array:
-    """Return the heights that the frames tell ``(frames,)``; nan where they tell none, or those are given or assumed."""
+    """Return the heights recorded with the frames ``(frames,)`` [m]; nan where unknown, given by the user or assumed."""
     if source.height_m is None or (isinstance(source, FrameSource) and source.assumed_height):
         return np.full(len(frames), np.nan)
     heights = np.asarray(source.height_m[frames], dtype=float)
@@ -279,7 +287,7 @@ def _altimeter(source: Source, frames: Index) -> Array:
 
 
 def _ahead(source: Source, frames: Index, height_m: Array) -> Array:
-    """Return how far ahead of the sonar its steepest rays meet the ground, in the mean of the beams ``(frames,)`` [m]."""
+    """Return how far ahead of the sonar its steepest rays meet the ground, averaged over the beams ``(frames,)`` [m]."""
     attitudes = source.attitudes(frames) if isinstance(source, FrameSource) else None
     if not isinstance(source, FrameSource) or attitudes is None:
         return np.zeros(len(frames))
@@ -287,34 +295,35 @@ def _ahead(source: Source, frames: Index, height_m: Array) -> Array:
     return np.asarray(height_m / np.tan(steepest) * float(np.cos(source.like.bearing_rad).mean()))
 
 
-# ---------------- odometry
+# ---------------- Odometry
 
 Row = tuple[str, float, str]
-"""Name, value, unit."""
+"""Name, value and unit of a result."""
 
 Smoothing = Literal["none", "spline", "kalman"]
 
 MANY = 0.1
-"""Fraction of invalid motions above which the user is warned: the path is then mostly interpolated."""
+"""Fraction of invalid motions above which the user is warned that much of the path is interpolated."""
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """A path, with all that it was computed from.
+    """An estimated path together with everything from which it was computed.
 
     Attributes:
         frames: numbers of the frames used, in their source ``(frames,)``.
-        estimates: of each pair of consecutive frames.
-        series: the motions of the path: scaled, bridged or smoothed; their covariances, where known.
+        estimates: estimate of each pair of consecutive frames.
+        series: motions of the path after scaling, bridging or smoothing, with covariances if known.
         path: poses at the times of the frames.
-        true: poses of the sonar at all frames of the source, where known.
+        true: true poses of the sonar at all frames of the source, if known.
         smooth: how the motions were smoothed.
-        factors: by which the estimates were multiplied, for sideways, forward, yaw ``(3,)``.
-        fitted: whether these factors come from the true path.
-        heights: over the ground along the path.
-        closure: what loops of motions leave over, where it was asked for.
-        graph: the pose graph's path, where sensors or loops were asked for.
-        correlated: how errors of motions over the same ground depend on each other; None: as ``series`` says, or not.
+        factors: factors that multiplied the estimates, for sideways, forward, yaw ``(3,)``.
+        fitted: whether these factors were fitted to the true path.
+        heights: heights over the ground along the path.
+        closure: residuals of short loops of motions, if requested.
+        graph: solution of the pose graph, if sensors or loops were requested.
+        correlated: how errors of motions over the same ground are correlated; None to use the correlation stored in
+            ``series``, if any.
     """
 
     frames: Index
@@ -332,22 +341,22 @@ class Odometry:
 
     @property
     def believed(self) -> NDArray[np.bool_]:
-        """Return which motions are valid ``(frames - 1,)``; the others were bridged."""
+        """Return whether each motion is valid ``(frames - 1,)``; invalid motions were bridged."""
         return np.array([estimate.valid for estimate in self.estimates], dtype=bool)
 
     @property
     def true_at_frames(self) -> Trajectory | None:
-        """Return the true path at the frames used; None where it is not known."""
+        """Return the true path at the frames used; None if it is not known."""
         return None if self.true is None else Trajectory(self.true.poses[self.frames], self.true.time_s[self.frames])
 
     @cached_property
     def pose_covariances(self) -> Array | None:
         """Return the covariances of x, y [m] and heading [rad] along the path ``(frames, 3, 3)``.
 
-        Errors over the same ground are alike, as :class:`~mitsonar.mapping.series.ErrorCorrelation` says, but for
-        motions by the local map. Of smoothed motions, and of records that do not show ground, they count as independent.
-        None where the covariances of the motions are not known. With sensors or loops they are the marginals of the pose
-        graph.
+        Errors of motions over the same ground are correlated as
+        :class:`~mitsonar.mapping.series.ErrorCorrelation` describes, except for motions from the local map. Errors of
+        smoothed motions, and of records that do not show the ground, are taken as independent. With sensors or loops the
+        covariances are the marginals of the pose graph. None if the covariances of the motions are not known.
         """
         if self.graph is not None:
             return self.graph.covariances
@@ -357,7 +366,7 @@ class Odometry:
         return pose_covariances(self.series, Pose.from_row(self.path.poses[0]), correlated=self.correlated, alone=by_map)
 
     def rows(self) -> list[Row]:
-        """Return name, value and unit of all results: the one table for console, file and README."""
+        """Return name, value and unit of every result, as shown on the console, in the files and in the README."""
         count = len(self.estimates)
         rows: list[Row] = [("motions", count, ""), ("motions rejected, bridged", count - int(self.believed.sum()), "")]
         by_map = [one.about["map"] for one in self.estimates if "map" in one.about]
@@ -385,7 +394,7 @@ class Odometry:
         return rows + [(name, float(value), unit) for name, value, unit in assess(self.path, self.true).rows()]
 
     def warnings(self) -> list[str]:
-        """Return what the user should know: how many motions are invalid or are not the map's, and why."""
+        """Return warnings for the user: many motions invalid or not from the map, doubtful heights, untrained regimes."""
         lost = [estimate.reason for estimate in self.estimates if not estimate.valid]
         without = [one.about["map"] for one in self.estimates if one.about.get("map", USED) != USED]
         told = []
@@ -428,53 +437,59 @@ def odometry(
 ) -> Odometry:
     """Estimate the path of a sonar from its frames.
 
-    Invalid motions are bridged from their neighbours. ``smooth`` says what else is assumed of the velocity: ``none``
-    assumes nothing and keeps corners; ``spline`` assumes slow changes, their period chosen by cross validation; ``kalman``
-    assumes a random walk, its size chosen by maximum likelihood, and smooths the covariances too.
+    Invalid motions are bridged from their neighbours. ``smooth`` selects a further assumption about the velocity. ``none``
+    assumes nothing and preserves corners. ``spline`` assumes slow changes, with a period chosen by cross validation.
+    ``kalman`` assumes a random walk, with a size chosen by maximum likelihood, and smooths the covariances too.
 
     Args:
-        frames: of one run.
-        estimator: estimates the motion between two frames; any that
-            :func:`~mitsonar.estimation.named.create_estimator` takes: a name, a checkpoint, one of your own.
-        smooth: see above.
-        scale: factors for sideways, forward, yaw ``(3,)``; ``fit``: by least squares of valid against true motions.
-        start: the first pose; default: the true one, or the origin with the height of the first frame. Along the path
-            heights, pitch and roll are those of the frames, where known.
-        every: use every so many frames only.
-        closure: motions over which loops are closed; covariances are raised to what the loops leave over. 0: none.
-        sensors: of the vehicle: they tell estimators where to begin, and join in a pose graph.
-        loops: search for places that are seen again, and close the path there, in a pose graph.
-        local_map: register frames to a map of the last metres as well; see :mod:`mitsonar.mapping.local_map`.
-        workers: processes beside this one; 1: none. The result is the same, to the bit.
-        known: estimates of an earlier run, by the number of their pair.
+        frames: frames of one run, in memory or as a source.
+        estimator: estimates the motion between two frames; anything that
+            :func:`~mitsonar.estimation.named.create_estimator` accepts: a name, a checkpoint, or an estimator object.
+        smooth: smoothing of the motions, see above.
+        scale: factors for sideways, forward, yaw ``(3,)``; ``fit`` fits valid to true motions by least squares.
+        start: first pose; by default the true one, or the origin at the height of the first frame. Height, pitch and roll
+            follow those of the frames along the path, where known.
+        every: use only every ``every``-th frame.
+        closure: number of motions over which loops are closed; covariances are inflated to explain the loop residuals. 0
+            closes none.
+        sensors: sensors of the vehicle; they give the estimators a prior and enter the pose graph.
+        loops: search for places seen again, and close the path there in a pose graph.
+        local_map: also register frames to a map of the last metres; see :mod:`mitsonar.mapping.local_map`.
+        workers: number of worker processes; 1 computes in this process. The result is bit-identical.
+        known: estimates of an earlier run, by pair number.
         keep: called with the number and the estimate of each new pair.
-        known_loops: registrations of loops of an earlier run.
-        keep_loop: called with the frames, the first guess and the estimate of each new one.
-        progress: called with the number of pairs that were added.
+        known_loops: loop registrations of an earlier run.
+        keep_loop: called with both frames, the initial guess and the estimate of each new loop registration.
+        progress: called with the number of pairs processed since the last call.
 
     Raises:
-        MitsonarError: fewer than two frames, times that do not increase, frames without what the estimator needs, no valid
-            motion, ``fit`` without true poses, loops of records that are not sonar frames, smoothing of a pose graph.
+        MitsonarError: fewer than two frames, times that do not increase, frames that lack what the estimator needs, no valid
+            motion, ``fit`` without true poses, loops in records that are not sonar frames, or smoothing of a pose graph.
     """
+    # 1. select the frames, and reject impossible options before hours of estimating
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
     estimator = create_estimator(estimator)
     numbers = _frames_used(source, smooth, scale, every, closure)
     time_s, shown = source.time_s[numbers], _ground_shown(source, sensors, smooth, loops, local_map)
     if local_map and shown is not None:
-        map_attitudes(shown, numbers)  # what cannot work is refused before hours of estimating
+        map_attitudes(shown, numbers)  # raises if the frames lack height or pitch
+    # 2. estimate the motion of each pair, and resolve ambiguous motions by their neighbours
     estimate = partial(estimate_motions, priors=None if sensors is None else sensors.priors(time_s))
     estimates = estimate(source, estimator, numbers, workers=workers, known=known, keep=keep, progress=progress)
     estimates = continued(estimates)
+    # 3. inflate covariances to explain the loop residuals, and refine the motions by the local map
     closing = closure_of(source, estimator, numbers, estimates, closure, progress) if closure else None
     estimates = estimates if closing is None else closing.honest(estimates)
-    pairs = estimates  # their first echoes tell the heights
+    pairs = estimates  # the height profile needs their first echoes
     estimates = mapped(shown, numbers, estimates, progress) if local_map and shown is not None else estimates
+    # 4. scale, bridge or smooth the motions, and compose them to a path
     measured = series_of(estimates, time_s)
     factors = _scale_factors(measured, source.true, numbers, scale)
     measured, first = scaled(measured, factors), start or _start(source, int(numbers[0]))
     series = _SMOOTHED[smooth](measured)
     path = path_of(series.motions, first, series.time_s)
     fitted = isinstance(scale, str)
+    # 5. with sensors or loops, the pose graph replaces this path
     graph = None
     if sensors is not None or loops:
         task = LoopTask(estimator, numbers, known_loops, keep_loop) if loops else None
@@ -484,6 +499,7 @@ def odometry(
             measured, bridged, first, start_known=known_start, sensors=sensors, loops=task, source=shown, by_map=by_map
         )
         series, path = graph.series, graph.path
+    # 6. complete the planar path: height, pitch and roll of the frames, height profile, correlation of the errors
     path = _with_known(path, source, numbers, by_sensors=sensors is not None and sensors.rises(time_s) is not None)
     heights = height_profile(source, numbers, pairs, sensors, path)
     alike = (
@@ -495,7 +511,7 @@ def odometry(
 def _ground_shown(
     source: Source, sensors: VehicleSensors | None, smooth: str, loops: bool, local_map: bool
 ) -> FrameSource | None:
-    """Return the source where its frames show ground from above. Reject what a pose graph cannot do."""
+    """Return the source if it holds sonar frames, else None. Reject options that exclude each other or need sonar frames."""
     if smooth != "none" and (loops or sensors is not None):
         raise MitsonarError(
             f"{argument('smooth')} {smooth} and a pose graph of sensors or loops exclude each other: give one"
@@ -509,7 +525,7 @@ def _ground_shown(
 
 
 def _frames_used(source: Source, smooth: str, scale: ArrayLike | str | None, every: int, closure: int) -> Index:
-    """Return the numbers of the frames. Reject arguments that cannot work before hours of estimating."""
+    """Return the numbers of the frames to use. Reject impossible arguments early, before hours of estimating."""
     if every < 1:
         raise MitsonarError(f"{argument('every')} must be at least 1: got {every}")
     if closure < 0 or closure == 1:
@@ -542,7 +558,7 @@ def _scale_factors(
 
 
 def _start(source: Source, first: int) -> Pose:
-    """Return the true first pose, or what is known of it."""
+    """Return the true first pose; without truth, the origin with the known height and pitch."""
     if source.poses is not None:
         return Pose.from_row(float(value) for value in source.poses[first])
     height = 0.0 if source.height_m is None else float(np.nan_to_num(source.height_m[first]))
@@ -550,13 +566,13 @@ def _start(source: Source, first: int) -> Pose:
 
 
 def _with_known(path: Trajectory, source: Source, numbers: Index, *, by_sensors: bool) -> Trajectory:
-    """Return a path along which height, pitch and roll change as those of its frames do, where known: motions are planar.
+    """Add the changes of height, pitch and roll of the frames to a path of planar motions, where they are known.
 
     Args:
-        path: poses at the frames; heights and angles count from its first pose.
-        source: of the records.
-        numbers: of the frames.
-        by_sensors: whether a depth sensor has given the heights already.
+        path: poses at the frames; changes count from its first pose.
+        source: source of the records.
+        numbers: numbers of the frames.
+        by_sensors: whether a depth sensor has already set the heights.
     """
     known = source.attitudes(numbers) if isinstance(source, FrameSource) else None
     known = source.poses[numbers] if known is None and source.poses is not None else known
@@ -573,11 +589,11 @@ def _by_axis(what: str, values: Array) -> list[Row]:
     return [(f"{what}, {axis.name}", float(value), axis.unit) for axis, value in zip(AXES, values, strict=True)]
 
 
-# ---------------------------------------------------------------- motions
+# ---------------- Series of motions
 
 
 def series_of(estimates: list[Estimate], time_s: ArrayLike) -> MotionSeries:
-    """Return the motions of estimates at ``time_s`` ``(frames,)`` [s] as a series.
+    """Return the motions of estimates between the times ``time_s`` ``(frames,)`` [s] as a series.
 
     Raises:
         MitsonarError: no estimate is valid; the message gives the most frequent reasons.
@@ -592,9 +608,9 @@ def series_of(estimates: list[Estimate], time_s: ArrayLike) -> MotionSeries:
 
 
 def bridged(measured: MotionSeries) -> MotionSeries:
-    """Fill in invalid motions from the others; valid motions stay as measured.
+    """Fill in invalid motions from the valid ones, which stay as measured.
 
-    Where covariances are known, the Kalman smoother fills the gaps and gives them a covariance. Otherwise the velocity is
+    If covariances are known, the Kalman smoother fills the gaps and supplies their covariances. Otherwise the velocity is
     interpolated linearly between its neighbours.
     """
     known = np.flatnonzero(measured.believed)
@@ -622,7 +638,7 @@ _SMOOTHED: dict[str, Callable[[MotionSeries], MotionSeries]] = {
 
 
 def _usual(reasons: list[str]) -> str:
-    """Return the most frequent reasons; reasons that differ in their numbers only count as one."""
+    """Return the three most frequent reasons as text; reasons that differ only in their numbers count as one."""
     kinds = Counter(re.sub(r"-?\d+(\.\d+)?", "#", reason) for reason in reasons).most_common(3)
     example = {re.sub(r"-?\d+(\.\d+)?", "#", reason): reason for reason in reversed(reasons)}
     return "; ".join(f"{counted(count, 'time')} such as {example[kind]!r}" for kind, count in kinds)

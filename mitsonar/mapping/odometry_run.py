@@ -1,4 +1,8 @@
-"""The folder of an odometry: estimates are written as they come, so that a killed run resumes; then path, table, figure."""
+"""How an odometry run is written to a folder, resumed and read back.
+
+:func:`run_odometry` appends each estimate to a journal as soon as it is computed, so that a killed run can be resumed. At
+the end it writes the path, a table and a figure. :class:`OdometryFolder` reads them back.
+"""
 
 from __future__ import annotations
 
@@ -50,16 +54,16 @@ ODOMETRY = RunKind(
     packages=("mitsonar", "numpy", "scipy", "opencv-python-headless"),
     deciding=("mitsonar",),
 )
-"""The files of an odometry: ``true.tum`` where poses are known; ``estimates.jsonl``, a line a pair. Of a search for loops,
-``loops.jsonl``, a line a registration, and ``loops.csv``."""
+"""The files of an odometry run. ``true.tum`` exists if true poses are known. ``estimates.jsonl`` has one line per pair. A
+search for loops adds ``loops.jsonl``, with one line per registration, and ``loops.csv``."""
 
 
 class OdometryFolder:
-    """A folder that an odometry is written to or read from.
+    """A folder to which an odometry run is written, or from which it is read.
 
     Attributes:
-        run: what was asked for, and how far it is.
-        path: of the folder.
+        run: options and state of the run.
+        path: path of the folder.
     """
 
     def __init__(self, run: RunDirectory) -> None:
@@ -67,10 +71,10 @@ class OdometryFolder:
 
     @classmethod
     def open(cls, path: str | Path) -> OdometryFolder:
-        """Open a finished odometry.
+        """Open the folder of a finished odometry run.
 
         Raises:
-            MitsonarError: there is none, or it is not finished.
+            MitsonarError: the folder holds no odometry run, or the run is not finished.
         """
         folder = cls(RunDirectory.open(path, ODOMETRY))
         if not folder.run.finished:
@@ -79,7 +83,7 @@ class OdometryFolder:
 
     @property
     def height_m(self) -> float | None:
-        """Return the height over the ground that the user gave [m]; None where none was given.
+        """Return the height over the ground that the user gave [m]; None if none was given.
 
         Raises:
             MitsonarError: ``run.json`` is damaged.
@@ -97,19 +101,19 @@ class OdometryFolder:
 
     @property
     def true(self) -> Trajectory | None:
-        """Return the true path; None where it was not known."""
+        """Return the true path; None if it was not known."""
         return self._path("true.tum") if (self.path / "true.tum").exists() else None
 
     def _path(self, name: str) -> Trajectory:
-        """Load a path in the convention in which it was written, without the warnings of a first reading."""
+        """Load a path in the convention in which it was written, without warnings."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MitsonarWarning)
             return Trajectory.load(self.path / name, str(self.run.notes.get("frame", "mitsonar")))
 
-    # ---------------------------------------------------------------- estimates
+    # ---------------- Journals
 
     def kept(self) -> dict[int, Estimate]:
-        """Return the estimates of an earlier run by the number of their pair. Cut off a line that a kill left half written.
+        """Return the estimates of an earlier run, by pair number. Remove a last line that a killed run left incomplete.
 
         Raises:
             MitsonarError: the journal is damaged.
@@ -117,16 +121,16 @@ class OdometryFolder:
         return {of["pair"]: estimate for of, estimate in read_journal(self.path / "estimates.jsonl", "pair")}
 
     def keep(self, pair: int, estimate: Estimate) -> None:
-        """Add an estimate to the journal; the folder is made with the first one.
+        """Append an estimate to the journal; the first one creates the folder.
 
         Raises:
-            MitsonarError: it cannot be made.
+            MitsonarError: the folder cannot be created.
         """
         self.run.start()
         add_to_journal(self.path / "estimates.jsonl", {"pair": pair}, estimate)
 
     def kept_loops(self) -> dict[tuple[int, int, Motion], Estimate]:
-        """Return the registrations of loops of an earlier run, as :meth:`kept` does.
+        """Return the loop registrations of an earlier run, by both frames and the initial guess; see :meth:`kept`.
 
         Raises:
             MitsonarError: the journal is damaged.
@@ -135,18 +139,18 @@ class OdometryFolder:
         return {(of["first"], of["second"], of["guess"]): estimate for of, estimate in journal}
 
     def keep_loop(self, first: int, second: int, guess: Motion, estimate: Estimate) -> None:
-        """Add the registration of a loop to its journal.
+        """Append a loop registration to its journal.
 
         Raises:
-            MitsonarError: the folder cannot be made.
+            MitsonarError: the folder cannot be created.
         """
         self.run.start()
         add_to_journal(self.path / "loops.jsonl", {"first": first, "second": second, "guess": list(guess)}, estimate)
 
-    # ---------------------------------------------------------------- results
+    # ---------------- Results
 
     def write(self, found: Odometry, title: str, more: PlainTable) -> None:
-        """Write all results. The last one is ``run.json``, which marks them as complete."""
+        """Write all results. ``run.json`` comes last and marks them as complete."""
         self.run.start()
         self.run.finished = False
         self.run.note(**more)
@@ -159,11 +163,11 @@ class OdometryFolder:
         if np.isfinite(found.heights.height_m).any():
             write_whole(self.path / "height_profile.csv", found.heights.csv().encode())
         else:
-            (self.path / "height_profile.csv").unlink(missing_ok=True)  # of frames that told heights
+            (self.path / "height_profile.csv").unlink(missing_ok=True)  # left from an earlier run with heights
         if found.graph is not None and found.graph.search is not None:
             write_whole(self.path / "loops.csv", _loops_csv(found, found.graph.search.loops, found.graph.kept).encode())
         else:
-            (self.path / "loops.csv").unlink(missing_ok=True)  # of an earlier search
+            (self.path / "loops.csv").unlink(missing_ok=True)  # left from an earlier search
         rows = found.rows()
         write_whole(self.path / "table.md", ("\n".join(table_lines(rows)) + "\n").encode())
         table = [{"name": name, "value": value if np.isfinite(value) else None, "unit": unit} for name, value, unit in rows]
@@ -195,26 +199,26 @@ def run_odometry(
     """Run :func:`mitsonar.mapping.odometry.odometry` and write the results, the files of :data:`ODOMETRY`, to a folder.
 
     Args:
-        source: of the records.
-        name: of the estimator, as given.
+        source: source of the records.
+        name: name of the estimator, as the user gave it.
         estimator: estimates the motions.
-        out: the folder; it is made.
-        smooth: as ``odometry`` takes it.
-        scale: as above.
-        start: as above.
+        out: folder to write to; it is created.
+        smooth: see :func:`~mitsonar.mapping.odometry.odometry`.
+        scale: see ``odometry``.
+        start: see ``odometry``.
         frame: convention of ``estimated.tum`` and ``true.tum``: ``mitsonar``, ``ros-enu`` or ``ned``.
-        every: as above.
-        closure: as above.
-        sensors: as above.
-        loops: as above.
-        local_map: as above.
-        workers: as above.
-        overwrite: replace an odometry in the folder.
-        resume: go on with an interrupted one.
-        progress: as above.
+        every: see ``odometry``.
+        closure: see ``odometry``.
+        sensors: see ``odometry``.
+        loops: see ``odometry``.
+        local_map: see ``odometry``.
+        workers: see ``odometry``.
+        overwrite: replace an odometry run in the folder.
+        resume: continue an interrupted run.
+        progress: see ``odometry``.
 
     Raises:
-        MitsonarError: as ``odometry`` does; the folder holds something else, or cannot be written.
+        MitsonarError: as for ``odometry``; or the folder holds something else, or cannot be written.
     """
     convention_named(frame)
     run = RunDirectory.begin(
@@ -242,13 +246,13 @@ def _named(scale: ArrayLike | Literal["fit"] | None) -> str | None:
 
 
 def _found(found: Odometry) -> PlainTable:
-    """Return what the record of the run holds of the path."""
+    """Return the notes about the path for ``run.json``."""
     lost = int((~found.believed).sum())
     return {"factors": found.factors, "from": found.path.poses[0], "not_believed": lost, "warnings": found.warnings()}
 
 
 def _asked(source: Source, name: str, estimator: AnyEstimator, every: int, sensors: VehicleSensors | None) -> PlainTable:
-    """Return what decides the estimates: a run is resumed only with the same."""
+    """Return the options on which the estimates depend; a run can be resumed only with the same ones."""
     options: PlainTable = dataclasses.asdict(estimator) if dataclasses.is_dataclass(estimator) else {}
     return {
         **{"estimator": name, "options": options, "frames": len(source), "frames_sha256": source.digest(), "every": every},
@@ -259,7 +263,7 @@ def _asked(source: Source, name: str, estimator: AnyEstimator, every: int, senso
     }
 
 
-# ---------------------------------------------------------------- files
+# ---------------- Files
 
 
 def _save_tum(path: Path, trajectory: Trajectory, frame: str) -> None:
@@ -269,7 +273,7 @@ def _save_tum(path: Path, trajectory: Trajectory, frame: str) -> None:
 
 
 def _motions_csv(found: Odometry) -> str:
-    """Write a line a motion, in mm and deg; standard deviations are empty where unknown."""
+    """Return a CSV table with one line per motion, in mm and deg; unknown standard deviations are empty."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     names = [f"{axis.name}_{axis.unit}" for axis in AXES]
@@ -286,7 +290,7 @@ def _motions_csv(found: Odometry) -> str:
 
 
 def _loops_csv(found: Odometry, loops: PoseEdges, kept: NDArray[np.bool_]) -> str:
-    """Write a line a loop, in mm and deg."""
+    """Return a CSV table with one line per loop, in mm and deg."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     names = [f"{axis.name}_{axis.unit}" for axis in AXES]
@@ -303,7 +307,7 @@ def _std(covariances: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
 
 
 def _covariances(found: Odometry) -> bytes:
-    """Pack times, motions and covariances in m and rad; covariances are nan where unknown."""
+    """Return an ``.npz`` file of times, motions and covariances in m and rad; unknown covariances are nan."""
     count = len(found.estimates)
     motions, poses = found.series.covariances, found.pose_covariances
     buffer = io.BytesIO()
@@ -345,24 +349,23 @@ def _figure(found: Odometry, title: str) -> Figure:
     )
 
 
-# ---------------- Journals of estimates: a JSON line each, written as they come, so that a killed run goes on. Bits
-# survive
+# ---------------- Journals of estimates
 
 
 LARGEST_JOURNAL = 2**30
-"""Bytes: some three million pairs."""
+"""Largest size of a journal [bytes]: some three million pairs."""
 
 HEIGHTS = ("height_m", "height_std_m")
-"""What an estimator may tell of the height over the ground [m]."""
+"""Height over the ground and its standard deviation [m], which an estimator may report."""
 
 
 def add_to_journal(path: Path, of: PlainTable, estimate: Estimate) -> None:
-    """Add an estimate to a journal.
+    """Append an estimate to a journal as one JSON line, which preserves every bit of its numbers.
 
     Args:
-        path: of the journal.
-        of: what the estimate is of: its ``pair``; or ``first`` and ``second`` frame, and ``guess``, where it began.
-        estimate: to add.
+        path: path of the journal.
+        of: identifies the estimate: its ``pair``; or its ``first`` and ``second`` frame and the initial ``guess``.
+        estimate: estimate to append.
     """
     covariance = None if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float).tolist()
     motion = [float(value) for value in estimate.motion]
@@ -374,11 +377,11 @@ def add_to_journal(path: Path, of: PlainTable, estimate: Estimate) -> None:
 
 
 def read_journal(path: Path, *names: str) -> Iterator[tuple[PlainTable, Estimate]]:
-    """Yield what the estimates of a journal are of, and the estimates. Cut off a line that a kill left half written.
+    """Yield the identifiers and the estimate of each line. Remove a last line that a killed run left incomplete.
 
     Args:
-        path: of the journal.
-        names: numbers that say what an estimate is of, which each line must hold.
+        path: path of the journal.
+        names: names of the numbers that identify an estimate; every line must hold them.
 
     Raises:
         MitsonarError: the journal is damaged.
@@ -386,13 +389,13 @@ def read_journal(path: Path, *names: str) -> Iterator[tuple[PlainTable, Estimate
     for number, line in enumerate(whole_lines(path, "journal", LARGEST_JOURNAL), start=1):
         try:
             found = _estimate_in(line, names)
-        except Exception:  # a line leads to whatever its bytes do
+        except Exception:  # a damaged line may raise anything
             raise MitsonarError(f"{path}, line {number} is damaged: start over with --overwrite") from None
         yield found
 
 
 def _estimate_in(line: bytes, names: tuple[str, ...]) -> tuple[PlainTable, Estimate]:
-    """Parse a line; a damaged one raises."""
+    """Parse and validate a line. A damaged line raises an exception of some kind."""
     table = parse_json(line, "the line")
     covariance = None if table["covariance"] is None else np.array(table["covariance"], dtype=float)
     motion = np.array(table["motion"], dtype=float)

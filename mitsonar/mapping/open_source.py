@@ -1,4 +1,7 @@
-"""The records of one run for odometry and maps: frames, views of a data set, or impulse responses."""
+"""How the records of one run are opened for odometry and maps: as frames, views of a data set, or impulse responses.
+
+:func:`open_source` opens what an estimator consumes, with the options of a :class:`Reading`.
+"""
 
 from __future__ import annotations
 
@@ -46,28 +49,28 @@ __all__ = [
 ]
 
 
-# ---------------- Several views of a sequence of a data set, as images or vectors, read some pings at a time
+# ---------------- Views of a data set
 
 
 @dataclass(frozen=True)
 class ViewSource:
-    """The pings of one sequence.
+    """The pings of one sequence of a data set in several views, read a few at a time.
 
     Attributes:
-        name: of the source, for messages.
-        store: of the data set.
-        views: that are read, in this order.
+        name: name of the source, for messages.
+        store: store of the data set.
+        views: names of the views to read, in this order.
         kind: ``image`` or ``vector``.
         first: number of the first frame of the sequence in the store.
-        time_s: of the pings ``(n,)`` [s].
-        poses: true poses of the vehicle, whose motion networks of data sets estimate ``(n, 6)`` [m, rad].
-        sonar_poses: of the sonar on it ``(n, 6)`` [m, rad].
-        height_m: over the ground ``(n,)``.
-        noise: added to the pings that are read, as to samples of the data set.
-        seed: of the noise.
+        time_s: times of the pings ``(n,)`` [s].
+        poses: true poses of the vehicle ``(n, 6)`` [m, rad], whose motion the networks of data sets estimate.
+        sonar_poses: true poses of the sonar on the vehicle ``(n, 6)`` [m, rad].
+        height_m: height over the ground ``(n,)`` [m].
+        noise: noise added to the pings when they are read, as to samples of the data set.
+        seed: seed of the noise.
         note: which sequence this is.
-        altimeter: measures the height of each ping that is read, in place of ``height_m``.
-        contrast: none: networks of data sets are trained on levels.
+        altimeter: measures the height of each ping as it is read, in place of ``height_m``.
+        contrast: always None: networks of data sets are trained on levels.
     """
 
     name: str
@@ -92,11 +95,11 @@ class ViewSource:
         return len(self.time_s)
 
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
-        """Return the same pings with noise: a function of the seed and the number of each frame."""
+        """Return the same pings with noise, which is a function of the seed and the frame number."""
         return self if noise.is_none else replace(self, noise=noise, seed=seed)
 
     def with_heights_by(self, estimator: HeightEstimator) -> Self:
-        """Return the same pings, whose heights an estimator measures in its views when they are read.
+        """Return the same pings with heights that an estimator measures in its views as they are read.
 
         Raises:
             MitsonarError: the data set lacks these views.
@@ -111,13 +114,13 @@ class ViewSource:
         return Trajectory(self.poses, self.time_s)
 
     def check_times(self) -> None:
-        """Check nothing: the times of a sequence increase."""
+        """Do nothing: the times of a sequence always increase."""
 
     def read(self, index: ArrayLike) -> ViewFrames:
-        """Read pings of these numbers ``(n,)`` with position and heading 0, so that no truth can leak.
+        """Read the pings with these numbers ``(n,)``, with zero position and heading so that no ground truth can leak.
 
         Raises:
-            MitsonarError: arrays that cannot be read.
+            MitsonarError: an array cannot be read.
         """
         chosen = np.asarray(index, dtype=np.intp)
         frames = self._read(chosen, self.views, self.kind)
@@ -132,6 +135,7 @@ class ViewSource:
         from mitsonar.config.data import array_names
         from mitsonar.datasets.arrangement import arrangement_of
 
+        # one slice from the first to the last ping, from which the chosen ones are picked
         here = slice(self.first + int(chosen[0]), self.first + int(chosen[-1]) + 1)
         kept = chosen - chosen[0]
         values, known = {}, {view.name: view for view in self.store.recipe.views}
@@ -142,6 +146,7 @@ class ViewSource:
                 for name, (stored, of) in array_names(self.store.recipe).items()
                 if of == view and (stored == kind or (stored == "nonzero" and kind == "vector"))
             }
+            # noise is a function of the frame number in the store, and of the seed, which differs between views
             numbers = (self.first + chosen.astype(np.int64))[None]
             values[view] = np.asarray(made.noisy(frames, view, numbers, self.seed + number))[0]
         return ViewFrames(
@@ -155,7 +160,7 @@ class ViewSource:
         )
 
     def digest(self) -> str:
-        """Return the SHA-256 of all data but the views, and of the views of the first and the last ping."""
+        """Return the SHA-256 of all data except the views, of which the first and the last ping enter."""
         digest = hashlib.sha256(self.store.recipe.model_dump_json().encode())
         for values in (self.time_s, self.poses, self.sonar_poses, self.height_m):
             digest.update(np.ascontiguousarray(values, dtype=float).tobytes())
@@ -166,10 +171,10 @@ class ViewSource:
 
 
 def open_views(url: str, views: Sequence[str], kind: str, *, sequence: int | None = None) -> ViewSource:
-    """Open views of a sequence of a data set. Default: the longest sequence; of several, the first.
+    """Open views of a sequence of a data set, by default the longest sequence, and the first of several as long.
 
     Raises:
-        MitsonarError: no data set, or one without such views, kind or sequence.
+        MitsonarError: there is no data set, or it lacks these views, this kind or this sequence.
     """
     from mitsonar.datasets.store import DataStore  # its import takes half a second
 
@@ -186,7 +191,7 @@ def _check_there(store: DataStore, views: Sequence[str], kind: str) -> None:
     """Check that a data set holds these views.
 
     Raises:
-        MitsonarError: it does not.
+        MitsonarError: a view is missing.
     """
     from mitsonar.config.data import array_names
 
@@ -197,33 +202,32 @@ def _check_there(store: DataStore, views: Sequence[str], kind: str) -> None:
         raise MitsonarError(f"{store.place.url} has no {kind}s of view {lacking[0]!r}: {had}")
 
 
-# ---------------- Impulse responses of one run, for odometry, as :class:`~mitsonar.mapping.sources.FrameSource`
-# gives frames
+# ---------------- Impulse responses
 
 
 @dataclass(frozen=True)
 class ResponseNoise:
-    """White complex noise at a ratio of signal to noise."""
+    """White complex noise at a signal-to-noise ratio [dB]."""
 
     snr_db: float
 
     def model_dump(self) -> dict[str, str]:
-        """Return its kind and ratio, for the record of a run."""
+        """Return the kind and ratio of the noise, for the record of a run."""
         return {"kind": "white", "snr": snr_said(self.snr_db)}
 
 
 @dataclass(frozen=True)
 class ResponseSource:
-    """The pings of one run.
+    """The impulse responses of one run; the counterpart of :class:`~mitsonar.mapping.sources.FrameSource`.
 
     Attributes:
-        name: of the source, for messages.
-        responses: of all pings.
-        told_height_m: the height that the user gave for responses without one.
-        noise: added to the pings that are read.
-        seed: of the noise.
-        note: empty; data sets are read by their samples.
-        contrast: none, as of all impulse responses.
+        name: name of the source, for messages.
+        responses: impulse responses of all pings.
+        told_height_m: height that the user gave for responses without one [m].
+        noise: noise added to the pings when they are read.
+        seed: seed of the noise.
+        note: always empty; data sets are read by their samples.
+        contrast: always None for impulse responses.
     """
 
     name: str
@@ -246,24 +250,24 @@ class ResponseSource:
 
     @property
     def poses(self) -> NDArray[np.float64] | None:
-        """Return the true poses of the transmitter ``(pings, 6)`` [m, rad]; None where they are not known."""
+        """Return the true poses of the transmitter ``(pings, 6)`` [m, rad]; None if they are not known."""
         return self.responses.poses
 
     @property
     def height_m(self) -> NDArray[np.float64] | None:
-        """Return the height over the ground ``(pings,)`` [m]; None where it is not known."""
+        """Return the height over the ground ``(pings,)`` [m]; None if it is not known."""
         return self.responses.height_m
 
     @property
     def true(self) -> Trajectory | None:
-        """Return the true path of the transmitter; None where it is not known."""
+        """Return the true path of the transmitter; None if it is not known."""
         return None if self.poses is None else Trajectory(self.poses, self.time_s)
 
     def with_noise(self, snr: str, seed: int = 0) -> Self:
-        """Return the same pings with noise at a ratio of signal to noise such as ``20 dB``.
+        """Return the same pings with noise at a signal-to-noise ratio such as ``20 dB``.
 
         Raises:
-            MitsonarError: not a ratio.
+            MitsonarError: ``snr`` is not a ratio.
         """
         ratio = snr_of(snr)
         return replace(self, noise=None if ratio is None else ResponseNoise(ratio), seed=seed)
@@ -272,7 +276,7 @@ class ResponseSource:
         """Return the same pings with a height [m] where they lack it.
 
         Raises:
-            MitsonarError: a height that is not above 0, or that would not be used.
+            MitsonarError: the height is not above 0, or would not be used.
         """
         if height_m is None:
             return self
@@ -288,15 +292,15 @@ class ResponseSource:
         """Check that the times of the pings increase.
 
         Raises:
-            MitsonarError: they do not, or are not finite.
+            MitsonarError: the times do not increase, or are not finite.
         """
         if not (np.isfinite(self.time_s).all() and (np.diff(self.time_s) > 0).all()):
             raise MitsonarError(f"{self.name}: times of pings must be finite and increase; write the pings in order")
 
     def read(self, index: ArrayLike) -> ImpulseResponses:
-        """Read pings of these numbers ``(n,)`` as estimators may use them.
+        """Read the pings with these numbers ``(n,)`` as an estimator may see them.
 
-        They have height and attitude, but neither position, heading nor velocity, so that no truth can leak.
+        They have height and attitude, but neither position, heading nor velocity, so that no ground truth can leak.
         """
         chosen = np.asarray(index, dtype=np.intp)
         picked = self.responses.select(chosen)
@@ -316,7 +320,7 @@ class ResponseSource:
 
 
 def holds_responses(where: str | Path) -> bool:
-    """Return whether impulse responses are there: a folder of ``mitsonar impulse``, or its responses.npz or .zarr."""
+    """Return whether a path holds impulse responses: a folder of ``mitsonar impulse``, or its responses.npz or .zarr."""
     path = Path(where)
     if path.name.startswith("responses."):
         return os.path.exists(path)
@@ -324,15 +328,15 @@ def holds_responses(where: str | Path) -> bool:
 
 
 def open_responses(where: str | Path) -> ResponseSource:
-    """Open the responses at a path.
+    """Open the impulse responses at a path.
 
     Raises:
-        MitsonarError: no responses, or a damaged file.
+        MitsonarError: there are no responses, or the file is damaged.
     """
     return ResponseSource(str(where), ImpulseResponses.load(where))
 
 
-# ---------------- open source
+# ---------------- Records for an estimator
 
 
 Source = FrameSource | ResponseSource | ViewSource
@@ -341,7 +345,7 @@ Framed = TypeVar("Framed", FrameSource, ViewSource)
 
 
 class ViewReader(Protocol):
-    """An estimator that reads views of a data set: their names, and ``image`` or ``vector``."""
+    """An estimator that reads views of a data set, with their names and their kind, ``image`` or ``vector``."""
 
     @property
     def views(self) -> tuple[str, ...]: ...
@@ -350,36 +354,36 @@ class ViewReader(Protocol):
 
 
 FRAME_OPTIONS = ("sequence", "view", "height_by", "pitch_rad", "geometry", "contrast")
-"""Options that impulse responses lack."""
+"""Options of :class:`Reading` that do not apply to impulse responses."""
 
 
 CONTRASTS = ("levels", "local", "moving")
 
 ASSUMED_HEIGHT = 0.15
-"""Height over the ground where nothing tells it, as part of the far end of the window."""
+"""Assumed height over the ground where it is unknown, as a fraction of the largest range of the window."""
 
 NEAREST = 0.25
-"""Least range at which the assumed ground is looked for, as part of the far end: windows may begin at 0."""
+"""Smallest range at which the assumed ground must be visible, as a fraction of the largest: windows may begin at 0."""
 
 LOOP = 8
-"""Motions over which loops of contrast are closed, where nothing else is told."""
+"""Default number of motions over which loops of contrast frames are closed."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How records are read: which, with which noise, and the height and pitch that are assumed where they lack them.
+    """Options for reading records: which ones, with which noise, and the height and pitch for records that lack them.
 
     Attributes:
-        sequence: of a data set; None: the longest.
-        view: of a data set; None: the first.
-        noise: name of a model, or a ratio of signal to noise for impulse responses.
-        seed: of the noise.
-        height_m: over the ground [m], for records that lack it.
-        pitch_rad: of the sonar [rad], for frames that lack poses.
-        height_by: measures the height in each frame: ``direct`` or a checkpoint.
-        geometry: file that tells how the pictures of a recording are laid out.
-        contrast: what is matched: ``levels``; ``local`` contrast; ``moving``: the same, less the pattern that moves with the
-            sonar. None: local for recordings that tell no height, levels for all others.
+        sequence: number of the sequence of a data set; None: the longest.
+        view: view of a data set; None: the first.
+        noise: name of a noise model, or a signal-to-noise ratio for impulse responses.
+        seed: seed of the noise.
+        height_m: height over the ground [m], for records that lack it.
+        pitch_rad: pitch of the sonar [rad], for frames that lack poses.
+        height_by: height estimator that measures the height in each frame: ``direct`` or a checkpoint.
+        geometry: file that describes the layout of the pictures of a recording.
+        contrast: quantity to match: ``levels``; ``local`` contrast; or ``moving``, local contrast without the pattern that
+            moves with the sonar. None: ``local`` for recordings without heights, ``levels`` for all others.
     """
 
     sequence: int | None = None
@@ -399,10 +403,15 @@ def record_at(where: str | Path) -> type[SonarFrames] | type[ImpulseResponses]:
 
 
 def open_source(where: str, estimator: AnyEstimator, reading: Reading) -> Source:
-    """Open the records of a run as an estimator consumes them.
+    """Open the records of a run in the form that an estimator consumes.
+
+    Args:
+        where: path or URL of the records.
+        estimator: estimator that will read them.
+        reading: options for reading.
 
     Raises:
-        MitsonarError: nothing there, records that the estimator does not consume, options that do not fit them.
+        MitsonarError: there are no records, the estimator does not consume them, or the options do not fit them.
     """
     there, wanted = record_at(where), estimator.consumes
     if there is ImpulseResponses:
@@ -420,10 +429,10 @@ def open_source(where: str, estimator: AnyEstimator, reading: Reading) -> Source
 
 
 def frames_for(where: str, reading: Reading) -> FrameSource:
-    """Open sonar frames.
+    """Open sonar frames with the noise, height and pitch of ``reading``.
 
     Raises:
-        MitsonarError: none there, or options that do not fit them.
+        MitsonarError: there are no frames, or the options do not fit them.
     """
     noise = load_noise(reading.noise)
     source = open_frames(where, sequence=reading.sequence, view=reading.view, geometry=reading.geometry)
@@ -433,16 +442,19 @@ def frames_for(where: str, reading: Reading) -> FrameSource:
 
 
 def views_for(where: str, views: tuple[str, ...], kind: str, reading: Reading) -> ViewSource:
-    """Open views of a data set, ``image`` or ``vector``.
+    """Open views of a data set, of kind ``image`` or ``vector``, with the noise of ``reading``.
 
     Raises:
-        MitsonarError: none there.
+        MitsonarError: there are no such views.
     """
     return open_views(where, views, kind, sequence=reading.sequence).with_noise(load_noise(reading.noise), reading.seed)
 
 
 def usual_loop(source: Source) -> int:
-    """Return over how many motions loops are closed where the user does not say; 0: none. Short records have short loops."""
+    """Return the default number of motions per loop; 0 for none.
+
+    Loops are closed by default only for frames of contrast. Short records have shorter loops.
+    """
     half = (len(source) - 1) // 2
     return 0 if source.contrast is None or half < 2 else min(LOOP, half)
 
@@ -457,7 +469,7 @@ def _views_of(where: str, estimator: ViewReader, reading: Reading) -> ViewSource
 
 
 def _responses_for(where: str, reading: Reading) -> ResponseSource:
-    """Open impulse responses with noise and the assumed height."""
+    """Open impulse responses with the noise and height of ``reading``."""
     if any(getattr(reading, name) is not None for name in FRAME_OPTIONS):
         raise MitsonarError(
             "--sequence, --view, --height-by, --pitch-deg and --geometry belong to frames, not to impulse responses"
@@ -466,15 +478,15 @@ def _responses_for(where: str, reading: Reading) -> ResponseSource:
 
 
 def _tells_height(source: FrameSource) -> bool:
-    """Return whether all frames have a height, told or measured."""
+    """Return whether all frames have a height, given or measured."""
     return source.altimeter is not None or (source.height_m is not None and bool(np.isfinite(source.height_m).all()))
 
 
 def _with_contrast(source: FrameSource, reading: Reading, *, bare: bool) -> FrameSource:
-    """Return the same frames, as levels or as contrast.
+    """Return the same frames as levels or as contrast.
 
     Raises:
-        MitsonarError: an unknown word.
+        MitsonarError: the contrast is not one of :data:`CONTRASTS`.
     """
     contrast = reading.contrast or ("local" if bare else "levels")
     if contrast not in CONTRASTS:
@@ -483,13 +495,14 @@ def _with_contrast(source: FrameSource, reading: Reading, *, bare: bool) -> Fram
 
 
 def with_assumed_plane(source: FrameSource) -> FrameSource:
-    """Return the same frames with a height and a pitch where neither they nor the user tell a height, and a warning.
+    """Assume a height and a pitch, with a warning, for frames without a height; return other frames unchanged.
 
-    The plane is seen over the whole window within the opening of the beams. Motions hardly depend on it: they are scaled by
-    the cosine of the angle at which the sonar looks at the ground.
+    The assumed ground plane is visible over the whole range window within the vertical opening of the beams. Motions hardly
+    depend on it: they scale with the cosine of the grazing angle at which the sonar looks at the ground.
     """
     if _tells_height(source):
         return source
+    # the depression angles asin(height / range) at both ends must fit in the opening, which bounds the height
     far = float(source.like.range_m[-1])
     near = max(float(source.like.range_m[0]), NEAREST * far)
     opening = math.radians(source.like.sonar.elevation_fov_deg)
@@ -506,7 +519,7 @@ def with_assumed_plane(source: FrameSource) -> FrameSource:
 
 
 def _with_heights(source: Framed, reading: Reading) -> Framed:
-    """Return the same records, whose heights are measured in them if the user asks for it."""
+    """Return the same records, with measured heights if ``reading`` requests them."""
     return source if reading.height_by is None else source.with_heights_by(height_estimator_from(reading.height_by))
 
 

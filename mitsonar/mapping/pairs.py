@@ -1,4 +1,7 @@
-"""An estimator over all pairs of consecutive frames of a run, in this process or in several."""
+"""How an estimator runs over all pairs of consecutive frames, in one process or in several.
+
+:func:`estimate_motions` estimates the motions. :func:`continued` then resolves ambiguous ones by their neighbours.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +34,10 @@ __all__ = ["continued", "estimate_motions"]
 Index = NDArray[np.intp]
 
 Priors = list[MotionPrior | None]
-"""What is expected of each pair's motion."""
+"""Prior for the motion of each pair; None where there is none."""
 
 PAIRS_A_BATCH = 8
-"""Pairs that a worker gets at a time, and that a kill may cost."""
+"""Pairs that a worker receives at a time, and the most that a worker loses if it is killed."""
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -50,21 +53,21 @@ def estimate_motions(
     keep: Callable[[int, Estimate], None] = lambda number, estimate: None,
     progress: Callable[[int], None] = lambda pairs: None,
 ) -> list[Estimate]:
-    """Estimate the motion of each pair of consecutive frames; only a few frames are in memory at a time.
+    """Estimate the motion of each pair of consecutive frames, with only a few frames in memory at a time.
 
     Args:
-        source: of the frames.
+        source: source of the frames.
         estimator: estimates the motion between two frames.
-        frames: numbers of the frames ``(n,)``; pair k holds the k-th and the next of them.
-        workers: processes beside this one, with one thread each; 1: none.
-        priors: what is expected of each pair's motion ``(n - 1,)``; default: nothing.
-        known: estimates of an earlier run, by the number of their pair.
+        frames: numbers of the frames ``(n,)``; pair ``k`` consists of frames ``k`` and ``k + 1`` of these.
+        workers: number of worker processes, with one thread each; 1 computes in this process.
+        priors: prior for the motion of each pair ``(n - 1,)``; default: none.
+        known: estimates of an earlier run, by pair number.
         keep: called with the number and the estimate of each new pair, in order.
-        progress: called with the number of pairs that were added.
+        progress: called with the number of pairs processed since the last call.
 
     Raises:
-        MitsonarError: frames that cannot be read, or that lack what the estimator needs; a worker that was lost; not one
-            prior a pair.
+        MitsonarError: frames cannot be read or lack what the estimator needs, a worker was lost, or the number of priors is
+            not the number of pairs.
     """
     numbers = np.asarray(frames, dtype=np.intp)
     if priors is not None and len(priors) != len(numbers) - 1:
@@ -85,7 +88,7 @@ def estimate_motions(
 
 
 def _batches(pairs: list[int]) -> list[range]:
-    """Group consecutive pairs, a few at a time."""
+    """Group consecutive pairs into batches of at most :data:`PAIRS_A_BATCH`."""
     batches: list[range] = []
     for pair in pairs:
         if batches and batches[-1].stop == pair and len(batches[-1]) < PAIRS_A_BATCH:
@@ -98,7 +101,7 @@ def _batches(pairs: list[int]) -> list[range]:
 def _made_here(
     source: Source, estimator: AnyEstimator, numbers: Index, priors: Priors, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
-    """Estimate in this process."""
+    """Yield each batch with its estimates, computed in this process."""
     with _one_opencv_thread():
         for batch in batches:
             yield batch, _estimates(estimator, _frames_of(source, numbers, batch), priors[batch.start : batch.stop])
@@ -107,7 +110,7 @@ def _made_here(
 def _made_beside(
     source: Source, estimator: AnyEstimator, numbers: Index, priors: Priors, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
-    """Estimate in new processes; this one reads the frames."""
+    """Yield each batch with its estimates, computed in worker processes; this process reads the frames."""
     with _one_thread_each():
         others, whole = multiprocessing.active_children(), False
         pool = ProcessPoolExecutor(
@@ -118,6 +121,7 @@ def _made_beside(
             for batch in batches:
                 task = pool.submit(_in_worker, _frames_of(source, numbers, batch), priors[batch.start : batch.stop])
                 waiting.append((batch, task))
+                # a bounded queue: frames of waiting batches are in memory
                 if len(waiting) > 2 * workers:
                     first, answers = waiting.popleft()
                     yield first, answers.result()
@@ -130,14 +134,14 @@ def _made_beside(
                 "a worker was lost: it was killed, or the memory did not suffice; go on with fewer workers"
             ) from None
         finally:
-            if not whole:  # nobody waits for what the workers do, and a batch may take long
+            if not whole:  # nobody will read the remaining results, and a batch may take long
                 for worker in set(multiprocessing.active_children()).difference(others):
                     worker.terminate()
             pool.shutdown(cancel_futures=True)
 
 
 def _frames_of(source: Source, numbers: Index, batch: range) -> Record:
-    """Read the frames of a batch of pairs."""
+    """Read the frames of a batch of pairs: one more frame than pairs."""
     return source.read(numbers[batch.start : batch.stop + 1])
 
 
@@ -162,7 +166,7 @@ def _one_opencv_thread() -> Iterator[None]:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Make new processes compute with one thread: libraries read these variables when they are loaded."""
+    """Limit new processes to one thread each: numeric libraries read these variables when they are loaded."""
     had = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
@@ -176,20 +180,20 @@ def _one_thread_each() -> Iterator[None]:
 
 
 _worker: AnyEstimator
-"""The estimator of this process, where it is a worker."""
+"""The estimator of this process, if it is a worker."""
 
 
 def _begin_worker(estimator: AnyEstimator) -> None:
     global _worker
     _worker = estimator
     cv2.setNumThreads(1)
-    # Ctrl-C reaches all processes of a terminal: the first one stops the others
+    # Ctrl-C reaches all processes of a terminal; only the parent reacts, and stops its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """End this worker when its parent was killed; it would wait forever."""
+    """End this worker when its parent was killed; otherwise it would wait forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -200,28 +204,28 @@ def _in_worker(frames: Record, priors: Priors) -> list[Estimate]:
     return _estimates(_worker, frames, priors)
 
 
-# ---------------- Ambiguous motions are resolved by their neighbours: the probability of each, given all others
-# (Rabiner 1989)
+# ---------------- Ambiguous motions
 
 
 Array = NDArray[np.float64]
 
 USUAL_M, USUAL_RAD = 0.005, 0.002
-"""Standard deviations of the change from one motion to the next."""
+"""Standard deviations of the usual change from one motion to the next [m, rad]."""
 
 SUDDEN = -12.0
-"""Log probability of a sudden change of any size: a path may turn a corner."""
+"""Log probability of a sudden change of any size, since a path may turn a corner."""
 
 SURE = 0.95
-"""Probability from which a motion is valid."""
+"""Smallest probability at which a candidate counts as the valid motion."""
 
 
 def continued(estimates: Sequence[Estimate]) -> list[Estimate]:
-    """Choose one motion of each ambiguous estimate, where its neighbours decide.
+    """Choose one motion of each ambiguous estimate where its neighbours decide.
 
     An estimator lists the candidates in ``about["modes"]``: probability, sideways, forward [m], yaw [rad] of each. Their
-    covariances are in ``about["spreads"]``. A candidate whose probability, given the motions before and after, reaches
-    :data:`SURE` becomes the valid motion. All other estimates stay as they are.
+    covariances are in ``about["spreads"]``. A candidate becomes the valid motion if its probability, given all motions
+    before and after, reaches :data:`SURE`. All other estimates are returned unchanged. The probabilities come from the
+    forward-backward algorithm (Rabiner 1989).
     """
     modes = [np.array(one.about.get("modes", []), dtype=float).reshape(-1, 4) for one in estimates]
     ambiguous = [len(mine) > 1 and not one.valid for one, mine in zip(estimates, modes, strict=True)]
@@ -240,14 +244,17 @@ def continued(estimates: Sequence[Estimate]) -> list[Estimate]:
 
 def _marginals(modes: list[Array]) -> list[Array]:
     """Return the probability of each mode of each step, given all steps; steps without modes are skipped."""
+    # 1. log probabilities of the modes alone, and of the changes between successive steps that have modes
     known = [k for k, mine in enumerate(modes) if len(mine)]
     own = [np.log(np.maximum(modes[k][:, 0], 1e-300)) for k in known]
     change = [_change(modes[a][:, 1:], modes[b][:, 1:], b - a) for a, b in pairwise(known)]
+    # 2. forward pass over all earlier steps, backward pass over all later ones, in logs against underflow
     before, after = [own[0]], [np.zeros(len(own[-1]))]
     for between, mine in zip(change, own[1:], strict=True):
         before.append(logsumexp(before[-1][:, None] + between, axis=0) + mine)
     for between, mine in zip(change[::-1], own[:0:-1], strict=True):
         after.append(logsumexp(between + (mine + after[-1])[None], axis=1))
+    # 3. their product, normalised, is the probability given all steps
     shares = [np.empty(0)] * len(modes)
     for step, first, last in zip(known, before, after[::-1], strict=True):
         shares[step] = np.exp(first + last - logsumexp(first + last))
@@ -255,7 +262,10 @@ def _marginals(modes: list[Array]) -> list[Array]:
 
 
 def _change(first: Array, second: Array, steps: int) -> Array:
-    """Return the log probability that each second motion ``(m, 3)`` follows each first one ``(n, 3)``: ``(n, m)``."""
+    """Return the log probability ``(n, m)`` that each second motion ``(m, 3)`` follows each first ``(n, 3)``.
+
+    The change is a random walk, so that its standard deviation grows with the square root of ``steps``.
+    """
     usual = np.array([USUAL_M, USUAL_M, USUAL_RAD]) * np.sqrt(steps)
     off = (second[None] - first[:, None]) / usual
     return np.asarray(np.maximum(-0.5 * (off**2).sum(axis=-1), SUDDEN))

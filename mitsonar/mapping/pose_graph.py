@@ -1,6 +1,7 @@
-"""A pose graph: poses, relative motions between them, loops and headings, and how their errors depend on each other.
+"""How the poses that agree best with relative motions, loops and headings are found, with their covariances.
 
-:mod:`mitsonar.mapping.pose_graph` solves it. Motions are those of Almanza-Medina, eq. 3.4, in axes of the second heading.
+A :class:`PoseGraph` holds the measurements and the model of their errors, and :func:`solved` solves it. Motions are those of
+Almanza-Medina, eq. 3.4, in axes of the second heading.
 """
 
 from __future__ import annotations
@@ -41,10 +42,10 @@ class PoseEdges(NamedTuple):
     """Relative motions between poses.
 
     Attributes:
-        first: numbers of the poses from which they lead ``(edges,)``.
-        second: numbers of the poses to which they lead.
+        first: index of the pose where each edge begins ``(edges,)``.
+        second: index of the pose where each edge ends ``(edges,)``.
         motions: sideways, forward [m], yaw [rad] ``(edges, 3)``.
-        covariances: of their errors ``(edges, 3, 3)`` [m, m, rad].
+        covariances: covariances of the errors of the motions ``(edges, 3, 3)`` [m, m, rad].
     """
 
     first: Index
@@ -54,18 +55,18 @@ class PoseEdges(NamedTuple):
 
     @classmethod
     def none(cls) -> Self:
-        """Return no edges."""
+        """Return an empty set of edges."""
         return cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
     @classmethod
     def chain(cls, motions: ArrayLike, covariances: ArrayLike) -> Self:
-        """Return the edges of consecutive poses, from motions ``(n, 3)`` and their covariances ``(n, 3, 3)``."""
+        """Return the edges between consecutive poses, from motions ``(n, 3)`` and their covariances ``(n, 3, 3)``."""
         table = np.asarray(motions, dtype=float)
         first = np.arange(len(table), dtype=np.intp)
         return cls(first, first + 1, table, np.asarray(covariances, dtype=float))
 
     def at(self, chosen: ArrayLike) -> Self:
-        """Return some of the edges, by number or by truth."""
+        """Return the edges selected by an index array or a boolean mask."""
         return type(self)(*(np.asarray(values)[np.asarray(chosen)] for values in self))
 
     @property
@@ -73,7 +74,7 @@ class PoseEdges(NamedTuple):
         """Return the inverse Cholesky factors of the covariances ``(edges, 3, 3)``.
 
         Raises:
-            MitsonarError: a covariance that is not positive.
+            MitsonarError: a covariance is not positive definite.
         """
         try:
             return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariances)))
@@ -82,14 +83,14 @@ class PoseEdges(NamedTuple):
 
 
 class CorrelatedErrors(NamedTuple):
-    """How errors of consecutive motions of the chain depend on each other.
+    """Correlation between the errors of consecutive motions of the chain.
 
     Attributes:
-        share: part of the variance of each motion's error that consecutive motions have in common, 0 to below 1.
-        onward: correlation of that part from each motion to the next ``(motions - 1,)``, 0 to below 1.
-        slope_std: standard deviation of the slope of each component's error (rows) over each of the motion (columns), the
-            same slopes for all motions ``(3, 3)``.
-        sloped: what the slopes are over, the motions without the errors of single ones ``(motions, 3)``.
+        share: fraction of the variance of each error that consecutive motions have in common, in [0, 1).
+        onward: correlation of the common part from each motion to the next ``(motions - 1,)``, in [0, 1).
+        slope_std: standard deviation of the slope of each component of the error (rows) over each component of the motion
+            (columns) ``(3, 3)``. All motions share the same slopes.
+        sloped: motions that the slopes multiply, smoothed to reduce the errors of single ones ``(motions, 3)``.
     """
 
     share: float
@@ -98,7 +99,7 @@ class CorrelatedErrors(NamedTuple):
     sloped: Array
 
     def by_slopes(self) -> Array:
-        """Return the derivative of errors by the nine slopes, in their standard deviations ``(motions, 3, 9)``."""
+        """Return the derivatives of the errors by the nine slopes, in standard deviations ``(motions, 3, 9)``."""
         table = np.zeros((len(self.sloped), 3, 3, 3))
         for axis in range(3):
             table[:, axis, axis] = self.sloped * self.slope_std[axis]
@@ -107,17 +108,18 @@ class CorrelatedErrors(NamedTuple):
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """What is known of poses.
+    """Measurements that constrain poses.
 
     Attributes:
-        start: first guess: x, y [m], heading [rad], not wrapped ``(poses, 3)``.
-        chain: motions between poses whose errors are as ``correlated`` says.
-        others: motions with independent errors, but for a bias.
-        bias: error of each of ``others`` by a standard deviation of one unknown bias ``(others, 3)``; None: no bias.
+        start: initial guess of the poses: x, y [m], heading [rad], not wrapped ``(poses, 3)``.
+        chain: motions between poses whose errors are correlated as in ``correlated``.
+        others: motions with independent errors, apart from a common bias.
+        bias: change of the error of each of ``others`` per standard deviation of one unknown bias ``(others, 3)``; None for
+            no bias.
         loops: motions with independent errors, some of which may be wrong.
-        headings: absolute ones.
-        correlated: None: errors of the chain are independent.
-        at_start: covariance of the first pose ``(3, 3)``; a component with variance 0 is known.
+        headings: absolute headings.
+        correlated: correlation of the errors of the chain; None: they are independent.
+        at_start: covariance of the first pose ``(3, 3)``; a component with variance 0 is known exactly.
     """
 
     start: Array
@@ -144,12 +146,15 @@ class PoseGraph:
 
     @property
     def unknown_errors(self) -> int:
-        """Return the number of unknowns beside the poses: three errors a motion, nine slopes and a bias, where asked for."""
+        """Return the number of unknowns besides the poses: three errors per motion and nine slopes, and a bias, if any."""
         return (0 if self.correlated is None else 3 * len(self.chain.first) + 9) + (self.bias is not None)
 
     @property
     def pose_of(self) -> Index:
-        """Return the pose of each unknown; of a motion's errors its first pose, of common ones -1 ``(unknowns,)``."""
+        """Return the pose to which each unknown belongs ``(unknowns,)``.
+
+        The errors of a motion belong to its first pose. Unknowns common to all motions have -1.
+        """
         errors = np.full(self.unknown_errors, -1, dtype=np.intp)
         if self.correlated is not None:
             errors[: 3 * len(self.chain.first)] = np.repeat(self.chain.first, 3)
@@ -157,34 +162,30 @@ class PoseGraph:
 
 
 def relative_motions(poses: Array, first: ArrayLike, second: ArrayLike) -> Array:
-    """Return the motions ``(edges, 3)`` from the first to the second poses, of x, y, heading ``(poses, 3)`` (eq. 3.4)."""
+    """Return the motions ``(edges, 3)`` from first to second poses, given x, y, heading ``(poses, 3)`` (eq. 3.4)."""
     there = poses[np.asarray(second)]
     x, y, yaw = (there - poses[np.asarray(first)]).T
     sin, cos = np.sin(there[:, 2]), np.cos(there[:, 2])
     return np.column_stack([x * cos - y * sin, x * sin + y * cos, wrapped(yaw)])
 
 
-# ---------------- Marginal covariances of the poses of a long graph, exact, in time that grows with the number of poses
-# Columns of the whole inverse are as many and as long as the poses. Here some poses are nodes. Each stretch between two
-# nodes depends on the rest only through them and the common errors: its covariance is the one given the nodes, plus
-# that of the nodes carried to it. The normal equations of the nodes are those of the graph without the stretches (Schur
-# complement). Both terms are covariances, so that their sum is positive definite.
+# ---------------- Marginal covariances of long graphs
 
 
 TOGETHER = 40
-"""Stretches whose covariances are computed at a time."""
+"""Number of stretches whose covariances are computed at a time."""
 
 
 class _Stretch(NamedTuple):
-    """Poses from one node to the next, both included.
+    """The poses from one node to the next, both included, conditioned on the nodes and the common unknowns.
 
     Attributes:
-        poses: their numbers ``(n,)``.
-        around: unknowns of both nodes, and the common ones ``(m,)``.
-        own: covariances of the poses, given the nodes ``(n, 3, 3)``.
-        following: those with the next pose ``(n - 1, 3, 3)``.
-        gain: by which errors of ``around`` carry over to the poses ``(n, 3, m)``.
-        added: what the stretch tells of ``around``: to be added to the normal equations ``(m, m)``.
+        poses: indices of the poses ``(n,)``.
+        around: unknowns of both nodes, and the common unknowns ``(m,)``.
+        own: covariances of the poses, given ``around`` ``(n, 3, 3)``.
+        following: covariances of each pose with the next, given ``around`` ``(n - 1, 3, 3)``.
+        gain: derivative of the poses by ``around`` ``(n, 3, m)``.
+        added: Schur complement to add to the normal equations of ``around`` ``(m, m)``.
     """
 
     poses: Index
@@ -196,28 +197,39 @@ class _Stretch(NamedTuple):
 
 
 def marginals_by_nodes(normal: csc_array, pose_of: Index, states: Index, nodes: int) -> tuple[Array, Array]:
-    """Return the marginal covariances of poses ``(poses, 3, 3)``, and those with the next pose ``(poses - 1, 3, 3)``.
+    """Return the marginal covariances of the poses of a long graph, and those with the next pose.
+
+    The result is exact, in time proportional to the number of poses; the whole inverse would need columns as many and as
+    long as the poses. Some poses are nodes. The stretch between two nodes depends on the rest only through them and the
+    common unknowns, so that its covariance is the covariance given the nodes, plus that of the nodes propagated to it. The
+    normal equations of the nodes follow by eliminating the stretches (Schur complement). Both terms are covariances, so that
+    their sum is positive definite.
 
     Args:
-        normal: the normal equations ``(unknowns, unknowns)``.
-        pose_of: number of the pose to which each unknown belongs; -1 of the last ones, common to all ``(unknowns,)``.
-        states: place of x, y and heading of each pose among the unknowns; -1 where it is known ``(poses, 3)``.
-        nodes: poses that are nodes, evenly spread; poses that are tied to others than their neighbours are nodes too.
+        normal: normal equations ``(unknowns, unknowns)``.
+        pose_of: pose to which each unknown belongs ``(unknowns,)``; -1 for the last ones, common to all poses.
+        states: index of x, y and heading of each pose among the unknowns ``(poses, 3)``; -1 where it is known.
+        nodes: number of evenly spread nodes; poses with edges beyond their neighbours become nodes too.
+
+    Returns:
+        Covariances ``(poses, 3, 3)``, and covariances with the next pose ``(poses - 1, 3, 3)``.
 
     Raises:
-        MitsonarError: poses that nothing ties.
+        MitsonarError: some poses are not connected by any measurement.
     """
+    # 1. sort the unknowns by pose, so that every stretch is a contiguous block, with the common ones last
     order = np.argsort(np.where(pose_of < 0, len(states), pose_of), kind="stable")
-    place = np.append(np.argsort(order), -1)  # the last one: what is known
+    place = np.append(np.argsort(order), -1)  # -1, for known components, stays -1
     table = csr_array(normal)[order][:, order]
     begin = np.searchsorted(pose_of[order][pose_of[order] >= 0], np.arange(len(states) + 1))
+    # 2. condition each stretch on its nodes, and join them by the covariance of the nodes
     chosen = _nodes(csc_array(normal), pose_of, len(states), nodes)
     stretches = [_stretch(table, begin, place[states], *ends) for ends in pairwise(chosen)]
     return _joined(table, int((pose_of < 0).sum()), stretches)
 
 
 def _nodes(normal: csc_array, pose_of: Index, count: int, nodes: int) -> Index:
-    """Return the numbers of poses that are nodes, in order: some evenly spread, and all with ties beyond neighbours."""
+    """Return the indices of the nodes, in order: evenly spread poses, and all poses with edges beyond their neighbours."""
     even = np.linspace(0, count - 1, min(nodes, count)).astype(np.intp)
     first, second = (pose_of[one] for one in normal.nonzero())
     beyond = (np.abs(first - second) > 1) & (first >= 0) & (second >= 0)
@@ -225,19 +237,22 @@ def _nodes(normal: csc_array, pose_of: Index, count: int, nodes: int) -> Index:
 
 
 def _stretch(table: csr_array, begin: Index, states: Index, first: int, last: int) -> _Stretch:
-    """Return the poses between two nodes, given these, from normal equations in the order of poses."""
+    """Return the stretch between two nodes, from normal equations sorted by pose."""
+    # 1. the rows of the inner unknowns; they connect only to the nodes and the common unknowns
     start, stop, common = begin[first], begin[last + 1], np.arange(begin[-1], table.shape[0])
     whole = np.concatenate([np.arange(start, stop), common])
     inner = slice(begin[first + 1] - start, begin[last] - start)
     beside = np.delete(np.arange(len(whole)), inner)
     rows = table[begin[first + 1] : begin[last]][:, whole].toarray()
-    # one row more than unknowns: what is known has no error
+    # 2. covariance of the inner unknowns given the others, and their response to the others; the extra last row of zeros
+    # serves components that are known, which have no error
     covariance, gain = np.zeros((len(whole) + 1, len(whole) + 1)), np.zeros((len(whole) + 1, len(beside)))
     gain[beside] = np.eye(len(beside))
     if len(rows):
         covariance[inner, inner] = cho_solve(cho_factor(rows[:, inner]), np.eye(len(rows)))
         gain[inner] = -covariance[inner, inner] @ rows[:, beside]
     added = rows[:, beside].T @ gain[inner]
+    # 3. the same for x, y and heading of each pose
     poses = np.arange(first, last + 1)
     row = np.where(states[poses] < 0, len(whole), states[poses] - start)
     return _Stretch(
@@ -251,7 +266,7 @@ def _stretch(table: csr_array, begin: Index, states: Index, first: int, last: in
 
 
 def _reduced(table: csr_array, kept: Index, stretches: list[_Stretch]) -> csc_array:
-    """Return the normal equations of the unknowns ``kept`` alone."""
+    """Return the normal equations of the unknowns ``kept`` after elimination of all others (Schur complement)."""
     parts = [np.broadcast_arrays(one.added, one.around[:, None], one.around) for one in stretches]
     added, row, column = (np.concatenate([part[axis].ravel() for part in parts]) for axis in range(3))
     place = (np.searchsorted(kept, row), np.searchsorted(kept, column))
@@ -259,12 +274,13 @@ def _reduced(table: csr_array, kept: Index, stretches: list[_Stretch]) -> csc_ar
 
 
 def _joined(table: csr_array, common: int, stretches: list[_Stretch]) -> tuple[Array, Array]:
-    """Return the covariances of all poses, from those given the nodes and those of the nodes."""
+    """Return the covariances of all poses: those given the nodes, plus those of the nodes propagated to the stretches."""
     kept = np.unique(np.concatenate([one.around for one in stretches]))
     factor = NormalFactor.of(_reduced(table, kept, stretches), common)
     last = int(stretches[-1].poses[-1])
     own, following = np.zeros((last + 1, 3, 3)), np.zeros((last, 3, 3))
     for begin in range(0, len(stretches), TOGETHER):
+        # columns of the inverse for the nodes of a few stretches: bounded memory, and few solves
         part = stretches[begin : begin + TOGETHER]
         wanted = np.searchsorted(kept, np.unique(np.concatenate([one.around for one in part])))
         right = np.zeros((len(kept), len(wanted)))
@@ -279,11 +295,16 @@ def _joined(table: csr_array, common: int, stretches: list[_Stretch]) -> tuple[A
     return (own + own.swapaxes(1, 2)) / 2, following
 
 
-# ---------------- Factor of the normal equations of a pose graph
+# ---------------- Factor of the normal equations
 
 
 class NormalFactor(NamedTuple):
-    """A factor of normal equations: of these with their unknowns in some order ``(unknowns,)``; None: in their own."""
+    """A sparse factorisation of normal equations.
+
+    Attributes:
+        lower_upper: LU factors of the equations.
+        order: permutation of the unknowns before the factorisation ``(unknowns,)``; None for none.
+    """
 
     lower_upper: SuperLU
     order: NDArray[np.intp] | None = None
@@ -293,12 +314,12 @@ class NormalFactor(NamedTuple):
         """Factor normal equations.
 
         Args:
-            normal: the normal equations ``(unknowns, unknowns)``.
-            common: so many unknowns, the last ones, are tied to most others, and are eliminated last. The search for a good
-                order takes the square of the time with them.
+            normal: normal equations ``(unknowns, unknowns)``.
+            common: number of unknowns, at the end, that are connected to most others and are eliminated last. With them, the
+                search for a fill-reducing order would take quadratic time.
 
         Raises:
-            MitsonarError: they are singular.
+            MitsonarError: the equations are singular.
         """
         size = normal.shape[0]
         try:
@@ -314,7 +335,7 @@ class NormalFactor(NamedTuple):
             ) from None
 
     def solve(self, right: Array) -> Array:
-        """Return the unknowns ``(unknowns,)`` or ``(unknowns, n)`` of which the normal equations make ``right``."""
+        """Solve the normal equations for a right-hand side ``(unknowns,)`` or ``(unknowns, n)``."""
         if self.order is None:
             return np.asarray(self.lower_upper.solve(right))
         found = np.empty_like(right)
@@ -326,45 +347,41 @@ def _split(normal: csc_array, order: str) -> SuperLU:
     return splu(normal, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-# ---------------- Solution of a pose graph: the poses that agree best with all that is known, and their marginal
-# covariances
-# Sparse Gauss-Newton over x, y [m] and heading [rad]. Errors of consecutive motions may depend on each other (see
-# :mod:`mitsonar.mapping.series`): then each motion has an unknown error of its own, and these errors form a
-# chain of first order. Loops have Cauchy weights until outliers are out.
+# ---------------- Solution
 
 
 ITERATIONS = 50
 SETTLED = 1e-10
-"""Most steps of Gauss-Newton, and the step [m, rad] at which they end."""
+"""Largest number of Gauss-Newton steps, and the step size [m, rad] below which they end."""
 
 CAUCHY = float(chi2.ppf(0.95, 3))
-"""Squared residual over the covariance at which a loop has half its weight."""
+"""Squared normalised residual at which a loop has half its weight."""
 
 OUTLIER = float(chi2.ppf(0.999, 3))
-"""Squared residual over the covariance beyond which a loop is an outlier: of 1,000 true loops one is."""
+"""Squared normalised residual beyond which a loop is an outlier; one of 1,000 true loops exceeds it."""
 
 COLUMNS = 384
-"""Columns of the inverse that are computed at a time."""
+"""Number of columns of the inverse that are computed at a time."""
 
 LONG = 1000
-"""Poses beyond which covariances are those of nodes and of stretches between them."""
+"""Number of poses beyond which covariances are computed by :func:`marginals_by_nodes`."""
 
 STRETCH, NODES = 25, 1000
-"""Poses from one node to the next, and nodes at most, those at the ends of loops not counted."""
+"""Poses from one node to the next, and the largest number of nodes, not counting those at the ends of loops."""
 
 
 @dataclass(frozen=True)
 class GraphSolution:
-    """The poses of a graph.
+    """The solved poses of a graph.
 
     Attributes:
         poses: x, y [m], heading [rad], not wrapped ``(poses, 3)``.
-        kept: which loops agree with all else ``(loops,)``; the others are left out.
-        squared: squared residual of each loop over its own covariance ``(loops,)``, with all poses as solved.
-        factor: of the normal equations.
-        states: place of each unknown among those of the factor; -1 where it is known.
-        normal: the normal equations.
-        pose_of: number of the pose to which each unknown of the factor belongs; -1 where it is common to all.
+        kept: whether each loop agrees with all other measurements ``(loops,)``; the others were left out.
+        squared: squared residual of each loop normalised by its covariance ``(loops,)``, at the solution.
+        factor: factor of the normal equations.
+        states: index of each unknown among those of the factor; -1 where it is known.
+        normal: normal equations at the solution.
+        pose_of: pose to which each unknown of the factor belongs; -1 where it is common to all.
     """
 
     poses: Array
@@ -376,18 +393,21 @@ class GraphSolution:
     pose_of: Index
 
     def columns(self, poses: ArrayLike) -> Array:
-        """Return the covariances of all poses with some of them ``(poses, 3, chosen, 3)``."""
+        """Return the covariances of all poses with the chosen ones ``(poses, 3, chosen, 3)``."""
         chosen = np.atleast_1d(np.asarray(poses, dtype=np.intp))
         wanted = (3 * chosen[:, None] + np.arange(3)).ravel()
         place = self.states[wanted]
         right = np.zeros((self.normal.shape[0], len(wanted)))
         right[place[place >= 0], np.flatnonzero(place >= 0)] = 1.0
-        solution = np.vstack([self.factor.solve(right), np.zeros((1, len(wanted)))])  # the last row: what is known
+        solution = np.vstack([self.factor.solve(right), np.zeros((1, len(wanted)))])  # the last row: known components
         count = 3 * len(self.poses)
         return np.asarray(solution[self.states[:count]].reshape(-1, 3, len(chosen), 3))
 
     def covariances(self) -> tuple[Array, Array]:
-        """Return the marginal covariances of poses ``(poses, 3, 3)``, and those with the next pose ``(poses - 1, 3, 3)``."""
+        """Return the marginal covariances of poses ``(poses, 3, 3)``, and those with the next pose ``(poses - 1, 3, 3)``.
+
+        Long graphs use :func:`marginals_by_nodes`, short ones the columns of the inverse.
+        """
         count = len(self.poses)
         if count > LONG:
             nodes = min(NODES, count // STRETCH + 1)
@@ -402,7 +422,12 @@ class GraphSolution:
         return (own + own.swapaxes(1, 2)) / 2, following
 
     def motion_covariances(self, own: Array, following: Array) -> Array:
-        """Return the covariances of motions from pose to pose ``(poses - 1, 3, 3)``, from :meth:`covariances`."""
+        """Return the covariances of the motions between consecutive poses ``(poses - 1, 3, 3)``.
+
+        Args:
+            own: marginal covariances of the poses, from :meth:`covariances`.
+            following: covariances of each pose with the next, from :meth:`covariances`.
+        """
         first = np.arange(len(self.poses) - 1)
         by_first, by_second = motion_derivatives(self.poses, first, first + 1)
         cross = by_first @ following @ by_second.swapaxes(1, 2)
@@ -411,15 +436,20 @@ class GraphSolution:
 
 
 def solved(graph: PoseGraph) -> GraphSolution:
-    """Solve a graph: outlying loops are found with Cauchy weights, and left out of the solution.
+    """Solve a pose graph for the poses that agree best with all measurements, by sparse Gauss-Newton.
+
+    Loops have Cauchy weights until no outlier is left; outliers are left out of the solution. If errors of consecutive
+    motions are correlated (see :mod:`mitsonar.mapping.series`), the errors themselves are unknowns that form a first-order
+    chain.
 
     Raises:
-        MitsonarError: covariances that are not positive, or poses that nothing ties.
+        MitsonarError: a covariance is not positive definite, or some poses are not connected by any measurement.
     """
     kept = np.ones(len(graph.loops.first), dtype=bool)
     poses = graph.start
     while True:
         asked = replace(graph, loops=graph.loops.at(kept))
+        # robust solution: drop the outliers among the loops, and repeat without them
         if kept.any():
             poses = _gauss_newton(asked, poses, robust=True)[0]
             squared = _squared(graph.loops, poses)
@@ -427,13 +457,14 @@ def solved(graph: PoseGraph) -> GraphSolution:
             if out.any():
                 kept &= ~out
                 continue
+        # final solution with full weights, whose normal equations give the covariances
         poses, normal, factor, states = _gauss_newton(asked, poses, robust=False)
         pose_of = asked.pose_of[states >= 0]
         return GraphSolution(poses, kept, _squared(graph.loops, poses), factor, states, normal, pose_of)
 
 
 def _squared(edges: PoseEdges, poses: Array) -> Array:
-    """Return the squared residuals of edges over their covariances ``(edges,)``."""
+    """Return the squared residuals of edges, normalised by their covariances ``(edges,)``."""
     return np.asarray((_residuals(edges, poses) ** 2).sum(axis=1))
 
 
@@ -445,7 +476,7 @@ def _residuals(edges: PoseEdges, poses: Array) -> Array:
 
 
 def motion_derivatives(poses: Array, first: ArrayLike, second: ArrayLike) -> tuple[Array, Array]:
-    """Return the derivatives of motions by the first and the second pose, each ``(edges, 3, 3)``."""
+    """Return the derivatives of motions by their first and second poses, each ``(edges, 3, 3)``."""
     there = poses[np.asarray(second)]
     sideways, forward, _ = relative_motions(poses, first, second).T
     sin, cos = np.sin(there[:, 2]), np.cos(there[:, 2])
@@ -456,11 +487,12 @@ def motion_derivatives(poses: Array, first: ArrayLike, second: ArrayLike) -> tup
     return by_first, by_second
 
 
-# ---------------------------------------------------------------- Gauss-Newton
+# ---------------- Gauss-Newton
 
 
 def _gauss_newton(graph: PoseGraph, start: Array, *, robust: bool) -> tuple[Array, csc_array, NormalFactor, Index]:
-    """Return the poses, the normal equations there, their factor, and the place of each unknown."""
+    """Return the poses, the normal equations there, their factor, and the index of each unknown (-1: known)."""
+    # known components of the first pose are no unknowns; unknowns common to all poses are eliminated last in long graphs
     total = 3 * len(start) + graph.unknown_errors
     unknown = np.ones(total, dtype=bool)
     unknown[:3] = np.diag(graph.at_start) > 0
@@ -481,7 +513,7 @@ def _gauss_newton(graph: PoseGraph, start: Array, *, robust: bool) -> tuple[Arra
 def _normal_equations(
     graph: PoseGraph, poses: Array, errors: Array, unknown: NDArray[np.bool_], *, robust: bool
 ) -> tuple[csc_array, Array]:
-    """Return the matrix and the right side of the equations of a step of the unknowns."""
+    """Return the matrix and the right-hand side of the normal equations of a Gauss-Newton step."""
     jacobian, residual = _linearised(graph, poses, errors, robust=robust)
     jacobian = jacobian[:, unknown]
     return csc_array(jacobian.T @ jacobian), -(jacobian.T @ residual)
@@ -496,7 +528,12 @@ class _Rows:
         self.residuals: list[Array] = []
 
     def add(self, residual: Array, *blocks: tuple[Index, Array]) -> None:
-        """Add residuals ``(n, rows)``; each block has first states ``(n,)`` and derivatives ``(n, rows, states)``."""
+        """Add residuals ``(n, rows)``.
+
+        Args:
+            residual: residuals in standard deviations ``(n, rows)``.
+            blocks: pairs of the first state ``(n,)`` and the derivatives by it and the following ones ``(n, rows, states)``.
+        """
         number, high = residual.shape
         row = self.count + np.arange(number * high).reshape(number, high, 1)
         for first, values in blocks:
@@ -533,7 +570,7 @@ def _linearised(graph: PoseGraph, poses: Array, errors: Array, *, robust: bool) 
 
 
 def _add_start(rows: _Rows, graph: PoseGraph, poses: Array) -> None:
-    """Add what is known of those components of the first pose that are unknown."""
+    """Add the prior of those components of the first pose that are not known exactly."""
     free = np.flatnonzero(np.diag(graph.at_start) > 0)
     if free.size:
         whitening = np.linalg.inv(np.linalg.cholesky(graph.at_start[np.ix_(free, free)]))
@@ -544,7 +581,7 @@ def _add_start(rows: _Rows, graph: PoseGraph, poses: Array) -> None:
 
 
 def _add_edges(rows: _Rows, edges: PoseEdges, poses: Array, weight: Array) -> None:
-    """Add the residuals of edges with independent errors, times the roots of their weights."""
+    """Add the residuals of edges with independent errors, times ``weight``, the square roots of their weights."""
     whitening = edges.whitening * weight[:, None, None]
     by_first, by_second = motion_derivatives(poses, edges.first, edges.second)
     rows.add(
@@ -555,7 +592,7 @@ def _add_edges(rows: _Rows, edges: PoseEdges, poses: Array, weight: Array) -> No
 
 
 def _add_biased(rows: _Rows, edges: PoseEdges, bias: Array, poses: Array, size: Array) -> None:
-    """Add the residuals of edges that share a bias, and its own; it is the last unknown."""
+    """Add the residuals of edges that share a bias, and the prior of the bias, which is the last unknown."""
     whitening, last = edges.whitening, np.array([rows.states - 1])
     by_first, by_second = motion_derivatives(poses, edges.first, edges.second)
     by_bias = whitening @ bias[..., None]
@@ -569,7 +606,8 @@ def _add_biased(rows: _Rows, edges: PoseEdges, bias: Array, poses: Array, size: 
 
 
 def _add_correlated(rows: _Rows, edges: PoseEdges, correlated: CorrelatedErrors, poses: Array, errors: Array) -> None:
-    """Add the residuals of the chain, its errors that wander, and its slopes, all in standard deviations."""
+    """Add the residuals of the chain, of its wandering errors, and of its slopes, all in standard deviations."""
+    # 1. motions: the independent part of their errors whitens the residuals; the shared part and the slopes are unknowns
     count = len(edges.first)
     wander, slopes = errors[: 3 * count].reshape(-1, 3), errors[3 * count : 3 * count + 9]
     own = 1 / np.sqrt(1 - correlated.share)
@@ -586,6 +624,7 @@ def _add_correlated(rows: _Rows, edges: PoseEdges, correlated: CorrelatedErrors,
         (begin + 3 * number, common),
         (np.full(count, begin + 3 * count), by_slopes),
     )
+    # 2. the wandering errors are a first-order chain with unit variance: the first one, then the innovation of each next
     rows.add(wander[:1], (np.array([begin]), np.eye(3)[None]))
     fresh = 1 / np.sqrt(1 - correlated.onward**2)
     along = (fresh * correlated.onward)[:, None, None] * np.eye(3)
@@ -594,4 +633,5 @@ def _add_correlated(rows: _Rows, edges: PoseEdges, correlated: CorrelatedErrors,
         (begin + 3 * number[:-1], -along),
         (begin + 3 * number[1:], fresh[:, None, None] * np.eye(3)),
     )
+    # 3. the slopes have unit variance
     rows.add(slopes[None], (np.array([begin + 3 * count]), np.eye(9)[None]))

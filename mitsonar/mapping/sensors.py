@@ -1,4 +1,4 @@
-"""Sensors of a vehicle from the topics of a ROS bag: IMU and velocities, with the covariances that their messages tell."""
+"""How the readings of vehicle sensors are opened from a file or a ROS bag, or simulated along a true path."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ Array = NDArray[np.float64]
 
 IMU = "sensor_msgs/msg/Imu"
 TWISTS = ("geometry_msgs/msg/TwistWithCovarianceStamped", "nav_msgs/msg/Odometry")
-"""Types of messages of gyroscopes, and of velocities; the first type that a bag has counts."""
+"""Message types of gyroscopes and of velocities; the first type of velocities that a bag holds is used."""
 
 DOWN = ("ned", "frd")
-"""Ends of the names of frames whose axes are forward, starboard, down; the others are forward, port, up (REP 103)."""
+"""Suffixes of the names of frames with axes forward, starboard, down; all others are forward, port, up (REP 103)."""
 
 TRAJECTORY = "trajectory.csv"
-"""The file of a folder whose columns may hold readings."""
+"""File in a folder that may have columns of readings."""
 
 LARGEST = 1e6
-"""Largest time step, velocity, rate and variance that counts."""
+"""Largest velocity, rate and variance of a reading that is used."""
 
 
 def open_sensors(path: str | Path) -> VehicleSensors:
     """Open the sensors of a CSV file (:func:`mitsonar.motion.sensors.load_sensors`) or of a ROS bag.
 
     Args:
-        path: of either, or a folder that holds ``trajectory.csv``, with columns of sensors.
+        path: path of either, or of a folder with a ``trajectory.csv`` that has columns of sensors.
 
     Raises:
-        MitsonarError: unreadable, or without readings.
+        MitsonarError: the file cannot be read, or holds no readings.
     """
     where = Path(path)
     if os.path.isdir(where) and not is_ros_bag(where, b""):
@@ -64,14 +64,15 @@ def open_sensors(path: str | Path) -> VehicleSensors:
 
 
 def sensors_in_bag(path: str | Path) -> VehicleSensors:
-    """Read the gyroscope and the velocities of a ROS bag, by the times in the headers of the messages.
+    """Read the gyroscope and the velocities of a ROS bag, with the covariances in the messages.
 
-    The gyroscope is the only topic of ``sensor_msgs/Imu``. Velocities are of the only topic of
-    ``geometry_msgs/TwistWithCovarianceStamped``, or else of ``nav_msgs/Odometry``. The vehicle is taken for level, and the
-    sensors for mounted along its axes. Readings count whose variance is told, and above 0.
+    Times are those in the headers of the messages. The gyroscope is the only topic of type ``sensor_msgs/Imu``. Velocities
+    are those of the only topic of type ``geometry_msgs/TwistWithCovarianceStamped``, or else ``nav_msgs/Odometry``. The
+    vehicle is assumed to be level, and the sensors to be mounted along its axes. Only readings with a variance above 0 are
+    used.
 
     Raises:
-        MitsonarError: a damaged bag, several topics of a kind, or none whose messages tell a covariance.
+        MitsonarError: the bag is damaged, has several topics of a type, or none whose messages hold a covariance.
     """
     bag = BagFile(path)
     topics = [one for one in bag.topics() if one.messages]
@@ -86,7 +87,7 @@ def sensors_in_bag(path: str | Path) -> VehicleSensors:
 
 
 def _gyroscope(bag: BagFile, topics: list[Topic]) -> Readings | None:
-    """Return the yaw rates of the only IMU; None without one that tells its noise."""
+    """Return the yaw rates of the only IMU; None if there is no IMU that reports its noise."""
     topic = _only(bag, topics, IMU)
     if topic is None:
         return None
@@ -97,13 +98,13 @@ def _gyroscope(bag: BagFile, topics: list[Topic]) -> Readings | None:
     table = _sound(rows, 3)
     if table is None:
         return None
-    # a variance of each reading is a noise density by the time between readings
+    # the variance of a reading times the time between readings is the squared noise density
     step = float(np.median(np.diff(table[:, 0])))
     return Readings(table[:, 0], table[:, 1], np.sqrt(table[:, 2] * step))
 
 
 def _velocities(bag: BagFile, topics: list[Topic]) -> tuple[Readings | None, Readings | None]:
-    """Return velocities to starboard and forward; None without a topic that tells their noise."""
+    """Return the velocities to starboard and forward; None if there is no topic that reports their noise."""
     topic = next((one for one in (_only(bag, topics, kind) for kind in TWISTS) if one is not None), None)
     if topic is None:
         return None, None
@@ -120,7 +121,7 @@ def _velocities(bag: BagFile, topics: list[Topic]) -> tuple[Readings | None, Rea
 
 
 def _only(bag: BagFile, topics: list[Topic], kind: str) -> Topic | None:
-    """Return the only topic of a type; None without one."""
+    """Return the only topic of a type; None if there is none."""
     these = [one for one in topics if one.kind == kind]
     if len(these) > 1:
         names = ", ".join(one.name for one in these)
@@ -134,7 +135,7 @@ def _messages(bag: BagFile, topic: Topic) -> Iterator[Message]:
 
 
 def _up(frame: object) -> float:
-    """Return 1 where the axes of a frame are forward, port, up; -1 where they are forward, starboard, down."""
+    """Return 1 if the axes of a frame are forward, port, up; -1 if they are forward, starboard, down."""
     return -1.0 if re.split("[_/]", str(frame).lower())[-1] in DOWN else 1.0
 
 
@@ -144,7 +145,10 @@ def _seconds(message: Message) -> float:
 
 
 def _sound(rows: array[float], width: int) -> Array | None:
-    """Return readings in the order of their times ``(n, width)``: time, then value and variance by turns; None below two."""
+    """Return the valid readings in order of time ``(n, width)``; None if there are fewer than two.
+
+    The columns are the time, and alternately a value and its variance.
+    """
     table = np.array(rows, dtype=float).reshape(-1, width)
     values, variances = table[:, 1::2], table[:, 2::2]
     good = np.isfinite(table).all(axis=1) & (np.abs(values) < LARGEST).all(axis=1)
@@ -154,22 +158,21 @@ def _sound(rows: array[float], width: int) -> Array | None:
     return table if len(table) >= 2 else None
 
 
-# ---------------- Readings that sensors of given noise would have along a true path: for tests, benchmarks and what-
-# if runs
+# ---------------- Simulated sensors
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Noise of the sensors that a vehicle has; None: it has no such sensor.
+    """Noise of the sensors of a vehicle; None where it has no such sensor.
 
     Attributes:
-        gyro_deg_rth: noise of the gyroscope [deg/h^0.5].
-        gyro_bias_deg_h: standard deviation of its constant bias [deg/h].
+        gyro_deg_rth: angle random walk of the gyroscope [deg/h^0.5].
+        gyro_bias_deg_h: standard deviation of the constant bias of the gyroscope [deg/h].
         velocity_m_s: standard deviation of each velocity of a DVL [m/s].
-        depth_m: of each depth [m].
-        compass_deg: of each heading [deg].
-        walk: of dead reckoning, after a second [m, deg].
-        rate_hz: readings a second of each sensor.
+        depth_m: standard deviation of each depth [m].
+        compass_deg: standard deviation of each heading [deg].
+        walk: random walk of dead reckoning after one second [m, deg].
+        rate_hz: readings per second of each sensor [Hz].
     """
 
     gyro_deg_rth: float | None = None
@@ -182,13 +185,20 @@ class SensorNoise:
 
 
 def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> VehicleSensors:
-    """Draw the readings of sensors along a true path.
+    """Simulate the readings of noisy sensors along a true path, for tests, benchmarks and what-if runs.
 
-    A reading of a rate or a velocity is the mean around its time; between the poses of the path they are constant.
+    A reading of a rate or a velocity is the mean over the interval around its time. Rates and velocities are constant
+    between the poses of the path.
+
+    Args:
+        true: true path of the vehicle.
+        noise: noise of its sensors.
+        seed: seed of the noise.
 
     Raises:
-        MitsonarError: no sensor, a path shorter than a reading, a rate that is not above 0.
+        MitsonarError: there is no sensor, the path is shorter than a reading, or the rate is not above 0.
     """
+    # 1. intervals of the readings, and the true motion over each
     span = float(true.time_s[-1] - true.time_s[0])
     if not (noise.rate_hz > 0 and span * noise.rate_hz >= 1):
         raise MitsonarError(f"a path of {span:g} s is too short for {noise.rate_hz:g} readings a second")
@@ -198,9 +208,10 @@ def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> Ve
     step, time = np.diff(edges), (edges[1:] + edges[:-1]) / 2
     on_edges = straight_poses(true, edges)
     moved = motions(on_edges)
-    # every draw is made, so that a sensor's errors do not depend on which others there are
+    # 2. draw the noise of all sensors, so that the errors of one do not depend on which others there are
     draws = rng.normal(size=(7, count))
     bias = rng.normal()
+    # 3. rates and velocities: mean over the interval, with motions turned into the axes half-way through it
     yaw_rate = sideways = forward = depth = heading = dead = None
     bias_std = noise.gyro_bias_deg_h * np.radians(1) / 3600
     if noise.gyro_deg_rth is not None:
@@ -212,6 +223,7 @@ def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> Ve
         sin, cos = np.sin(moved[:, 2] / 2), np.cos(moved[:, 2] / 2)
         sideways = Readings(time, (moved[:, 0] * cos + moved[:, 1] * sin) / step + std * draws[1], std)
         forward = Readings(time, (moved[:, 1] * cos - moved[:, 0] * sin) / step + std * draws[2], std)
+    # 4. depth, compass and dead reckoning at the times themselves
     at = straight_poses(true, time)
     if noise.depth_m is not None:
         depth = Readings(time, -at[:, 2] + noise.depth_m * draws[3], np.full(count, noise.depth_m))
@@ -224,9 +236,9 @@ def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> Ve
 
 
 def _simulated_reckoning(poses: Array, time_s: Array, walk: tuple[float, float], draws: Array) -> DeadReckoning:
-    """Return poses whose position and heading wander from the true ones."""
+    """Return dead reckoning whose position and heading wander from the true ones as a random walk."""
     off = np.cumsum(np.sqrt(np.diff(time_s))[:, None] * [walk[0], walk[0], np.radians(walk[1])] * draws, axis=0)
-    # the walk turns with the vehicle: what it adds is of the motion, in axes of the path
+    # the walk adds to the motions, in axes that turn with the vehicle
     moved = motions(poses) + np.diff(off, axis=0, prepend=0)
     wandered = path_of(moved, Pose.from_row(poses[0]), time_s)
     return DeadReckoning(wandered, walk[0], float(np.radians(walk[1])))

@@ -1,4 +1,8 @@
-"""Motions between consecutive frames with their errors: composed to a path (Almanza-Medina, eq. 3.4), and scaled."""
+"""How motions between consecutive frames become a path, and how the errors of the path follow from theirs.
+
+A :class:`MotionSeries` holds motions with their covariances. Functions here compose it to a path (Almanza-Medina, eq. 3.4),
+scale it, smooth it, and propagate its covariances to those of the poses, with errors that may be correlated.
+"""
 
 from __future__ import annotations
 
@@ -42,19 +46,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MotionSeries:
-    """Motions between consecutive frames, and what is known of their errors.
+    """Motions between consecutive frames, with the statistics of their errors.
 
     Attributes:
         motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)`` (eq. 3.4).
-        time_s: of the frames ``(frames,)``, increasing, not necessarily evenly.
-        covariances: of the errors of the motions ``(frames - 1, 3, 3)`` [m, m, rad], where known.
+        time_s: times of the frames ``(frames,)`` [s], increasing, not necessarily evenly spaced.
+        covariances: covariances of the errors of the motions ``(frames - 1, 3, 3)`` [m, m, rad], if known.
         valid: False where a motion and its covariance must not be used ``(frames - 1,)``; None: all are valid.
-        with_next: covariance of each motion's error (rows) with that of the next (columns) ``(frames - 2, 3, 3)``. Errors
-            further apart depend on each other only through those between (Markov). None: errors are independent.
+        with_next: covariance of the error of each motion (rows) with that of the next (columns) ``(frames - 2, 3, 3)``.
+            Errors further apart depend on each other only through those between (Markov). None: errors are independent.
 
     Raises:
-        MitsonarError: shapes that do not fit, times that do not increase, no valid motion, or a valid motion that is not
-            finite or has no valid covariance.
+        MitsonarError: shapes do not fit, times do not increase, no motion is valid, or a valid motion is not finite or has
+            no valid covariance.
     """
 
     motions: Array
@@ -99,7 +103,7 @@ class MotionSeries:
             )
 
     def __len__(self) -> int:
-        """Return the number of motions: one less than frames."""
+        """Return the number of motions, one less than the number of frames."""
         return len(self.time_s) - 1
 
     @classmethod
@@ -117,7 +121,7 @@ class MotionSeries:
 
     @cached_property
     def believed(self) -> NDArray[np.bool_]:
-        """Return which motions are valid ``(frames - 1,)``."""
+        """Return whether each motion is valid ``(frames - 1,)``."""
         return np.ones(len(self), dtype=bool) if self.valid is None else self.valid
 
     @cached_property
@@ -127,31 +131,31 @@ class MotionSeries:
 
     @cached_property
     def middle_s(self) -> Array:
-        """Return the time half-way through each motion ``(frames - 1,)`` [s], at which it has its mean velocity."""
+        """Return the time half-way through each motion ``(frames - 1,)`` [s], to which its mean velocity is assigned."""
         return (self.time_s[1:] + self.time_s[:-1]) / 2
 
     @cached_property
     def velocity(self) -> Array:
-        """Return the mean velocity of each motion in the vehicle's frame ``(frames - 1, 3)`` [m/s, m/s, rad/s]."""
+        """Return the mean velocity of each motion in the vehicle frame ``(frames - 1, 3)`` [m/s, m/s, rad/s]."""
         return self.motions / self.step_s[:, None]
 
 
-# ---------------------------------------------------------------- composition
+# ---------------- Composition
 
 
 def path_of(motions: ArrayLike, start: Pose, time_s: ArrayLike) -> Trajectory:
-    """Compose motions to a path from ``start`` (Almanza-Medina, eq. 3.4).
+    """Compose motions to a path that begins at ``start`` (Almanza-Medina, eq. 3.4).
 
     Each step is :func:`mitsonar.motion.composition.compose`; :func:`mitsonar.motion.composition.motions` is the inverse.
     Height, pitch and roll stay those of ``start``.
 
     Args:
         motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)``.
-        start: the first pose.
-        time_s: of the frames ``(frames,)`` [s].
+        start: first pose.
+        time_s: times of the frames ``(frames,)`` [s].
 
     Raises:
-        MitsonarError: shapes that do not fit, a motion that is not finite, times that do not increase.
+        MitsonarError: shapes do not fit, a motion is not finite, or times do not increase.
     """
     series = MotionSeries(np.asarray(motions, dtype=float), np.asarray(time_s, dtype=float))
     sideways, forward, yaw = series.motions.T
@@ -164,16 +168,16 @@ def path_of(motions: ArrayLike, start: Pose, time_s: ArrayLike) -> Trajectory:
     return Trajectory(poses, series.time_s)
 
 
-# ---------------------------------------------------------------- scale
+# ---------------- Scale
 
 
 def scaled(measured: MotionSeries, factors: ArrayLike) -> MotionSeries:
     """Multiply motions and their covariances by a factor for each of sideways, forward, yaw ``(3,)``.
 
-    Almanza-Medina takes 2.3 for sideways (3.5.2), and 9.0 for sideways with 4.0 for forward (3.5.3).
+    Almanza-Medina uses 2.3 for sideways (3.5.2), and 9.0 for sideways with 4.0 for forward (3.5.3).
 
     Raises:
-        MitsonarError: not three finite factors.
+        MitsonarError: the factors are not three finite numbers.
     """
     factor = np.asarray(factors, dtype=float)
     if factor.shape != (3,) or not np.isfinite(factor).all():
@@ -184,13 +188,13 @@ def scaled(measured: MotionSeries, factors: ArrayLike) -> MotionSeries:
 
 
 def fit_scale(estimated: ArrayLike, true: ArrayLike) -> Array:
-    """Fit the factors ``(3,)`` from estimated to true motions, both ``(frames - 1, 3)``.
+    """Fit the factors ``(3,)`` that scale estimated to true motions, both ``(frames - 1, 3)``.
 
-    Each axis is fitted by least squares through the origin. An axis whose estimates are all zero keeps the factor 1. Noise
-    in the estimates lowers a factor by signal / (signal + noise) power.
+    Each axis is fitted by least squares through the origin. An axis whose estimates are all zero has factor 1. Noise in the
+    estimates biases a factor low, by the ratio of signal power to signal plus noise power.
 
     Raises:
-        MitsonarError: motions of different shapes, or not finite.
+        MitsonarError: the motions differ in shape, or are not finite.
     """
     e, t = np.asarray(estimated, dtype=float), np.asarray(true, dtype=float)
     if e.shape != t.shape or e.ndim != 2 or e.shape[1] != 3 or not (np.isfinite(e).all() and np.isfinite(t).all()):
@@ -201,41 +205,41 @@ def fit_scale(estimated: ArrayLike, true: ArrayLike) -> Array:
     return np.where(power > 0, (e * t).sum(axis=0) / np.where(power > 0, power, 1), 1.0)
 
 
-# ---------------- Smoothing of motions: by a weighted spline, or by a Kalman filter with RTS smoother
+# ---------------- Smoothing: weighted spline
 # Almanza-Medina composes estimates without smoothing (3.5.1, 4.4.4, 5.4.5), and leaves splines and Kalman filters to
-# further work (6.2).
+# future work (6.2).
 
 
 FEWEST_FOR_SPLINE = 5
-"""Fewest motions that SciPy's smoothing spline takes; fewer are joined by straight lines."""
+"""Smallest number of motions that SciPy's smoothing spline accepts; fewer are interpolated linearly."""
 
 LONGEST_PERIOD = 2000.0
-"""Longest period [motions]: beyond, the spline is a straight line, and SciPy's equations lose their digits (from 6000)."""
-
-
-# ---------------------------------------------------------------- splines
+"""Longest period [motions]; beyond, the spline is a straight line, and from 6000 SciPy's equations lose precision."""
 
 
 def spline_smoothed(measured: MotionSeries, period_s: ArrayLike | None = None) -> MotionSeries:
-    """Smooth the velocities, axis by axis, by a cubic spline; bridge invalid motions.
+    """Smooth the velocities, axis by axis, with a cubic spline, and bridge invalid motions.
 
     The weights are the inverse variances of the estimates; without covariances all motions weigh the same. Henson and
     Zakharov, whose method Almanza-Medina compares with (3.4.8, 3.5.3), integrate such splines. Before the first and after
-    the last valid motion the velocity is constant. Fewer than five valid motions are not smoothed, but joined by straight
-    lines. The smoothed motions have no covariance; those of :func:`kalman_smoothed` have one.
+    the last valid motion the velocity is constant. Fewer than five valid motions are interpolated linearly, without
+    smoothing. The smoothed motions have no covariance; those of :func:`kalman_smoothed` do.
 
     Args:
-        measured: the motions.
-        period_s: an oscillation of this period [s] keeps half of its amplitude, faster ones less; one number, or one an
-            axis ``(3,)``. Default: :func:`spline_period`. At most 2,000 motions: there the spline is a straight line.
+        measured: motions to smooth.
+        period_s: period [s] of an oscillation whose amplitude is halved; faster ones are damped more. One number, or one per
+            axis ``(3,)``. Default: :func:`spline_period`. It is capped at 2,000 motions, where the spline is a straight
+            line.
 
     Raises:
-        MitsonarError: a period that is not positive, or a variance that is not.
+        MitsonarError: a period or a variance is not positive.
     """
+    # 1. fallback for few motions: linear interpolation of the velocities
     known, abscissa, weight = _spline_data(measured)
     velocity = np.column_stack(
         [np.interp(measured.middle_s, measured.middle_s[known], v[known]) for v in measured.velocity.T]
     )
+    # 2. the spline, over times in units of the mean gap; clipping them holds the velocity constant beyond the ends
     if known.size >= FEWEST_FOR_SPLINE:
         gap = _mean_gap(measured, known)
         period = np.asarray(spline_period(measured) if period_s is None else period_s, dtype=float)
@@ -251,13 +255,13 @@ def spline_smoothed(measured: MotionSeries, period_s: ArrayLike | None = None) -
 
 
 def spline_period(measured: MotionSeries) -> Array:
-    """Choose the period ``(3,)`` [s] at which :func:`spline_smoothed` halves an oscillation.
+    """Choose the periods ``(3,)`` [s] at which :func:`spline_smoothed` halves an oscillation.
 
-    Each axis is chosen by generalised cross validation (Craven and Wahba, 1979), between two and 2,000 motions. SciPy's own
-    choice changes with the unit of time, and ignores the weights of the residuals.
+    The period of each axis is chosen by generalised cross validation (Craven and Wahba, 1979), between two and 2,000
+    motions. SciPy's choice depends on the unit of time, and ignores the weights of the residuals.
 
     Raises:
-        MitsonarError: fewer than five valid motions.
+        MitsonarError: fewer than five motions are valid.
     """
     known, abscissa, weight = _spline_data(measured)
     if known.size < FEWEST_FOR_SPLINE:
@@ -272,7 +276,7 @@ def spline_period(measured: MotionSeries) -> Array:
 
 
 def _spline_data(measured: MotionSeries) -> tuple[NDArray[np.intp], Array, Array]:
-    """Return which motions are valid, their times (mean gap 1) and their weights for each axis (mean 1)."""
+    """Return the indices of the valid motions, their times (mean gap 1) and their weights on each axis (mean 1)."""
     known = np.flatnonzero(measured.believed)
     weight = np.broadcast_to(measured.step_s[known, None] ** 2, (known.size, 3))
     if measured.covariances is not None:
@@ -287,26 +291,33 @@ def _mean_gap(measured: MotionSeries, known: NDArray[np.intp]) -> float:
 
 
 def _strength(period: Array) -> Array:
-    """Return the factor of the integral of f''^2 that halves an oscillation of a period [mean gaps]; weights of mean 1."""
+    """Return the weight of the integral of f''^2 that halves an oscillation of this period [mean gaps].
+
+    The weights of the residuals have mean 1.
+    """
     return (period / (2 * np.pi)) ** 4
 
 
 def _generalised_cross_validation(x: Array, y: Array, w: Array, strength: Array) -> Array:
     """Score smoothing splines of many strengths ``(many, axes)`` through y ``(n, axes)`` with weights w.
 
-    In Reinsch's form: with B = R + strength S, S = Q'W^-1Q and B c = Q'y, the residuals are strength W^-1 Q c, and the trace
-    of (1 - hat matrix) is that of strength B^-1 S.
+    In Reinsch's form, with B = R + strength S, S = Q'W^-1Q and B c = Q'y, the residuals are strength W^-1 Q c, and the trace
+    of (1 - hat matrix) is the trace of strength B^-1 S. The strength cancels in the score.
     """
+    # 1. columns of Q: weighted second differences
     h = np.diff(x)[:, None]
-    a, c = 1 / h[:-1], 1 / h[1:]  # Q takes second differences: its columns are a, b, c
+    a, c = 1 / h[:-1], 1 / h[1:]
     b = -(a + c)
-    r, s = np.zeros((3, len(a), 1)), np.zeros((3, len(a), y.shape[1]))  # diagonals: the main one, and those above
+    # 2. diagonals of R and S: the main one and the two above, since both are symmetric and banded
+    r, s = np.zeros((3, len(a), 1)), np.zeros((3, len(a), y.shape[1]))
     r[0], r[1, :-1] = (h[:-1] + h[1:]) / 3, h[1:-1] / 6
     s[0] = a**2 / w[:-2] + b**2 / w[1:-1] + c**2 / w[2:]
     s[1, :-1] = b[:-1] * a[1:] / w[1:-2] + c[:-1] * b[1:] / w[2:-1]
     s[2, :-2] = c[:-2] * a[2:] / w[2:-2]
+    # 3. solve for the curvature c, and find the same diagonals of B^-1, which suffice for the trace
     s = s[:, :, None]
     curve, inverse = _five_diagonals(r[:, :, None] + strength * s, a * y[:-2] + b * y[1:-1] + c * y[2:])
+    # 4. weighted sum of squared residuals c'Sc, and trace of B^-1 S; off-diagonals count twice
     misfit, free = (s[0] * curve * curve).sum(axis=0), (s[0] * inverse[0]).sum(axis=0)
     for k in (1, 2):
         misfit += 2 * (s[k, :-k] * curve[:-k] * curve[k:]).sum(axis=0)
@@ -317,18 +328,20 @@ def _generalised_cross_validation(x: Array, y: Array, w: Array, strength: Array)
 def _five_diagonals(band: Array, right: Array) -> tuple[Array, Array]:
     """Solve symmetric equations with five diagonals (Hutchinson and de Hoog, 1985).
 
-    ``band`` is the main diagonal and the two above ``(3, n, many, axes)``. Return the solution ``(n, many, axes)`` and the
-    same diagonals of the inverse.
+    ``band`` holds the main diagonal and the two above ``(3, n, many, axes)``. Return the solution ``(n, many, axes)`` and
+    the same diagonals of the inverse.
     """
     _, n, *many = band.shape
-    d, z, l1, l2 = np.zeros((4, n + 2, *many))  # B = L d L', L z = right; two zeros before the first
+    # 1. forward: factor B = L d L' and solve L z = right; two leading zeros avoid special cases
+    d, z, l1, l2 = np.zeros((4, n + 2, *many))
     for i in range(2, n + 2):
         d[i] = band[0, i - 2] - l1[i - 1] ** 2 * d[i - 1] - l2[i - 2] ** 2 * d[i - 2]
         z[i] = right[i - 2] - l1[i - 1] * z[i - 1] - l2[i - 2] * z[i - 2]
         l1[i] = (band[1, i - 2] - l1[i - 1] * d[i - 1] * l2[i - 1]) / d[i]
         l2[i] = band[2, i - 2] / d[i]
     d, z, l1, l2 = d[2:], z[2:], l1[2:], l2[2:]
-    solution, inverse = np.zeros((n + 2, *many)), np.zeros((3, n + 2, *many))  # two zeros after the last
+    # 2. backward: substitute, and find the band of the inverse from the rows below; two trailing zeros
+    solution, inverse = np.zeros((n + 2, *many)), np.zeros((3, n + 2, *many))
     for i in range(n - 1, -1, -1):
         solution[i] = z[i] / d[i] - l1[i] * solution[i + 1] - l2[i] * solution[i + 2]
         inverse[2, i] = -l1[i] * inverse[1, i + 1] - l2[i] * inverse[0, i + 2]
@@ -337,24 +350,24 @@ def _five_diagonals(band: Array, right: Array) -> tuple[Array, Array]:
     return solution[:-2], inverse[:, :-2]
 
 
-# ---------------------------------------------------------------- Kalman filter
+# ---------------- Smoothing: Kalman filter and RTS smoother
 
 
 def kalman_smoothed(measured: MotionSeries, wander: ArrayLike | None = None) -> MotionSeries:
-    """Estimate motions and covariances from all measurements: Kalman filter and Rauch-Tung-Striebel smoother.
+    """Smooth motions with a Kalman filter and a Rauch-Tung-Striebel smoother, and estimate their covariances.
 
-    The state is the velocity in the vehicle's frame (sideways, forward, yaw). From the middle of one motion to that of the
-    next it is a random walk, independent on each axis, with no prior. A measured motion is velocity times its time, with its
-    whole 3 x 3 covariance. Invalid motions are filled in. ``with_next`` of the result holds the covariances of consecutive
-    errors; without them the covariance of the pose would be too small.
+    The state is the velocity in the vehicle frame (sideways, forward, yaw). Between the middles of consecutive motions it is
+    a random walk, independent on each axis, with no prior. A measured motion is the velocity times the duration of the
+    motion, with its full 3 x 3 covariance. Invalid motions are filled in. ``with_next`` of the result holds the covariances
+    of consecutive errors; without them the covariances of the poses would be too small.
 
     Args:
-        measured: the motions; where they have no covariances, :func:`fit_noise` estimates one for all.
-        wander: standard deviation of the random walk after a second: [m/s, m/s, rad/s] per root second ``(3,)``; it grows
-            with the root of time. Default: :func:`fit_wander`.
+        measured: motions to smooth; without covariances, :func:`fit_noise` estimates one for all of them.
+        wander: standard deviation of the random walk after one second ``(3,)`` [m/s, m/s, rad/s per root second]; it grows
+            with the square root of time. Default: :func:`fit_wander`.
 
     Raises:
-        MitsonarError: a variance or wander that is not positive, or too few motions to estimate them.
+        MitsonarError: a variance or ``wander`` is not positive, or there are too few motions to estimate them.
     """
     if measured.covariances is None:
         covariances = np.tile(np.diag(fit_noise(measured) ** 2), (len(measured), 1, 1))
@@ -365,6 +378,7 @@ def kalman_smoothed(measured: MotionSeries, wander: ArrayLike | None = None) -> 
     _variances(measured)
     mean, covariance, gain = _filtered(measured, walk)
     mean, covariance, lag = _rts(mean, covariance, gain, _walked(measured, walk))
+    # velocities back to motions: each covariance scales with the product of both durations
     step = measured.step_s
     squared, crossed = (step**2)[:, None, None], (step[:-1] * step[1:])[:, None, None]
     return MotionSeries(mean * step[:, None], measured.time_s, covariance * squared, with_next=lag * crossed)
@@ -378,47 +392,50 @@ def _walked(measured: MotionSeries, wander: Array) -> Array:
 def _filtered(measured: MotionSeries, wander: Array) -> tuple[Array, Array, Array]:
     """Return the filtered velocity ``(n, 3)``, its covariance, and the gain of the smoother ``(n - 1, 3, 3)``.
 
-    Before the first valid motion the gain is the identity.
+    Before the first valid motion the gain is the identity, so that smoothing extends the first valid velocity backwards.
     """
     seen, noise = measured.velocity, np.asarray(measured.covariances) / (measured.step_s**2)[:, None, None]
     walked = _walked(measured, wander)
+    # without a prior the first valid motion initialises the filter
     first = int(np.argmax(measured.believed))
     n, one = len(measured), np.eye(3)
     mean, covariance = np.tile(seen[first], (n, 1)), np.zeros((n, 3, 3))
     back = np.tile(one, (max(n - 1, 0), 1, 1))
     covariance[first] = noise[first]
     for k in range(first + 1, n):
+        # predict by the random walk
         ahead = covariance[k - 1] + walked[k - 1]
         back[k - 1] = np.linalg.solve(ahead, covariance[k - 1]).T
         mean[k], covariance[k] = mean[k - 1], ahead
+        # update by a valid measurement, in Joseph form: a sum of two squares, which rounding cannot make negative
         if measured.believed[k]:
             gain = np.linalg.solve(ahead + noise[k], ahead).T
             mean[k] += gain @ (seen[k] - mean[k - 1])
-            # Joseph's form: a sum of two squares, so that rounding cannot make it negative
             covariance[k] = _symmetric((one - gain) @ ahead @ (one - gain).T + gain @ noise[k] @ gain.T)
     return mean, covariance, back
 
 
 def _rts(mean: Array, covariance: Array, back: Array, walked: Array) -> tuple[Array, Array, Array]:
-    """Return the smoothed velocity, its covariance, and the covariance of each with the next."""
+    """Return the smoothed velocity, its covariance, and the covariance of each velocity with the next."""
     mean, covariance, lag = mean.copy(), covariance.copy(), np.zeros_like(back)
     one = np.eye(3)
     for k in range(len(mean) - 2, -1, -1):
         gain, rest = back[k], one - back[k]
         lag[k] = gain @ covariance[k + 1]
         mean[k] += gain @ (mean[k + 1] - mean[k])
-        # P - G (P + Q) G' + G P' G', written as a sum of squares
+        # P - G (P + Q) G' + G P' G', with the smoothed P' of the next step, written as a sum of squares
         covariance[k] = _symmetric(rest @ covariance[k] @ rest.T + gain @ (covariance[k + 1] + walked[k]) @ gain.T)
     return mean, covariance, lag
 
 
 def fit_wander(measured: MotionSeries) -> Array:
-    """Estimate the random walk of the velocity in a second ``(3,)`` [m/s, m/s, rad/s per root second].
+    """Estimate the random walk of the velocity after one second ``(3,)`` [m/s, m/s, rad/s per root second].
 
-    It maximises the likelihood of the filter's innovations, each axis by itself, with the diagonal of the covariances.
+    The estimate maximises the likelihood of the innovations of the filter, axis by axis, with the diagonals of the
+    covariances.
 
     Raises:
-        MitsonarError: no covariances, a variance that is not positive, or one valid motion among several.
+        MitsonarError: there are no covariances, a variance is not positive, or only one of several motions is valid.
     """
     if measured.covariances is None:
         raise MitsonarError("fit_wander needs the motions' covariances: give them, or estimate the noise with fit_noise")
@@ -427,7 +444,7 @@ def fit_wander(measured: MotionSeries) -> Array:
         raise MitsonarError(f"one valid motion of {len(measured)} shows no change of velocity: give wander")
     gap, seen = np.diff(measured.middle_s[known])[:, None], measured.velocity[known]
     noise = _variances(measured)[known] / measured.step_s[known, None] ** 2
-    if known.size == 1:  # nothing to walk to
+    if known.size == 1:  # a single motion shows no walk: its noise sets the scale
         return np.asarray(np.sqrt(noise[0]))
 
     def misfit(log_walk: Array) -> Array:
@@ -439,12 +456,12 @@ def fit_wander(measured: MotionSeries) -> Array:
 
 
 def fit_noise(measured: MotionSeries) -> Array:
-    """Estimate the standard deviation of the errors ``(3,)`` [m, m, rad], one for all motions, from their differences.
+    """Estimate the standard deviation of the errors ``(3,)`` [m, m, rad], common to all motions, from their differences.
 
-    It maximises the likelihood jointly with the random walk of the velocity.
+    The estimate maximises the likelihood jointly with the random walk of the velocity.
 
     Raises:
-        MitsonarError: fewer than five valid motions, or an axis that never changes.
+        MitsonarError: fewer than five motions are valid, or an axis never changes.
     """
     known = np.flatnonzero(measured.believed)
     seen, step = measured.velocity[known], measured.step_s[known, None]
@@ -455,6 +472,7 @@ def fit_noise(measured: MotionSeries) -> Array:
         raise MitsonarError(
             f"{still[0]} is the same in all motions, so that its noise cannot be estimated: give covariances"
         )
+    # unit noise: its size drops out of the search, as the mean normalised square of the innovations
     noise, gap = np.broadcast_to((step.mean() / step) ** 2, seen.shape), np.diff(measured.middle_s[known])[:, None]
 
     def power(log_walk: Array) -> tuple[Array, Array]:
@@ -465,15 +483,15 @@ def fit_noise(measured: MotionSeries) -> Array:
         log_spread, each = power(log_walk)
         return np.asarray(log_spread + len(gap) * np.log(each))
 
-    unit = np.full(3, -np.log(gap.mean()))  # a walk as large as the noise
+    unit = np.full(3, -np.log(gap.mean()))  # a walk as large as the noise after a mean gap
     walk = _least(misfit, unit - np.log(1e10), unit + np.log(1e6))
     return np.asarray(np.sqrt(power(walk[None])[1][0]) * step.mean())
 
 
 def _innovations(seen: Array, noise: Array, gap: Array, walk: Array) -> tuple[Array, Array]:
-    """Sum the log variances and the normalised squares of the filter's innovations, each axis by itself.
+    """Sum the log variances and the normalised squares of the innovations of a scalar filter on each axis.
 
-    ``walk`` holds many variances of the random walk in a second ``(many, 3)``.
+    ``walk`` holds many trial variances of the random walk after one second ``(many, 3)``.
     """
     mean, variance = seen[0] + 0 * walk, noise[0] + 0 * walk
     log_spread, chi = 0 * walk, 0 * walk
@@ -488,7 +506,7 @@ def _innovations(seen: Array, noise: Array, gap: Array, walk: Array) -> tuple[Ar
 
 
 def _variances(measured: MotionSeries) -> Array:
-    """Return the variances of the motions ``(frames - 1, 3)``, positive where valid."""
+    """Return the variances of the motions ``(frames - 1, 3)``, checked to be positive where valid."""
     variance = np.diagonal(np.asarray(measured.covariances), axis1=1, axis2=2)
     for axis, values in zip(AXES, variance[measured.believed].T, strict=True):
         if not (values > 0).all():
@@ -497,7 +515,7 @@ def _variances(measured: MotionSeries) -> Array:
 
 
 def _least(score: Callable[[Array], Array], low: Array, high: Array, points: int = 25, rounds: int = 4) -> Array:
-    """Return where each column of ``score((points, axes))`` is least between low and high: a grid, then finer ones."""
+    """Return the minimum of each column of ``score((points, axes))`` between low and high, by successively finer grids."""
     columns = np.arange(low.size)
     for _ in range(rounds):
         grid = np.linspace(low, high, points)
@@ -510,7 +528,7 @@ def _symmetric(matrix: Array) -> Array:
     return (matrix + matrix.T) / 2
 
 
-# ---------------- Covariances of the poses along a path, from the covariances of its motions
+# ---------------- Covariances of poses
 
 
 def pose_covariances(
@@ -523,14 +541,15 @@ def pose_covariances(
     """Return the covariances of x, y [m] and heading [rad] of every frame ``(frames, 3, 3)`` along a path, to first order.
 
     Args:
-        series: the motions with their covariances, all valid: smooth a series with gaps first.
-        start: the first pose.
-        at_start: its covariance ``(3, 3)``; not given: known exactly.
-        correlated: how errors of consecutive motions depend on each other; not given: as ``series.with_next`` says, or not.
-        alone: motions that share no errors all the same ``(frames - 1,)``.
+        series: motions with their covariances, all valid; smooth a series with gaps first.
+        start: first pose.
+        at_start: covariance of the first pose ``(3, 3)``; default: known exactly.
+        correlated: how errors of consecutive motions are correlated; default: as in ``series.with_next``, or independent
+            without it.
+        alone: motions whose errors are independent in spite of ``correlated`` ``(frames - 1,)``.
 
     Raises:
-        MitsonarError: no covariances, or an invalid motion, whose error is not known.
+        MitsonarError: there are no covariances, or a motion is invalid, so that its error is not known.
     """
     if series.covariances is None:
         raise MitsonarError("the pose's covariance needs those of the motions: give them, or use kalman_smoothed")
@@ -540,15 +559,17 @@ def pose_covariances(
     poses = path_of(series.motions, start, series.time_s).poses
     found = np.zeros((len(poses), 3, 3))
     found[0] = 0.0 if at_start is None else np.asarray(at_start, dtype=float)
+    # 1. model of the errors: a state shared by consecutive motions, and an independent rest for each
     if correlated is None:
         shared, steps = np.zeros((3, 3)), _as_next_says(series.covariances, series.with_next)
     else:
-        # one slope stays for good; what wanders begins anew with the first motion
+        # the nine slopes are constant with unit variance; the wandering part starts with the first motion
         shared, steps = np.diag([0.0] * 3 + [1.0] * 9), _correlated(series, correlated, alone)
-    joint = block_diag(found[0], shared)  # of the pose and of what motions share
+    # 2. propagate the joint covariance of the pose and the shared state from frame to frame
+    joint = block_diag(found[0], shared)
     for k, ((x, y), step) in enumerate(zip(np.diff(poses[:, :2], axis=0), steps, strict=True)):
         sin, cos = np.sin(poses[k + 1, 5]), np.cos(poses[k + 1, 5])
-        pose = np.array([[1, 0, y], [0, 1, -x], [0, 0, 1]])  # derivatives of eq. 3.4: by the pose,
+        pose = np.array([[1, 0, y], [0, 1, -x], [0, 0, 1]])  # derivative of eq. 3.4 by the pose
         motion = np.array([[cos, sin, y], [-sin, cos, -x], [0, 0, 1]])  # and by the motion
         by_shared = motion @ step.by_shared
         onward = np.block([[pose, by_shared @ step.onward], [np.zeros((len(step.onward), 3)), step.onward]])
@@ -561,10 +582,13 @@ def pose_covariances(
 
 
 class _Step(NamedTuple):
-    """The error of a motion, by what it shares with others ``(m,)``: that before it times a matrix, and a fresh part.
+    """Error model of one motion: a state ``(m,)`` that motions share, plus an independent rest.
 
-    ``onward`` is the matrix ``(m, m)``; ``fresh`` the covariance of the fresh part ``(m, m)``; ``by_shared`` the derivative
-    of the error ``(3, m)``; ``own`` the covariance of the rest ``(3, 3)``.
+    Attributes:
+        onward: transition matrix of the state from the motion before ``(m, m)``.
+        fresh: covariance of the innovation of the state ``(m, m)``.
+        by_shared: derivative of the error of the motion by the state ``(3, m)``.
+        own: covariance of the independent rest ``(3, 3)``.
     """
 
     onward: Array
@@ -574,7 +598,7 @@ class _Step(NamedTuple):
 
 
 def _as_next_says(covariances: Array, with_next: Array | None) -> Iterator[_Step]:
-    """Regress each motion's error on the one before: it is itself what is shared."""
+    """Yield steps whose shared state is the error itself, regressed on the error of the motion before."""
     along, fresh = np.zeros_like(covariances), covariances.copy()
     if with_next is not None and len(with_next):
         along[1:] = np.linalg.solve(covariances[:-1], with_next).swapaxes(1, 2)
@@ -584,8 +608,9 @@ def _as_next_says(covariances: Array, with_next: Array | None) -> Iterator[_Step
 
 
 def _correlated(series: MotionSeries, correlated: CorrelatedErrors, alone: NDArray[np.bool_] | None) -> Iterator[_Step]:
-    """Share errors that wander, in standard deviations, and slopes over the motion."""
+    """Yield steps whose shared state is a wandering error ``(3,)`` and nine slopes over the motion, of unit variance."""
     assert series.covariances is not None
+    # 1. the symmetric square root of each covariance scales the wandering part to its share of the variance
     variance, axes = np.linalg.eigh(series.covariances)
     root = axes * np.sqrt(np.maximum(variance, 0))[:, None] @ axes.swapaxes(1, 2)
     wander = np.sqrt(correlated.share) * root
@@ -593,6 +618,7 @@ def _correlated(series: MotionSeries, correlated: CorrelatedErrors, alone: NDArr
     own = (1 - correlated.share) * series.covariances
     if alone is not None:
         by_shared[alone], own[alone] = 0.0, series.covariances[alone]
+    # 2. the wandering part is a first-order chain of unit variance; slopes stay constant
     for along, by, rest in zip(np.append(0.0, correlated.onward), by_shared, own, strict=True):
         onward, fresh = np.ones(12), np.zeros(12)
         onward[:3], fresh[:3] = along, 1 - along**2
@@ -600,7 +626,7 @@ def _correlated(series: MotionSeries, correlated: CorrelatedErrors, alone: NDArr
 
 
 class Ellipse(NamedTuple):
-    """A confidence ellipse: half axes [m], and the bearing of the longer one [rad], clockwise from +y as a heading."""
+    """A confidence ellipse: semi-axes [m] and the direction of the longer one [rad], clockwise from +y like a heading."""
 
     major_m: float
     minor_m: float
@@ -608,10 +634,14 @@ class Ellipse(NamedTuple):
 
 
 def ellipse(covariance: ArrayLike, probability: float = 0.95) -> Ellipse:
-    """Return the ellipse that holds a position with a probability, from a covariance that begins with x, y ``(2.., 2..)``.
+    """Return the ellipse that contains a position with a given probability.
+
+    Args:
+        covariance: covariance whose first two components are x, y ``(2.., 2..)`` [m].
+        probability: probability of the ellipse.
 
     Raises:
-        MitsonarError: a probability that is not between 0 and 1.
+        MitsonarError: ``probability`` is not between 0 and 1.
     """
     if not 0 < probability < 1:
         raise MitsonarError(f"probability must be between 0 and 1: got {probability:g}")
@@ -620,24 +650,25 @@ def ellipse(covariance: ArrayLike, probability: float = 0.95) -> Ellipse:
     return Ellipse(float(major), float(minor), float(np.arctan2(axes[0, 1], axes[1, 1]) % np.pi))
 
 
-# ---------------- Correlation of the errors of consecutive motions: they are estimated over the same ground
-# Relief over level ground, and the outline of the light, pull an estimate in one direction as long as the same ground
-# is seen. A covariance that tells the error of one motion rightly then tells that of a path far too small.
+# ---------------- Correlation of errors over the same ground
 
 
 @dataclass(frozen=True)
 class ErrorCorrelation:
-    """How errors of motions over the same ground depend on each other.
+    """Model of the correlation between errors of motions over the same ground.
 
-    The defaults are measured on rocky fields with ``direct`` (``benchmarks/bench_loops.py``).
+    Relief and the outline of the insonified area bias estimates in one direction as long as the same ground is in view.
+    Covariances that are right for single motions then give far too small a covariance for the path. The defaults are
+    measured on rocky fields with ``direct`` (``benchmarks/bench_loops.py``).
 
     Attributes:
-        share: part of the variance that motions over the same ground have in common.
-        length: of the ground's way through the window, after which that part correlates by 1/e, as a part of the reach.
-        slope: standard deviation of a common error in proportion to the motion, as a scale by a wrong height is.
+        share: fraction of the variance that motions over the same ground have in common.
+        length: displacement of the ground through the window after which the common part has correlation 1/e, as a fraction
+            of the reach.
+        slope: standard deviation of a common error proportional to the motion, such as the scale error of a wrong height.
 
     Raises:
-        MitsonarError: numbers outside their limits.
+        MitsonarError: a number is outside its limits.
     """
 
     share: float = 0.9
@@ -652,33 +683,35 @@ class ErrorCorrelation:
             )
 
     def of(self, motions: ArrayLike, reach_m: float) -> CorrelatedErrors:
-        """Return how the errors of consecutive motions ``(n, 3)`` depend on each other.
+        """Return the correlation of the errors of consecutive motions ``(n, 3)``.
 
         Args:
             motions: sideways, forward [m], yaw [rad].
-            reach_m: horizontal distance of the sonar from the middle of the ground that it sees [m].
+            reach_m: horizontal distance from the sonar to the middle of the ground in view [m].
         """
+        # displacement of the middle of the ground in view: a turn moves it by the reach
         moved = np.asarray(motions, dtype=float)
         way = np.hypot(moved[:, 0] + reach_m * moved[:, 2], moved[:, 1])
         between = (way[1:] + way[:-1]) / 2
-        # a sonar at rest sees the same ground for good: errors stay, but the graph needs some change
+        # a sonar at rest keeps its errors, but a correlation of exactly 1 would make the graph singular
         onward = np.exp(-np.maximum(between / (self.length * reach_m), 1e-6))
+        # slopes are a ratio of lengths: yaw enters as a length at the reach
         lever = np.array([1.0, 1.0, 1.0 / reach_m])
         slope_std = self.slope * np.outer(lever, 1 / lever)
         return CorrelatedErrors(self.share, onward, slope_std, _spread(moved, onward))
 
 
 def _spread(moved: Array, onward: Array) -> Array:
-    """Spread each motion over those that see the same ground, so that their sum stays ``(n, 3)``.
+    """Spread each motion over those that see the same ground, with their sum unchanged ``(n, 3)``.
 
-    A slope over measured motions would take an error that two components share for an error in proportion.
+    A slope over the unsmoothed motions would mistake an error that two components share for a proportional error.
     """
     total = _alike(np.ones((len(moved), 1)), onward)
     return _alike(moved / total, onward)
 
 
 def _alike(values: Array, onward: Array) -> Array:
-    """Sum values ``(n, k)`` with weights that are the correlations of their motions."""
+    """Sum values ``(n, k)`` weighted by the correlations of their motions, with one recursion in each direction."""
     before, after = values.copy(), values.copy()
     for k, stays in enumerate(onward):
         before[k + 1] += stays * before[k]

@@ -1,4 +1,8 @@
-"""Sonar frames of one run, read some at a time: of a simulated run, a data set or a recording."""
+"""How the sonar frames of one run are opened and read, from a simulated run, a data set or a recording.
+
+:class:`FrameSource` reads frames a few at a time, and :func:`open_frames` opens one at a path or URL. :func:`recording_at`
+gives the same frames as a recording, with labels. :func:`poses_at` interpolates a path at the times of frames.
+"""
 
 from __future__ import annotations
 
@@ -55,37 +59,38 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 PATTERN_FRAMES = 64
-"""Frames of which a static pattern is the mean, at most."""
+"""Largest number of frames that are averaged to a static pattern."""
 
 FITTED, FITTED_RUNS = 3, 4
-"""Consecutive frames of a run by which the contrast is fitted, and the number of such runs."""
+"""Number of consecutive frames in a run for fitting the contrast, and the number of such runs."""
 
 PLANAR = 1e-6
-"""Smallest change of height, pitch or roll along a path [m, rad]: files round them."""
+"""Smallest change of height, pitch or roll that makes a path non-planar [m, rad]: files round them."""
 
 
 @dataclass(frozen=True)
 class FrameSource:
-    """The frames of one run; pixels are read on demand.
+    """The frames of one run, whose pixels are read on demand.
 
     Attributes:
-        name: of the source, for messages.
-        like: no frames, but all that is the same for each of them: sonar, bins, beams, level.
-        time_s: of the frames ``(frames,)`` [s]; where each beam has its own, their mean.
-        images: reads the frames of given numbers ``(n,)``: ``(n, bins, beams)``.
-        poses: true poses of the sonar ``(frames, 6)`` [m, rad], where known.
-        attitude_rad: pitch, roll, heading by the sonar's own sensors ``(frames, 3)`` [rad], where known; nan where not.
-        height_m: over the ground ``(frames,)``, where known; nan where nothing is below.
-        pitch_rad: of the sonar, where its poses are not known.
-        told_height_m: the height that the user gave for frames without one.
-        assumed_height: whether ``height_m`` is assumed, since nobody tells it.
-        noise: added to the frames that are read.
-        seed: of the noise.
-        first_number: number of the first frame, of which the noise is a function.
-        note: which frames these are, where the name does not say it.
-        altimeter: measures the height of each frame that is read, in place of ``height_m``.
-        contrast: turns levels into local contrast when frames are read.
-        pattern_db: static pattern ``(bins, beams)`` [dB] that moves with the sonar, taken out before the contrast.
+        name: name of the source, for messages.
+        like: a record of zero frames that holds what all frames share: sonar, bins, beams, level.
+        time_s: times of the frames ``(frames,)`` [s]; the mean over the beams if each beam has its own time.
+        images: reads the frames with the given numbers ``(n,)`` as ``(n, bins, beams)``.
+        poses: true poses of the sonar ``(frames, 6)`` [m, rad], if known.
+        attitude_rad: pitch, roll, heading measured by the sensors of the sonar ``(frames, 3)`` [rad], if known; nan where
+            not.
+        height_m: height over the ground ``(frames,)`` [m], if known; nan where nothing is below.
+        pitch_rad: pitch of the sonar [rad], if its poses are not known.
+        told_height_m: height that the user gave for frames without one [m].
+        assumed_height: whether ``height_m`` is an assumption, because neither the frames nor the user give a height.
+        noise: noise added to the frames when they are read.
+        seed: seed of the noise.
+        first_number: number of the first frame; the noise is a function of the frame number.
+        note: which frames these are, if the name does not show it.
+        altimeter: measures the height of each frame as it is read, in place of ``height_m``.
+        contrast: converts levels to local contrast when frames are read.
+        pattern_db: static pattern ``(bins, beams)`` [dB] that moves with the sonar, subtracted before the contrast.
     """
 
     name: str
@@ -112,7 +117,7 @@ class FrameSource:
 
     @classmethod
     def of(cls, frames: SonarFrames, name: str = "the frames") -> Self:
-        """Take frames that are in memory; labels are not kept."""
+        """Make a source of frames in memory; labels are dropped."""
         nothing: dict[str, Any] = dict.fromkeys(LABELS)
         frames = replace(frames, **nothing)
         like, images = frames.select(slice(0)), frames.image.__getitem__
@@ -121,7 +126,7 @@ class FrameSource:
 
     @classmethod
     def of_part(cls, part: Part, name: str, note: str = "") -> Self:
-        """Take a part of a recording."""
+        """Make a source of a part of a recording."""
         known, attitude = (part.poses, part.height_m), part.attitude_rad
         return cls.of_arrays(part.like, part.time_s, *known, part.images, name, attitude_rad=attitude, note=note)
 
@@ -139,22 +144,23 @@ class FrameSource:
         first_number: int = 0,
         note: str = "",
     ) -> Self:
-        """Take frames whose times, poses, attitudes and heights are in memory, and whose images are read on demand."""
+        """Make a source of times, poses, attitudes and heights in memory, with images that are read on demand."""
         time = np.asarray(time_s, dtype=float)
         time = time.mean(axis=1) if time.ndim == 2 else time
-        like = replace(like, beam_poses=None, **BodyStates().fields())  # as labels: truth that is not kept
+        like = replace(like, beam_poses=None, **BodyStates().fields())  # truth, dropped as labels are
         return cls(name, like, time, images, poses, attitude_rad, height_m, first_number=first_number, note=note)
 
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
-        """Return the same frames with noise: a function of the seed and the number of each frame."""
+        """Return the same frames with noise, which is a function of the seed and the frame number."""
         return self if noise.is_none else replace(self, noise=noise, seed=seed)
 
     def with_contrast(self, contrast: LocalContrast | None = None, *, moving: bool = False) -> Self:
-        """Return the same frames as local contrast: without the light that moves with the sonar.
+        """Return the same frames as local contrast, which removes illumination that moves with the sonar.
 
         Args:
-            contrast: how; default: smoothed as little as makes consecutive frames alike, by some of these frames.
-            moving: take out the mean of frames over the whole run too. A sonar at rest loses its scene by that.
+            contrast: conversion to use; by default, the least smoothing at which consecutive frames correlate well, fitted
+                to some of these frames.
+            moving: also subtract the mean of frames over the whole run. This removes the scene of a sonar at rest.
         """
         plain = replace(self, altimeter=None)
         pattern = None
@@ -169,10 +175,10 @@ class FrameSource:
         return replace(self, contrast=contrast, pattern_db=pattern)
 
     def with_heights_by(self, estimator: HeightEstimator) -> Self:
-        """Return the same frames, whose heights an estimator measures when they are read.
+        """Return the same frames with heights that an estimator measures as they are read.
 
         Raises:
-            MitsonarError: an estimator that reads views, not frames.
+            MitsonarError: the estimator reads views of a data set, not frames.
         """
         if estimator.views is not None:
             raise MitsonarError(
@@ -185,7 +191,7 @@ class FrameSource:
         """Return the same frames with a height [m] and a pitch [rad] where they lack them.
 
         Raises:
-            MitsonarError: they lack nothing, or a number outside its limits.
+            MitsonarError: the frames already have the height or pitch, or a number is outside its limits.
         """
         lacking = self.height_m is None or not np.isfinite(self.height_m).all()
         if height_m is not None and not lacking:
@@ -217,19 +223,19 @@ class FrameSource:
 
     @property
     def sonar_poses(self) -> Array | None:
-        """Return the poses of the sonar ``(frames, 6)`` [m, rad]; None where they are not known."""
+        """Return the poses of the sonar ``(frames, 6)`` [m, rad]; None if they are not known."""
         return self.poses
 
     @property
     def true(self) -> Trajectory | None:
-        """Return the true path of the sonar; None where it is not known."""
+        """Return the true path of the sonar; None if it is not known."""
         return None if self.poses is None else Trajectory(self.poses, self.time_s)
 
     def check_times(self) -> None:
         """Check that the times of the frames increase.
 
         Raises:
-            MitsonarError: they do not, or are not finite.
+            MitsonarError: the times do not increase, or are not finite.
         """
         bad = np.flatnonzero(~(np.diff(self.time_s) > 0))
         if not np.isfinite(self.time_s).all() or bad.size:
@@ -241,13 +247,13 @@ class FrameSource:
             )
 
     def read(self, index: ArrayLike) -> SonarFrames:
-        """Read frames of these numbers ``(n,)`` as estimators may use them.
+        """Read the frames with these numbers ``(n,)`` as an estimator may see them.
 
-        Their poses have height, pitch and roll, but position and heading 0, so that no truth can leak. Where only pitch and
-        roll are known, the height is nan.
+        Their poses have height, pitch and roll, but zero position and heading, so that no ground truth can leak. If only
+        pitch and roll are known, the height is nan.
 
         Raises:
-            MitsonarError: frames that are not there, or pixels that cannot be read.
+            MitsonarError: a frame does not exist, or its pixels cannot be read.
         """
         chosen = np.asarray(index, dtype=np.intp)
         beyond = chosen[(chosen < 0) | (chosen >= len(self))]
@@ -282,7 +288,7 @@ class FrameSource:
         return replace(frames, image=contrast.apply(level), level="contrast")
 
     def attitudes(self, chosen: Index) -> Array | None:
-        """Return poses of frames without position and heading ``(n, 6)``; None where neither poses nor pitch are known."""
+        """Return poses without position and heading ``(n, 6)``; None if neither poses, pitch nor attitudes are known."""
         if self.poses is not None:
             return self.poses[chosen] * [0, 0, 1, 1, 1, 0]
         if self.pitch_rad is not None:
@@ -293,7 +299,7 @@ class FrameSource:
         return np.column_stack([np.zeros((len(chosen), 3)), pitch_roll, np.zeros(len(chosen))])
 
     def chunks(self, index: ArrayLike) -> Iterator[SonarFrames]:
-        """Read frames of these numbers, some at a time."""
+        """Read the frames with these numbers ``(n,)``, a few at a time."""
         chosen = np.asarray(index, dtype=np.intp)
         count = self.frames_a_chunk
         for start in range(0, len(chosen), count):
@@ -302,10 +308,11 @@ class FrameSource:
     def along(self, path: Trajectory, tolerance_s: float = 0.01) -> tuple[Index, Array]:
         """Return the numbers ``(n,)`` of the frames for which a path has a pose, and these poses ``(n, 6)``.
 
-        A path of odometry has one height, pitch and roll throughout. Pitch and roll are then those of the frames, if known.
+        If height, pitch and roll are constant along the path, as from planar odometry, pitch and roll are taken from the
+        frames, if known.
 
         Raises:
-            MitsonarError: no frame is at the time of a pose, within the tolerance.
+            MitsonarError: no frame lies within the tolerance of the time of a pose.
         """
         self.check_times()
         try:
@@ -323,11 +330,11 @@ class FrameSource:
 
     @property
     def frames_a_chunk(self) -> int:
-        """Return how many frames are read at a time."""
+        """Return the number of frames that are read at a time."""
         return max(1, CHUNK_BYTES // max(1, len(self.like.range_m) * len(self.like.bearing_rad) * 4))
 
     def digest(self) -> str:
-        """Return the SHA-256 of all data but the images, and of the first, the middle and the last image."""
+        """Return the SHA-256 of all data except the images, of which the first, middle and last enter."""
         digest = hashlib.sha256(self.like.sonar.model_dump_json().encode())
         for values in (self.like.range_m, self.like.bearing_rad, self.time_s, self.poses, self.height_m):
             digest.update(b"-" if values is None else np.ascontiguousarray(values, dtype=float).tobytes())
@@ -341,12 +348,11 @@ class FrameSource:
         return digest.hexdigest()
 
 
-# ---------------- Sonar frames at a path or URL: ``frames.npz``, ``frames.zarr`` of a long run, a sequence of a data
-# set, a recording
+# ---------------- Frames at a path or URL
 
 
 StoredArray = Any
-"""An array of Zarr, whichever form of its metadata; read by indices."""
+"""A Zarr array of either metadata format, read by indexing."""
 
 FINDING = "give frames.npz, frames.zarr, the folder of a run, a data set or a recording"
 
@@ -358,12 +364,13 @@ def open_frames(
 
     Args:
         where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
-        sequence: of a data set, or part of a recording; default: the longest; of several, the first.
-        view: of a data set, or topic of a ROS bag; default: the first, or the only one.
-        geometry: file that tells how the pictures of a recording are laid out.
+        sequence: number of the sequence of a data set, or of the part of a recording; by default the longest, and the first
+            of several as long.
+        view: view of a data set, or topic of a ROS bag; by default the first, or the only one.
+        geometry: file that describes the layout of the pictures of a recording.
 
     Raises:
-        MitsonarError: no frames there; a sequence or view that is not there; a geometry that is not needed.
+        MitsonarError: there are no frames, the sequence or view does not exist, or the geometry is not needed.
     """
     path = Path(where)
     data_set = is_data_set(where)
@@ -386,25 +393,29 @@ def open_frames(
 def load_frames(
     where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
 ) -> SonarFrames:
-    """Load all frames at a path or URL into memory, with true poses where they are known.
+    """Load all frames at a path or URL into memory, with true poses if they are known.
 
-    Labels are not loaded: :meth:`mitsonar.SonarFrames.load` loads those of a run.
+    Labels are not loaded; use :meth:`mitsonar.SonarFrames.load` for those of a run.
 
     Args:
         where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
-        sequence: of a data set, or part of a recording; default: the longest; of several, the first.
-        view: of a data set, or topic of a ROS bag; default: the first, or the only one.
-        geometry: file that tells how the pictures of a recording are laid out.
+        sequence: number of the sequence of a data set, or of the part of a recording; by default the longest, and the first
+            of several as long.
+        view: view of a data set, or topic of a ROS bag; by default the first, or the only one.
+        geometry: file that describes the layout of the pictures of a recording.
 
     Raises:
-        MitsonarError: no frames there; a sequence or view that is not there; a geometry that is not needed.
+        MitsonarError: there are no frames, the sequence or view does not exist, or the geometry is not needed.
     """
     source = open_frames(where, sequence=sequence, view=view, geometry=geometry)
     return replace(source.read(np.arange(len(source))), poses=source.poses, attitude_rad=source.attitude_rad)
 
 
 def is_data_set(where: str | Path) -> bool:
-    """Return whether a data set is there. Every URL is one. Frames of a long run are Zarr too, with other attributes."""
+    """Return whether a path or URL is a data set.
+
+    Every URL counts as one. The frames of a long run are a Zarr group too, told apart by its attributes.
+    """
     path = Path(where)
     if "://" in str(where):
         return True
@@ -419,12 +430,12 @@ def is_data_set(where: str | Path) -> bool:
 
 
 def is_recording(where: str | Path) -> bool:
-    """Return whether a recording of a real sonar is there."""
+    """Return whether a path is a recording of a real sonar."""
     return "://" not in str(where) and format_of(where) is not None
 
 
 def _of_recording(path: Path, number: int | None, view: str | None, geometry: str | Path | None) -> FrameSource:
-    """Open a part of a recording."""
+    """Open a part of a recording, by default the longest."""
     recording = open_recording(path, geometry, view)
     for note in recording.notes:
         warnings.warn(f"{path}: {note}", MitsonarWarning, stacklevel=3)
@@ -437,10 +448,10 @@ def _of_recording(path: Path, number: int | None, view: str | None, geometry: st
 
 
 def _of_npz(path: Path, name: str) -> FrameSource:
-    """Take the frames of ``frames.npz``.
+    """Open the frames of ``frames.npz``.
 
     Raises:
-        MitsonarError: nothing there, a file of another kind, or a damaged one.
+        MitsonarError: the file is missing, of another kind, or damaged.
     """
     if not os.path.exists(path):
         raise MitsonarError(f"there are no frames at {path}: {FINDING}")
@@ -452,7 +463,8 @@ def _of_npz(path: Path, name: str) -> FrameSource:
 
 
 def _of_zarr(path: Path, name: str) -> FrameSource:
-    """Open the frames of a long run, also of one that is not finished."""
+    """Open the frames of a long run, even if it is not finished."""
+    # 1. read everything but images and labels, up to the frames that are written
     try:
         found, done = open_group(path, COLUMNS, "time_s", "frames_done")
         arrays = {name: one for name, one in found.items() if not isinstance(one, np.ndarray)}
@@ -466,6 +478,7 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
         none_of = {name: values[:0] for name, values in table.items() if name in PER_FRAME}
     except Exception as error:
         raise MitsonarError(f"cannot read frames {path}: {' '.join(str(error).split())[:160]}; {FINDING}") from None
+    # 2. validate: a record of zero frames for what all frames share, the columns per frame by themselves
     like = SonarFrames.from_arrays(table | none_of | {"image": nothing}, str(path))
     for known in ("poses", "attitude_rad", "height_m"):
         if known in table:
@@ -506,7 +519,14 @@ def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSourc
 
 
 class StoredView(NamedTuple):
-    """A view of a data set: its name, its array of images, frames like them without images, and whether there are others."""
+    """A view of a data set.
+
+    Attributes:
+        name: name of the view.
+        array: name of the array that holds its images.
+        like: a record of zero frames with the sonar, bins, beams and level of the images.
+        several: whether the data set has other views.
+    """
 
     name: str
     array: str
@@ -515,10 +535,10 @@ class StoredView(NamedTuple):
 
 
 def view_in(store: DataStore, view: str | None = None) -> StoredView:
-    """Return a view of a data set whose images are stored; default: the first.
+    """Return a view of a data set whose images are stored; by default the first.
 
     Raises:
-        MitsonarError: no images, or no such view.
+        MitsonarError: the data set holds no images, or no such view.
     """
     from mitsonar.config.data import array_names
 
@@ -543,10 +563,12 @@ def view_in(store: DataStore, view: str | None = None) -> StoredView:
 
 
 def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, int, str]:
-    """Return the frames of a sequence of a data set, its number, and a description. Default: the longest, or the first such.
+    """Return the frames of a sequence of a data set, its number and a description.
+
+    The default is the longest sequence, and the first of several as long.
 
     Raises:
-        MitsonarError: no such sequence.
+        MitsonarError: there is no such sequence.
     """
     sequences = store.read("sequence")
     lengths = np.bincount(sequences)
@@ -560,7 +582,7 @@ def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, i
 
 
 def _picked(image: StoredArray, index: Index) -> Pixels:
-    """Read frames of a Zarr array; those at equal steps at once."""
+    """Read frames of a Zarr array; evenly spaced frames are read in one slice."""
     if not len(index):
         return np.asarray(image[:0])
     steps = np.unique(np.diff(index))
@@ -569,33 +591,33 @@ def _picked(image: StoredArray, index: Index) -> Pixels:
     return np.stack([np.asarray(image[int(one)]) for one in index])
 
 
-# ---------------- Frames of any origin as a recording: files of real sonars, runs and data sets; with poses and labels
+# ---------------- Frames as a recording, with labels
 
 
 Labels: TypeAlias = dict[str, Any]
-"""Arrays of per-pixel truth by the names of :data:`~mitsonar.records.frames.LABELS`."""
+"""Arrays of per-pixel ground truth, keyed by the names in :data:`~mitsonar.records.frames.LABELS`."""
 
 
 @dataclass(frozen=True)
 class LabelledPart(Part):
-    """A part with per-pixel truth.
+    """A part of a recording with per-pixel ground truth.
 
     Attributes:
-        labels: reads the labels of frames of given numbers ``(n,)`` by name: ``(n, bins, beams)``.
+        labels: reads the labels of the frames with the given numbers ``(n,)``, by name, as ``(n, bins, beams)``.
     """
 
     labels: Callable[[Index], Labels] = lambda index: {}
 
     def read(self, index: ArrayLike) -> SonarFrames:
-        """Read frames of these numbers ``(n,)``, with labels.
+        """Read the frames with these numbers ``(n,)``, including labels.
 
         Raises:
-            MitsonarError: frames that are not there, or that cannot be read.
+            MitsonarError: a frame does not exist, or cannot be read.
         """
         return replace(super().read(index), **self.labels(np.asarray(index, dtype=np.intp)))
 
     def _read_within(self, rows: slice, columns: slice) -> dict[str, Any]:
-        """Return the fields that read pixels and their labels, of these bins and beams."""
+        """Return the fields that read pixels and labels, restricted to these bins and beams."""
 
         def labels(index: Index) -> Labels:
             return {name: values[:, rows, columns] for name, values in self.labels(index).items()}
@@ -610,12 +632,12 @@ def recording_at(
 
     Args:
         where: a recording of a real sonar, ``frames.npz``, ``frames.zarr``, the folder of a run, or a data set.
-        sequence: of a data set.
-        view: of a data set, or topic of a ROS bag.
-        geometry: file that tells how pictures are laid out.
+        sequence: number of the sequence of a data set.
+        view: view of a data set, or topic of a ROS bag.
+        geometry: file that describes the layout of pictures.
 
     Raises:
-        MitsonarError: no frames there, or choices that do not fit them.
+        MitsonarError: there are no frames, or the options do not fit them.
     """
     data_set = is_data_set(where)
     if not data_set and is_recording(where):
@@ -636,7 +658,7 @@ def recording_at(
 
 
 def _labels_at(path: Path) -> Callable[[Index], Labels] | None:
-    """Return what reads the labels of a run; None where it has none."""
+    """Return a function that reads the labels of a run by frame number; None if the run has no labels."""
     if os.path.isdir(path) and path.suffix != ".zarr":
         path = next(one for one in (path / "frames.npz", path / "frames.zarr") if os.path.exists(one))
     if os.path.isfile(path):
@@ -657,7 +679,7 @@ def _labels_at(path: Path) -> Callable[[Index], Labels] | None:
     return stored if arrays else None
 
 
-# ---------------- Heights that are measured in the frames themselves, in place of recorded ones
+# ---------------- Heights measured in the frames
 
 
 Framed = TypeVar("Framed", bound="SonarFrames | ViewFrames")
@@ -666,17 +688,17 @@ Framed = TypeVar("Framed", bound="SonarFrames | ViewFrames")
 def measured(
     frames: Framed, by: HeightEstimator, like: SonarFrames | ViewFrames | None = None
 ) -> tuple[Framed, list[HeightEstimate]]:
-    """Measure the height in each frame, and return the frames with these heights, and the estimates.
+    """Measure the height in each frame; return the frames with these heights, and the estimates.
 
-    Heights are nan where the estimate is not valid. The poses take the same heights, so that no other can be read.
+    Heights are nan where the estimate is not valid. The poses take the same heights, so that no recorded height remains.
 
     Args:
-        frames: whose heights are replaced.
+        frames: frames whose heights are replaced.
         by: measures the heights.
-        like: the same pings as the estimator reads them; None: the frames.
+        like: the same pings in the form that the estimator reads; None: ``frames``.
 
     Raises:
-        MitsonarError: as the estimator does.
+        MitsonarError: the estimator cannot read the frames.
     """
     read = frames if like is None else like
     estimates = [by.height(read.select(slice(k, k + 1))) for k in range(len(read))]
@@ -685,7 +707,7 @@ def measured(
 
 
 def without_height(frames: Record) -> bool:
-    """Return whether heights were measured in these frames, and none was found."""
+    """Return whether heights were measured in these frames, but none was found."""
     heights, poses = getattr(frames, "height_m", None), frames.poses
     if heights is None or np.isfinite(heights).any():
         return False
@@ -701,18 +723,17 @@ def _at(poses: NDArray[np.float64] | None, heights: NDArray[np.float64]) -> NDAr
     return moved
 
 
-# ---------------- Poses at the times of frames, from a path that was measured or estimated, and the stretches of
-# frames that have them
+# ---------------- Poses at the times of frames
 
 
 SAME_S = 0.01
-"""Distance of a frame from a pose that is taken for it [s]: times in files are rounded."""
+"""Largest time between a frame and a pose that count as simultaneous [s]: times in files are rounded."""
 
 LONGEST_GAP_S = 1.0
-"""Longest step of a path within which poses are interpolated [s]."""
+"""Longest step of a path over which poses are interpolated [s]."""
 
 PAUSE = 5.0
-"""Step from frame to frame, as part of the median step, that ends a stretch."""
+"""Multiple of the median step between frames above which a step ends a stretch."""
 
 
 def poses_at(
@@ -720,25 +741,27 @@ def poses_at(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Interpolate a path at the times of frames.
 
-    A frame has a pose where one of the path is within 10 ms of it, or where it lies between two that are at most a second
-    apart. A path of odometry has one height, pitch and roll throughout. Pitch and roll are then those of the frames, if
-    known.
+    A frame has a pose if a pose of the path is within 10 ms of it, or if it lies between two poses at most a second apart.
+    If height, pitch and roll are constant along the path, as from planar odometry, pitch and roll are taken from the frames,
+    if known.
 
     Args:
-        path: its times rise.
-        time_s: of the frames ``(frames,)`` [s].
-        name: of the frames, for errors.
-        attitude_rad: pitch, roll, heading of the frames by their own sensors ``(frames, 3)``; nan where unknown.
+        path: path with increasing times.
+        time_s: times of the frames ``(frames,)`` [s].
+        name: name of the frames, for error messages.
+        attitude_rad: pitch, roll, heading of the frames measured by the sensors of the sonar ``(frames, 3)`` [rad]; nan
+            where unknown.
 
     Returns:
-        Poses ``(frames, 6)`` [m, rad], and which frames have one ``(frames,)``; the others are nan.
+        Poses ``(frames, 6)`` [m, rad], nan where there is none, and whether each frame has one ``(frames,)``.
 
     Raises:
-        MitsonarError: the times of the path do not rise, or no frame has a pose.
+        MitsonarError: the times of the path do not increase, or no frame has a pose.
     """
     times = path.time_s
     if not (np.diff(times) > 0).all():
         raise MitsonarError("the times of the path must rise: sort its poses")
+    # 1. the poses of the path before and after each frame, and whether they are close enough
     after = np.clip(np.searchsorted(times, time_s), 1, max(1, len(times) - 1)).astype(np.intp)
     before = after - 1
     after = np.minimum(after, len(times) - 1)
@@ -750,6 +773,7 @@ def poses_at(
             f"no pose for the frames of {name}: the path lasts from {times[0]:.10g} to {times[-1]:.10g} s, the frames from "
             f"{time_s[0]:.10g} to {time_s[-1]:.10g} s; give a path with the times of the frames"
         )
+    # 2. interpolate; a planar path carries no attitudes, so those of the frames replace them
     poses = np.full((len(time_s), 6), np.nan)
     poses[known] = _interpolated(path, np.clip(time_s[known], times[0], times[-1]))
     if attitude_rad is not None and (np.ptp(path.poses[:, 2:5], axis=0) < PLANAR).all():
@@ -762,8 +786,8 @@ def stretches(known: NDArray[np.bool_], time_s: Array) -> list[slice]:
     """Return the stretches of two or more consecutive frames that have poses and follow each other without a pause.
 
     Args:
-        known: which frames have a pose ``(frames,)``.
-        time_s: of the frames ``(frames,)`` [s].
+        known: whether each frame has a pose ``(frames,)``.
+        time_s: times of the frames ``(frames,)`` [s].
     """
     steps = np.diff(time_s)
     usual = float(np.median(steps)) if len(steps) else 0.0
@@ -773,9 +797,9 @@ def stretches(known: NDArray[np.bool_], time_s: Array) -> list[slice]:
 
 
 def _interpolated(path: Trajectory, time_s: Array) -> Array:
-    """Return the poses of a path at times within it ``(n, 6)``: positions in straight lines, attitudes by the arc.
+    """Interpolate a path at times within it ``(n, 6)``: positions linearly, attitudes spherically (slerp).
 
-    At a time of the path the pose is the path's own to the bit.
+    At a time of the path, the result is the pose of the path, bit for bit.
     """
     if len(path) == 1:
         return np.repeat(path.poses, len(time_s), axis=0)

@@ -1,4 +1,4 @@
-"""Motions between pings: composition (Almanza-Medina, eq. 3.4), inverse, constant rates."""
+"""How motions between pings compose to poses (Almanza-Medina, eq. 3.4), and how poses give motions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Motion(NamedTuple):
 
 
 def compose(pose: Pose, motion: Motion) -> Pose:
-    """Compute the pose after a motion along the *new* heading (Almanza-Medina, eq. 3.4)."""
+    """Compute the pose after a motion, which is given in axes of the *new* heading (Almanza-Medina, eq. 3.4)."""
     heading = pose.heading + motion.yaw
     sin, cos = np.sin(heading), np.cos(heading)
     x = pose.x + motion.forward * sin + motion.sideways * cos
@@ -36,7 +36,7 @@ def compose(pose: Pose, motion: Motion) -> Pose:
 
 
 def inverse(motion: AnyArray) -> AnyArray:
-    """Invert motions ``(..., 3)`` (sideways, forward [m], yaw [rad]; eq. 3.4), of NumPy or torch."""
+    """Invert motions ``(..., 3)`` (sideways, forward [m], yaw [rad]; eq. 3.4), as arrays of NumPy or torch."""
     xp = array_namespace(motion)
     sideways, forward, yaw = (motion[..., k] for k in range(3))
     cos, sin = xp.cos(yaw), xp.sin(yaw)
@@ -63,21 +63,21 @@ def motions(poses: ArrayLike) -> NDArray[np.float64]:
 def steady(
     start: Pose, velocity: tuple[float, float, float], frames: int, rate_hz: float
 ) -> tuple[Trajectory, NDArray[np.float64]]:
-    """Simulate a level vehicle that keeps its velocity in its own axes, and so drives along an arc.
+    """Simulate a level vehicle with constant velocity in body axes, which moves along an arc.
 
     Args:
         start: first pose.
-        velocity: to starboard, forward [m/s], and turn [rad/s].
+        velocity: velocity to starboard and forward [m/s], and turn rate [rad/s].
         frames: number of poses.
-        rate_hz: poses a second.
+        rate_hz: poses per second [Hz].
 
     Returns:
-        The trajectory, and its velocities ``(frames, 4)`` as :func:`velocities` returns them.
+        The trajectory, and its velocities ``(frames, 4)`` as in :func:`mitsonar.motion.trajectory.velocities`.
     """
     sideways, forward, turn = velocity
     time = np.arange(frames) / rate_hz
     angle = turn * time
-    # integral of the velocity turned by the heading: sin(a)/a and (1 - cos a)/a along the arc
+    # integrals over time of the cosine and sine of the turned angle a: t sin(a)/a and t (1 - cos a)/a
     along, beside = time * np.sinc(angle / np.pi), time * np.sin(angle / 2) * np.sinc(angle / (2 * np.pi))
     sin, cos = np.sin(start.heading), np.cos(start.heading)
     right, ahead = sideways * along + forward * beside, forward * along - sideways * beside
@@ -88,18 +88,19 @@ def steady(
     return Trajectory(poses, time), np.tile([sideways, forward, 0.0, turn], (frames, 1))
 
 
-# ---------------- Steering: level vehicles that move with a constant velocity in their own axes for a while
+# ---------------- Steering
 
 
 def steered(poses: ArrayLike, velocity: ArrayLike, step_s: float) -> NDArray[np.float64]:
-    """Return the poses after a step: the inverse of :func:`mitsonar.motion.trajectory.velocities`.
+    """Compute the poses of level vehicles after a step; the inverse of :func:`mitsonar.motion.trajectory.velocities`.
 
-    A constant velocity and turn lead along an arc, whose chord is shorter by the sinc of half the turn. Pitch and roll stay.
+    Constant velocity and turn rate in body axes lead along an arc. Its chord is shorter than the arc by the sinc of half the
+    turn. Pitch and roll do not change.
 
     Args:
-        poses: before ``(n, 6)`` [m, rad].
-        velocity: to starboard, forward, up [m/s], and turn to starboard [rad/s] ``(n, 4)``.
-        step_s: duration [s].
+        poses: poses before the step ``(n, 6)`` [m, rad].
+        velocity: velocity to starboard, forward, up [m/s], and turn rate to starboard [rad/s] ``(n, 4)``.
+        step_s: duration of the step [s].
     """
     poses, velocity = np.asarray(poses, dtype=float), np.asarray(velocity, dtype=float)
     starboard, forward, up, turn = (velocity * step_s).T
@@ -114,15 +115,15 @@ def steered(poses: ArrayLike, velocity: ArrayLike, step_s: float) -> NDArray[np.
     return after
 
 
-# ---------------- What other sensors, or the last motions, tell of a motion before the frames are looked at
+# ---------------- Priors
 
 
 class MotionPrior(NamedTuple):
-    """A motion between two frames as it is expected, with its covariance.
+    """The expected motion between two frames with its covariance, from other sensors or from earlier motions.
 
     Attributes:
         motion: sideways, forward [m], yaw [rad] (Almanza-Medina, eq. 3.4).
-        covariance: of the motion ``(3, 3)`` [m, m, rad]; a component that nothing tells has a large variance.
+        covariance: covariance of the motion ``(3, 3)`` [m, m, rad]; an unknown component has a large variance.
     """
 
     motion: Motion

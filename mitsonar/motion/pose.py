@@ -1,4 +1,4 @@
-"""Pose: position and attitude of a sonar or vehicle, as six numbers, rotations and matrices."""
+"""How position and attitude of a sonar or vehicle are expressed, as six numbers, rotations and matrices."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ __all__ = [
 ]
 
 FULL_TURN = 2 * math.pi
-"""Largest angle of a pose that is typed in [rad]."""
+"""Largest angle of a pose that is given by hand [rad]."""
 
 SENSOR_IN_VEHICLE = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 FARTHEST = 1e12
-"""Largest coordinate of a pose [m]: farther away, single precision cannot hold a scene."""
+"""Largest coordinate of a pose [m]: farther away, single precision cannot represent a scene."""
 
 MOST_TURNED = 1e6
-"""Largest angle of a pose [rad]: larger ones no longer say where it points."""
+"""Largest angle of a pose [rad]: larger ones no longer determine a direction precisely."""
 
 
 def plain_number(value: object) -> object:
-    """Return a number of NumPy as one of Python; others as they are."""
+    """Convert a NumPy scalar to a Python number; return other values unchanged."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -52,11 +52,11 @@ class _Six(NamedTuple):
 
 
 class Pose(_Six):
-    """Position and attitude of the sonar: x, y, z [m], pitch, roll, heading [rad].
+    """Position and attitude of a sonar or vehicle: x, y, z [m], pitch, roll, heading [rad].
 
     Raises:
-        MitsonarError: an angle beyond a full turn: degrees, in all likelihood. :meth:`from_degrees` takes degrees,
-            :meth:`from_row` a heading that has turned several times.
+        MitsonarError: an angle exceeds a full turn, probably because it is in degrees. Use :meth:`from_degrees` for degrees,
+            and :meth:`from_row` for a heading that has turned several times.
     """
 
     __slots__ = ()
@@ -72,12 +72,12 @@ class Pose(_Six):
         return super().__new__(cls, x, y, z, pitch, roll, heading)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Copy and pickle without the check of angles."""
+        """Support copying and pickling without the check of angles."""
         return type(self).from_row, (tuple(self),)
 
     @classmethod
     def from_row(cls, row: Iterable[float]) -> Self:
-        """Make a pose from a row of a trajectory: six numbers in metres and radians, with a heading of any size."""
+        """Make a pose from a row of a trajectory: six numbers in metres and radians, with angles of any size."""
         return cls._make(row)
 
     def __repr__(self) -> str:
@@ -88,7 +88,7 @@ class Pose(_Six):
         """Make a pose from ``x, y, z, pitch, roll, heading`` in metres and degrees.
 
         Raises:
-            MitsonarError: not six finite numbers, or too large ones.
+            MitsonarError: ``numbers`` is not six finite numbers, or one is too large.
         """
         values = np.asarray(numbers, dtype=float)
         if values.shape != (6,):
@@ -101,10 +101,10 @@ class Pose(_Six):
 
 
 def refuse_beyond_reach(poses: ArrayLike) -> None:
-    """Refuse poses ``(..., 6)`` [m, rad] whose numbers are so large that nothing could be rendered there.
+    """Reject poses ``(..., 6)`` [m, rad] whose numbers are too large to render anything there.
 
     Raises:
-        MitsonarError: a coordinate or an angle is beyond its bound.
+        MitsonarError: a coordinate or an angle exceeds its bound.
     """
     table = np.abs(np.asarray(poses, dtype=float).reshape(-1, 6))
     for what, unit, values, bound in (
@@ -116,13 +116,13 @@ def refuse_beyond_reach(poses: ArrayLike) -> None:
 
 
 def mounted(poses: ArrayLike, mount: Pose) -> NDArray[np.float64]:
-    """Compute the poses ``(frames, 6)`` of a sonar on a vehicle.
+    """Compute the poses ``(frames, 6)`` [m, rad] of a sonar that is mounted on a vehicle.
 
-    A mount that only pitches keeps position, heading and roll of a level vehicle to the bit.
+    A mount that only pitches preserves position, heading and roll of a level vehicle bit for bit.
 
     Args:
-        poses: of the vehicle ``(frames, 6)`` [m, rad].
-        mount: pose of the sonar in the vehicle's axes.
+        poses: poses of the vehicle ``(frames, 6)`` [m, rad].
+        mount: pose of the sonar in the axes of the vehicle.
     """
     table = np.atleast_2d(np.asarray(poses, dtype=float))
     if not any((*mount[:3], mount.roll, mount.heading)) and not table[:, 3:5].any():
@@ -133,7 +133,7 @@ def mounted(poses: ArrayLike, mount: Pose) -> NDArray[np.float64]:
 
 
 def mount_between(vehicle: Pose, sensor: Pose) -> Pose:
-    """Return the mount that puts a sensor where it is on a vehicle: ``mounted(vehicle, mount)`` is the sensor's pose."""
+    """Return the mount of a sensor on a vehicle, for which ``mounted(vehicle, mount)`` is the pose of the sensor."""
     turn = vehicle_rotation(vehicle).inv()
     place = turn.apply(np.subtract(sensor[:3], vehicle[:3]))
     return Pose(*(float(value) for value in poses_from(place, turn * vehicle_rotation(sensor))[0]))
@@ -151,14 +151,14 @@ def poses_from(position: ArrayLike, rotation: Rotation) -> NDArray[np.float64]:
     starboard, forward, up = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
     pitch = np.arcsin(np.clip(-forward[:, 2], -1, 1))
     level = np.hypot(forward[:, 0], forward[:, 1]) > 1e-9
-    # straight up or down, heading and roll are one angle: the heading takes it
+    # a forward axis straight up or down (gimbal lock) leaves one angle for heading and roll: the heading takes it
     heading = np.where(level, np.arctan2(forward[:, 0], forward[:, 1]), np.arctan2(-starboard[:, 1], starboard[:, 0]))
     roll = np.where(level, np.arctan2(-starboard[:, 2], up[:, 2]), 0.0)
     return np.column_stack([np.asarray(position, dtype=float).reshape(-1, 3), pitch, roll, heading])
 
 
 def to_world_matrices(poses: ArrayLike) -> NDArray[np.float64]:
-    """Return Mitsuba's ``to_world`` of poses ``(frames, 4, 4)``: local +z the acoustic axis, +y up, +x port."""
+    """Return Mitsuba's ``to_world`` matrices of poses ``(frames, 4, 4)``; local +z is the acoustic axis, +y up, +x port."""
     table = np.atleast_2d(np.asarray(poses, dtype=float))
     matrices = np.tile(np.eye(4), (len(table), 1, 1))
     matrices[:, :3, :3] = vehicle_rotation(table).as_matrix() @ SENSOR_IN_VEHICLE
@@ -167,7 +167,7 @@ def to_world_matrices(poses: ArrayLike) -> NDArray[np.float64]:
 
 
 def pose_from_to_world(matrix: ArrayLike) -> Pose:
-    """Recover the pose from a sensor's ``to_world`` ``(4, 4)``.
+    """Return the pose of a sensor with the matrix ``to_world`` ``(4, 4)``.
 
     Raises:
         MitsonarError: the matrix is not finite, scales, shears or mirrors.

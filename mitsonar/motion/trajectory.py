@@ -1,4 +1,7 @@
-"""Trajectory: poses at times, read and written in any of the conventions, and its velocities."""
+"""How poses at times are held, interpolated, and read and written as TUM or CSV files in any of the conventions.
+
+The class :class:`Trajectory` holds poses in the convention of mitsonar. :data:`CONVENTIONS` lists those of files.
+"""
 
 from __future__ import annotations
 
@@ -35,21 +38,24 @@ __all__ = [
 
 
 def velocities(flown: Trajectory) -> NDArray[np.float64]:
-    """Compute the velocities along a trajectory in the vehicle's own axes.
+    """Compute the velocities along a trajectory in the axes of the vehicle.
 
-    A constant velocity leads along an arc. Its chord lies half a turn off the first heading, and is shorter by the sinc of
-    half a turn. This is exact for level vehicles, as :func:`steady` drives them.
+    A constant velocity leads along an arc. Its chord points half the turn off the first heading, and is shorter than the arc
+    by the sinc of half the turn. This is exact for level vehicles, such as those of
+    :func:`mitsonar.motion.composition.steady`.
 
     Returns:
-        To starboard, forward, up [m/s], and turn to starboard [rad/s] ``(frames, 4)``. Each row holds for the step after its
-        pose; the last row repeats the one before. A single pose has velocity 0.
+        Velocity to starboard, forward, up [m/s], and turn rate to starboard [rad/s] ``(frames, 4)``. Each row is valid for
+        the step after its pose; the last row repeats the one before. A single pose has velocity 0.
     """
     if len(flown) == 1:
         return np.zeros((1, 4))
+    # 1. chord of each step in the axes of its first pose, and the shortest turn
     step = np.diff(flown.time_s)[:, None]
     chord = vehicle_rotation(flown.poses[:-1]).inv().apply(np.diff(flown.poses[:, :3], axis=0))
     turn = np.diff(flown.poses[:, 5])
     turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
+    # 2. chord to arc: turn back by half the turn, and divide by the sinc
     shorter = np.sinc(turn / (2 * np.pi))
     sin, cos = np.sin(turn / 2) / shorter, np.cos(turn / 2) / shorter
     starboard, forward, up = chord.T
@@ -83,11 +89,11 @@ class Trajectory:
     def between(cls, start: Pose, end: Pose, frames: int, rate_hz: float) -> Self:
         """Space ``frames`` poses equally from ``start`` to ``end`` (Almanza-Medina, 2.2.1).
 
-        The six numbers run linearly without wrapping: heading 350 to 370 deg turns 20 deg to starboard
-        (:meth:`Pose.from_degrees` takes angles beyond a full turn).
+        The six numbers are interpolated linearly without wrapping: a heading from 350 to 370 deg turns 20 deg to starboard
+        (:meth:`Pose.from_degrees` accepts angles beyond a full turn).
 
         Raises:
-            MitsonarError: no frames.
+            MitsonarError: ``frames`` is less than 1.
         """
         if frames < 1:
             raise MitsonarError(f"frames must be at least 1: got {frames}")
@@ -97,7 +103,7 @@ class Trajectory:
         """Interpolate ``frames`` poses equally spaced in time, along straight lines and shortest turns.
 
         Raises:
-            MitsonarError: no frames.
+            MitsonarError: ``frames`` is less than 1.
         """
         if frames < 1:
             raise MitsonarError(f"frames must be at least 1: got {frames}")
@@ -109,10 +115,10 @@ class Trajectory:
     def at(self, time_s: ArrayLike) -> NDArray[np.float64]:
         """Interpolate the poses ``(n, 6)`` at times ``(n,)`` [s], along straight lines and shortest turns.
 
-        Before the first time and after the last one the first and the last pose hold.
+        Times before the first or after the last take the first or the last pose.
 
         Raises:
-            MitsonarError: times of the trajectory that do not grow.
+            MitsonarError: the times of the trajectory do not increase.
         """
         time = np.clip(np.atleast_1d(np.asarray(time_s, dtype=float)), self.time_s[0], self.time_s[-1])
         if len(self) == 1:
@@ -123,9 +129,9 @@ class Trajectory:
         return poses_from(position, Slerp(self.time_s, vehicle_rotation(self.poses))(time))
 
     def lengthened(self, seconds: float) -> Trajectory:
-        """Return the trajectory with a pose this long before its first and one after its last, at the speed beside each.
+        """Extend the trajectory by one pose ``seconds`` before its first and one after its last [s].
 
-        Turns go on about the axis of the step beside them. A single pose stands still.
+        Velocity and rotation of the first and the last step continue. A trajectory of a single pose is returned unchanged.
         """
         if len(self) == 1 or seconds <= 0:
             return self
@@ -142,22 +148,23 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: str | Path, frame: str = "mitsonar", *, looks_ahead: bool = True) -> Self:
-        """Read a TUM file, or a CSV file where the name ends with ``.csv``.
+        """Read a TUM file, or a CSV file if the name ends with ``.csv``.
 
         A CSV file names its columns in its first line: ``time_s`` (or ``time``, ``timestamp``), ``x``, ``y``, ``z`` (or
         ``x_m`` ...), and either ``qx``, ``qy``, ``qz``, ``qw`` or ``roll``, ``pitch`` and ``heading`` (or ``yaw``; in
-        ``ros-enu`` only ``yaw``), each with ``_deg`` or ``_rad``; other columns are not read.
+        ``ros-enu`` only ``yaw``), each with ``_deg`` or ``_rad``. Other columns are ignored.
 
         Args:
-            path: of the file.
-            frame: its convention: ``mitsonar``, ``ros-enu`` or ``ned`` (:mod:`mitsonar.motion.trajectory`).
-            looks_ahead: False where the sonar points down from a level vehicle; decides only on the warning.
+            path: path of the file.
+            frame: convention of the file: ``mitsonar``, ``ros-enu`` or ``ned`` (:class:`Convention`).
+            looks_ahead: False if the sonar points down from a level vehicle; only affects the warning.
 
         Raises:
-            MitsonarError: unknown convention; unreadable file, or a broken line, with its number.
+            MitsonarError: the convention is unknown, the file cannot be read, or a line is broken; the message names the
+                line.
 
         Warns:
-            MitsonarWarning: in most frames the sonar points sideways or at the sky. The convention is probably wrong.
+            MitsonarWarning: the sonar points sideways or at the sky in most frames; the convention is probably wrong.
         """
         convention = convention_named(frame)
         if Path(path).suffix.lower() != ".csv":
@@ -172,18 +179,18 @@ class Trajectory:
         return cls(read[frame], table[:, 0])
 
     def save(self, path: str | Path, frame: str = "mitsonar") -> None:
-        """Write a TUM file, or a CSV file where the name ends with ``.csv``. :meth:`load` reads it back to 1e-9 m and deg.
+        """Write a TUM file, or a CSV file if the name ends with ``.csv``. :meth:`load` reads it back to 1e-9 m and deg.
 
         Args:
-            path: of the file, which is replaced.
-            frame: the file's convention: ``mitsonar``, ``ros-enu`` or ``ned``.
+            path: path of the file, which is replaced.
+            frame: convention of the file: ``mitsonar``, ``ros-enu`` or ``ned``.
 
         Raises:
-            MitsonarError: unknown convention.
+            MitsonarError: the convention is unknown.
         """
         convention = convention_named(frame)
         position, rotation = self.poses[:, :3], vehicle_rotation(self.poses)
-        if frame != "mitsonar":  # whose numbers keep their bits
+        if frame != "mitsonar":  # the conversion would round the numbers
             position, rotation = convention.from_ours(position, rotation)
         if Path(path).suffix.lower() == ".csv":
             angles = convention.angles_from_ours(self.poses[:, 3:])
@@ -194,16 +201,16 @@ class Trajectory:
 
     @classmethod
     def load_tum(cls, path: str | Path) -> Self:
-        """Read a TUM file in mitsonar's convention: the quaternion turns (starboard, forward, up) to the world.
+        """Read a TUM file in the convention of mitsonar: the quaternion rotates (starboard, forward, up) to the world.
 
         Raises:
-            MitsonarError: unreadable file, or a broken line, with its number.
+            MitsonarError: the file cannot be read, or a line is broken; the message names the line.
         """
         table = read_tum(path, CONVENTIONS["mitsonar"])
         return cls(_posed(table, CONVENTIONS["mitsonar"]), table[:, 0])
 
     def save_tum(self, path: str | Path) -> None:
-        """Write a TUM file in mitsonar's convention. :meth:`load_tum` reads it back to 1e-9."""
+        """Write a TUM file in the convention of mitsonar. :meth:`load_tum` reads it back to 1e-9."""
         quaternions = vehicle_rotation(self.poses).as_quat(canonical=True)
         write_tum(path, np.column_stack([self.time_s, self.poses[:, :3], quaternions]), CONVENTIONS["mitsonar"])
 
@@ -222,7 +229,7 @@ def _posed_by_angles(table: NDArray[np.float64], convention: Convention) -> NDAr
 
 
 def _warn_of_attitude(path: str | Path, read: dict[str, NDArray[np.float64]], frame: str, looks_ahead: bool) -> None:
-    """Warn where most frames point sideways or at the sky; ``read`` has the poses by convention."""
+    """Warn if the sonar points sideways or at the sky in most frames; ``read`` holds the poses in every convention."""
     share = {name: sideways_or_up(poses, looks_ahead=looks_ahead).mean() for name, poses in read.items()}
     if share[frame] <= 0.5:
         return
@@ -239,21 +246,20 @@ def _warn_of_attitude(path: str | Path, read: dict[str, NDArray[np.float64]], fr
     )
 
 
-# ---------------- Files of poses: TUM (``time x y z qx qy qz qw`` a line) and CSV (columns by name), in any
-# convention by name
+# ---------------- Files of poses
 
 
 Table = NDArray[np.float64]
 
 OURS = "(starboard, forward, up to world)"
-"""End of the first line of a TUM file in mitsonar's own convention."""
+"""End of the first line of a TUM file in the convention of mitsonar."""
 
 ALIASES = {
     "time": ("time_s", "time", "timestamp"),
     **{axis: (f"{axis}_m", axis) for axis in "xyz"},
     **{f"q{axis}": (f"q{axis}",) for axis in "xyzw"},
 }
-"""Names of columns; the first is written."""
+"""Accepted names of each column, of which the first is written."""
 
 COLUMNS = (
     "time_s (or time, timestamp), x, y, z (or x_m, y_m, z_m), and either qx, qy, qz, qw or roll, pitch and heading (or yaw) "
@@ -264,8 +270,10 @@ COLUMNS = (
 def read_tum(path: str | Path, convention: Convention) -> Table:
     """Read the numbers of a TUM file ``(poses, 8)``: time [s], position [m], quaternion (x, y, z, w).
 
+    Each line of the file is ``time x y z qx qy qz qw``.
+
     Raises:
-        MitsonarError: unreadable file, a broken line, with its number, or a file that names another convention.
+        MitsonarError: the file cannot be read or names another convention, or a line is broken; the message names the line.
     """
     rows: list[list[float]] = []
     for number, line in enumerate(_text(path).splitlines(), start=1):
@@ -283,30 +291,33 @@ def write_tum(path: str | Path, table: Table, convention: Convention) -> None:
     """Write a TUM file.
 
     Args:
-        path: of the file, which is replaced.
+        path: path of the file, which is replaced.
         table: time, position, quaternion ``(poses, 8)``, in the convention.
-        convention: named in the first line.
+        convention: convention of the table, which the first line names.
     """
     axes = OURS if convention.name == "mitsonar" else f"(frame {convention.name}: {convention.axes})"
     np.savetxt(path, table, fmt="%.9f", header=f"time_s x y z qx qy qz qw {axes}")
 
 
 LARGEST = 2**30
-"""Bytes of a trajectory, at most."""
+"""Largest size of a file [bytes]."""
 
 FARTHEST = 1e12
-"""Largest position [m], time [s] and number of a quaternion in a file."""
+"""Largest position [m], time [s] and quaternion component in a file."""
 
 
 def read_csv(path: str | Path, convention: Convention) -> tuple[Table, Table, Table | None]:
-    """Read the numbers of a CSV file. Other columns are not read, nor lines that hold a time and other columns only.
+    """Read the numbers of a CSV file, whose first line names the columns.
+
+    Other columns are ignored, and so are lines with a time and values in other columns only.
 
     Returns:
         Times [s] and positions [m] ``(poses, 4)``; then quaternions ``(poses, 4)`` and None, or twice the angles pitch, roll
         and turn about the vertical ``(poses, 3)`` [rad].
 
     Raises:
-        MitsonarError: unreadable file, columns that are missing or double, a broken line, with its number.
+        MitsonarError: the file cannot be read, a column is missing or duplicated, or a line is broken; the message names the
+            line.
     """
     try:
         lines = list(csv.reader(io.StringIO(_text(path))))
@@ -332,12 +343,14 @@ def read_csv(path: str | Path, convention: Convention) -> tuple[Table, Table, Ta
 
 
 def write_csv(path: str | Path, table: Table, convention: Convention) -> None:
-    """Write a CSV file: ``time_s,x_m,y_m,z_m,roll_deg,pitch_deg,heading_deg`` (``yaw_deg`` in ros-enu), whole or absent.
+    """Write a CSV file ``time_s,x_m,y_m,z_m,roll_deg,pitch_deg,heading_deg`` (``yaw_deg`` in ros-enu).
+
+    The file is replaced atomically: it is never left half written.
 
     Args:
-        path: of the file, which is replaced.
+        path: path of the file, which is replaced.
         table: time, position [m], pitch, roll, turn about the vertical [rad] ``(poses, 7)``, in the convention.
-        convention: has the name of that turn.
+        convention: convention of the table, which names the turn about the vertical.
     """
     names = ["time_s", "x_m", "y_m", "z_m", "roll_deg", "pitch_deg", f"{convention.turn[0]}_deg"]
     shown = np.column_stack([table[:, :4], np.degrees(table[:, [5, 4, 6]])])
@@ -359,7 +372,7 @@ def _text(path: str | Path) -> str:
 
 
 def _refuse_another(path: str | Path, line: str, convention: Convention) -> None:
-    """Refuse a file of mitsonar that names another convention."""
+    """Raise a MitsonarError if a comment line written by mitsonar names another convention."""
     named = re.search(r"\(frame ([\w-]+):", line)
     name = named.group(1) if named else "mitsonar" if OURS in line else convention.name
     if name != convention.name:
@@ -389,7 +402,7 @@ def _tum_row(path: str | Path, number: int, line: str) -> list[float]:
 
 
 def _column(path: str | Path, names: list[str], key: str) -> int:
-    """Return the column of a key."""
+    """Return the index of the column of a key of :data:`ALIASES`."""
     found = [number for number, name in enumerate(names) if name in ALIASES[key]]
     if len(found) > 1:
         raise MitsonarError(f"trajectory {path} has {key} in {len(found)} columns: leave all but one out")
@@ -401,7 +414,7 @@ def _column(path: str | Path, names: list[str], key: str) -> int:
 
 
 def _attitude(path: str | Path, names: list[str], convention: Convention) -> tuple[list[int], Table | None]:
-    """Return the columns of the attitude: a quaternion and None, or pitch, roll, turn and the factors to radians."""
+    """Return the columns of a quaternion and None, or those of pitch, roll, turn and their factors to radians."""
     quaternion = [name for name in names if name in ("qx", "qy", "qz", "qw")]
     angles = [name for name in names if name.rsplit("_", 1)[0] in ("roll", "pitch", "heading", "yaw")]
     if quaternion and angles:
@@ -436,7 +449,7 @@ def _angle(path: str | Path, names: list[str], wanted: Sequence[str], convention
 
 
 def _readings_only(words: list[str], columns: list[int]) -> bool:
-    """Return whether a line has a time and no pose, but something else: readings of sensors at a time of their own."""
+    """Return whether a line has a time and values but no pose: readings of sensors between poses."""
     held = {number for number, word in enumerate(words) if word.strip()}
     return not held & set(columns[1:]) and columns[0] in held and len(held) > 1
 
@@ -455,28 +468,28 @@ def _csv_row(path: str | Path, number: int, words: list[str], columns: list[int]
     return row
 
 
-# ---------------- Conventions of poses by name: mitsonar's own, that of ROS (REP 103), and that of navigation at sea
+# ---------------- Conventions
 # | name | world: x, y, z | body: x, y, z | pitch > 0 | roll > 0 | turn about the vertical |
 # |---|---|---|---|---|---|
 # | ``mitsonar`` | east, north, up | starboard, forward, up | looks down | starboard down | heading, clockwise from north |
 # | ``ros-enu`` | east, north, up | forward, left, up | looks down | starboard down | yaw, anticlockwise from east |
 # | ``ned`` | north, east, down | forward, right, down | looks up | starboard down | heading, clockwise from north |
-#
-# East and north are names of the world's first two axes. The user chooses their directions on the earth.
 
 
 @dataclass(frozen=True)
 class Convention:
-    """A convention for the poses of a file.
+    """A convention for the poses of a file: that of mitsonar, of ROS (REP 103), or of navigation at sea.
+
+    East and north only name the horizontal axes of the world; the user chooses their directions on Earth.
 
     Attributes:
-        name: for the user, ``ros-enu``.
-        axes: of world and body, in words.
-        world: its world axes in mitsonar's world, as columns ``(3, 3)``.
+        name: name of the convention for users, such as ``ros-enu``.
+        axes: description of the axes of world and body.
+        world: its world axes in the world of mitsonar, as columns ``(3, 3)``.
         body: starboard, forward and up in its body axes, as columns ``(3, 3)``.
-        signs: of pitch, roll and the turn about the vertical, relative to mitsonar's.
+        signs: signs of pitch, roll and the turn about the vertical, relative to those of mitsonar.
         north: its turn about the vertical at heading 0 [rad].
-        turn: names of that turn in a table's column; the first is written.
+        turn: names of the column of that turn in a table, of which the first is written.
     """
 
     name: str
@@ -488,34 +501,34 @@ class Convention:
     turn: tuple[str, ...]
 
     def to_ours(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
-        """Convert positions and attitudes to mitsonar's convention.
+        """Convert positions and attitudes to the convention of mitsonar.
 
         Args:
-            position: in this convention's world ``(n, 3)`` [m].
-            rotation: of its body to its world.
+            position: positions in the world of this convention ``(n, 3)`` [m].
+            rotation: rotations from its body to its world.
 
         Returns:
-            Positions ``(n, 3)`` in mitsonar's world [m], and the rotations of (starboard, forward, up) to it.
+            Positions ``(n, 3)`` in the world of mitsonar [m], and rotations from (starboard, forward, up) to it.
         """
         world, body = Rotation.from_matrix(self.world), Rotation.from_matrix(self.body)
         return world.apply(position), world * rotation * body
 
     def from_ours(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
-        """Convert positions and attitudes from mitsonar's convention, the inverse of :meth:`to_ours`."""
+        """Convert positions and attitudes from the convention of mitsonar, the inverse of :meth:`to_ours`."""
         world, body = Rotation.from_matrix(self.world), Rotation.from_matrix(self.body)
         return world.inv().apply(position), world.inv() * rotation * body.inv()
 
     def angles_to_ours(self, angles: Table) -> Table:
-        """Convert angles to mitsonar's pitch, roll, heading ``(n, 3)`` [rad].
+        """Convert angles to pitch, roll, heading of mitsonar ``(n, 3)`` [rad].
 
         Args:
-            angles: pitch, roll and turn about the vertical ``(n, 3)`` [rad]; the rotation takes the turn first,
-                then pitch, then roll.
+            angles: pitch, roll and turn about the vertical ``(n, 3)`` [rad]; the rotation applies the turn first, then
+                pitch, then roll.
         """
         return np.asarray((angles - (0, 0, self.north)) * self.signs)
 
     def angles_from_ours(self, angles: Table) -> Table:
-        """Convert angles from mitsonar's convention: the inverse of :meth:`angles_to_ours`."""
+        """Convert angles from the convention of mitsonar, the inverse of :meth:`angles_to_ours`."""
         return np.asarray(angles * self.signs + (0, 0, self.north))
 
 
@@ -551,14 +564,14 @@ CONVENTIONS = {
         ),
     )
 }
-"""The conventions that pose files may have, by name."""
+"""The supported conventions of pose files, by name."""
 
 
 def convention_named(name: str) -> Convention:
-    """Return the convention of a name.
+    """Return the convention with a name.
 
     Raises:
-        MitsonarError: unknown name.
+        MitsonarError: the name is unknown.
     """
     if name not in CONVENTIONS:
         raise MitsonarError(f"unknown frame {name!r} of poses: {nearest_names(name, CONVENTIONS)}")
@@ -566,34 +579,37 @@ def convention_named(name: str) -> Convention:
 
 
 LEVEL = math.sin(math.radians(10))
-"""An axis is level where its vertical part is smaller."""
+"""Vertical component of an axis below which the axis counts as level."""
 
 ON_ITS_SIDE = math.sin(math.radians(45))
-"""A sonar lies on its side where the vertical part of its starboard axis is larger."""
+"""Vertical component of the starboard axis above which a sonar lies on its side."""
 
 ALONG = math.cos(math.radians(60))
-"""A sonar points across its course where the part of its axis along the course, ahead or astern, is smaller."""
+"""Component of the axis along the course, ahead or astern, below which a sonar points across its course."""
 
 
 def sideways_or_up(poses: Table, *, looks_ahead: bool = True) -> NDArray[np.bool_]:
-    """Detect the frames in which a sonar points at the sky or sideways. A file read in a wrong convention has many.
+    """Detect the frames in which a sonar points at the sky or sideways, as in a file read in the wrong convention.
 
-    At the sky: its axis rises by more than 10 deg. Sideways: its starboard axis is 45 deg off the level or more; or its own
-    axis is level to 10 deg while its starboard axis is not, or while it moves across that axis (60..120 deg).
+    A sonar points at the sky if its axis rises by more than 10 deg. It points sideways if its starboard axis is 45 deg or
+    more off the level. It also points sideways if its acoustic axis is level to within 10 deg while its starboard axis is
+    not, or while it moves across that axis (60..120 deg).
 
     Args:
         poses: x, y, z [m], pitch, roll, heading [rad] ``(frames, 6)``.
-        looks_ahead: False for a sonar that points down from a level vehicle, as hydrophones do. It points sideways where the
-            vehicle's own axes are 45 deg off the level, and at the sky where the vehicle is upside down.
+        looks_ahead: False for a sonar that points down from a level vehicle, as hydrophones do. It points sideways if the
+            axes of the vehicle are 45 deg off the level, and at the sky if the vehicle is upside down.
 
     Returns:
         True for these frames ``(frames,)``.
     """
+    # vertical components of the acoustic axis, of the starboard axis (absolute) and of the up axis
     pitch, roll, heading = poses[:, 3:].T
     rises, leans, up = -np.sin(pitch), np.abs(np.sin(roll) * np.cos(pitch)), np.cos(roll) * np.cos(pitch)
     if not looks_ahead:
         return np.asarray(up < ON_ITS_SIDE)
     level = np.abs(rises) < LEVEL
+    # direction of motion relative to the horizontal acoustic axis; frames without motion do not count
     way = np.gradient(poses[:, :2], axis=0) if len(poses) > 1 else np.zeros((1, 2))
     length = np.linalg.norm(way, axis=1)
     ahead = np.abs(way[:, 0] * np.sin(heading) + way[:, 1] * np.cos(heading))
