@@ -1,4 +1,4 @@
-"""How frames become the input of a network, and motions its labels; on the array API, for NumPy and torch alike."""
+"""How frames become the input of a network, and motions its labels; for NumPy and torch, on the array API."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from mitsonar.geometry.fan import CartesianMap, cartesian_map
 __all__ = ["LABELS", "Arrangement", "ArrayOfAnyLibrary", "Labels", "arrangement_of"]
 
 ArrayOfAnyLibrary: TypeAlias = Any
-"""An array of NumPy or torch, on any device: code on the array API takes both and returns what it was given."""
+"""An array of NumPy or torch on any device. Code on the array API accepts both, and returns the type that it was given."""
 
 InputOfAnyLibrary: TypeAlias = ArrayOfAnyLibrary | tuple[ArrayOfAnyLibrary, ...]
-"""The input of a network: one array, or a polar and a Cartesian one."""
+"""Input of a network: one array, or a polar and a Cartesian array."""
 
 LABELS = ("raw", "quantised", "normx10")
 """Kinds of labels; see :class:`Labels`."""
 
 LEVELS = 32
-"""Values of a quantised label, 0 to 31 (Almanza-Medina, 3.4.1)."""
+"""Number of values of a quantised label, 0 to 31 (Almanza-Medina, 3.4.1)."""
 
 SCALE = 10.0
-"""Normalised labels lie in +-10 ("Normx10", Almanza-Medina, 3.4.2)."""
+"""Limit of normalised labels, which lie in +-10 ("Normx10", Almanza-Medina, 3.4.2)."""
 
 WHICH_LEVEL = 0x1E7E1
-"""Difference of the seed of noise and the seed that draws its level."""
+"""Offset of the seed that draws a noise level from the seed of the noise."""
 
 Layout = Literal["side", "stack", "channels"]
 Coordinates = Literal["polar", "cartesian", "both"]
@@ -41,11 +41,11 @@ Coordinates = Literal["polar", "cartesian", "both"]
 
 @dataclass(frozen=True)
 class Labels:
-    """Encodes targets as a network learns them, and decodes them.
+    """Encoder of targets to the labels that a network learns, and decoder of labels.
 
     Attributes:
-        kind: ``raw`` (m, m, rad; or m of height), ``quantised`` to 32 levels 0..31, or ``normx10``, in +-10.
-        low, high: limits of the targets, from the recipe ``(targets,)``.
+        kind: ``raw`` (m, m, rad; or m for heights), ``quantised`` to 32 levels 0..31, or ``normx10``, in +-10.
+        low, high: limits of the targets in the recipe ``(targets,)``.
         names: of the targets, with units.
     """
 
@@ -56,10 +56,10 @@ class Labels:
 
     @classmethod
     def of(cls, kind: str, recipe: Recipe, frames: int) -> Labels:
-        """Return the labels of samples of ``frames`` frames: their motion, or the height if a sample is one frame.
+        """Return the labels for samples with ``frames`` frames: motions, or heights if a sample is one frame.
 
         Raises:
-            MitsonarError: an unknown kind.
+            MitsonarError: unknown kind.
         """
         if kind not in LABELS:
             raise MitsonarError(f"unknown labels {kind!r}: {nearest_names(kind, LABELS)}")
@@ -71,7 +71,7 @@ class Labels:
         return cls(kind, -limit, limit, ("sideways (m)", "forward (m)", "yaw (rad)"))
 
     def encode(self, targets: ArrayLike) -> NDArray[np.float32]:
-        """Compute the labels ``(..., targets)`` of targets [m, rad]. Quantised labels are clipped to the limits."""
+        """Compute the labels ``(..., targets)`` of targets [m, rad]; quantised labels are clipped to the limits."""
         values = np.asarray(targets, dtype=float)
         if self.kind == "raw":
             return values.astype(np.float32)
@@ -81,7 +81,7 @@ class Labels:
         return ((2 * part - 1) * SCALE).astype(np.float32)
 
     def decode(self, labels: ArrayLike) -> NDArray[np.float64]:
-        """Compute the targets [m, rad] of labels, or of estimates of them ``(..., targets)``."""
+        """Compute the targets [m, rad] of labels ``(..., targets)``, or of estimates of labels."""
         values = np.asarray(labels, dtype=float)
         if self.kind == "raw":
             return values
@@ -89,27 +89,27 @@ class Labels:
         return np.asarray(self.low + part * (self.high - self.low), dtype=np.float64)
 
     def _part(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Compute 0 at the lower limit and 1 at the upper one; 1/2 where the limits are equal."""
+        """Map the lower limit to 0 and the upper limit to 1; return 1/2 if the limits are equal."""
         span = self.high - self.low
         return np.where(span > 0, (values - self.low) / np.where(span > 0, span, 1), 0.5)
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Turns the frames of a batch into the input of a network.
+    """Conversion of the frames of a batch to the input of a network.
 
     Attributes:
-        views: names of the views, in the order in which they are placed.
+        views: names of the views, in the order of their placement.
         kind: ``image`` or ``vector``.
         layout: ``side``: frames side by side, view by view (batch, 1, bins, frames * beams); ``stack``: one below the
             other; ``channels``: one channel each. Vectors are columns (batch, 1, bins, frames * views), or channels.
         coordinates: ``polar``; ``cartesian``, fans in metres; ``both``, a pair of the two.
-        noise: drawn from (seed, frame, cell).
+        noise: noise model; the noise depends on seed, frame and cell.
         beams: number of beams of each view.
         maps: scan conversion of each view.
-        range_levels: number of levels of a vector, whose bins are added up in groups; None: one level a bin.
+        range_levels: number of levels in a vector, whose bins are summed in groups; None: one level per bin.
         halves: whether images become vectors of their port and starboard halves (Almanza-Medina, fig. 4.18).
-        levels: levels of noise, of which each sample draws one by (seed, its first frame); empty: ``noise`` for all.
+        levels: noise levels, from which each sample draws one by seed and first frame; empty: ``noise`` for all samples.
     """
 
     views: tuple[str, ...]
@@ -127,13 +127,13 @@ class Arrangement:
         """Arrange the input of a network.
 
         Args:
-            frames: by view ``(batch, frames, bins, beams)`` uint8 or float 0..1; as vectors ``(batch, frames, bins)`` with
-                ``nonzero_VIEW`` beside; NumPy or torch, on any device.
-            numbers: of the frames ``(batch, frames)``, integers, from which noise is drawn.
+            frames: arrays keyed by view, of NumPy or torch, on any device: images ``(batch, frames, bins, beams)`` of uint8
+                or float in 0..1, or vectors ``(batch, frames, bins)`` together with ``nonzero_VIEW``.
+            numbers: of the frames ``(batch, frames)``, integers that seed the noise.
             seed: of the noise.
 
         Returns:
-            One array ``(batch, channels, rows, columns)`` float32, or a polar and a Cartesian one.
+            One float32 array ``(batch, channels, rows, columns)``, or a polar and a Cartesian array.
         """
         if self.levels:
             return self._with_drawn_levels(frames, numbers, seed)
@@ -153,12 +153,14 @@ class Arrangement:
     def _with_drawn_levels(
         self, frames: Mapping[str, ArrayOfAnyLibrary], numbers: ArrayOfAnyLibrary, seed: int
     ) -> InputOfAnyLibrary:
-        """Arrange a batch whose samples draw their noise levels, level by level, in the order of the batch."""
+        """Arrange a batch whose samples draw their noise levels; the order of the batch is preserved."""
+        # 1. Draw the level of each sample, and group the samples by level.
         xp = array_namespace(numbers)
         drawn, _ = uniform((numbers.shape[0], 1, 1), seed=seed + WHICH_LEVEL, frames=numbers[:, 0], like=numbers)
         level = xp.floor(drawn[:, 0, 0] * len(self.levels))
         groups = [(model, xp.nonzero(level == k)[0]) for k, model in enumerate(self.levels)]
         mine = {name: values for name, values in frames.items() if name.removeprefix("nonzero_") in self.views}
+        # 2. Arrange each group with a single noise model.
         parts = [
             replace(self, noise=model, levels=())(
                 {name: xp.take(values, chosen, axis=0) for name, values in mine.items()},
@@ -168,6 +170,7 @@ class Arrangement:
             for model, chosen in groups
             if chosen.shape[0]
         ]
+        # 3. Join the groups and restore the order of the batch.
         back = xp.argsort(xp.concat([chosen for _, chosen in groups]))
 
         def joined(pieces: Iterable[ArrayOfAnyLibrary]) -> ArrayOfAnyLibrary:
@@ -181,8 +184,8 @@ class Arrangement:
         """Add noise to the frames of a view.
 
         Args:
-            frames: as for a call.
-            view: whose frames are wanted.
+            frames: as in :meth:`__call__`.
+            view: name of the view.
             numbers: of the frames ``(batch, frames)``.
             seed: of the noise.
 
@@ -195,10 +198,12 @@ class Arrangement:
         batch, count, *shape = values.shape
         flat = xp.reshape(values, (batch * count, *shape))
         numbers = xp.reshape(numbers, (batch * count,))
+        # Vectors: the noise of a sum over beams, given the number of beams that have an echo.
         if len(shape) == 1:
             nonzero = xp.reshape(frames[f"nonzero_{view}"], flat.shape)
             flat = self.noise.apply_sum(flat, nonzero, self.beams[view], seed=seed, frames=numbers)
             return xp.reshape(flat, values.shape)
+        # Images: scale to 0..1 and add noise to each pixel; sum over beams afterwards if vectors are requested.
         if values.dtype == xp.uint8:
             flat = xp.astype(flat, xp.float32) * xp.asarray(1 / 255, dtype=xp.float32, device=device(flat))
         flat = self.noise.apply(flat, seed=seed, frames=numbers)
@@ -206,12 +211,12 @@ class Arrangement:
             return xp.reshape(flat, values.shape)
         if not self.halves:
             return xp.reshape(xp.sum(flat, axis=-1), values.shape[:-1])
-        half = flat.shape[-1] // 2  # an odd beam in the middle is in neither half
+        half = flat.shape[-1] // 2  # with an odd number of beams, the middle one is in neither half
         both = [xp.sum(side, axis=-1) for side in (flat[..., :half], flat[..., flat.shape[-1] - half :])]
         return xp.reshape(xp.stack(both, axis=-1), (*values.shape[:-1], 2))
 
     def _coarser(self, vectors: ArrayOfAnyLibrary) -> ArrayOfAnyLibrary:
-        """Add up neighbouring bins of vectors ``(batch, bins)``."""
+        """Sum neighbouring bins of vectors ``(batch, bins)`` into ``range_levels`` levels."""
         if self.range_levels is None:
             return vectors
         batch, bins = vectors.shape
@@ -219,7 +224,7 @@ class Arrangement:
         return array_namespace(vectors).sum(split, axis=-1)
 
     def _laid_out(self, parts: list[ArrayOfAnyLibrary]) -> ArrayOfAnyLibrary:
-        """Join frames of all views in one array ``(batch, channels, rows, columns)``."""
+        """Join the frames of all views into one array ``(batch, channels, rows, columns)``."""
         xp = array_namespace(parts[0])
         pictures = [part[:, q, ...] for part in parts for q in range(part.shape[1])]
         if self.layout == "channels":
@@ -239,13 +244,14 @@ def arrangement_of(
     range_levels: int | None = None,
     halves: bool = False,
 ) -> Arrangement:
-    """Build the arrangement of a recipe's frames; of several noise levels each sample draws one.
+    """Build the arrangement of a recipe's frames.
 
-    The options are those of :class:`Arrangement`. By default all stored views are taken, of the first stored kind.
-    ``cartesian_rows`` is the number of pixels of a fan in the forward direction.
+    The options are those of :class:`Arrangement`. By default the arrangement uses all stored views, of the first stored
+    kind. If ``noise`` is a list, each sample draws one of its levels. ``cartesian_rows`` is the number of pixels of a fan in
+    the forward direction.
 
     Raises:
-        MitsonarError: an option that is unknown, or that does not fit the others.
+        MitsonarError: an option is unknown, or does not fit the others.
     """
     known = {view.name: view for view in recipe.views}
     chosen = (views,) if isinstance(views, str) else tuple(known if views is None else views)
@@ -277,10 +283,10 @@ def arrangement_of(
 
 
 def _noise_models(noise: str | NoiseModel | Sequence[str | NoiseModel]) -> tuple[NoiseModel, ...]:
-    """Return the models of one level of noise, or of several.
+    """Return the noise models of one level or of several levels.
 
     Raises:
-        MitsonarError: something else, or an unknown name.
+        MitsonarError: the argument has another type, or a name is unknown.
     """
     levels = [noise] if isinstance(noise, str | NoiseModel) else list(noise) if isinstance(noise, Sequence) else []
     if not levels or not all(isinstance(level, str | NoiseModel) for level in levels):
@@ -289,10 +295,10 @@ def _noise_models(noise: str | NoiseModel | Sequence[str | NoiseModel]) -> tuple
 
 
 def _check_names(recipe: Recipe, views: tuple[str, ...], kind: str, layout: str, coordinates: str) -> None:
-    """Check the options that are names, and whether they fit each other and what is stored.
+    """Check that named options are known, and that they fit each other and the stored arrays.
 
     Raises:
-        MitsonarError: an unknown name, or names that do not fit.
+        MitsonarError: a name is unknown or does not fit.
     """
     for word, name, allowed in (
         (kind, "kind", ("image", "vector")),
@@ -314,10 +320,10 @@ def _check_names(recipe: Recipe, views: tuple[str, ...], kind: str, layout: str,
 
 
 def _check_vectors(recipe: Recipe, kind: str, range_levels: int | None, halves: bool) -> None:
-    """Check the options that are for vectors only.
+    """Check the options that apply to vectors only.
 
     Raises:
-        MitsonarError: they do not fit the others.
+        MitsonarError: they do not fit the other options.
     """
     if (range_levels is not None or halves) and kind != "vector":
         raise MitsonarError("range_levels and halves are for vectors: read kind='vector', or leave them out")

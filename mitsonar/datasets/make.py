@@ -1,4 +1,7 @@
-"""Making a data set: shard by shard, by one process or many. A whole shard is never made twice, whatever was killed."""
+"""How a data set is made and checked: shard by shard, by one process or many.
+
+An interrupted run can be continued: a complete shard is never rendered again, whichever process was killed.
+"""
 
 from __future__ import annotations
 
@@ -68,25 +71,25 @@ __all__ = [
 
 
 HALF_A_GROUP = re.compile(r"zarr\.[0-9a-f]{32}\.partial")
-"""What a kill leaves before anything else is there. Any other file belongs to the user."""
+"""Partial file that a killed writer may leave in an otherwise empty folder. Any other file belongs to the user."""
 
 ROUNDS = 3
-"""How often shards that are missing at the end are made."""
+"""Number of passes over the shards that are still missing."""
 
 SHARDS_TO_CHECK = 32
-"""Shards of a large data set that are searched for empty frames. `mitsonar dataset check` reads all of them."""
+"""Number of shards of a large data set that are searched for empty frames; `mitsonar dataset check` reads all."""
 
 
 @dataclass(frozen=True)
 class Made:
-    """What making a data set did.
+    """Report of :func:`make_dataset`.
 
     Attributes:
         url: of the store.
-        frames: of the data set.
-        made: shards that this call wrote.
-        shards: of the data set.
-        warnings: a sentence each.
+        frames: number of frames of the data set.
+        made: number of shards that this call wrote.
+        shards: number of shards of the data set.
+        warnings: one sentence each.
     """
 
     url: str
@@ -107,20 +110,23 @@ def make_dataset(
     begun: Callable[[int, int], None] = lambda frames, done: None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> Made:
-    """Make a data set, or continue one that was interrupted. The result is the same bit for bit.
+    """Make a data set, or continue one that was interrupted; the result is the same bit for bit.
 
     Args:
         recipe: of the data set.
         url: folder or URL of the store.
-        sequences: only so many of the recipe's sequences.
-        workers: processes on this machine; with 1 this process renders, with all its threads.
+        sequences: number of sequences to make; all of the recipe by default.
+        workers: number of processes on this machine; with 1 this process renders, with all its threads.
         scheduler: address of a running dask scheduler, whose workers render instead.
-        verify: whether existing shards are compared with their digests, too, and remade where these differ.
-        begun: called with the number of frames of the data set and the number of those that exist already.
+        verify: whether to compare existing shards with their digests, too, and make those again that differ.
+        begun: called with the number of frames of the data set and the number of those that already exist.
         progress: called with the number of frames that were added.
 
+    Returns:
+        The report.
+
     Raises:
-        MitsonarError: the store is another data set, another process writes it, or it was begun with other versions.
+        MitsonarError: the store holds another data set, another process writes to it, or it was begun with other versions.
     """
     if recipe.recorded is not None:
         raise MitsonarError(f"the recipe {recipe.name} is of recorded frames: `mitsonar dataset from-frames` copies them")
@@ -133,7 +139,7 @@ def make_dataset(
         todo = store.missing(verify=verify)
         begun(len(store), len(store) - _frames(store, todo))
         written = 0
-        for _ in range(ROUNDS):  # what was damaged meanwhile is remade
+        for _ in range(ROUNDS):  # later passes replace shards that were damaged meanwhile
             if not todo:
                 break
             _check_versions(store)
@@ -150,7 +156,7 @@ def make_dataset(
 
 
 def _refuse_other_files(storage: Storage) -> None:
-    """Refuse a folder with other files: creating an array removes what has its name.
+    """Refuse a folder with other files, because creating an array removes any file of the same name.
 
     Raises:
         MitsonarError: there are other files.
@@ -163,7 +169,7 @@ def _refuse_other_files(storage: Storage) -> None:
 def _open_or_create(storage: Storage, recipe: Recipe, sequences: int | None, variant: str, verify: bool) -> DataStore:
     """Open the existing store if it is the same data set, or create a new one."""
     count = recipe.sequences if sequences is None else sequences
-    scenes_of(recipe, count)  # refuses a wrong number before anything is rendered
+    scenes_of(recipe, count)  # rejects a wrong number before anything is rendered
     if "zarr.json" in storage.sizes():
         store = DataStore.open(storage, write=True, unfinished=True)
         _check_same(store, recipe, count, variant)
@@ -179,7 +185,7 @@ def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) 
     """Check that the store was begun with this recipe, number of sequences and variant.
 
     Raises:
-        MitsonarError: it was not; the message names what differs.
+        MitsonarError: it was not; the message names the differences.
     """
     about = store.about
     asked = {**recipe.model_dump(mode="json"), "sequences": sequences}
@@ -193,7 +199,7 @@ def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) 
 
 
 def _check_versions(store: DataStore) -> None:
-    """Check that the missing shards would fit the existing ones.
+    """Check that the missing shards would be made with the same versions as the existing ones.
 
     Raises:
         MitsonarError: the store was begun with other versions.
@@ -207,7 +213,7 @@ def _check_versions(store: DataStore) -> None:
 
 
 def _clear_parts(storage: Storage) -> None:
-    """Remove the partial files of a killed writer. A file gets its name only when it is whole."""
+    """Remove the partial files of a killed writer; a file gets its final name only when it is complete."""
     if storage.local:
         for name in storage.sizes():
             if name.endswith(".partial"):
@@ -215,7 +221,7 @@ def _clear_parts(storage: Storage) -> None:
 
 
 def _too_few(store: DataStore) -> list[str]:
-    """Return a sentence if the recipe's own split has too few scenes or sequences."""
+    """Return a warning if there are too few scenes or sequences for the recipe's split."""
     split = store.recipe.split
     worlds = world_of(store.recipe, store.scenes)[store.read("scene")]
     try:
@@ -230,7 +236,7 @@ def _frames(store: DataStore, shards: list[int]) -> int:
 
 
 def _warnings(store: DataStore) -> list[str]:
-    """List what the user should know of a finished data set, a sentence each."""
+    """Return all warnings for the user about a finished data set, one sentence each."""
     sentences = [*_too_few(store)]
     over_nothing = int(np.isnan(store.read("height_m")).sum())
     if over_nothing:
@@ -242,41 +248,41 @@ def _warnings(store: DataStore) -> list[str]:
 
 
 def _empty(store: DataStore) -> list[str]:
-    """Return a sentence if frames hold no echo, in shards spread evenly over the data set."""
+    """Return a warning if frames have no echo, searching shards that are spread evenly over the data set."""
     shards = np.unique(np.linspace(0, store.shards - 1, min(SHARDS_TO_CHECK, store.shards)).round().astype(int))
     empty, frames = [], 0
     for shard in shards:
         here = store.frames_of(int(shard))
         try:
             empty += (here.start + np.flatnonzero(store.modality.empty(store.read, here))).tolist()
-        except MitsonarError:  # damaged: `mitsonar dataset check` says which
+        except MitsonarError:  # damaged: `mitsonar dataset check` reports it
             continue
         frames += here.stop - here.start
     checked = "" if frames == len(store) else f" that were checked (of {len(store):,})"
     return [empty_sentence(empty, frames, checked)] if empty else []
 
 
-# ---------------- Who makes the shards: this process, processes beside it, or the workers of a dask scheduler anywhere
+# ---------------- Workers: this process, local processes or dask
 
 
 AHEAD = 2
-"""Shards that a worker holds at a time: one that it makes, one that waits."""
+"""Number of shards assigned to a worker at a time: one in progress, one waiting."""
 
 ASK_S = 1.0
 """Seconds between two requests for the list of workers."""
 
 LOSSES = 3
-"""Number of workers that may be lost with the same shard."""
+"""Number of workers that may be lost on the same shard."""
 
 SILENCE_S = 90.0
-"""Seconds for which there may be no worker at all."""
+"""Seconds that the scheduler may be without any worker."""
 
 ANSWERS_WITHIN = "10s"
-"""Time for the scheduler's first answer, in dask's notation."""
+"""Time limit for the scheduler's first answer, in dask's notation."""
 
 
 class Future(Protocol):
-    """A task of dask, which has no types of its own."""
+    """A task of dask, which comes without type annotations."""
 
     status: str
 
@@ -287,33 +293,34 @@ class Future(Protocol):
         """Return the error of a task that failed."""
 
     def cancel(self) -> None:
-        """Withdraw the task."""
+        """Cancel the task."""
 
 
 class Client(Protocol):
     """A client of a dask scheduler."""
 
     def ncores(self) -> dict[str, int]:
-        """Return the threads of each worker, by address."""
+        """Return the number of threads of each worker, keyed by address."""
 
     def submit(self, task: Callable[[str, int], int], /, *args: object, workers: list[str], pure: bool) -> Future:
-        """Hand a task to one of the workers."""
+        """Submit a task to one of the workers."""
 
     def cancel(self, futures: list[Future]) -> None:
-        """Withdraw tasks."""
+        """Cancel tasks."""
 
 
 def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: str | None = None) -> Iterator[int]:
-    """Make shards. Yield the number of each when it is done.
+    """Make shards, and yield the number of each when it is done.
 
     Args:
-        store: to which they belong.
-        todo: their numbers.
-        workers: processes on this machine, one thread each; with 1 this process renders, with all its threads.
+        store: to which the shards belong.
+        todo: numbers of the shards to make.
+        workers: number of processes on this machine, with one thread each; with 1 this process renders, with all its
+            threads.
         scheduler: address of a running dask scheduler, whose workers render instead.
 
     Raises:
-        MitsonarError: no scheduler there, no worker left, too many workers lost at one shard, or a worker's error.
+        MitsonarError: no scheduler answers, no worker is left, too many workers were lost on one shard, or a worker failed.
     """
     if scheduler is None and workers <= 1:
         try:
@@ -328,7 +335,7 @@ def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: s
 
 @contextlib.contextmanager
 def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
-    """Open a client of the scheduler. Local workers are started by spawn, with one thread each."""
+    """Open a client of the scheduler, or start a local cluster of spawned workers with one thread each."""
     import logging
 
     import dask
@@ -351,13 +358,13 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
     settings = {
         "distributed.worker.multiprocessing-method": "spawn",
         "distributed.comm.timeouts.connect": "60s",
-        # by default dask makes workers return memory at each release, which doubles NumPy's time, and samples their stacks
+        # dask's defaults return memory to the system at each release, which doubles NumPy's time, and sample the stacks
         "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": "1"},
         "distributed.worker.profile.enabled": False,
-        # Ctrl-C reaches all processes of a terminal: this process stops the others
+        # Ctrl-C reaches every process of a terminal; workers ignore it, and this process stops them
         "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
     }
-    quiet = logging.CRITICAL  # mitsonar itself reports a lost worker
+    quiet = logging.CRITICAL  # mitsonar reports lost workers itself
     with (
         dask.config.set(settings),
         start(
@@ -369,7 +376,10 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
 
 
 class Queue:
-    """Shards that wait. A worker continues after its last shard, whose scene it has loaded, or begins a stretch of its own.
+    """Queue of the shards to make.
+
+    A worker gets the shard after its last one, whose scene it has already loaded. If that shard is taken, the worker starts
+    a new run of consecutive shards.
 
     Args:
         todo: numbers of the shards.
@@ -388,14 +398,14 @@ class Queue:
         shard = self.at.get(worker, -2) + 1
         if shard not in self.waiting:
             first, end = self._longest()
-            taken = first - 1 in self.at.values()  # another worker will continue there
+            taken = first - 1 in self.at.values()  # another worker will continue there: start in the middle
             shard = (first + end) // 2 if taken else first
         self.waiting.remove(shard)
         self.at[worker] = shard
         return shard
 
     def _longest(self) -> tuple[int, int]:
-        """Find the longest stretch of shards that wait: its first, and the one after its last."""
+        """Find the longest run of consecutive waiting shards, as its first shard and the one after its last."""
         waiting = np.sort(np.fromiter(self.waiting, dtype=int))
         ends = np.flatnonzero(np.append(np.diff(waiting) > 1, True)) + 1
         lengths = np.diff(ends, prepend=0)
@@ -404,10 +414,10 @@ class Queue:
         return first, first + int(lengths[longest])
 
     def give_back(self, shard: int) -> None:
-        """Return a shard whose worker was lost, so that another worker makes it.
+        """Put a shard back whose worker was lost, so that another worker makes it.
 
         Raises:
-            MitsonarError: too many workers were lost with it.
+            MitsonarError: too many workers were lost on this shard.
         """
         self.lost[shard] += 1
         if self.lost[shard] > LOSSES:
@@ -418,21 +428,22 @@ class Queue:
         self.waiting.add(shard)
 
     def forget(self, alive: list[str]) -> None:
-        """Forget the workers that are gone."""
+        """Forget the workers that are no longer alive."""
         self.at = {worker: shard for worker, shard in self.at.items() if worker in alive}
 
 
 def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
-    """Supply every worker with shards until all are made. Yield the number of each when it is done."""
+    """Supply every worker with shards until all are made, and yield the number of each when it is done."""
     url = store.place.root if store.place.local else store.place.url
     given: dict[Future, tuple[str, int]] = {}
     asked, received, alive = 0.0, time.monotonic(), list[str]()
     try:
         while queue or given:
+            # 1. Refresh the list of workers, and take back the shards of lost ones.
             if time.monotonic() - asked > ASK_S:
                 alive, asked = list(client.ncores()), time.monotonic()
                 queue.forget(alive)
-                # dask would keep a task waiting for ever whose worker is gone
+                # dask would wait for ever for a worker that is gone
                 for future in [future for future, (worker, _) in given.items() if worker not in alive]:
                     queue.give_back(given.pop(future)[1])
                     future.cancel()
@@ -440,10 +451,12 @@ def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
                 received = time.monotonic()
             elif time.monotonic() - received > SILENCE_S:
                 raise _no_worker(queue)
+            # 2. Keep AHEAD shards assigned to every worker, so that none idles between two shards.
             for worker in alive:
                 while queue and sum(owner == worker for owner, _ in given.values()) < AHEAD:
                     shard = queue.next(worker)
                     given[client.submit(_work, url, shard, workers=[worker], pure=False)] = worker, shard
+            # 3. Yield finished shards, raise the error of a task, and put back the shards of workers that died.
             done = [future for future in given if future.done()]
             for future in done:
                 shard = given.pop(future)[1]
@@ -461,7 +474,7 @@ def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
 
 
 def _no_worker(queue: Queue) -> MitsonarError:
-    """Write the error of a scheduler without workers."""
+    """Return the error for a scheduler without workers."""
     lost = ", ".join(map(str, queue.lost))
     cause = (
         f"workers were lost at shards {lost} and none has come back for {SILENCE_S:.0f} s "
@@ -473,17 +486,17 @@ def _no_worker(queue: Queue) -> MitsonarError:
 
 
 def _is_lost(future: Future) -> bool:
-    """Return whether the worker died, rather than its task failed."""
+    """Return whether the worker died, as opposed to a failure of its task."""
     from distributed import KilledWorker
 
     return isinstance(future.exception(), KilledWorker)
 
 
 def _work(url: str, shard: int) -> int:
-    """Make one shard in a dask worker, with as many threads of the ray tracer as the worker has.
+    """Make one shard in a dask worker, tracing rays with as many threads as the worker has.
 
     Raises:
-        MitsonarError: this worker cannot open the store, or has other versions.
+        MitsonarError: this worker cannot open the store, or has other versions of the packages.
     """
     from distributed import get_worker
 
@@ -497,18 +510,18 @@ def _work(url: str, shard: int) -> int:
     return make_shard(store, shard)
 
 
-# ---------------- One shard of a data set: rendered, written and sealed, in any process
+# ---------------- Rendering and writing one shard
 
 
 _RENDERER: dict[tuple[str, Scene], Renderer] = {}
-"""The last scene, by all that it depends on: the recipe, and the scene's plan."""
+"""Renderer of the last scene, keyed by everything that it depends on: the recipe and the scene's plan."""
 
 _ONE_AT_A_TIME = threading.Lock()
-"""A process renders one shard at a time, since the threads of a dask worker share one ray tracer."""
+"""Lock that lets a process render one shard at a time, because the threads of a dask worker share one ray tracer."""
 
 
 def make_shard(store: DataStore, shard: int) -> int:
-    """Render and write one shard, and return its number. The last scene stays loaded for the next call."""
+    """Render and write one shard, and return its number; the last scene stays loaded for the next call."""
     with _ONE_AT_A_TIME:
         ensure_variant(store.about["variant"])
         store.write_shard(shard, _shard_values(store, shard))
@@ -522,7 +535,7 @@ def forget() -> None:
 
 
 def _shard_values(store: DataStore, shard: int) -> dict[str, Values]:
-    """Render all arrays of a shard, by name; frames of several scenes follow each other."""
+    """Render all arrays of a shard, keyed by name; frames of several scenes are concatenated."""
     here = store.frames_of(shard)
     scene_of = store.read("scene")[here]
     planned = {name: store.read(name, here) for name in ("pose", *store.modality.planned)}
@@ -538,37 +551,37 @@ def _shard_values(store: DataStore, shard: int) -> dict[str, Values]:
 
 
 def _first_frames(store: DataStore) -> dict[int, int]:
-    """Find the first frame of each scene. Frames of a scene are consecutive."""
+    """Return the first frame of each scene, keyed by scene number; frames of a scene are consecutive."""
     numbers, first = np.unique(store.read("scene"), return_index=True)
     return dict(zip(numbers.tolist(), first.tolist(), strict=True))
 
 
 def _renderer(store: DataStore, number: int) -> Renderer:
-    """Return the renderer of a scene; the last one is kept."""
+    """Return the renderer of a scene; the last one is cached."""
     scene = store.scenes[number]
     key = (store.recipe.model_dump_json(), scene)
     if key not in _RENDERER:
-        forget()  # before the next is loaded: two scenes would need twice the memory
+        forget()  # before the next scene is loaded: two scenes would need twice the memory
         _RENDERER[key] = renderer_of(store.modality)(store.recipe, scene)
     return _RENDERER[key]
 
 
-# ---------------- Checks of a data set: checksums, counts, ranges, and labels that follow from poses
+# ---------------- Checks of a finished data set
 
 
 LABEL_TOLERANCE = 1e-9
-"""Largest difference of labels and limits [m, rad]."""
+"""Tolerance of the checks of labels and of limits [m, rad]."""
 
 
 def check(store: DataStore, progress: Callable[[int], None] = lambda frames: None) -> list[str]:
-    """Check a data set. Everything is read.
+    """Check checksums, counts, value ranges and labels of a data set; every file is read.
 
     Args:
         store: of the data set.
         progress: called with the number of frames that were checked.
 
     Returns:
-        A sentence for each fault.
+        One sentence per fault.
     """
     wrong = _files(store, progress)
     for check_part in (_plan, _counts, _labels, _flight):
@@ -580,7 +593,7 @@ def check(store: DataStore, progress: Callable[[int], None] = lambda frames: Non
 
 
 def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
-    """Check every file against its seal, and its values against their limits."""
+    """Check every file against its seal, and the values against their limits."""
     wrong: list[str] = []
     unwritten: list[int] = []
     empty: list[int] = []
@@ -589,6 +602,7 @@ def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
         here = store.frames_of(shard)
         keys = [store.key(name, shard) for name in store.rendered]
         lacking = [key for key in keys if key not in sizes]
+        # Values are only checked in shards that are complete and undamaged.
         if lacking or not seals[shard].any():
             unwritten.append(shard)
         else:
@@ -616,8 +630,8 @@ def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
 
 
 def _plan(store: DataStore) -> list[str]:
-    """Check the planned arrays against a plan that is made anew from recipe and seed."""
-    if store.recipe.recorded is not None:  # its poses were given
+    """Check the planned arrays against a new plan from recipe and seed."""
+    if store.recipe.recorded is not None:  # recorded frames come with their poses, there is no plan
         return []
     plan = Plan.of(store.recipe, int(store.about["sequences"]))
     return [f"{name} is not what recipe and seed give" for name in store.unplanned(plan)]
@@ -663,7 +677,7 @@ def _labels(store: DataStore) -> list[str]:
 
 
 def _flight(store: DataStore) -> list[str]:
-    """Check the limits of motions and jumps, and that footprints lie inside their scenes."""
+    """Check that motions and jumps are within their limits, and that footprints lie inside their scenes."""
     recipe = store.recipe
     flight = recipe.flight
     if flight.kind != "random":
@@ -687,14 +701,16 @@ def _flight(store: DataStore) -> list[str]:
 
 
 def _outside(store: DataStore, vehicle: NDArray[np.float64], scene: NDArray[np.int32]) -> float:
-    """Return how far footprints leave their scenes at most [m]."""
+    """Compute the largest distance by which a footprint leaves its scene [m]; negative if all lie inside."""
     recipe = store.recipe
+    # Half the side of each frame's scene.
     half = {number: recipe.family(one.group).half_m for number, one in store.scenes.items()}
     limit = np.array([half[int(number)] for number in scene])
     farthest = -np.inf
-    # where no pose of the vehicle is stored, it differs from the sonar's by the mount's pitch alone
+    # If no vehicle poses are stored, they differ from those of the sonar by the pitch of the mount only.
     lean = 0.0 if "vehicle_pose" in store.group else recipe.mount.pose.pitch
     flown = np.column_stack([vehicle[:, 2], np.round(vehicle[:, 3] - lean, 9)])
+    # Frames at the same height and pitch share one footprint.
     for height, pitch in np.unique(flown, axis=0):
         mine = (flown == (height, pitch)).all(axis=1)
         corners = np.abs(footprints_at(vehicle[mine], store.modality.reach(float(height), float(pitch))))
@@ -702,23 +718,23 @@ def _outside(store: DataStore, vehicle: NDArray[np.float64], scene: NDArray[np.i
     return farthest
 
 
-# ---------------- A scene of a recipe becomes pixels, for stores and for training with rendered frames
+# ---------------- Rendering images, for stores and for training
 
 
 VISIBLE = 1e-4
-"""Expected level of a cell with a visible label, at least, as a part of full scale; it must exceed the noise too."""
+"""Smallest expected level of a cell with a visible label, as a fraction of full scale; it must also exceed the noise."""
 
 FRAMES_A_SCENE = 10_000_000
-"""A ping's number is its scene's number times this, plus its position in the scene: jitter does not depend on the size of
-the data set."""
+"""Stride of ping numbers between scenes. A ping's number is its scene's number times this, plus its position in the scene,
+so jitter does not depend on the size of the data set."""
 
 
 class SceneRenderer:
-    """One scene, built, loaded, and ready to render.
+    """Renderer of images of one scene, which it builds and loads.
 
     Args:
         recipe: of the data set.
-        scene: which of its scenes.
+        scene: the scene to render.
     """
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
@@ -727,15 +743,15 @@ class SceneRenderer:
         self.simulator = Simulator(world, sonar, views=recipe.views, mirrors=recipe.mirrors)
         self.bodies = body_places(recipe, self.simulator.motion)
         self._labeller: Simulator | None = None
-        if recipe.labels and recipe.visible_labels:  # the expected levels, over all that the patterns receive
+        if recipe.labels and recipe.visible_labels:  # expected levels, over everything that the patterns receive
             patterns = {"pattern": sonar.beam_pattern, "elevation_pattern": sonar.vertical_pattern}
             self._labeller = Simulator(world, sonar.replace(model="physical", **patterns))
 
     @staticmethod
     def settled(recipe: Recipe) -> Fields:
-        """Compute the gain of the data set and its inverse, and with labels of shapes the names of those of scene files.
+        """Compute the gain of the data set, its inverse, and, if shapes are labelled, the shape names of scene files.
 
-        See :func:`calibrate`. The names are a list for each group of scenes; it is empty for worlds that are built.
+        See :func:`calibrate` for the gain. The names are a list for each group of scenes; it is empty for generated worlds.
         """
         refuse_worlds(recipe)
         gain = calibrate(recipe)
@@ -753,26 +769,28 @@ class SceneRenderer:
         return found
 
     def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[RenderedPings]]:
-        """Render levels of frames ``first``, ``first + 1`` ... of the scene, in batches with a part for each view.
+        """Render the levels of frames ``first``, ``first + 1`` ... of the scene, and yield batches with one part per view.
 
-        Bodies that the scene's file moves are where they are at frame / ``frame_rate_hz``.
+        Moving bodies of the scene file are placed at the time frame / ``frame_rate_hz``.
         """
         time_s = self._time_s(first, len(poses))
         number = self.scene.number * FRAMES_A_SCENE + first
         return self.simulator.render_views(poses, first=number, labels=labels, time_s=time_s)
 
     def frames(self, poses: NDArray[np.float64], first: int, gain: float) -> dict[str, Values]:
-        """Render frames of the scene. Return what is stored of them, ``(frames, ...)`` by array name.
+        """Render frames of the scene, and return the arrays to store ``(frames, ...)``, keyed by name.
 
         Args:
-            poses: of the sonar ``(frames, 6)``.
-            first: number of the first in the scene.
+            poses: of the sonar ``(frames, 6)`` [m, rad].
+            first: number of the first frame in the scene.
             gain: of the data set.
         """
         values = self._empty(len(poses))
+        # 1. Pixels, and labels unless a second simulator makes them.
         for batch in self.render_views(poses, first, labels=bool(self.recipe.labels) and self._labeller is None):
             start = batch[0].first - (self.scene.number * FRAMES_A_SCENE + first)
             self._fill({name: array[start : start + len(batch[0])] for name, array in values.items()}, batch, gain)
+        # 2. Visible labels: only cells whose expected level exceeds the noise and VISIBLE keep theirs.
         if self._labeller is not None:
             number = self.scene.number * FRAMES_A_SCENE + first
             for pings in self._labeller.pings(poses, first=number, labels=True, time_s=self._time_s(first, len(poses))):
@@ -781,6 +799,7 @@ class SceneRenderer:
                 for label, shown in labels_above(pings, gain, floor).items():
                     if label in self.recipe.labels:
                         values[label][here] = shown
+        # 3. States of the moving bodies, as functions of time.
         if self.bodies:
             states = self.simulator.bodies(self._time_s(first, len(poses)))
             assert states.poses is not None
@@ -790,26 +809,26 @@ class SceneRenderer:
         return values
 
     def _time_s(self, first: int, frames: int) -> NDArray[np.float64]:
-        """Return the times of frames of the scene, of which its moving bodies are functions ``(frames,)`` [s]."""
+        """Return the times ``(frames,)`` [s] of frames of the scene, which determine where its moving bodies are."""
         return np.asarray((first + np.arange(frames)) / self.simulator.sonar.frame_rate_hz, dtype=np.float64)
 
     def recorded(self, planned: dict[str, Values], first: int, about: Fields) -> dict[str, Values]:
-        """Render frames at the poses of the plan; see :class:`~mitsonar.datasets.modality.Renderer`."""
+        """Render frames at the planned poses; see :class:`~mitsonar.datasets.modality.Renderer`."""
         return self.frames(planned["pose"], first, float(about["gain"]))
 
     def _empty(self, frames: int) -> dict[str, Values]:
-        """Allocate the arrays to fill; counts begin at 0."""
+        """Allocate the arrays to fill, with zeros."""
         stored = ImageModality(self.recipe).stored
         return {name: np.zeros((frames, *one.shape), dtype=one.kind) for name, one in stored.items()}
 
     def _fill(self, values: dict[str, Values], batch: list[RenderedPings], gain: float) -> None:
-        """Write what is stored of one batch into the arrays."""
+        """Write the stored quantities of one batch into the arrays."""
         values["height_m"][:] = batch[0].height_m
         for view, pings in zip(self.simulator.views, batch, strict=True):
             suffix = self.recipe.suffix(view.name)
             outside = (pings.counts.nearer + pings.counts.farther).sum(axis=1).astype(np.uint32)
-            np.maximum(values["dropped"], outside, out=values["dropped"])  # portions overlap
-            for number, levels in enumerate(pings.levels):  # one by one: a frame fits the cache, a batch does not
+            np.maximum(values["dropped"], outside, out=values["dropped"])  # views overlap: a sum would count twice
+            for number, levels in enumerate(pings.levels):  # frame by frame: a frame fits the cache, a batch does not
                 image = to_image(levels, gain, view.sonar)
                 values["saturated"][number] += np.count_nonzero(image >= 1)
                 if f"image{suffix}" in values:
@@ -822,9 +841,10 @@ class SceneRenderer:
 
 
 def instrument_in(recipe: Recipe, scene: Scene) -> Sonar:
-    """Return the sonar of a scene: that of speckle has a seed of each scene, since its scatterers are hashed by it.
+    """Return the sonar for a scene.
 
-    Where the recipe has ``noise_db``, the noise of a scene is raised.
+    A coherent sonar gets a different seed in each scene, because the seed determines the scatterers behind its speckle. If
+    the recipe has ``noise_db``, the noise level is raised by the scene's value.
     """
     sonar = recipe.instrument
     if sonar.model != "coherent":
@@ -836,10 +856,10 @@ def instrument_in(recipe: Recipe, scene: Scene) -> Sonar:
 
 
 def body_places(recipe: Recipe, motion: SceneMotion | None) -> list[int]:
-    """Return the places of the recipe's bodies among those that move in a scene.
+    """Return the indices of the recipe's bodies among the moving bodies of a scene.
 
     Raises:
-        MitsonarError: a body that does not move there.
+        MitsonarError: one of the recipe's bodies does not move in the scene.
     """
     known = () if motion is None else motion.bodies.names
     for name in recipe.bodies:
@@ -853,7 +873,7 @@ def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
     """Build a scene's world in a temporary folder, and load it.
 
     Raises:
-        MitsonarError: a scene of the user's own that is smaller than the recipe says.
+        MitsonarError: the world is a scene file of the user and smaller than the recipe states.
     """
     with tempfile.TemporaryDirectory(prefix="mitsonar-world-") as folder:
         family = recipe.family(scene.group)
@@ -865,12 +885,12 @@ def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
 
 
 def refuse_worlds(recipe: Recipe) -> None:
-    """Refuse scenes of the user's own that are smaller than the recipe says, and worlds without the mirrors that it names.
+    """Refuse scene files that are smaller than the recipe states, and worlds that lack its mirrors or moving bodies.
 
-    Nothing is rendered yet. Of each group of scenes one world is looked at.
+    The check renders nothing. It loads one world of each group of scenes.
 
     Raises:
-        MitsonarError: one is smaller than its ``size_m``, lacks a mirror or a body that moves, or cannot be loaded.
+        MitsonarError: a world is smaller than its ``size_m``, lacks a mirror or a moving body, or cannot be loaded.
     """
     from mitsonar.simulation.mirrors import mirror_of
     from mitsonar.simulation.moving import motion_in
@@ -890,10 +910,10 @@ def refuse_worlds(recipe: Recipe) -> None:
 
 
 def calibrate(recipe: Recipe) -> float:
-    """Compute the gain: the 99.9th percentile of all pixels of the first 20 frames of the first scene becomes 0.9.
+    """Compute the gain that maps the 99.9th percentile of all pixels in the first 20 frames of the first scene to 0.9.
 
-    The frames are those of the recipe, however few of them are made. A recipe may also give the gain, such as that of
-    another data set of the same sonar.
+    The frames are those of the whole recipe, even if fewer are made. If the recipe gives a gain, such as that of another
+    data set of the same sonar, it is returned unchanged.
 
     Raises:
         MitsonarError: these frames are empty.
@@ -920,7 +940,7 @@ def calibrate(recipe: Recipe) -> float:
 
 
 def _joined(batches: list[list[RenderedPings]]) -> RenderedPings:
-    """Join all views of all frames as frames of one column, since the gain is one constant for all."""
+    """Join all views of all frames into frames of one column, because one gain applies to all views."""
     first = batches[0][0]
     frames = []
     for batch in batches:
@@ -928,15 +948,15 @@ def _joined(batches: list[list[RenderedPings]]) -> RenderedPings:
     return RenderedPings(first.first, np.stack(frames)[:, :, None], first.counts, first.height_m)
 
 
-# ---------------- A scene of a recipe becomes impulse responses
+# ---------------- Rendering impulse responses
 
 
 class ResponseRenderer:
-    """One scene, built, loaded, and ready to record.
+    """Renderer of impulse responses of one scene, which it builds and loads.
 
     Args:
         recipe: of the data set.
-        scene: which of its scenes.
+        scene: the scene to render.
     """
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
@@ -944,12 +964,12 @@ class ResponseRenderer:
 
     @staticmethod
     def settled(recipe: Recipe) -> Fields:
-        """Return no numbers: responses have no gain. Mirrors are looked for in the worlds."""
+        """Check that the worlds have the recipe's mirrors, and return no attributes, because responses have no gain."""
         refuse_worlds(recipe)
         return {}
 
     def recorded(self, planned: dict[str, Values], first: int, about: Fields) -> dict[str, Values]:
-        """Simulate responses at the poses and velocities of the plan; see :class:`~mitsonar.datasets.modality.Renderer`."""
+        """Simulate responses at the planned poses and velocities; see :class:`~mitsonar.datasets.modality.Renderer`."""
         parts = list(self.simulator.pings(planned["pose"], planned["velocity"], first=first))
         names = ("response", "height_m", "echoes", "dropped")
         return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}

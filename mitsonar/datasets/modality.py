@@ -1,4 +1,4 @@
-"""A modality: one object that says what an instrument records of a ping, how it is simulated, checked, read and compared."""
+"""What depends on the kind of instrument in a data set: how a ping is simulated, stored, checked, read and compared."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ __all__ = [
 Array = NDArray[np.float64]
 
 Values: TypeAlias = NDArray[Any]
-"""Values of a stored array; their type is the array's own."""
+"""Values of a stored array, of any data type."""
 
 Fields: TypeAlias = dict[str, Any]
-"""Attributes or keys by name, as JSON holds them."""
+"""JSON fields, keyed by name."""
 
 OpenedSamples: TypeAlias = Any
-"""An object of the class that :attr:`Modality.samples_class` names, which is loaded only when it is used."""
+"""Instance of the class that :attr:`Modality.samples_class` names; the class is imported only when it is needed."""
 
 Read = Callable[..., Values]
-"""Reads values of an array of a store by its name, all or those of a slice of frames."""
+"""Function that reads the values of a stored array by name, either all of them or those of a slice of frames."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,10 @@ class StoredArray:
     """An array that is filled ping by ping.
 
     Attributes:
-        kind: its type.
-        about: a description, kept in the store.
-        shape: of one ping's values.
-        dims: names of these dimensions.
+        kind: its data type.
+        about: description, saved in the store.
+        shape: of the values of one ping.
+        dims: names of the dimensions in ``shape``.
     """
 
     kind: np.dtype[Any]
@@ -69,7 +69,7 @@ class StoredArray:
 
 @dataclass(frozen=True)
 class StoredAxis:
-    """Values along a dimension, known from the start."""
+    """Coordinates along a dimension, known from the start."""
 
     values: Array
     dim: str
@@ -77,46 +77,46 @@ class StoredAxis:
 
 
 class Renderer(Protocol):
-    """Renders one scene, which is loaded."""
+    """Renderer of one loaded scene."""
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None: ...
 
     @staticmethod
     def settled(recipe: Recipe) -> Fields:
-        """Compute the numbers of the whole data set, which are set before its first ping is recorded.
+        """Compute the attributes of the whole data set that must be known before its first ping is recorded.
 
         Raises:
             MitsonarError: the first frames are empty.
         """
 
     def recorded(self, planned: dict[str, Values], first: int, about: Fields) -> dict[str, Values]:
-        """Render consecutive pings of the scene. Return what is stored of them, by name.
+        """Render consecutive pings of the scene, and return the arrays to store, keyed by name.
 
         Args:
-            planned: values of the plan for these pings: ``pose``, and what the modality names.
-            first: number of the first in the scene.
+            planned: values of the plan for these pings: ``pose``, and the arrays in the modality's ``planned``.
+            first: number of the first ping in the scene.
             about: attributes of the store.
         """
 
 
 class Modality(Protocol):
-    """Everything that depends on what a recipe's instrument records, from simulation to comparison.
+    """Everything that depends on the kind of record of a recipe's instrument, from simulation to comparison.
 
     Attributes:
-        what: the name of one ping's record.
-        sonar: the instrument; all have a name, a model and a frame rate.
+        what: noun for the record of one ping.
+        sonar: the instrument; every instrument has a name, a model and a frame rate.
         stored: arrays that are filled ping by ping, those with a shape first.
-        axes: arrays along their dimensions.
+        axes: coordinates along their dimensions.
         attributes: of the store.
-        settled: names of attributes that are numbers of the whole data set, set before its first ping is recorded.
-        planned: arrays of the plan that are stored beside the poses.
-        decided_by: packages whose versions decide what is recorded, beside those that always do.
-        ping_bytes: approximate size of one ping.
-        renderer_class: what renders a scene of the recipe, ``module:class``; see :func:`renderer_of`.
-        samples_class: what reads the samples that estimators are compared on, ``module:class``.
-        sample_frames: records of a sample in a comparison.
-        estimators: that a comparison runs unless others are named, by name with commas between.
-        variations: whether a comparison can give estimators wrong assumptions on its samples.
+        settled: names of the numeric attributes of the whole data set that are set before its first ping is recorded.
+        planned: arrays of the plan that are stored in addition to the poses.
+        decided_by: packages whose versions affect the recorded values, in addition to those that always do.
+        ping_bytes: approximate size of one ping [bytes].
+        renderer_class: class that renders a scene of the recipe, as ``module:class``; see :func:`renderer_of`.
+        samples_class: class that reads the samples on which estimators are compared, as ``module:class``.
+        sample_frames: number of records per sample in a comparison.
+        estimators: default estimators of a comparison, as names separated by commas.
+        variations: whether a comparison can give estimators wrong assumptions about its samples.
     """
 
     what: str
@@ -138,7 +138,7 @@ class Modality(Protocol):
 
     @property
     def axes(self) -> dict[str, StoredAxis]:
-        """Return the arrays along dimensions."""
+        """Return the coordinates along the dimensions of the arrays."""
 
     @property
     def attributes(self) -> Fields:
@@ -150,58 +150,63 @@ class Modality(Protocol):
 
     @property
     def sample_frames(self) -> int:
-        """Return the number of records of a sample in a comparison."""
+        """Return the number of records per sample in a comparison."""
 
     def reach(self, height: float, pitch: float = 0.0) -> Array:
-        """Compute the footprint of a vehicle at a height [m] and a pitch [rad], > 0 down.
+        """Compute the footprint of the instrument on a vehicle at a height [m] and a pitch [rad], positive down.
 
         Returns:
             Corners ``(n, 2)`` on the ground z = 0, starboard and forward of the vehicle [m].
 
         Raises:
-            MitsonarError: no ground is seen.
+            MitsonarError: the ground is out of range.
         """
 
     def noise_model(self, name: str) -> NoiseModel | None:
-        """Return the noise model of a name, or None if the name alone defines the noise.
+        """Return the noise model with the given name, or None if the name alone defines the noise.
 
         Raises:
             MitsonarError: unknown name.
         """
 
     def empty(self, read: Read, here: slice) -> NDArray[np.bool_]:
-        """Find the pings without any echo, in all views or at all receivers ``(pings,)``."""
+        """Mark the pings ``(pings,)`` that have no echo in any view or at any receiver."""
 
     def faults(self, read: Read, here: slice) -> list[str]:
-        """Check the values of some frames. Return a sentence for each fault."""
+        """Check the values of some frames, and return one sentence per fault."""
 
     def warnings(self, read: Read) -> list[str]:
-        """List what the user should know of a finished data set, a sentence each."""
+        """Return warnings for the user about a finished data set, one sentence each."""
 
 
 def renderer_of(modality: Modality) -> type[Renderer]:
-    """Load the class that renders scenes. It is loaded here, so that reading a stored set loads no simulator."""
+    """Import the class that renders scenes; importing it late means that reading a store loads no simulator."""
     found: type[Renderer] = resolve_name(modality.renderer_class)
     return found
 
 
 def samples_of(modality: Modality, url: str | Path, **options: Any) -> OpenedSamples:
-    """Open the samples of a store, as estimators are compared on them.
+    """Open the samples of a store on which estimators are compared.
+
+    Args:
+        modality: of the store's recipe.
+        url: path or URL of the store.
+        **options: further arguments of the class that :attr:`Modality.samples_class` names.
 
     Raises:
-        MitsonarError: options that do not fit, no samples in that part.
+        MitsonarError: the options do not fit the store, or the selected part has no samples.
     """
     return resolve_name(modality.samples_class)(url, frames=modality.sample_frames, **options)
 
 
 def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:
-    """Compute the corners ``(n, 2)`` of the area where rays meet the ground z = 0 [m].
+    """Compute the corners ``(n, 2)`` [m] of the convex area in which rays meet the ground z = 0.
 
-    Rays that meet it beyond ``range_max``, or never, end at that range.
+    Rays that meet the ground beyond ``range_max``, or never, end on the ground at that range.
 
     Args:
-        eye: where the rays start ``(3,)`` [m].
-        directions: ``(rays, 3)``, unit.
+        eye: origin of the rays ``(3,)`` [m].
+        directions: unit vectors ``(rays, 3)``.
         range_max: of the instrument [m].
 
     Raises:
@@ -224,12 +229,12 @@ def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:
 
 
 def empty_sentence(empty: Sequence[int], frames: int, checked: str = "") -> str:
-    """Write the sentence on frames without echoes.
+    """Write the warning about frames without echoes.
 
     Args:
-        empty: their numbers.
+        empty: numbers of the empty frames.
         frames: number of frames that were checked.
-        checked: which frames these are, unless all.
+        checked: words for the frames that were checked, if not all.
     """
     which = ", ".join(f"{number:,}" for number in empty[:6]) + (" ..." if len(empty) > 6 else "")
     return (

@@ -1,7 +1,8 @@
-"""The vehicle's pose in every frame of a data set: sequences of pings at a constant rate, jumps between them, runs.
+"""Where the vehicle is in every frame of a data set, and what its instrument records there.
 
-A plan is a function of recipe, seed, scene and sequence: every process computes the same numbers. The sequences of a small
-data set are the first ones of each scene of a large one.
+Frames form sequences of pings at a constant rate. Sequences are drawn at random, with jumps between them, or follow one of
+the predefined runs. A plan depends only on recipe, seed, scene and sequence, so every process computes the same numbers.
+The sequences of a small data set are the first ones of each scene of a large data set from the same recipe.
 """
 
 from __future__ import annotations
@@ -42,21 +43,28 @@ __all__ = [
 
 
 FEWEST_SEQUENCES = 10
-"""Sequences of a scene before a small data set opens another scene: worlds cost more than frames."""
+"""Sequences per scene before a small data set adds another scene: building a world costs more than rendering frames."""
 
 CANDIDATES = 64
-"""Positions and headings that are drawn at once for a sequence."""
+"""Number of candidate positions and headings drawn at once for a sequence."""
 
 TRIES = 200
-"""How often they are drawn before the recipe is refused."""
+"""Number of draws of candidates before the recipe is rejected."""
 
 FLIGHT, WORLD = 3, 4
-"""Purposes of random numbers (see worlds.world.stream)."""
+"""Keys of the random streams for flights and worlds (see worlds.world.stream)."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One scene of a data set: its number, its group in the recipe, the seed of its world, how many sequences it has."""
+    """One scene of a data set.
+
+    Attributes:
+        number: index of the scene in the data set.
+        group: index of its group in the recipe.
+        seed: of its world.
+        sequences: number of its sequences.
+    """
 
     number: int
     group: int
@@ -66,28 +74,30 @@ class Scene:
 
 @dataclass(frozen=True)
 class Sequence:
-    """Pings of one sequence: poses ``(pings, 6)`` [m, rad] of the vehicle."""
+    """The vehicle's poses ``(pings, 6)`` [m, rad] at the pings of one sequence."""
 
     vehicle: NDArray[np.float64]
 
     def at_rate(self, rate_hz: float) -> Trajectory:
-        """Return the vehicle's trajectory at a rate of pings [Hz]."""
+        """Return the vehicle's trajectory for a given ping rate [Hz]."""
         return Trajectory(self.vehicle, np.arange(len(self.vehicle)) / rate_hz)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All frames of a data set, in the order in which they are stored.
+    """All frames of a data set, in storage order.
 
     Attributes:
-        scenes: those that have frames.
-        scene: number of the scene of each frame ``(frames,)``.
-        sequence: number of the sequence of each frame, counted over the data set ``(frames,)``.
-        time_s: since the sequence began ``(frames,)`` [s].
+        scenes: scenes that have frames.
+        scene: scene number of each frame ``(frames,)``.
+        sequence: sequence number of each frame, counted over the whole data set ``(frames,)``.
+        time_s: time since the start of the sequence ``(frames,)`` [s].
         vehicle: poses of the vehicle ``(frames, 6)`` [m, rad].
-        poses: of the sonar ``(frames, 6)`` [m, rad].
-        motion: sideways, forward [m], yaw [rad] to the next frame of the sequence ``(frames, 3)``; nan for its last.
-        velocity: of the vehicle in its own axes; see :func:`~mitsonar.motion.trajectory.velocities` ``(frames, 4)``.
+        poses: poses of the sonar ``(frames, 6)`` [m, rad].
+        motion: motion to the next frame of the sequence ``(frames, 3)``: sideways, forward [m], yaw [rad]; nan for the last
+            frame of a sequence.
+        velocity: velocity of the vehicle in its body frame ``(frames, 4)``; see
+            :func:`~mitsonar.motion.trajectory.velocities`.
     """
 
     scenes: list[Scene]
@@ -104,15 +114,20 @@ class Plan:
 
     @classmethod
     def of(cls, recipe: Recipe, sequences: int | None = None) -> Plan:
-        """Plan a recipe, or its first ``sequences`` sequences.
+        """Plan a data set from its recipe.
+
+        Args:
+            recipe: of the data set.
+            sequences: number of sequences to plan; all of the recipe by default.
 
         Raises:
-            MitsonarError: more sequences than the recipe has, none, or a footprint that fits no scene.
+            MitsonarError: fewer than one sequence, more than the recipe has, or a footprint that does not fit its scene.
         """
         scenes = scenes_of(recipe, recipe.sequences if sequences is None else sequences)
         flown = [(scene, one) for scene in scenes for one in _first(sequences_of(recipe, scene), scene.sequences)]
         lengths = [len(one.vehicle) for _, one in flown]
         vehicle = np.concatenate([one.vehicle for _, one in flown])
+        # the last frame of a sequence has no motion: the next one belongs to another sequence
         motion = np.full((len(vehicle), 3), np.nan)
         last = np.cumsum(lengths) - 1
         inner = np.setdiff1d(np.arange(len(vehicle)), last)
@@ -132,10 +147,10 @@ class Plan:
 
 
 def scenes_of(recipe: Recipe, sequences: int) -> list[Scene]:
-    """Spread ``sequences`` sequences over scenes, in proportion to the recipe's own numbers.
+    """Distribute a number of sequences over scenes, in proportion to the sequences that the recipe gives each scene.
 
     Raises:
-        MitsonarError: no sequence, or more than the recipe has.
+        MitsonarError: fewer than one sequence, or more than the recipe has.
     """
     if not 1 <= sequences <= recipe.sequences:
         raise MitsonarError(
@@ -145,8 +160,9 @@ def scenes_of(recipe: Recipe, sequences: int) -> list[Scene]:
     groups = [group for group, part in enumerate(recipe.scenes) for _ in range(part.count)]
     own = np.array([recipe.scenes[group].sequences for group in groups])
     opened = len(own) if sequences == own.sum() else int(np.clip(sequences // FEWEST_SEQUENCES, 1, len(own)))
-    while own[:opened].sum() < sequences:  # small scenes may not hold ten
+    while own[:opened].sum() < sequences:  # small scenes may have fewer than FEWEST_SEQUENCES
         opened += 1
+    # Rounding the cumulative sum, not each share, keeps the total exact.
     exact = sequences * np.cumsum(own[:opened]) / own[:opened].sum()
     counts = np.diff(np.floor(exact + 1e-9).astype(int), prepend=0)
     return [
@@ -162,19 +178,19 @@ def world_seed(seed: int, scene: int) -> int:
 
 
 def _first(sequences: Iterator[Sequence], count: int) -> list[Sequence]:
-    """Take the first sequences of a scene."""
+    """Return the first ``count`` sequences of a scene."""
     return [next(sequences) for _ in range(count)]
 
 
 def sequences_of(recipe: Recipe, scene: Scene) -> Iterator[Sequence]:
-    """Yield the sequences of a scene, one after the other; random flights have no end.
+    """Yield the sequences of a scene in order; with random flights the iterator never ends.
 
     Raises:
-        MitsonarError: the footprint does not fit the scene, or frames were recorded.
+        MitsonarError: the footprint does not fit the scene, or the recipe is one of recorded frames.
     """
     flight = recipe.flight
     if flight.kind == "recorded":
-        recipe.family(scene.group)  # refuses
+        recipe.family(scene.group)  # raises: recorded frames have no world
     if flight.kind == "runs":
         for name in flight.runs:
             yield Sequence(run_poses(name, flight.heights[0]))
@@ -191,12 +207,15 @@ def sequences_of(recipe: Recipe, scene: Scene) -> Iterator[Sequence]:
 def _sequence(
     recipe: Recipe, family: Family, rng: np.random.Generator, last: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """Draw the next sequence ``(pings, 6)``: its motion, then positions until one keeps all footprints in the scene.
+    """Draw the next sequence of a random flight: poses ``(pings, 6)`` [m, rad].
+
+    The motion is drawn first. Start positions are then drawn until one keeps the footprints of all pings in the scene.
 
     Raises:
         MitsonarError: no position was found.
     """
     flight, half = recipe.flight, family.half_m
+    # 1. Height, motion and pitch are constant over the sequence; motions are uniform up to the limits of the recipe.
     low, high = flight.heights
     draws = rng.random(4)
     height = low + (high - low) * float(draws[0])
@@ -205,17 +224,21 @@ def _sequence(
     pitch = 0.0
     if flight.pitch_deg is not None:
         pitch = math.radians(float(draw(rng, flight.pitch_deg)))
+    # 2. Drive the sequence from the origin, so that each candidate only needs a rotation and a shift of its footprints.
     driven = _drive(Pose(0, 0, height), motion, flight.pings)
     corners = _corners(recipe, height, pitch, driven)
     for _ in range(TRIES):
+        # 3. Draw candidate positions and headings, and rotate all corners into the axes of the world.
         position = _positions(flight, half, rng, last)
         heading = np.pi * (2 * rng.random(CANDIDATES) - 1)
         sin, cos = np.sin(heading)[:, None], np.cos(heading)[:, None]
         x, y = corners.T[0] * cos + corners.T[1] * sin, corners.T[1] * cos - corners.T[0] * sin
+        # 4. Accept candidates whose corners all lie within the square scene, and whose pings avoid the excluded boxes.
         outermost = np.maximum(np.abs(x + position[:, :1]), np.abs(y + position[:, 1:])).max(axis=1)
         fits = outermost <= half
-        here = slice(-flight.pings, None)  # the last of the corners are the pings themselves
+        here = slice(-flight.pings, None)  # the last corners are the positions of the pings
         fits &= ~_kept_out(flight, x[:, here] + position[:, :1], y[:, here] + position[:, 1:], height)
+        # 5. Take the first accepted candidate.
         found = int(fits.argmax())
         if fits[found]:
             start = Pose.from_row(
@@ -231,7 +254,14 @@ def _sequence(
 
 
 def _kept_out(flight: Flight, x: NDArray[np.float64], y: NDArray[np.float64], height: float) -> NDArray[np.bool_]:
-    """Mark the candidates with a ping ``(candidates, pings)`` [m] in a box that is kept out ``(candidates,)``."""
+    """Mark the candidates ``(candidates,)`` with at least one ping in an excluded box.
+
+    Args:
+        flight: with the excluded boxes.
+        x: of each ping ``(candidates, pings)`` [m].
+        y: of each ping ``(candidates, pings)`` [m].
+        height: of the sequence [m].
+    """
     inside = np.zeros(len(x), dtype=bool)
     for left, near, low, right, far, high in flight.keep_out:
         if low <= height <= high:
@@ -240,13 +270,21 @@ def _kept_out(flight: Flight, x: NDArray[np.float64], y: NDArray[np.float64], he
 
 
 def _corners(recipe: Recipe, height: float, pitch: float, driven: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute positions and footprints of all pings ``(n, 2)`` [m], relative to the first ping and in its axes."""
+    """Compute footprint corners and positions of all pings ``(n, 2)`` [m] in the frame of the first ping."""
     reach = modality_of(recipe).reach(height, pitch)
     return np.concatenate([footprints_at(driven, reach).reshape(-1, 2), driven[:, :2]])
 
 
 def footprints_at(vehicle: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Transform a footprint ``(n, 2)`` from the vehicle's axes to the world's at each pose: ``(poses, n, 2)`` [m]."""
+    """Transform a footprint ``(n, 2)`` [m] from the body frame to the world frame at each pose.
+
+    Args:
+        vehicle: poses of the vehicle ``(poses, 6)`` [m, rad].
+        reach: corners of the footprint, starboard and forward of the vehicle ``(n, 2)`` [m].
+
+    Returns:
+        Corners in the world frame ``(poses, n, 2)`` [m].
+    """
     sin, cos = np.sin(vehicle[:, 5:]), np.cos(vehicle[:, 5:])
     x = vehicle[:, :1] + reach.T[0] * cos + reach.T[1] * sin
     y = vehicle[:, 1:2] + reach.T[1] * cos - reach.T[0] * sin
@@ -256,7 +294,7 @@ def footprints_at(vehicle: NDArray[np.float64], reach: NDArray[np.float64]) -> N
 def _positions(
     flight: Flight, half_m: float, rng: np.random.Generator, last: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """Draw candidates for the next position ``(n, 2)``: anywhere, or a jump away in x and in y."""
+    """Draw candidates for the next position ``(n, 2)`` [m]: anywhere, or a jump away from the last pose in x and y."""
     draws = rng.random((2, CANDIDATES, 2))
     if last is None or flight.jump_m is None:
         return np.asarray(half_m * (2 * draws[0] - 1), dtype=np.float64)
@@ -265,7 +303,7 @@ def _positions(
 
 
 def _drive(start: Pose, motion: Motion, pings: int) -> NDArray[np.float64]:
-    """Compose poses at a constant rate (Almanza-Medina, eq. 3.4)."""
+    """Compose the poses ``(pings, 6)`` of a vehicle that repeats one motion (Almanza-Medina, eq. 3.4)."""
     poses = [start]
     for _ in range(pings - 1):
         poses.append(compose(poses[-1], motion))
@@ -273,12 +311,16 @@ def _drive(start: Pose, motion: Motion, pings: int) -> NDArray[np.float64]:
 
 
 def run_poses(name: str, height_m: float) -> NDArray[np.float64]:
-    """Return a run over the pattern (Almanza-Medina, 2.3 or 4.4.4): poses of the vehicle ``(frames, 6)`` [m, rad].
+    """Return the vehicle's poses ``(frames, 6)`` [m, rad] in a run over the pattern (Almanza-Medina, 2.3 or 4.4.4).
 
-    ``legs``: 250 frames over 5 m to starboard, 100 over 1.2 m forward, 250 over 5 m to port, 100 over 1.1 m forward, 250
-    over 5 m to starboard. ``diagonal``: 300 frames, 5 m to starboard and 2.3 m forward. ``turn``: 300 frames over 120 deg on
-    the spot, the T ahead half-way. ``sideways_50``, ``sideways_54``: 50 and 54 steps from the middle of a scene, almost all
-    to starboard, some back near the end. Figures 4.16 and 4.17 show them without numbers; the numbers are ours.
+    The runs are:
+
+    - ``legs``: 250 frames over 5 m to starboard, 100 over 1.2 m forward, 250 over 5 m to port, 100 over 1.1 m forward, 250
+      over 5 m to starboard.
+    - ``diagonal``: 300 frames, 5 m to starboard and 2.3 m forward.
+    - ``turn``: 300 frames over 120 deg on the spot; the T is straight ahead half-way.
+    - ``sideways_50``, ``sideways_54``: 50 and 54 steps from the middle of a scene, almost all to starboard, some back near
+      the end. Figures 4.16 and 4.17 show these two without numbers, so the numbers are our own choice.
     """
     x, y = -2.5, -4.85
     match name:
@@ -303,19 +345,19 @@ def run_poses(name: str, height_m: float) -> NDArray[np.float64]:
     return np.column_stack([position, rest])
 
 
-# ---------------- The modality of a recipe, by its instrument
+# ---------------- Modality of a recipe
 
 
 def modality_of(recipe: Recipe) -> Modality:
-    """Return the modality of the recipe's instrument."""
+    """Return the modality of the recipe's instrument: responses for a channel sonar, images for any other."""
     return ImageModality(recipe) if recipe.channel is None else ResponseModality(recipe)
 
 
-# ---------------- What an imaging sonar records of a ping: images, vectors, or both, of each view, with their labels
+# ---------------- Imaging sonars: images, vectors and labels
 
 
 RAYS = 61
-"""Rays over azimuth and over elevation whose ends make a footprint. Arcs bulge less than 0.2 mm between them."""
+"""Number of rays over azimuth and over elevation that sample a footprint. Arcs deviate less than 0.2 mm between rays."""
 
 TEXTS = {
     "image": "{}: level times gain, 0..255 (or 0..1), row 0 nearest, column 0 most to port; zero means no echo",
@@ -342,11 +384,14 @@ PER_FRAME = {
 
 
 MOST_DROPPED = 0.5
-"""Part of a ping's rays that the window of a recipe may drop: a recipe that states its window means it."""
+"""Share of a ping's rays that may be dropped without a warning if the recipe sets the range window explicitly."""
 
 
 class ImageModality:
-    """Images of a recipe with a sonar; see :class:`~mitsonar.datasets.modality.Modality`."""
+    """Modality of imaging sonars: images, vectors or both of each view, with their labels.
+
+    The members are those of :class:`~mitsonar.datasets.modality.Modality`.
+    """
 
     what = "frame"
     settled: tuple[str, ...] = ("gain", "level_scale")
@@ -362,7 +407,7 @@ class ImageModality:
 
     @property
     def stored(self) -> dict[str, StoredArray]:
-        """Return the arrays of pixels, and what rendering reports of each frame."""
+        """Return the arrays of pixels, labels and body states, and the counters that rendering reports for each frame."""
         views = {view.name: view for view in self.recipe.views}
         table = {}
         for name, (kind, view_name) in array_names(self.recipe).items():
@@ -377,7 +422,7 @@ class ImageModality:
 
     @property
     def axes(self) -> dict[str, StoredAxis]:
-        """Return the bearings of each view, and the ranges."""
+        """Return the bearing axis of each view, and the range axis."""
         table = {}
         for view in self.recipe.views:
             suffix = self.recipe.suffix(view.name)
@@ -387,7 +432,7 @@ class ImageModality:
 
     @property
     def attributes(self) -> Fields:
-        """Return the sonar, and that of each view."""
+        """Return the parameters of the sonar and of the sonar of each view, and the kind of level."""
         views = {view.name: view.sonar.model_dump() for view in self.recipe.views}
         return {
             "sonar": self.sonar.model_dump(),
@@ -397,7 +442,7 @@ class ImageModality:
 
     @property
     def ping_bytes(self) -> int:
-        """Return the size of a frame's pixels and labels; of vectors alone that of sums and counts [bytes]."""
+        """Return the size of a frame's pixels and labels, or of its sums and counts if it has only vectors [bytes]."""
         if "image" not in self.recipe.kinds:
             return sum(view.sonar.range_bins * 8 for view in self.recipe.views)
         size = 1 if self.recipe.pixel == "uint8" else 4
@@ -406,11 +451,11 @@ class ImageModality:
 
     @property
     def sample_frames(self) -> int:
-        """Return 2: estimators of images are compared on pairs."""
+        """Return 2, because image estimators are compared on pairs."""
         return 2
 
     def reach(self, height: float, pitch: float = 0.0) -> NDArray[np.float64]:
-        """Compute the footprint ``(n, 2)`` [m], or that of the field of view that the flight names.
+        """Compute the footprint ``(n, 2)`` [m] of the sonar, or of the field of view in ``flight.footprint_fov_deg``.
 
         Raises:
             MitsonarError: the ground is out of range.
@@ -418,14 +463,14 @@ class ImageModality:
         return footprint(self.sonar, self.recipe.mount.pose, height, self.recipe.flight.footprint_fov_deg, pitch)
 
     def _stored(self, kind: str, view: str, shape: tuple[int, ...], dims: tuple[str, ...]) -> StoredArray:
-        """Return an array of this kind for a view."""
+        """Return the specification of an array of the given kind for a view."""
         known = {"image": self.recipe.pixel, "vector": np.float32, "nonzero": np.uint32}
         return StoredArray(np.dtype(known[kind] if kind in known else LABELS[kind]), TEXTS[kind].format(view), shape, dims)
 
     # ---------------------------------------------------------------- noise
 
     def noise_model(self, name: str) -> NoiseModel:
-        """Return the noise model of a name.
+        """Return the noise model with the given name.
 
         Raises:
             MitsonarError: unknown name.
@@ -435,7 +480,7 @@ class ImageModality:
     # ---------------------------------------------------------------- checks
 
     def empty(self, read: Read, here: slice) -> NDArray[np.bool_]:
-        """Find the frames without a pixel above 0 in any view ``(frames,)``."""
+        """Mark the frames ``(frames,)`` that have no pixel above 0 in any view."""
         dark = np.ones(here.stop - here.start, dtype=bool)
         for name, (kind, _) in array_names(self.recipe).items():
             if kind in ("image", "vector"):
@@ -443,7 +488,7 @@ class ImageModality:
         return dark
 
     def faults(self, read: Read, here: slice) -> list[str]:
-        """Check the limits of pixels, sums and labels. Return a sentence for each fault."""
+        """Check pixels, sums and labels against their limits, and return one sentence per fault."""
         wrong = []
         beams = {view.name: len(view.bearing_rad) for view in self.recipe.views}
         for name, (kind, view) in array_names(self.recipe).items():
@@ -464,8 +509,8 @@ class ImageModality:
         return wrong
 
     def warnings(self, read: Read) -> list[str]:
-        """Warn of motions far below a bin, of returns outside the window, and of a gain that is too high."""
-        from mitsonar.simulation.pings import NEGLIGIBLE  # a stored set is read without a simulator
+        """Return warnings about motions far below a range bin, returns outside the window, and too high a gain."""
+        from mitsonar.simulation.pings import NEGLIGIBLE  # imported here: reading a store must not load the simulator
 
         sentences = []
         flight, bin_mm = self.recipe.flight, 1e3 * self.sonar.bin_m
@@ -493,7 +538,7 @@ class ImageModality:
 
 
 def _limits(kind: str, values: Values, beams: int) -> tuple[float, float]:
-    """Return the lowest and the highest value that an array of this kind may hold."""
+    """Return the smallest and the largest valid value of an array of this kind."""
     match kind:
         case "image":
             return 0, 255 if values.dtype == np.uint8 else 1
@@ -511,14 +556,17 @@ def _limits(kind: str, values: Values, beams: int) -> tuple[float, float]:
 def footprint(
     sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, float] | None = None, pitch: float = 0.0
 ) -> NDArray[np.float64]:
-    """Compute a sonar's footprint on the ground z = 0: corners ``(n, 2)``, starboard and forward of the vehicle [m].
+    """Compute a sonar's footprint on the ground z = 0.
 
     Args:
-        sonar: whose field of view it is.
+        sonar: whose field of view is projected.
         mount: pose of the sonar on the vehicle.
         height: of the vehicle [m].
-        fov_deg: azimuth and elevation in place of the sonar's own [deg].
-        pitch: of the vehicle [rad], > 0 down.
+        fov_deg: azimuth and elevation that replace the sonar's field of view [deg].
+        pitch: of the vehicle [rad], positive down.
+
+    Returns:
+        Corners ``(n, 2)`` [m], starboard and forward of the vehicle.
 
     Raises:
         MitsonarError: the ground is out of range.
@@ -531,11 +579,14 @@ def footprint(
     return ground_reach(eye[:3], vehicle_rotation(eye).apply(local), sonar.range_max)
 
 
-# ---------------- What a channel sonar records of a ping: a complex impulse response at each receiver
+# ---------------- Channel sonars: impulse responses
 
 
 class ResponseModality:
-    """Responses of a recipe with a channel sonar; see :class:`~mitsonar.datasets.modality.Modality`."""
+    """Modality of channel sonars: a complex impulse response at each receiver.
+
+    The members are those of :class:`~mitsonar.datasets.modality.Modality`.
+    """
 
     what = "ping"
     settled: tuple[str, ...] = ()
@@ -551,7 +602,7 @@ class ResponseModality:
 
     @property
     def stored(self) -> dict[str, StoredArray]:
-        """Return the array of responses, and what the simulation reports of each ping."""
+        """Return the array of responses, and the quantities that the simulation reports for each ping."""
         count = len(self.sonar.receivers)
         response = "complex baseband responses; receivers in the order of the attribute sonar"
         return {
@@ -565,26 +616,26 @@ class ResponseModality:
 
     @property
     def axes(self) -> dict[str, StoredAxis]:
-        """Return the delays."""
+        """Return the delay axis."""
         return {"delay_s": StoredAxis(self.sonar.delay_s, "tap", "delay of each tap [s]")}
 
     @property
     def attributes(self) -> Fields:
-        """Return the instrument and the names of its receivers."""
+        """Return the parameters of the instrument and the names of its receivers."""
         return {"sonar": self.sonar.model_dump(mode="json"), "receivers": [one.name for one in self.sonar.receivers]}
 
     @property
     def ping_bytes(self) -> int:
-        """Return the size of the responses of a ping [bytes]."""
+        """Return the size of one ping's responses [bytes]."""
         return 8 * len(self.sonar.receivers) * self.sonar.taps
 
     @property
     def sample_frames(self) -> int:
-        """Return the number of pings of a sample, as the recipe has it."""
+        """Return the number of pings per sample in the recipe."""
         return self.recipe.frames
 
     def reach(self, height: float, pitch: float = 0.0) -> NDArray[np.float64]:
-        """Compute the corners ``(n, 2)`` of what the receivers cover of the ground [m].
+        """Compute the corners ``(n, 2)`` [m] of the ground that the receivers cover.
 
         Raises:
             MitsonarError: a receiver has no ground in range.
@@ -592,19 +643,19 @@ class ResponseModality:
         return _reach(self.sonar, height)
 
     def noise_model(self, name: str) -> None:
-        """Check a signal-to-noise ratio, whose name alone defines the noise.
+        """Check the name of a signal-to-noise ratio; the ratio alone defines the noise, so there is no model.
 
         Raises:
-            MitsonarError: not a ratio.
+            MitsonarError: the name is not a ratio.
         """
         snr_of(name)
 
     def empty(self, read: Read, here: slice) -> NDArray[np.bool_]:
-        """Find the pings of which no receiver recorded an echo ``(pings,)``."""
+        """Mark the pings ``(pings,)`` of which no receiver recorded an echo."""
         return np.asarray((read("echoes", here) == 0).all(axis=1))
 
     def faults(self, read: Read, here: slice) -> list[str]:
-        """Check that responses are finite and that no count is below 0. Return a sentence for each fault."""
+        """Check that responses are finite and counts not negative, and return one sentence per fault."""
         wrong = [
             f"response, pings {here.start}..{here.stop - 1}: values that are not finite"
             for _ in range(not np.isfinite(read("response", here)).all())
@@ -615,7 +666,7 @@ class ResponseModality:
         return wrong
 
     def warnings(self, read: Read) -> list[str]:
-        """Warn of receivers without echoes, of echoes that were dropped, and of motions far below a wavelength."""
+        """Return warnings about receivers without echoes, dropped echoes, and motions far below a wavelength."""
         sentences = []
         echoes, dropped = read("echoes"), read("dropped")
         for number, receiver in enumerate(self.sonar.receivers):
@@ -644,7 +695,7 @@ class ResponseModality:
 
 @lru_cache(maxsize=8)
 def _reach(sonar: ChannelSonar, height: float) -> NDArray[np.float64]:
-    """Compute the footprints of all receivers, one after the other."""
+    """Compute the footprint of every receiver and concatenate their corners ``(n, 2)`` [m]."""
     parts = [
         ground_reach(np.array([*one.position[:2], height + one.position[2]]), _rays(one.field), sonar.range_max)
         for one in sonar.receivers
@@ -653,7 +704,7 @@ def _reach(sonar: ChannelSonar, height: float) -> NDArray[np.float64]:
 
 
 def _rays(field: FieldOfView) -> NDArray[np.float64]:
-    """Compute directions over a field of view, borders included, in the vehicle's axes ``(n, 3)``."""
+    """Sample the directions of a field of view, edges included, in the body frame ``(n, 3)``."""
     part = np.linspace(-1, 1, RAYS)
     match field.shape:
         case "rectangular":

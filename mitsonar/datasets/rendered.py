@@ -1,4 +1,4 @@
-"""Samples that are rendered while a network trains, and never stored: new worlds and motions without end."""
+"""How samples are rendered while a network trains: an endless stream of new worlds and motions that is never stored."""
 
 from __future__ import annotations
 
@@ -28,29 +28,30 @@ __all__ = ["RawStream", "RenderedPairs", "re_rendered"]
 
 
 class RenderedPairs(IterableDataset[Batch], Samples):
-    """Endless samples of a recipe. Their worlds and flights are in no data set that ``dataset make`` writes.
+    """Endless stream of rendered samples of a recipe.
 
-    A world that does not depend on its seed, such as a scene file, is the same in both.
+    Its worlds and flights differ from those of any data set that ``dataset make`` writes, except for worlds that do not
+    depend on a seed, such as scene files.
 
-    Iteration yields ``(input, label)`` as :class:`~mitsonar.datasets.samples.SonarPairs` does. :meth:`loader` yields
-    batches, with noise and layout computed on their device. Each worker of a ``DataLoader`` renders worlds of its own.
-    Workers must be started by spawn, since the ray tracer does not survive a fork: ``DataLoader(pairs, num_workers=2,
+    Iteration yields ``(input, label)``, as :class:`~mitsonar.datasets.samples.SonarPairs` does. :meth:`loader` yields
+    batches, with noise and layout computed on their device. Each worker of a ``DataLoader`` renders different worlds.
+    Workers must be started by spawn, because the ray tracer does not survive a fork: ``DataLoader(pairs, num_workers=2,
     multiprocessing_context="spawn")``.
 
     Args:
         recipe: a recipe, its name, or a YAML file.
         seed: of worlds, flights, jitter and noise.
-        length: samples of an epoch over all workers; None: no end.
-        sequences_a_world: number of sequences of a world.
-        buffer: number of samples among which the next one is drawn.
-        gain: of the pixels; default: that of the recipe's own data set, which is computed first.
+        length: number of samples per epoch over all workers; None: endless.
+        sequences_a_world: number of sequences per world.
+        buffer: number of samples from which the next one is drawn at random.
+        gain: of the pixels; default: that of the data set of this recipe, which is computed first.
         arrangement: as for ``SonarPairs``: frames, views, kind, layout, coordinates, noise, labels.
 
     Attributes:
         worlds: the recipe with the seed of these worlds, flights and jitter.
 
     Raises:
-        MitsonarError: an unknown recipe or option; workers that were forked.
+        MitsonarError: the recipe or an option is unknown, or workers were forked.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         if self.frames > recipe.flight.pings:
             raise MitsonarError(f"frames must be at most flight.pings, {recipe.flight.pings}: got {self.frames}")
         own_seed = int(np.random.SeedSequence([self.seed, 9]).generate_state(1)[0] // 2)
-        self.worlds = recipe_from({**recipe.model_dump(), "seed": own_seed})  # a copy would keep cached values
+        self.worlds = recipe_from({**recipe.model_dump(), "seed": own_seed})  # built anew: a copy would keep cached values
         self.length, self.sequences_a_world, self.buffer, self.gain = length, sequences_a_world, buffer, gain
 
     def __repr__(self) -> str:
@@ -85,16 +86,18 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             yield self.one(sample)
 
     def raw(self, skip: int = 0, share: tuple[int, int] | None = None) -> Iterator[RawSample]:
-        """Yield raw samples of this worker; :meth:`~mitsonar.datasets.samples.Samples.finished` makes a batch of them.
+        """Yield the raw samples of this worker; :meth:`~mitsonar.datasets.samples.Samples.finished` makes a batch of them.
 
         Args:
-            skip: number of samples to skip. They are not rendered, except those that lie between samples that are needed.
-            share: number of the worker and number of workers; default: as torch has them.
+            skip: number of samples to skip. They are not rendered, except those between samples that are needed.
+            share: number of this worker and number of workers; default: those of torch.
         """
+        # 1. Divide the samples of the epoch among the workers.
         known = self._ready()
         worker, workers = share or known
         self._calibrate()
         mine = None if self.length is None else self.length // workers + (worker < self.length % workers)
+        # 2. Replay the shuffled order up to ``skip``. Rendering starts at the first sample that was not skipped.
         order = self._order(worker, mine)
         skipped: set[int] = set()
         first = 0
@@ -103,6 +106,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             while first in skipped:
                 skipped.remove(first)
                 first += 1
+        # 3. Render in sequence, and hold samples back until the shuffled order calls for them.
         rendered = self._rendered(worker, workers, first)
         waiting: dict[int, RawSample] = {}
         for number in order:
@@ -113,7 +117,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             yield waiting.pop(number)
 
     def _order(self, worker: int, length: int | None) -> Iterator[int]:
-        """Yield the numbers of rendered samples in a random order: each time one of ``buffer`` that wait."""
+        """Yield the numbers of rendered samples in random order, each drawn from a buffer of ``buffer`` numbers."""
         rng = np.random.default_rng([self.seed, 7, self.epoch, worker])
         waiting: list[int] = []
 
@@ -133,11 +137,11 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         """Yield batches on a device.
 
         Args:
-            batch_size: samples of a batch.
+            batch_size: number of samples per batch.
             device: of inputs and labels.
-            workers: processes that render; 0: this process.
+            workers: number of processes that render; with 0 this process does.
         """
-        if workers:  # once here, not in each worker
+        if workers:  # calibrate once here, not in each worker
             ensure_variant()
             self._calibrate()
         yield from self.batches(RawStream(self, batch_size), batch_size, device, workers)
@@ -147,7 +151,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             self.gain = calibrate(self.recipe)
 
     def _ready(self) -> tuple[int, int]:
-        """Set up the renderer. Return the number of this worker and the number of workers."""
+        """Set up the renderer, and return the number of this worker and the number of workers."""
         info = get_worker_info()
         if info is None:
             ensure_variant()
@@ -162,9 +166,9 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         return info.id, info.num_workers
 
     def _rendered(self, worker: int, workers: int, first: int = 0) -> Iterator[tuple[int, RawSample]]:
-        """Render samples, world after world. Yield each with its number.
+        """Render samples world by world, and yield each with its number.
 
-        The first sample is the first one of the sequence that holds number ``first``.
+        The stream starts with the first sample of the sequence that contains sample ``first``.
         """
         weights = np.array([group.count * group.sequences for group in self.worlds.scenes], dtype=float)
         of_sequence = self.worlds.flight.pings - self.frames + 1
@@ -182,7 +186,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             number, sequence = number + workers, 0
 
     def _of_world(self, renderer: SceneRenderer, begin: int = 0) -> Iterator[RawSample]:
-        """Render samples of one world from a sequence on, as many sequences a launch as fit."""
+        """Render samples of one world, starting at sequence ``begin``, with as many sequences per launch as fit."""
         assert self.gain is not None
         recipe, pings = renderer.recipe, renderer.recipe.flight.pings
         together = max(1, renderer.simulator.pings_per_launch // pings)
@@ -208,12 +212,12 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         """Cut one sample from a batch of frames.
 
         Args:
-            values: of all frames of the batch, by array name.
-            vehicle: poses of the sample's sequence ``(pings, 6)``.
-            poses: of the sonar in all frames of the batch ``(frames, 6)``.
+            values: arrays of all frames of the batch, keyed by name.
+            vehicle: poses of the vehicle in the sample's sequence ``(pings, 6)`` [m, rad].
+            poses: of the sonar in all frames of the batch ``(frames, 6)`` [m, rad].
             begin: first frame of the sequence in the batch.
             first: first frame of the sample in the sequence.
-            number: of the first frame of the batch, for its noise.
+            number: of the first frame of the batch, which seeds its noise.
         """
         here = slice(begin + first, begin + first + self.frames)
         if self.frames == 1:
@@ -237,13 +241,13 @@ class RenderedPairs(IterableDataset[Batch], Samples):
 
 
 class RawStream(IterableDataset[RawSample]):
-    """The raw samples, for workers that only render.
+    """Stream of raw samples for worker processes, which only render.
 
     Args:
         pairs: the samples to render.
         batch_size: of the loader.
-        skip: number of batches that were read before. The loader continues with the next one, if it has as many workers.
-        share: number of this loader and number of loaders, where several processes train together.
+        skip: number of batches already read. The loader continues with the next one if its number of workers is unchanged.
+        share: number of this loader and number of loaders, if several processes train together.
     """
 
     def __init__(self, pairs: RenderedPairs, batch_size: int = 1, skip: int = 0, share: tuple[int, int] = (0, 1)) -> None:
@@ -252,14 +256,13 @@ class RawStream(IterableDataset[RawSample]):
     def __iter__(self) -> Iterator[RawSample]:
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
-        worker = (worker + self.skip) % workers  # torch starts with worker 0, whichever was next
-        had = len(range(worker, self.skip, workers))  # batches come from the workers in turn
+        worker = (worker + self.skip) % workers  # torch always starts with worker 0
+        had = len(range(worker, self.skip, workers))  # batches come from the workers in rotation
         loader, loaders = self.share
         return self.pairs.raw(self.batch_size * had, (loader * workers + worker, loaders * workers))
 
 
-# ---------------- Pairs of a data set re-rendered with a change: heave between the pings, or rays that move within
-# their cells
+# ---------------- Rendering stored pairs again with a change
 
 
 def re_rendered(
@@ -269,17 +272,22 @@ def re_rendered(
     shift: Callable[[int, NDArray[np.float64]], NDArray[np.float64]] | None = None,
     jitter: bool | None = None,
 ) -> Iterator[tuple[int, SonarFrames]]:
-    """Re-render samples of a data set. Yield (number, frames) scene by scene, with the stored gain and noise.
+    """Render samples of a data set again with other poses, such as heave between the pings, or other jitter.
+
+    The gain and the noise are those of the store.
 
     Args:
-        pairs: samples of a store of images of one view. Its worlds are rebuilt.
+        pairs: samples of a store with images of one view. Its worlds are built again.
         numbers: of the samples.
-        shift: from a sample's number and its poses ``(frames, 6)`` to the poses that are rendered. The frames
-            keep the stored poses, heights and times.
+        shift: function of a sample's number and its poses ``(frames, 6)`` [m, rad] that returns the poses to render. The
+            frames keep the stored poses, heights and times.
         jitter: whether rays move at random within their cells in each ping; default: as in the data set.
 
+    Yields:
+        The number of a sample and its frames, scene by scene.
+
     Raises:
-        MitsonarError: a store of vectors, or of several views.
+        MitsonarError: the store has vectors, or several views.
     """
     fields = pairs.recipe.model_dump()
     recipe = pairs.recipe if jitter is None else recipe_from({**fields, "sonar": {**fields["sonar"], "jitter": jitter}})

@@ -1,4 +1,4 @@
-"""Impulse responses as input of networks (Almanza-Medina, 5.2.5), with noise at a signal-to-noise ratio; NumPy only."""
+"""How impulse responses of a data set become samples for networks and estimators (Almanza-Medina, 5.2.5), with noise."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ __all__ = ["ImpulsePairs", "ImpulseSamples", "Leak", "Packing", "displacement_la
 
 
 SIGNAL_ENERGY = (0.01, 0.99)
-"""Parts of the energy between whose delays the signal lies."""
+"""Fractions of the energy that mark the first and the last tap of the signal."""
 
 
 def packed(response: NDArray[np.complexfloating]) -> NDArray[np.float32]:
     """Pack responses ``(..., Q, M, taps)`` into matrices ``(..., taps, 2 M Q)`` (Almanza-Medina, 5.2.5).
 
-    The columns are, for each of M receivers, the real parts of its Q responses, then their imaginary parts. They are divided
-    by the largest magnitude of the sample. A sample without signal stays 0.
+    For each of M receivers, the columns are the real parts of its Q responses, then their imaginary parts. They are divided
+    by the largest magnitude of the sample. A sample without signal remains 0.
     """
     pings, receivers, taps = response.shape[-3:]
     largest = np.abs(response).max(axis=(-3, -2, -1), keepdims=True)
@@ -46,10 +46,10 @@ def packed(response: NDArray[np.complexfloating]) -> NDArray[np.float32]:
 
 
 def noise_power(response: NDArray[np.complexfloating], snr_db: float) -> float:
-    """Compute the variance of the complex noise of each tap at a signal-to-noise ratio [dB].
+    """Compute the variance of the complex noise per tap for a signal-to-noise ratio [dB].
 
-    The signal is the mean power of the taps, over pings and receivers ``(Q, M, taps)``, from the tap where 1 % of the energy
-    has arrived to the tap where 99 % has. Silence before and after does not count.
+    The signal power is the mean power over pings, receivers and taps of the responses ``(Q, M, taps)``, from the tap where
+    1 % of the energy has arrived to the tap where 99 % has. Silence before and after these does not count.
     """
     energy = (np.abs(response.astype(np.complex128)) ** 2).mean(axis=(0, 1))
     total = np.cumsum(energy)
@@ -62,10 +62,10 @@ def noise_power(response: NDArray[np.complexfloating], snr_db: float) -> float:
 def with_noise(
     response: NDArray[np.complexfloating], numbers: ArrayLike, snr_db: float | None, seed: int
 ) -> NDArray[np.complexfloating]:
-    """Add white complex noise, drawn from (seed, ping), to the responses ``(Q, M, taps)`` of one sample.
+    """Add white complex noise to the responses of one sample; the noise of a ping depends on seed and ping number.
 
     Args:
-        response: without noise.
+        response: without noise ``(Q, M, taps)``.
         numbers: of the pings ``(Q,)``.
         snr_db: signal-to-noise ratio [dB], see :func:`noise_power`; None: no noise.
         seed: of the noise.
@@ -81,18 +81,19 @@ def with_noise(
 
 @dataclass(frozen=True)
 class Packing:
-    """Turns the responses of a batch into the input of a network.
+    """Conversion of the responses of a batch to the input of a network.
 
     Attributes:
-        receivers: their names, in order.
-        levels: signal-to-noise ratios [dB], None for no noise; of several, each sample draws one by (seed, first ping).
+        receivers: names of the receivers, in order.
+        levels: signal-to-noise ratios [dB], None for no noise; if there are several, each sample draws one from seed and
+            number of its first ping.
     """
 
     receivers: tuple[str, ...]
     levels: Sequence[float | None] = (None,)
 
     def received(self, response: NDArray[np.complexfloating], numbers: ArrayLike, seed: int) -> NDArray[np.complexfloating]:
-        """Add its noise to one sample ``(Q, M, taps)``."""
+        """Add noise to one sample ``(Q, M, taps)``, at a level that is drawn if there are several."""
         level = 0
         if len(self.levels) > 1:
             level = int(np.random.default_rng([seed, WHICH_LEVEL, int(np.asarray(numbers)[0])]).integers(len(self.levels)))
@@ -110,17 +111,17 @@ class Packing:
         return packed(np.stack([self.received(one, mine, seed) for one, mine in rows]))[:, None]
 
 
-# ---------------- Impulse responses of a data set, sample by sample, for estimators and regressors; NumPy only
+# ---------------- Samples for estimators, without torch
 
 
 Leak = Literal["none", "one_ping", "strangers"]
-"""What a sample keeps of the motion; see :class:`ImpulseSamples`."""
+"""Replacement of responses that removes the motion from a sample; see :class:`ImpulseSamples`."""
 
 LEAKS = ("none", "one_ping", "strangers")
 
 
 def displacement_labels(kind: str, recipe: Recipe, pings: int) -> Labels:
-    """Return the labels of displacements from the first of ``pings`` pings to the last; yaw only where the recipe turns."""
+    """Return the labels for displacements from the first of ``pings`` pings to the last; with yaw if the recipe has yaw."""
     step = Labels.of(kind, recipe, 2)
     count = 3 if recipe.flight.yaw_deg > 0 else 2
     return Labels(kind, (pings - 1) * step.low[:count], (pings - 1) * step.high[:count], step.names[:count])
@@ -132,22 +133,22 @@ class ImpulseSamples:
     Args:
         url: path or URL of the store.
         part: ``train``, ``validation``, ``test``, or ``all``.
-        split: ``scene``, ``sequence``, keys, or a :class:`~mitsonar.config.data.Split`; default: the recipe's own.
-        frames: Q, pings of a sample; default: the recipe's.
-        noise: ``none``, a signal-to-noise ratio such as ``20 dB`` (see
-            :func:`~mitsonar.datasets.responses.noise_power`), or a list of them, of which each sample draws one.
+        split: ``scene``, ``sequence``, keys, or a :class:`~mitsonar.config.data.Split`; default: the recipe's split.
+        frames: Q, the number of pings per sample; default: that of the recipe.
+        noise: ``none``, a signal-to-noise ratio such as ``20 dB`` (see :func:`noise_power`), or a list of them, from which
+            each sample draws one.
         labels: ``raw`` (m, m, rad), ``quantised`` or ``normx10``.
         seed: of the noise.
-        leak: for tests of where an estimator finds the motion. ``one_ping`` repeats the first response, ``strangers`` takes
-            all but the first response from a sample of another scene. Neither holds the motion.
-        one_a_sequence: whether only one sample of each sequence is taken.
+        leak: removes the motion from the samples, to test where an estimator finds it. ``one_ping`` repeats the first
+            response; ``strangers`` takes all but the first response from a sample of another scene.
+        one_a_sequence: whether to take only one sample from each sequence.
 
     Attributes:
         sonar: the instrument.
         arrange: packing and noise.
 
     Raises:
-        MitsonarError: no finished data set of responses there, an unknown option, a part without samples.
+        MitsonarError: there is no finished data set of responses, an option is unknown, or the part has no samples.
     """
 
     def __init__(
@@ -194,24 +195,24 @@ class ImpulseSamples:
         )
 
     def frame_numbers(self, index: int) -> slice:
-        """Return the pings of a sample, as numbered in the store."""
+        """Return the slice of the store's pings that a sample holds."""
         return self.chosen.frame_numbers(index)
 
     def target(self, index: int) -> NDArray[np.float64]:
         """Return the displacement from the first ping to the last (Almanza-Medina, eq. 3.4).
 
-        It is sideways, forward [m] and, if the recipe turns, yaw [rad].
+        Its components are sideways, forward [m] and, if the recipe has yaw, yaw [rad].
         """
         here = self.frame_numbers(index)
         ends = self.chosen.pose[[here.start, here.stop - 1]]
         return np.asarray(motions(ends)[0, : len(self.labels.names)])
 
     def targets(self) -> NDArray[np.float64]:
-        """Return the displacements of all samples ``(samples, 2 or 3)``."""
+        """Return the displacements of all samples ``(samples, 2 or 3)`` [m, m, rad]."""
         return np.array([self.target(index) for index in range(len(self))])
 
     def response(self, index: int) -> NDArray[np.complex64]:
-        """Read the responses of a sample ``(Q, M, taps)``, without noise, changed as ``leak`` says."""
+        """Read the responses of a sample ``(Q, M, taps)`` without noise, with the replacement that ``leak`` selects."""
         mine = self.store.read("response", self.frame_numbers(index))
         if self.leak == "one_ping":
             return np.repeat(mine[:1], self.frames, axis=0)
@@ -227,16 +228,16 @@ class ImpulseSamples:
         return self.seed
 
     def received(self, index: int) -> NDArray[np.complexfloating]:
-        """Read the responses of a sample ``(Q, M, taps)``, with its noise."""
+        """Read the responses of a sample ``(Q, M, taps)`` with noise."""
         here = self.frame_numbers(index)
         return self.arrange.received(self.response(index), np.arange(here.start, here.stop), self.noise_seed)
 
     def matrix(self, index: int) -> NDArray[np.float32]:
-        """Read the packed matrix ``(taps, 2 M Q)`` of a sample, with its noise."""
+        """Read the packed matrix ``(taps, 2 M Q)`` of a sample with noise."""
         return packed(self.received(index))
 
     def responses(self, index: int) -> ImpulseResponses:
-        """Read a sample with its noise, as estimators take it."""
+        """Read a sample with noise as :class:`ImpulseResponses`, the input of estimators."""
         here = self.frame_numbers(index)
         known = self._per_ping
         return ImpulseResponses(
@@ -250,20 +251,20 @@ class ImpulseSamples:
 
     @cached_property
     def _per_ping(self) -> dict[str, NDArray[np.float64]]:
-        """Read the small arrays of the whole store, one chunk each."""
+        """Read the small arrays of the whole store, which are stored as single chunks."""
         return {name: self.store.read(name) for name in ("time_s", "velocity", "height_m")}
 
 
-# ---------------- Samples of impulse responses for torch: packed matrices with the displacement between the pings
+# ---------------- Samples for torch
 
 
 class ImpulsePairs(ImpulseSamples, StoredBatches, Dataset[Batch]):
-    """Samples of impulse responses; ``pairs[i]`` is ``(input, label)``, float32 tensors.
+    """Samples of impulse responses for torch; ``pairs[i]`` is ``(input, label)``, float32 tensors.
 
     The input is ``(1, taps, 2 M Q)``: for each of M receivers the real parts of its Q responses, then their imaginary parts,
     one column each, divided by the largest magnitude of the sample (Almanza-Medina, 5.2.5). The label is the displacement
-    from the first ping to the last: sideways, forward, and yaw where the recipe turns. Arguments and errors:
-    :class:`~mitsonar.datasets.responses.ImpulseSamples`.
+    from the first ping to the last: sideways, forward, and yaw if the recipe has yaw. See :class:`ImpulseSamples` for
+    arguments and errors.
     """
 
     @property
@@ -272,27 +273,27 @@ class ImpulsePairs(ImpulseSamples, StoredBatches, Dataset[Batch]):
         return self.epoch_seed
 
     def raw(self, index: int) -> RawSample:
-        """Read a sample as it is stored: responses ``(Q, M, taps)``, numbers of the pings, and the label."""
+        """Read a sample as stored: the responses ``(Q, M, taps)``, the numbers of the pings, and the label."""
         here = self.frame_numbers(index)
         label = self.labels.encode(self.target(index))
         return {"frames": np.arange(here.start, here.stop), "response": self.response(index), "label": label}
 
     def finished(self, batch: dict[str, Tensor], device: Device = None) -> Batch:
-        """Make matrices and labels of a batch of raw samples, on a device."""
+        """Compute the matrices and labels of a batch of raw samples on a device."""
         response, numbers = (torch.as_tensor(batch[name]).cpu().numpy() for name in ("response", "frames"))
         inputs = torch.from_numpy(self.arrange(response, numbers, self.noise_seed))
         return inputs.to(device, non_blocking=True), torch.as_tensor(batch["label"]).to(device, non_blocking=True)
 
     def at_noise(self, level: str) -> Packing:
-        """Return the packing with one level of noise.
+        """Return the packing with a single noise level.
 
         Raises:
-            MitsonarError: an unknown level.
+            MitsonarError: unknown level.
         """
         return replace(self.arrange, levels=(snr_of(level),))
 
     def described(self) -> Fields:
-        """Describe the samples, as a checkpoint keeps it; see :meth:`~mitsonar.datasets.samples.Batches.described`."""
+        """Return the description for a checkpoint; see :meth:`~mitsonar.datasets.samples.Batches.described`."""
         low, high = self.recipe.flight.heights
         return {
             "arrangement": {

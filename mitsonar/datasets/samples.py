@@ -1,4 +1,4 @@
-"""The geometry of level ground as networks read it: at a few nodes of an image, in bins and beams."""
+"""How frames of a data set become samples for training: inputs, labels and, if requested, the geometry of the ground."""
 
 from __future__ import annotations
 
@@ -48,46 +48,50 @@ __all__ = [
 
 
 NODES = (17, 9)
-"""Nodes along range and bearing. The geometry is smooth: linear interpolation between them errs by less than 1e-3 cells."""
+"""Number of nodes along range and bearing. Linear interpolation of the smooth geometry errs by less than 1e-3 cells."""
 
 RISE = 0.05
-"""Part of the height by which the ground is raised and lowered to compute the derivative by relief."""
+"""Fraction of the height by which the ground is raised and lowered to compute the derivative with respect to relief."""
 
 
 def ground_at(
     range_m: ArrayLike, bearing_rad: ArrayLike, bearing: Bearing, height_m: float, pitch_rad: float, roll_rad: float = 0.0
 ) -> dict[str, NDArray[np.float32]]:
-    """Compute where the nodes of an image lie on the ground, and how they move with the sonar.
+    """Compute where the nodes of an image lie on level ground, and how they move with the sonar.
 
     Args:
-        range_m: of the bins ``(bins,)`` [m], rising.
-        bearing_rad: of the beams ``(beams,)`` [rad], rising.
-        bearing: the kind of that angle.
-        height_m: of the sonar over the ground [m].
-        pitch_rad: > 0 tilts the sonar down.
-        roll_rad: > 0 puts starboard down.
+        range_m: of the bins ``(bins,)`` [m], ascending.
+        bearing_rad: of the beams ``(beams,)`` [rad], ascending.
+        bearing: definition of the bearing angle.
+        height_m: of the sonar above the ground [m].
+        pitch_rad: of the sonar [rad], positive down.
+        roll_rad: of the sonar [rad], positive with starboard down.
 
     Returns:
-        By name, float32: ``points (R, C, 2)`` [m], ``turn (3, 3)``, ``height ()`` [m], ``place (2, R, C)`` range [m] and
-        bearing [rad] of the nodes, ``cell (2, R, C)`` bin [m] and beam [rad] there, ``derivative (2, 3, R, C)`` in bins and
-        beams by motion [m, m, rad], ``by_relief (2, 3, R, C)`` its change with relief above the ground, by parts of the
-        height, ``cone ()``: 1 where the bearing is the angle of a cone.
+        Arrays of float32, keyed by name. ``points (R, C, 2)`` [m], ``turn (3, 3)``, ``height ()`` [m]. ``place (2, R, C)``:
+        range [m] and bearing [rad] of the nodes. ``cell (2, R, C)``: size of a bin [m] and of a beam [rad] at the nodes.
+        ``derivative (2, 3, R, C)``: derivative in bins and beams with respect to motion [m, m, rad].
+        ``by_relief (2, 3, R, C)``: its derivative with respect to relief above the ground, as a fraction of the height.
+        ``cone ()``: 1 if the bearing is a cone angle.
     """
+    # 1. Place the nodes evenly in index, and measure the local size of a bin and of a beam there.
     axes = [np.asarray(values, dtype=float) for values in (range_m, bearing_rad)]
     index = [np.linspace(0, len(axis) - 1, count) for axis, count in zip(axes, NODES, strict=True)]
     nodes = [np.interp(at, np.arange(len(axis)), axis) for at, axis in zip(index, axes, strict=True)]
     cell = [np.interp(at, np.arange(len(axis)), np.gradient(axis)) for at, axis in zip(index, axes, strict=True)]
     geometry = GroundGeometry(nodes[0], nodes[1], bearing, height_m, pitch_rad, roll_rad)
+    # 2. Where a node does not meet the ground, take the nearest node that does.
     row, column = nearest_known(np.asarray(np.isfinite(geometry.points).all(axis=-1)))
     points = np.nan_to_num(geometry.points[row, column])
     cells = np.stack(np.meshgrid(*cell, indexing="ij"))
 
     def derivative(part: float) -> NDArray[np.float64]:
-        """Compute the derivative by motion, over ground at this part of the height."""
+        """Compute the derivative with respect to motion, for a sonar at this fraction of the height."""
         own = GroundGeometry(nodes[0], nodes[1], bearing, part * height_m, pitch_rad, roll_rad)
         values = np.nan_to_num(own.derivative[row, column]) / np.moveaxis(cells, 0, -1)[..., None]
         return np.moveaxis(values, (2, 3), (0, 1))
 
+    # 3. Differentiate with respect to relief by central differences: higher ground is the same as a lower sonar.
     higher, lower = (derivative(1 - sign * RISE) for sign in (1, -1))
     table = {
         "points": points,
@@ -103,9 +107,10 @@ def ground_at(
 
 
 def ground_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.float32]]:
-    """Compute the geometry of frames at their attitude over the ground; see :func:`ground_at`.
+    """Compute the ground geometry of frames from their attitude; see :func:`ground_at` for the arrays.
 
-    Of two frames at known attitudes, ``points`` are those of the first frame, ``turn`` and ``height`` those of the second.
+    If the attitudes of two frames are known, ``points`` and ``place`` are those of the first frame, ``turn`` and ``height``
+    those of the second.
     """
     axes = frames.range_m, frames.bearing_rad, frames.sonar.bearing
     table = ground_at(*axes, attitude.height_m, attitude.pitch_rad, attitude.roll_rad)
@@ -116,10 +121,10 @@ def ground_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.f
 
 
 def light_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.float32]]:
-    """Compute how far inside the light the ground of each node lies, as ``lit (R, C)``; empty where its outline is left in.
+    """Compute how far inside the insonified area the ground at each node lies, as ``lit (R, C)``.
 
-    See :func:`mitsonar.geometry.ground.margin_of_light`. It stays in where
-    little of the window is lit, as in training, which does without this table.
+    See :func:`mitsonar.geometry.ground.margin_of_light`. The result is empty if the outline of the area is not to be masked,
+    which is the case if little of the window is insonified. Training does not use this array.
     """
     range_m, bearing_rad = (
         np.interp(np.linspace(0, len(axis) - 1, count), np.arange(len(axis)), axis)
@@ -131,33 +136,33 @@ def light_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.fl
     return {} if margin is None else {"lit": margin.astype(np.float32)}
 
 
-# ---------------- How torch reads samples: raw ones by number, a batch of them finished on a device
+# ---------------- Batches for torch
 
 
 Inputs: TypeAlias = Any
-"""The input of a network: a tensor, a tuple of tensors, or a tensor and the tensors of the ground's geometry by name."""
+"""Input of a network: a tensor, a tuple of tensors, or a tensor and a dictionary of ground geometry tensors."""
 
 Batch: TypeAlias = tuple[Inputs, Tensor]
 """Inputs and labels of a batch, or of one sample."""
 
 RawSample: TypeAlias = dict[str, NDArray[Any]]
-"""A sample as it is stored: frames by view, their numbers, and the label."""
+"""A sample as stored: the frames keyed by view, their numbers, and the label."""
 
 Device: TypeAlias = torch.device | str | None
-"""A device of torch; None: where the tensors are."""
+"""A torch device; None keeps tensors where they are."""
 
 SEED_STEP = 1_000_003
-"""Difference of the noise seeds of two epochs: more than any number of views."""
+"""Difference between the noise seeds of two epochs; it exceeds any number of views."""
 
 
 class Batches:
-    """What all samples share. Each kind of samples defines how a batch of raw ones is :meth:`finished`.
+    """Base class of all samples; a subclass implements :meth:`finished`, which turns raw samples into a batch.
 
     Attributes:
         recipe: of the data set.
-        labels: encodes and decodes targets.
+        labels: encoder and decoder of targets.
         seed: of noise and order.
-        epoch: changes both; see :meth:`set_epoch`.
+        epoch: current epoch, which changes noise and order; see :meth:`set_epoch`.
     """
 
     recipe: Recipe
@@ -166,27 +171,27 @@ class Batches:
     epoch: int
 
     def finished(self, batch: dict[str, Tensor], device: Device = None) -> Batch:
-        """Make inputs and labels of a batch of raw samples, on a device."""
+        """Compute the inputs and labels of a batch of raw samples on a device."""
         raise NotImplementedError
 
     def described(self) -> Fields:
-        """Describe the samples, as a checkpoint of a network that was trained on them keeps it.
+        """Return the description of the samples that is saved in the checkpoint of a network trained on them.
 
         The keys are ``arrangement``, ``sonar``, ``trained_at``, ``model`` and ``noise``.
         """
         raise NotImplementedError
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, which changes the noise, and the order in :meth:`StoredBatches.loader`."""
+        """Set the epoch, which changes the noise and the order in :meth:`StoredBatches.loader`."""
         self.epoch = epoch
 
     @property
     def epoch_seed(self) -> int:
-        """Return the seed of the noise of this epoch."""
+        """Return the noise seed of the current epoch."""
         return self.seed + SEED_STEP * self.epoch
 
     def one(self, sample: RawSample) -> Batch:
-        """Make the input and the label of one raw sample."""
+        """Compute the input and the label of one raw sample."""
         batch = {name: torch.as_tensor(values)[None] for name, values in sample.items()}
         inputs, label = self.finished(batch)
         return _first(inputs), label[0]
@@ -202,16 +207,16 @@ class Batches:
         generator: torch.Generator | None = None,
         drop_last: bool = False,
     ) -> Iterator[Batch]:
-        """Yield inputs and labels of batches of raw samples, which workers read or render, on a device.
+        """Yield batches of inputs and labels on a device, from raw samples that workers read or render.
 
         Args:
-            raw: the samples.
-            batch_size: samples of a batch.
+            raw: the raw samples.
+            batch_size: number of samples per batch.
             device: of inputs and labels.
-            workers: processes that read or render; 0: this process.
-            shuffle: whether the order is drawn.
-            generator: from which it is drawn.
-            drop_last: whether a last, smaller batch is left out.
+            workers: number of processes that read or render; with 0 this process does.
+            shuffle: whether to draw the order at random.
+            generator: random generator for the order.
+            drop_last: whether to omit a last, smaller batch.
         """
         pinned = device is not None and torch.device(device).type == "cuda"
         start = "spawn" if workers else None  # a fork after the ray tracer has started is unsafe
@@ -230,13 +235,13 @@ class Batches:
 
 
 class StoredBatches(Batches):
-    """Samples of a store, which are numbered."""
+    """Base class of the samples of a store, which are numbered."""
 
     def __len__(self) -> int:
         raise NotImplementedError
 
     def raw(self, index: int) -> RawSample:
-        """Read a sample as it is stored."""
+        """Read a sample as stored."""
         raise NotImplementedError
 
     def __getitem__(self, index: int) -> Batch:
@@ -251,7 +256,7 @@ class StoredBatches(Batches):
         workers: int = 0,
         drop_last: bool = False,
     ) -> Iterator[Batch]:
-        """Yield the batches of one epoch on a device. Their order is a function of seed and epoch."""
+        """Yield the batches of one epoch on a device; their order depends on seed and epoch only."""
         order = torch.Generator().manual_seed(self.epoch_seed)
         yield from self.batches(
             _Raw(self), batch_size, device, workers, shuffle=shuffle, generator=order, drop_last=drop_last
@@ -267,7 +272,7 @@ def _first(inputs: Inputs) -> Inputs:
 
 @dataclass(frozen=True)
 class _Raw(Dataset[RawSample]):
-    """The raw samples, for workers that only read."""
+    """Raw samples for worker processes, which only read."""
 
     samples: StoredBatches
 
@@ -278,14 +283,14 @@ class _Raw(Dataset[RawSample]):
         return self.samples.raw(index)
 
 
-# ---------------- Samples of a data set for torch: two or more consecutive frames with their labels
+# ---------------- Samples of images and vectors
 
 
 GROUND = "ground/"
-"""Prefix of the names of the ground's geometry in a raw sample."""
+"""Prefix of the names of ground geometry arrays in a raw sample."""
 
 KEPT_BYTES = 2**28
-"""Largest array of vectors that is kept in memory once it has been read."""
+"""Largest array of vectors that is cached in memory [bytes]."""
 
 
 class ArrangementOptions(TypedDict, total=False):
@@ -305,22 +310,22 @@ class ArrangementOptions(TypedDict, total=False):
 
 
 class SampleOptions(ArrangementOptions, total=False):
-    """The same, and the seed."""
+    """Options of :class:`ArrangementOptions`, and the seed."""
 
     seed: int
 
 
 class Samples(Batches):
-    """What stored and rendered samples share: how raw frames become inputs and labels.
+    """Base class of stored and rendered samples of images and vectors: turns raw frames into inputs and labels.
 
     Attributes:
         recipe: of the data set.
-        frames: number of frames of a sample.
-        arrange: turns frames into inputs.
-        labels: encodes and decodes targets.
+        frames: number of frames per sample.
+        arrange: conversion of frames to inputs.
+        labels: encoder and decoder of targets.
         seed: of noise and order.
-        epoch: changes both; see :meth:`set_epoch`.
-        ground: whether inputs come with the geometry of the ground.
+        epoch: current epoch, which changes noise and order; see :meth:`set_epoch`.
+        ground: whether inputs include the geometry of the ground.
     """
 
     def __init__(
@@ -364,19 +369,19 @@ class Samples(Batches):
             )
 
     def finished(self, batch: dict[str, Tensor], device: Device = None) -> Batch:
-        """Make inputs and labels of a batch of raw samples. Noise and layout are computed on ``device``."""
+        """Compute the inputs and labels of a batch of raw samples; noise and layout are computed on ``device``."""
         moved = {name: values.to(device, non_blocking=True) for name, values in batch.items()}
         ground = {name.removeprefix(GROUND): moved.pop(name) for name in list(moved) if name.startswith(GROUND)}
         inputs = self.arrange(moved, moved["frames"], self.epoch_seed)
         return (inputs, ground) if self.ground else inputs, moved["label"]
 
     def ground_below(self, image: Values, poses: NDArray[np.float64], height_m: NDArray[np.float64]) -> RawSample:
-        """Compute the ground's geometry for a raw sample's frames, by name, to be added to the sample.
+        """Compute the ground geometry of a raw sample's frames, keyed by the names that it has in the sample.
 
         Args:
-            image: of the one view ``(frames, bins, beams)``, without noise.
+            image: frames of the only view ``(frames, bins, beams)``, without noise.
             poses: of the sonar ``(frames, 6)`` [m, rad].
-            height_m: over the ground ``(frames,)`` [m].
+            height_m: of the sonar above the ground ``(frames,)`` [m].
         """
         frames = self.frames_of(image, poses, height_m, time_s=np.arange(len(image), dtype=float))
         attitude = attitude_of(frames, "the ground", None, None)
@@ -391,14 +396,14 @@ class Samples(Batches):
         time_s: NDArray[np.float64],
         level_scale: float = 1.0,
     ) -> SonarFrames:
-        """Build the frames of the one view.
+        """Build the :class:`SonarFrames` of the first view.
 
         Args:
-            image: ``(frames, bins, beams)``.
+            image: pixels ``(frames, bins, beams)``.
             poses: of the sonar ``(frames, 6)`` [m, rad].
-            height_m: over the ground ``(frames,)`` [m].
-            time_s: of each frame ``(frames,)`` [s].
-            level_scale: level of a pixel of 1.
+            height_m: of the sonar above the ground ``(frames,)`` [m].
+            time_s: time of each frame ``(frames,)`` [s].
+            level_scale: level of a pixel of value 1.
         """
         view = next(view for view in self.recipe.views if view.name == self.arrange.views[0])
         return SonarFrames(
@@ -415,19 +420,19 @@ class Samples(Batches):
 
     @property
     def stored_kind(self) -> str:
-        """Return the stored kind that is read. Vectors are made of images if only images are stored, and for halves."""
+        """Return the kind of array to read; vectors come from images if only images are stored, and for halves."""
         return self.arrange.kind if self.arrange.kind in self.recipe.kinds and not self.arrange.halves else "image"
 
     def at_noise(self, level: str) -> Arrangement:
-        """Return the arrangement with one level of noise.
+        """Return the arrangement with a single noise level.
 
         Raises:
-            MitsonarError: an unknown level.
+            MitsonarError: unknown level.
         """
         return replace(self.arrange, noise=load_noise(level), levels=())
 
     def described(self) -> Fields:
-        """Describe the samples, as a checkpoint keeps it; see :meth:`~mitsonar.datasets.samples.Batches.described`."""
+        """Return the description of the samples for a checkpoint; see :meth:`Batches.described`."""
         recipe, mount, arrange = self.recipe, self.recipe.mount, self.arrange
         rows = {conversion.index.shape[1] for conversion in arrange.maps.values()}
         return {
@@ -454,7 +459,7 @@ class Samples(Batches):
 
 
 class SonarPairs(StoredBatches, Samples, Dataset[Any]):
-    """Samples of a data set's store. Each has ``frames`` consecutive frames and the motion between them.
+    """Samples of a stored data set: ``frames`` consecutive frames each, and the motion between them.
 
     ``pairs[i]`` is ``(input, label)``, float32 tensors, ready for ``torch.utils.data.DataLoader``. :meth:`loader` yields
     batches, with noise and layout computed on their device.
@@ -462,28 +467,31 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
     Args:
         url: path or URL of the store.
         part: ``train``, ``validation``, ``test``, or ``all``.
-        split: ``scene`` (80, 10 and 10 % of the scenes: other worlds than those of training; scenes of one world stay
-            together), ``sequence`` (95 and 5 % of the sequences), ``sample`` (Almanza-Medina's: samples are dealt out one by
-            one, 90 and 5 %, so that those for validation have a frame in common with those of training; 5 % of the
-            sequences are for test), or by, train, validation, test and seed as a dictionary or
-            :class:`~mitsonar.config.data.Split`; default: the recipe's own.
-        frames: number of frames of a sample; with 1 the labels are heights; default: the recipe's.
-        views: which views; default: all.
-        kind: ``image`` or ``vector``; default: what is stored.
+        split: one of the following; default: the recipe's split.
+
+            - ``scene``: 80, 10 and 10 % of the scenes. Validation and test use other worlds than training; scenes of one
+              world stay together.
+            - ``sequence``: 95 and 5 % of the sequences.
+            - ``sample``: the split of Almanza-Medina. Single samples are assigned, 90 and 5 %, so samples for validation
+              have a frame in common with samples for training; 5 % of the sequences are for test.
+            - the keys by, train, validation, test and seed, as a dictionary or :class:`~mitsonar.config.data.Split`.
+        frames: number of frames per sample; with 1 the labels are heights; default: that of the recipe.
+        views: names of the views; default: all.
+        kind: ``image`` or ``vector``; default: the stored kind.
         layout: ``side``, ``stack`` or ``channels``; see :class:`~mitsonar.datasets.arrangement.Arrangement`.
         coordinates: ``polar``, ``cartesian`` or ``both`` (then the input is a pair).
-        cartesian_rows: pixels of a fan in the forward direction.
-        range_levels: number of levels of a vector, whose bins are added up in groups, with their noise; default: one a bin.
+        cartesian_rows: number of pixels of a fan in the forward direction.
+        range_levels: number of levels in a vector, whose bins are summed in groups, with their noise; default: one per bin.
         halves: whether images become vectors of their halves in azimuth (Almanza-Medina, fig. 4.18), port first.
-        noise: ``none``, ``low``, ``high``, ``chapter2``, three numbers, or a model; of a list each sample draws one.
+        noise: ``none``, ``low``, ``high``, ``chapter2``, three numbers, or a model; from a list each sample draws one.
         labels: ``raw`` (m, m, rad), ``quantised`` (0..31) or ``normx10`` (+-10); ``pairs.labels.decode`` inverts them.
-        seed: of noise and order. The split has its own (``Split.seed``), so that another seed never mixes its parts.
-        ground: whether the input is images and the geometry of the ground below them, as ``corrnet`` takes it. The labels
-            are then motions of the sonar, not those of the vehicle that carries it.
-        one_a_sequence: whether only one sample of each sequence is taken, for independent tests.
+        seed: of noise and order. The split has a separate seed (``Split.seed``), so another seed never mixes its parts.
+        ground: whether the input is images and the geometry of the ground below them, as ``corrnet`` requires. The labels
+            are then motions of the sonar, not of the vehicle that carries it.
+        one_a_sequence: whether to take only one sample from each sequence, for independent tests.
 
     Raises:
-        MitsonarError: no finished data set there, an unknown option, a part without frames.
+        MitsonarError: there is no finished data set, an option is unknown, or the part has no frames.
     """
 
     def __init__(
@@ -516,23 +524,23 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         return len(self.first)
 
     def frame_numbers(self, index: int) -> slice:
-        """Return the frames of a sample, as numbered in the store."""
+        """Return the slice of the store's frames that a sample holds."""
         return self.chosen.frame_numbers(index)
 
     def target(self, index: int) -> NDArray[np.float64]:
-        """Return the mean motion from frame to frame (sideways m, forward m, yaw rad).
+        """Return the mean motion from frame to frame (sideways [m], forward [m], yaw [rad]).
 
-        Of a sample of one frame the target is its height over z = 0 [m].
+        The target of a sample with one frame is its height above z = 0 [m].
         """
         here = self.frame_numbers(index)
         if self.frames == 1:
             return self.pose[here, 2]
-        if self.ground:  # in the axes of the sonar, which its geometry has
+        if self.ground:  # in the frame of the sonar, as the ground geometry
             return np.asarray(motions(self.pose[here]).mean(axis=0))
         return np.asarray(self.motion[here.start : here.stop - 1].mean(axis=0))
 
     def raw(self, index: int) -> RawSample:
-        """Read a sample as it is stored: frames by view, their numbers, and the label; see :meth:`finished`."""
+        """Read a sample as stored: the frames keyed by view, their numbers, and the label; see :meth:`finished`."""
         here = self.frame_numbers(index)
         sample: RawSample = {
             "frames": np.arange(here.start, here.stop),
@@ -544,14 +552,14 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
             elif view in self.arrange.views and kind == "nonzero" and self.stored_kind == "vector":
                 sample[f"nonzero_{view}"] = self._read(name, here).astype(np.int32)
         if self.ground:
-            if index not in self._grounds:  # it is the same in every epoch
+            if index not in self._grounds:  # cached: it is the same in every epoch
                 image = sample[self.arrange.views[0]]
                 self._grounds[index] = self.ground_below(image, self.pose[here], self.store.read("height_m", here))
             sample |= self._grounds[index]
         return sample
 
     def _read(self, name: str, here: slice) -> Values:
-        """Read frames of an array. Vectors are small and kept in memory: reading each of them costs more than learning."""
+        """Read frames of an array; vectors are small and cached, because reading each one costs more than training on it."""
         levels = int(np.prod(self.store.modality.stored[name].shape))
         if self.stored_kind != "vector" or 4 * levels * len(self.sequence) > KEPT_BYTES:
             return self.store.read(name, here)
@@ -560,18 +568,18 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         return self._whole[name][here]
 
     def __getstate__(self) -> Fields:
-        """Return the state without what was read: other processes read for themselves."""
+        """Return the state without cached arrays, because other processes read them themselves."""
         return {**vars(self), "_whole": {}}
 
     def sonar_frames(self, index: int, image: Values | None = None) -> SonarFrames:
-        """Read a sample of one view as frames with noise, poses and heights, as estimators take it.
+        """Read a sample of one view as :class:`SonarFrames` with noise, poses and heights, the input of estimators.
 
         Args:
             index: of the sample.
-            image: replaces the stored frames ``(frames, bins, beams)``; it gets the same noise.
+            image: pixels ``(frames, bins, beams)`` that replace the stored frames; they get the same noise.
 
         Raises:
-            MitsonarError: samples of vectors, or of several views.
+            MitsonarError: the samples are vectors, or have several views.
         """
         if len(self.arrange.views) > 1 or self.arrange.kind != "image":
             raise MitsonarError(f"frames hold images of one view: choose one of {', '.join(self.arrange.views)}")
@@ -595,25 +603,26 @@ def _noise_name(noise: NoiseModel) -> str:
     return names[0] if names else f"{noise.mean:g},{noise.std:g},{noise.scale:g}"
 
 
-# ---------------- Samples of several data sets of one sonar, such as one in each model, joined for one training
+# ---------------- Samples of several data sets
 
 
 class JoinedPairs(StoredBatches, Dataset[Any]):
-    """Samples of several data sets, one set after the other. Samples, frames and sequences are numbered through all sets.
+    """Concatenated samples of several data sets of one sonar, such as one data set per sonar model.
 
-    The first set arranges all samples and encodes all labels.
+    Samples, frames and sequences are numbered consecutively over all sets. The first set arranges all samples and encodes
+    all labels.
 
     Args:
-        parts: samples of each data set, arranged alike.
+        parts: samples of each data set, with the same arrangement.
 
     Attributes:
         parts: as given.
-        frames: number of frames of a sample.
+        frames: number of frames per sample.
         first: first frame of each sample ``(samples,)``.
-        sequence: of each frame ``(frames,)``.
+        sequence: sequence number of each frame ``(frames,)``.
 
     Raises:
-        MitsonarError: other views, window, beams, pixels, mount, heights or largest motions than those of the first set.
+        MitsonarError: views, window, beams, pixels, mount, heights or largest motions differ from those of the first set.
     """
 
     def __init__(self, parts: Sequence[SonarPairs]) -> None:
@@ -634,7 +643,7 @@ class JoinedPairs(StoredBatches, Dataset[Any]):
 
     @property
     def arrange(self) -> Arrangement:
-        """Return what turns frames into inputs."""
+        """Return the conversion of frames to inputs."""
         return self.parts[0].arrange
 
     @arrange.setter
@@ -642,10 +651,10 @@ class JoinedPairs(StoredBatches, Dataset[Any]):
         self.parts[0].arrange = arrange
 
     def at_noise(self, level: str) -> Arrangement:
-        """Return the arrangement with one level of noise.
+        """Return the arrangement with a single noise level.
 
         Raises:
-            MitsonarError: an unknown level.
+            MitsonarError: unknown level.
         """
         return self.parts[0].at_noise(level)
 
@@ -655,17 +664,17 @@ class JoinedPairs(StoredBatches, Dataset[Any]):
         self.parts[0].set_epoch(epoch)
 
     def raw(self, index: int) -> RawSample:
-        """Read a sample as it is stored."""
+        """Read a sample as stored."""
         place = int(np.searchsorted(self._samples, index, side="right")) - 1
         sample = self.parts[place].raw(index - int(self._samples[place]))
-        return {**sample, "frames": sample["frames"] + self._frames[place]}  # so that no two sets share their noise
+        return {**sample, "frames": sample["frames"] + self._frames[place]}  # so that no two sets share noise
 
     def finished(self, batch: dict[str, Tensor], device: Device = None) -> Batch:
-        """Make inputs and labels of a batch of raw samples of any of the sets, on a device."""
+        """Compute the inputs and labels of a batch of raw samples from any of the sets on a device."""
         return self.parts[0].finished(batch, device)
 
     def described(self) -> Fields:
-        """Describe the samples, as a checkpoint keeps it: of the first set, with the models and names of all."""
+        """Return the description for a checkpoint: that of the first set, with the models and names of all sets."""
         told = [part.described() for part in self.parts]
         names = [part.recipe.name for part in self.parts]
         return {**told[0], "model": _listed([one["model"] for one in told]), "data": _listed(names)}
@@ -676,10 +685,10 @@ def _listed(names: list[str]) -> str:
 
 
 def _refuse_others(leader: SonarPairs, part: SonarPairs) -> None:
-    """Refuse a data set whose samples are other inputs or labels than those of the first.
+    """Refuse a data set whose inputs or labels have another form than those of the first.
 
     Raises:
-        MitsonarError: they are.
+        MitsonarError: they have.
     """
     mine, its = (_what_must_agree(pairs) for pairs in (leader, part))
     other = [name for name in mine if mine[name] != its[name]]
@@ -692,7 +701,7 @@ def _refuse_others(leader: SonarPairs, part: SonarPairs) -> None:
 
 
 def _what_must_agree(pairs: SonarPairs) -> Fields:
-    """Return what decides the form of inputs and labels, by name."""
+    """Return the properties that determine the form of inputs and labels, keyed by name."""
     views = [view for view in pairs.recipe.views if view.name in pairs.arrange.views]
     told = pairs.described()
     return {
@@ -705,24 +714,24 @@ def _what_must_agree(pairs: SonarPairs) -> Fields:
     }
 
 
-# ---------------- The samples of a part of a data set: their frames, poses and scenes
+# ---------------- Samples of one part of a data set
 
 
 AnySplit: TypeAlias = str | Split | Fields | None
-"""A split by name, as an object, or by the keys of a recipe; None: the recipe's own."""
+"""A split as a name, an object, or the keys of a recipe; None: the recipe's split."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Samples of consecutive frames of one sequence.
+    """The samples in one part of a data set; the frames of a sample are consecutive and belong to one sequence.
 
     Attributes:
-        split: that assigns the frames.
-        frames: number of frames of a sample.
-        first: the first frame of each sample ``(samples,)``.
-        scene, sequence: of each frame of the store ``(frames,)``.
-        pose: of the sonar ``(frames, 6)``.
-        motion: to the next frame ``(frames, 3)``.
+        split: assignment of the frames to parts.
+        frames: number of frames per sample.
+        first: first frame of each sample ``(samples,)``.
+        scene, sequence: numbers of scene and sequence of each frame of the store ``(frames,)``.
+        pose: of the sonar ``(frames, 6)`` [m, rad].
+        motion: to the next frame ``(frames, 3)`` [m, m, rad].
     """
 
     split: Split
@@ -750,12 +759,12 @@ class Part:
             store: of the data set.
             part: ``train``, ``validation``, ``test``, or ``all``.
             split: see :func:`split_for`.
-            frames: number of frames of a sample.
-            seed: of the choice of one sample a sequence.
-            one_a_sequence: whether only one sample of each sequence is taken.
+            frames: number of frames per sample.
+            seed: of the random choice of one sample per sequence.
+            one_a_sequence: whether to take only one sample from each sequence.
 
         Raises:
-            MitsonarError: unknown part or split, a part without samples.
+            MitsonarError: the part or split is unknown, or the part has no samples.
         """
         dealt = split_for(split, store.recipe)
         scene, sequence, pose, motion = (store.read(name) for name in ("scene", "sequence", "pose", "motion"))
@@ -777,16 +786,16 @@ class Part:
         return cls(dealt, frames, first, scene, sequence, pose, motion)
 
     def frame_numbers(self, index: int) -> slice:
-        """Return the frames of a sample, as numbered in the store."""
+        """Return the slice of the store's frames that a sample holds."""
         first = int(self.first[index])
         return slice(first, first + self.frames)
 
 
 def split_for(split: AnySplit, recipe: Recipe) -> Split:
-    """Return a split of a data set of this recipe; see :class:`~mitsonar.datasets.samples.SonarPairs`.
+    """Return the split of a data set of this recipe; see :class:`SonarPairs` for the choices.
 
     Raises:
-        MitsonarError: an unknown name or key.
+        MitsonarError: unknown name or key.
     """
     if isinstance(split, Split):
         return split

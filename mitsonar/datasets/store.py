@@ -1,4 +1,7 @@
-"""A data set on disk or in object storage: one Zarr v3 group, written shard by shard (docs/guides/data-sets.md)."""
+"""How a data set is stored on disk or in object storage: one Zarr v3 group, written shard by shard.
+
+docs/guides/data-sets.md describes the format.
+"""
 
 from __future__ import annotations
 
@@ -46,26 +49,26 @@ __all__ = [
 
 
 FORMAT = 1
-"""Version of what docs/guides/data-sets.md describes."""
+"""Version of the format that docs/guides/data-sets.md describes."""
 
 PACKAGES = ("mitsonar", "mitsuba", "drjit", "numpy", "finufft", "zarr")
-"""Packages whose versions a store names."""
+"""Packages whose versions a store records."""
 
 DECIDING = PACKAGES[:3]
-"""Packages whose versions decide what is recorded."""
+"""Packages whose versions affect the recorded values."""
 
 Kind: TypeAlias = np.dtype[Any]
-"""The type of an array, whatever it holds."""
+"""Data type of an array, with any type of element."""
 
 
 class DataStore:
-    """One data set. :meth:`create` makes an empty store, :meth:`open` opens an existing one.
+    """One data set on disk or in object storage; use :meth:`create` or :meth:`open` to get one.
 
     Attributes:
         place: its storage.
-        group: the Zarr group.
+        group: its Zarr group.
         recipe: of the data set.
-        modality: what its instrument records.
+        modality: of the recipe's instrument.
     """
 
     def __init__(self, storage: Storage, group: zarr.Group) -> None:
@@ -76,15 +79,15 @@ class DataStore:
 
     @classmethod
     def create(cls, storage: Storage, recipe: Recipe, plan: Plan, about: Fields) -> DataStore:
-        """Create an empty store with all that is known before rendering.
+        """Create an empty store and write everything that is known before rendering.
 
-        An unfinished attempt that lies there is overwritten.
+        An unfinished attempt at the same place is overwritten.
 
         Args:
-            storage: where the store shall lie.
+            storage: location of the store.
             recipe: of the data set.
-            plan: all its frames.
-            about: further attributes, at least those that the modality calls ``settled``.
+            plan: all frames of the data set.
+            about: further attributes, at least those in the modality's ``settled``.
         """
         modality, layout = modality_of(recipe), ShardLayout.of(recipe, plan)
         attributes = {
@@ -104,7 +107,7 @@ class DataStore:
         if "zarr.json" in storage.sizes():
             group = zarr.open_group(storage.store(write=True), mode="r+", zarr_format=3)
             group.attrs.put(attributes)
-        else:  # in one write: a group without its attributes is nobody's
+        else:  # in one write: a group without attributes could not be recognised as a data set
             group = zarr.create_group(storage.store(write=True), zarr_format=3, attributes=attributes)
         store = cls(storage, group)
         create_arrays(group, plan, modality, layout)
@@ -118,10 +121,10 @@ class DataStore:
         Args:
             url: path or URL.
             write: whether shards will be written.
-            unfinished: whether a store that is not finished is accepted.
+            unfinished: whether to accept a store that is not finished.
 
         Raises:
-            MitsonarError: nothing there, not a data set of mitsonar, damaged, or not finished.
+            MitsonarError: there is no store, or it is not a mitsonar data set, damaged, or not finished.
         """
         storage = url if isinstance(url, Storage) else Storage(url)
         try:
@@ -171,17 +174,17 @@ class DataStore:
 
     @property
     def about(self) -> Fields:
-        """Return the attributes, by name."""
+        """Return the attributes of the group, keyed by name."""
         return dict(self.group.attrs)
 
     @property
     def ready(self) -> bool:
-        """Return whether all arrays were created."""
+        """Return whether all arrays have been created."""
         return bool(self.group.attrs.get("ready"))
 
     @property
     def finished(self) -> bool:
-        """Return whether every shard was written."""
+        """Return whether every shard has been written."""
         return bool(self.group.attrs.get("finished"))
 
     def __len__(self) -> int:
@@ -189,22 +192,22 @@ class DataStore:
 
     @cached_property
     def scenes(self) -> dict[int, Scene]:
-        """Return the scenes, by number."""
+        """Return the scenes, keyed by number."""
         return {int(fields["number"]): Scene(**fields) for fields in self.about["scenes"]}
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """Return an array by its name.
+        """Return the array with the given name.
 
         Raises:
-            MitsonarError: its metadata is damaged or gone, or it has another type, shape or layout than the recipe gives.
+            MitsonarError: its metadata is damaged or missing, or its type, shape or layout does not follow from the recipe.
         """
-        if name not in self._arrays:  # the group would read the metadata anew each time
+        if name not in self._arrays:  # cached, because the group reads the metadata at every access
             try:
                 with zarr.config.set({"array.write_empty_chunks": True}):  # a missing file is a missing shard
                     found = self.group[name]
                 if isinstance(found, zarr.Array):
                     refuse_codecs(found)
-            except Exception as error:  # no metadata, or damaged ones
+            except Exception as error:  # metadata missing or damaged
                 raise MitsonarError(
                     f"{self.place.url}/{name}/zarr.json is damaged or gone ({type(error).__name__}): remove the data set "
                     "and make it again"
@@ -216,10 +219,10 @@ class DataStore:
         return self._arrays[name]
 
     def read(self, name: str, index: int | slice | EllipsisType = ...) -> Values:
-        """Read the values of an array: all, those of a frame, or those of a slice of frames.
+        """Read the values of an array: all of them, or those of one frame or of a slice of frames.
 
         Raises:
-            MitsonarError: the bytes are damaged, or the values cannot be.
+            MitsonarError: the bytes are damaged, or the values are impossible.
         """
         array = self.array(name)
         try:
@@ -243,10 +246,10 @@ class DataStore:
         return values
 
     def _check_rows(self) -> None:
-        """Check that the bytes of poses, motions or times can hold as many frames as the attributes promise.
+        """Check that the stored bytes of poses, motions or times suffice for the number of frames in the attributes.
 
         Raises:
-            ValueError: they cannot.
+            ValueError: they do not.
         """
         if len(self) <= FEW_ROWS:
             return
@@ -258,10 +261,10 @@ class DataStore:
             raise ValueError(f"{len(self):,} frames are more than the {stored:,} bytes of their poses can hold")
 
     def _check_array(self, name: str, found: zarr.Array[Any]) -> None:
-        """Check that an array has the type, the shape and the pieces that the recipe gives it.
+        """Check that type, shape and chunks of an array follow from the recipe.
 
         Raises:
-            MitsonarError: it has others.
+            MitsonarError: they do not.
         """
         wanted = self._wanted.get(name)
         if wanted is None:
@@ -278,7 +281,7 @@ class DataStore:
 
     @cached_property
     def _wanted(self) -> dict[str, tuple[tuple[int, ...], Kind]]:
-        """Return shape and type of each array, by name."""
+        """Return the expected shape and type of each array, keyed by name."""
         frames = len(self)
         table: dict[str, tuple[tuple[int, ...], Kind]] = {}
         table |= {name: ((frames, *one.shape), one.kind) for name, one in self.modality.stored.items()}
@@ -293,7 +296,7 @@ class DataStore:
 
     @property
     def shard_frames(self) -> int:
-        """Return the number of frames of a shard; the last shard may hold fewer."""
+        """Return the number of frames in a shard; the last shard may hold fewer."""
         return int(self.about["shard_frames"])
 
     @property
@@ -302,7 +305,7 @@ class DataStore:
         return -(-len(self) // self.shard_frames)
 
     def frames_of(self, shard: int) -> slice:
-        """Return the frames of a shard, as numbered in the store."""
+        """Return the slice of the store's frames that a shard holds."""
         return slice(shard * self.shard_frames, min((shard + 1) * self.shard_frames, len(self)))
 
     @cached_property
@@ -311,34 +314,34 @@ class DataStore:
         return list(self.modality.stored)
 
     def key(self, name: str, shard: int) -> str:
-        """Return the file of one array and shard, relative to the store."""
+        """Return the path of the file for one array and shard, relative to the store."""
         array = self.array(name)
         return f"{name}/{array.metadata.encode_chunk_key((shard, *(0,) * (array.ndim - 1)))}"
 
     def write_shard(self, shard: int, values: dict[str, Values]) -> None:
-        """Write all arrays of a shard by name, then its seal: sizes and digests of the files."""
+        """Write all arrays of a shard, keyed by name, then its seal: the sizes and digests of the files."""
         for name in self.rendered:
             self.place.remove(self.key(name, shard))  # Zarr would read a damaged shard before it overwrites it
             self.array(name)[self.frames_of(shard)] = values[name]
         self.seal(shard)
 
     def seal(self, shard: int) -> None:
-        """Record sizes and digests of a shard's files as they are. The shard is then done."""
+        """Record the current sizes and digests of a shard's files, which marks the shard as done."""
         contents = [self.place.read(self.key(name, shard)) for name in self.rendered]
         rows = [(len(content), digest(content)) for content in contents]
         self.array(SEAL)[shard] = np.array(rows, dtype=np.uint64)
 
     def seals(self) -> NDArray[np.uint64]:
-        """Read sizes and digests of all files ``(shards, arrays, 2)``; zeros where a shard is not done."""
+        """Read the sizes and digests of all files ``(shards, arrays, 2)``; zeros where a shard is not done."""
         return np.asarray(self.read(SEAL), dtype=np.uint64)
 
     def missing(self, *, verify: bool = False) -> list[int]:
-        """Find the shards that are not written or that have changed. A whole shard without a seal is sealed.
+        """Find the shards that are missing or whose files have changed.
 
-        In a store that is open for reading only, a shard without a seal counts as missing.
+        A complete shard without a seal is sealed. In a store that is open for reading only, it counts as missing.
 
         Args:
-            verify: whether digests are compared, too, which reads everything; otherwise only sizes.
+            verify: whether to compare digests, too, which reads everything; otherwise only sizes are compared.
         """
         sizes, seals = self.place.sizes(), self.seals()
         lacking = []
@@ -347,7 +350,7 @@ class DataStore:
             found = np.array([sizes.get(key, -1) for key in keys])
             if (found < 0).any():
                 lacking.append(shard)
-            elif not seals[shard].any():  # stopped between the last file and the seal
+            elif not seals[shard].any():  # the writer stopped between the last file and the seal
                 if not self.group.read_only and self._reads_whole(shard):
                     self.seal(shard)
                 else:
@@ -357,7 +360,7 @@ class DataStore:
         return lacking
 
     def damaged(self, shard: int, seal: NDArray[np.uint64]) -> list[str]:
-        """Find the files of a shard whose digest is not the sealed one."""
+        """Return the files of a shard whose digest differs from the sealed one."""
         wrong = []
         for name, (_, wanted) in zip(self.rendered, seal, strict=True):
             try:
@@ -369,7 +372,7 @@ class DataStore:
         return wrong
 
     def _reads_whole(self, shard: int) -> bool:
-        """Return whether all checksums within the files of a shard hold."""
+        """Return whether all checksums inside the files of a shard are correct."""
         try:
             for name in self.rendered:
                 self.read(name, self.frames_of(shard))
@@ -378,20 +381,20 @@ class DataStore:
         return True
 
     def finish(self) -> None:
-        """Mark the store as finished: every shard is there."""
+        """Mark the store as finished, with every shard written."""
         self.group.attrs["finished"] = True
 
     def unfinish(self) -> None:
-        """Mark the store as not finished: shards will be rewritten."""
+        """Mark the store as not finished, because shards will be rewritten."""
         if self.finished:
             self.group.attrs["finished"] = False
 
     def other_versions(self) -> list[str]:
-        """List the packages that decide what is recorded and whose version here is not the one of the store."""
+        """List the packages that affect recorded values and whose installed version differs from the store's."""
         return other_versions(self.about["versions"], (*DECIDING, *self.modality.decided_by))
 
     def unplanned(self, plan: Plan) -> list[str]:
-        """List the planned arrays that do not hold the plan to 1e-9; processors differ in last bits."""
+        """List the planned arrays that deviate from the plan by more than 1e-9; processors differ in the last bits."""
         wrong = []
         for name, values in planned_arrays(plan, self.modality).items():
             try:
@@ -411,19 +414,18 @@ class DataStore:
 
 
 def digest(content: bytes) -> int:
-    """Compute 64 bits of BLAKE2b."""
+    """Compute the 64-bit BLAKE2b digest of some bytes."""
     return int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "little")
 
 
-# ---------------- The arrays of a data set's store: how frames are cut into files, how the arrays are created, what
-# each one holds
+# ---------------- Arrays of a store and their layout
 
 
 SHARD_BYTES = 32 * 2**20
-"""Approximate size of what is recorded in a shard. A worker holds so much, and a kill may cost so much."""
+"""Approximate size of the recorded values in a shard. A worker holds this much in memory and loses it if it is killed."""
 
 SEAL = "seal"
-"""Name of the array with the sizes and digests of all files."""
+"""Name of the array that holds the sizes and digests of all files."""
 
 ABOUT = {
     "pose": "sonar: x, y, z [m], pitch, roll, heading [rad]",
@@ -439,11 +441,11 @@ ABOUT = {
 
 @dataclass(frozen=True)
 class ShardLayout:
-    """How frames are cut into files.
+    """How frames are divided into files.
 
     Attributes:
-        chunk: frames that are compressed together: a sequence, where sequences are short.
-        shard: frames of one file, the unit of work.
+        chunk: number of frames that are compressed together; one sequence if sequences are short.
+        shard: number of frames in one file, the unit of work.
     """
 
     chunk: int
@@ -451,13 +453,14 @@ class ShardLayout:
 
     @classmethod
     def of(cls, recipe: Recipe, plan: Plan) -> ShardLayout:
-        """Choose chunks that hold whole short sequences, and shards of about 32 MiB, of one scene if possible."""
+        """Choose chunks that hold whole short sequences, and shards of about 32 MiB that hold one scene if possible."""
         pings = recipe.flight.pings if recipe.flight.kind == "random" else 10
         chunk = pings if pings <= 10 else 10
         each = modality_of(recipe).ping_bytes
         scenes = np.bincount(plan.scene)
         wanted = max(1, min(SHARD_BYTES // each, int(scenes.max())) // chunk)
-        # where scenes allow it, shards end with them: a shard of two scenes loads both
+        # Shards end where scenes end if the sizes allow it, because rendering a shard of two scenes loads both. The
+        # aligned size is taken unless it is less than a third of the wanted size.
         whole = int(np.gcd.reduce(scenes[scenes > 0])) // chunk
         aligned = max((n for n in range(1, wanted + 1) if whole % n == 0), default=1) if whole else 1
         return cls(chunk, chunk * (aligned if 3 * aligned >= wanted else wanted))
@@ -469,11 +472,11 @@ def create_arrays(group: zarr.Group, plan: Plan, modality: Modality, layout: Sha
     Args:
         group: of the store.
         plan: all frames of the data set.
-        modality: what its instrument records.
-        layout: how frames are cut into files.
+        modality: of the recipe's instrument.
+        layout: division of the frames into files.
     """
     for name, stored in modality.stored.items():
-        # numbers of a shard's pings are small: one chunk
+        # Scalars per ping are small, so one chunk holds those of a whole shard.
         _create_recorded(group, name, len(plan), stored, layout if len(stored.shape) > 0 else ShardLayout(layout.shard, 0))
     for name, axis in modality.axes.items():
         _write_known(group, name, axis.values, (axis.dim,), axis.about)
@@ -495,9 +498,9 @@ def create_arrays(group: zarr.Group, plan: Plan, modality: Modality, layout: Sha
 
 
 def planned_arrays(plan: Plan, modality: Modality) -> dict[str, Values]:
-    """Return the arrays that the plan decides, by name, each ``(frames, ...)``.
+    """Return the arrays ``(frames, ...)`` that follow from the plan, keyed by name.
 
-    The vehicle's poses are among them where x, y, z or heading of the sonar differ from the vehicle's.
+    The vehicle's poses are included if x, y, z or heading of the sonar differ from the vehicle's.
     """
     known: dict[str, Values] = {"pose": plan.poses, "motion": plan.motion, "time_s": plan.time_s}
     known |= {"scene": plan.scene, "sequence": plan.sequence}
@@ -507,15 +510,18 @@ def planned_arrays(plan: Plan, modality: Modality) -> dict[str, Values]:
 
 
 def write_planned(group: zarr.Group, name: str, values: Values) -> None:
-    """Write an array of :func:`planned_arrays`, in one piece."""
+    """Write an array of :func:`planned_arrays` as a single chunk."""
     inner = {"pose": ("six",), "vehicle_pose": ("six",), "motion": ("three",), "velocity": ("four",)}
     _write_known(group, name, values, ("frame", *inner.get(name, ())), ABOUT[name])
 
 
 def _create_recorded(group: zarr.Group, name: str, frames: int, stored: StoredArray, layout: ShardLayout) -> None:
-    """Create an array that rendering fills: shards of compressed chunks with checksums, or plain chunks if a shard is 0."""
+    """Create an array that rendering fills.
+
+    It consists of shards of compressed chunks with checksums, or of unsharded chunks if ``layout.shard`` is 0.
+    """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # checksums of v3 are not in every reader
+        warnings.simplefilter("ignore")  # Zarr warns that not every reader supports the checksums of v3
         group.create_array(
             name,
             shape=(frames, *stored.shape),
@@ -531,7 +537,7 @@ def _create_recorded(group: zarr.Group, name: str, frames: int, stored: StoredAr
 
 
 def _write_known(group: zarr.Group, name: str, values: Values, dims: tuple[str, ...], about: str) -> None:
-    """Write an array whose values are known from the start, in one piece."""
+    """Create an array whose values are known from the start, and write it as a single chunk."""
     array = group.create_array(
         name,
         shape=values.shape,
@@ -546,24 +552,25 @@ def _write_known(group: zarr.Group, name: str, values: Values, dims: tuple[str, 
         array[...] = values
 
 
-# ---------------- The attributes of a data set's store, checked before anything is allocated for the frames that they
-# promise
+# ---------------- Validation of a store's attributes
 
 
 MOST_FRAMES = 10**9
-"""Largest number of frames of a data set."""
+"""Largest number of frames in a data set."""
 
 
 def check_attributes(about: Fields, recipe: Recipe, modality: Modality) -> None:
-    """Check the numbers of a store against each other and against its recipe.
+    """Check the numbers in a store's attributes against each other and against the recipe.
+
+    The check runs before any memory is allocated for the number of frames in the attributes.
 
     Args:
         about: attributes of the Zarr group.
         recipe: of the data set.
-        modality: what its instrument records.
+        modality: of the recipe's instrument.
 
     Raises:
-        MitsonarError, KeyError, ValueError: a number that cannot be, or one that is missing.
+        MitsonarError, KeyError, ValueError: a number is impossible or missing.
     """
     sequences = whole_number(about["sequences"], "sequences", 1, recipe.sequences)
     most = MOST_FRAMES
@@ -591,16 +598,15 @@ def check_attributes(about: Fields, recipe: Recipe, modality: Modality) -> None:
         raise ValueError("ready and finished must be true or false")
 
 
-# ---------------- Which frames are for training, validation and test: sequences, whole worlds, or samples, assigned
-# at random
+# ---------------- Training, validation and test parts
 
 
 PARTS = ("train", "validation", "test")
 
 
 def world_of(recipe: Recipe, scenes: dict[int, Scene]) -> NDArray[np.int64]:
-    """Find the first scene with the same world, by number of the scene. Some worlds do not depend on their seed."""
-    if recipe.recorded is not None:  # nobody knows whether two recordings are of one place
+    """Return for each scene number the first scene with the same world; some worlds do not depend on their seed."""
+    if recipe.recorded is not None:  # it is unknown whether two recordings show the same place
         return np.arange(max(scenes) + 1)
     known: dict[tuple[type[Family], str, int], int] = {}
     worlds = np.zeros(max(scenes) + 1, dtype=np.int64)
@@ -612,7 +618,9 @@ def world_of(recipe: Recipe, scenes: dict[int, Scene]) -> NDArray[np.int64]:
 
 
 def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
-    """Mark the frames ``(frames,)`` of a part. Sequences, or worlds with all their frames, are assigned at random.
+    """Mark the frames ``(frames,)`` of a part.
+
+    Whole sequences, or whole worlds with all their frames, are assigned to the parts at random.
 
     Args:
         world: of each frame ``(frames,)``.
@@ -621,7 +629,7 @@ def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, pa
         part: ``train``, ``validation``, ``test`` or ``all``.
 
     Raises:
-        MitsonarError: unknown part, a part that the split lacks, fewer worlds or sequences than parts.
+        MitsonarError: the part is unknown or not in the split, or there are fewer worlds or sequences than parts.
     """
     if part == "all":
         return np.ones(len(world), dtype=bool)
@@ -645,8 +653,10 @@ def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, pa
 
 
 def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
-    """Mark the samples ``(samples,)`` of a part. Training and validation share sequences, whose samples are assigned one by
-    one: these have the same motion and a frame in common. The test part, if there is one, is whole sequences.
+    """Mark the samples ``(samples,)`` of a part.
+
+    Samples are assigned to training and validation one by one, so the two parts share sequences. Samples of a sequence have
+    the same motion, and consecutive ones have a frame in common. The test part, if there is one, holds whole sequences.
 
     Args:
         sequence: of each sample ``(samples,)``.
@@ -654,14 +664,17 @@ def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArra
         part: ``train``, ``validation``, ``test`` or ``all``.
 
     Raises:
-        MitsonarError: as of :func:`deal`.
+        MitsonarError: in the same cases as :func:`deal`.
     """
+    # 1. Without a test part, each sample is assigned as if it were a sequence.
     number = np.arange(len(sequence), dtype=np.int32)
     if part not in PARTS or not split.test:
         return deal(number.astype(np.int64), number, split, part)
+    # 2. Otherwise set whole sequences aside for the test, so that it shares no motion with training.
     whole = Split(by="sequence", train=1 - split.test, validation=0.0, test=split.test, seed=split.seed)
     if part == "test":
         return deal(sequence.astype(np.int64), sequence, whole, part)
+    # 3. Assign the remaining samples one by one, with the shares that remain.
     marked = deal(sequence.astype(np.int64), sequence, whole, "train")
     rest = 1 - split.test
     shared = split.model_copy(update={"train": split.train / rest, "validation": split.validation / rest, "test": 0.0})
@@ -670,7 +683,7 @@ def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArra
 
 
 def _counts(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Divide ``total`` among the parts by their shares; a part with a share gets at least one."""
+    """Divide ``total`` among the parts by their shares; every part with a share gets at least one."""
     counts = np.maximum(np.rint(shares * total).astype(np.int64), (shares > 0).astype(np.int64))
     largest = int(shares.argmax())
     counts[largest] = total - (counts.sum() - counts[largest])
@@ -678,19 +691,22 @@ def _counts(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _shares(split: Split) -> str:
-    """Write the shares of all parts."""
+    """Format the shares of all parts."""
     return ", ".join(f"{name} {getattr(split, name):.0%}" for name in PARTS)
 
 
-# ---------------- Names of the shapes of a data set's scenes, which its labels number
+# ---------------- Shape names behind the labels
 
 
 def names_of_scenes(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArray[np.int32]]]:
-    """Return the names of all shapes of a data set, and the places among them of each scene's shapes.
+    """Return the names of all shapes of a data set, and the mapping from each scene's ``shape_id`` to these names.
 
-    Names of a scene file are in the store; worlds that depend on a seed are built once more. The second part gives by the
-    number of the scene the place of each ``shape_id``, and -1 for -1 ``(shapes + 1,)``. Both are empty where nothing is
-    known: of frames that were recorded, and of scene files in stores of earlier versions.
+    The names of a scene file are in the store; worlds that depend on a seed are built again.
+
+    Returns:
+        The names, and for each scene number an array ``(shapes + 1,)`` with the index of each ``shape_id`` among the names,
+        and -1 for -1. The mapping is empty if all scenes number their shapes as the names do. Both are empty if the names
+        are unknown: for recorded frames, and for scene files in stores of earlier versions.
     """
     if store.recipe.recorded is not None:
         return (), {}
@@ -709,7 +725,7 @@ def names_of_scenes(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArra
                 built[key] = family.build(scene.seed).shape_names
             found[number] = built[key]
     names = tuple(dict.fromkeys(name for own in found.values() for name in own))
-    if len(set(map(len, found.values()))) == 1 and len(set(found.values())) == 1:  # as the scenes number them
+    if len(set(map(len, found.values()))) == 1 and len(set(found.values())) == 1:  # the scenes number them so
         return next(iter(found.values())), {}
     place = {name: at for at, name in enumerate(names)}
     return names, {number: np.array([*map(place.get, own), -1], dtype=np.int32) for number, own in found.items()}

@@ -1,4 +1,7 @@
-"""Building blocks of Almanza-Medina's networks: layers padded and initialised as in MATLAB, and the common options."""
+"""Building blocks of networks: layers that are padded and initialised as in MATLAB, and the common options.
+
+"Ours" marks a choice that Almanza-Medina's text leaves open.
+"""
 
 from __future__ import annotations
 
@@ -33,20 +36,20 @@ __all__ = [
 ]
 
 Size = Sequence[int]
-"""(rows, columns) of an input."""
+"""Rows and columns of an input."""
 
 Table = Sequence[tuple[int, int, int]]
 """Kernel, channels and stride of each convolution."""
 
 
 class Network(nn.Module):
-    """A network that keeps its options, so that a checkpoint can rebuild it.
+    """Base class of networks, which stores the options so that a checkpoint can rebuild the network.
 
     Attributes:
-        options: of the network, defaults included; plain values.
-        needs: options of the input's arrangement that it requires.
-        any_sonar: whether it works with sonars that it was not trained on.
-        has_covariance: whether it returns a :class:`~mitsonar.networks.corrnet.GaussianHead` rather than labels.
+        options: of the network, including defaults, as plain values.
+        needs: required options of the arrangement of the input.
+        any_sonar: whether the network works with sonars that it was not trained on.
+        has_covariance: whether it returns a :class:`~mitsonar.networks.corrnet.GaussianHead` instead of labels.
     """
 
     needs: ClassVar[Fields] = {}
@@ -54,10 +57,10 @@ class Network(nn.Module):
     has_covariance: ClassVar[bool] = False
 
     def __init__(self, *, outputs: int, width: float, dropout: float, channels: int | None = None, **sizes: Size) -> None:
-        """Check and keep the common options.
+        """Check and store the common options.
 
         Raises:
-            MitsonarError: a value out of its range.
+            MitsonarError: a value is out of range.
         """
         super().__init__()
         counts = {"outputs": outputs} | ({} if channels is None else {"channels": channels})
@@ -77,10 +80,10 @@ class Network(nn.Module):
             self.options[name] = [int(length) for length in size]
 
     def expect(self, image: Tensor, name: str = "size") -> None:
-        """Refuse an input of another size than that of the network.
+        """Check that an input has the size of the network.
 
         Raises:
-            MitsonarError: another number of channels, rows or columns.
+            MitsonarError: the number of channels, rows or columns differs.
         """
         made_for = (self.options.get("channels", 1), *self.options[name])
         if image.dim() != 4 or tuple(image.shape[1:]) != made_for:
@@ -91,19 +94,19 @@ class Network(nn.Module):
 
 
 def _is_size(size: object) -> bool:
-    """Return whether this is a number of rows and a number of columns, each at least 1."""
+    """Return whether the argument is a number of rows and a number of columns, each at least 1."""
     if not isinstance(size, Sequence) or len(size) != 2:
         return False
     return all(isinstance(length, int) for length in size) and min(size) >= 1
 
 
 def scaled(channels: int, width: float) -> int:
-    """Scale the channels of a layer by the width of its network; at least 1 is left."""
+    """Scale the number of channels of a layer by the width of its network; the result is at least 1."""
     return max(1, round(channels * width))
 
 
 def cells_after(size: Size, strides: Iterable[int]) -> tuple[int, int]:
-    """Compute rows and columns after layers with "same" padding: each stride divides and rounds up."""
+    """Compute rows and columns after layers with "same" padding; each stride divides them and rounds up."""
     rows, columns = size
     for stride in strides:
         rows, columns = -(-rows // stride), -(-columns // stride)
@@ -111,7 +114,10 @@ def cells_after(size: Size, strides: Iterable[int]) -> tuple[int, int]:
 
 
 class SameConv2d(nn.Conv2d):
-    """Convolution with MATLAB's "same" padding: ceil(input / stride) cells, zeros around, an odd one below and right."""
+    """Convolution with the "same" padding of MATLAB.
+
+    The output has ceil(input / stride) cells. Zeros are added on all sides; an odd one goes below or to the right.
+    """
 
     def forward(self, input: Tensor) -> Tensor:
         """Convolve ``(batch, channels, rows, columns)``."""
@@ -125,26 +131,27 @@ class SameConv2d(nn.Conv2d):
 
 
 def _padding(length: int, kernel: int, stride: int) -> tuple[int, int]:
-    """Compute the zeros before and after."""
+    """Compute the numbers of zeros before and after the input along one axis."""
     total = max(0, (-(-length // stride) - 1) * stride + kernel - length)
     return total // 2, total - total // 2
 
 
 class SameAverage(nn.Module):
-    """Mean over 4 x 4 cells, stride 1, as many cells out as in (Table 4.1): one cell before, itself, two after.
+    """Mean over 4 x 4 cells with stride 1 that preserves the size (Table 4.1).
 
-    Cells outside the image do not count (ours): a map of one cell does not change. By MATLAB's default zeros count:
-    they would divide the one cell that 512 x 192 leaves by 16, and slow down the last layer's learning by as much.
+    Along each axis a window covers one cell before, the cell, and two after. Cells outside the image do not count (ours), so
+    a map of one cell does not change. By default MATLAB counts zeros there. They would divide the single cell that remains
+    of 512 x 192 by 16, and slow down training of the last layer by as much.
     """
 
     def forward(self, image: Tensor) -> Tensor:
         """Average ``(batch, channels, rows, columns)``."""
         mean = functional.avg_pool2d(image, 4, stride=1, padding=2, count_include_pad=False)
-        return mean[..., 1:, 1:]  # the first window has two cells before
+        return mean[..., 1:, 1:]  # drop the first window, which has two cells before
 
 
 def convolution(inputs: int, outputs: int, kernel: int, stride: int = 2) -> nn.Sequential:
-    """Build convolution, batch normalisation and ReLU. The convolution has no bias: the normalisation would remove it."""
+    """Build a convolution without bias, which the batch normalisation would remove, then normalisation and ReLU."""
     return nn.Sequential(
         SameConv2d(inputs, outputs, kernel, stride, bias=False),
         nn.BatchNorm2d(outputs),
@@ -159,7 +166,7 @@ def convolutions(table: Table, channels: int, width: float, *, bare_end: bool = 
         table: of the layers.
         channels: of the input.
         width: factor on the table's channels.
-        bare_end: whether the last convolution has a bias in place of normalisation and ReLU.
+        bare_end: whether the last convolution has a bias instead of normalisation and ReLU.
     """
     layers: OrderedDict[str, nn.Module] = OrderedDict()
     for number, (kernel, full, stride) in enumerate(table, start=1):
@@ -173,14 +180,14 @@ def convolutions(table: Table, channels: int, width: float, *, bare_end: bool = 
 def column_convolutions(
     kernels: Sequence[int], table: Sequence[int], across: int, width: float, channels: int = 1
 ) -> list[nn.Module]:
-    """Build convolutions of stride 2 along the rows and 1 across columns, whose number does not change.
+    """Build convolutions with stride 2 along rows and 1 across columns, which preserve the number of columns.
 
     Each is followed by normalisation and ReLU, except the last, which has a bias.
 
     Args:
-        kernels: rows of each.
-        table: channels of each.
-        across: columns of all.
+        kernels: number of rows of each kernel.
+        table: channels of each convolution.
+        across: number of columns of every kernel.
         width: factor on the table's channels.
         channels: of the input.
     """
@@ -194,7 +201,7 @@ def column_convolutions(
 
 
 def values_after(table: Table, size: Size, width: float) -> int:
-    """Compute the number of values that the convolutions of a table leave of an input of a size."""
+    """Compute the number of output values of the convolutions of a table, for an input of a given size."""
     rows, columns = cells_after(size, [stride for _, _, stride in table])
     return scaled(table[-1][1], width) * rows * columns
 
@@ -208,19 +215,19 @@ def fully_connected(sizes: Sequence[int]) -> nn.Sequential:
 
 
 class ConvolutionNetwork(Network):
-    """Convolutions, a mean over 4 x 4 cells, and a fully connected layer to the estimates.
+    """Network of convolutions, a mean over 4 x 4 cells, and a fully connected layer; a subclass sets the convolutions.
 
-    Dropout lies before the fully connected layer (ours; the text gives no position).
+    Dropout is applied before the fully connected layer (ours; the text gives no position).
 
     Args:
-        outputs: estimates.
+        outputs: number of estimates.
         width: factor on the channels.
         dropout: rate in training.
         size: rows and columns of the input.
         channels: of the input; with Almanza-Medina's 1 the frames are side by side.
 
     Raises:
-        MitsonarError: a value out of its range.
+        MitsonarError: a value is out of range.
     """
 
     table: ClassVar[Table]
@@ -242,25 +249,25 @@ class ConvolutionNetwork(Network):
         glorot(self)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` of frames ``(batch, channels, rows, columns)``, grey values 0..1.
+        """Estimate labels ``(batch, outputs)`` from frames ``(batch, channels, rows, columns)`` with grey values in 0..1.
 
         Raises:
-            MitsonarError: frames of another size.
+            MitsonarError: the frames have another size.
         """
         self.expect(image)
         return self.regression(self.dropout(self.layers(image).flatten(1)))  # type: ignore[no-any-return]
 
 
 class Quadrants(nn.Module):
-    """Cuts two images side by side into four pairs of quadrants.
+    """Division of two images side by side into four pairs of quadrants.
 
-    The input is ``(batch, channels, rows, columns)``. Each pair is ``(batch, channels, rows / 2, columns / 2)``, the
-    quadrant of the left image beside that of the right. Their order is upper left, upper right, lower left, lower right
-    (Almanza-Medina, 3.3.3).
+    The input is ``(batch, channels, rows, columns)``. Each pair is ``(batch, channels, rows / 2, columns / 2)``, with the
+    quadrant of the left image to the left of that of the right image. Their order is upper left, upper right, lower left,
+    lower right (Almanza-Medina, 3.3.3).
     """
 
     def forward(self, pair: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Cut two images side by side."""
+        """Return the four pairs of quadrants of two images side by side."""
         batch, channels, rows, columns = pair.shape
         cut = pair.reshape(batch, channels, 2, rows // 2, 2, 2, columns // 4)  # half of rows, row, image, half, column
         upper_left, upper_right, lower_left, lower_right = (
@@ -275,7 +282,7 @@ class Quadrants(nn.Module):
         """Compute rows and columns of a pair of quadrants.
 
         Raises:
-            MitsonarError: rows that cannot be halved, or columns that cannot be cut into four.
+            MitsonarError: the number of rows is odd, or the number of columns is not divisible by 4.
         """
         rows, columns = pair
         if rows % 2 or columns % 4:
@@ -287,7 +294,7 @@ class Quadrants(nn.Module):
 
 
 def glorot(network: nn.Module) -> None:
-    """Initialise a network as MATLAB does: weights uniform after Glorot and Bengio (2010), biases 0."""
+    """Initialise a network as MATLAB does: uniform weights after Glorot and Bengio (2010), biases 0."""
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d | nn.Linear):
             nn.init.xavier_uniform_(layer.weight)

@@ -1,4 +1,4 @@
-"""A trained network in one file that explains itself: weights, input, labels, sonar, training, and how well it did."""
+"""How a trained network is saved in a self-contained file: weights, input, labels, sonar, training and accuracy."""
 
 from __future__ import annotations
 
@@ -56,40 +56,40 @@ __all__ = [
 
 
 FORMAT = 1
-"""Version of the file's content. A reader knows only its own version."""
+"""Version of the file format. A reader accepts only this version."""
 
 KIND = "mitsonar checkpoint"
-"""The file's own name of its kind."""
+"""Value of the field ``kind``, which identifies a checkpoint."""
 
 LARGEST_OPTION = 1_000_000
-"""Largest number among a network's options: sizes, channels, layers."""
+"""Largest valid number among the options of a network, such as sizes, channels and layers."""
 
 FEW_WEIGHTS = 10_000_000
-"""Weights that may be allocated before they are compared with those of the file."""
+"""Number of weights that may be allocated without comparing it with the number in the file."""
 
 Plain: TypeAlias = "str | bool | int | float | list[Plain] | dict[str, Plain] | None"
-"""What a file holds beside weights."""
+"""Type of every value in a file except weights."""
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A trained network and all that is needed to use it.
+    """A trained network and everything that is needed to use it.
 
     Attributes:
         network: its name, for :func:`~mitsonar.networks.create.create_network`.
         options: of the network.
         weights: its state, on the CPU.
-        arrangement: of its input: the options of :data:`WORDS`.
+        arrangement: of its input: the options in :data:`WORDS`.
         labels: of its output: kind, low, high, names; see :attr:`coder`.
-        sonar: fields of the sonar of each view, by name; empty where the network works with any sonar.
-        trained_at: geometry of the sonar in training: ``height_m`` [low, high] over z = 0, ``pitch_deg``, ``roll_deg``.
-        model: ``thesis``, ``physical`` or ``coherent``; of several data sets all of them: ``coherent and physical``.
+        sonar: fields of the sonar of each view, keyed by view; empty if the network works with any sonar.
+        trained_at: geometry of the sonar in training: ``height_m`` [low, high] above z = 0, ``pitch_deg``, ``roll_deg``.
+        model: ``thesis``, ``physical`` or ``coherent``; for several data sets all of them: ``coherent and physical``.
         noise: of training, as text.
-        data: name of the recipe of the data set, or of all of them.
-        data_recipe: that recipe, or the first.
+        data: name of the data set's recipe, or names of all recipes.
+        data_recipe: that recipe, or the first one.
         recipe: of the training.
-        metrics: of validation by noise level: ``{"none": {"rmse": [sideways mm, forward mm, yaw deg], "pairs": 500}}``;
-            for heights rmse is ``[mm]``.
+        metrics: of validation, keyed by noise level: ``{"none": {"rmse": [sideways mm, forward mm, yaw deg], "pairs":
+            500}}``; for heights rmse is ``[mm]``.
         trained: number of pairs, minutes, epochs, seed ...
         version: of the mitsonar that wrote the file.
         format: :data:`FORMAT`.
@@ -114,15 +114,15 @@ class Checkpoint:
 
     @classmethod
     def of(cls, network: nn.Module, samples: Batches, **about: object) -> Self:
-        """Make the checkpoint of a network of :data:`~mitsonar.networks.create.NETWORKS` in its present state.
+        """Make the checkpoint of a network of :data:`~mitsonar.networks.create.NETWORKS` in its current state.
 
         Args:
-            network: whose weights are copied.
-            samples: on which it was trained. They define input, labels, sonar, geometry and noise.
-            about: further fields: recipe, metrics, trained; noise, where it is not that of the samples.
+            network: network whose weights are copied.
+            samples: samples on which it was trained. They define input, labels, sonar, geometry and noise.
+            about: further fields: recipe, metrics, trained; and noise, if it is not that of the samples.
 
         Raises:
-            MitsonarError: a module that is not one of ours, or a value that a file cannot hold.
+            MitsonarError: the module is not one of these networks, or a value cannot be saved.
         """
         names = [name for name, made in NETWORKS.items() if type(network) is made]
         if not names:
@@ -146,9 +146,9 @@ class Checkpoint:
         return cls(**plain)
 
     def halved(self) -> Self:
-        """Return the checkpoint with matrices and filters of half precision, about half as large; statistics stay whole.
+        """Return the checkpoint with matrices and filters in half precision, which is about half as large.
 
-        :meth:`build` computes with whole precision again.
+        Statistics keep single precision, and :meth:`build` returns a network of single precision.
         """
         weights = {
             name: values.half() if values.is_floating_point() and values.dim() > 1 else values
@@ -157,10 +157,10 @@ class Checkpoint:
         return replace(self, weights=weights)
 
     def build(self) -> nn.Module:
-        """Build the network with its weights, in evaluation mode. The state of torch's random numbers does not change.
+        """Build the network with its weights, in evaluation mode, without a change to the state of torch's random generator.
 
         Raises:
-            MitsonarError: an unknown network or option, or weights that do not fit it.
+            MitsonarError: the network or an option is unknown, or the weights do not fit.
         """
         written = f"the checkpoint was written by mitsonar {self.version[:40]}, this is {version('mitsonar')}"
         self._check_fit(written)
@@ -169,7 +169,7 @@ class Checkpoint:
                 network = create_network(self.network, **self.options)
             except MitsonarError as error:
                 raise MitsonarError(f"{error} ({written})") from None
-            except Exception as error:  # wrong options may raise anything
+            except Exception as error:  # invalid options may raise anything
                 raise MitsonarError(
                     f"no {self.network} has these options, {shortened(self.options)}: {first_line(error)}"
                 ) from None
@@ -183,7 +183,7 @@ class Checkpoint:
         return network.eval().requires_grad_(False)
 
     def _check_fit(self, written: str) -> None:
-        """Check that options and weights fit each other, before memory is allocated for the network.
+        """Check that options and weights fit each other before memory is allocated for the network.
 
         Raises:
             MitsonarError: they do not fit.
@@ -196,7 +196,7 @@ class Checkpoint:
         try:
             with torch.device("meta"), torch.random.fork_rng(devices=[]):
                 promised = create_network(self.network, **self.options).state_dict()
-        except Exception:  # build raises it again, with a message
+        except Exception:  # ``build`` raises it again, with a message
             return
         there = sum(values.numel() for values in self.weights.values())
         wanted = sum(values.numel() for values in promised.values())
@@ -206,17 +206,17 @@ class Checkpoint:
                 f"it has {wanted:,} ({written})"
             )
 
-    # ---------------------------------------------------------------- what it describes
+    # ---------------------------------------------------------------- description
 
     @property
     def coder(self) -> Labels:
-        """Return the labels, which encode and decode targets."""
+        """Return the encoder and decoder of targets."""
         low, high = (np.array(self.labels[end], dtype=float) for end in ("low", "high"))
         return Labels(self.labels["kind"], low, high, tuple(self.labels["names"]))
 
     @property
     def sonars(self) -> dict[str, Sonar]:
-        """Return the sonar of each view; empty where the network works with any sonar, or on impulse responses."""
+        """Return the sonar of each view; empty if the network works with any sonar, or on impulse responses."""
         return {} if self.channel else {name: Sonar.create(**fields) for name, fields in self.sonar.items()}
 
     @property
@@ -234,18 +234,18 @@ class Checkpoint:
 
     @property
     def covariance(self) -> NDArray[np.float64] | None:
-        """Return the covariance of a motion [m, m, rad] ``(3, 3)`` from :attr:`rmse`, for networks that estimate none.
+        """Return the covariance of a motion [m, m, rad] ``(3, 3)`` from :attr:`rmse`; None if the errors are unknown.
 
-        It is None if the errors are not known.
+        It serves networks that do not estimate a covariance.
         """
         rmse = self.rmse
         return None if rmse is None or len(rmse) != len(AXES) else np.diag((rmse / [axis.scale for axis in AXES]) ** 2)
 
     @property
     def rmse(self) -> NDArray[np.float64] | None:
-        """Return the errors in validation [mm, mm, deg], or of heights [mm]; None if they are not known.
+        """Return the RMSE of validation [mm, mm, deg], or of heights [mm]; None if it is unknown.
 
-        They are those at the noise of training if it was validated, else those over all levels.
+        It is that at the noise of training if this level was validated, otherwise that over all levels.
         """
         known = {level: found.get("rmse") for level, found in self.metrics.items() if isinstance(found, dict)}
         chosen = [known[self.noise]] if self.noise in known else list(known.values())
@@ -254,24 +254,25 @@ class Checkpoint:
         return np.asarray(np.sqrt((np.array(chosen, dtype=float) ** 2).mean(axis=0)))
 
     def split_of_training(self, recipe: Recipe) -> Split | None:
-        """Return how training has split the data set of a recipe; None where it was trained on other data.
+        """Return how training split the data set of a recipe; None if the network was trained on other data.
 
         Raises:
-            MitsonarError: the file holds no split.
+            MitsonarError: the file has no valid split.
         """
         if self.trained.get("rendered") or self.data_recipe != recipe.model_dump(mode="json"):
             return None
         return split_for(self.recipe.get("split"), recipe)
 
     def learnt(self, samples: SonarPairs | ImpulseSamples) -> NDArray[np.bool_]:
-        """Return which samples of a data set training may have seen ``(samples,)``: all of whose motions it was given.
+        """Mark the samples ``(samples,)`` of a data set that training may have seen: those whose motions it all used.
 
         Raises:
-            MitsonarError: the file holds no split.
+            MitsonarError: the file has no valid split.
         """
         split = self.split_of_training(samples.recipe)
         if split is None:
             return np.zeros(len(samples), dtype=bool)
+        # 1. First frames of the samples of training: its part of the split, cut to the share of the data that it used.
         part, length = self.recipe.get("part_of_data"), self.arrangement["frames"]
         seen = Part.of(samples.store, "train", split, length)
         share = part if isinstance(part, int | float) else 1.0
@@ -279,6 +280,7 @@ class Checkpoint:
         given = np.zeros(len(samples.store) + length, dtype=bool)  # motions from each frame to the next
         for step in range(max(length - 1, 1)):
             given[first + step] = True
+        # 2. A sample counts as seen if training has seen every motion between its frames.
         steps = range(max(samples.frames - 1, 1))
         return np.asarray(np.all([given[samples.first + step] for step in steps], axis=0))
 
@@ -286,14 +288,14 @@ class Checkpoint:
         """Decode the output of the network.
 
         Returns:
-            Targets ``(batch, n)`` [m, rad], and their covariances ``(batch, n, n)``, or None if it estimates none.
+            Targets ``(batch, n)`` [m, rad], and their covariances ``(batch, n, n)``, or None if the network estimates none.
 
         Raises:
-            MitsonarError: an output of another shape than the labels.
+            MitsonarError: the shape of the output differs from that of the labels.
         """
         if isinstance(answer, GaussianHead):
             mean, covariance = (values.detach().cpu().double().numpy() for values in answer)
-            return mean, (covariance + covariance.swapaxes(-1, -2)) / 2  # single precision leaves it lopsided by 1e-8
+            return mean, (covariance + covariance.swapaxes(-1, -2)) / 2  # single precision leaves an asymmetry of 1e-8
         names = self.labels["names"]
         if not isinstance(answer, Tensor) or answer.ndim != 2 or answer.shape[1] != len(names):
             got = tuple(answer.shape) if isinstance(answer, Tensor) else type(answer).__name__
@@ -310,7 +312,7 @@ class Checkpoint:
         return total.hexdigest()
 
     def rows(self) -> list[tuple[str, str]]:
-        """List what a user wants to know as names and values, for a console."""
+        """Return a summary as pairs of names and values, for a console."""
         words = self.arrangement
         shape = [words[word] for word in ("kind", "layout", "coordinates")] + ["ground"] * words["ground"]
         count = sum(values.numel() for values in self.weights.values())
@@ -345,7 +347,7 @@ class Checkpoint:
     # ---------------------------------------------------------------- files
 
     def to_bytes(self) -> bytes:
-        """Return the content of the file."""
+        """Return the checkpoint as the bytes of a file."""
         table = {one.name: getattr(self, one.name) for one in fields(self)}
         plain: Fields = {key: value if key == "weights" else _plain(value, key) for key, value in table.items()}
         buffer = io.BytesIO()
@@ -353,17 +355,17 @@ class Checkpoint:
         return buffer.getvalue()
 
     def save(self, path: str | Path) -> None:
-        """Write the file, whole or not at all."""
+        """Write the file atomically: either all of it or nothing."""
         write_whole(path, self.to_bytes())
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Load the checkpoint of a file, of a training run's folder, or the one of that name that comes with mitsonar.
+        """Load a checkpoint from a file, from the folder of a training run, or by name.
 
-        Nothing in the file is executed.
+        The names are those of the networks that come with mitsonar. Nothing in the file is executed.
 
         Raises:
-            MitsonarError: no such file, not a checkpoint, damaged, or of another format.
+            MitsonarError: the file does not exist, is not a checkpoint, is damaged, or has another format.
         """
         path = shipped_path(path) if isinstance(path, str) and path in SHIPPED else Path(path)
         if os.path.isdir(path):
@@ -382,10 +384,10 @@ class Checkpoint:
 
     @classmethod
     def from_bytes(cls, content: bytes, source: str = "the checkpoint") -> Self:
-        """Load what :meth:`to_bytes` returned; errors name ``source``.
+        """Load a checkpoint from the bytes that :meth:`to_bytes` returned; errors name ``source``.
 
         Raises:
-            MitsonarError: not a checkpoint, damaged, or of another format.
+            MitsonarError: the bytes are not a checkpoint, are damaged, or have another format.
         """
         table = unpacked(content, source)
         if table.get("kind") != KIND:
@@ -406,16 +408,16 @@ class Checkpoint:
 
 
 def _numbers_in(options: Fields) -> list[tuple[str, float]]:
-    """List the numbers of a network's options, also those of lists, each with the option's name."""
+    """List the numbers in a network's options, including those in lists, each with the name of its option."""
     pairs = [(name, one) for name, value in options.items() for one in (value if isinstance(value, list) else [value])]
     return [(name, one) for name, one in pairs if isinstance(one, int | float)]
 
 
 def _plain(value: object, name: str) -> Plain:
-    """Convert a value to numbers, texts, lists and tables.
+    """Convert a value to numbers, strings, lists and dictionaries.
 
     Raises:
-        MitsonarError: something else.
+        MitsonarError: the value has another type.
     """
     if value is None or isinstance(value, str | bool | int | float):
         return value
@@ -432,24 +434,24 @@ def _plain(value: object, name: str) -> Plain:
 
 
 def _mismatch(error: RuntimeError) -> str:
-    """Return torch's message on the first weight that does not fit."""
+    """Return the part of torch's message about the first weight that does not fit."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join((lines[1] if len(lines) > 1 else lines[0]).split())[:300]
 
 
 def _number(value: object) -> str:
-    """Write a number, or anything else, for a console."""
+    """Format a number, or any other value, for a console."""
     return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}" if type(value) is int else str(value)
 
 
-# ---------------- What the file of a checkpoint may hold: it is unpacked and checked before anything in it is used
+# ---------------- Unpacking and validation of a file
 
 
 FILE = "network.ckpt"
 """Name of a checkpoint in the folder of a training run."""
 
 Table: TypeAlias = dict[Any, Any]
-"""What a file holds, before it is known that its keys are texts."""
+"""Content of a file before its keys have been checked."""
 
 WORDS = {
     "frames": int,
@@ -460,32 +462,32 @@ WORDS = {
     "cartesian_rows": int,
     "ground": bool,
 }
-"""The options of :class:`~mitsonar.datasets.samples.SonarPairs` that define the input of a network, with their types."""
+"""Options of :class:`~mitsonar.datasets.samples.SonarPairs` that define the input of a network, with their types."""
 
 LATER: dict[str, type | tuple[type, ...]] = {"range_levels": (int, type(None)), "halves": bool}
-"""Options that files of earlier versions lack. They then have the defaults of SonarPairs."""
+"""Options that may be missing in files of earlier versions; their defaults are those of SonarPairs."""
 
 LARGEST = 8 * 2**30
-"""Largest size of a checkpoint that is unpacked [bytes]."""
+"""Largest accepted size of a checkpoint when unpacked [bytes]."""
 
 
 LONGEST_NAME = 80
-"""Letters of a name in a message; those of a stranger's file may be of any length."""
+"""Largest number of letters of a name in a message; names in an untrusted file may have any length."""
 
 
 def unpacked(content: bytes, source: str) -> Table:
-    """Unpack the table in a file of torch. Its parts are checked, which torch does not do.
+    """Unpack the dictionary in a torch file, after checks of sizes and checksums that torch does not make.
 
     Args:
         content: of the file.
-        source: the file's name in messages.
+        source: name of the file in messages.
 
     Raises:
-        MitsonarError: not a file of torch, damaged, or one that would unpack to more than it is.
+        MitsonarError: this is not a torch file, it is damaged, or it would unpack to more than its size.
     """
     buffer = io.BytesIO(content)
     try:
-        if not zipfile.is_zipfile(buffer):  # raises where the end says that parts lie in other files
+        if not zipfile.is_zipfile(buffer):  # raises if the archive claims to span several files
             raise MitsonarError(f"{source} is not a checkpoint, or was cut off: give a {FILE} of `mitsonar train`")
         with zipfile.ZipFile(buffer) as parts:
             packed = [part for part in parts.infolist() if part.compress_type != zipfile.ZIP_STORED]
@@ -508,16 +510,18 @@ def unpacked(content: bytes, source: str) -> Table:
 
 
 def faults_of(table: Table, names: Collection[str]) -> list[str]:
-    """Check the fields of a file. Return a sentence for each fault.
+    """Check the fields of a file, and return one sentence per fault.
 
     Args:
-        table: of the file.
-        names: of the fields that a checkpoint has.
+        table: content of the file.
+        names: of the fields of a checkpoint.
     """
+    # 1. The fields must be those of a checkpoint.
     found = [f"it lacks {name}" for name in sorted(set(names) - set(table))]
     found += [f"{shortened(key)} is unknown" for key in table if key not in names]
     if found:
         return found
+    # 2. All values but the weights must be plain, and have the right type.
     try:
         check_plain({name: value for name, value in table.items() if name != "weights"}, "it")
     except MitsonarError as error:
@@ -532,6 +536,7 @@ def faults_of(table: Table, names: Collection[str]) -> list[str]:
             found.append(f"{name} is not a table")
     if found:
         return found
+    # 3. The values must be possible.
     for name, values in table["weights"].items():
         found += _faults_of_weights(name, values)
     words = table["arrangement"]
@@ -541,7 +546,7 @@ def faults_of(table: Table, names: Collection[str]) -> list[str]:
 
 
 def _faults_of_weights(name: str, values: object) -> list[str]:
-    """Check one of the weights."""
+    """Check one array of weights."""
     if not isinstance(values, Tensor):
         return [f"weights {name[:LONGEST_NAME]} are not numbers"]
     if not _stored_whole(values):
@@ -552,7 +557,7 @@ def _faults_of_weights(name: str, values: object) -> list[str]:
 
 
 def _faults_of_types(words: Fields) -> list[str]:
-    """Check the names and the types of an arrangement's options."""
+    """Check the names and types of an arrangement's options."""
     found = [
         f"arrangement {word} is missing or of another type"
         for word, kind in WORDS.items()
@@ -590,14 +595,14 @@ def _faults_of_arrangement(words: Fields) -> list[str]:
 
 
 def _stored_whole(values: Tensor) -> bool:
-    """Return whether the file holds each number of a tensor. An expanded tensor would need memory that the file lacks."""
+    """Return whether the file holds every number of a tensor; an expanded tensor would need more memory than the file."""
     if values.layout != torch.strided or values.device.type != "cpu" or values.is_quantized:
         return False
     return values.numel() * values.element_size() <= values.untyped_storage().nbytes()
 
 
 def _faults_of_labels(labels: Fields) -> list[str]:
-    """Check kind, names and limits of the labels."""
+    """Check the kind, names and limits of the labels."""
     ends, names = [labels.get("low"), labels.get("high")], labels.get("names")
     if labels.get("kind") not in LABELS:
         return [f"labels are {shortened(labels.get('kind'))}, not one of {', '.join(LABELS)}"]
@@ -609,7 +614,7 @@ def _faults_of_labels(labels: Fields) -> list[str]:
 
 
 def _faults_of_sonar(sonar: Fields, trained_at: Fields, receives: bool) -> list[str]:
-    """Check the instrument of each view, and its geometry in training."""
+    """Check the instrument of each view and the geometry in training."""
     if receives and list(sonar) != ["channel"]:
         return ["sonar has no channel"]
     for view, own in sonar.items():
@@ -626,48 +631,51 @@ def _faults_of_sonar(sonar: Fields, trained_at: Fields, receives: bool) -> list[
 
 
 def are_numbers(values: object, count: int) -> TypeGuard[list[float]]:
-    """Return whether this is a list of ``count`` finite numbers."""
+    """Return whether ``values`` is a list of ``count`` finite numbers."""
     if not isinstance(values, list) or len(values) != count:
         return False
     return all(type(value) in (int, float) and math.isfinite(value) for value in values)
 
 
 def first_line(error: Exception) -> str:
-    """Return the first line of an error's message, cut where it is long, or its class."""
+    """Return the first line of an error's message, shortened if it is long, or the name of its class."""
     return (str(error).splitlines() or [type(error).__name__])[0][:300]
 
 
-# ---------------- A checkpoint as ONNX, for programs without torch. The file's metadata describe inputs and outputs
+# ---------------- Export to ONNX
 
 
 def onnx_of(checkpoint: Checkpoint, batch: int | None = None) -> bytes:
-    """Write a checkpoint as ONNX, and return the file's content.
+    """Return a checkpoint as the bytes of an ONNX file, for programs without torch.
 
-    Inputs: ``image`` in the checkpoint's arrangement, grey values 0..1, and ``cartesian`` for ``both`` coordinates;
-    for networks that know the geometry also the tables of :func:`~mitsonar.datasets.samples.ground_at`, by name.
-    Outputs: ``labels``, or ``motion`` and its ``covariance``.
+    The inputs are ``image`` in the checkpoint's arrangement, with grey values in 0..1, and ``cartesian`` for ``both``
+    coordinates. Networks that need the geometry also have the arrays of :func:`~mitsonar.datasets.samples.ground_at` as
+    inputs, by name. The outputs are ``labels``, or ``motion`` and its ``covariance``. The metadata of the file describe
+    inputs and outputs.
 
     Args:
         checkpoint: of the network.
-        batch: number of samples of a batch; None: any number.
+        batch: number of samples per batch; None: any number.
 
     Raises:
-        MitsonarError: ``onnx`` or ``onnxscript`` is missing, or torch cannot write the network.
+        MitsonarError: ``onnx`` or ``onnxscript`` is missing, or torch cannot export the network.
     """
     missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]
     if missing:
         raise MitsonarError(f"writing ONNX needs {' and '.join(missing)}: pip install 'mitsonar[learn]'")
     import onnx
 
+    # 1. Example inputs; a dynamic batch size needs an example of more than one sample.
     network = _Named(checkpoint.build(), checkpoint.arrangement["ground"]).eval()
     inputs = _inputs(checkpoint, 3 if batch is None else batch)
     shapes = None
     if batch is None:
         shapes = {"inputs": {name: {0: torch.export.Dim("batch")} for name in inputs}}
+    # 2. Trace the network, and replace the operations that ONNX lacks.
     outputs = ["motion", "covariance"] if NETWORKS[checkpoint.network].has_covariance else ["labels"]
     try:
         with _quiet(), torch.no_grad():
-            network(inputs)  # fills the networks' caches before the tracer passes empty tensors
+            network(inputs)  # fill the caches of the network before the tracer passes empty tensors
             traced = torch.export.export(network, (), {"inputs": inputs}, dynamic_shapes=shapes)
             traced = traced.run_decompositions({**torch.export.default_decompositions(), **WITHOUT})
             program = torch.onnx.export(
@@ -682,6 +690,7 @@ def onnx_of(checkpoint: Checkpoint, batch: int | None = None) -> bytes:
         cause = str(error.__cause__ or error).splitlines() or [type(error).__name__]
         how = "of any number of samples at a time; give a number" if batch is None else f"of {batch} samples at a time"
         raise MitsonarError(f"torch cannot write this {checkpoint.network} as ONNX {how} ({cause[0]})") from None
+    # 3. Describe inputs and outputs in the metadata.
     assert program is not None
     model = program.model_proto
     onnx.helper.set_model_props(model, _about(checkpoint))
@@ -689,14 +698,14 @@ def onnx_of(checkpoint: Checkpoint, batch: int | None = None) -> bytes:
 
 
 class _Named(nn.Module):
-    """A network whose inputs are passed by name."""
+    """Wrapper of a network that takes its inputs by name."""
 
     def __init__(self, network: nn.Module, ground: bool) -> None:
         super().__init__()
         self.network, self.ground = network, ground
 
     def forward(self, inputs: dict[str, Tensor]) -> Tensor | tuple[Tensor, Tensor]:
-        """Return labels, or a motion and its covariance."""
+        """Return the labels, or a motion and its covariance."""
         rest = dict(inputs)
         image = rest.pop("image")
         answer = self.network(image, rest) if self.ground else self.network(image, *rest.values())
@@ -704,7 +713,7 @@ class _Named(nn.Module):
 
 
 def _inputs(checkpoint: Checkpoint, batch: int) -> dict[str, Tensor]:
-    """Make a batch of the network's inputs by name, with noise in place of frames."""
+    """Make a batch of network inputs, keyed by name, with noise instead of frames."""
     made = torch.Generator().manual_seed(0)
     if not checkpoint.arrangement["ground"]:
         options = checkpoint.options
@@ -722,7 +731,7 @@ def _inputs(checkpoint: Checkpoint, batch: int) -> dict[str, Tensor]:
 
 
 def _about(checkpoint: Checkpoint) -> dict[str, str]:
-    """Return the metadata of the file; tables as JSON."""
+    """Return the metadata of the ONNX file; dictionaries are JSON."""
     texts = ("network", "model", "noise", "data", "digest")
     tables = ("options", "arrangement", "labels", "sonar", "trained_at", "metrics", "trained")
     about: dict[str, str] = {name: getattr(checkpoint, name) for name in texts}
@@ -746,12 +755,12 @@ def _inverted(matrix: Tensor) -> Tensor:
 
 
 WITHOUT = {torch.ops.aten.linalg_solve.default: _solved, torch.ops.aten.linalg_inv.default: _inverted}
-"""Operations that ONNX lacks, and what replaces them."""
+"""Replacements of operations that ONNX lacks."""
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress torch's remarks on packages that are not needed, and on its own deprecations."""
+    """Suppress torch's messages about packages that are not needed and about its own deprecations."""
     logs = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir", "onnxscript")]
     had = [log.level for log in logs]
     for log in logs:

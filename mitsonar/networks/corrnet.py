@@ -1,14 +1,15 @@
-"""CorrNet: two frames are matched cell by cell, and the known geometry turns the displacements into one motion (ours).
+"""How CorrNet estimates motion: it matches two frames cell by cell, and known geometry turns the shifts into one motion.
 
-A shared encoder describes blocks of both frames. The second frame's blocks are sampled where the motion so far moves those
-of the first. A local correlation volume gives each block a displacement (soft-argmax) and its 2 x 2 information matrix. One
-weighted least-squares problem with the sonar's derivative turns them into a step of the motion, in closed form. Its normal
-matrix gives the covariance. Finer iterations, on cells one beam wide, estimate the rest from the frames' differences and
-slopes. Rocks lie above the ground of the geometry: a few layers estimate their height from both frames.
+A shared encoder computes descriptors of blocks in both frames. Those of the second frame are sampled where the current
+motion estimate places the blocks of the first. A local correlation volume gives the displacement of each block
+(soft-argmax) and its 2 x 2 information matrix. A weighted least-squares problem with the derivative of the sonar geometry
+turns the displacements into a step of the motion, in closed form. Its normal matrix gives the covariance. Finer iterations,
+on cells one beam wide, estimate the remainder from the differences and slopes of the frames. Because rocks rise above the
+level ground of the geometry, a few layers estimate their height from both frames.
 
-Correlation volumes and their lookup are from PWC-Net (Sun et al. 2018) and RAFT (Teed and Deng 2020); here the
-flow has three parameters, and their derivative is known. The volume's second axis is the beam. The geometry defines how far
-a motion shifts each cell along it, so the beams need not be evenly spaced.
+The network is ours. Correlation volumes and their lookup are from PWC-Net (Sun et al. 2018) and RAFT (Teed and Deng 2020);
+here the flow has three parameters, and its derivative with respect to them is known. The second axis of the volume is the
+beam. The geometry defines how far a motion shifts each cell along it, so the beams need not be evenly spaced.
 """
 
 from __future__ import annotations
@@ -44,35 +45,35 @@ __all__ = [
 
 
 BLOCK = (16, 2)
-"""Bins and beams of a block."""
+"""Number of bins and beams in a block."""
 
 FEWEST = (128, 16)
-"""Fewest bins and beams of an image: smaller ones leave the first iteration too few blocks."""
+"""Smallest number of bins and beams in an image; a smaller image has too few blocks for the first iteration."""
 
 RANGE_M = 4.4
-"""Mean range at which the unit of length is 1 mm. The unit scales with the range, since images do not change with scale."""
+"""Mean range at which the unit of length is 1 mm [m]. The unit is proportional to range, as images do not show scale."""
 
 TURN = 2.5e-4
 """Unit of yaw [rad]."""
 
 JUDGED = 2
-"""Finer iterations that compute weights. Later ones keep these weights."""
+"""Number of finer iterations that compute weights; later iterations reuse the last ones."""
 
 TALLEST = 0.2
-"""Largest relief, as part of the height."""
+"""Largest relief, as a fraction of the sonar's height."""
 
 
 class CorrNet(nn.Module):
-    """A network that matches two frames with known geometry.
+    """Network that estimates motion and covariance by matching two frames with known ground geometry.
 
     Args:
-        width: scales the channels.
-        looks: number of iterations on blocks, which share their weights. The second reaches farther than the first.
-        finer: number of iterations on differences and slopes, which share their weights, too.
-        relief: whether the height above the ground is estimated for each cell.
+        width: factor on the channels.
+        looks: number of iterations on blocks, which share their parameters. The second reaches farther than the first.
+        finer: number of iterations on differences and slopes, which also share their parameters.
+        relief: whether to estimate the height of each cell above the ground.
 
     Raises:
-        MitsonarError: a value out of its range.
+        MitsonarError: a value is out of range.
     """
 
     needs: ClassVar[Fields] = {"layout": "channels", "ground": True}
@@ -109,41 +110,50 @@ class CorrNet(nn.Module):
         Args:
             images: ``(batch, 2, bins, beams)`` in 0..1.
             ground: a batch of :func:`mitsonar.datasets.samples.ground_at`.
-            start: the motion with which the iterations begin ``(batch, 3)`` [m, m, rad]; default: none.
+            start: initial motion of the iterations ``(batch, 3)`` [m, m, rad]; default: zero.
 
         Returns:
-            The distribution of the motion; in training that of each iteration.
+            The distribution of the motion; in training mode that of each iteration.
 
         Raises:
-            MitsonarError: images that are too small, or not pairs.
+            MitsonarError: the images are too small, or not pairs.
         """
         if images.dim() != 4 or images.shape[1] != 2 or images.shape[2] < FEWEST[0] or images.shape[3] < FEWEST[1]:
             raise MitsonarError(
                 f"corrnet takes (batch, 2, bins, beams) of {FEWEST[0]} bins and {FEWEST[1]} beams or more: got "
                 f"{tuple(images.shape)}"
             )
+        # 1. Compute descriptors of blocks, and filtered frames with their slopes for the finer iterations.
         batch, size = images.shape[0], (images.shape[2], images.shape[3])
         frames = _even(images).reshape(2 * batch, 1, *size)
         blocks = tuple(cells.contiguous() for cells in _pair(self.encoder(frames)))
         cells = self.slopes.prepared(*_pair(self.slopes.filter(frames)))
+        # 2. Work in units of motion in which all three components are of similar size.
         unit, estimates = _units(ground), []
         relief = None if self.relief is None else self.relief(*blocks)
         motion, judged = images.new_zeros(batch, 3) if start is None else start / unit, None
+        # 3. Coarse iterations: match blocks by correlation, which tolerates large displacements.
         warp_grid = WarpGrid(ground, unit, BLOCK, size, blocks[0].shape[-2:], relief)
         for _ in range(self.options["looks"]):
             motion, normal = self.matching(blocks, warp_grid, motion)
             estimates.append((motion, normal))
+        # 4. Fine iterations: Gauss-Newton steps on small cells, which are accurate close to the result.
         warp_grid = WarpGrid(ground, unit, (STEP, 1), size, cells[0].shape[-2:], _resized(relief, cells[0]))
         for k in range(self.options["finer"]):
             motion, normal, judged = self.slopes(cells, warp_grid, motion, judged if k >= JUDGED else None)
             estimates.append((motion, normal))
+        # 5. In training the likelihood sees every iteration, so that each one learns.
         if not self.training:
             return self._head(motion, normal, unit)
         heads = [self._head(*estimate, unit) for estimate in estimates]
         return GaussianHead(*(torch.stack(values) for values in zip(*heads, strict=True)))
 
     def _head(self, motion: Tensor, normal: Tensor, unit: Tensor) -> GaussianHead:
-        """Compute mean and covariance: cells have correlated errors, a floor remains, scale errors grow with the motion."""
+        """Compute mean and covariance of the motion.
+
+        The inverse normal matrix is scaled, because errors of cells are correlated. A constant floor and a variance that
+        grows with the square of the motion, for scale errors, are added.
+        """
         inverse = torch.linalg.inv(normal)
         far = motion.detach()
         covariance = torch.exp(2 * self.scale) * (inverse + inverse.mT) / 2 + torch.diag_embed(
@@ -153,7 +163,7 @@ class CorrNet(nn.Module):
 
 
 class Relief(nn.Module):
-    """Height of each block above the ground, as part of the sonar's height, from both frames."""
+    """Layers that estimate the height of each block above the ground from both frames, relative to the sonar's height."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -166,55 +176,54 @@ class Relief(nn.Module):
         )
 
     def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        """Estimate the relief ``(batch, 1, rows, columns)`` from descriptions of both frames."""
+        """Estimate the relief ``(batch, 1, rows, columns)`` from the descriptors of both frames."""
         return TALLEST * torch.tanh(self.layers(torch.cat([first, second], dim=1)))
 
 
 def _units(ground: Ground) -> Tensor:
-    """Compute the units of motions ``(batch, 3)`` [m, m, rad]."""
+    """Compute the units of motion ``(batch, 3)`` [m, m, rad]."""
     length = 1e-3 * ground["place"][:, 0].mean(dim=(1, 2)) / RANGE_M
     return torch.stack([length, length, torch.full_like(length, TURN)], dim=1)
 
 
 def _even(images: Tensor) -> Tensor:
-    """Scale pairs of frames to mean 0 and standard deviation 1: their levels hold no information on the motion."""
+    """Normalise pairs of frames to mean 0 and standard deviation 1, as their levels carry no information on motion."""
     mean, std = images.mean(dim=(1, 2, 3), keepdim=True), images.std(dim=(1, 2, 3), keepdim=True)
     return (images - mean) / (std + 1e-6)
 
 
 def _pair(frames: Tensor) -> tuple[Tensor, ...]:
-    """Separate first and second frames ``(batch, ...)`` of alternating frames ``(2 * batch, ...)``."""
+    """Split alternating frames ``(2 * batch, ...)`` into first and second frames ``(batch, ...)``."""
     return frames.reshape(-1, 2, *frames.shape[1:]).unbind(dim=1)
 
 
 def _resized(relief: Tensor | None, cells: Tensor) -> Tensor | None:
-    """Interpolate the relief to cells of another size."""
+    """Interpolate the relief to the grid of other cells."""
     if relief is None or relief.shape[-2:] == cells.shape[-2:]:
         return relief
     return functional.interpolate(relief, size=cells.shape[-2:], mode="bilinear")
 
 
-# ---------------- Cells matched by correlation: the displacement of each, its information, and the step of the motion
-# that follows
+# ---------------- Coarse iterations: matching by correlation
 
 
 Pair = tuple[Tensor, ...]
-"""Cells of the first and of the second frame, and further tensors of them."""
+"""Cells of the first and of the second frame, and tensors derived from them."""
 
 Context: TypeAlias = Any
-"""What torch keeps between a function and its derivative; torch gives it no type."""
+"""Context object that torch passes from a function to its derivative; torch gives it no type."""
 
 FAINT = 1e-2
-"""Mean square of a description below which it is treated as empty."""
+"""Mean square of a descriptor below which the cell is treated as empty."""
 
 
 class Matching(nn.Module):
-    """Displacement of each cell and its information, from the correlation with the cells around its predicted position.
+    """Layers that refine a motion by correlating each cell with the cells around its predicted position.
 
     Args:
-        reach: cells searched each way, along range and beams.
-        channels: of the descriptions.
-        hidden: channels of the layers between.
+        reach: number of cells searched on either side, along range and beams.
+        channels: of the descriptors.
+        hidden: channels of the intermediate layers.
     """
 
     def __init__(self, reach: tuple[int, int], channels: int, hidden: int) -> None:
@@ -234,7 +243,7 @@ class Matching(nn.Module):
             nn.ReLU(),
             quiet(nn.Conv2d(hidden, count + 3, 1)),
         )
-        with torch.no_grad():  # at first correlations are averaged over 3 x 3 cells, and the judge has no effect
+        with torch.no_grad():  # initially average correlations over 3 x 3 cells; the judge has no effect
             self.smooth.weight.zero_()
             self.smooth.weight[range(count), range(count)] = 1 / 9
 
@@ -242,17 +251,20 @@ class Matching(nn.Module):
         """Refine a motion by one step.
 
         Args:
-            cells: descriptions of both frames ``(batch, channels, rows, columns)``.
+            cells: descriptors of both frames ``(batch, channels, rows, columns)``.
             warp_grid: of these cells.
-            motion: the estimate so far ``(batch, 3)``, in units.
+            motion: current estimate ``(batch, 3)``, in units.
 
         Returns:
             The motion ``(batch, 3)`` in units, and its normal matrix ``(batch, 3, 3)``.
         """
+        # 1. Sample the second frame at the predicted positions, and measure the remaining displacements.
         second, inside = warp_grid.draw(cells[1], motion)
         displaced, sure = self.displaced(cells[0], second)
+        # 2. Form the information matrix L L' of each cell; cells outside the frame get none.
         l11, l22, l21 = (sure * inside[:, None]).unbind(dim=1)
         along, across, both = l11 * l11, l21 * l21 + l22 * l22, l11 * l21
+        # 3. Solve the weighted least-squares problem for the step of the motion.
         down, aside = displaced.unbind(dim=1)
         pull = torch.stack([along * down + both * aside, both * down + across * aside], dim=1)
         step, normal = warp_grid.solved(torch.stack([along, across, both], dim=1), pull)
@@ -262,16 +274,20 @@ class Matching(nn.Module):
         """Estimate the displacement of each cell.
 
         Returns:
-            Displacements ``(batch, 2, rows, columns)`` [cells], and the elements 11, 22 and 21 of the factor L of their
-            information L L' ``(batch, 3, rows, columns)``.
+            Displacements ``(batch, 2, rows, columns)`` [cells], and the elements 11, 22 and 21 of the Cholesky factor L of
+            their information matrix L L' ``(batch, 3, rows, columns)``.
         """
+        # 1. Correlate normalised descriptors, so that brightness does not bias the match.
         one, one_size = _unit_descriptions(first)
         other, other_size = _unit_descriptions(second)
         volume = self._volume(one, other)
+        # 2. Judge each cell by its correlations and by the power of its descriptors: faint cells carry little information.
         judged = self.judge(torch.cat([volume, one_size, other_size], dim=1))
         count = volume.shape[1]
+        # 3. Displacement by soft-argmax over the smoothed correlations, which is differentiable and finer than a cell.
         share = torch.softmax(torch.exp(self.sharpness) * self.smooth(volume) + judged[:, :count], dim=1)
         moved_by = torch.stack([(share * place).sum(dim=1) for place in self.places], dim=1)
+        # 4. Cholesky factor of the information, whose diagonal must be positive.
         sure = functional.softplus(judged[:, count : count + 2] - 1)
         return moved_by, torch.cat([sure, 0.3 * judged[:, count + 2 :]], dim=1)
 
@@ -285,39 +301,39 @@ class Matching(nn.Module):
 
 
 def quiet(layer: nn.Conv2d) -> nn.Conv2d:
-    """Set a layer's parameters to 0, so that it has no effect before training."""
+    """Set the parameters of a layer to 0, so that it has no effect before training, and return it."""
     for values in layer.parameters():
         nn.init.zeros_(values)
     return layer
 
 
 def channels_last(*layers: nn.Module) -> nn.Sequential:
-    """Join layers in torch's channels-last format, with which a CPU convolves few channels 1.5 times faster."""
+    """Join layers in torch's channels-last format, in which a CPU convolves few channels 1.5 times faster."""
     return nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
 def _unit_descriptions(cells: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale descriptions to mean square 1. Return them and the logarithm of their mean square."""
+    """Scale descriptors to mean square 1, and return them with the logarithm of their original mean square."""
     power = (cells * cells).mean(dim=1, keepdim=True) + FAINT
     return cells * torch.rsqrt(power), torch.log(power)
 
 
 def _shifted(one: Tensor, wide: Tensor) -> list[Tensor]:
-    """List the views of the wide frame that have the size of the other one, along range first."""
+    """Return all views of the padded frame that have the size of the other one, with range as the outer loop."""
     rows, columns = one.shape[-2:]
     down, across = (large - small + 1 for large, small in zip(wide.shape[-2:], (rows, columns), strict=True))
     return [wide[:, :, r : r + rows, c : c + columns] for r in range(down) for c in range(across)]
 
 
 def _correlations(one: Tensor, wide: Tensor) -> Tensor:
-    """Correlate each cell with all shifts of the other frame, mean over the channels."""
+    """Correlate each cell with all shifts of the padded frame, as means over the channels."""
     rows, columns = one.shape[-2:]
     shifted = wide.unfold(2, rows, 1).unfold(3, columns, 1)
     return (one[:, :, None, None] * shifted).mean(dim=1).flatten(1, 2)
 
 
 class _Correlations(torch.autograd.Function):
-    """:func:`_correlations` with a derivative that touches memory a third as often as torch's own."""
+    """:func:`_correlations` with a derivative that needs a third of the memory accesses of torch's derivative."""
 
     @staticmethod
     def forward(context: Context, one: Tensor, wide: Tensor) -> Tensor:
@@ -335,40 +351,33 @@ class _Correlations(torch.autograd.Function):
         return by_one, by_wide
 
 
-# ---------------- The rest of a motion, from the differences of two frames along their slopes, as `direct` does, but
-# with learnt filters
-# The most informative detail is as fine as a beam, in both directions. So neither the slopes nor the second frame may be
-# smoothed when it is sampled between its cells. Slopes are differences of fourth order, and the second frame is first
-# interpolated to twice its resolution.
-#
-# Noise lengthens slopes and makes steps too short. Products of the slopes of both frames measure by how much, since their
-# noise is independent.
+# ---------------- Fine iterations: differences and slopes
 
 
 STEP = 2
-"""Bins of a cell. A cell is one beam wide."""
+"""Number of bins in a cell; a cell is one beam wide."""
 
 TOGETHER = (4, 2)
-"""Cells along range and beams that share their weights."""
+"""Numbers of cells along range and beams that share one weight."""
 
 HALFWAY = (0.0243, -0.1351, 0.6079, 0.6079, -0.1351, 0.0243)
-"""Lanczos weights (three lobes) of six cells for the value in their middle. Training changes them."""
+"""Lanczos weights (three lobes) of six cells for the value midway between them. Training changes them."""
 
 LONGEST = 8.0
-"""Longest step, in units. It starts close to the result."""
+"""Largest step, in units; fine iterations start close to the result."""
 
 LEAST_TRUE = 0.2
-"""Smallest part of the slopes' square that is not noise: a step is lengthened by a factor of at most five."""
+"""Smallest share of the squared slopes that is taken as signal; steps are lengthened by a factor of at most five."""
 
 
 class SlopeStep(NamedTuple):
-    """Slopes and weights of an iteration, which the next one may keep.
+    """Slopes and weights of an iteration, which the next one may reuse.
 
     Attributes:
         down: slopes along range times their weight ``(batch, filters, rows, columns)``.
-        aside: likewise across beams.
-        information: about each cell's displacement ``(batch, 3, rows, columns)``.
-        true: part of the slopes' square that is not noise ``(batch, 1)``.
+        aside: slopes across beams times their weight ``(batch, filters, rows, columns)``.
+        information: about the displacement of each cell ``(batch, 3, rows, columns)``.
+        true: share of the squared slopes that is not noise ``(batch, 1)``.
     """
 
     down: Tensor
@@ -378,7 +387,14 @@ class SlopeStep(NamedTuple):
 
 
 class Slopes(nn.Module):
-    """Gauss-Newton steps on filtered frames.
+    """Gauss-Newton steps on filtered frames, as in the estimator ``direct``, but with learnt filters.
+
+    The most informative detail is as fine as a beam, in both directions. Therefore neither the slopes nor the second frame
+    may be smoothed when it is sampled between its cells: slopes are differences of fourth order, and the second frame is
+    first interpolated to twice its resolution.
+
+    Noise makes slopes too steep and steps too short. The products of the slopes of both frames measure by how much, because
+    their noise is independent.
 
     Args:
         filters: number of filtered frames.
@@ -388,7 +404,7 @@ class Slopes(nn.Module):
     def __init__(self, filters: int, hidden: int) -> None:
         super().__init__()
         levels = max(2, round(filters * 2 / 3))
-        self.filter = channels_last(  # levels first: additive noise leaves most information in faint levels
+        self.filter = channels_last(  # levels first: with additive noise, faint levels hold most information
             nn.Conv2d(1, levels, 1),
             nn.ReLU(),
             nn.Conv2d(levels, filters, (6, 5), stride=(STEP, 1), padding=(2, 2), bias=False),
@@ -409,7 +425,7 @@ class Slopes(nn.Module):
         """Prepare filtered frames ``(batch, filters, rows, columns)``.
 
         Returns:
-            The first frame, the second one at twice the resolution, and both slopes of the first.
+            The first frame, the second frame at twice the resolution, and both slopes of the first.
         """
         first = first.contiguous()
         finer = _doubled(_doubled(second.contiguous(), self.across, 3), self.along, 2)
@@ -421,10 +437,10 @@ class Slopes(nn.Module):
         """Refine a motion by one step.
 
         Args:
-            frames: of :meth:`prepared`.
+            frames: result of :meth:`prepared`.
             warp_grid: of these cells.
-            motion: the estimate so far ``(batch, 3)``, in units.
-            judged: slopes and weights of an earlier iteration, to be kept; default: they are computed.
+            motion: current estimate ``(batch, 3)``, in units.
+            judged: slopes and weights of an earlier iteration to reuse; by default they are computed.
 
         Returns:
             The motion ``(batch, 3)`` in units, its normal matrix ``(batch, 3, 3)``, and the slopes and weights.
@@ -440,22 +456,25 @@ class Slopes(nn.Module):
         return motion + step, normal * judged.true[..., None] * torch.exp(self.scale), judged
 
     def _judged(self, frames: Pair, second: Tensor, residual: Tensor, inside: Tensor) -> SlopeStep:
-        """Compute slopes and weights from both frames at the present motion."""
+        """Compute slopes and weights from both frames at the current motion."""
+        # 1. Average the slopes of both frames, whose noise is independent.
         first, own = frames[0], frames[2:]
         others = _slope(second, 2), _slope(second, 3)
         weight = self._weight(first, second, residual) * inside[:, None]
         down, aside = ((a + b) / 2 for a, b in zip(own, others, strict=True))
+        # 2. Information about the displacement: weighted products of slopes, summed over filters.
         by_down, by_aside = weight * down, weight * aside
         along, across = (by_down * down).sum(dim=1), (by_aside * aside).sum(dim=1)
+        # 3. Noise cancels in products of slopes of different frames, so their share of the information is the signal.
         common = (weight * (own[0] * others[0] + own[1] * others[1])).sum(dim=(1, 2, 3))
         true = common / (along + across).sum(dim=(1, 2)).clamp(min=1e-12)
         information = torch.stack([along, across, (by_down * aside).sum(dim=1)], dim=1)
         return SlopeStep(by_down, by_aside, information, true.clamp(LEAST_TRUE, 1.0)[:, None])
 
     def _weight(self, first: Tensor, second: Tensor, residual: Tensor) -> Tensor:
-        """Compute the weight of each cell and filter from what both frames have in common there."""
+        """Compute the weight of each cell and filter from the local power of difference, mean and product of both frames."""
         apart, mean = _together(residual.square()), _together((first + second).square()) / 4
-        powers = torch.cat([apart, mean, (mean - apart / 4).abs()], dim=1)  # the last: of first times second
+        powers = torch.cat([apart, mean, (mean - apart / 4).abs()], dim=1)  # the last one: of first times second
         weight = functional.softplus(self.judge(torch.log(powers + 1e-3)))
         return functional.interpolate(weight, size=first.shape[-2:], mode="nearest")
 
@@ -469,46 +488,45 @@ def _doubled(frame: Tensor, weights: Tensor, axis: int) -> Tensor:
 
 
 def _slope(frame: Tensor, axis: int) -> Tensor:
-    """Compute the slope by cell along an axis, to fourth order."""
+    """Compute the slope per cell along an axis, to fourth order."""
     count, wide = frame.shape[axis], _wide(frame, axis)
     near, far = (wide.narrow(axis, 2 + k, count) - wide.narrow(axis, 2 - k, count) for k in (1, 2))
     return (2 / 3) * near - (1 / 12) * far
 
 
 def _wide(frame: Tensor, axis: int) -> Tensor:
-    """Pad two cells at both ends of an axis."""
+    """Pad an axis by two replicated cells at both ends."""
     return functional.pad(frame, (2, 2, 0, 0) if axis == 3 else (0, 0, 2, 2), mode="replicate")
 
 
 def _together(values: Tensor) -> Tensor:
-    """Average the cells that share their weights."""
+    """Average over the cells that share one weight."""
     rows, columns = (length // count for length, count in zip(values.shape[-2:], TOGETHER, strict=True))
     values = values[:, :, : rows * TOGETHER[0], : columns * TOGETHER[1]]
     by_row = values.unflatten(2, (rows, TOGETHER[0])).sum(dim=3)  # type: ignore[no-untyped-call]  # torch gives no types
     return sum(by_row[..., k :: TOGETHER[1]] for k in range(TOGETHER[1])) / math.prod(TOGETHER)  # type: ignore[no-any-return]
 
 
-# ---------------- Cells of one size under a motion of the sonar: where the second frame shows the ground of each, and
-# the derivative
+# ---------------- Geometry of a grid of cells
 
 
 Ground = dict[str, Tensor]
-"""A batch of the tables of :func:`mitsonar.datasets.samples.ground_at`, by name."""
+"""A batch of the arrays of :func:`mitsonar.datasets.samples.ground_at`, keyed by name."""
 
 PRIOR = 0.01
-"""Information of a weak prior of no step, with a standard deviation of ten units, for frames without detail."""
+"""Information of a weak zero-mean prior on the step, with a standard deviation of ten units, for frames without detail."""
 
 
 class WarpGrid:
-    """Cells of one size: their positions, and how they move with the sonar.
+    """Grid of cells of one size: their positions, and how they move with the sonar.
 
     Args:
         ground: a batch of :func:`mitsonar.datasets.samples.ground_at`.
         unit: of motions ``(batch, 3)`` [m, m, rad].
-        step: bins and beams of a cell.
-        size: bins and beams of the image.
-        shape: rows and columns of cells.
-        relief: height above the ground as part of the sonar's height ``(batch, 1, rows, columns)``.
+        step: numbers of bins and beams in a cell.
+        size: numbers of bins and beams in the image.
+        shape: numbers of rows and columns of the grid.
+        relief: height above the ground, as a fraction of the sonar's height ``(batch, 1, rows, columns)``.
     """
 
     def __init__(
@@ -537,17 +555,17 @@ class WarpGrid:
         self.lit = self._on_cells(ground["lit"]) > 0 if "lit" in ground else None
 
     def draw(self, second: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
-        """Sample the second frame, bilinearly, where a motion moves the cells of the first.
+        """Sample the second frame bilinearly at the positions to which a motion moves the cells of the first.
 
         Args:
             second: the second frame ``(batch, channels, rows, columns)``.
             motion: ``(batch, 3)``, in units.
 
         Returns:
-            The samples, and 1 where they lie within the frame, else 0 ``(batch, rows, columns)``.
+            The samples, and a mask ``(batch, rows, columns)``: 1 if a sample lies within the frame, else 0.
         """
         place = self.base + self.span * self._shift(motion)
-        inside = (place.abs().amax(dim=1) <= 1 + 1e-3).to(second.dtype)  # rounding must not decide at the border
+        inside = (place.abs().amax(dim=1) <= 1 + 1e-3).to(second.dtype)  # tolerate rounding at the border
         if self.lit is not None:
             inside = inside * self.lit
         grid = torch.stack([place[:, 1], place[:, 0]], dim=-1)
@@ -557,7 +575,8 @@ class WarpGrid:
         """Solve the least-squares problem for the step of the motion.
 
         Args:
-            information: about each cell's displacement: along range, across beams, of both ``(batch, 3, rows, columns)``.
+            information: about the displacement of each cell: along range, across beams, and the off-diagonal element
+                ``(batch, 3, rows, columns)``.
             pull: information times displacement, along range and across beams ``(batch, 2, rows, columns)``.
 
         Returns:
@@ -591,25 +610,25 @@ def displacement(ground: Ground, motion: Tensor) -> Tensor:
     turn, height = ground["turn"], ground["height"][:, None, None]
     sonar = points.flatten(1, 2) @ turn[:, :2] - height * turn[:, 2:]
     s, f, u = sonar.unflatten(1, points.shape[1:3]).unbind(dim=-1)
-    # a batch may hold both kinds of bearing
+    # the two definitions of bearing may occur in one batch
     beside = torch.where(ground["cone"][:, None, None] > 0, torch.sqrt(f * f + u * u), f)
     radius, bearing = torch.sqrt(s * s + f * f + u * u), torch.atan2(s, beside)
     return (torch.stack([radius, bearing], dim=1) - ground["place"]) / ground["cell"]
 
 
 def _borders(shape: tuple[int, ...], unit: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute positions ``(2, rows, columns)`` and sizes ``(2, 1, 1)`` of cells in an image from -1 to 1."""
+    """Compute positions ``(2, rows, columns)`` and sizes ``(2, 1, 1)`` of cells in image coordinates from -1 to 1."""
     axes = [torch.linspace(-1, 1, count, dtype=unit.dtype, device=unit.device) for count in shape]
     span = unit.new_tensor([2 / (count - 1) for count in shape])
     return torch.stack(torch.meshgrid(*axes, indexing="ij")), span[:, None, None]
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # cached: a training may use what an evaluation computed first
+@torch.inference_mode(False)  # the cache may pass tensors from evaluation to training
 def _from_nodes(nodes: int, length: int, every: int, count: int, device: torch.device) -> Tensor:
-    """Compute the weights ``(count, nodes)`` of evenly spaced nodes at the middles of cells.
+    """Compute the linear interpolation weights ``(count, nodes)`` from evenly spaced nodes to the centres of cells.
 
-    The nodes span ``length`` bins or beams; a cell has ``every`` of them.
+    The nodes span ``length`` bins or beams; a cell has ``every`` bins or beams.
     """
     middle = torch.arange(count, dtype=torch.float64) * every + (every - 1) / 2
     place = (middle * ((nodes - 1) / (length - 1))).clamp(0, nodes - 1)
@@ -621,15 +640,14 @@ def _from_nodes(nodes: int, length: int, every: int, count: int, device: torch.d
     return weight.to(torch.float32).to(device)
 
 
-# ---------------- The output of networks that estimate their uncertainty: a Gaussian distribution of the motion, and
-# its likelihood
+# ---------------- Output distribution and likelihood
 
 
 class GaussianHead(NamedTuple):
-    """Mean and covariance of motions: sideways, forward [m], yaw [rad].
+    """Gaussian distribution of motions: sideways, forward [m], yaw [rad].
 
     Attributes:
-        mean: ``(batch, 3)``; in training ``(iterations, batch, 3)``, the last iteration last.
+        mean: ``(batch, 3)``; in training mode ``(iterations, batch, 3)``, in the order of the iterations.
         covariance: ``(batch, 3, 3)``, or ``(iterations, batch, 3, 3)``.
     """
 
@@ -638,11 +656,11 @@ class GaussianHead(NamedTuple):
 
 
 SCALE = (1e-3, 1e-3, 2.5e-4)
-"""Units of the likelihood [m, m, rad]. They are about as large as errors, so that float32 suffices."""
+"""Units of the likelihood [m, m, rad]. They are of the order of typical errors, so float32 suffices."""
 
 
 def likelihood(head: GaussianHead, target: Tensor, *, fading: float = 0.6) -> Tensor:
-    """Compute the negative log-likelihood of the target, in units of mm, mm, 0.25 mrad, mean over the batch.
+    """Compute the mean negative log-likelihood of a batch of targets, in units of mm, mm and 0.25 mrad.
 
     Args:
         head: distribution of the motion.
@@ -650,16 +668,18 @@ def likelihood(head: GaussianHead, target: Tensor, *, fading: float = 0.6) -> Te
         fading: weight of an iteration relative to the next one.
 
     Returns:
-        A scalar, summed over the iterations.
+        A scalar, the weighted sum over the iterations.
     """
     mean, covariance = head
     if mean.dim() == 2:
         mean, covariance = mean[None], covariance[None]
+    # 1. Whiten the errors with the Cholesky factor, which also gives the determinant of the covariance.
     scale = torch.tensor(SCALE, dtype=mean.dtype, device=mean.device)
     error = (mean - target) / scale
     factor = torch.linalg.cholesky(covariance / (scale[:, None] * scale))
     white = torch.linalg.solve_triangular(factor, error[..., None], upper=False)[..., 0]
     each = 0.5 * white.square().sum(-1) + factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    # 2. Weight later iterations more, because the last one is the result.
     weight = fading ** torch.arange(len(mean) - 1, -1, -1, dtype=mean.dtype, device=mean.device)
     total: Tensor = (weight * each.mean(dim=1)).sum()
     return total

@@ -1,4 +1,4 @@
-"""All networks, by name."""
+"""How a network is created by its name, and which options it takes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mitsonar.networks.thesis import Cnn1b, Cnn4b, Cnn4PoseNet, ImpulsePoseNet, 
 __all__ = ["NETWORKS", "called", "create_network", "options_for", "options_of"]
 
 Output: TypeAlias = Any
-"""The output of a network: labels ``(batch, outputs)``, or a :class:`~mitsonar.networks.corrnet.GaussianHead`."""
+"""Output of a network: labels ``(batch, outputs)``, or a :class:`~mitsonar.networks.corrnet.GaussianHead`."""
 
 NETWORKS: dict[str, Any] = {
     "posenet": PoseNet,
@@ -31,20 +31,20 @@ NETWORKS: dict[str, Any] = {
     "posenetvec": PoseNetVec,
     "profilenet": ProfileNet,
 }
-"""Classes of networks. Each has ``needs``, ``any_sonar`` and ``has_covariance``; see
+"""Network classes, keyed by name. Each has ``needs``, ``any_sonar`` and ``has_covariance``; see
 :class:`~mitsonar.networks.blocks.Network`."""
 
 
 def create_network(name: str, **options: object) -> nn.Module:
-    """Create a network by name, with weights drawn from torch's generator.
+    """Create a network by name, with initial weights from torch's random generator.
 
     Args:
-        name: of :data:`NETWORKS`.
-        options: of that network; see its class. Those of Almanza-Medina's networks are outputs, width, dropout, size and,
-            where frames may be channels, channels.
+        name: key of :data:`NETWORKS`.
+        options: of that network; see its class. Those of Almanza-Medina's networks are outputs, width, dropout, size and, if
+            frames may be channels, channels.
 
     Raises:
-        MitsonarError: unknown name or option, or a value out of its range.
+        MitsonarError: the name or an option is unknown, or a value is out of range.
     """
     known = options_of(name)
     for option in options:
@@ -55,7 +55,7 @@ def create_network(name: str, **options: object) -> nn.Module:
 
 
 def called(network: nn.Module, inputs: Inputs) -> Output:
-    """Call a network. The inputs of a tuple are passed one by one."""
+    """Call a network, passing the inputs of a tuple as separate arguments."""
     return network(*inputs) if isinstance(inputs, tuple) else network(inputs)
 
 
@@ -71,12 +71,12 @@ def options_of(name: str) -> list[str]:
 
 
 def options_for(name: str, inputs: Inputs, labels: Tensor, receivers: int = 1) -> Fields:
-    """Derive the options of a network that samples define: number of labels, sizes and channels of the input.
+    """Derive the network options that the samples determine: number of labels, sizes and channels of the input.
 
     Args:
-        name: of :data:`NETWORKS`.
-        inputs: of a batch, as :class:`~mitsonar.datasets.samples.SonarPairs` makes them: one tensor or a tuple.
-        labels: ``(batch, outputs)``.
+        name: key of :data:`NETWORKS`.
+        inputs: of a batch from :class:`~mitsonar.datasets.samples.SonarPairs`: one tensor or a tuple.
+        labels: of the batch ``(batch, outputs)``.
         receivers: number of receivers whose impulse responses the input holds.
 
     Raises:

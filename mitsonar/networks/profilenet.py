@@ -1,9 +1,9 @@
-"""ProfileNet (ours): motion from the shifts between range profiles of a few portions of the field of view.
+"""How ProfileNet estimates motion from the shifts between range profiles of a few portions of the field of view.
 
-A vector is the range profile of a portion. If the ground comes nearer by a part of a range level, that part of each level's
-echo moves to the level before it. So products of both profiles at neighbouring lags measure the shift, which grows with the
-sine of incidence along the profile. The network computes such products of filtered profiles and averages them over windows
-of range. A few layers combine those of all portions.
+A vector is the range profile of a portion. If the ground comes nearer by a fraction of a range level, that fraction of each
+level's echo moves to the preceding level. Therefore products of both profiles at neighbouring lags measure the shift, which
+grows with the sine of incidence along the profile. The network computes such products of filtered profiles and averages
+them over windows of range. A few layers combine those of all portions. The network is ours.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from mitsonar.networks.blocks import Network, Size
 __all__ = ["ProfileNet"]
 
 FAINT = 1e-4
-"""Variance of a level below which it is ignored, in squares of the mean of all levels."""
+"""Variance below which a level is ignored, relative to the squared mean of all levels."""
 
 QUIET = 1e-2
-"""Power of filtered profiles below which products are ignored, in variances of a level."""
+"""Power of filtered profiles below which products are ignored, relative to the variance of a level."""
 
 SYMMETRIES: dict[int, list[tuple[tuple[int, ...], tuple[float, float, float]]]] = {
     # quadrants from fore-starboard clockwise: unchanged, mirrored sideways, fore and aft, both
@@ -38,29 +38,29 @@ SYMMETRIES: dict[int, list[tuple[tuple[int, ...], tuple[float, float, float]]]] 
     2: [((0, 1), (1, 1, 1)), ((1, 0), (-1, 1, -1))],
     1: [((0,), (1, 1, 1))],
 }
-"""By number of portions: their order in a mirrored world, and the signs of sideways, forward and yaw there."""
+"""Order of the portions in a mirrored world, and the signs of sideways, forward and yaw there, by number of portions."""
 
 
 class ProfileNet(Network):
-    """Products of filtered profiles at a few lags, averaged over windows of range, through a small perceptron.
+    """Network on range profiles: products of filtered profiles at a few lags, followed by a small perceptron.
 
-    The estimate has the symmetries of the world by construction. It is the mean over mirrored portions and over both
-    directions of time, each with its motion mirrored back. This holds along the heading between both pings, which differs
-    from the last heading by half the yaw, or 0.1 mm at most. There are four portions (quadrants or
-    circular segments, from fore-starboard clockwise), two (halves, port first), or one.
+    The products are averaged over windows of range. The estimate has the symmetries of the world by construction: it is the
+    mean over mirrored portions and over both directions of time, each with its motion mirrored back. The symmetry is exact
+    along the mean heading of both pings, which differs from the last heading by half the yaw, or 0.1 mm at most. There are
+    four portions (quadrants or circular segments, from fore-starboard clockwise), two (halves, port first), or one.
 
     Args:
-        outputs: estimates: sideways, forward, yaw.
+        outputs: number of estimates: sideways, forward, yaw.
         width: factor on filters and layers.
         dropout: rate in training, before each layer.
-        size: range levels and columns, two of each portion.
-        filters: of the profiles.
-        taps: of a filter, odd.
+        size: range levels and columns; each portion has two columns.
+        filters: number of filters of the profiles.
+        taps: number of taps of a filter, odd.
         lags: largest lag of the products, in levels.
-        windows: of range.
+        windows: number of windows of range.
 
     Raises:
-        MitsonarError: a value out of its range.
+        MitsonarError: a value is out of range.
     """
 
     needs: ClassVar[Fields] = {"kind": "vector", "frames": 2, "layout": "side"}
@@ -109,30 +109,33 @@ class ProfileNet(Network):
         self.register_buffer("turned", torch.tensor([signs for _, signs in symmetries]), persistent=False)
 
     def forward(self, vectors: Tensor) -> Tensor:
-        """Estimate labels ``(batch, 3)``, symmetric about no motion, of vectors ``(batch, 1, levels, 2 portions)``.
+        """Estimate labels ``(batch, 3)``, symmetric about zero motion, from vectors ``(batch, 1, levels, 2 portions)``.
 
         Raises:
-            MitsonarError: vectors of another size.
+            MitsonarError: the vectors have another size.
         """
         self.expect(vectors)
+        # 1. Products at all lags measure shifts, differences of power measure gains; both relative to the mean power.
         first, second = self._filtered(vectors)
         power = self._windowed(first * first), self._windowed(second * second)
         mean = (power[0] + power[1]) / 2 + QUIET
         shared = self._products(first, second) / mean[..., None]
         gained = (power[0] - power[1]) / mean
-        # backwards in time lags and gains change their sign
+        # 2. Features of each portion, forwards and backwards in time; reversal changes the sign of lags and gains.
         both = [
             torch.cat([self.shift(s.flatten(2)), self.change(g.flatten(2))], dim=-1)
             for s, g in ((shared, gained), (shared.flip(-1), -gained))
         ]
         features = torch.stack(both, dim=1)[:, :, self.order].flatten(3)  # batch, time, mirror, portions and values
+        # 3. Estimate in each mirrored world, mirror the motions back, and average with the reversed ones.
         answers = self.layers(features) * self.turned
         return (answers[:, 0] - answers[:, 1]).mean(dim=1) / 2  # type: ignore[no-any-return]
 
     def _filtered(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Filter the profiles of both pings ``(batch, portions, filters, levels)``, each level in its standard deviations.
+        """Filter the profiles of both pings ``(batch, portions, filters, levels)``.
 
-        They are first divided by their mean, which removes the sonar's gain.
+        Profiles are first divided by their mean, which removes the sonar's gain. Each level is then normalised by its
+        standard deviation.
         """
         batch, _, levels, columns = vectors.shape
         vectors = vectors / vectors.mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-12)
@@ -145,8 +148,8 @@ class ProfileNet(Network):
     def _products(self, first: Tensor, second: Tensor) -> Tensor:
         """Compute products at all lags, averaged over windows ``(batch, portions, filters, windows, lags)``.
 
-        At a positive lag the farther level is that of the second profile, at a negative lag that of the first. Backwards in
-        time both are exchanged.
+        At a positive lag the farther level is in the second profile, at a negative lag in the first. Reversal of time
+        exchanges the two.
         """
         levels = first.shape[-1]
         early, late = (functional.pad(one, (0, self.lags)) for one in (first, second))
@@ -155,5 +158,5 @@ class ProfileNet(Network):
         return torch.stack([self._windowed(product) for product in products], dim=-1)
 
     def _windowed(self, values: Tensor) -> Tensor:
-        """Average over windows ``(..., windows)``."""
+        """Average over windows of range ``(..., windows)``."""
         return values.reshape(*values.shape[:-1], self.windows, -1).mean(dim=-1)

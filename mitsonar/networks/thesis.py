@@ -1,4 +1,7 @@
-"""PoseNet, the best network on images of Almanza-Medina (3.3.2 and Table 4.1), after GeoNet (Yin and Shi, 2018)."""
+"""The networks of Almanza-Medina's thesis: for images, for vectors and for impulse responses.
+
+"The text" is the thesis. "Ours" marks a choice that it leaves open.
+"""
 
 from __future__ import annotations
 
@@ -53,34 +56,36 @@ POSENET_CHANNELS = (32, 64, 128, 256, 512, 512, 512, 1024, 1024)
 POSENET_LAYERS: Table = tuple(
     (kernel, channels, 2) for kernel, channels in zip(POSENET_KERNELS, POSENET_CHANNELS, strict=True)
 )
-"""Table 4.1."""
+"""Kernel, channels and stride of each convolution (Table 4.1)."""
 
 
 class PoseNet(ConvolutionNetwork):
-    """Nine convolutions of stride 2, a mean over 4 x 4 cells, and a fully connected layer to the estimates.
+    """PoseNet: nine convolutions of stride 2, a mean over 4 x 4 cells, and a fully connected layer.
 
-    It reads any size: two frames side by side (512 x 192), three (512 x 288), two sensors (512 x 384), wide frames side by
-    side (512 x 1024) or stacked (1024 x 512). The text has 3 (Q - 1) outputs. Here three frames have 3, too, since their
-    motion is constant. Options and errors: :class:`~mitsonar.networks.blocks.ConvolutionNetwork`.
+    It is Almanza-Medina's best network on images (3.3.2 and Table 4.1), after GeoNet (Yin and Shi, 2018). It accepts any
+    size: two frames side by side (512 x 192), three (512 x 288), two sensors (512 x 384), wide frames side by side (512 x
+    1024) or stacked (1024 x 512). The text has 3 (Q - 1) outputs. Here three frames also have 3, because their motion is
+    constant. See :class:`~mitsonar.networks.blocks.ConvolutionNetwork` for options and errors.
     """
 
     table: ClassVar[Table] = POSENET_LAYERS
 
 
-# ---------------- PoseNet on polar and Cartesian images together (Almanza-Medina, 3.4.7)
+# ---------------- PoseNet for polar and Cartesian images
 
 
 DUAL_VALUES = 1024
-"""Values of the fully connected layer that reads both branches (ours: as many as a branch has)."""
+"""Number of values of the fully connected layer that joins both branches (ours: as many as a branch has)."""
 
 
 class PoseNetDual(Network):
-    """Two PoseNets whose averages are joined by a fully connected layer with a ReLU (ours) before the estimates.
+    """Two PoseNets, on polar and on Cartesian images of the same frames (Almanza-Medina, 3.4.7).
 
-    Dropout lies before that layer (ours).
+    A fully connected layer with a ReLU (ours) joins the averages of both before the estimates. Dropout is applied before
+    that layer (ours).
 
     Args:
-        outputs: estimates.
+        outputs: number of estimates.
         width: factor on the channels and on the fully connected layer.
         dropout: rate in training.
         size: rows and columns of the polar input.
@@ -88,7 +93,7 @@ class PoseNetDual(Network):
         channels: of each input; with Almanza-Medina's 1 the frames are side by side.
 
     Raises:
-        MitsonarError: a value out of its range.
+        MitsonarError: a value is out of range.
     """
 
     needs: ClassVar[Fields] = {"coordinates": "both"}
@@ -114,14 +119,14 @@ class PoseNetDual(Network):
         glorot(self)
 
     def forward(self, polar: Tensor, cartesian: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` of the same frames as polar and as Cartesian images, grey values 0..1.
+        """Estimate labels ``(batch, outputs)`` from the same frames as polar and as Cartesian images.
 
         Args:
-            polar: ``(batch, channels, rows, columns)`` of ``size``.
-            cartesian: ``(batch, channels, rows, columns)`` of ``cartesian_size``.
+            polar: grey values in 0..1 ``(batch, channels, rows, columns)`` of ``size``.
+            cartesian: grey values in 0..1 ``(batch, channels, rows, columns)`` of ``cartesian_size``.
 
         Raises:
-            MitsonarError: frames of another size.
+            MitsonarError: the frames have another size.
         """
         self.expect(polar)
         self.expect(cartesian, "cartesian_size")
@@ -129,35 +134,35 @@ class PoseNetDual(Network):
         return self.regression(self.layers(self.dropout(features)))  # type: ignore[no-any-return]
 
 
-# ---------------- PoseNetVec: a PoseNet for vectors that keeps the number of columns (Almanza-Medina, 4.3.1 and Table
-# 4.2)
+# ---------------- PoseNet for vectors
 
 
 POSENETVEC_KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3)
-"""Rows of the kernels, along the range."""
+"""Rows of the kernels, along range."""
 
 POSENETVEC_CHANNELS = (32, 64, 128, 256, 512, 512, 512, 1024, 1024)
 
 POSENETVEC_COLUMNS = 2
-"""Columns of a kernel."""
+"""Columns of each kernel."""
 
 
 class PoseNetVec(Network):
-    """Nine convolutions of stride 2 along the range and 1 across, a mean over 4 x 4 cells, a fully connected layer.
+    """PoseNet for vectors, which preserves the number of columns (Almanza-Medina, 4.3.1 and Table 4.2).
 
-    It reads vectors side by side, two of each portion of the field of view: 512 x 2 of the whole, 512 x 8 of four quadrants.
-    From one vector it estimates the height (Table 4.4). Dropout lies before the fully connected layer (ours, as in PoseNet;
-    the text gives no position).
+    Nine convolutions of stride 2 along range and 1 across columns are followed by a mean over 4 x 4 cells and a fully
+    connected layer. The input is vectors side by side, two of each portion of the field of view: 512 x 2 for the whole,
+    512 x 8 for four quadrants. From one vector the network estimates the height (Table 4.4). Dropout is applied before the
+    fully connected layer (ours, as in PoseNet; the text gives no position).
 
     Args:
-        outputs: estimates.
+        outputs: number of estimates.
         width: factor on the channels.
         dropout: rate in training.
         size: range levels and columns of the input.
         channels: of the input.
 
     Raises:
-        MitsonarError: a value out of its range.
+        MitsonarError: a value is out of range.
     """
 
     needs: ClassVar[Fields] = {"kind": "vector"}
@@ -176,56 +181,59 @@ class PoseNetVec(Network):
         glorot(self)
 
     def forward(self, vectors: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` of vectors ``(batch, channels, levels, columns)``.
+        """Estimate labels ``(batch, outputs)`` from vectors ``(batch, channels, levels, columns)``.
 
         Raises:
-            MitsonarError: vectors of another size.
+            MitsonarError: the vectors have another size.
         """
         self.expect(vectors)
         return self.regression(self.dropout(self.layers(vectors).flatten(1)))  # type: ignore[no-any-return]
 
 
-# ---------------- SfMNet: the part of SfM-Net that estimates the camera's motion (Almanza-Medina, 3.3.1;
-# Vijayanarasimhan et al., 2017)
+# ---------------- SfMNet
 
 
 SFMNET_KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3, 3)
 SFMNET_CHANNELS = (32, 64, 128, 128, 256, 256, 512, 512, 1024, 1024)
 SFMNET_STRIDES = (4, 3, 3, 2, 1, 2, 1, 2, 1, 2)
 SFMNET_LAYERS: Table = tuple(zip(SFMNET_KERNELS, SFMNET_CHANNELS, SFMNET_STRIDES, strict=True))
-"""The channels are those of SfM-Net without its second layer of 64: 32, then twice 64 to 1024, as in the text."""
+"""Kernel, channels and stride of each convolution.
+
+The channels are those of SfM-Net without its second layer of 64: 32, then twice 64 to 1024, as in the text.
+"""
 
 
 class SfMNet(ConvolutionNetwork):
-    """Ten convolutions, a mean over 4 x 4 cells, and a fully connected layer to the estimates.
+    """SfMNet: ten convolutions, a mean over 4 x 4 cells, and a fully connected layer.
 
-    The text gives neither padding nor the extent of the average: they are PoseNet's (ours).
-    Options and errors: :class:`~mitsonar.networks.blocks.ConvolutionNetwork`.
+    It is the part of SfM-Net that estimates the motion of the camera (Almanza-Medina, 3.3.1; Vijayanarasimhan et al., 2017).
+    The text gives neither the padding nor the extent of the average, which are those of PoseNet (ours). See
+    :class:`~mitsonar.networks.blocks.ConvolutionNetwork` for options and errors.
     """
 
     table: ClassVar[Table] = SFMNET_LAYERS
 
 
-# ---------------- CNN-1b: two convolutions on a coarse image (Almanza-Medina, 3.3.3; Costante et al., 2016)
+# ---------------- CNN-1b
 
 
 CNN1B_CHANNELS = (64, 20)
 """Channels of the two convolutions (ours, after Costante et al.; the text gives only their kernels)."""
 
 SIZES = (2400, 1200, 600, 300)
-"""Values of the fully connected layers. The text gives them for CNN-4b, and four layers for both networks."""
+"""Number of values of each fully connected layer. The text gives them for CNN-4b, and four layers for both networks."""
 
 
 class CoarseFeatures(nn.Module):
     """Features of CNN-1b and of each quarter of CNN-4b: a coarse image after one convolution, and after two.
 
-    ``coarse``, a mean over cells; ``conv1``, 9 x 9; ``pool1``, the maximum over 4 x 4; ``conv2``, 2 x 2; ``pool2``, 2 x 2.
-    The text is silent on the following, which is ours. The convolutions have ReLU, "same" padding and stride 1. Pools do not
-    overlap, and cells that do not fill one are left out, as in MATLAB. The text's layer that joins the outputs of both pools
-    has no weights.
+    The layers are ``coarse``, a mean over cells; ``conv1``, 9 x 9; ``pool1``, the maximum over 4 x 4; ``conv2``, 2 x 2; and
+    ``pool2``, 2 x 2. The text leaves the following open, which is ours. The convolutions have ReLU, "same" padding and
+    stride 1. Pools do not overlap, and cells that do not fill one are omitted, as in MATLAB. The text's layer that joins the
+    outputs of both pools has no weights.
 
     Args:
-        cells: rows and columns of cells of a mean.
+        cells: number of rows and of columns in each mean.
         size: rows and columns of the input.
         width: factor on the channels.
         channels: of the input.
@@ -248,25 +256,26 @@ class CoarseFeatures(nn.Module):
         self.values = first * rows * columns + second * (rows // 2) * (columns // 2)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Compute features ``(batch, values)`` of images ``(batch, channels, rows, columns)``."""
+        """Compute the features ``(batch, values)`` of images ``(batch, channels, rows, columns)``."""
         fine = self.pool1(self.conv1(self.coarse(image)))
         return torch.cat((fine.flatten(1), self.pool2(self.conv2(fine)).flatten(1)), dim=1)
 
 
 class Cnn1b(Network):
-    """Means over 8 x 8 cells, two convolutions, and a fully connected network of four layers.
+    """CNN-1b: means over 8 x 8 cells, two convolutions, and four fully connected layers.
 
-    Dropout lies before the fully connected network (ours; the text gives a rate, but no position).
+    The network is from Almanza-Medina (3.3.3), after Costante et al. (2016). Dropout is applied before the fully connected
+    layers (ours; the text gives a rate, but no position).
 
     Args:
-        outputs: estimates.
+        outputs: number of estimates.
         width: factor on the channels and on the sizes of the fully connected layers.
         dropout: rate in training.
         size: rows and columns of the input, at least 64 each.
         channels: of the input; with Almanza-Medina's 1 the frames are side by side.
 
     Raises:
-        MitsonarError: a value out of its range.
+        MitsonarError: a value is out of range.
     """
 
     def __init__(
@@ -286,31 +295,32 @@ class Cnn1b(Network):
         glorot(self)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` of frames ``(batch, channels, rows, columns)``, grey values 0..1.
+        """Estimate labels ``(batch, outputs)`` from frames ``(batch, channels, rows, columns)`` with grey values in 0..1.
 
         Raises:
-            MitsonarError: frames of another size.
+            MitsonarError: the frames have another size.
         """
         self.expect(image)
         return self.regression(self.layers(self.dropout(self.features(image))))  # type: ignore[no-any-return]
 
 
-# ---------------- CNN-4b: CNN-1b on each quadrant of the two images (Almanza-Medina, 3.3.3; Costante et al., 2016)
+# ---------------- CNN-4b
 
 
 class Cnn4b(Network):
-    """Four pairs of quadrants, each with CNN-1b's convolutions on means over 4 x 4 cells, and one fully connected network.
+    """CNN-4b: the convolutions of CNN-1b on each pair of quadrants of two images, and four fully connected layers.
 
-    The four share no weights. Dropout lies before the fully connected network. Both are ours.
+    The network is from Almanza-Medina (3.3.3), after Costante et al. (2016). The convolutions read means over 4 x 4 cells.
+    The four quadrants share no weights, and dropout is applied before the fully connected layers; both are ours.
 
     Args:
-        outputs: estimates.
+        outputs: number of estimates.
         width: factor on the channels and on the sizes of the fully connected layers.
         dropout: rate in training.
         size: rows and columns of the input, two images side by side; at least 64 each, rows even, columns divisible by 4.
 
     Raises:
-        MitsonarError: a value out of its range, or images that cannot be cut into quadrants.
+        MitsonarError: a value is out of range, or the images cannot be cut into quadrants.
     """
 
     def __init__(
@@ -333,31 +343,34 @@ class Cnn4b(Network):
         glorot(self)
 
     def forward(self, pair: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` of two images side by side ``(batch, 1, rows, columns)``, grey values 0..1.
+        """Estimate labels ``(batch, outputs)`` from two images side by side ``(batch, 1, rows, columns)``.
+
+        The grey values are in 0..1.
 
         Raises:
-            MitsonarError: images of another size.
+            MitsonarError: the images have another size.
         """
         self.expect(pair)
         features = [quarter(image) for quarter, image in zip(self.quarters, self.split(pair), strict=True)]
         return self.regression(self.layers(self.dropout(torch.cat(features, dim=1))))  # type: ignore[no-any-return]
 
 
-# ---------------- CNN-4PoseNet: a PoseNet on each quadrant of the two images (Almanza-Medina, 3.3.4)
+# ---------------- CNN-4PoseNet
 
 
 CNN4POSENET_LAYERS = POSENET_LAYERS[:8]
 """Convolutions of a QuadPoseNet. The text gives their number and kernels; channels and strides are PoseNet's (ours)."""
 
 CNN4POSENET_VALUES = 1024
-"""Values of each of its two fully connected layers."""
+"""Number of values of each of the two fully connected layers of a QuadPoseNet."""
 
 
 class QuadPoseNet(nn.Module):
-    """Eight convolutions, with a fully connected layer on the last one and another on the first: coarse and fine features.
+    """Features of a pair of quadrants: eight convolutions, with fully connected layers on the first and on the last.
 
-    The 5 x 5 average after the first convolution does not overlap (ours: MATLAB's stride of 1 would need 200 million weights
-    after it). Cells that do not fill it are left out. The fully connected layers have a ReLU (ours). We read the text's
+    The layer on the first convolution gives fine features, that on the last one coarse features. The windows of the 5 x 5
+    average after the first convolution do not overlap (ours: MATLAB's stride of 1 would need 200 million weights after it).
+    Cells that do not fill a window are omitted. The fully connected layers have a ReLU (ours). We interpret the text's
     layers of 2 x 1024 and 8 x 1024 values as these outputs side by side, without weights.
 
     Args:
@@ -380,25 +393,25 @@ class QuadPoseNet(nn.Module):
         self.values = 2 * values
 
     def forward(self, image: Tensor) -> Tensor:
-        """Compute features ``(batch, values)`` of images ``(batch, 1, rows, columns)``."""
+        """Compute the features ``(batch, values)`` of images ``(batch, 1, rows, columns)``."""
         first = self.first(image)
         last = self.from_last(self.others(first).flatten(1))
         return torch.cat((last, self.from_first(self.early(first).flatten(1))), dim=1)
 
 
 class Cnn4PoseNet(Network):
-    """Four pairs of quadrants, each with its own QuadPoseNet; a fully connected layer reads them all.
+    """CNN-4PoseNet: a QuadPoseNet on each pair of quadrants of two images, and a fully connected layer on all of them.
 
-    Dropout lies before that layer (ours).
+    The network is from Almanza-Medina (3.3.4). Dropout is applied before the last layer (ours).
 
     Args:
-        outputs: estimates.
+        outputs: number of estimates.
         width: factor on the channels and on the sizes of the fully connected layers.
         dropout: rate in training.
         size: rows and columns of the input, two images side by side; rows even, columns divisible by 4.
 
     Raises:
-        MitsonarError: a value out of its range, or images that cannot be cut into quadrants.
+        MitsonarError: a value is out of range, or the images cannot be cut into quadrants.
     """
 
     def __init__(
@@ -419,48 +432,51 @@ class Cnn4PoseNet(Network):
         glorot(self)
 
     def forward(self, pair: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` of two images side by side ``(batch, 1, rows, columns)``, grey values 0..1.
+        """Estimate labels ``(batch, outputs)`` from two images side by side ``(batch, 1, rows, columns)``.
+
+        The grey values are in 0..1.
 
         Raises:
-            MitsonarError: images of another size.
+            MitsonarError: the images have another size.
         """
         self.expect(pair)
         features = [quarter(image) for quarter, image in zip(self.quarters, self.split(pair), strict=True)]
         return self.regression(self.dropout(torch.cat(features, dim=1)))  # type: ignore[no-any-return]
 
 
-# ---------------- The PoseNets that read impulse responses side by side (Almanza-Medina, 5.3, fig. 5.5 and Table 5.1)
+# ---------------- PoseNet for impulse responses
 
 
 IMPULSE_KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3)
-"""Rows of the kernels, along the delay (Table 5.1)."""
+"""Rows of the kernels, along delay (Table 5.1)."""
 
 IMPULSE_CHANNELS = (32, 64, 128, 256, 512, 512, 512, 512, 512)
 
 IMPULSE_COLUMNS = 4
-"""Columns of a kernel."""
+"""Columns of each kernel."""
 
 IMPULSE_LAYERS = (6, 9)
-"""Fewest and most convolutions of Table 5.2."""
+"""Smallest and largest number of convolutions in Table 5.2."""
 
 
 class ImpulsePoseNet(Network):
-    """A PoseNet for each receiver's block of columns, all joined in one fully connected layer to the estimates.
+    """PoseNet for impulse responses: one PoseNet per receiver, joined by a fully connected layer.
 
-    Convolutions have stride 2 along the delay and 1 across. All but the last have batch normalisation and ReLU. A mean over
-    4 x 4 cells follows. Dropout lies after the first ReLU and after the mean. A block keeps its 2 Q columns: "4 x 8" of
+    The network is from Almanza-Medina (5.3, fig. 5.5 and Table 5.1). Convolutions have stride 2 along delay and 1 across
+    columns. All but the last have batch normalisation and ReLU. A mean over 4 x 4 cells follows. Dropout is applied after
+    the first ReLU and after the mean. Each receiver has a block of 2 Q columns, whose number does not change: "4 x 8" for
     Conv8 in Table 5.1 is a slip.
 
     Args:
-        outputs: estimates.
+        outputs: number of estimates.
         width: factor on the channels.
         dropout: rate in training.
-        layers: convolutions, 6 to 9: those of Table 5.1 from the first on.
-        receivers: M, blocks of columns.
+        layers: number of convolutions, 6 to 9: the first ones of Table 5.1.
+        receivers: M, the number of blocks of columns.
         size: taps and columns of the input, 2 M Q.
 
     Raises:
-        MitsonarError: a value out of its range, a number of columns that cannot be divided among the receivers.
+        MitsonarError: a value is out of range, or the columns cannot be divided among the receivers.
     """
 
     needs: ClassVar[Fields] = {"kind": "response"}
@@ -495,10 +511,10 @@ class ImpulsePoseNet(Network):
         glorot(self)
 
     def forward(self, matrix: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` of packed matrices ``(batch, 1, taps, 2 M Q)``.
+        """Estimate labels ``(batch, outputs)`` from packed matrices ``(batch, 1, taps, 2 M Q)``.
 
         Raises:
-            MitsonarError: matrices of another size.
+            MitsonarError: the matrices have another size.
         """
         self.expect(matrix)
         blocks = matrix.chunk(len(self.nets), dim=-1)
@@ -507,7 +523,7 @@ class ImpulsePoseNet(Network):
 
 
 def _pose_net(layers: int, width: float, dropout: float) -> nn.Sequential:
-    """Build the convolutions of Table 5.1, the mean, and dropout, also after the first ReLU."""
+    """Build the convolutions of Table 5.1 and the mean, with dropout after the first ReLU and after the mean."""
     parts = column_convolutions(IMPULSE_KERNELS[:layers], IMPULSE_CHANNELS[:layers], IMPULSE_COLUMNS, width)
     parts.insert(3, nn.Dropout(dropout))
     return nn.Sequential(*parts, SameAverage(), nn.Dropout(dropout))

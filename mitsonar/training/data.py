@@ -1,4 +1,4 @@
-"""Samples of a training: batches whose order is a function of (seed, epoch, index), and validation samples."""
+"""Which samples a training uses: batches in an order that depends only on (seed, epoch, index), and validation samples."""
 
 from __future__ import annotations
 
@@ -49,34 +49,34 @@ __all__ = [
 ]
 
 
-# ---------------- Names for what the training room passes on without looking inside
+# ---------------- Types
 
 
 Array = NDArray[np.float64]
-"""Numbers in SI units, unless the text says otherwise."""
+"""Numbers in SI units, unless stated otherwise."""
 
 JsonObject = dict[str, Any]
-"""What a JSON file, a YAML file or a report holds: plain values by name."""
+"""Content of a JSON file, a YAML file or a report: plain values, keyed by name."""
 
 RawSample = dict[str, Any]
-"""One sample as a data set stores it: arrays and numbers by name, before noise and arrangement."""
+"""One sample as stored in a data set: arrays and numbers, keyed by name, before noise and arrangement."""
 
 Batch = dict[str, Any]
 """Samples of one step: ``epoch``, ``frames``, and ``raw`` samples, or finished ``inputs`` and ``label``."""
 
 
-# ---------------- training data
+# ---------------- Training and validation data
 
 
 ORDER, STEP, CHOICE, WORLDS = 31, 32, 33, 34
-"""Purposes of random numbers; see :func:`seed_of`."""
+"""Keys of the random streams, by purpose; see :func:`seed_of`."""
 
 VALIDATION_WORLDS = 5
-"""Worlds that rendered validation samples come from."""
+"""Number of worlds from which rendered validation samples come."""
 
 
 def seed_of(*numbers: int) -> int:
-    """Return a seed of 63 bits, a hash of whole numbers."""
+    """Return a seed of 63 bits as a hash of integers."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
 
 
@@ -84,19 +84,19 @@ Stored = SonarPairs | JoinedPairs | ImpulsePairs
 """Samples of data sets."""
 
 Kind = Stored | RenderedPairs
-"""Samples that a network can learn from."""
+"""Samples for training."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """What a network learns from.
+    """Data of a training.
 
     Attributes:
         samples: stored or rendered samples.
-        numbers: numbers of the stored samples for training; None: samples are rendered.
-        epoch: samples of an epoch.
+        numbers: numbers of the stored samples for training; None if samples are rendered.
+        epoch: number of samples per epoch.
         validation: validation samples.
-        about: name, digest and gain of the data, which a resumed run must repeat.
+        about: name, digest and gain of the data, which must be the same in a resumed run.
     """
 
     samples: Kind
@@ -107,12 +107,12 @@ class Material:
 
 
 class Validation:
-    """Samples that training does not use, with each level of noise. Samples and noise are always the same.
+    """Samples that training does not use, at each noise level; samples and noise are the same in every validation.
 
     Args:
-        samples: with labels of kind ``raw``.
+        samples: stored or rendered samples with labels of kind ``raw``.
         rows: raw samples, or numbers of stored samples.
-        levels: names of levels of noise.
+        levels: names of the noise levels.
     """
 
     def __init__(self, samples: Kind, rows: list[RawSample] | list[int], levels: list[str]) -> None:
@@ -125,7 +125,7 @@ class Validation:
         return len(self.rows)
 
     def batches(self, size: int, device: torch.device | str | None = None) -> Iterator[tuple[str, NetworkInput, Array]]:
-        """Yield level of noise, inputs on a device, and true motions [m, rad] (or heights [m]) of each batch."""
+        """Yield the noise level, inputs on a device, and true motions [m, m, rad] or heights [m] of each batch."""
         for begin in range(0, len(self), size):
             rows = [self.samples.raw(row) if isinstance(row, int) else row for row in self.rows[begin : begin + size]]
             raw = default_collate(rows)
@@ -138,17 +138,17 @@ class Validation:
 def material_of(
     recipe: TrainingRecipe, data: str | Path | Sequence[str | Path] | None, *, render: bool, gain: float | None = None
 ) -> Material:
-    """Open the data of a recipe: parts of a data set, or frames that are rendered during training.
+    """Open the data of a training: parts of data sets, or frames that are rendered during training.
 
     Args:
         recipe: of the training.
         data: path or URL of a data set, or of several, which are joined. With ``render`` one, for validation only.
-        render: render training samples, by the recipe of ``data`` or the one that the recipe names.
+        render: render training samples, by the recipe of ``data`` or the one that ``recipe`` names.
         gain: of rendered pixels, if it is known.
 
     Raises:
-        MitsonarError: neither ``data`` nor ``render``, no such data set, missing views or kinds, too few samples, or
-            several data sets that cannot be joined.
+        MitsonarError: neither ``data`` nor ``render`` is given, a data set does not exist, lacks views or kinds or has too
+            few samples, or several data sets cannot be joined.
     """
     sets = [] if data is None else [data] if isinstance(data, str | Path) else list(data)
     if not sets and not render:
@@ -191,7 +191,7 @@ def _joined(recipe: TrainingRecipe, sets: list[str | Path], part: str, **words: 
     """Open a part of one data set, or of several as one.
 
     Raises:
-        MitsonarError: impulse responses of several data sets; data sets that do not fit each other.
+        MitsonarError: several data sets hold impulse responses, or do not fit each other.
     """
     if len(sets) == 1:
         return _part(recipe, sets[0], part, **words)
@@ -203,7 +203,7 @@ def _joined(recipe: TrainingRecipe, sets: list[str | Path], part: str, **words: 
 
 
 def _about(pairs: Stored) -> JsonObject:
-    """Return name, digest and gain of the data, which a resumed run must repeat; of several data sets no gain."""
+    """Return name, digest and gain of the data, which must be the same in a resumed run; joined data sets have no gain."""
     if not isinstance(pairs, JoinedPairs):
         own, gain = pairs.recipe.digest(len(pairs.store)), pairs.store.about.get("gain")
         return {"name": pairs.recipe.name, "digest": own, "gain": gain}
@@ -217,14 +217,14 @@ def _part(recipe: TrainingRecipe, data: str | Path, part: str, **words: str) -> 
 
 
 def _within(recipe: TrainingRecipe, pairs: Stored) -> NDArray[np.bool_]:
-    """Return which samples are in the part of the data that is used ``(samples,)``; of each data set its first frames."""
+    """Mark the samples ``(samples,)`` that lie in the used part of the data, which is the first frames of each data set."""
     if isinstance(pairs, JoinedPairs):
         return np.concatenate([_within(recipe, part) for part in pairs.parts])
     return np.asarray(pairs.first + pairs.frames <= recipe.part_of_data * len(pairs.store))
 
 
 def _validation(recipe: TrainingRecipe, pairs: Stored) -> Validation:
-    """Choose stored samples, from as many sequences as possible."""
+    """Choose stored validation samples from as many sequences as possible."""
     wanted = recipe.validation
     numbers = np.flatnonzero(_within(recipe, pairs))
     if not len(numbers):
@@ -233,7 +233,7 @@ def _validation(recipe: TrainingRecipe, pairs: Stored) -> Validation:
             "part_of_data, or make more"
         )
     numbers = np.random.default_rng([recipe.seed, CHOICE]).permutation(numbers)
-    # rank within the sequence: the first sample of each sequence is taken, then the second ...
+    # Rank the samples within their sequence: take the first sample of each sequence, then the second ...
     sequence = pairs.sequence[pairs.first[numbers]]
     order = np.argsort(sequence, kind="stable")
     starts = np.flatnonzero(np.diff(sequence[order], prepend=-1))
@@ -244,7 +244,7 @@ def _validation(recipe: TrainingRecipe, pairs: Stored) -> Validation:
 
 
 def _rendered_validation(recipe: TrainingRecipe, world: Recipe, gain: float) -> Validation:
-    """Render samples of a few worlds that training does not use."""
+    """Render validation samples of a few worlds that training does not use."""
     wanted = recipe.validation
     count = wanted.pairs or 500
     words = {**recipe.arrangement(), "labels": "raw", "seed": seed_of(recipe.seed, WORLDS) >> 33}
@@ -254,7 +254,7 @@ def _rendered_validation(recipe: TrainingRecipe, world: Recipe, gain: float) -> 
     return Validation(samples, list(samples.raw()), [*wanted.noise, *recipe.noises])
 
 
-# ---------------------------------------------------------------- batches
+# ---------------- Batches
 
 
 def batches(
@@ -267,18 +267,19 @@ def batches(
     workers: int = 0,
     share: tuple[int, int] = (0, 1),
 ) -> DataLoader[Batch]:
-    """Load the batches ``start`` to ``stop`` of a training. They do not depend on ``start``; skipped batches are not read.
+    """Return a loader of the batches for steps ``start`` to ``stop`` of a training.
 
-    On a CPU, the processes that read also finish the samples. Otherwise :func:`finished` does this on the device.
+    The batch of a step does not depend on ``start``, and skipped batches are not read. On a CPU, the processes that read
+    also finish the samples. Otherwise :func:`finished` does this on the device.
 
     Args:
         material: data of the training.
         recipe: of the training.
         start: first step.
-        stop: step after the last.
+        stop: step after the last one.
         device: of the network.
         workers: number of processes that read or render.
-        share: number of this device, and number of devices.
+        share: index of this device, and number of devices.
     """
     together = _Together(material.samples, finish=device.type == "cpu")
     words: JsonObject = {
@@ -297,15 +298,16 @@ def batches(
 
 
 def _leave_signals(worker: int) -> None:
-    """Ignore signals in a process that reads: where they reach all of a job, the first process ends the others."""
+    """Ignore signals in a worker process, because they may reach all processes of a job, and the first one ends the rest."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 
 
 class Order(Sampler[list[tuple[int, int]]]):
-    """(epoch, sample) of each batch from step ``start`` on. Each epoch permutes the samples by (seed, epoch).
+    """Sampler that yields the (epoch, sample) pairs of each batch from step ``start`` to ``stop``.
 
-    Samples that do not fill a batch at the end of an epoch are left out of that epoch.
+    Each epoch has a permutation of the samples that depends on (seed, epoch). Samples that do not fill a batch at the end of
+    an epoch are omitted from that epoch.
     """
 
     def __init__(
@@ -325,7 +327,7 @@ class Order(Sampler[list[tuple[int, int]]]):
 
 @dataclass(frozen=True)
 class _Stored(Dataset[RawSample]):
-    """Raw samples with their epoch, for workers that only read."""
+    """Raw samples with their epoch, for worker processes that only read."""
 
     pairs: Stored
 
@@ -336,7 +338,7 @@ class _Stored(Dataset[RawSample]):
 
 @dataclass(frozen=True)
 class _Together:
-    """Collates raw samples into a batch: ``epoch``, ``frames``, and ``raw``, or finished ``inputs`` and ``label``."""
+    """Collation of raw samples to a batch: ``epoch``, ``frames``, and ``raw``, or finished ``inputs`` and ``label``."""
 
     samples: Kind
     finish: bool
@@ -353,7 +355,7 @@ class _Together:
 
 
 def finished(batch: Batch, samples: Kind, device: torch.device) -> tuple[NetworkInput, Tensor]:
-    """Return inputs and labels of a batch on a device."""
+    """Return the inputs and labels of a batch on a device."""
     if "inputs" in batch:
         return batch["inputs"], batch["label"]
     samples.set_epoch(batch["epoch"])

@@ -1,4 +1,4 @@
-"""Evaluation of a trained network on a data set, with baselines and confidence intervals."""
+"""How well a trained network estimates motion on a data set, with a baseline and confidence intervals."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ __all__ = ["NOISES", "evaluate", "predictions", "refuse_tables", "report_lines",
 
 
 NOISES = ("none", "low", "high")
-"""Levels of noise, by default."""
+"""Default noise levels."""
 
 SAME_INSTRUMENT = ("name", "model", "seed", "rays", "points_per_m2", "scatterer_spacing_m")
-"""Keys of a channel sonar that do not make it another instrument."""
+"""Keys in which two channel sonars may differ and still count as the same instrument."""
 
 TIMED = 20
-"""Pairs over which the time of one estimate is measured."""
+"""Number of pairs over which the time of one estimate is measured."""
 
 
 def predictions(
@@ -50,19 +50,19 @@ def predictions(
     device: torch.device | str | None = None,
     progress: Callable[[int], object] = lambda pairs: None,
 ) -> tuple[Array, Array | None]:
-    """Estimate the targets of samples by a network.
+    """Estimate the targets of samples with a network.
 
     Args:
         checkpoint: of the network.
         pairs: samples, arranged as in training; see :func:`samples_for`.
-        batch: samples at a time.
+        batch: number of samples per batch.
         numbers: numbers of the samples; default: all samples.
         device: of the computation; default: a GPU, if there is one.
         progress: called with the number of samples that were done.
 
     Returns:
-        Targets ``(n, 3)`` [m, m, rad], ``(n, 2)`` [m] without yaw, or ``(n, 1)`` [m] of heights; covariances
-        ``(n, 3, 3)``, if the network estimates them.
+        Estimated targets ``(n, 3)`` [m, m, rad], ``(n, 2)`` [m] without yaw, or ``(n, 1)`` [m] for heights; and covariances
+        ``(n, 3, 3)``, or None if the network does not estimate them.
     """
     torch_device = _device(device)
     network = checkpoint.build().to(torch_device)
@@ -92,23 +92,30 @@ def evaluate(
     device: torch.device | str | None = None,
     begin: Callable[[int], Callable[[int], object]] = lambda total: lambda done: None,
 ) -> JsonObject:
-    """Evaluate a network on one sample of each sequence of a data set, beside always answering zero: see :func:`_report`.
+    """Evaluate a network on one sample of each sequence of a data set, in comparison with the constant estimate zero.
 
     Args:
         checkpoint: of the network.
         data: path or URL of the data set.
-        noise: levels, each a table; default: :data:`NOISES`, or none for impulse responses.
+        noise: noise levels, each of which gives a table; default: :data:`NOISES`, or none for impulse responses.
         part: ``train``, ``validation``, ``test`` or ``all``; default: ``test`` if the split has one, else ``validation``.
-        split: default: that of the training, else of the data set.
-        pairs: largest number of pairs, which are drawn at random.
-        force: allow another sonar than that of training.
+        split: default: that of the training, else that of the data set.
+        pairs: largest number of pairs; if there are more, pairs are drawn at random.
+        force: allow a sonar that differs from that of training.
         seed: of noise, choice of samples, and bootstrap.
-        batch: samples at a time.
-        device: of the computation; default: a GPU, if there is one. Times are always of one CPU core.
-        begin: called with the number of all estimates; returns what is called with how many more are done.
+        batch: number of samples per batch.
+        device: of the computation; default: a GPU, if there is one. Times are always measured on one CPU core.
+        begin: called with the total number of estimates; returns a function that is called with the number of new ones.
+
+    Returns:
+        The report: facts about network and data, ``notes`` and ``tables``. ``notes`` are sentences that a reader of the
+        tables needs. ``tables`` has one table per noise level. Its rows are those of the network and of ``zero``, with the
+        fields of :class:`~mitsonar.estimation.compare.BenchmarkRow` in mm, mm, deg (heights: mm), and ``thesis``, the RMSE
+        in mm, mm, 1/100 deg. ``beyond`` has the shares of true motions and of estimates outside the range of training,
+        ``correlations`` the correlations of the network's errors between any two axes.
 
     Raises:
-        MitsonarError: another sonar than that of training, missing views or arrays, or no samples.
+        MitsonarError: the sonar differs from that of training, views or arrays are missing, or there are no samples.
     """
     others = _other_sonars(checkpoint, DataStore.open(data).recipe)
     if others and not force:
@@ -131,11 +138,11 @@ class _Subject:
     """The samples of an evaluation.
 
     Attributes:
-        numbers: of the samples, n of them.
+        numbers: numbers of the n samples.
         truth: true targets ``(n, outputs)`` [m, rad].
         scenes: number of distinct scenes.
-        resamples: samples of each bootstrap resample ``(resamples, n)``.
-        seed: of the choice and the bootstrap.
+        resamples: indices of the samples in each bootstrap resample ``(resamples, n)``.
+        seed: of the choice of samples and of the bootstrap.
     """
 
     numbers: list[int]
@@ -146,7 +153,7 @@ class _Subject:
 
     @classmethod
     def of(cls, samples: SonarPairs | ImpulsePairs, pairs: int | None, seed: int) -> _Subject:
-        """Choose samples and draw the resamples."""
+        """Choose samples and draw the bootstrap resamples."""
         numbers = chosen(len(samples), pairs, seed)
         truth = np.array([samples.target(number) for number in numbers])
         scenes = samples.scene[samples.first[numbers]]
@@ -162,14 +169,7 @@ def _report(
     others: list[str],
     tables: list[JsonObject],
 ) -> JsonObject:
-    """Return the report of an evaluation.
-
-    ``notes`` are sentences that a reader of the tables needs. ``tables`` has one table for each level of noise. The rows of
-    a table are of the network and of ``zero``, and hold the fields of
-    :class:`~mitsonar.estimation.compare.BenchmarkRow` in mm, mm, deg (heights: mm), and ``thesis``, the RMSE in mm, mm,
-    1/100 deg. ``beyond`` holds the shares of true motions and of estimates outside the range of training, ``correlations``
-    those of the network's errors between any two axes.
-    """
+    """Return the report of an evaluation; see :func:`evaluate`."""
     recipe = DataStore.open(data).recipe
     return {
         "network": checkpoint.network,
@@ -198,7 +198,7 @@ def samples_for(
     noise: str = "none",
     seed: int = 0,
 ) -> SonarPairs | ImpulsePairs:
-    """Return one sample of each sequence of a data set, of recorded frames all, arranged for a network.
+    """Return one sample of each sequence of a data set, or all samples of recorded frames, arranged for a network.
 
     Raises:
         MitsonarError: the data set lacks an input of the network, or has no samples in that part.
@@ -217,7 +217,7 @@ def _device(device: torch.device | str | None) -> torch.device:
 
 
 def _milliseconds(checkpoint: Checkpoint, pairs: SonarPairs | ImpulsePairs, numbers: Sequence[int]) -> float:
-    """Measure the median processor time of one sample on one core [ms], from frames (and their geometry) to the estimate."""
+    """Measure the median CPU time per sample on one core [ms], from the frames (and their geometry) to the estimate."""
     network = checkpoint.build()
     spent = []
     with torch.inference_mode(), one_thread():
@@ -229,13 +229,14 @@ def _milliseconds(checkpoint: Checkpoint, pairs: SonarPairs | ImpulsePairs, numb
     return float(np.median(spent[1:]))  # the first sample warms up
 
 
-# ---------------------------------------------------------------- tables
+# ---------------- Error tables
 
 
 def _table(checkpoint: Checkpoint, subject: _Subject, ms: float, estimates: Array, covariances: Array | None) -> JsonObject:
-    """Return the rows of the network and of always answering zero."""
+    """Return the table of one noise level, with rows for the network and for the constant estimate zero."""
     truth, resamples = subject.truth, subject.resamples
     inputs, beyond = {checkpoint.network: inputs_of(checkpoint), "zero": "nothing"}, _beyond(checkpoint, truth, estimates)
+    # Motions: a missing yaw is filled with zeros, since the rows of a comparison have three axes, and is cut off again.
     if truth.shape[1] >= 2:
         truth, estimates, axes = _with_yaw(truth), _with_yaw(estimates), truth.shape[1]
         nan, valid = np.full((len(truth), 3, 3), np.nan), np.ones(len(truth), dtype=bool)
@@ -246,6 +247,7 @@ def _table(checkpoint: Checkpoint, subject: _Subject, ms: float, estimates: Arra
         }
         rows = [_of_axes(row.plain(), axes) for row in rows_of(answers, inputs, truth, resamples, reference="zero")]
         scale = np.array([1, 1, 100])[:axes]
+    # Heights: the baseline is the middle of the training heights, since zero is no height.
     else:
         middle = np.full_like(truth, checkpoint.coder.low.mean() / 2 + checkpoint.coder.high.mean() / 2)
         found = {checkpoint.network: estimates, "zero": middle}
@@ -262,7 +264,7 @@ def _table(checkpoint: Checkpoint, subject: _Subject, ms: float, estimates: Arra
 
 
 def _correlations(error: Array, axes: int) -> dict[str, float | None]:
-    """Return the correlations of the errors of any two axes ``(n, axes)``; None of one sample, or of no error."""
+    """Compute the correlations between the errors ``(n, axes)`` of any two axes; None for one sample, or without error."""
     table = np.full((axes, axes), np.nan)
     if len(error) > 1:
         with np.errstate(invalid="ignore"):
@@ -274,20 +276,20 @@ def _correlations(error: Array, axes: int) -> dict[str, float | None]:
 
 
 def _with_yaw(motion: Array) -> Array:
-    """Return motions ``(n, 3)``; a missing yaw is 0."""
+    """Return motions ``(n, 3)``, with a missing yaw as 0."""
     return np.hstack([motion, np.zeros((len(motion), len(AXES) - motion.shape[1]))])
 
 
 def _of_axes(row: JsonObject, axes: int) -> JsonObject:
-    """Return a row with the numbers of its first axes."""
+    """Return a row with the values of its first axes only."""
     return {name: value[:axes] if isinstance(value, list) else value for name, value in row.items()}
 
 
 def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArray[np.int64]) -> JsonObject:
-    """Return the errors of heights ``(n, 1)`` [m], with the fields of :class:`~mitsonar.motion.errors.MotionErrors`.
+    """Compute the errors of heights ``(n, 1)`` [m], with the fields of :class:`~mitsonar.motion.errors.MotionErrors`.
 
-    Errors are in mm. ``zero`` is the RMSE of always answering the middle of the training heights. Slopes are over the
-    differences from this middle.
+    Errors are in mm. ``zero`` is the RMSE of a constant estimate, the middle of the training heights. The slope is that of
+    estimated against true differences from this middle.
     """
     error, side = 1e3 * (heights - truth), 1e3 * (truth - middle)
     rmse, zero = (float(np.sqrt((values**2).mean())) for values in (error, side))
@@ -313,7 +315,7 @@ def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArr
 
 
 def _beyond(checkpoint: Checkpoint, truth: Array, estimates: Array) -> dict[str, float]:
-    """Return the shares of true and of estimated targets that are outside the range of training on any axis."""
+    """Compute the shares of true and of estimated targets that are outside the range of training on any axis."""
     low, high = checkpoint.coder.low - 1e-9, checkpoint.coder.high + 1e-9
     return {
         name: float(((values < low) | (values > high)).any(axis=1).mean())
@@ -321,7 +323,7 @@ def _beyond(checkpoint: Checkpoint, truth: Array, estimates: Array) -> dict[str,
     }
 
 
-# ---------------------------------------------------------------- differences from training
+# ---------------- Differences from training
 
 
 def _other_sonars(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
@@ -343,14 +345,14 @@ def _other_sonars(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
 
 
 def _other_channel(trained: ChannelSonar, other: ChannelSonar, name: str) -> list[str]:
-    """Describe the keys that differ and change responses."""
+    """Describe the differences between two channel sonars that change responses."""
     mine, its = trained.model_dump(mode="json"), other.model_dump(mode="json")
     changed = [key for key in mine if mine[key] != its[key] and key not in SAME_INSTRUMENT]
     return [f"trained with another channel sonar than that of {name}: {', '.join(changed)} differ"] if changed else []
 
 
 def _learnt_of(checkpoint: Checkpoint, samples: SonarPairs | ImpulsePairs, subject: _Subject) -> list[str]:
-    """Return a sentence on how many of the pairs training has seen, if any."""
+    """Return a note on the number of pairs that training has seen, if any."""
     seen = int(checkpoint.learnt(samples)[subject.numbers].sum())
     count = counted(len(subject.numbers), "pair")
     return [f"training has seen {seen} of these {count}: their errors do not show how it does on others"] if seen else []
@@ -375,7 +377,7 @@ def _notes(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
     return found
 
 
-# ---------------- Tables of an evaluation: as Markdown, and as files in a folder
+# ---------------- Output of the tables
 
 
 COLUMNS = (
@@ -385,7 +387,7 @@ COLUMNS = (
 
 
 def report_lines(report: JsonObject) -> list[str]:
-    """Format the tables of :func:`mitsonar.training.evaluate.evaluate` as Markdown."""
+    """Format the report of :func:`evaluate` as lines of Markdown."""
     units = "height mm" if len(report["names"]) == 1 else "sideways mm / forward mm / yaw deg"
     units = units.removesuffix(" / yaw deg") if len(report["names"]) == 2 else units
     lines = [
@@ -405,10 +407,10 @@ def report_lines(report: JsonObject) -> list[str]:
 
 
 def refuse_tables(out: Path, *, overwrite: bool) -> None:
-    """Refuse to replace the tables in a folder without ``overwrite``.
+    """Check that no tables in a folder would be replaced without ``overwrite``.
 
     Raises:
-        MitsonarError: the folder holds tables, or the path is a file.
+        MitsonarError: the folder contains tables, or the path is a file.
     """
     if out.exists() and not out.is_dir():
         raise MitsonarError(f"-o is a folder: got the file {out}")
@@ -416,7 +418,7 @@ def refuse_tables(out: Path, *, overwrite: bool) -> None:
 
 
 def save_tables(out: Path, report: JsonObject) -> None:
-    """Write ``table.md`` and ``table.json``. The folder is created."""
+    """Write ``table.md`` and ``table.json`` to a folder, which is created if it does not exist."""
     out.mkdir(parents=True, exist_ok=True)
     write_whole(out / "table.md", ("\n".join(report_lines(report)) + "\n").encode())
     write_json(out / "table.json", report)

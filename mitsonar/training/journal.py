@@ -1,4 +1,4 @@
-"""What happens between the steps of a training: reports, validation, states, the best network, and the end."""
+"""What happens between the steps of a training: reports, validation, saving of state and best network, and the end."""
 
 from __future__ import annotations
 
@@ -49,31 +49,31 @@ __all__ = [
 
 
 STATE_MINUTES = 5.0
-"""Minutes between two states on disk: what a kill may cost."""
+"""Time between two states on disk, and so the training that a kill may cost [min]."""
 
 LOG_SECONDS = 30.0
-"""Time between two rows of the log without a validation."""
+"""Time between two rows of the log without a validation [s]."""
 
 SMOOTH = 0.98
-"""Weight of the past in the running numbers of a report."""
+"""Decay per step of the weights in the running means of a report."""
 
 
 @dataclass(frozen=True)
 class TrainingReport:
-    """Progress of a training, after each step.
+    """Progress of a training after a step.
 
     Attributes:
         step: number of steps done.
         steps: number of steps planned.
         epoch: number of epochs done, with a fraction.
-        pairs: samples seen.
-        minutes: duration of training [min], of all resumed runs together.
-        per_second: samples a second in this process.
+        pairs: number of samples seen.
+        minutes: duration of training, including earlier parts of a resumed run [min].
+        per_second: samples per second in this process.
         loss: running mean of the loss.
-        rmse: running RMSE of the samples that it learns from, in the units of ``axes``.
-        validation: RMSE of the last validation by level of noise, in the units of ``axes``.
-        validated: whether this step was validated.
-        logged: whether the log has a row of this step.
+        rmse: running RMSE on the training samples, in the units of ``axes``.
+        validation: RMSE of the last validation, keyed by noise level, in the units of ``axes``.
+        validated: whether the network was validated after this step.
+        logged: whether the log has a row for this step.
         axes: names and units of the estimates.
     """
 
@@ -93,7 +93,7 @@ class TrainingReport:
 
 @dataclass(frozen=True)
 class Pace:
-    """When a training reports, saves its state and stops: see :func:`mitsonar.training.run.train`."""
+    """Options of when a training reports, saves its state and stops; see :func:`mitsonar.training.run.train`."""
 
     minutes: float | None
     state_minutes: float
@@ -102,9 +102,9 @@ class Pace:
 
 
 class Journal(Callback):
-    """Reports, validates, saves states and the best network, and ends training.
+    """Callback that reports, validates, saves states and the best network, and ends training.
 
-    Nothing here changes what the next step computes.
+    It does not affect the result of the next step.
     """
 
     def __init__(self, folder: RunFolder, module: NetworkTraining, material: Material, pace: Pace) -> None:
@@ -118,24 +118,24 @@ class Journal(Callback):
         self.validation: dict[str, list[float]] = {}
 
     def state_dict(self) -> JsonObject:
-        """Return what ``last.ckpt`` keeps of the journal."""
+        """Return the state of the journal for ``last.ckpt``."""
         return {**vars(self.kept), "minutes": self.spent}
 
     def load_state_dict(self, state_dict: JsonObject) -> None:
-        """Take what ``last.ckpt`` keeps of the journal."""
+        """Restore the state of the journal from ``last.ckpt``."""
         self.had_minutes = float(state_dict["minutes"])
         self.kept = _Kept(**{name: value for name, value in state_dict.items() if name != "minutes"})
 
     @property
     def spent(self) -> float:
-        """Return the duration of training [min], of all resumed runs together."""
+        """Return the duration of training, including earlier parts of a resumed run [min]."""
         return self.had_minutes + (time.monotonic() - self.begun) / 60
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Start the clock.
+        """Start the clock, and restore the handler of SIGTERM.
 
-        Lightning has taken SIGTERM over: it would end the process with code 0, and without a state. Whoever can stop the
-        training gets the signal back.
+        Lightning has replaced the handler by one that ends the process with code 0, and without a state. If the caller can
+        stop the training, the caller's handler is restored.
         """
         if self.pace.stop is not None and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, self.on_sigterm)
@@ -150,14 +150,14 @@ class Journal(Callback):
         batch: Batch,
         batch_idx: int,
     ) -> None:
-        """Report, validate, save or end, as is due after this step."""
+        """Report, validate, save or end, whichever is due after this step."""
         assert isinstance(outputs, Mapping)
         step = trainer.global_step
         loss = float(outputs["loss"].detach())
         self.kept.add(loss, self.module.squares)
         end, validate, save = self._due(trainer, step)
         stopped = end and self.stopped
-        if stopped and self._finite():  # first: a second signal, or what sent this one, may not wait
+        if stopped and self._finite():  # save first: whatever sent the signal may not wait
             trainer.save_checkpoint(self.folder.state)
         log = validate or stopped or time.monotonic() - self.logged >= LOG_SECONDS
         if log and trainer.is_global_zero:
@@ -175,7 +175,7 @@ class Journal(Callback):
             trainer.should_stop = True
 
     def _due(self, trainer: lightning.Trainer, step: int) -> tuple[bool, bool, bool]:
-        """Return whether training ends, is validated, and saves its state. The first process decides for all."""
+        """Return whether training ends, validates, and saves its state; the first process decides for all."""
         now, wanted = time.monotonic(), self.recipe.validation
         stopped = self.stopped or (self.pace.stop is not None and self.pace.stop())
         over = self.pace.minutes is not None and self.spent >= self.pace.minutes
@@ -190,9 +190,10 @@ class Journal(Callback):
         return end, validate, save
 
     def _log(self, trainer: lightning.Trainer, step: int, *, validate: bool, stopped: bool) -> None:
-        """Add a row to the log; validate where that is due, and save the network if it is the best so far.
+        """Add a row to the log; validate if that is due, and save the network if it is the best so far.
 
-        A stop validates, too, but what is best does not depend on it: only a run without a network gets this one.
+        A stop also validates, but does not count for the choice of the best network. Its network is saved only if the run
+        has none.
         """
         row: JsonObject = {
             "step": step,
@@ -219,16 +220,16 @@ class Journal(Callback):
         self.logged = time.monotonic()
 
     def _columns(self, what: str, rmse: list[float] | None) -> JsonObject:
-        """Return the columns of an RMSE by their names, empty without one."""
+        """Return the columns of an RMSE, keyed by name; None if there is no RMSE."""
         values = [None] * len(self.axes) if rmse is None else rmse
         return {column(what, axis): value for axis, value in zip(self.axes, values, strict=True)}
 
     def _training_rmse(self) -> list[float]:
-        """Return the running RMSE of the samples that it learns from, in the units of the axes."""
+        """Return the running RMSE on the training samples, in the units of the axes."""
         return [float(value) for value in np.sqrt(self.kept.squares) * self.scales]
 
     def _validate(self, trainer: lightning.Trainer) -> float:
-        """Validate, and return the score of the network."""
+        """Validate the network, and return its score."""
         context = trainer.precision_plugin.forward_context()
         size = max(self.recipe.batch, 8)
         labels, device = self.material.samples.labels, self.module.device
@@ -241,7 +242,7 @@ class Journal(Callback):
         return _score([rmse[level] for level in self.recipe.noises], zero)
 
     def _checkpoint(self, row: JsonObject) -> Checkpoint:
-        """Return the present network as a checkpoint."""
+        """Return the current network as a checkpoint."""
         count = len(self.material.validation)
         metrics = {level: {"rmse": values, "pairs": count} for level, values in self.validation.items()}
         trained = {"pairs": row["pairs"], "minutes": round(row["minutes"], 2), "epochs": round(row["epoch"], 3)}
@@ -284,12 +285,12 @@ class _Kept:
 
     Attributes:
         rows: of the log.
-        loss_sum: of the steps since the last row.
-        loss_count: number of these.
+        loss_sum: sum of the losses since the last row.
+        loss_count: number of steps since the last row.
         best: score of the best network.
-        zero: RMSE of always answering zero, in the units of the axes.
-        weight: of the running means.
-        loss: their running mean.
+        zero: RMSE of the constant estimate zero, in the units of the axes.
+        weight: sum of the weights of the running means.
+        loss: running mean of the loss.
         squares: running mean of squared errors, by axis [m^2, m^2, rad^2].
     """
 
@@ -303,7 +304,7 @@ class _Kept:
     squares: list[float] = field(default_factory=list)
 
     def add(self, loss: float, squares: Array) -> None:
-        """Add one step."""
+        """Add the loss and the squared errors of one step."""
         self.loss_sum, self.loss_count = self.loss_sum + loss, self.loss_count + 1
         self.weight = SMOOTH * self.weight + 1
         self.loss += (loss - self.loss) / self.weight
@@ -312,24 +313,24 @@ class _Kept:
 
 
 def _score(rmse: list[Array], zero: Array) -> float:
-    """Return the score of a validation, of which the smallest is the best.
+    """Compute the score of a validation; smaller is better.
 
-    The score is the RMSE over that of always answering zero, as a geometric mean over axes and levels of noise. The
-    geometric mean gives equal weight to equal relative errors, also if one axis cannot be estimated.
+    The score is the ratio of the RMSE to that of the constant estimate zero, as a geometric mean over axes and noise levels.
+    The geometric mean gives equal weight to equal relative errors, even if one axis cannot be estimated.
     """
     moves = zero > 0
     parts = np.array([level[moves] / zero[moves] for level in rmse])
     return float(np.exp(np.log(np.maximum(parts, 1e-9)).mean())) if moves.any() else float(np.mean(rmse))
 
 
-# ---------------- The folder of a training run: recipe, state, best network, log and learning curve, each whole or absent
+# ---------------- Folder of a training run
 
 
 EVENTS = "tensorboard"
-"""Folder of what TensorBoard shows, in the folder of a training."""
+"""Name of the folder for TensorBoard inside the folder of a training."""
 
 TRAINED = "training"
-"""What the columns of the log are of that hold the RMSE of the samples that a network learns from."""
+"""Prefix of the log's columns that hold the RMSE on the training samples."""
 
 TRAINING = RunKind(
     "training",
@@ -342,14 +343,14 @@ TRAINING = RunKind(
 )
 
 WIDE = 30
-"""Ratio of last to first samples seen from which their axis is logarithmic."""
+"""Ratio of the last to the first number of samples seen from which their axis is logarithmic."""
 
 
 class StateFile(TorchCheckpointIO):
-    """The file of Lightning's state. It is written whole or not at all, and nothing in it is executed."""
+    """Reader and writer of Lightning's state, which writes atomically and executes nothing in the file."""
 
     def save_checkpoint(self, checkpoint: JsonObject, path: str | Path, storage_options: object | None = None) -> None:
-        """Write a state, whole or not at all."""
+        """Write a state atomically: either all of it or nothing."""
         buffer = io.BytesIO()
         torch.save(checkpoint, buffer)
         write_whole(path, buffer.getvalue())
@@ -357,10 +358,10 @@ class StateFile(TorchCheckpointIO):
     def load_checkpoint(
         self, path: str | Path, map_location: Callable[..., Any] | None = None, weights_only: bool | None = True
     ) -> JsonObject:
-        """Read a state, without executing anything in it.
+        """Read a state without executing anything in it.
 
         Raises:
-            MitsonarError: the file is damaged, or holds something else.
+            MitsonarError: the file is damaged, or is not a state.
         """
         try:
             state = torch.load(path, map_location=map_location or "cpu", weights_only=True)
@@ -377,12 +378,12 @@ class StateFile(TorchCheckpointIO):
 
 @dataclass
 class RunFolder:
-    """The folder of a training.
+    """Folder of a training: recipe, state, best network, log and learning curve, each of them complete or absent.
 
     Attributes:
         path: of the folder.
         writes: whether this process writes.
-        run: arguments and progress; None before :meth:`begin`, and if another process writes.
+        run: arguments and progress; None before :meth:`begin`, or if another process writes.
     """
 
     path: Path
@@ -391,7 +392,7 @@ class RunFolder:
 
     @property
     def state(self) -> Path:
-        """Return the path of the state, from which --resume continues."""
+        """Return the path of the state from which --resume continues."""
         return self.path / "last.ckpt"
 
     @property
@@ -400,10 +401,10 @@ class RunFolder:
         return self.path / "network.ckpt"
 
     def known(self) -> RunDirectory | None:
-        """Return the earlier run in the folder, if there is one. Its arguments may differ.
+        """Return the earlier run in the folder, if there is one; its arguments may differ.
 
         Raises:
-            MitsonarError: its file is damaged.
+            MitsonarError: the file of the run is damaged.
         """
         return RunDirectory.open(self.path, TRAINING) if (self.path / RUN_FILE).is_file() else None
 
@@ -414,13 +415,13 @@ class RunFolder:
 
         Args:
             recipe: of the training.
-            asked: arguments beside the recipe that a resumed run must repeat to reach the same weights.
-            notes: other facts on the run.
+            asked: further arguments that a resumed run must repeat to reach the same weights.
+            notes: other facts about the run.
             resume: resume a run in the folder.
             overwrite: replace a run in the folder.
 
         Raises:
-            MitsonarError: the folder holds a run and neither is allowed, the arguments differ, or it holds other things.
+            MitsonarError: the folder has a run and neither is allowed, the arguments differ, or the folder has other files.
         """
         if not self.writes:
             return None
@@ -433,7 +434,7 @@ class RunFolder:
         return self.run if self.run.resumed else None
 
     def end(self, *, finished: bool, **notes: float) -> None:
-        """Store the progress of the training."""
+        """Save the progress of the training at its end."""
         if self.run is not None:
             self.run.finished = finished
             self.run.note(**notes)
@@ -455,22 +456,22 @@ class RunFolder:
 
 
 def machine() -> JsonObject:
-    """Describe this machine."""
+    """Return a description of this machine."""
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     return {"system": platform.platform(), "cores": len(os.sched_getaffinity(0)), "gpu": device}
 
 
 def column(level: str, axis: Axis) -> str:
-    """Return the name of a column of the log: the RMSE of one axis in training, or in validation at a level of noise."""
+    """Return the name of a log column: the RMSE of one axis in training, or in validation at a noise level."""
     return f"{level} {axis.name} ({axis.unit})"
 
 
 def curve_figure(rows: list[JsonObject], zero: list[float], axes: tuple[Axis, ...]) -> Figure:
-    """Draw the loss, and the RMSE of each axis in training and validation, against the training samples seen.
+    """Draw the loss, and the RMSE of each axis in training and validation, against the number of samples seen.
 
     Args:
-        rows: of the log; one at least with a validation.
-        zero: RMSE of always answering no motion, in the units of ``axes``.
+        rows: of the log; at least one with a validation.
+        zero: RMSE of the constant estimate of no motion, in the units of ``axes``.
         axes: names and units of the estimates.
     """
     from matplotlib.figure import Figure

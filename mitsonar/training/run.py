@@ -1,7 +1,7 @@
-"""A training from recipe to checkpoint. It may be killed at any moment, and a resumed run ends with the same bits.
+"""How a network is trained, from the recipe to the checkpoint, and how an interrupted run is resumed.
 
-Sample order, noise and dropout are functions of (seed, epoch, index) and (seed, step). The bits are the same on a CPU with
-the same number of threads.
+A run may be killed at any moment. A resumed run ends with the same bits, on a CPU with the same number of threads, because
+sample order, noise and dropout depend only on (seed, epoch, index) and (seed, step).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from mitsonar.training.step import NetworkTraining, network_for
 __all__ = ["TrainingReport", "leads", "train"]
 
 MOST_AT_ONCE = 1024
-"""Largest number of threads, and of processes, that a run may have had."""
+"""Largest valid number of threads or processes in the record of a run."""
 
 
 def train(
@@ -58,27 +58,27 @@ def train(
     """Train a network, and return the best one by validation at the noise of training.
 
     Args:
-        recipe: of the training; its name, or a YAML file.
-        data: path or URL of a data set; or of several of one sonar, such as one in each model, which are joined.
+        recipe: training recipe, its name, or a YAML file.
+        data: path or URL of a data set, or of several data sets of one sonar, which are joined, such as one per model.
         out: folder of the run.
-        render: render training samples meanwhile, by the recipe of ``data``, else by the one that the recipe names.
-        minutes: duration after which training stops [min], of all resumed runs together, with validation.
-        resume: resume the run in ``out``, or begin if there is none.
+        render: render samples during training, by the recipe of ``data`` or else by the one that ``recipe`` names.
+        minutes: total duration after which training stops [min], including validation and earlier parts of a resumed run.
+        resume: resume the run in ``out``, or start a new run if there is none.
         overwrite: replace a run in ``out``.
-        scale: part of the data to use, times ``part_of_data`` of the recipe.
-        pairs: length of the training in samples, in place of the recipe's.
+        scale: fraction of the data to use, which multiplies ``part_of_data`` of the recipe.
+        pairs: length of the training in samples, which replaces that of the recipe.
         accelerator: as in Lightning's trainer.
         devices: as in Lightning's trainer.
         strategy: as in Lightning's trainer.
-        precision: as in Lightning's trainer, in place of the recipe's.
+        precision: as in Lightning's trainer; replaces that of the recipe.
         threads: number of CPU threads.
-        workers: number of processes that read or render; default: by the machine.
+        workers: number of processes that read or render; by default it depends on the machine.
         state_minutes: time between two states on disk [min].
         progress: called after each step.
         stop: called after each step; if it returns true, the state is saved and training stops.
 
     Raises:
-        MitsonarError: contradictory arguments, before training begins; or a loss that is not finite.
+        MitsonarError: arguments contradict each other, which is checked before training begins, or the loss is not finite.
     """
     recipe, folder = _changed(recipe, scale, pairs, precision), RunFolder(Path(out), writes=leads())
     hardware = _Hardware(accelerator, devices, strategy, threads, workers)
@@ -88,7 +88,7 @@ def train(
 
 @dataclass(frozen=True)
 class _Hardware:
-    """Where a training is computed: see :func:`train`."""
+    """Options of the hardware and the processes of a training; see :func:`train`."""
 
     accelerator: str
     devices: str | int
@@ -99,7 +99,7 @@ class _Hardware:
 
 @dataclass(frozen=True)
 class _Run:
-    """What is trained and where it is kept: see :func:`train`."""
+    """A training run: its recipe, data and folder; see :func:`train`."""
 
     recipe: TrainingRecipe
     data: str | Path | Sequence[str | Path] | None
@@ -119,7 +119,7 @@ class _Run:
         threads = hardware.threads or (known.count("threads", MOST_AT_ONCE) if known is not None else None)
         material = material_of(self.recipe, self.data, render=self.render, gain=gain)
         network = network_for(self.recipe, material)
-        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # convolutions are faster
+        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster convolutions
         with _quiet(), _settings(threads), torch.random.fork_rng(devices=[]):
             module = NetworkTraining(network, self.recipe, material)
             journal = Journal(self.folder, module, material, pace)
@@ -132,7 +132,7 @@ class _Run:
         return Checkpoint.load(self.folder.path)
 
     def _begin(self, material: Material, module: NetworkTraining, trainer: lightning.Trainer, workers: int) -> None:
-        """Create the folder of the run, or check that it holds this run."""
+        """Create the folder of the run, or check that it contains the same run."""
         asked = {
             "data": material.about["name"],
             "digest": material.about["digest"],
@@ -151,10 +151,10 @@ class _Run:
         _warn_of_other_bits(earlier, notes)
 
     def _fit(self, module: NetworkTraining, journal: Journal, trainer: lightning.Trainer, workers: int) -> None:
-        """Train from the last state on, if steps and minutes are left.
+        """Train from the last state, if steps and minutes are left.
 
         Raises:
-            MitsonarError: no minutes are left, and there is no network yet.
+            MitsonarError: no minutes are left, but no network has been saved.
         """
         minutes = journal.pace.minutes
         state = self.folder.state if self.resume and self.folder.state.is_file() else None
@@ -170,7 +170,7 @@ class _Run:
 
 
 def _position(state: Path | None, journal: Journal) -> tuple[int, float]:
-    """Return the steps and minutes that a state has done; without a state none."""
+    """Return the steps done and minutes used in a state; zeros without a state."""
     if state is None:
         return 0, 0.0
     begun = StateFile().load_checkpoint(state)
@@ -178,14 +178,14 @@ def _position(state: Path | None, journal: Journal) -> tuple[int, float]:
 
 
 def leads() -> bool:
-    """Return whether this process writes and prints, of the several that Lightning may have started."""
+    """Return whether this process is the one that writes and prints, if Lightning has started several."""
     return all(os.environ.get(name, "0") == "0" for name in ("LOCAL_RANK", "NODE_RANK", "SLURM_PROCID"))
 
 
 def _changed(
     recipe: TrainingRecipe | str | Path, scale: float | None, pairs: int | None, precision: str | None
 ) -> TrainingRecipe:
-    """Load a recipe and change it by the arguments. The folder of the run keeps the result."""
+    """Load a recipe and apply the arguments that change it; the result is saved in the folder of the run."""
     recipe = recipe if isinstance(recipe, TrainingRecipe) else load_training_recipe(recipe)
     changes: JsonObject = {}
     if scale is not None:
@@ -205,7 +205,7 @@ def _trainer(module: NetworkTraining, folder: RunFolder, journal: Journal, hardw
     """Create Lightning's trainer.
 
     Raises:
-        MitsonarError: Lightning refuses an argument, or the devices cannot share a batch equally.
+        MitsonarError: Lightning rejects an argument, or a batch cannot be divided equally among the devices.
     """
     try:
         trainer = lightning.Trainer(
@@ -237,19 +237,19 @@ def _trainer(module: NetworkTraining, folder: RunFolder, journal: Journal, hardw
         )
     if trainer.strategy.root_device.type == "cpu":
         torch.use_deterministic_algorithms(True)
-        deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]  # a seventh of the time
+        deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]  # saves a seventh of the time
     return trainer
 
 
 def _tensorboard(folder: RunFolder) -> TensorBoardLogger | bool:
-    """Return what writes the rows of the log for TensorBoard, where that is installed."""
+    """Return the logger for TensorBoard; False if TensorBoard is not installed or this process does not write."""
     if not folder.writes or importlib.util.find_spec("tensorboard") is None:
         return False
     return TensorBoardLogger(folder.path, name="", version=EVENTS)
 
 
 def _workers(workers: int | None, known: RunDirectory | None, render: bool, trainer: lightning.Trainer) -> int:
-    """Return the number of processes that read or render: as in the earlier run, or by the machine."""
+    """Return the number of processes that read or render: that of the earlier run, or one that suits the machine."""
     if workers is not None:
         if workers < 0:
             raise MitsonarError(f"--workers must be at least 0: got {workers}")
@@ -264,7 +264,7 @@ def _workers(workers: int | None, known: RunDirectory | None, render: bool, trai
 
 
 def _warn_of_other_bits(had: RunDirectory | None, notes: JsonObject) -> None:
-    """Warn of differences after which a resumed run ends with other bits than an uninterrupted one."""
+    """Warn of differences because of which a resumed run ends with other bits than an uninterrupted one."""
     if had is None:
         return
     other = [
@@ -280,7 +280,7 @@ def _warn_of_other_bits(had: RunDirectory | None, notes: JsonObject) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence Lightning. Everything important is an error or in a report."""
+    """Silence Lightning; everything important is raised as an error or part of a report."""
     logs = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric", "lightning_utilities")]
     levels = [log.level for log in logs]
     with warnings.catch_warnings():
@@ -297,7 +297,7 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _settings(threads: int | None) -> Iterator[None]:
-    """Set the threads and algorithms of torch for this training, and restore them afterwards."""
+    """Set torch's number of threads for this training, and restore threads and algorithms afterwards."""
     had, exact = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
     filled = deterministic.fill_uninitialized_memory  # type: ignore[attr-defined]

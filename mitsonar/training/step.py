@@ -1,4 +1,4 @@
-"""One step of training as a Lightning module, and the network's estimates in physical units."""
+"""How one step of training works: network, loss and augmentation, as a Lightning module."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ __all__ = [
 
 
 def axes_of(labels: Labels) -> tuple[Axis, ...]:
-    """Return names and units of the estimates: of a motion or of a height."""
+    """Return the names and units of the estimates, which are a motion or a height."""
     known = {axis.name: axis for axis in (*AXES, Axis("height", "mm", 1e3))}
     return tuple(known[name.split()[0]] for name in labels.names)
 
 
 def estimates(output: NetworkOutput, labels: Labels) -> Array:
-    """Return the estimates of a network in SI units ``(batch, outputs)``; of a Gaussian head its (last) mean."""
+    """Return the estimates of a network in SI units ``(batch, outputs)``; for a Gaussian head the mean, or its last one."""
     if isinstance(output, GaussianHead):
         mean = output.mean if output.mean.dim() == 2 else output.mean[-1]
         return np.asarray(mean.detach().cpu().double().numpy())
@@ -55,10 +55,10 @@ def estimates(output: NetworkOutput, labels: Labels) -> Array:
 
 
 def network_for(recipe: TrainingRecipe, material: Material) -> nn.Module:
-    """Create the network of a recipe, with weights drawn by its seed, and try it on two samples.
+    """Create the network of a recipe, with initial weights drawn by its seed, and test it on two samples.
 
     Raises:
-        MitsonarError: an unknown network or option; or an input, labels or loss that do not fit the network.
+        MitsonarError: the network or an option is unknown, or input, labels or loss do not fit the network.
     """
     name, options = recipe.network["name"], {key: value for key, value in recipe.network.items() if key != "name"}
     _check_recipe(name, recipe)
@@ -75,7 +75,11 @@ def network_for(recipe: TrainingRecipe, material: Material) -> nn.Module:
 
 
 def _check_recipe(name: str, recipe: TrainingRecipe) -> None:
-    """Refuse input, labels or loss that do not fit a network."""
+    """Check that input, labels and loss fit a network.
+
+    Raises:
+        MitsonarError: they do not.
+    """
     words = recipe.input.model_dump()
     for word, needed in getattr(NETWORKS.get(name), "needs", {}).items():
         if words[word] != needed:
@@ -90,7 +94,11 @@ def _check_recipe(name: str, recipe: TrainingRecipe) -> None:
 
 
 def _try(network: nn.Module, name: str, inputs: NetworkInput, labels: Tensor, material: Material) -> None:
-    """Refuse a network that cannot read the input or does not return the labels."""
+    """Check that a network accepts the input and returns as many values as there are labels.
+
+    Raises:
+        MitsonarError: it does not.
+    """
     try:
         with torch.no_grad():
             shape = estimates(called(network.eval(), inputs), material.samples.labels).shape
@@ -101,7 +109,7 @@ def _try(network: nn.Module, name: str, inputs: NetworkInput, labels: Tensor, ma
     except ValueError as error:
         if isinstance(error, MitsonarError):
             raise
-        shape = (0, 0)  # labels of another number do not decode
+        shape = (0, 0)  # a different number of labels cannot be decoded
     if shape != labels.shape:
         raise MitsonarError(
             f"network {name} gives another number of values than the {labels.shape[1]} of the labels "
@@ -110,10 +118,10 @@ def _try(network: nn.Module, name: str, inputs: NetworkInput, labels: Tensor, ma
 
 
 def _begin_with(network: nn.Module, name: str, checkpoint: Checkpoint) -> None:
-    """Load the weights of a trained network.
+    """Load the weights of a trained network from a checkpoint.
 
     Raises:
-        MitsonarError: the checkpoint is of another network.
+        MitsonarError: the checkpoint is of another network, or has other options.
     """
     options = network.options
     if checkpoint.network != name or checkpoint.options != options:
@@ -125,7 +133,7 @@ def _begin_with(network: nn.Module, name: str, checkpoint: Checkpoint) -> None:
 
 
 class NetworkTraining(lightning.LightningModule):
-    """A network in training. Each step, with the draws of dropout, is a function of (recipe, step, weights).
+    """Network in training; each step, including dropout, depends only on (recipe, step, weights).
 
     Args:
         network: to be trained.
@@ -133,10 +141,10 @@ class NetworkTraining(lightning.LightningModule):
         material: data of the training.
 
     Attributes:
-        epoch_steps: steps of an epoch.
-        steps: of the whole training.
+        epoch_steps: number of steps per epoch.
+        steps: number of steps of the whole training.
         workers: number of processes that read or render.
-        squares: squared errors of the last step, mean over the batch [m^2, m^2, rad^2].
+        squares: squared errors of the last step, as means over the batch [m^2, m^2, rad^2].
     """
 
     def __init__(self, network: nn.Module, recipe: TrainingRecipe, material: Material) -> None:
@@ -149,14 +157,14 @@ class NetworkTraining(lightning.LightningModule):
         self.squares: Array = np.zeros(len(material.samples.labels.names))
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Load all batches from the next step on."""
+        """Return a loader of all batches from the next step to the end of training."""
         share = (self.trainer.global_rank, self.trainer.world_size)
         return batches(
             self.material, self.recipe, self.global_step, self.steps, device=self.device, workers=self.workers, share=share
         )
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Create Adam or AdamW. The learning rate is set before each step."""
+        """Create the optimiser, Adam or AdamW; its learning rate is set before each step."""
         wanted = self.recipe.optimiser
         kind: type[torch.optim.Adam] = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[wanted.kind]
         return kind(self.network.parameters(), lr=wanted.rate, weight_decay=wanted.weight_decay, fused=True)
@@ -167,7 +175,7 @@ class NetworkTraining(lightning.LightningModule):
         return self.recipe.optimiser.rate_at(self.global_step, self.epoch_steps, self.steps)
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Set the learning rate and the random numbers of this step."""
+        """Set the learning rate and seed torch's random generator for this step."""
         optimiser = self.optimizers()
         for group in optimiser.param_groups:  # type: ignore[union-attr]
             group["lr"] = self.rate
@@ -210,17 +218,17 @@ def rmse_by_level(
     device: torch.device | str | None = None,
     context: AbstractContextManager[object] | None = None,
 ) -> tuple[dict[str, Array], Array]:
-    """Compute the RMSE for each level of noise ``(outputs,)`` [m, m, rad], and that of always answering zero.
+    """Compute the RMSE for each noise level ``(outputs,)`` [m, m, rad], and that of the constant estimate zero.
 
-    The network is in evaluation mode meanwhile. Its mode is restored afterwards.
+    The network is evaluated in evaluation mode. Its mode is restored afterwards.
 
     Args:
-        network: to validate.
+        network: to be validated.
         validation: validation samples.
-        labels: encoding of its output.
-        batch: samples at a time.
+        labels: encoding of the network's output.
+        batch: number of samples per batch.
         device: of the network.
-        context: of the precision of training.
+        context: context manager for the precision of training.
     """
     squares: dict[str, list[Array]] = {level: [] for level in validation.arrangements}
     truths: list[Array] = []
@@ -237,21 +245,22 @@ def rmse_by_level(
     return means, np.asarray(np.sqrt(np.concatenate(truths).mean(axis=0)))
 
 
-# ---------------- Losses of training: eq. 3.1, eq. 3.2-3.3 with the penalty (Almanza-Medina, 3.4), and the Gaussian
-# likelihood
+# ---------------- Losses
 
 
 def squared_error(
     estimates: Tensor, labels: Tensor, *, penalty: float = 0.0, low: Tensor | float = -10.0, high: Tensor | float = 10.0
 ) -> Tensor:
-    """Return the loss of eq. 3.1, or with a penalty that of eq. 3.3: the sum of squared errors and penalties over 2 S W.
+    """Compute the squared-error loss of Almanza-Medina (3.4): eq. 3.1, or with a penalty eq. 3.3.
+
+    It is the sum of squared errors and penalties, divided by 2 S W.
 
     Args:
         estimates: ``(S, W)`` in label units.
         labels: ``(S, W)`` in label units.
         penalty: eta of eq. 3.2.
-        low: u_1 of eq. 3.2, one value or one for each of the W labels.
-        high: u_2 of eq. 3.2, one value or one for each of the W labels.
+        low: u_1 of eq. 3.2, a single value or one for each of the W labels.
+        high: u_2 of eq. 3.2, a single value or one for each of the W labels.
     """
     square = (estimates - labels).square()
     if penalty:
@@ -261,7 +270,10 @@ def squared_error(
 
 
 def create_loss(loss: Loss, labels: Labels) -> Callable[[NetworkOutput, Tensor], Tensor]:
-    """Return the loss of a network's output ``(batch, outputs)`` against labels, as a recipe defines it."""
+    """Return the loss function of a recipe, which takes a network's output and labels ``(batch, outputs)``.
+
+    It is the squared error, with or without a penalty, or the Gaussian likelihood.
+    """
     if loss.kind == "likelihood":
         return _likelihood
     low, high = (torch.from_numpy(labels.encode(end)) for end in (labels.low, labels.high))
@@ -281,18 +293,20 @@ def _likelihood(estimates: NetworkOutput, target: Tensor) -> Tensor:
     return likelihood(estimates, target)
 
 
-# ---------------- Data augmentation: random changes of frames and motions that leave the motion known
+# ---------------- Data augmentation
 
 
 STRANGERS = 0.05
-"""Part of the pairs whose second frame is another pair's. Nothing matches, and the covariance must be large."""
+"""Share of pairs whose second frame comes from another pair. Nothing matches there, so the covariance must be large."""
 
 Augmented = tuple[Tensor, Ground, Tensor]
 """Images ``(batch, 2, bins, beams)``, geometry of the ground, and motions ``(batch, 3)`` [m, m, rad]."""
 
 
 def augmented(inputs: tuple[Tensor, Ground], labels: Tensor, kinds: Sequence[str]) -> tuple[tuple[Tensor, Ground], Tensor]:
-    """Change inputs and labels of a batch at random, by torch's generator.
+    """Augment the inputs and labels of a batch by random changes after which the motion is still known.
+
+    The changes are drawn from torch's random generator.
 
     Args:
         inputs: images ``(batch, 2, bins, beams)`` and the geometry of the ground.
@@ -310,7 +324,7 @@ def augmented(inputs: tuple[Tensor, Ground], labels: Tensor, kinds: Sequence[str
 def mirrored(batch: Augmented) -> Augmented:
     """Exchange port and starboard in half of the pairs.
 
-    This holds for sonars without roll, whose beams are symmetric about the axis.
+    This is valid for sonars without roll whose beams are symmetric about the axis.
     """
     images, ground, labels = batch
     chosen = _some(labels, 0.5)
@@ -327,7 +341,7 @@ def reversed_(batch: Augmented) -> Augmented:
 
 
 def strange(batch: Augmented) -> Augmented:
-    """Replace some second frames by those of other pairs."""
+    """Replace the second frame by that of another pair in a share :data:`STRANGERS` of the pairs."""
     images, ground, labels = batch
     chosen = _some(labels, STRANGERS)
     second = torch.where(chosen[:, None, None], images[:, 1].roll(1, dims=0), images[:, 1])
@@ -339,9 +353,9 @@ AUGMENTATIONS: dict[str, Callable[[Augmented], Augmented]] = {
     "reverse": reversed_,
     "strangers": strange,
 }
-"""Changes of a batch, by name."""
+"""Augmentations of a batch, keyed by name."""
 
 
 def _some(labels: Tensor, part: float) -> Tensor:
-    """Draw which pairs are changed ``(batch,)``."""
+    """Draw a mask ``(batch,)`` of the pairs to change."""
     return torch.rand(len(labels), device=labels.device) < part
