@@ -1,6 +1,7 @@
-"""Names for arrays whose library is not known, for signatures.
+"""Type aliases for arrays whose library is not known.
 
-No type checker can say "the array that was handed in" across NumPy, torch and Dr.Jit. These names say it to readers.
+No type checker can express that a function returns an array of the same library as its argument, across NumPy, torch and
+Dr.Jit. These aliases document it for the reader.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import Any, TypeAlias
 __all__ = ["AnyArray", "DeviceArray"]
 
 AnyArray: TypeAlias = Any
-"""An array of NumPy, torch or Dr.Jit. The function returns the library that it was handed."""
+"""An array of NumPy, torch or Dr.Jit. Functions return arrays of the library that they receive."""
 
 DeviceArray: TypeAlias = Any
-"""An array of Dr.Jit in the variant that is set, perhaps not evaluated yet; also a number where Dr.Jit broadcasts it."""
+"""A Dr.Jit array in the current variant, possibly not evaluated yet; also a number where Dr.Jit broadcasts it."""

@@ -1,4 +1,4 @@
-"""Errors and warnings, in words a user can act on: what, got, allowed, what to do."""
+"""Raise errors and warnings that a user can act on: what is wrong, what was given, what is allowed, what to do."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ EXTRAS = {
     "small_gicp": ("bench", "the estimator cfar-gicp"),
     "pystackreg": ("bench", "the estimator stackreg"),
 }
-"""Optional packages: the extras that install each, by the tasks that need it, and what these tasks are."""
+"""Optional packages: the extras that install each, and the tasks that need it."""
 
 LONGEST_KEY = 60
-"""Letters of a key in a message; those of a stranger's file may be of any length."""
+"""Largest number of characters of a key in a message, since keys of foreign files may be of any length."""
 
 MARK = "\x1f"
-"""Marks the begin and the end of an argument's name in a message; never shown."""
+"""Delimiter of an argument's name within a message; never displayed."""
 
 
 class MitsonarError(ValueError):
@@ -67,11 +67,11 @@ class MitsonarError(ValueError):
         return self.said({})
 
     def said(self, options: Mapping[str, str]) -> str:
-        """Return the message in the words of its reader.
+        """Return the message with arguments named as the reader knows them.
 
         Args:
-            options: the option for each argument that :func:`mitsonar.errors.argument` names,
-                ``{"height_m": "--height"}``. Other arguments keep their Python names.
+            options: command-line option for each argument that :func:`mitsonar.errors.argument` marks, such as
+                ``{"height_m": "--height"}``. Other arguments appear under their Python names.
         """
 
         def typed(found: re.Match[str]) -> str:
@@ -83,10 +83,10 @@ class MitsonarError(ValueError):
 def argument(name: str) -> str:
     """Mark the name of an argument in the message of a :class:`MitsonarError`.
 
-    Where the command line has an option for the argument, it prints the option instead.
+    If the command line has an option for the argument, it prints the option instead.
 
     Args:
-        name: of the argument. Words before it say what it belongs to, as in ``sonar model``; an option replaces them too.
+        name: name of the argument. Preceding words state its owner, as in ``sonar model``; an option replaces them too.
     """
     return f"{MARK}{name}{MARK}"
 
@@ -96,10 +96,10 @@ class MitsonarWarning(UserWarning):
 
 
 def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
-    """Turn an absent optional package into a sentence that names the extra which installs it.
+    """Return an error that names the extra which installs a missing optional package.
 
     Raises:
-        ModuleNotFoundError: the error itself, where no extra installs that module.
+        ModuleNotFoundError: the original error, if no extra installs that module.
     """
     package = (error.name or "").partition(".")[0]
     if package not in EXTRAS:
@@ -110,7 +110,7 @@ def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
 
 
 def nearest_names(wrong: str, names: Iterable[str]) -> str:
-    """List the known names, those near to ``wrong`` first, for the end of an error message."""
+    """List the known names for the end of an error message, starting with those similar to ``wrong``."""
     known = list(names)
     near = [name for name in known if wrong and wrong.lower() in name.lower()]
     near = near or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
@@ -118,26 +118,26 @@ def nearest_names(wrong: str, names: Iterable[str]) -> str:
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
-    """Return a number with its noun, for messages: ``1 frame``, ``1,200 frames``."""
+    """Format a number with its noun for messages: ``1 frame``, ``1,200 frames``."""
     return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 def meant(wrong: object, names: Iterable[str]) -> str:
-    """Suggest the nearest of some names, for the end of a message that lists them; empty where none is near."""
+    """Suggest the most similar of some names, for the end of a message that lists them; empty if none is similar."""
     near = difflib.get_close_matches(str(wrong).lower(), [str(name) for name in names], n=1, cutoff=0.5)
     return f"; did you mean {near[0]}?" if near else ""
 
 
 def refuse_unknown(given: Iterable[str], known: Iterable[str], owner: str) -> None:
-    """Refuse keyword arguments of other names.
+    """Reject keyword arguments with unknown names.
 
     Args:
-        given: names.
-        known: those that there are.
-        owner: of the arguments, for the message.
+        given: names given.
+        known: valid names.
+        owner: owner of the arguments, for the message.
 
     Raises:
-        MitsonarError: an unknown name, with the nearest one and all that are known.
+        MitsonarError: an unknown name, with the most similar one and all valid ones.
     """
     names = list(known)
     for name in given:
@@ -146,13 +146,13 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str], owner: str) -> No
 
 
 def complaint(error: ValidationError, model: type[BaseModel], what: str, see: str = "") -> str:
-    """Turn the first of pydantic's complaints into one sentence: what, got, allowed.
+    """Turn the first error of a pydantic validation into one sentence: what is wrong, what was given, what is allowed.
 
     Args:
-        error: as pydantic raised it.
-        model: its fields are the known keys.
-        what: the owner of the keys, for the sentence: ``sonar``.
-        see: a page with more, for the end of the sentence.
+        error: the error raised by pydantic.
+        model: model whose fields are the valid keys.
+        what: owner of the keys, for the sentence, such as ``sonar``.
+        see: reference to a page, for the end of the sentence.
     """
     first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")  # a mistyped key explains a missing one
     where = [str(part) for part in first["loc"]]
@@ -170,14 +170,14 @@ def complaint(error: ValidationError, model: type[BaseModel], what: str, see: st
 
 
 def _meant(error: ErrorDetails) -> str:
-    """Suggest the nearest of the names that a value may have, where it is none of them."""
+    """Suggest the most similar allowed value if the given one is not allowed."""
     if error["type"] != "literal_error":
         return ""
     return meant(error["input"], re.findall(r"'([^']*)'", str(error["ctx"]["expected"])))
 
 
 def shortened(value: object) -> str:
-    """Return a value as Python writes it, cut where it is long. The value may be huge, or refer to itself."""
+    """Return the repr of a value, truncated if long. The value may be huge, or refer to itself."""
     if isinstance(value, int) and abs(value) > 10**40:
         return f"an integer of {value.bit_length():,} bits"
     brief = reprlib.Repr()
@@ -186,7 +186,7 @@ def shortened(value: object) -> str:
 
 
 def _fields_of(model: type[BaseModel], where: list[str]) -> dict[str, object]:
-    """Return the fields of a model nested in another; empty where the annotation does not name one model."""
+    """Return the fields of a nested model; empty if the annotation does not name exactly one model."""
     from pydantic import BaseModel
 
     for name in where:
@@ -201,7 +201,7 @@ def _fields_of(model: type[BaseModel], where: list[str]) -> dict[str, object]:
 
 
 def _kinds(annotation: object) -> list[type]:
-    """List the classes in an annotation: ``list[A] | None`` holds A and NoneType."""
+    """List the classes in an annotation: ``list[A] | None`` contains A and NoneType."""
     from typing import get_args
 
     parts = get_args(annotation)

@@ -1,8 +1,8 @@
 """Plugins for Mitsuba 3, usable from any XML scene: ``imaging_sonar``, ``echo``, ``acoustic_material`` ...
 
-Mitsuba keeps one registry of plugins a variant, and a class can derive from ``mi.Sensor`` only once a variant is set.
-:func:`install` registers them for the variant that is set, if any, and after each change of variant. Mitsuba may be imported
-before mitsonar or after it.
+Mitsuba has a separate plugin registry for each variant, and a class can derive from ``mi.Sensor`` only once a variant is
+set. :func:`install` registers the plugins for the current variant, if any, and after each change of variant. Mitsuba may be
+imported before or after mitsonar.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ PLUGINS = (
     "perlin",
     "trajectory_texture",
 )
-"""The modules that use Mitsuba, in the order in which they import each other."""
+"""Modules that use Mitsuba, in the order in which they import each other."""
 
 
 def install() -> None:
-    """Register the plugins now if Mitsuba is imported, otherwise as soon as it is. Set no variant."""
+    """Register the plugins now if Mitsuba is imported, otherwise once it is; does not set a variant."""
     if "mitsuba" in sys.modules:
         _watch_variants()
     elif not any(isinstance(finder, _AfterMitsuba) for finder in sys.meta_path):
@@ -48,7 +48,7 @@ def _watch_variants() -> None:
 
 
 def _register(_old: str | None, new: str | None) -> None:
-    """Load the plugin modules for the variant that is set now; in a scalar variant their names only, which refuse."""
+    """Load the plugin modules for the new variant; for a scalar variant, register plugins that only raise an error."""
     if new is None:
         return
     if not new.startswith(("llvm", "cuda")):
@@ -63,17 +63,17 @@ def _register(_old: str | None, new: str | None) -> None:
 
 
 class _AfterMitsuba(MetaPathFinder, Loader):
-    """Find ``mitsuba`` as usual, then watch its variants. ``import mitsonar`` need not wait until it is loaded."""
+    """Import hook that watches the variants of ``mitsuba`` once it is loaded, so ``import mitsonar`` need not import it."""
 
     def __init__(self) -> None:
         self.real: Loader | None = None
         self.searching = False
 
     def find_spec(self, name: str, path: object = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Return the spec of ``mitsuba`` with this loader in front of its own; None for any other module."""
+        """Return the spec of ``mitsuba`` with this loader in front of the original one; None for any other module."""
         if name != "mitsuba" or self.searching:
             return None
-        self.searching = True  # ask the other finders for it
+        self.searching = True  # so that the other finders are used
         try:
             spec = importlib.util.find_spec(name)
         finally:
@@ -83,12 +83,12 @@ class _AfterMitsuba(MetaPathFinder, Loader):
         return spec
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        """Create the module as its own loader does."""
+        """Create the module with its original loader."""
         assert self.real is not None
         return self.real.create_module(spec)
 
     def exec_module(self, module: ModuleType) -> None:
-        """Load the module, leave the import system, and register the plugins."""
+        """Load the module, remove this import hook, and register the plugins."""
         assert self.real is not None
         module.__spec__.loader = module.__loader__ = self.real  # type: ignore[union-attr]
         self.real.exec_module(module)

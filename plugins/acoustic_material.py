@@ -1,4 +1,4 @@
-"""The BSDF ``acoustic_material``."""
+"""The BSDF ``acoustic_material``: a surface whose echo depends on the grazing angle."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from mitsonar.plugins.native_plugins import load_dict
 __all__ = ["AcousticMaterial", "is_acoustic_material"]
 
 SHADE = 0.5
-"""Reflectance for cameras where none is given."""
+"""Default reflectance for cameras."""
 
 NO_MATERIAL = "none"
-"""Material of a surface that has none."""
+"""Name that selects a surface without a material."""
 
 LOUDEST, FAINTEST = 1.0, 1e-6
-"""Bounds of the one reflectivity that stands for a material where its law is not asked."""
+"""Limits of the single reflectivity that represents a material where its scattering law is not evaluated."""
 
 
 class AcousticMaterial(mi.BSDF):
     """A surface of a material of :mod:`mitsonar.acoustics.materials`: its echo follows a law of the grazing angle.
 
-    Properties: ``material``: a name, or a YAML file (its path counts from the scene's folder), or ``none``, which makes
-    a plain ``diffuse`` whose reflectance is the reflectivity; ``reflectance`` [0.5]: a texture or number.
-    ``reflectance_mean`` [the texture's own]: what it is divided by for sonars; ``mesh_attribute`` needs it.
+    Properties: ``material``: a name, or a YAML file (relative to the scene's folder), or ``none``, which gives a plain
+    ``diffuse`` whose reflectance is the reflectivity; ``reflectance`` [0.5]: a texture or number. ``reflectance_mean`` [the
+    mean of the texture]: what the reflectance is divided by for sonars; required for ``mesh_attribute``.
 
-    Cameras see a diffuse surface of that reflectance, from both sides. For sonars only its relative variation counts: it is
-    divided by its mean, and multiplies the cross-section. So a number changes nothing but the camera's picture.
+    Cameras see a diffuse surface of that reflectance, from both sides. For sonars only its relative variation matters: it is
+    divided by its mean, and multiplies the cross-section. A plain number therefore affects only camera images.
 
-    The models ``physical`` and ``coherent`` read the law at each ray's angle, at the sonar's frequency. The model ``thesis``
-    takes the law's mu, or sigma at normal incidence, for all angles. Impulse responses, other sensors and shapes of a
-    ``shapegroup`` take mu, or sigma / sin^2 at 45 deg of grazing.
+    The models ``physical`` and ``coherent`` evaluate the law at each ray's angle, at the sonar's frequency. The model
+    ``thesis`` uses the mu of the law, or sigma at normal incidence, for all angles. Impulse responses, other sensors and
+    shapes of a ``shapegroup`` use mu, or sigma / sin^2 at 45 deg grazing.
 
-    Not modelled: the mirror part's own echo, transmission, two materials on one shape.
+    Not modelled: the echo of the mirror part, transmission, two materials on one shape.
 
     .. code-block:: xml
 
@@ -62,7 +62,7 @@ class AcousticMaterial(mi.BSDF):
         self.m_flags = self.shown.flags()
 
     def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: DeviceArray = True) -> mi.Spectrum:
-        """Return the one reflectivity that sonars take where they do not ask the law: mu times the relative variation."""
+        """Return the reflectivity for sonars that do not evaluate the law: mu times the relative variation."""
         value: Any = self.reflectance.eval(si, active) * (self.mu / self.mean)
         return mi.Spectrum(value)
 
@@ -74,7 +74,7 @@ class AcousticMaterial(mi.BSDF):
         sample2: mi.Point2f,
         active: DeviceArray = True,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-        """Sample a direction as the diffuse surface does that cameras see."""
+        """Sample a direction from the diffuse surface that cameras see."""
         return self.shown.sample(ctx, si, sample1, sample2, active)
 
     def eval(
@@ -86,7 +86,7 @@ class AcousticMaterial(mi.BSDF):
     def pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: DeviceArray = True
     ) -> DeviceArray:
-        """Return the density of :meth:`sample`."""
+        """Return the probability density of :meth:`sample`."""
         return self.shown.pdf(ctx, si, wo, active)
 
     def eval_pdf(
@@ -96,11 +96,11 @@ class AcousticMaterial(mi.BSDF):
         return self.shown.eval_pdf(ctx, si, wo, active)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Show the reflectance to ``mi.traverse``."""
+        """Expose the reflectance to ``mi.traverse``."""
         callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Read the mean of the reflectance anew, which has changed."""
+        """Update the mean of the reflectance after a change."""
         self.mean = _mean(self.reflectance, self.given_mean)
 
     def to_string(self) -> str:
@@ -109,7 +109,7 @@ class AcousticMaterial(mi.BSDF):
 
 
 def _material(name: str) -> Material:
-    """Return the material of a name, or of a YAML file that Mitsuba finds from the scene's folder."""
+    """Return a material by name, or from a YAML file that Mitsuba resolves relative to the scene's folder."""
     if not name:
         raise MitsonarError(
             f"acoustic_material needs a material: {', '.join(named_materials())}, or a YAML file of your own"
@@ -120,7 +120,7 @@ def _material(name: str) -> Material:
 
 
 def _mean(texture: mi.Texture, given: float) -> float:
-    """Return what a reflectance is divided by, above 0."""
+    """Return the positive number by which a reflectance is divided."""
     if given == 0:
         try:
             given = float(texture.mean()[0])
@@ -135,12 +135,12 @@ def _mean(texture: mi.Texture, given: float) -> float:
 
 
 def is_acoustic_material(bsdf: mi.Object) -> bool:
-    """Return whether a BSDF is one. Compare names: each variant makes the class anew."""
+    """Return whether a BSDF is an acoustic material, by class name, since each variant creates a new class."""
     return type(bsdf).__name__ == AcousticMaterial.__name__
 
 
 def _create(props: mi.Properties) -> mi.BSDF:
-    """Return the BSDF: a plain diffuse one for the material ``none``."""
+    """Create the BSDF, which is a plain diffuse one for the material ``none``."""
     if str(props.get("material", "")) != NO_MATERIAL:
         return AcousticMaterial(props)
     reflectance = props.get_texture("reflectance", SHADE)

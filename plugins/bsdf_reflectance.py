@@ -1,4 +1,4 @@
-"""The reflectivity of a BSDF: which textures it comes from, and its value at points."""
+"""Find the textures that determine the reflectivity of a BSDF, and evaluate it at points."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ WRAPPERS = {"TwoSidedBRDF", "MaskBSDF", TWO_FACED, *BENT}
 
 
 def reflectances_of(bsdf: mi.BSDF) -> list[mi.Object]:
-    """Return the textures that a BSDF's reflectivity may come from."""
+    """Return the textures that may determine the reflectivity of a BSDF."""
     return kinds_and_textures(bsdf)[1]
 
 
 def reflectivity_at(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f) -> DeviceArray:
-    """Return the reflectivity 0..1 of a BSDF at points; :data:`DEFAULT_REFLECTIVITY` where it has no diffuse reflectance."""
+    """Return the reflectivity 0..1 of a BSDF at points, or :data:`DEFAULT_REFLECTIVITY` without a diffuse reflectance."""
     if not kinds_and_textures(bsdf)[0] <= DIFFUSE | APPROXIMATED | WRAPPERS:
         return mi.Float(DEFAULT_REFLECTIVITY)
     return unit(one_number(bsdf.eval_diffuse_reflectance(si)))
@@ -52,25 +52,25 @@ def one_number(spectrum: DeviceArray) -> DeviceArray:
 
 
 def unit(value: DeviceArray) -> DeviceArray:
-    """Clip to 0..1, by comparisons: LLVM 15 and 16 abort on `max` (see simulation.variant)."""
+    """Clip to 0..1, using comparisons since LLVM 15 and 16 abort on `max` (see simulation.variant)."""
     return dr.select(value > 0, dr.select(value < 1, value, 1), 0)
 
 
 class _Children(mi.TraversalCallback):
-    """Collect the objects directly below one."""
+    """Traversal that collects the direct children of an object."""
 
     def __init__(self) -> None:
         super().__init__()
         self.objects: list[mi.Object] = []
 
     def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
-        """Keep a value that is an object; Mitsuba calls this for each parameter."""
+        """Collect a value if it is an object; Mitsuba calls this for each parameter."""
         if isinstance(value, mi.Object):
             self.objects.append(value)
 
 
 def kinds_and_textures(bsdf: mi.BSDF) -> tuple[set[str], list[mi.Object]]:
-    """Return the class names of a BSDF and all nested ones, and the textures that their reflectance may come from."""
+    """Return the class names of a BSDF and all nested ones, and the textures that may determine their reflectance."""
     children = _Children()
     bsdf.traverse(children)
     kinds, textures = {_kind(bsdf)}, []
@@ -87,19 +87,19 @@ def kinds_and_textures(bsdf: mi.BSDF) -> tuple[set[str], list[mi.Object]]:
 
 
 def _kind(bsdf: mi.Object) -> str:
-    """Return the name of a BSDF's class; Mitsuba calls all that are written in Python ``BSDF``."""
+    """Return the class name of a BSDF, since Mitsuba reports ``BSDF`` for all those written in Python."""
     name = bsdf.class_name()
     return type(bsdf).__name__ if name == "BSDF" else name
 
 
 def constant_on_facets(texture: mi.Object) -> bool:
-    """Return whether a texture has one value on each facet."""
+    """Return whether a texture is constant on each facet."""
     name = texture.class_name()
     return name == "UniformSpectrum" or (name == "MeshAttribute" and 'name = "face_' in str(texture))
 
 
 def is_black(bsdf: mi.BSDF) -> bool:
-    """Return whether a BSDF is diffuse and reflects nothing anywhere."""
+    """Return whether a BSDF is diffuse with zero reflectance everywhere."""
     kinds, textures = kinds_and_textures(bsdf)
     if kinds != {"SmoothDiffuse"} or any(texture.class_name() != "UniformSpectrum" for texture in textures):
         return False
@@ -107,5 +107,5 @@ def is_black(bsdf: mi.BSDF) -> bool:
 
 
 def by_vertex(texture: mi.Object) -> bool:
-    """Return whether a texture is an attribute of a mesh."""
+    """Return whether a texture is a mesh attribute."""
     return texture.class_name() == "MeshAttribute"

@@ -1,4 +1,4 @@
-"""The texture ``cell_noise``."""
+"""The texture ``cell_noise``: an independent random value in each cell of a grid."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ __all__ = ["CellNoise"]
 
 
 class CellNoise(HashedTexture):
-    """Independent reflectivity in every cell of a grid, from a hash: no bitmap in memory, however fine the grid.
+    """Independent reflectivity in every cell of a grid, computed from a hash without a bitmap in memory at any resolution.
 
-    Properties: ``coordinates`` [uv]: uv or position; ``cells`` [2048]: cells a unit of uv; ``cell_size`` [m, 0.015]: edge
-    of a cubic cell for position; ``distribution`` [uniform]: uniform in ``low``..``high`` [0..1], or gaussian with
-    ``mean`` [0.5] and ``std`` [0.2], clipped to 0..1; ``octaves`` [1]: grids of half the cell each with half the weight;
-    ``seed`` [0]; ``to_uv``: transform of uv.
+    Properties: ``coordinates`` [uv]: uv or position; ``cells`` [2048]: cells per unit of uv; ``cell_size`` [m, 0.015]: edge
+    of a cubic cell for position; ``distribution`` [uniform]: uniform in ``low``..``high`` [0..1], or gaussian with ``mean``
+    [0.5] and ``std`` [0.2], clipped to 0..1; ``octaves`` [1]: number of grids, each with half the cell size and half the
+    weight of the previous one; ``seed`` [0]; ``to_uv``: transform of uv.
 
-    It does not filter. A ray reads the one cell that it hits.
+    It is not filtered: a ray reads the single cell that it hits.
 
     .. code-block:: xml
 
@@ -44,7 +44,7 @@ class CellNoise(HashedTexture):
             )
 
     def octave(self, point: DeviceArray, seed: int) -> DeviceArray:
-        """Return the value of the cell that holds ``point``, in cells."""
+        """Return the value of the cell that contains ``point``, in units of cells."""
         first, second = self.hash(dr.floor(point), seed)
         value: DeviceArray = (mi.Float(first >> 8) + 0.5) * 2.0**-24
         if self.distribution == "uniform":

@@ -1,4 +1,4 @@
-"""The sensor ``channel_sonar``."""
+"""The sensor ``channel_sonar``: a transmitter and receivers for channel impulse responses."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ OWN = tuple(name for name in ChannelSonar.model_fields if name not in ("transmit
 class ChannelSensor(mi.Sensor):
     """A transmitter and named receivers between which channel impulse responses are measured.
 
-    Properties: those of :class:`mitsonar.instruments.hydrophones.ChannelSonar` (``carrier_hz`` [Hz, 80000],
-    ``bandwidth_hz`` [Hz, 4800], ``sampling_hz`` [Hz, 8000], ``frequency_step_hz`` [Hz, 10], ``rolloff`` [0.5], ``range_max``
-    [m, 25], ``sound_speed`` [m/s, 1500], ``frame_rate_hz`` [Hz, 20], ``model`` [scatterers], ``spreading``,
-    ``bounces`` [1], ``direct`` [false], ``points_per_m2`` [1700],
-    ``scatterer_spacing_m`` [m], ``rays`` [50000], ``seed`` [0], ``name``); ``receivers`` [front,
-    left, back, right]: names with commas between; ``to_world``: of the vehicle, local +z forward, +y up.
+    Properties: those of :class:`mitsonar.instruments.hydrophones.ChannelSonar` (``carrier_hz`` [Hz, 80000], ``bandwidth_hz``
+    [Hz, 4800], ``sampling_hz`` [Hz, 8000], ``frequency_step_hz`` [Hz, 10], ``rolloff`` [0.5], ``range_max`` [m, 25],
+    ``sound_speed`` [m/s, 1500], ``frame_rate_hz`` [Hz, 20], ``model`` [scatterers], ``spreading``, ``bounces`` [1],
+    ``direct`` [false], ``points_per_m2`` [1700], ``scatterer_spacing_m`` [m], ``rays`` [50000], ``seed`` [0], ``name``);
+    ``receivers`` [front, left, back, right]: names separated by commas; ``to_world``: of the vehicle, local +z forward, +y
+    up.
 
     Fields of view of all receivers: ``shape`` [rectangular], ``tilt_deg`` [deg, 25], ``across_deg`` [deg, 10], ``along_deg``
-    [deg, 50], ``taper`` [0.5]. Of one receiver: the same and ``heading_deg``, with the receiver's name before, as in
+    [deg, 50], ``taper`` [0.5]. Of one receiver: the same and ``heading_deg``, prefixed with the name of the receiver, as in
     ``front_heading_deg``; and its position, ``front_position`` [m, starboard, forward, up]. Of the transmitter:
     ``transmitter_shape`` [all] and so on.
 
-    By default the receivers front, left, back and right lie 0.1 m from the transmitter and point that way. Others must have
-    a heading and a position. As a camera the sensor sends one ray, forward; ``mitsonar impulse`` computes responses. It does
-    not model a vehicle that shadows its own receivers. Several bounces need mirrors (``--mirrors``).
+    By default the receivers front, left, back and right lie 0.1 m from the transmitter and point outwards. Others require a
+    heading and a position. As a camera the sensor sends one ray, forward; ``mitsonar impulse`` computes responses. Shadowing
+    of the receivers by the vehicle is not modelled. Multiple bounces require mirrors (``--mirrors``).
 
     .. code-block:: xml
 
@@ -60,7 +60,7 @@ class ChannelSensor(mi.Sensor):
             one = {"type": "hdrfilm", "width": 1, "height": 1, "pixel_format": "luminance", "rfilter": {"type": "box"}}
             props["film"] = load_dict(one)
         super().__init__(props)
-        self.pose  # noqa: B018  a to_world that scales is refused here
+        self.pose  # noqa: B018  rejects a to_world with scaling
 
     @property
     def pose(self) -> Pose:
@@ -75,7 +75,7 @@ class ChannelSensor(mi.Sensor):
         sample3: mi.Point2f,
         active: DeviceArray = True,
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """Return a ray forward, and weight 1."""
+        """Return a forward ray with weight 1."""
         matrix = to_world_matrices(self.pose)[0]
         ray = dr.zeros(mi.Ray3f, dr.width(sample2))
         ray.o, ray.d = mi.Point3f(*map(float, matrix[:3, 3])), mi.Vector3f(*map(float, matrix[:3, 2]))
@@ -101,12 +101,12 @@ class ChannelSensor(mi.Sensor):
 
 
 def is_channel_sonar(sensor: mi.Sensor) -> bool:
-    """Return whether a sensor is one. Compare names: each variant makes the class anew."""
+    """Return whether a sensor is a channel sonar, by class name, since each variant creates a new class."""
     return any(base.__name__ == ChannelSensor.__name__ for base in type(sensor).__mro__)
 
 
 def _read(props: mi.Properties) -> ChannelSonar:
-    """Read the instrument from the properties."""
+    """Create the instrument from the properties."""
     fields = _some(props, OWN)
     shared = _some(props, tuple(name for name in FIELD if name != "heading_deg"))
     sends = {"shape": "all", **_some(props, FIELD, "transmitter_")}
@@ -136,7 +136,7 @@ def _read(props: mi.Properties) -> ChannelSonar:
 
 
 def _position(key: str, value: object) -> tuple[float, ...]:
-    """Three numbers from a point, or from a text with commas."""
+    """Parse three numbers from a point, or from comma-separated text."""
     try:
         given = value.replace(",", " ").split() if isinstance(value, str) else np.ravel(cast(ArrayLike, value))
         position = tuple(float(number) for number in given)
@@ -149,10 +149,10 @@ def _position(key: str, value: object) -> tuple[float, ...]:
 
 
 def _refuse_unknown(props: mi.Properties, names: list[str]) -> None:
-    """Refuse properties that the sensor does not have.
+    """Check that the sensor has all of the given properties.
 
     Raises:
-        MitsonarError: there are some.
+        MitsonarError: an unknown property.
     """
     known = {*OWN, *FIELD, "receivers", "to_world", "id", *(f"transmitter_{key}" for key in FIELD)} - {"heading_deg"}
     known |= {f"{name}_{key}" for name in names for key in (*FIELD, "position")}
@@ -162,7 +162,7 @@ def _refuse_unknown(props: mi.Properties, names: list[str]) -> None:
 
 
 def _some(props: mi.Properties, names: tuple[str, ...], before: str = "") -> dict[str, object]:
-    """Return the properties of these names that are given."""
+    """Return those of the named properties that are given."""
     return {name: props[before + name] for name in names if before + name in props}
 
 

@@ -1,4 +1,4 @@
-"""The integrator ``echo``."""
+"""The integrator ``echo``: one ray per pixel, and what it meets."""
 
 from __future__ import annotations
 
@@ -18,40 +18,43 @@ from mitsonar.records.echoes import CHANNELS, Echoes
 __all__ = ["GRAZING", "Echo", "edge_direction", "flatter", "steep"]
 
 GRAZING = 0.02
-"""Sine of the flattest angle (1.1 deg) at which a cell follows its tangent plane unasked: flatter, it may leave the body."""
+"""Sine of the grazing angle (1.1 deg) down to which a cell is extended along its tangent plane without a check.
+
+At smaller angles the plane may leave the body.
+"""
 
 LEVEL = 0.01
-"""Sine of the largest angle between the tangent plane and the line to an edge, on the same surface as the point hit."""
+"""Sine of the largest angle to the tangent plane at which the line to an edge stays on the surface of the hit point."""
 
 
 def steep(toward: DeviceArray) -> DeviceArray:
-    """Return the part of a ray along the normal, kept away from 0 where the ray grazes (see :data:`GRAZING`)."""
+    """Return the component of a ray along the normal, bounded away from 0 for grazing rays (see :data:`GRAZING`)."""
     size: DeviceArray = dr.abs(toward)
     return dr.select(size > GRAZING, toward, dr.select(toward > 0, GRAZING, -GRAZING))
 
 
 def edge_direction(fan: Fan, angle: DeviceArray) -> DeviceArray:
-    """Return the unit direction to the middle of a cell's edge, ``angle`` above the ray [rad]; to its first order."""
+    """Return the unit direction to the middle of a cell's edge, ``angle`` above the ray [rad], to first order."""
     return dr.normalize(fan.d + fan.side * fan.aside + fan.lift * angle)
 
 
 def flatter(normal: DeviceArray, d: DeviceArray, way: DeviceArray) -> DeviceArray:
-    """Return whether a direction meets the tangent plane of the ray ``d`` below :data:`GRAZING`, or does not meet it."""
+    """Return whether a direction meets the tangent plane of the ray ``d`` below :data:`GRAZING`, or misses it."""
     return dr.dot(normal, way) * dr.select(dr.dot(normal, d) > 0, 1, -1) <= GRAZING
 
 
 class Echo(ADIntegrator):
     """Record what each ray meets: range, reflectivity, |cosine|, point, geometric normal, shape, solid angle.
 
-    The film's own channel holds reflectivity times cosine. The channels after it are those of
+    The film's main channel holds reflectivity times cosine. It is followed by the channels of
     :class:`mitsonar.records.echoes.Echoes`, in its order, all float32. A miss has ``hit`` 0, ``shape_id`` -1 and zero
-    elsewhere. Each pixel gets exactly one ray, whatever the sampler asks for, so nothing is averaged. The ray passes through
-    the pixel's cell (``imaging_sonar``) or its centre (any other sensor). The range counts from the sensor's position, also
-    where a camera starts its rays at a near plane. With other sensors than ``imaging_sonar`` the solid angle is 0 and
+    elsewhere. Each pixel gets exactly one ray, whatever the sampler requests, so nothing is averaged. The ray passes through
+    the pixel's cell (``imaging_sonar``) or its centre (any other sensor). The range is measured from the sensor's position,
+    even if a camera starts its rays at a near plane. With sensors other than ``imaging_sonar`` the solid angle is 0 and
     ``near_m`` = ``far_m`` = ``range_m``.
 
-    Properties: none. Reflectivity of BSDFs that are not diffuse: see :mod:`mitsonar.plugins.surfaces`. It does not
-    model multiple bounces, transmission or volumes.
+    Properties: none. For the reflectivity of BSDFs that are not diffuse, see :mod:`mitsonar.plugins.surfaces`. Multiple
+    bounces, transmission and volumes are not modelled.
 
     .. code-block:: xml
 
@@ -59,7 +62,7 @@ class Echo(ADIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        if given := list(props.keys()):  # before the base class reads max_depth, rr_depth and hide_emitters
+        if given := list(props.keys()):  # check before the base class reads max_depth, rr_depth and hide_emitters
             raise MitsonarError(f"the integrator echo has no properties: got {', '.join(given)}; leave them out")
         super().__init__(props)  # type: ignore[no-untyped-call]  # Mitsuba's own class has no types
         self._fan: Fan | None = None
@@ -71,24 +74,27 @@ class Echo(ADIntegrator):
     def measure(
         scene: mi.Scene, surfaces: Surfaces, ray: mi.Ray3f, fan: Fan, skipped: DeviceArray = 0.0, *, edges: bool = False
     ) -> Echoes:
-        """Return the echoes of rays, arrays that are not evaluated yet.
+        """Return the echoes of rays as arrays that are not evaluated yet.
 
-        The cell's range interval is that of its middle line, wherever in its cell the ray is: see :func:`_interval`.
+        The range interval of a cell is that of its centre line, wherever the ray lies within the cell: see
+        :func:`_interval`.
 
         Args:
-            scene: is traced.
+            scene: scene to trace.
             surfaces: tables of that scene.
-            ray: one a cell, in world axes.
+            ray: one ray per cell, in world axes.
             fan: the same rays; ``lift`` and ``side`` in world axes.
             skipped: distance from the sonar to where each ray starts [m].
-            edges: whether flat edges of cells are traced (:func:`_meets`), as sums over footprints need it.
+            edges: whether grazing edges of cells are traced (:func:`_meets`), as sums over footprints require.
         """
         hit = surfaces.hit(scene, ray)
         valid = hit.valid
+        # Cosine of incidence, clipped against rounding, and the ranges of the cell's edges on the tangent plane.
         toward = dr.dot(hit.n, ray.d)
         cosine = dr.select(dr.abs(toward) < 1, dr.abs(toward), 1)
         range_m = hit.t + skipped
         low, high = _interval(fan, hit, range_m)
+        # At grazing incidence the tangent plane may leave the body, so trace the edges.
         if edges:
             low, high = _meets(scene, ray, fan, hit, fan.below, low), _meets(scene, ray, fan, hit, fan.above, high)
         point = ray.o + ray.d * hit.t
@@ -121,14 +127,14 @@ class Echo(ADIntegrator):
     def prepare(
         self, sensor: mi.Sensor, seed: DeviceArray = 0, spp: int = 0, aovs: list[str] | None = None
     ) -> tuple[mi.Sampler, int]:
-        """Prepare one sample a pixel, whatever ``spp`` is asked."""
+        """Prepare one sample per pixel, whatever ``spp`` is requested."""
         sampler, samples = super().prepare(sensor, seed, 1, aovs or [])
         return sampler, samples
 
     def sample_rays(
         self, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Vector2f]:
-        """Return the one ray of every pixel, its weight, and its film position in pixels."""
+        """Return one ray per pixel, its weight, and its film position in pixels."""
         size = sensor.film().crop_size()
         index = dr.arange(mi.UInt32, dr.prod(size))
         row, column = index // size.x, index % size.x
@@ -168,11 +174,11 @@ class Echo(ADIntegrator):
 
 
 def _interval(fan: Fan, hit: Hit, range_m: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
-    """Return the ranges of a cell's lower and upper edge on the tangent plane of the point hit [m].
+    """Return the ranges of a cell's lower and upper edge on the tangent plane of the hit point [m].
 
-    There dR/de = -R (n . dd/de) / (n . d), and the same by bearing. So on a plane cells join without gap or overlap, also
-    where rays jitter, as long as they are short along range. The slope is that at :data:`GRAZING` at most: beyond the end
-    of a body a cell reaches by R de / GRAZING.
+    There dR/de = -R (n . dd/de) / (n . d), and the same for bearing. On a plane, cells therefore join without gaps or
+    overlaps, even if rays are jittered, as long as cells are short along range. The slope is limited to that at
+    :data:`GRAZING`: beyond the end of a body, a cell extends by R de / GRAZING.
     """
     per_radian = -range_m / steep(dr.dot(hit.n, fan.d))
     slope = per_radian * dr.dot(hit.n, fan.lift)
@@ -181,10 +187,10 @@ def _interval(fan: Fan, hit: Hit, range_m: DeviceArray) -> tuple[DeviceArray, De
 
 
 def _meets(scene: mi.Scene, ray: mi.Ray3f, fan: Fan, hit: Hit, angle: DeviceArray, otherwise: DeviceArray) -> DeviceArray:
-    """Return where a flat edge of a cell meets the surface that its ray met [m]; elsewhere ``otherwise``.
+    """Return where a grazing edge of a cell meets the surface that its ray met [m], or else ``otherwise``.
 
-    The edge's point counts where the line to it lies within :data:`LEVEL` of the tangent plane. An edge is the same ray for
-    both of its cells, so they join.
+    The point on the edge counts if the line to it lies within :data:`LEVEL` of the tangent plane. An edge is the same ray
+    for both of its cells, so they join.
     """
     way = edge_direction(fan, angle)
     asked = hit.valid & flatter(hit.n, ray.d, way)

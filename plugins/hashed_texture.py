@@ -1,4 +1,4 @@
-"""The base class of the textures ``cell_noise`` and ``perlin``: a value that is a hash of the point on a surface."""
+"""Base class of the textures ``cell_noise`` and ``perlin``, whose values are hashes of the point on a surface."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from mitsonar.errors import MitsonarError
 __all__ = ["ROUNDS", "HashedTexture", "number_of_property"]
 
 ROUNDS = 8
-"""Rounds of the hash (Tiny Encryption Algorithm): with Mitsuba's default of 4, neighbours correlate by 0.4."""
+"""Rounds of the hash (Tiny Encryption Algorithm); with Mitsuba's default of 4, neighbours have a correlation of 0.4."""
 
 
 class HashedTexture(mi.Texture):
-    """A sum of octaves over uv or world position. A subclass defines :meth:`octave`."""
+    """A sum of octaves over uv or world position. Subclasses define :meth:`octave`."""
 
     def __init__(self, props: mi.Properties, *, cells: float, cell_size: float, octaves: int = 1) -> None:
         super().__init__(props)
@@ -48,13 +48,13 @@ class HashedTexture(mi.Texture):
         """Return the values of one octave.
 
         Args:
-            point: Dr.Jit points of 2 or 3 coordinates, in cells.
-            seed: of this octave, 0..2^32 - 1.
+            point: Dr.Jit points with 2 or 3 coordinates, in units of cells.
+            seed: seed of this octave, 0..2^32 - 1.
         """
         raise NotImplementedError
 
     def finish(self, value: DeviceArray) -> DeviceArray:
-        """Return the value of the texture for the mean of the octaves; a subclass may change it."""
+        """Map the mean of the octaves to the value of the texture; subclasses may override this."""
         return value
 
     def hash(self, point: DeviceArray, seed: int) -> tuple[DeviceArray, DeviceArray]:
@@ -67,7 +67,7 @@ class HashedTexture(mi.Texture):
         return first, second
 
     def value(self, si: mi.SurfaceInteraction3f) -> DeviceArray:
-        """Return the mean of the octaves. Each has half the weight of the one before."""
+        """Return the mean of the octaves, each with half the weight of the previous one."""
         on_surface = self.coordinates == "uv"
         point = self._transformed(si.uv) * self.cells if on_surface else si.p / self.cell_size
         total: DeviceArray = mi.Float(0)
@@ -82,19 +82,19 @@ class HashedTexture(mi.Texture):
         return mi.Point2f(*(float(u) * uv.x + float(v) * uv.y + float(one) for u, v, one in self.to_uv))
 
     def eval(self, si: mi.SurfaceInteraction3f, active: DeviceArray = True) -> mi.UnpolarizedSpectrum:
-        """Return :meth:`value` as a spectrum; 0 where not active."""
+        """Return :meth:`value` as a spectrum; 0 for inactive lanes."""
         return mi.UnpolarizedSpectrum(dr.select(active, self.value(si), 0))
 
     def eval_1(self, si: mi.SurfaceInteraction3f, active: DeviceArray = True) -> DeviceArray:
-        """Return :meth:`value`; 0 where not active."""
+        """Return :meth:`value`; 0 for inactive lanes."""
         return dr.select(active, self.value(si), 0)
 
     def eval_3(self, si: mi.SurfaceInteraction3f, active: DeviceArray = True) -> mi.Color3f:
-        """Return :meth:`value` as a grey colour; 0 where not active."""
+        """Return :meth:`value` as a grey colour; 0 for inactive lanes."""
         return mi.Color3f(self.eval_1(si, active))
 
     def is_spatially_varying(self) -> bool:
-        """Return True: Mitsuba must not take the texture for a constant."""
+        """Return True, so that Mitsuba does not treat the texture as constant."""
         return True
 
     def to_string(self) -> str:
@@ -103,12 +103,12 @@ class HashedTexture(mi.Texture):
 
 
 def number_of_property(props: mi.Properties, name: str, default: float) -> float:
-    """Return a number among a plugin's properties."""
+    """Return a numeric property of a plugin."""
     return float(cast(float, props.get(name, default)))
 
 
 def _scramble(seed: int, octave: int) -> int:
-    """32 bits of seed and octave (the finaliser of SplitMix64)."""
+    """Hash seed and octave to 32 bits (the finaliser of SplitMix64)."""
     value = (seed * 64 + octave + 1) * 0x9E3779B97F4A7C15 % 2**64
     value = (value ^ (value >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
     value = (value ^ (value >> 27)) * 0x94D049BB133111EB % 2**64

@@ -1,4 +1,4 @@
-"""The sensor ``imaging_sonar``."""
+"""The sensor ``imaging_sonar``: the fans of rays of an imaging sonar."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ __all__ = ["Fan", "ImagingSonar", "is_imaging_sonar"]
 
 @dataclass
 class Fan:
-    """Rays in the sensor's frame (local +z the acoustic axis, +y up, +x port).
+    """Rays in the sensor's frame (local +z is the acoustic axis, +y up, +x port).
 
     Attributes:
         d: unit direction.
-        lift: its derivative by elevation.
-        side: its derivative by bearing.
+        lift: derivative of the direction by elevation.
+        side: derivative of the direction by bearing.
         below: elevation of the lower edge of the ray's cell, relative to the ray [rad], <= 0.
-        above: of the upper edge, >= 0.
-        aside: bearing of the cell's middle, relative to the ray [rad].
-        solid_angle: of the ray's cell [sr].
-        elevation: of the ray [rad].
+        above: elevation of the upper edge, >= 0.
+        aside: bearing of the centre of the cell, relative to the ray [rad].
+        solid_angle: solid angle of the ray's cell [sr].
+        elevation: elevation of the ray [rad].
     """
 
     d: mi.Vector3f
@@ -45,39 +45,36 @@ class Fan:
     elevation: DeviceArray
 
     def carried(self, lines: list[mi.Vector4f]) -> Fan:
-        """Return the same rays in the world's axes; ``lines`` are the first three rows of ``to_world``."""
+        """Return the same rays in world axes; ``lines`` are the first three rows of ``to_world``."""
         return replace(self, d=carried(lines, self.d), lift=carried(lines, self.lift), side=carried(lines, self.side))
 
 
 class ImagingSonar(mi.Sensor):
-    """Fans of rays as an imaging sonar sends them: one pixel of the film is one ray.
+    """Fans of rays of an imaging sonar, where each pixel of the film is one ray.
 
-    Column ``beam * rays_across + k`` of the film is the k-th ray across a beam, most to port first; row 0 is the
-    highest elevation. Direction for azimuth or bearing b and elevation e, as (starboard, forward, up):
-    ``bearing: azimuth`` (cos e sin b, cos e cos b, sin e); ``bearing: cone``, what a line array measures,
-    (sin b, cos b cos e, cos b sin e).
+    Column ``beam * rays_across + k`` of the film is the k-th ray across a beam, from port to starboard; row 0 is the highest
+    elevation. Direction for azimuth or bearing b and elevation e, as (starboard, forward, up): ``bearing: azimuth`` (cos e
+    sin b, cos e cos b, sin e); ``bearing: cone``, which a line array measures, (sin b, cos b cos e, cos b sin e).
 
-    Properties: those of :class:`mitsonar.instruments.sonar.Sonar` (``azimuth_fov_deg`` [deg, 29],
-    ``elevation_fov_deg`` [deg, 14], ``beams`` [96], ``range_min`` [m, 3.2], ``range_max`` [m, 5.6], ``range_bins`` [512],
-    ``sound_speed`` [m/s, 1500], ``bearing`` [azimuth], ``beam_layout`` [even], ``beam_width_deg`` [deg, the spacing],
-    ``jitter`` [physical: true], ``seed`` [0], ``model`` [physical], ``gain_exponent`` [0], ``bounces`` [1],
-    ``frame_rate_hz`` [Hz, 10], ``ping_groups`` [1], ``group_order`` [interleaved],
-    ``group_interval_s`` [s, 2 range_max / sound_speed + group_overhead_s], ``group_overhead_s`` [s, 0]: groups of beams
-    that ping one after another, which ``mitsonar.Simulator`` reads (docs/guides/moving.md);
-    ``quality`` [standard]: draft, standard or fine, ``thesis_rays`` [700], ``rays_per_beam`` and ``rays_across`` [from
-    quality; of the model ``thesis`` these are ``thesis_rays`` and one]); of the model ``coherent``, and in part of
-    ``physical`` with a pattern: ``frequency_hz`` [Hz], ``bandwidth_hz`` [Hz] or ``pulse_m`` [m, one bin], ``focus_m`` [m],
-    ``pattern``, ``shading`` [hann], ``elevation_pattern``, ``scatterers_per_cell`` [6], ``scatterer_spacing_m`` [m],
+    Properties: those of :class:`mitsonar.instruments.sonar.Sonar` (``azimuth_fov_deg`` [deg, 29], ``elevation_fov_deg``
+    [deg, 14], ``beams`` [96], ``range_min`` [m, 3.2], ``range_max`` [m, 5.6], ``range_bins`` [512], ``sound_speed`` [m/s,
+    1500], ``bearing`` [azimuth], ``beam_layout`` [even], ``beam_width_deg`` [deg, the spacing], ``jitter`` [physical: true],
+    ``seed`` [0], ``model`` [physical], ``gain_exponent`` [0], ``bounces`` [1], ``frame_rate_hz`` [Hz, 10], ``ping_groups``
+    [1], ``group_order`` [interleaved], ``group_interval_s`` [s, 2 range_max / sound_speed + group_overhead_s],
+    ``group_overhead_s`` [s, 0]: groups of beams that ping one after another, which ``mitsonar.Simulator`` reads
+    (docs/guides/moving.md); ``quality`` [standard]: draft, standard or fine, ``thesis_rays`` [700], ``rays_per_beam`` and
+    ``rays_across`` [from quality; in the model ``thesis``, ``thesis_rays`` and one]); of the model ``coherent``, and in part
+    of ``physical`` with a pattern: ``frequency_hz`` [Hz], ``bandwidth_hz`` [Hz] or ``pulse_m`` [m, one bin], ``focus_m``
+    [m], ``pattern``, ``shading`` [hann], ``elevation_pattern``, ``scatterers_per_cell`` [6], ``scatterer_spacing_m`` [m],
     ``speckle_nu``, ``speckle_patch_m`` [m, 0.1], ``source_level_db`` [0], ``noise_level_db``, ``near_glow_db`` [0],
-    ``near_glow_m`` [m, 0.5], ``near_glow_edge_db`` [0], ``near_glow_spread_db`` [0], ``near_glow_still`` [0],
-    ``volume_db``, ``absorption_db_per_m``, ``temperature_c`` [10], ``salinity_psu`` [35], ``water_depth_m`` [m, 10],
-    ``ph`` [8], ``gain_absorption`` [false], ``crosstalk_db``, ``stripes_db`` [0], ``coding``, ``coding_db`` [80],
-    ``coding_gamma`` [0.5] (docs/guides/coherent.md); ``preset``: a name; the others change its numbers; ``ping`` [0]: number
-    of the jitter's draw; ``to_world``. A film is not needed. One that is given must have the size that follows from beams
-    and rays.
+    ``near_glow_m`` [m, 0.5], ``near_glow_edge_db`` [0], ``near_glow_spread_db`` [0], ``near_glow_still`` [0], ``volume_db``,
+    ``absorption_db_per_m``, ``temperature_c`` [10], ``salinity_psu`` [35], ``water_depth_m`` [m, 10], ``ph`` [8],
+    ``gain_absorption`` [false], ``crosstalk_db``, ``stripes_db`` [0], ``coding``, ``coding_db`` [80], ``coding_gamma`` [0.5]
+    (docs/guides/coherent.md); ``preset``: name of a preset, whose values the other properties override; ``ping`` [0]: index
+    of the jitter's draw; ``to_world``. A film is optional. If given, it must have the size that follows from beams and rays.
 
-    Its rays are those of the models ``physical`` and ``thesis``. The model ``coherent`` traces a fan of its own, with beam
-    patterns and side lobes. No model has a sonar that moves during a ping.
+    Its rays are those of the models ``physical`` and ``thesis``. The model ``coherent`` traces a separate fan, with beam
+    patterns and side lobes. In all models, the sonar is stationary during a ping.
 
     .. code-block:: xml
 
@@ -98,7 +95,7 @@ class ImagingSonar(mi.Sensor):
             props["film"] = self._film()
         super().__init__(props)
         self._check_film()
-        self.pose  # noqa: B018  a to_world that scales is refused here
+        self.pose  # noqa: B018  rejects a to_world with scaling
 
     @property
     def pose(self) -> Pose:
@@ -109,12 +106,13 @@ class ImagingSonar(mi.Sensor):
         """Return the first three rows of ``to_world``, for :func:`carried`."""
         return [mi.Vector4f(*map(float, row)) for row in to_world_matrices(self.pose)[0, :3].astype(np.float32)]
 
-    # ---------------------------------------------------------------- directions of the rays
+    # ---------------- Directions of the rays
 
     def fan(self, column: mi.UInt32, row: mi.UInt32, key: mi.UInt32) -> Fan:
-        """Return the ray of each cell. Where the sonar jitters, ``key`` (see :meth:`key`) draws its position in the cell."""
+        """Return the ray of each cell. If the sonar jitters, ``key`` (see :meth:`key`) draws its position in the cell."""
         sonar = self.sonar
         beam, step = column // sonar.across, column % sonar.across
+        # 1. Position of the ray within its cell, and the angles of the cell's centre and of the ray.
         across, along = self._position_in_cell(row * sonar.columns + column, key)
         width = sonar.beam_width_rad / sonar.across
         height = np.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
@@ -123,6 +121,7 @@ class ImagingSonar(mi.Sensor):
         sin_b, cos_b = dr.sincos(middle + (across - 0.5) * width)
         elevation = level - (along - 0.5) * height
         sin_e, cos_e = dr.sincos(elevation)
+        # 2. Direction, its derivatives by elevation and bearing, and the exact solid angle of the cell.
         if sonar.bearing == "azimuth":
             d = _local(cos_e * sin_b, cos_e * cos_b, sin_e)
             lift = _local(-sin_e * sin_b, -sin_e * cos_b, cos_e)
@@ -133,27 +132,28 @@ class ImagingSonar(mi.Sensor):
             lift = _local(mi.Float(0), -cos_b * sin_e, cos_b * cos_e)
             side = _local(cos_b, -sin_b * cos_e, -sin_b * sin_e)
             solid_angle = dr.cos(middle) * (2 * np.sin(width / 2) * height)
+        # 3. Edges and centre of the cell relative to the ray.
         below, above, aside = (along - 1) * height, along * height, (0.5 - across) * width
         return Fan(d, lift, side, below, above, aside, solid_angle, elevation)
 
     def key(self, ping: int) -> int:
-        """Return 32 bits of (seed, ping), the key of the jitter's hash."""
+        """Return a 32-bit key of (seed, ping) for the hash of the jitter."""
         return int(np.random.SeedSequence((self.sonar.seed, ping)).generate_state(1)[0])
 
     def _axis(self, beam: mi.UInt32) -> mi.Float:
-        """Bearing of a beam's axis [rad]; the same formula as ``Sonar.bearing_rad``."""
+        """Return the bearing of a beam's axis [rad], with the formula of ``Sonar.bearing_rad``."""
         half = float(np.radians(self.sonar.azimuth_fov_deg)) / 2
         part = (mi.Float(beam) + (0.5 - self.sonar.beams / 2)) * (2 / self.sonar.beams)  # -1..1 across the fan
         return part * half if self.sonar.beam_layout == "even" else dr.asin(part * np.sin(half))
 
     def _position_in_cell(self, ray: DeviceArray, key: DeviceArray) -> tuple[mi.Float, mi.Float]:
-        """Return the position across and down the cell, 0..1: its centre, or a hash of (seed, ping, ray)."""
+        """Return the position across and down the cell, 0..1: its centre, or a hash of (seed, ping, ray) with jitter."""
         if not self.sonar.jittered:
             return mi.Float(0.5), mi.Float(0.5)
         first, second = mi.sample_tea_32(ray, key, ROUNDS)
         return (mi.Float(first >> 8) + 0.5) * 2.0**-24, (mi.Float(second >> 8) + 0.5) * 2.0**-24
 
-    # ---------------------------------------------------------------- what Mitsuba asks of a sensor
+    # ---------------- Sensor interface of Mitsuba
 
     def sample_ray(
         self,
@@ -163,7 +163,7 @@ class ImagingSonar(mi.Sensor):
         sample3: mi.Point2f,
         active: DeviceArray = True,
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """Return the ray of the film's cell that holds ``sample2``, and weight 1."""
+        """Return the ray of the film cell that contains ``sample2``, with weight 1."""
         fan = self.film_fan(sample2)
         lines = self.lines()
         ray = dr.zeros(mi.Ray3f, dr.width(fan.d))
@@ -181,12 +181,12 @@ class ImagingSonar(mi.Sensor):
         sample3: mi.Point2f,
         active: DeviceArray = True,
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """Return the same as :meth:`sample_ray`. A sonar's rays have no differentials."""
+        """Return the same as :meth:`sample_ray`, since sonar rays have no differentials."""
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         return mi.RayDifferential3f(ray), weight
 
     def film_fan(self, position: mi.Point2f) -> Fan:
-        """Return the rays of film positions 0..1."""
+        """Return the rays at film positions 0..1."""
         column = mi.UInt32(position.x * self.sonar.columns)
         row = mi.UInt32(position.y * self.sonar.rays_per_beam)
         return self.fan(column, row, dr.opaque(mi.UInt32, self.key(self.ping)))
@@ -226,17 +226,17 @@ def _read_sonar(props: mi.Properties) -> Sonar:
 
 
 def _local(starboard: mi.Float, forward: mi.Float, up: mi.Float) -> mi.Vector3f:
-    """Turn (starboard, forward, up) into the sensor's axes."""
+    """Convert (starboard, forward, up) to the sensor's axes."""
     return mi.Vector3f(-starboard, up, forward)
 
 
 def carried(lines: list[mi.Vector4f], v: mi.Vector3f) -> mi.Vector3f:
-    """Return a direction of the sensor's axes in the world's; every caller gets the same products, and so the same bits."""
+    """Rotate a direction from sensor to world axes, with the same products and thus the same bits for every caller."""
     return mi.Vector3f(*(line.x * v.x + line.y * v.y + line.z * v.z for line in lines))
 
 
 def is_imaging_sonar(sensor: mi.Sensor) -> bool:
-    """Return whether a sensor is one. Compare names: each variant makes the class anew."""
+    """Return whether a sensor is an imaging sonar, by class name, since each variant creates a new class."""
     return any(base.__name__ == ImagingSonar.__name__ for base in type(sensor).__mro__)
 
 

@@ -1,4 +1,4 @@
-"""Tables of materials on the device: what a ray multiplies the reflectivity of a surface by at its own angle."""
+"""Evaluate the scattering laws of materials on the device, at the angle of each ray."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from mitsonar.plugins.acoustic_material import AcousticMaterial, is_acoustic_mat
 __all__ = ["law_rows", "material_of", "mirror_rows", "weighed"]
 
 ENTRIES = 91
-"""Pairs of numbers of a material: 90 of value and change to the next degree, and the power of the sine."""
+"""Number of pairs per material: 90 of a value and its change to the next degree, and one with the power of the sine."""
 
 
 def law_rows(materials: Sequence[AcousticMaterial], sonar: Sonar) -> mi.Float:
-    """Return the laws of materials for one sonar, relative to the one reflectivity that each has without a law.
+    """Return the laws of materials for one sonar, relative to the single reflectivity that each has without a law.
 
     Args:
-        materials: one of each kind.
-        sonar: of the models ``physical`` and ``coherent``, or of ``thesis``, which has no laws.
+        materials: one BSDF per material.
+        sonar: sonar of the models ``physical`` or ``coherent``, or of ``thesis``, which has no laws.
     """
     rows = np.zeros((len(materials), ENTRIES, 2))
     for row, one in zip(rows, materials, strict=True):
@@ -43,27 +43,29 @@ def law_rows(materials: Sequence[AcousticMaterial], sonar: Sonar) -> mi.Float:
 
 
 def mirror_rows(materials: Sequence[Material]) -> mi.Float:
-    """Return reflection coefficient at normal incidence and rms height [m] of each material; zeros without a mirror part."""
+    """Return the reflection coefficient at normal incidence and rms height [m] per material; zeros without a mirror part."""
     return mi.Float([number for one in materials for number in (one.reflection or 0.0, one.roughness_m or 0.0)])
 
 
 def weighed(laws: mi.Float, material: DeviceArray, reflectivity: DeviceArray, cosine: DeviceArray) -> DeviceArray:
-    """Return the effective reflectivity of points at the angle of their rays; unchanged where there is no material.
+    """Return the effective reflectivity of points at the angle of their rays; unchanged without a material.
 
-    It is that of :func:`mitsonar.acoustics.materials.mu_at`, and at most 1 / cosine.
+    It equals that of :func:`mitsonar.acoustics.materials.mu_at`, and is at most 1 / cosine.
 
     Args:
-        laws: of :func:`law_rows`.
-        material: number of each point's material; -1 without one.
-        reflectivity: of the points without a law.
-        cosine: of the angle between ray and normal, 0..1.
+        laws: result of :func:`law_rows`.
+        material: material number of each point; -1 without one.
+        reflectivity: reflectivity of the points without a law.
+        cosine: cosine of the angle between ray and normal, 0..1.
     """
     known = material >= 0
+    # Interpolate the tabulated law between whole degrees of the grazing angle.
     place = dr.asin(cosine) * (180 / math.pi)
     below = dr.select(place < 89, dr.floor(place), 89)
     begin = mi.UInt32(dr.select(known, material, 0)) * ENTRIES
     value = dr.gather(mi.Vector2f, laws, begin + mi.UInt32(below), known)
     power = dr.gather(mi.Vector2f, laws, begin + 90, known).x
+    # Restore the power of the sine that was divided out of the table, then limit the result to 1 / cosine.
     steep = dr.select(cosine > FLATTEST, cosine, FLATTEST)
     shape = dr.select(power > 1.5, 1, dr.select(power > 0.5, 1 / steep, 1 / (steep * steep)))
     law = reflectivity * (value.x + value.y * (place - below)) * shape
@@ -71,23 +73,23 @@ def weighed(laws: mi.Float, material: DeviceArray, reflectivity: DeviceArray, co
 
 
 class _Children(mi.TraversalCallback):
-    """Collect the BSDFs directly below one."""
+    """Traversal that collects the BSDFs directly below an object."""
 
     def __init__(self) -> None:
         super().__init__()
         self.found: list[mi.BSDF] = []
 
     def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
-        """Keep a value that is a BSDF; Mitsuba calls this for each parameter."""
+        """Collect a value if it is a BSDF; Mitsuba calls this for each parameter."""
         if isinstance(value, mi.BSDF):
             self.found.append(value)
 
 
 def material_of(shape: mi.Shape) -> AcousticMaterial | None:
-    """Return the material of a shape, also where another BSDF wraps it; None where it has none.
+    """Return the material of a shape, even if another BSDF wraps it; None without one.
 
     Raises:
-        MitsonarError: several materials, or a material beside another BSDF.
+        MitsonarError: several materials, or a material together with another BSDF.
     """
     found, others = _leaves(shape.bsdf())
     names = sorted({one.material.name for one in found})
@@ -100,7 +102,7 @@ def material_of(shape: mi.Shape) -> AcousticMaterial | None:
 
 
 def _leaves(bsdf: mi.BSDF) -> tuple[list[AcousticMaterial], int]:
-    """Return the materials at or below a BSDF, each once, and how many other BSDFs without any below them there are."""
+    """Return the distinct materials at or below a BSDF, and the number of other BSDFs that contain none."""
     if is_acoustic_material(bsdf):
         return [cast(AcousticMaterial, bsdf)], 0
     children = _Children()

@@ -1,7 +1,8 @@
-"""Where Mitsuba may load code from: its own folder, and nowhere else.
+"""Restrict Mitsuba to loading code from its own folder.
 
-Mitsuba looks for ``plugins/NAME.so`` beside the scene and in the current directory before it looks in its own folder, and
-runs what it finds: a folder that comes with a scene could run code. So all that lets Mitsuba create objects does it here.
+Mitsuba looks for ``plugins/NAME.so`` next to the scene and in the current directory before it looks in its own folder, and
+runs what it finds. A folder that comes with a scene could therefore run code. All creation of Mitsuba objects goes through
+this module.
 """
 
 from __future__ import annotations
@@ -19,21 +20,21 @@ from mitsonar.errors import MitsonarError, meant, shortened
 __all__ = ["file_resolver", "foreign_names", "load_dict", "own_code_only", "search_folders", "search_in"]
 
 LIBRARIES = (".so", ".dylib", ".dll")
-"""Endings of Mitsuba's plugins on Linux, macOS and Windows."""
+"""File suffixes of Mitsuba's plugins on Linux, macOS and Windows."""
 
 BUILT_IN = frozenset({"scene", "rgb", "spectrum"})
 """Types that Mitsuba creates without a plugin."""
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
-"""What the name of a plugin written in Python may look like."""
+"""Valid names of plugins written in Python."""
 
 DECOYS = "mitsonar-plugins-"
-"""What the name of a folder of empty files begins with."""
+"""Prefix of the names of folders with empty decoy files."""
 
 
 @cache
 def own_folder() -> Path:
-    """Return the folder of Mitsuba, which holds its ``plugins`` and ``data``."""
+    """Return the folder of Mitsuba, which contains its ``plugins`` and ``data``."""
     import mitsuba as mi
 
     return Path(str(mi.__file__)).resolve().parent
@@ -46,10 +47,10 @@ def own_names() -> frozenset[str]:
 
 
 def foreign_names(names: Iterable[str]) -> list[str]:
-    """Return the names that are no plugins of Mitsuba: only a class registered in Python may stand behind them.
+    """Return the names that are not plugins of Mitsuba, and must therefore be classes registered in Python.
 
     Raises:
-        MitsonarError: one is no name but a path.
+        MitsonarError: a path instead of a name.
     """
     found = sorted(set(names) - own_names())
     for name in found:
@@ -60,16 +61,16 @@ def foreign_names(names: Iterable[str]) -> list[str]:
 
 @contextmanager
 def own_code_only(names: Iterable[str]) -> Iterator[None]:
-    """Keep Mitsuba from every library but its own while it creates objects.
+    """Prevent Mitsuba from loading any library but its own while it creates objects.
 
-    Its own folder comes first of those that it searches. For any other name it finds an empty file, which it cannot load;
+    Its own folder becomes the first of its search path. For any other name it finds an empty file, which it cannot load;
     classes registered in Python need no file.
 
     Args:
-        names: of the plugins that are created.
+        names: names of the plugins to create.
 
     Raises:
-        MitsonarError: a name is a path; or no plugin has that name.
+        MitsonarError: a name that is a path, or that no plugin has.
     """
     foreign = foreign_names(names)
     try:
@@ -94,14 +95,14 @@ def own_code_only(names: Iterable[str]) -> Iterator[None]:
 def _make_decoys(folder: Path, names: list[str]) -> None:
     folder.mkdir()
     for name in names:
-        for stem in {name, name.rpartition(".")[0] or name}:  # Mitsuba replaces what follows the last dot
+        for stem in {name, name.rpartition(".")[0] or name}:  # Mitsuba replaces the part after the last dot
             for ending in LIBRARIES:
                 (folder / f"{stem}{ending}").touch()
 
 
 @contextmanager
 def search_in(folders: Iterable[str | Path]) -> Iterator[None]:
-    """Let Mitsuba search these folders first, in this order, and afterwards as before."""
+    """Prepend folders to Mitsuba's search path, in this order, for the duration of the context."""
     import mitsuba as mi
 
     before = file_resolver()
@@ -117,7 +118,7 @@ def search_in(folders: Iterable[str | Path]) -> Iterator[None]:
 
 
 def file_resolver() -> Any:
-    """Return what finds the files that a scene names."""
+    """Return the resolver of the files that a scene refers to."""
     import mitsuba as mi
 
     resolver: Any = mi.file_resolver  # an `object` to Mitsuba's stubs
@@ -125,20 +126,20 @@ def file_resolver() -> Any:
 
 
 def search_folders() -> list[Path]:
-    """Return the folders that Mitsuba searches for files of a scene, without its own."""
+    """Return the folders that Mitsuba searches for files of a scene, excluding its own."""
     found = [Path(str(folder)) for folder in file_resolver()]
     return [folder for folder in found if folder.resolve() != own_folder() and not folder.name.startswith(DECOYS)]
 
 
 def load_dict(parts: dict[str, Any], **options: bool) -> Any:
-    """Create an object as ``mi.load_dict`` does, with no code but Mitsuba's own and that of registered classes.
+    """Create an object as ``mi.load_dict`` does, running only code of Mitsuba and of registered classes.
 
     Args:
         parts: as for ``mi.load_dict``.
         options: as for ``mi.load_dict``.
 
     Raises:
-        MitsonarError: no plugin has one of the names.
+        MitsonarError: a type that no plugin has.
     """
     import mitsuba as mi
 
@@ -150,5 +151,5 @@ def _types_in(parts: dict[str, Any]) -> Iterator[str]:
     for name, value in parts.items():
         if isinstance(value, dict):
             yield from _types_in(value)
-        elif name == "type" and value != "ref":  # which names no plugin
+        elif name == "type" and value != "ref":  # "ref" is not a plugin
             yield str(value)

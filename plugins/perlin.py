@@ -1,4 +1,4 @@
-"""The texture ``perlin``."""
+"""The texture ``perlin``: smooth gradient noise."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["Perlin"]
 class Perlin(HashedTexture):
     """Perlin's gradient noise (Perlin, Improving Noise, 2002) in two dimensions (uv) or three (position).
 
-    Properties: ``coordinates`` [uv]: uv or position; ``cells`` [64]: lattice cells a unit of uv; ``cell_size`` [m, 0.5]:
-    edge of a lattice cell for position; ``octaves`` [4]: each with half the cell and half the weight of the one before;
-    ``low`` [0], ``high`` [1]: reflectivity at noise -1 and 1, clipped; ``contrast`` [1.5]: factor of the noise before that;
-    ``seed`` [0]; ``to_uv``: transform of uv.
+    Properties: ``coordinates`` [uv]: uv or position; ``cells`` [64]: lattice cells per unit of uv; ``cell_size`` [m, 0.5]:
+    edge of a lattice cell for position; ``octaves`` [4]: number of octaves, each with half the cell size and half the weight
+    of the previous one; ``low`` [0], ``high`` [1]: reflectivity at noise -1 and 1, clipped; ``contrast`` [1.5]: factor
+    applied to the noise before that; ``seed`` [0]; ``to_uv``: transform of uv.
 
     It repeats only after the 2^32 lattice points of its hash.
 
@@ -41,7 +41,7 @@ class Perlin(HashedTexture):
             )
 
     def octave(self, point: DeviceArray, seed: int) -> DeviceArray:
-        """Return the reflectivity of one octave at ``point``, in lattice cells."""
+        """Return the reflectivity of one octave at ``point``, in units of lattice cells."""
         corner = dr.floor(point)
         inside = point - corner
         ease = inside * inside * inside * (inside * (inside * 6 - 15) + 10)
@@ -50,13 +50,13 @@ class Perlin(HashedTexture):
         return self.low + (self.high - self.low) * value
 
     def finish(self, value: DeviceArray) -> DeviceArray:
-        """Clip to low..high, which the mean of the octaves seldom leaves."""
+        """Clip to low..high, which the mean of the octaves rarely exceeds."""
         return dr.select(value > self.low, dr.select(value < self.high, value, self.high), self.low)
 
     def _blend(
         self, corner: DeviceArray, inside: DeviceArray, ease: DeviceArray, seed: int, chosen: tuple[int, ...]
     ) -> DeviceArray:
-        """Interpolate the ramps of the lattice points around, one dimension after the other."""
+        """Interpolate the ramps of the surrounding lattice points, one dimension after the other."""
         if len(chosen) == len(corner):
             return self._ramp(corner, inside, seed, chosen)
         low = self._blend(corner, inside, ease, seed, (*chosen, 0))
@@ -64,13 +64,13 @@ class Perlin(HashedTexture):
         return dr.lerp(low, high, ease[len(chosen)])
 
     def _ramp(self, corner: DeviceArray, inside: DeviceArray, seed: int, chosen: tuple[int, ...]) -> DeviceArray:
-        """Return the linear ramp of one lattice point: its random unit gradient times the offset from it."""
+        """Return the linear ramp of a lattice point: its random unit gradient times the offset from it."""
         offset = type(corner)(*chosen)
         first, second = self.hash(corner + offset, seed)
         way = inside - offset
         sin, cos = dr.sincos(mi.Float(first >> 8) * (2.0**-24 * 2 * dr.pi))
         if len(chosen) == 2:
-            # scaled so that the largest value, half a cell from four points, is 1
+            # scaled so that the maximum, at the centre of four points, is 1
             return (cos * way[0] + sin * way[1]) * dr.sqrt(2.0)
         up = mi.Float(second >> 8) * 2.0**-23 - 1
         across = dr.sqrt(dr.select(up * up < 1, 1 - up * up, 0))

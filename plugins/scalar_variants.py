@@ -1,4 +1,4 @@
-"""What the plugins answer in Mitsuba's scalar variants, which cannot run plugins written in Python."""
+"""Raise a clear error in Mitsuba's scalar variants, which cannot run plugins written in Python."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ KINDS = {
     "bsdf": ("acoustic_material",),
     "texture": ("cell_noise", "perlin", "trajectory"),
 }
-"""Names of the plugins in XML, by the kind under which Mitsuba registers them."""
+"""Names of the plugins in XML, by the type under which Mitsuba registers them."""
 
 
 def register_refusals(variant: str) -> None:
-    """Register, in place of each plugin, one that names the variants that are needed; Mitsuba would say "not found"."""
+    """Register plugins that raise an error naming the required variants, instead of Mitsuba's "not found"."""
     import mitsuba as mi
 
     for kind, names in KINDS.items():

@@ -1,12 +1,12 @@
-"""The surface that a ray meets: normal, reflectivity and shape, read from a table of facets where the surface allows it.
+"""Look up the surface that a ray meets: normal, reflectivity and shape, from a table of facets where possible.
 
-Reflectivity of a surface is one number in 0..1; colours count by their luminance:
+The reflectivity of a surface is one number in 0..1; colours are converted to luminance:
 
-- ``acoustic_material``: one number of its law, or for a sonar (:meth:`Surfaces.heard_by`) what its law says at the angle;
+- ``acoustic_material``: a constant of its law, or for a sonar (:meth:`Surfaces.heard_by`) the value of the law at the angle;
 - a BSDF with a diffuse reflectance (``diffuse``, ``plastic``, ``roughplastic``; through ``twosided``, ``mask``,
   ``bumpmap``, ``normalmap``): that reflectance, textured or not;
 - ``principled``, ``principledthin``: the base colour; ``blendbsdf``: the weighted mean of the two;
-- any other (``dielectric``, ``conductor``, ``null`` ...) has none; it gets :data:`DEFAULT_REFLECTIVITY`.
+- any other (``dielectric``, ``conductor``, ``null`` ...) has none and gets :data:`DEFAULT_REFLECTIVITY`.
 
 :attr:`Surfaces.notes` names the shapes of the last two kinds.
 """
@@ -45,9 +45,9 @@ __all__ = ["Hit", "Surfaces", "facet_points", "registry_index"]
 
 @dataclass
 class Hit:
-    """Where rays end: ``valid``, distance ``t`` [m], unit normal ``n``, ``reflectivity``, shape, object and material.
+    """Intersections of rays: ``valid``, distance ``t`` [m], unit normal ``n``, ``reflectivity``, shape, object and material.
 
-    The reflectivity lies in 0..1; where a law is asked, in 0..1 / cosine. ``material`` is -1 where a shape has none.
+    The reflectivity lies in 0..1, or in 0..1 / cosine where a law is evaluated. ``material`` is -1 for a shape without one.
     """
 
     valid: DeviceArray
@@ -61,28 +61,27 @@ class Hit:
 
 @dataclass
 class Surfaces:
-    """Tables of a scene's shapes. :meth:`of` makes them once a scene.
+    """Tables of the shapes of a scene, built once per scene by :meth:`of`.
 
     A triangle of a mesh is a row of four floats, normal and reflectivity. One fetch of 16 bytes replaces two virtual calls
-    and a dozen scattered reads. Where the reflectivity varies within triangles, a second table gives uv, and the BSDF is
-    evaluated. Mitsuba itself evaluates other shapes, and instances, bump maps and vertex colours.
+    and a dozen scattered reads. If the reflectivity varies within triangles, a second table provides uv, and the BSDF is
+    evaluated. Mitsuba itself evaluates other shapes, instances, bump maps and vertex colours.
 
     Attributes:
-        facets: normal and reflectivity (negative: evaluate the BSDF), four floats a triangle.
-        corners: uv of the first corner and its change to the second and third, eight floats a triangle (two unused).
-        shapes: by registry index, four numbers a shape: first facet (-1: not in the tables), first row in ``corners``,
+        facets: normal and reflectivity (negative: evaluate the BSDF), four floats per triangle.
+        corners: uv of the first corner and its change to the second and third, eight floats per triangle (two unused).
+        shapes: by registry index, four numbers per shape: first facet (-1: not in the tables), first row in ``corners``,
             index of the shape in ``scene.shapes()``, number of its material (-1: none).
-        constant: by registry index, reflectivity of a shape that has no diffuse reflectance; negative:
-            evaluate its BSDF.
-        objects: number of the object that a triangle belongs to (the mesh's attribute ``face_id``, 0 without it), one a
-            triangle; empty but for one 0 where no mesh has it.
-        laws: of the materials, for the sonar of :meth:`heard_by`; without one, a single 0.
+        constant: by registry index, reflectivity of a shape without a diffuse reflectance; negative: evaluate its BSDF.
+        objects: number of the object that a triangle belongs to (the mesh's attribute ``face_id``, 0 without it), one per
+            triangle; a single 0 if no mesh has the attribute.
+        laws: scattering laws of the materials, for the sonar of :meth:`heard_by`; a single 0 without a sonar.
         mirrors: by material, reflection coefficient at normal incidence and rms height [m]; zeros without a mirror part.
-        materials: BSDFs, one of each material, by number.
-        lawful: whether the laws are asked.
-        textured: whether some shape has a reflectivity that varies within a triangle.
-        foreign: whether some shape is not in the tables.
-        notes: what a user should know about the scene's BSDFs, a sentence each.
+        materials: one BSDF per material, by number.
+        lawful: whether the laws are evaluated.
+        textured: whether any shape has a reflectivity that varies within a triangle.
+        foreign: whether any shape is not in the tables.
+        notes: notes for the user on the scene's BSDFs, one sentence each.
     """
 
     facets: mi.Float
@@ -100,15 +99,16 @@ class Surfaces:
 
     @classmethod
     def of(cls, scene: mi.Scene, shapes: Sequence[mi.Shape] | None = None) -> Surfaces:
-        """Return the tables of a scene. Materials have one reflectivity for all angles; see :meth:`heard_by`.
+        """Build the tables of a scene, with one reflectivity per material for all angles; see :meth:`heard_by`.
 
         Args:
-            scene: that is traced.
-            shapes: that stand for those of the scene, in their order; default: they themselves.
+            scene: scene to trace.
+            shapes: replacements for the shapes of the scene, in the same order; default: the shapes themselves.
 
         Raises:
             MitsonarError: a shape with several materials.
         """
+        # Rows are addressed by registry index, the number by which kernels identify a shape.
         shapes = scene.shapes() if shapes is None else shapes
         size = 1 + max((registry_index(shape) for shape in shapes), default=0)
         rows = [[-1, 0, -1, -1] for _ in range(size)]
@@ -122,11 +122,13 @@ class Surfaces:
         for number, shape in enumerate(shapes):
             index = registry_index(shape)
             rows[index][2] = number
-            if shape.bsdf() is None:  # an instance: Mitsuba evaluates the shapes of its group
+            if shape.bsdf() is None:  # an instance, for which Mitsuba evaluates the shapes of its group
                 continue
             kinds, textures = kinds_and_textures(shape.bsdf())
             rows[index][3] = _number_of_material(shape, materials) if AcousticMaterial.__name__ in kinds else -1
             constant[index] = _fixed_reflectivity(shape, kinds, named)
+            # Tabulate a mesh if its reflectivity is constant on facets, or a function of uv. Bump maps and vertex attributes
+            # need Mitsuba.
             flat = constant[index] >= 0 or (TWO_FACED not in kinds and all(map(constant_on_facets, textures)))
             if shape.is_mesh() and (flat or not (kinds & BENT or any(map(by_vertex, textures)))):
                 rows[index][:2] = facet_count, corner_count
@@ -154,10 +156,10 @@ class Surfaces:
         return tables
 
     def adopt(self, now: Surfaces) -> bool:
-        """Take over the tables of the same scene as it is now.
+        """Replace the tables by those of the current state of the same scene.
 
         Returns:
-            False, and nothing is taken over, where launches that were recorded with these tables do not fit the new ones.
+            False, with nothing replaced, if launches recorded with these tables are incompatible with the new ones.
         """
         if any(getattr(self, name) != getattr(now, name) for name in ("lawful", "textured", "foreign", "notes")):
             return False
@@ -166,7 +168,7 @@ class Surfaces:
         return True
 
     def turn_facets(self, mesh: mi.Mesh) -> None:
-        """Read the normals of a mesh anew: its vertices have moved. Reflectivities stay."""
+        """Update the normals of a mesh whose vertices have moved; reflectivities remain."""
         first = int(self.shapes[4 * registry_index(mesh)])
         if first < 0:
             return
@@ -179,15 +181,15 @@ class Surfaces:
         dr.eval(self.facets)
 
     def arrays(self) -> dict[str, DeviceArray]:
-        """Return the tables by name: the inputs of a launch."""
+        """Return the tables by name, as inputs of a launch."""
         names = ("facets", "corners", "shapes", "constant", "objects", "laws", "mirrors")
         return {name: getattr(self, name) for name in names}
 
     def heard_by(self, sonar: Sonar) -> Surfaces:
-        """Return the tables with the laws of the materials at a sonar's frequency, and notes on them.
+        """Return the tables with the laws of the materials at the frequency of a sonar, and notes on them.
 
-        The models ``physical`` and ``coherent`` ask the law at each ray's angle. The model ``thesis`` takes mu, or sigma at
-        normal incidence, for all angles. Without a ``frequency_hz`` a material is taken in the middle of its band.
+        The models ``physical`` and ``coherent`` evaluate the law at each ray's angle. The model ``thesis`` uses mu, or sigma
+        at normal incidence, for all angles. Without a ``frequency_hz`` the middle of a material's band is used.
         """
         if not self.materials:
             return self
@@ -197,17 +199,18 @@ class Surfaces:
         return replace(self, laws=laws, lawful=True, notes=[*self.notes, *notes])
 
     def mirror(self, material: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
-        """Return reflection coefficient at normal incidence and rms height [m] of materials; 0 where the number is -1."""
+        """Return the reflection coefficient at normal incidence and rms height [m] of materials; 0 for number -1."""
         pair = dr.gather(mi.Vector2f, self.mirrors, mi.UInt32(dr.select(material >= 0, material, 0)), material >= 0)
         return pair.x, pair.y
 
     def hit(self, scene: mi.Scene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
-        """Trace rays to the nearest surface. The arrays are not evaluated: later operations join the same kernel."""
+        """Trace rays to the nearest surface, without evaluation, so that later operations join the same kernel."""
         coherent: DeviceArray = True
         return self.read(scene.ray_intersect_preliminary(ray, coherent=coherent, active=active), ray, active)
 
     def read(self, found: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
-        """Return the surface at points that rays were found to meet; both in the axes of the shape's scene."""
+        """Return the surface at given intersections; rays and intersections are in the axes of the shape's scene."""
+        # 1. Find the shape, and read normal and reflectivity of its facet from the table.
         valid = found.is_valid() & active
         index: DeviceArray = dr.reinterpret_array(mi.UInt32, found.shape)
         known = valid & (index * 4 < dr.width(self.shapes))
@@ -218,11 +221,13 @@ class Surfaces:
         normal: DeviceArray = mi.Normal3f(row.x, row.y, row.z)
         reflectivity: DeviceArray = row.w
         shape_id: DeviceArray = dr.select(known, shape.z, -1)
+        # 2. Evaluate textures that vary within a facet, at a uv from the table.
         if self.textured:
             evaluated = tabled & (reflectivity < 0)
             si = self._on_facet(found, ray, normal, mi.UInt32(shape.y), evaluated)
             own: DeviceArray = one_number(found.shape.bsdf().eval_diffuse_reflectance(si, evaluated))
             reflectivity = dr.select(evaluated, unit(own), reflectivity)
+        # 3. Let Mitsuba evaluate shapes that are not in the tables. An instance counts as one shape of the scene.
         if self.foreign:
             evaluated = valid & ~tabled
             si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, evaluated)
@@ -233,10 +238,12 @@ class Surfaces:
             top: DeviceArray = dr.reinterpret_array(mi.UInt32, found.instance)
             inside = valid & (top > 0) & (top * 4 < dr.width(self.shapes))
             shape_id = dr.select(inside, dr.gather(mi.Vector4i, self.shapes, top, inside).z, shape_id)
+        # 4. Apply the scattering law of the material at the angle of the ray.
         material: DeviceArray = dr.select(known, shape.w, -1) if self.materials else mi.Int32(-1)
         if self.lawful:
             cosine: DeviceArray = dr.abs(dr.dot(normal, ray.d))
             reflectivity = weighed(self.laws, material, reflectivity, dr.select(cosine < 1, cosine, 1))
+        # 5. Read the object number of the facet.
         numbered = tabled & (dr.width(self.objects) > 1)
         object_id = dr.gather(mi.Float, self.objects, mi.UInt32(first) + found.prim_index, numbered)
         return Hit(valid, found.t, normal, reflectivity, shape_id, object_id, material)
@@ -249,7 +256,7 @@ class Surfaces:
         first: mi.UInt32,
         active: DeviceArray,
     ) -> mi.SurfaceInteraction3f:
-        """Collect what a texture or BSDF reads at a point: uv, position, triangle, and the side that is hit."""
+        """Return the inputs of a texture or BSDF at a point: uv, position, triangle, and the side that is hit."""
         corner = (first + found.prim_index) * 2
         uv = dr.gather(mi.Vector4f, self.corners, corner, active)
         change = dr.gather(mi.Vector4f, self.corners, corner + 1, active)
@@ -264,13 +271,13 @@ class Surfaces:
 
 
 def registry_index(shape: mi.Shape) -> int:
-    """Return the number by which kernels know a shape: that of ``found.shape``."""
+    """Return the number by which kernels identify a shape, which is that of ``found.shape``."""
     index: DeviceArray = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
     return int(index[0])
 
 
 def _fixed_reflectivity(shape: mi.Shape, kinds: set[str], named: dict[str, list[str]]) -> float:
-    """Return the reflectivity of a shape that has no diffuse reflectance, else -1; note what a user should know."""
+    """Return the reflectivity of a shape without diffuse reflectance, else -1; record shapes for the notes."""
     if not kinds <= DIFFUSE | APPROXIMATED | WRAPPERS:
         named["without"] += [shape.id()]
         return DEFAULT_REFLECTIVITY
@@ -280,7 +287,7 @@ def _fixed_reflectivity(shape: mi.Shape, kinds: set[str], named: dict[str, list[
 
 
 def _number_of_material(shape: mi.Shape, materials: list[AcousticMaterial]) -> int:
-    """Return the number of a shape's material; it joins ``materials`` where no equal one is there."""
+    """Return the number of a shape's material, which is appended to ``materials`` unless an equal one is present."""
     own = material_of(shape)
     assert own is not None
     for number, other in enumerate(materials):
@@ -291,7 +298,7 @@ def _number_of_material(shape: mi.Shape, materials: list[AcousticMaterial]) -> i
 
 
 def _facet_rows(mesh: mi.Mesh, constant: float, flat: bool) -> DeviceArray:
-    """Return normal and reflectivity of each triangle, as Mitsuba itself computes them."""
+    """Return the normal and reflectivity of each triangle, as computed by Mitsuba."""
     si = facet_points(mesh, dr.arange(mi.UInt32, mesh.face_count()), mi.Point2f(1 / 3))
     own: DeviceArray = mi.Float(-1)
     if flat:
@@ -301,7 +308,7 @@ def _facet_rows(mesh: mi.Mesh, constant: float, flat: bool) -> DeviceArray:
 
 
 def _object_ids(meshes: list[mi.Mesh]) -> mi.Float:
-    """Return the attribute ``face_id`` of all triangles, 0 where a mesh has none; one 0 if no mesh has any."""
+    """Return the attribute ``face_id`` of all triangles, 0 for meshes without it; a single 0 if no mesh has it."""
     given = [bool(mesh.has_attribute("face_id")[0]) for mesh in meshes]
     if not any(given):
         return dr.zeros(mi.Float, 1)
@@ -313,7 +320,7 @@ def _object_ids(meshes: list[mi.Mesh]) -> mi.Float:
 
 
 def _corner_rows(mesh: mi.Mesh) -> mi.Float:
-    """Return uv of each triangle's first corner, and its change to the second and to the third."""
+    """Return the uv of each triangle's first corner, and its change to the second and third."""
     facets = dr.arange(mi.UInt32, mesh.face_count())
     first, second, third = (facet_points(mesh, facets, mi.Point2f(*corner)).uv for corner in ((0, 0), (1, 0), (0, 1)))
     second, third = second - first, third - first
@@ -328,8 +335,8 @@ def facet_points(mesh: mi.Mesh, facet: DeviceArray, uv: mi.Point2f) -> mi.Surfac
     """Return points on triangles.
 
     Args:
-        mesh: that has the triangles.
-        facet: numbers of the triangles, ``UInt32``.
+        mesh: the mesh of the triangles.
+        facet: indices of the triangles, ``UInt32``.
         uv: second and third barycentric coordinates of the points.
     """
     count = dr.width(facet)

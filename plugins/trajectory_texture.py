@@ -1,4 +1,4 @@
-"""The texture ``trajectory``, by which a shape of a scene says where it moves."""
+"""The texture ``trajectory``, with which a shape of a scene specifies its motion."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from mitsonar.plugins.native_plugins import search_folders
 __all__ = ["MOTION", "TrajectoryTexture"]
 
 MOTION = "motion"
-"""Name of the texture in a shape."""
+"""Name of the texture within a shape."""
 
 
 class TrajectoryTexture(mi.Texture):
-    """The path of the shape that holds it, under the name ``motion``. It has no colour; sonars and cameras follow it.
+    """The trajectory of the shape that contains the texture, under the name ``motion``.
 
-    Properties: ``filename``: a TUM or CSV file, several as ``school/*.tum`` (the shape in several places), or ``vehicle``:
-    the path that is flown; ``frame`` [mitsonar]: convention of the file, or ros-enu or ned; ``meshes``: PLY files of a mesh
-    that deforms, ``fish/*.ply``, as many vertices each as the shape; ``rate_hz`` [10]: meshes a second; ``loop`` [true].
-    Paths are relative to the folder of the scene's file. At pose 0 the shape lies where the scene has it
-    (docs/guides/moving.md). Mitsuba alone renders the shape there.
+    It has no colour; sonars and cameras follow it.
+
+    Properties: ``filename``: a TUM or CSV file, or several as ``school/*.tum`` (which places the shape several times), or
+    ``vehicle`` for the path of the vehicle; ``frame`` [mitsonar]: coordinate convention of the file, or ros-enu or ned;
+    ``meshes``: PLY files of a deforming mesh, ``fish/*.ply``, each with as many vertices as the shape; ``rate_hz`` [10]:
+    meshes per second; ``loop`` [true]. Paths are relative to the folder of the scene file. At pose 0 the shape lies where
+    the scene places it (docs/guides/moving.md). Mitsuba alone renders the shape there.
 
     .. code-block:: xml
 
@@ -46,7 +48,7 @@ class TrajectoryTexture(mi.Texture):
         return f"Trajectory[{self.fields}]"
 
     def mean(self) -> Any:
-        """Return 0: it has no colour."""
+        """Return 0, since the texture has no colour."""
         return mi.Float(0)
 
 

@@ -1,7 +1,7 @@
-"""Level of an echo: its contribution to its bins.
+"""Compute and encode the levels of echoes, detect echoes in beams, and extract local contrast.
 
-The reflectivity C is Lambert's mu, what is scattered into a steradian: C = 1 scatters pi times what arrives, and a body that
-reflects all has C = 1 / pi.
+The reflectivity C is Lambert's mu, the share scattered per steradian: C = 1 scatters pi times the incident power, and a body
+that reflects everything has C = 1 / pi.
 """
 
 from __future__ import annotations
@@ -35,39 +35,42 @@ __all__ = [
 
 
 class LevelParts(Protocol):
-    """What a level is made of."""
+    """Quantities that determine the level of an echo."""
 
     @property
     def reflectivity(self) -> AnyArray:
-        """Lambert's mu."""
+        """Return the reflectivity, Lambert's mu."""
 
     @property
     def cosine(self) -> AnyArray:
-        """Of the angle between ray and normal."""
+        """Return the cosine of the angle between ray and normal."""
 
     @property
     def solid_angle_sr(self) -> AnyArray:
-        """Of the ray's cell [sr]."""
+        """Return the solid angle of the ray's cell [sr]."""
 
     @property
     def range_m(self) -> AnyArray:
-        """To the surface [m]."""
+        """Return the range to the surface [m]."""
 
 
 def level(echoes: LevelParts, sonar: Sonar, where: Callable[..., AnyArray]) -> AnyArray:
-    """Compute the level of each echo, float64, by plain IEEE products: NumPy and Dr.Jit agree to the bit.
+    """Compute the level of each echo, which is its contribution to the range bins.
+
+    Only IEEE products in float64 are used, so NumPy and Dr.Jit agree to the bit.
 
     ``thesis``: C L, reflectivity times cosine (Almanza-Medina, eq. 2.2).
 
-    ``physical``, monostatic: C cos(theta) dOmega / R^2 times the gain R^g [sr/m^2]. The factors are spreading 1/R^4 there
-    and back, Lambert's law C cos^2(theta), and the lit area dA = R^2 dOmega / cos(theta), which cancels one cosine. C is
-    Lambert's mu [1/sr]. The gain g = 2 undoes the spreading of one way, g = 4 that of both. R is clamped below to the
-    window's begin or one bin, and above to four times the window's end, where only a footprint's tail reaches.
+    ``physical``, monostatic: C cos(theta) dOmega / R^2 times the gain R^g [sr/m^2]. The factors are the two-way spreading
+    1/R^4, Lambert's law C cos^2(theta), and the lit area dA = R^2 dOmega / cos(theta), which cancels one cosine. C is
+    Lambert's mu [1/sr]. A gain of g = 2 compensates one-way spreading, g = 4 two-way spreading. R is clamped from below to
+    the start of the window or one bin, and from above to four times the end of the window, which only the tail of a
+    footprint reaches.
 
     Args:
         echoes: arrays of float64.
         sonar: the instrument.
-        where: ``where(condition, a, b)`` of the arrays' library.
+        where: function ``where(condition, a, b)`` of the array library.
     """
     lambert = echoes.reflectivity * echoes.cosine
     if sonar.model == "thesis":
@@ -78,7 +81,7 @@ def level(echoes: LevelParts, sonar: Sonar, where: Callable[..., AnyArray]) -> A
 
 
 def largest_level(sonar: Sonar, solid_angle: float) -> float:
-    """Return the largest level of one ray; ``solid_angle`` [sr] is the largest of a cell."""
+    """Return the largest possible level of one ray, given the largest ``solid_angle`` of a cell [sr]."""
     if sonar.model == "thesis":
         return 1.0
     largest: float = max(_spreading(end, sonar.gain_exponent) for end in _ends(sonar))
@@ -86,13 +89,13 @@ def largest_level(sonar: Sonar, solid_angle: float) -> float:
 
 
 def _ends(sonar: Sonar) -> tuple[float, float]:
-    """Return the least and the greatest range of spreading and gain [m]."""
+    """Return the limits to which ranges are clamped in spreading and gain [m]."""
     nearest = max(sonar.range_min, sonar.bin_m)
     return nearest, max(4 * sonar.range_max, nearest)
 
 
 def _spreading(radius: AnyArray, gain_exponent: int) -> AnyArray:
-    """Compute R^(g - 2) by products, not powers."""
+    """Compute R^(g - 2) by multiplication rather than powers, for bitwise reproducibility."""
     match gain_exponent:
         case 0:
             return 1 / (radius * radius)
@@ -106,15 +109,14 @@ def _spreading(radius: AnyArray, gain_exponent: int) -> AnyArray:
             return radius * radius
 
 
-# ---------------- How values 0..1 of a picture stand for levels: linearly, in decibels (ARIS, DIDSON), or as a power
-# (Oculus)
+# ---------------- Encoding of levels as image values
 
 
 def coded(level: NDArray[np.float32], sonar: Sonar) -> NDArray[np.float32]:
-    """Return values 0..1, float32, for levels relative to full scale, of the same shape.
+    """Encode levels relative to full scale as image values in 0..1, float32, of the same shape.
 
-    ``linear``: the level. ``dB``: 1 + 10 log10(level) / ``coding_db``. ``gamma``: amplitude^``coding_gamma``. All are
-    clipped to 0..1.
+    ``linear`` stores the level. ``dB`` (ARIS, DIDSON) stores 1 + 10 log10(level) / ``coding_db``. ``gamma`` (Oculus) stores
+    amplitude^``coding_gamma``. All are clipped to 0..1.
     """
     if sonar.value_coding == "linear":
         linear: NDArray[np.float32] = np.clip(level, 0, 1)
@@ -127,11 +129,11 @@ def coded(level: NDArray[np.float32], sonar: Sonar) -> NDArray[np.float32]:
 
 
 def coding_slope(level: NDArray[np.float64], sonar: Sonar) -> NDArray[np.float64]:
-    """Return the derivative of values 0..1 by the level relative to full scale, of the same shape; 0 beyond full scale.
+    """Return the derivative of image values in 0..1 with respect to the level, of the same shape; 0 above full scale.
 
     Args:
-        level: above 0.
-        sonar: its coding.
+        level: levels relative to full scale, above 0.
+        sonar: the sonar that defines the coding.
     """
     match sonar.value_coding:
         case "linear":
@@ -144,9 +146,10 @@ def coding_slope(level: NDArray[np.float64], sonar: Sonar) -> NDArray[np.float64
 
 
 def decoded(value: ArrayLike, sonar: Sonar, coding: str | None = None) -> NDArray[np.float64]:
-    """Return the levels relative to full scale that values 0..1 stand for, of the same shape.
+    """Decode image values in 0..1 to levels relative to full scale, of the same shape.
 
-    A value of 0 of the coding ``dB`` stands for its least level, or less. ``coding`` None is the sonar's own.
+    In the ``dB`` coding, a value of 0 represents the lowest level of the coding or less. If ``coding`` is None, the coding
+    of the sonar is used.
     """
     value = np.asarray(value, dtype=float)
     match coding or sonar.value_coding:
@@ -158,20 +161,19 @@ def decoded(value: ArrayLike, sonar: Sonar, coding: str | None = None) -> NDArra
             return np.asarray(10 ** ((value - 1) * (sonar.coding_db / 10)), dtype=np.float64)
 
 
-# ---------------- Bottom detection: the range of the first or of the strongest echo in a beam, finer than a bin, with
-# a quality
+# ---------------- Echo detection
 
 
 Array = NDArray[np.float64]
 
 
 class Detected(NamedTuple):
-    """An echo in each beam; nan where there is none.
+    """Range, level and quality of one detected echo per beam; range and level are nan where there is none.
 
     Attributes:
-        range_m: of the echo ``(...)``.
-        level_db: of its strongest bin ``(...)``.
-        quality: part of the beam's energy above the noise that lies in the echo ``(...)``, 0..1.
+        range_m: range of the echo ``(...)``, with sub-bin resolution.
+        level_db: level of its strongest bin ``(...)``.
+        quality: fraction of the beam's energy above the noise that lies in the echo ``(...)``, 0..1.
     """
 
     range_m: Array
@@ -180,22 +182,24 @@ class Detected(NamedTuple):
 
 
 def first_echoes(levels: Array, range_m: Array, noise: Array, *, below_db: float, above_noise_db: float) -> Detected:
-    """Find where the first echo of each beam begins, as an altimeter does.
+    """Find the onset of the first echo in each beam, as an altimeter does.
 
-    It begins where levels rise over the threshold, interpolated between the middles of two bins. The threshold lies
-    ``below_db`` under the strongest bin, and ``above_noise_db`` over the noise at least.
+    The onset is where the level rises above the threshold, interpolated between the centres of two bins. The threshold lies
+    ``below_db`` under the strongest bin, but at least ``above_noise_db`` over the noise.
 
     Args:
         levels: intensities ``(..., bins)``.
-        range_m: middles of the bins ``(bins,)``, at equal steps.
-        noise: mean intensity of the noise ``(bins,)``; 0: none.
-        below_db: of the threshold under the strongest bin.
-        above_noise_db: of the threshold over the noise.
+        range_m: centres of the bins ``(bins,)``, evenly spaced.
+        noise: mean intensity of the noise ``(bins,)``; 0 for none.
+        below_db: threshold relative to the strongest bin, downwards.
+        above_noise_db: threshold relative to the noise, upwards.
     """
     levels, limit, above = _thresholds(levels, noise, below_db, above_noise_db)
+    # Find the first bin above the threshold, and the bin before it.
     first = above.argmax(axis=-1)[..., None]
     before = np.maximum(first - 1, 0)
     here, low, wanted = (np.take_along_axis(one, at, -1) for one, at in ((levels, first), (levels, before), (limit, first)))
+    # Interpolate the threshold crossing linearly between the two; an echo in the first bin starts there.
     rise = np.where(here > low, here - low, 1.0)
     back = np.where(first > 0, np.clip((here - wanted) / rise, 0, 1), 0)
     place = (range_m[first] - back * (range_m[1] - range_m[0] if len(range_m) > 1 else 0))[..., 0]
@@ -203,24 +207,26 @@ def first_echoes(levels: Array, range_m: Array, noise: Array, *, below_db: float
 
 
 def strongest_echoes(levels: Array, range_m: Array, noise: Array, *, below_db: float, above_noise_db: float) -> Detected:
-    """Find the middle of the strongest echo of each beam: the centroid of its energy.
+    """Find the centre of the strongest echo in each beam, as the centroid of its energy.
 
-    The echo is the run of bins around the strongest that exceed the threshold of :func:`first_echoes`, with one bin on each
-    side; speckle may interrupt it for two bins. Noise is taken off.
+    The echo is the run of bins around the strongest bin that exceed the threshold of :func:`first_echoes`, extended by one
+    bin on each side. Speckle may interrupt it for up to two bins. The noise is subtracted.
 
     Args:
         levels: intensities ``(..., bins)``.
-        range_m: middles of the bins ``(bins,)``.
-        noise: mean intensity of the noise ``(bins,)``; 0: none.
-        below_db: of the threshold under the strongest bin.
-        above_noise_db: of the threshold over the noise.
+        range_m: centres of the bins ``(bins,)``.
+        noise: mean intensity of the noise ``(bins,)``; 0 for none.
+        below_db: threshold relative to the strongest bin, downwards.
+        above_noise_db: threshold relative to the noise, upwards.
     """
     levels, _, above = _thresholds(levels, noise, below_db, above_noise_db)
     strongest = np.where(above, levels, 0).argmax(axis=-1)[..., None]
+    # Extend the runs by one bin on each side, which bridges gaps of up to two bins from speckle.
     wide = above.copy()
     wide[..., 1:] |= above[..., :-1]
     wide[..., :-1] |= above[..., 1:]
     echo = _joined(wide, strongest)
+    # Average the ranges of the echo, weighted by the energy above the noise.
     energy = np.where(echo, np.maximum(levels - noise, 0), 0)
     total = energy.sum(axis=-1)
     middle = (energy * range_m).sum(axis=-1) / np.where(total > 0, total, 1)
@@ -238,13 +244,13 @@ def _thresholds(
 
 
 def _joined(above: NDArray[np.bool_], at: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return the run of bins around ``at`` ``(..., 1)`` of which all are above the threshold."""
+    """Return the contiguous run of bins above the threshold that contains ``at`` ``(..., 1)``."""
     gaps = np.cumsum(~above, axis=-1)
     return np.asarray(above & (gaps == np.take_along_axis(gaps, at, -1)))
 
 
 def _told(levels: Array, noise: Array, above: NDArray[np.bool_], echo: NDArray[np.bool_], place: Array) -> Detected:
-    """Return detections, nan where no bin is above the threshold."""
+    """Return the detections, with nan where no bin exceeds the threshold."""
     there = above.any(axis=-1)
     energy = np.maximum(levels - noise, 0)
     total, inside = energy.sum(axis=-1), np.where(echo, energy, 0).sum(axis=-1)
@@ -254,47 +260,48 @@ def _told(levels: Array, noise: Array, above: NDArray[np.bool_], echo: NDArray[n
     return Detected(np.where(there, place, np.nan), np.where(there, level, np.nan), quality)
 
 
-# ---------------- Local contrast of sonar images: what stands out of its neighbourhood, in standard deviations of the
-# image
-# A real sonar lights the ground unevenly: a bright patch, stripes of beams, a fall with range. This light moves with
-# the sonar, so that estimators that match levels are pulled towards no motion. Its scale is that of the patch, larger
-# than that of stones and their shadows. So the mean of a neighbourhood is taken out of levels in dB. Its spread is not:
-# dividing by it made the errors of closure five times larger on a real recording. Speckle and noise that are new in
-# each frame are smoothed away, as far as the frames themselves say.
+# ---------------- Local contrast of sonar images
 
 
 Images = NDArray[np.float32]
 
 SPREAD = 8.0
-"""Standard deviations over the range of the values, 0 to 1."""
+"""Number of standard deviations that the values 0 to 1 span."""
 
 SMOOTHINGS = ((1.0, 0.5), (2.0, 0.7), (4.0, 1.0), (8.0, 1.4), (16.0, 2.0))
-"""Smoothings that are tried, least first: standard deviations of Gaussians [bins, beams]."""
+"""Candidate smoothings, weakest first: standard deviations of Gaussians [bins, beams]."""
 
 ENOUGH = 0.75
-"""Correlation of consecutive frames at which they need no more smoothing."""
+"""Correlation of consecutive frames at which they need no further smoothing."""
 
 NEIGHBOURHOOD = (0.12, 0.3)
-"""Standard deviation of the Gaussian that a neighbourhood is, as part of the bins and of the beams."""
+"""Standard deviation of the Gaussian neighbourhood, as a fraction of the number of bins and of beams."""
 
 LEAST_SPREAD_DB = 0.5
-"""Spread of an image [dB] below which it is taken for even: its noise must not be blown up."""
+"""Lower limit of the standard deviation of an image [dB], so that the noise of a uniform image is not amplified."""
 
 
 @dataclass(frozen=True)
 class LocalContrast:
-    """How levels become contrast.
+    """Conversion of levels to local contrast: the deviation from the neighbourhood, in standard deviations of the image.
+
+    A real sonar illuminates the ground unevenly: with a bright patch, stripes of beams, and a decay with range. This
+    illumination moves with the sonar, so it biases estimators that match levels towards zero motion. Its scale is that of
+    the patch, which is larger than stones and their shadows. The mean of a neighbourhood is therefore subtracted from the
+    levels in dB. Its standard deviation is not divided out, since this increased closure errors fivefold on a real
+    recording. Smoothing suppresses speckle and noise that differ from frame to frame; its strength is chosen from the frames
+    by :func:`mitsonar.acoustics.levels.fitted_contrast`.
 
     Attributes:
         bins: standard deviation of the smoothing along range [bins].
-        beams: and across beams [beams].
+        beams: standard deviation of the smoothing across beams [beams].
     """
 
     bins: float = 4.0
     beams: float = 1.0
 
     def apply(self, level_db: Images) -> Images:
-        """Return the contrast of images ``(frames, bins, beams)`` [dB] in 0..1: 0.5 is the mean of the neighbourhood."""
+        """Return the contrast of images ``(frames, bins, beams)`` [dB] in 0..1; 0.5 is the mean of the neighbourhood."""
         return np.stack([self._of(one) for one in level_db]) if len(level_db) else level_db.astype(np.float32)
 
     def _of(self, level_db: Images) -> Images:
@@ -316,12 +323,12 @@ def alike(images: Images) -> float:
 
 
 def fitted_contrast(runs: Sequence[Images]) -> LocalContrast:
-    """Choose the least smoothing by which consecutive images are alike.
+    """Choose the weakest smoothing at which consecutive images are sufficiently correlated.
 
-    They correlate by 0.75 then. Where none of the smoothings reaches it, the one with the largest correlation is taken.
+    The required correlation is 0.75. If no smoothing reaches it, the one with the largest correlation is chosen.
 
     Args:
-        runs: consecutive images, each ``(frames, bins, beams)`` [dB].
+        runs: sequences of consecutive images, each ``(frames, bins, beams)`` [dB].
     """
     found, best = LocalContrast(*SMOOTHINGS[0]), -1.0
     for bins, beams in SMOOTHINGS:

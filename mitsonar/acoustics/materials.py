@@ -1,16 +1,16 @@
-"""Backscatter of surfaces: a material is a table of its scattering cross-section over the grazing angle.
+"""Compute the acoustic backscatter of surfaces as a function of the grazing angle.
 
-The cross-section sigma is that per unit area and steradian [1/sr], for sound that returns where it came from.
-``10 log sigma`` is the bottom scattering strength. The grazing angle lies between ray and surface; its sine is the cosine
-of incidence.
+A material is a table of its scattering cross-section over the grazing angle. The cross-section sigma is per unit area and
+steradian [1/sr], for sound that returns to where it came from. ``10 log sigma`` is the bottom scattering strength. The
+grazing angle lies between ray and surface; its sine is the cosine of incidence.
 
-The simulator's reflectivity C is Lambert's mu itself, not pi mu. A surface of C = 1 scatters pi times what arrives, 5 dB
-more than it can. A material's mu is physical: ``pi mu`` is at most 1. Where C is to mean the share that is scattered, mu is
-C / pi.
+The simulator's reflectivity C is Lambert's mu itself, not pi mu. A surface with C = 1 scatters pi times the incident power,
+5 dB more than is physically possible. The mu of a material is physical: ``pi mu`` is at most 1. To use C as the share of the
+power that is scattered, set mu to C / pi.
 
-Named materials are one YAML file each in ``materials/``, every number with its source. In a source ``(not seen)`` marks a
-number that is widely quoted from a document which could not be read when this was written, ``second hand`` one that a third
-party quotes from the named document, ``ours`` a choice or our own arithmetic.
+Each named material is a YAML file in ``materials/`` that cites a source for every number. In a source, ``(not seen)`` marks
+a number that is widely quoted from a document that could not be consulted, ``second hand`` a number that a third party
+quotes from the named document, and ``ours`` a choice or calculation of this project.
 """
 
 from __future__ import annotations
@@ -73,27 +73,28 @@ __all__ = [
 ]
 
 
-# ---------------- Materials as rays read them: the reflectivity, Lambert's mu, that scatters as much at a ray's angle
-# A surface of cross-section sigma at the grazing angle g has the effective reflectivity C = sigma / sin^2 g. A ray then
-# needs one number, whatever the law is. The sine of the grazing angle is the cosine of incidence.
+# ---------------- Effective reflectivity for ray tracing
+# A surface with cross-section sigma at the grazing angle g has the effective reflectivity C = sigma / sin^2 g: the Lambert's
+# mu that scatters as much at this angle. A ray then needs a single number, whatever the scattering law. The sine of the
+# grazing angle is the cosine of incidence.
 
 
 FLATTEST = 1e-3
-"""Sine of the flattest grazing angle that a law is asked for; flatter, its reflectivity stays what it is there."""
+"""Sine of the smallest grazing angle at which a law is evaluated; at smaller angles the reflectivity is held constant."""
 
 POWERS = {"lambert": 2, "lommel-seeliger": 1, "rough-fluid": 2, "table": 0}
-"""Power of the sine that is taken out of each law's table, so that what is left is smooth between whole degrees."""
+"""Power of the sine that is divided out of each law's table, so that the rest is smooth between whole degrees."""
 
 UNBOUNDED_HZ = 100e3
-"""Frequency at which a material without a band is taken where the sonar has none [Hz]."""
+"""Frequency at which a material without a band is evaluated if the sonar has none [Hz]."""
 
 
 class MuTable(NamedTuple):
-    """A law as ``C = value sin^(power - 2)``, linear between whole degrees.
+    """A scattering law in the form ``C = value sin^(power - 2)``, with values linear between whole degrees.
 
     Attributes:
         values: at grazing angles of 0, 1 ... 90 deg ``(91,)``.
-        power: of the sine that was taken out of the cross-sections.
+        power: power of the sine that was divided out of the cross-sections.
     """
 
     values: NDArray[np.float64]
@@ -103,16 +104,16 @@ class MuTable(NamedTuple):
 def mu_table(material: Material, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> MuTable:
     """Compute the table of a material's effective reflectivity [1/sr].
 
-    A law ``lambert`` is constant, exactly. Between whole degrees a ``table`` is linear in sigma, as ``sigma_at`` is;
-    ``rough-fluid`` is linear in C, which meets the law within 2 % from 5 deg on, and 12 % at 1.5 deg.
+    The law ``lambert`` gives an exact constant. Between whole degrees a ``table`` is linear in sigma, as is ``sigma_at``.
+    ``rough-fluid`` is linear in C, which is within 2 % of the law from 5 deg on, and within 12 % at 1.5 deg.
 
     Args:
         material: the material.
-        frequency_hz: of the carrier.
-        sound_speed_m_s: in the water.
+        frequency_hz: carrier frequency [Hz].
+        sound_speed_m_s: speed of sound in the water [m/s].
 
     Raises:
-        MitsonarError: a frequency or speed that is not above 0.
+        MitsonarError: a frequency or speed that is not positive.
     """
     power = POWERS[material.law]
     sigma = sigma_table(material, frequency_hz, sound_speed_m_s)
@@ -125,13 +126,13 @@ def mu_table(material: Material, frequency_hz: float, sound_speed_m_s: float = 1
 
 
 def mu_at(table: MuTable, cosine: ArrayLike) -> NDArray[np.float64]:
-    """Compute the effective reflectivity at angles of incidence, as rays read it, in float64.
+    """Evaluate the effective reflectivity at angles of incidence as rays do, in float64.
 
-    It is bounded by 1 / cosine, or a sonar's sums could overflow: cross-sections above the cosine are clipped to it.
+    It is limited to 1 / cosine, since the sums of a sonar could overflow otherwise. This clips cross-sections to the cosine.
 
     Args:
-        table: of :func:`mu_table`.
-        cosine: of the angle between ray and normal ``(...)``, 0..1; at least :data:`FLATTEST` counts.
+        table: result of :func:`mu_table`.
+        cosine: cosine of the angle between ray and normal ``(...)``, 0..1; smaller values are raised to :data:`FLATTEST`.
     """
     given = np.asarray(cosine, dtype=np.float64)
     steep = np.maximum(given, FLATTEST)
@@ -141,14 +142,14 @@ def mu_at(table: MuTable, cosine: ArrayLike) -> NDArray[np.float64]:
 
 
 def single_mu(material: Material, frequency_hz: float | None = None, sound_speed_m_s: float = 1500.0) -> float:
-    """Return one reflectivity for all angles: mu of the law ``lambert``, else sigma / sin^2 at 45 deg of grazing [1/sr].
+    """Return a single reflectivity for all angles: mu of the law ``lambert``, else sigma / sin^2 at 45 deg grazing [1/sr].
 
-    Impulse responses use it. A mirror part is not taken off.
+    It is used for impulse responses. A mirror part is not subtracted.
 
     Args:
         material: the material.
-        frequency_hz: of the carrier; default: :func:`reference_hz`.
-        sound_speed_m_s: in the water.
+        frequency_hz: carrier frequency [Hz]; default: :func:`reference_hz`.
+        sound_speed_m_s: speed of sound in the water [m/s].
     """
     if material.law == "lambert" and material.mu is not None:
         return material.mu
@@ -157,12 +158,12 @@ def single_mu(material: Material, frequency_hz: float | None = None, sound_speed
 
 
 def normal_mu(material: Material, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> float:
-    """Return the reflectivity of the model ``thesis``: the law's mu, or sigma at normal incidence without one [1/sr]."""
+    """Return the reflectivity for the ``thesis`` model: mu of the law, or sigma at normal incidence without one [1/sr]."""
     return float(sigma_table(material, frequency_hz, sound_speed_m_s)[90]) if material.mu is None else material.mu
 
 
 def reference_hz(material: Material) -> float:
-    """Return the frequency at which a material is taken where none is given: the middle of its band, or its only end."""
+    """Return the frequency used if none is given: the geometric mean of the material's band, or its only limit."""
     low, high = material.band_hz
     if low and math.isfinite(high):
         return math.sqrt(low * high)
@@ -170,19 +171,19 @@ def reference_hz(material: Material) -> float:
 
 
 def depends_on_frequency(material: Material) -> bool:
-    """Return whether a material's cross-section depends on the frequency."""
+    """Return whether the cross-section of a material depends on frequency."""
     return material.law == "rough-fluid" or material.has_mirror
 
 
 def hearing_notes(materials: Sequence[Material], frequency_hz: float | None, sound_speed_m_s: float = 1500.0) -> list[str]:
-    """Say in a sentence each what a user should know about materials at a sonar's frequency.
+    """Return one-sentence notes for the user about materials at the frequency of a sonar.
 
-    They are: a frequency that is not given, one outside a material's band, and cross-sections that are clipped.
+    They report a missing frequency, a frequency outside the band of a material, and cross-sections that are clipped.
 
     Args:
-        materials: of a scene.
-        frequency_hz: of the sonar; None where it has none.
-        sound_speed_m_s: in the water.
+        materials: the materials of a scene.
+        frequency_hz: carrier of the sonar [Hz]; None if it has none.
+        sound_speed_m_s: speed of sound in the water [m/s].
     """
     notes = []
     for one in materials:
@@ -203,14 +204,15 @@ def hearing_notes(materials: Sequence[Material], frequency_hz: float | None, sou
     return notes
 
 
-# ---------------- The sediment of a mean grain size, -1 phi (sandy gravel) to 9 phi (clay), as numbers of a rough fluid
-# The regressions are those of APL-UW TR 9407 (1994), section IV, which could not be read: they are quoted from memory
-# of the literature. At 0.5, 1.5, 2.5 and 6 phi they give the numbers of a program of D. R. Jackson as the project
-# hyo2_openbst has them, which is a second route (``tests/acoustics/test_grain_size.py``). They hold for 10 to 100 kHz.
+# ---------------- Sediments by mean grain size
+# Mean grain sizes from -1 phi (sandy gravel) to 9 phi (clay) are mapped to the parameters of a rough fluid. The regressions
+# are those of APL-UW TR 9407 (1994), section IV, which could not be consulted: they are quoted from memory of the
+# literature. At 0.5, 1.5, 2.5 and 6 phi they reproduce the numbers of a program by D. R. Jackson as contained in the project
+# hyo2_openbst, an independent source (``tests/acoustics/test_grain_size.py``). They are valid from 10 to 100 kHz.
 
 
 COARSEST_PHI, FINEST_PHI = -1.0, 9.0
-"""Grain sizes that the regressions cover: phi is minus the logarithm to base 2 of the diameter in mm."""
+"""Range of grain sizes that the regressions cover; phi is minus the logarithm to base 2 of the diameter in mm."""
 
 SEDIMENTS: dict[str, float] = {
     "sandy gravel": -1.0,
@@ -234,25 +236,25 @@ SEDIMENTS: dict[str, float] = {
     "silty clay": 8.0,
     "clay": 9.0,
 }
-"""Names of sediments, and the grain size that stands for each [phi]."""
+"""Mean grain size by name of sediment [phi]."""
 
 SPECTRAL_EXPONENT = 3.25
 
 WATER_M_S = 1528.0
-"""Speed of sound of the water that attenuations refer to [m/s]."""
+"""Speed of sound in the water that attenuations refer to [m/s]."""
 
 LOSS_OF_ATTENUATION = 2.302585093 / (40 * 3.141592654) * 1e-3
-"""Loss parameter of an attenuation of 1 dB/m/kHz and a speed of 1 m/s."""
+"""Loss parameter for an attenuation of 1 dB/m/kHz and a speed of 1 m/s."""
 
 
 def sediment_of(phi: float) -> Sediment:
-    """Return the rough fluid that stands for a sediment of a mean grain size.
+    """Return the rough fluid that models a sediment of a mean grain size.
 
     Args:
         phi: mean grain size, -1..9.
 
     Raises:
-        MitsonarError: a grain size outside the regressions.
+        MitsonarError: a grain size outside the range of the regressions.
     """
     if not COARSEST_PHI <= phi <= FINEST_PHI:
         raise MitsonarError(
@@ -300,40 +302,41 @@ def _attenuation(phi: float) -> float:
 
 
 def _strength(phi: float) -> float:
-    """Return the strength of the spectrum of heights [m^(4 - 3.25)], from that in cm^4 at 1 / cm."""
+    """Return the strength of the roughness spectrum [m^(4 - 3.25)], converted from cm^4 at 1 / cm."""
     height_cm = (2.03846 - 0.26923 * phi) / (1 + 0.076923 * phi) if phi < 5 else 0.5
     centimetre = 0.01
     return float(0.00207 * height_cm**2 * centimetre**4 * centimetre**-SPECTRAL_EXPONENT)
 
 
-# ---------------- Backscatter of a sea floor that is a rough, absorbing fluid with scatterers within: roughness and
-# volume added
-# Roughness is the small-slope approximation of first order for a power-law spectrum. It becomes the Kirchhoff
+# ---------------- Rough absorbing fluid
+# The sea floor is modelled as a rough, absorbing fluid with volume scatterers. Roughness and volume scattering are added.
+# Roughness scattering is the first-order small-slope approximation for a power-law spectrum. It approaches the Kirchhoff
 # approximation near normal incidence and first-order perturbation at low grazing angles, without a rule to join them
-# (Jackson and Richardson, High-Frequency Seafloor Acoustics, 2007). APL-UW TR 9407 (1994) joins the same two limits by
-# an interpolation, averages the second over the slopes of the large roughness, and has a law of its own for rock; these
-# three parts are not here. The volume term is that of TR 9407 and of Mourad and Jackson (1989).
+# (Jackson and Richardson, High-Frequency Seafloor Acoustics, 2007). APL-UW TR 9407 (1994) joins the same two limits by an
+# interpolation, averages the second over the slopes of the large-scale roughness, and has a separate model for rock; these
+# three parts are not implemented. The volume term is that of TR 9407 and of Mourad and Jackson (1989).
 #
-# Not modelled: shear waves (rock), layers, gas, scattering more than once. Slopes must be small: far above 100 kHz rough
-# floors scatter more at low angles than at steep ones, which is a fault of the approximation.
+# Shear waves (rock), layers, gas and multiple scattering are not modelled. Slopes must be small: far above 100 kHz, rough
+# floors scatter more at low angles than at steep ones, which is an artefact of the approximation.
 
 
 Angles = NDArray[np.float64]
 
 LOWEST_COSINE = 1e-5
-"""Cosine that stands for normal incidence, where the formula is 0 / 0."""
+"""Cosine used at normal incidence, where the formula is 0 / 0."""
 
 
 class Sediment(NamedTuple):
-    """A rough fluid below water.
+    """Acoustic parameters of a rough fluid below water.
 
     Attributes:
-        density_ratio: rho, density over that of the water.
-        sound_speed_ratio: nu, speed of sound over that of the water.
+        density_ratio: rho, density relative to that of the water.
+        sound_speed_ratio: nu, speed of sound relative to that of the water.
         loss: delta, imaginary over real part of the wavenumber.
-        volume: sigma_2, volume scattering cross-section per unit volume and steradian over the attenuation in dB per length.
-        spectral_exponent: gamma of the spectrum of heights ``W(K) = w K^-gamma``, 2..4. The integral of W over the plane of
-            wave vectors is the mean square height.
+        volume: sigma_2, volume scattering cross-section per unit volume and steradian, over the attenuation in dB per
+            length.
+        spectral_exponent: gamma of the height spectrum ``W(K) = w K^-gamma``, 2..4. The integral of W over the plane of wave
+            vectors is the mean square height.
         spectral_strength: w [m^(4 - gamma)].
     """
 
@@ -351,13 +354,13 @@ def rough_fluid_sigma(sediment: Sediment, grazing_rad: Angles, wavenumber: float
     Args:
         sediment: the sea floor.
         grazing_rad: angle between ray and surface, 0..pi/2 ``(n,)``.
-        wavenumber: 2 pi f / c of the water [rad/m].
+        wavenumber: 2 pi f / c in the water [rad/m].
     """
     return roughness_sigma(sediment, grazing_rad, wavenumber) + volume_sigma(sediment, grazing_rad)
 
 
 def roughness_sigma(sediment: Sediment, grazing_rad: Angles, wavenumber: float) -> Angles:
-    """Compute the part of the roughness, ``sin^2 |Y|^2 I(q) / (8 pi cos^2)`` ``(n,)`` [1/sr].
+    """Compute the roughness contribution ``sin^2 |Y|^2 I(q) / (8 pi cos^2)`` ``(n,)`` [1/sr].
 
     Y is the factor of first-order perturbation for two fluids, I the integral of :func:`structure_integral`, and
     ``q = 2 C^2 k^2 sin^2 (2 k cos)^(-2 alpha)`` with ``alpha = gamma / 2 - 1`` and the structure constant C^2.
@@ -365,7 +368,7 @@ def roughness_sigma(sediment: Sediment, grazing_rad: Angles, wavenumber: float) 
     Args:
         sediment: the sea floor.
         grazing_rad: angle between ray and surface, 0..pi/2 ``(n,)``.
-        wavenumber: of the water [rad/m].
+        wavenumber: in the water [rad/m].
     """
     sine, cosine = np.sin(grazing_rad), np.maximum(np.cos(grazing_rad), LOWEST_COSINE)
     alpha = sediment.spectral_exponent / 2 - 1
@@ -377,31 +380,34 @@ def roughness_sigma(sediment: Sediment, grazing_rad: Angles, wavenumber: float) 
 
 
 def structure_constant(sediment: Sediment) -> float:
-    """Return C^2 [m^(2 - 2 alpha)]: heights a distance r apart differ by ``C^2 r^(2 alpha)`` in the mean square."""
+    """Return C^2 [m^(2 - 2 alpha)]: the mean square height difference at a distance r is ``C^2 r^(2 alpha)``."""
     alpha = sediment.spectral_exponent / 2 - 1
     gammas = math.gamma(2 - alpha) / (alpha * (1 - alpha) * math.gamma(1 + alpha))
     return 2 * math.pi * sediment.spectral_strength * 2 ** (-2 * alpha) * gammas
 
 
 def structure_integral(q: Angles, alpha: float) -> Angles:
-    """Compute ``I(q)``, the integral of ``exp(-q u^(2 alpha)) J0(u) u`` over u from 0, ``(n,)``.
+    """Compute ``I(q)``, the integral of ``exp(-q u^(2 alpha)) J0(u) u`` over u from 0 to infinity, ``(n,)``.
 
-    J0 is the real part of a Hankel function. On a ray turned into the upper half of the complex plane both factors decay; a
-    sum over even steps of log u then converges exponentially. Below q = 1 the integral of ``H0(u) u``, which is zero, is
-    taken away first.
+    J0 is the real part of a Hankel function. On a ray rotated into the upper half of the complex plane both factors decay,
+    and a sum over even steps of log u converges exponentially. Below q = 1, the integral of ``H0(u) u``, which is zero, is
+    subtracted first.
 
     Args:
         q: 0 or more ``(n,)``.
         alpha: 0..1, both excluded.
     """
+    # Rotation of the path that keeps both the exponential and the Hankel function decaying.
     turn = min(math.pi / 4, math.pi / (8 * alpha))
     found = np.zeros_like(q)
     for k, one in enumerate(q):
         if one > 0:
-            begin, end = -19.0, math.log(40 / math.sin(turn))  # of log u: beyond, nothing is left
+            begin, end = -19.0, math.log(40 / math.sin(turn))  # limits of log u, beyond which the integrand is negligible
+            # A large q moves the scale of the exponential to smaller u, and with it both limits.
             if one >= 1:
                 begin -= math.log(one) / (2 * alpha)
                 end = min(end, math.log(40 / (one * math.cos(2 * alpha * turn))) / (2 * alpha))
+            # Sum over even steps of log u along the rotated ray.
             t = np.exp(np.arange(begin, end, 0.04))
             u = t * np.exp(1j * turn)
             exponent = -one * t ** (2 * alpha) * np.exp(2j * alpha * turn)
@@ -411,9 +417,9 @@ def structure_integral(q: Angles, alpha: float) -> Angles:
 
 
 def volume_sigma(sediment: Sediment, grazing_rad: Angles) -> Angles:
-    """Compute the part of the volume ``(n,)`` [1/sr]: ``5 delta sigma_2 |1 - V^2|^2 sin^2 / (nu ln 10 |P|^2 Im P)``.
+    """Compute the volume contribution ``5 delta sigma_2 |1 - V^2|^2 sin^2 / (nu ln 10 |P|^2 Im P)`` ``(n,)`` [1/sr].
 
-    V is the reflection coefficient, P the sine of the grazing angle below the surface times its relative wavenumber.
+    V is the reflection coefficient, P the sine of the grazing angle below the surface times the relative wavenumber there.
 
     Args:
         sediment: the sea floor.
@@ -426,22 +432,22 @@ def volume_sigma(sediment: Sediment, grazing_rad: Angles) -> Angles:
 
 
 def reflection(sediment: Sediment, grazing_rad: Angles) -> NDArray[np.complex128]:
-    """Compute the reflection coefficient of the flat surface, of pressures ``(n,)``."""
+    """Compute the pressure reflection coefficient of the flat surface ``(n,)``."""
     ratio = sediment.density_ratio * np.sin(grazing_rad) / _sine_below(sediment, np.cos(grazing_rad))
     return np.asarray((ratio - 1) / (ratio + 1))
 
 
 def _relative_wavenumber(sediment: Sediment) -> complex:
-    """Return kappa, the wavenumber below over that of the water."""
+    """Return kappa, the wavenumber in the sediment over that in the water."""
     return (1 + 1j * sediment.loss) / sediment.sound_speed_ratio
 
 
 def _sine_below(sediment: Sediment, cosine: Angles) -> NDArray[np.complex128]:
-    """Return P, the vertical wavenumber below over the wavenumber of the water ``(n,)``."""
+    """Return P, the vertical wavenumber in the sediment over the wavenumber in the water ``(n,)``."""
     return np.asarray(np.sqrt(_relative_wavenumber(sediment) ** 2 - cosine**2))
 
 
-# ---------------- backscatter
+# ---------------- Materials and their scattering laws
 
 
 Law = Literal["lambert", "lommel-seeliger", "rough-fluid", "table"]
@@ -455,17 +461,17 @@ LAWS: dict[str, tuple[str, ...]] = {
     "rough-fluid": ("density_ratio", "sound_speed_ratio", "loss", "volume", "spectral_exponent", "spectral_strength"),
     "table": ("strength_db",),
 }
-"""Laws of scattering, and the keys that each needs."""
+"""Scattering laws, and the keys that each requires."""
 
 MIRROR = ("reflection", "roughness_m")
-"""Keys of the mirror part, both or none; ``lambert`` and ``lommel-seeliger`` may have them."""
+"""Keys of the mirror part, to be given together or not at all; only ``lambert`` and ``lommel-seeliger`` accept them."""
 
 LARGEST_MU = {"lambert": 1 / math.pi, "lommel-seeliger": 1 / (4 * math.pi)}
-"""The mu of each law at which some direction of arrival is scattered without loss."""
+"""Value of mu for each law at which some direction of incidence is scattered without loss."""
 
 
 class Material(CheckedModel):
-    """What a surface is made of: a law of scattering with its numbers, where they hold and where they come from."""
+    """The scattering law of a surface with its parameters, their band and their source."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -496,10 +502,10 @@ class Material(CheckedModel):
 
     @classmethod
     def create(cls, **fields: PlainValue) -> Self:
-        """Create a material with these fields.
+        """Create a material from its fields.
 
         Raises:
-            MitsonarError: an unknown key, a value outside its limits, or keys that do not fit the law.
+            MitsonarError: an unknown key, a value outside its limits, or keys that do not match the law.
         """
         return cls(**fields)
 
@@ -526,7 +532,7 @@ class Material(CheckedModel):
         return self
 
     def _check_energy(self, mu: float) -> None:
-        """Refuse a mu by which more would be scattered than arrives, or than a mirror part would return."""
+        """Reject a mu that would scatter more than the incident power, or more than a mirror part returns."""
         most = LARGEST_MU[self.law] * (1.0 if self.reflection is None else self.reflection**2)
         if mu > most * (1 + 1e-9):
             than = "than arrives" if self.reflection is None else "than its reflection returns"
@@ -534,17 +540,17 @@ class Material(CheckedModel):
 
     @property
     def band_hz(self) -> tuple[float, float]:
-        """Return the lowest and the highest frequency at which the numbers hold [Hz]; 0 and infinity where none is given."""
+        """Return the lowest and highest frequency at which the numbers are valid [Hz]; 0 and infinity if not given."""
         return self.frequency_min_hz or 0.0, self.frequency_max_hz or math.inf
 
     @property
     def has_mirror(self) -> bool:
-        """Return whether a part of the echo is a mirror's."""
+        """Return whether the echo has a mirror (specular) part."""
         return self.reflection is not None
 
 
 def band_warning(material: Material, frequency_hz: float) -> str | None:
-    """Say in one sentence where a frequency lies outside the band of a material; None where it lies within."""
+    """Return a one-sentence warning if a frequency lies outside the band of a material, else None."""
     low, high = material.band_hz
     if low <= frequency_hz <= high:
         return None
@@ -560,21 +566,21 @@ def sigma_table(material: Material, frequency_hz: float, sound_speed_m_s: float 
     law                   sigma at the grazing angle g
     ====================  ==========================================================================================
     ``lambert``           ``mu sin^2 g``: a matt surface
-    ``lommel-seeliger``   ``mu sin g``: grains that scatter once, evenly to all sides, each in the shadow of others
-    ``rough-fluid``       :mod:`mitsonar.acoustics.materials`
+    ``lommel-seeliger``   ``mu sin g``: grains that scatter once, isotropically, each in the shadow of others
+    ``rough-fluid``       :func:`mitsonar.acoustics.materials.rough_fluid_sigma`
     ``table``             as given
     ====================  ==========================================================================================
 
-    With a mirror part, mu is what a fully rough surface scatters. The rest of the coherent echo of :func:`mirror_amplitude`
-    is scattered: mu is multiplied by ``1 - exp(-4 k^2 h^2 sin^2 g)``. Both together never exceed the reflection.
+    With a mirror part, mu is the scattering of a fully rough surface. What the coherent echo of :func:`mirror_amplitude`
+    loses is scattered: mu is multiplied by ``1 - exp(-4 k^2 h^2 sin^2 g)``. The two together never exceed the reflection.
 
     Args:
         material: the material.
-        frequency_hz: of the carrier.
-        sound_speed_m_s: in the water.
+        frequency_hz: carrier frequency [Hz].
+        sound_speed_m_s: speed of sound in the water [m/s].
 
     Raises:
-        MitsonarError: a frequency or speed that is not above 0.
+        MitsonarError: a frequency or speed that is not positive.
     """
     wavenumber = _wavenumber(frequency_hz, sound_speed_m_s)
     grazing = np.radians(GRAZING_DEG)
@@ -595,19 +601,19 @@ def sigma_table(material: Material, frequency_hz: float, sound_speed_m_s: float 
 
 
 def sigma_at(material: Material, cosine: AnyArray, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> AnyArray:
-    """Gather the cross-section of a material at angles of incidence, linear between whole degrees, in float64 [1/sr].
+    """Evaluate the cross-section of a material at angles of incidence, linear between whole degrees, in float64 [1/sr].
 
     Args:
         material: the material.
-        cosine: of the angle between ray and normal ``(...)``, NumPy or torch; clipped to 0..1.
-        frequency_hz: of the carrier.
-        sound_speed_m_s: in the water.
+        cosine: cosine of the angle between ray and normal ``(...)``, NumPy or torch; clipped to 0..1.
+        frequency_hz: carrier frequency [Hz].
+        sound_speed_m_s: speed of sound in the water [m/s].
 
     Returns:
-        Like ``cosine``. A smooth law is met within 1e-4 of its largest value.
+        Like ``cosine``. The error for a smooth law is within 1e-4 of its largest value.
 
     Raises:
-        MitsonarError: a frequency or speed that is not above 0.
+        MitsonarError: a frequency or speed that is not positive.
     """
     cosine = np.asarray(cosine, dtype=np.float64) if isinstance(cosine, int | float) else cosine
     xp = array_namespace(cosine)
@@ -621,22 +627,22 @@ def sigma_at(material: Material, cosine: AnyArray, frequency_hz: float, sound_sp
 
 
 def mirror_amplitude(material: Material, cosine: AnyArray, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> AnyArray:
-    """Compute the coherent reflection coefficient of a rough mirror, ``V exp(-2 k^2 h^2 cos^2)``, of pressures.
+    """Compute the coherent pressure reflection coefficient of a rough mirror, ``V exp(-2 k^2 h^2 cos^2)``.
 
-    V is ``reflection``, taken the same at all angles, h ``roughness_m``, k the wavenumber. The factor is that of Gaussian
-    heights in Kirchhoff's approximation (Jackson and Richardson, High-Frequency Seafloor Acoustics, 2007).
+    V is ``reflection``, assumed independent of the angle, h is ``roughness_m`` and k the wavenumber. The factor is that of
+    Gaussian heights in the Kirchhoff approximation (Jackson and Richardson, High-Frequency Seafloor Acoustics, 2007).
 
     Args:
         material: the material.
-        cosine: of the angle between ray and normal ``(...)``, NumPy or torch.
-        frequency_hz: of the carrier.
-        sound_speed_m_s: in the water.
+        cosine: cosine of the angle between ray and normal ``(...)``, NumPy or torch.
+        frequency_hz: carrier frequency [Hz].
+        sound_speed_m_s: speed of sound in the water [m/s].
 
     Returns:
         Like ``cosine``; zero without a mirror part.
 
     Raises:
-        MitsonarError: a frequency or speed that is not above 0.
+        MitsonarError: a frequency or speed that is not positive.
     """
     cosine = np.asarray(cosine, dtype=np.float64) if isinstance(cosine, int | float) else cosine
     height = _wavenumber(frequency_hz, sound_speed_m_s) * (material.roughness_m or 0.0)
@@ -644,7 +650,7 @@ def mirror_amplitude(material: Material, cosine: AnyArray, frequency_hz: float, 
 
 
 def _rough_share(material: Material, sine: NDArray[np.float64], wavenumber: float) -> NDArray[np.float64]:
-    """Return the share of the intensity that roughness takes from a mirror ``(n,)``; one without a mirror part."""
+    """Return the share of the intensity that roughness removes from a mirror ``(n,)``; one without a mirror part."""
     if material.roughness_m is None:
         return np.ones_like(sine)
     return np.asarray(-np.expm1(-4 * (wavenumber * material.roughness_m * sine) ** 2))
@@ -659,20 +665,20 @@ def _wavenumber(frequency_hz: float, sound_speed_m_s: float) -> float:
 
 
 def _number(material: Material, key: str) -> float:
-    """Return a number that the material's law needs, and which is therefore there."""
+    """Return a parameter that the material's law requires, and which is therefore set."""
     return float(getattr(material, key))
 
 
-# ---------------------------------------------------------------- named materials
+# ---------------- Named materials
 
 
 class NamedMaterial(NamedTuple):
-    """A material of the package.
+    """A material that ships with the package.
 
     Attributes:
-        about: what it stands for.
-        values: of the fields of :class:`Material`, by name.
-        sources: where each value comes from.
+        about: description of the material.
+        values: values of the fields of :class:`Material`, by name.
+        sources: source of each value.
     """
 
     about: str
@@ -682,7 +688,7 @@ class NamedMaterial(NamedTuple):
 
 @cache
 def named_materials() -> dict[str, NamedMaterial]:
-    """Return all named materials by name, from the files of the package."""
+    """Return all named materials of the package, by name."""
     found = {}
     for path in sorted((files("mitsonar.acoustics") / "materials").iterdir(), key=lambda path: path.name):
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -694,12 +700,12 @@ def named_materials() -> dict[str, NamedMaterial]:
 def material(name_or_file: str | Path) -> Material:
     """Load a material by its name, or from a YAML file (keys: the fields of :class:`Material`, and ``material``).
 
-    The key ``material`` (optional) names a material whose numbers the others replace. Where they give another ``law``, only
-    name, description and band are taken over. The key ``grain_size_phi`` gives the numbers of a sediment of that mean grain
-    size (:mod:`mitsonar.acoustics.materials`), which the others replace too.
+    The optional key ``material`` names a base material whose numbers the other keys replace. If they give another ``law``,
+    only name, description and band of the base are used. The key ``grain_size_phi`` sets the parameters of a sediment of
+    that mean grain size (:func:`mitsonar.acoustics.materials.sediment_of`), which the other keys also replace.
 
     Raises:
-        MitsonarError: unknown name (with the nearest ones), unreadable file, unknown key, value out of limits.
+        MitsonarError: unknown name (suggesting the nearest ones), unreadable file, unknown key, or value outside its limits.
     """
     text = str(name_or_file)
     if not text.lower().endswith((".yaml", ".yml")):
@@ -721,7 +727,7 @@ def material(name_or_file: str | Path) -> Material:
 
 
 def _by_grain_size(fields: dict[str, PlainValue], text: str) -> dict[str, PlainValue]:
-    """Return the fields of a file with the numbers of its grain size, where it gives one; its own numbers win."""
+    """Return the fields of a file, completed from its grain size if it gives one; explicit fields take precedence."""
     if "grain_size_phi" not in fields:
         return fields
     phi = fields.pop("grain_size_phi")
@@ -735,7 +741,7 @@ def _by_grain_size(fields: dict[str, PlainValue], text: str) -> dict[str, PlainV
 
 
 def _named(name: str) -> dict[str, PlainValue]:
-    """Return the fields of a named material, its sources in one text."""
+    """Return the fields of a named material, with its sources joined into one text."""
     known = named_materials()
     if name not in known:
         raise MitsonarError(f"unknown material {shortened(name)}: {nearest_names(name, known)}")
@@ -744,20 +750,19 @@ def _named(name: str) -> dict[str, PlainValue]:
     return {"name": name, "about": one.about, "source": source, **one.values}
 
 
-# ---------------- Which instruments hear mirrors and several reflections: refusals that recipes, commands and
-# simulators share
+# ---------------- Checks for mirrors and multiple reflections
 
 
 def check_image_mirrors(sonar: Sonar, views: Sequence[View] | None, mirrors: bool) -> None:
-    """Refuse mirrors and several reflections that an imaging sonar does not hear.
+    """Check that an imaging sonar supports the requested mirrors and multiple reflections.
 
     Args:
         sonar: the instrument.
-        views: of its images; None: the whole.
+        views: views of its images; None: the whole.
         mirrors: whether shapes are to reflect as mirrors.
 
     Raises:
-        MitsonarError: mirrors in a model without them; several reflections at receivers elsewhere or in portions.
+        MitsonarError: mirrors in a model without them, or multiple reflections with remote receivers or partial views.
     """
     if mirrors and sonar.model != "coherent" and sonar.bounces == 1:
         raise MitsonarError(
@@ -771,15 +776,15 @@ def check_image_mirrors(sonar: Sonar, views: Sequence[View] | None, mirrors: boo
 
 
 def check_channel_mirrors(sonar: ChannelSonar, mirrors: bool, lacking: str) -> None:
-    """Refuse several bounces without mirrors, and mirrors in the model ``rays``.
+    """Check that bounces come with mirrors, and that the model ``rays`` has no mirrors.
 
     Args:
         sonar: the instrument.
         mirrors: whether any shape reflects as a mirror.
-        lacking: how to name mirrors where the instrument needs them.
+        lacking: text of the error if the instrument needs mirrors and the scene has none.
 
     Raises:
-        MitsonarError: they do not fit.
+        MitsonarError: an unsupported combination.
     """
     if sonar.bounces > 1 and not mirrors:
         raise MitsonarError(f"bounces {sonar.bounces} need mirrors, and the scene has none: {lacking}")

@@ -1,7 +1,8 @@
-"""Noise of sonar images (Almanza-Medina, 2.2.3): a function of (seed, frame, cell), the same in NumPy and torch.
+"""Add pixel noise to sonar images (Almanza-Medina, 2.2.3), reproducibly in NumPy and torch.
 
-The echo is clipped to [0, 1]. Pixels without echo become Gaussian; others get an added Rayleigh value. The sum is clipped.
-It is kept as published, for its tables: a pixel's law depends on whether it holds an echo, so the noise draws the shadows.
+The noise is a function of (seed, frame, cell). The echo is clipped to [0, 1]. Pixels without an echo become Gaussian; the
+others have a Rayleigh value added. The sum is clipped. The model is retained as published, to reproduce its tables. Its
+distribution depends on whether a pixel contains an echo, so the noise itself outlines the shadows.
 """
 
 from __future__ import annotations
@@ -40,11 +41,12 @@ MASK = 0xFFFFFFFF
 
 
 class NoiseModel(CheckedModel):
-    """Gaussian of the empty pixels and Rayleigh of the others, in fractions of the largest pixel value.
+    """Gaussian noise of empty pixels and Rayleigh noise of the others, in fractions of the largest pixel value.
 
-    This is the noise of the model ``thesis``, and no model of a real sonar's. A real receiver adds noise of one law to every
-    pixel, whether an echo is in it or not. Here the law changes at the border of every shadow, so a network or an estimator
-    can read the exact mask of empty pixels off the noise. Results with it say little about real images.
+    This is the noise of the ``thesis`` model, and not a model of a real sonar. A real receiver adds noise of the same
+    distribution to every pixel, with or without an echo. Here the distribution changes at the border of every shadow, so a
+    network or an estimator can read the exact mask of empty pixels from the noise. Results with it say little about real
+    images.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -66,35 +68,36 @@ class NoiseModel(CheckedModel):
         Args:
             image: ``(frames, bins, beams)`` in 0..1, NumPy or torch.
             seed: seed of the noise.
-            frames: number of each frame ``(frames,)``, an integer array of the same kind.
+            frames: number of each frame ``(frames,)``, an integer array of the same library.
         """
         xp = array_namespace(image)
         if self.is_none:
             return xp.clip(image, 0.0, 1.0)
-        if image.shape[0] > 1 and str(device(image)) == "cpu":  # the arrays of one frame fit the cache
+        if image.shape[0] > 1 and str(device(image)) == "cpu":  # one frame at a time fits the cache
             one = [self.apply(image[k : k + 1, ...], seed=seed, frames=frames[k : k + 1]) for k in range(image.shape[0])]
             return xp.concat(one, axis=0)
         first, second = uniform(image.shape, seed=seed, frames=frames, like=image)
+        # Box-Muller: the radius is also a Rayleigh variable, used for the echoes.
         radius = xp.sqrt(-2.0 * xp.log(first))
         gaussian = self.mean + self.std * radius * xp.cos(2.0 * math.pi * second)
         echo = xp.clip(xp.astype(image, xp.float64), 0.0, 1.0)
         noisy = xp.where(echo > 0, echo + self.scale * radius, gaussian)
-        # libraries differ in the last bit of log and cos: a grid of 2^-30 far above it hides that
+        # rounding to 2^-30 hides the last bits of log and cos, in which libraries differ
         noisy = xp.round(xp.clip(noisy, 0.0, 1.0) * 2.0**30) * 2.0**-30
         return xp.astype(noisy, xp.float32)
 
     def apply_sum(self, vector: AnyArray, nonzero: AnyArray, cells: int, *, seed: int, frames: AnyArray) -> AnyArray:
-        """Add noise to sums over the beams; return float32. The noise is a Gaussian of the sum's mean and variance.
+        """Add Gaussian noise with the correct mean and variance to sums over the beams; return float32.
 
-        The noise of single pixels, :meth:`apply`, summed over a row of the image, has the same mean and variance. This holds
-        while echoes do not reach 1, where they would be clipped.
+        The pixel noise of :meth:`apply`, summed over a row of the image, has the same mean and variance, provided that
+        echoes do not reach 1, where they would be clipped.
 
         Args:
             vector: sums of images in 0..1 ``(frames, bins)``, NumPy or torch.
-            nonzero: number of pixels of each row that hold an echo, like ``vector``.
-            cells: pixels of a row.
+            nonzero: number of pixels with an echo in each row, like ``vector``.
+            cells: number of pixels per row.
             seed: seed of the noise.
-            frames: number of each frame ``(frames,)``, an integer array of the same kind.
+            frames: number of each frame ``(frames,)``, an integer array of the same library.
         """
         xp = array_namespace(vector)
         if self.is_none:
@@ -107,17 +110,17 @@ class NoiseModel(CheckedModel):
         mean = echoes * echo_mean + (cells - echoes) * empty_mean
         std = xp.sqrt(echoes * echo_variance + (cells - echoes) * empty_variance)
         noisy = xp.clip(xp.astype(vector, xp.float64) + mean + std * gaussian, 0.0, None)
-        noisy = xp.round(noisy * 2.0**24) * 2.0**-24  # hides the last bits in which libraries differ
+        noisy = xp.round(noisy * 2.0**24) * 2.0**-24  # hides the last bits, in which libraries differ
         return xp.astype(noisy, xp.float32)
 
     def grey_of_empty(self, greys: int = 255) -> NDArray[np.float64]:
-        """Compute the probability of each grey value 0..``greys`` of a pixel without echo, as stored ``(greys + 1,)``."""
+        """Compute the probability of each stored grey value 0..``greys`` of a pixel without an echo ``(greys + 1,)``."""
         edges = _grey_edges(greys)
         above = (self.mean > edges).astype(float) if self.std == 0 else ndtr((self.mean - edges) / self.std)
         return np.asarray(-np.diff(above, prepend=1.0, append=0.0), dtype=np.float64)
 
     def grey_of_echo(self, level: ArrayLike, greys: int = 255) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Compute the probability of each grey value 0..``greys`` of a pixel with an echo, and its derivative by the echo.
+        """Compute the probability of each grey value of a pixel with an echo, and its derivative with respect to the echo.
 
         Args:
             level: the echo before noise, above 0 ``(...)``.
@@ -127,7 +130,7 @@ class NoiseModel(CheckedModel):
             Two arrays ``(..., greys + 1)``.
 
         Raises:
-            MitsonarError: echoes get no noise, so their grey values have no derivative.
+            MitsonarError: echoes have no noise, so their grey values have no derivative.
         """
         if self.scale == 0:
             raise MitsonarError("the distribution of an echo needs noise: got scale 0; give a scale above 0")
@@ -142,7 +145,7 @@ class NoiseModel(CheckedModel):
 
 
 def _clipped_gaussian(mean: float, std: float) -> tuple[float, float]:
-    """Compute mean and variance of a Gaussian clipped to 0..1."""
+    """Compute the mean and variance of a Gaussian clipped to 0..1."""
     if std == 0:
         return mean, 0.0
 
@@ -175,9 +178,9 @@ def uniform(shape: tuple[int, int, int], *, seed: int, frames: AnyArray, like: A
 
     Args:
         shape: (frames, bins, beams).
-        seed: of the noise.
+        seed: seed of the noise.
         frames: number of each frame ``(frames,)``.
-        like: an array of the library and device.
+        like: an array that selects library and device.
     """
     xp = array_namespace(like)
     count, bins, beams = shape
@@ -191,12 +194,12 @@ def uniform(shape: tuple[int, int, int], *, seed: int, frames: AnyArray, like: A
 
 
 def _multiply(value: AnyArray, factor: int) -> AnyArray:
-    """Multiply modulo 2^32. int64 arrays wrap, which keeps the low bits right."""
+    """Multiply modulo 2^32; int64 overflow wraps, which leaves the low bits correct."""
     return (value * factor) & MASK
 
 
 def _mix(value: AnyArray, key: AnyArray) -> AnyArray:
-    """Hash by Chris Wellons's 32-bit integer hash `lowbias32`, keyed, twice."""
+    """Hash with a key, using two rounds of Chris Wellons's 32-bit integer hash `lowbias32`."""
     for _ in range(2):
         value = value ^ key
         value = _multiply(value ^ (value >> 16), 0x7FEB352D)
@@ -211,17 +214,17 @@ def _mix_int(value: int) -> int:
 
 
 def _grey_edges(greys: int) -> NDArray[np.float64]:
-    """Return the lower bounds of grey 1, 2 ... ``greys``; a value above zero is at least grey 1."""
+    """Return the lower bounds of grey values 1, 2 ... ``greys``; any value above zero is at least grey 1."""
     edges = (np.arange(1, greys + 1) - 0.5) / greys
     edges[0] = 0.0
     return edges
 
 
 def refuse_noise(noise: NoiseModel | None, sonar: Sonar) -> None:
-    """Refuse a noise of pixels for a sonar that has its own, in its field.
+    """Check that pixel noise is not combined with a sonar model that adds its own noise.
 
     Raises:
-        MitsonarError: noise of pixels in the model ``coherent``.
+        MitsonarError: pixel noise with the ``coherent`` model.
     """
     if noise is not None and not noise.is_none and sonar.model == "coherent":
         raise MitsonarError(
@@ -231,13 +234,13 @@ def refuse_noise(noise: NoiseModel | None, sonar: Sonar) -> None:
 
 
 class Information(NamedTuple):
-    """Information of noisy values about two numbers of each pixel: its mean echo, and the probability that it holds one.
+    """Information that noisy values carry about the mean echo of a pixel and the probability that it contains one.
 
     Attributes:
-        law: Fisher information of the exact distribution ``(..., 2, 2)``, in 1 / (fraction of the maximum)^2. None where
-            echoes have no noise and the information is unbounded.
-        slope: derivative of the value's mean by the two numbers ``(..., 2)``.
-        variance: of the value ``(...)``.
+        law: Fisher information of the exact distribution ``(..., 2, 2)``, in 1 / (fraction of the maximum)^2. None if echoes
+            have no noise, where the information is unbounded.
+        slope: derivative of the mean of the value by the two parameters ``(..., 2)``.
+        variance: variance of the value ``(...)``.
     """
 
     law: NDArray[np.float64] | None
@@ -245,9 +248,9 @@ class Information(NamedTuple):
     variance: NDArray[np.float64]
 
     def matched(self, more: ArrayLike = 0.0) -> NDArray[np.float64]:
-        """Compute the information of a Gaussian of this mean and variance ``(..., 2, 2)``.
+        """Compute the information of a Gaussian with this mean and variance ``(..., 2, 2)``.
 
-        Least squares can use this much. It never exceeds ``law``.
+        This is the information that least squares can use. It never exceeds ``law``.
 
         Args:
             more: variance to add ``(...)``.
@@ -257,26 +260,26 @@ class Information(NamedTuple):
 
 
 CHUNK = 2048
-"""Pixels whose distributions are held at a time: 4 MB an array."""
+"""Number of pixels whose distributions are held in memory at a time: 4 MB per array."""
 
 
 def information(noise: NoiseModel, level: ArrayLike, filled: ArrayLike = 1.0, *, greys: int = 255) -> Information:
     """Compute the Fisher information of noisy, clipped pixels, stored as grey values 0..``greys``.
 
     The noise is that of Almanza-Medina, 2.2.3; the distribution is derived here. A pixel holds an echo ``level / filled``
-    with probability ``filled``, else none: where the edge of a shadow crosses a pixel, only part of the pings fill it. Let
-    p_e and p_0 be the distributions of a pixel with and without echo. The pixel's is p = filled p_e + (1 - filled) p_0. The
-    information is the sum over grey values of g g' / p, with g the derivatives of p.
+    with probability ``filled``, and otherwise none: where the edge of a shadow crosses a pixel, only some of the pings fill
+    it. Let p_e and p_0 be the distributions of a pixel with and without an echo. The distribution of the pixel is p = filled
+    p_e + (1 - filled) p_0. The information is the sum over grey values of g g' / p, with g the derivatives of p.
 
-    The information of an added Rayleigh value alone grows with the logarithm of ``greys``: its density begins with a corner,
+    The information of an added Rayleigh value alone grows with the logarithm of ``greys``: its density starts with a corner,
     which fine grey values resolve.
 
-    Where echoes have no noise (scale 0) ``law`` is None, and ``variance`` is the variance of rounding, 1 / (12 greys^2).
+    If echoes have no noise (scale 0), ``law`` is None, and ``variance`` includes the variance of rounding, 1 / (12 greys^2).
 
     Args:
-        noise: of the pixels.
+        noise: noise of the pixels.
         level: mean echo, 0..1, over pings that fill the pixel and pings that do not ``(...)``.
-        filled: part of the pings that fill it, 0..1 ``(...)``.
+        filled: fraction of the pings that fill the pixel, 0..1 ``(...)``.
         greys: the largest grey value.
     """
     level, filled = np.broadcast_arrays(np.asarray(level, dtype=float), np.asarray(filled, dtype=float))
@@ -293,12 +296,14 @@ def information(noise: NoiseModel, level: ArrayLike, filled: ArrayLike = 1.0, *,
 def _exact(
     noise: NoiseModel, echo: NDArray[np.float64], filled: NDArray[np.float64], greys: int
 ) -> tuple[NDArray[np.float64], ...]:
-    """Compute information, slope and variance of some pixels."""
+    """Compute information, slope and variance of a chunk of pixels."""
     empty = noise.grey_of_empty(greys)
     p_echo, by_echo = noise.grey_of_echo(echo, greys)
+    # Mixture of the distributions with and without an echo.
     c = filled[:, None]
     p = c * p_echo + (1 - c) * empty
     by_level, by_filled = by_echo, p_echo - empty - echo[:, None] * by_echo  # the echo is level / filled
+    # Derivatives of p by both parameters, divided by p where it is not zero.
     g = np.stack([by_level, by_filled], axis=1)
     weighted = np.divide(g, p[:, None], out=np.zeros_like(g), where=p[:, None] > 0)
     value = np.arange(greys + 1) / greys
@@ -309,7 +314,7 @@ def _exact(
 def _noiseless(
     noise: NoiseModel, echo: NDArray[np.float64], filled: NDArray[np.float64], greys: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute slope and variance where echoes are only rounded."""
+    """Compute slope and variance if echoes are only rounded."""
     mean, variance = _clipped_gaussian(noise.mean, noise.std)
     slope = np.stack([(echo < 1).astype(float), np.full_like(echo, -mean)], axis=-1)
     spread = filled * (1 - filled) * (echo - mean) ** 2 + (1 - filled) * variance
@@ -319,12 +324,12 @@ def _noiseless(
 def information_of_sums(noise: NoiseModel, nonzero: ArrayLike, cells: int) -> Information:
     """Compute the Fisher information of noisy sums over the beams (:meth:`NoiseModel.apply_sum`).
 
-    The two numbers are the sum of the echoes and the number of pixels that hold one. Sums are not rounded.
+    The two parameters are the sum of the echoes and the number of pixels that contain one. Sums are not rounded.
 
     Args:
-        noise: of the pixels.
-        nonzero: number of pixels of each row that hold an echo ``(...)``.
-        cells: pixels of a row.
+        noise: noise of the pixels.
+        nonzero: number of pixels with an echo in each row ``(...)``.
+        cells: number of pixels per row.
     """
     nonzero = np.asarray(nonzero, dtype=float)
     empty_mean, empty_variance = _clipped_gaussian(noise.mean, noise.std)
@@ -369,14 +374,14 @@ def load_noise(text: str) -> NoiseModel:
         ) from None
 
 
-# ---------------- Signal to noise ratios, as recipes and commands write them
+# ---------------- Signal-to-noise ratios in recipes and commands
 
 
 def snr_of(text: str) -> float | None:
-    """Parse a signal to noise ratio in dB: ``20 dB``; ``none`` for no noise.
+    """Parse a signal-to-noise ratio in dB, such as ``20 dB``; ``none`` means no noise.
 
     Raises:
-        MitsonarError: something else.
+        MitsonarError: any other text.
     """
     found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d+)?)\s*dB\s*", text)
     if text != "none" and not found:
@@ -387,5 +392,5 @@ def snr_of(text: str) -> float | None:
 
 
 def snr_said(snr_db: float | None) -> str:
-    """Format a signal to noise ratio [dB] as :func:`snr_of` parses it."""
+    """Format a signal-to-noise ratio [dB] in the form that :func:`snr_of` parses."""
     return "none" if snr_db is None else f"{snr_db:g} dB"

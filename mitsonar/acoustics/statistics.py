@@ -1,7 +1,7 @@
-"""Statistics of sonar frames that tell real images from simulated ones: grain, memory, stripes, smear, edges.
+"""Compute statistics that distinguish real sonar frames from simulated ones: grain, persistence, stripes, smear, edges.
 
-Frames are ``(frames, bins, beams)``. Levels are in dB, finite; intensities are linear, 0 and more. *Detrended* means that
-the local mean of the levels over :data:`WINDOW` cells is removed, so that grain is left and the picture is not.
+Frames are ``(frames, bins, beams)``. Levels are in dB and finite; intensities are linear, 0 or more. *Detrended* means that
+the local mean of the levels over :data:`WINDOW` cells is subtracted, which leaves the grain and removes the picture.
 """
 
 from __future__ import annotations
@@ -40,79 +40,82 @@ __all__ = [
 Array = NDArray[np.float64]
 
 WINDOW = (31, 9)
-"""Bins and beams of the local mean."""
+"""Bins and beams of the window of the local mean."""
 
 RAYLEIGH_DB = 10 / np.log(10) * np.pi / np.sqrt(6)
 """Standard deviation of exponential intensities in dB: 5.57."""
 
 STRIPE_BLOCKS = 8
-"""Blocks of bins whose stripes must agree, so that speckle does not count as stripes."""
+"""Number of blocks of bins whose stripes must agree, so that speckle is not counted as stripes."""
 
 GLOW_BINS, TREND_BINS = 20, 60
-"""Bins of the near glow, and bins behind them that give the trend."""
+"""Number of bins of the near glow, and of the bins behind it that define the trend."""
 
 LEAK_GUARD, LEAK_BINS, LEAK_ROWS, LEAK_SURE = 8, 8, 12, 3
-"""Of the smear: bins between a row and the rows that it is compared with, how many of these there are on either side, and
-rows of a frame that are compared, those that exceed theirs most; standard errors that a leak must exceed."""
+"""Parameters of the smear estimate.
+
+In order: bins between a row and the rows that it is compared with; number of these rows on each side; rows compared per
+frame, those with the largest excess; standard errors that a leak must exceed.
+"""
 
 LEAK_CONTRAST = 1000.0
-"""Least ratio of a row's brightest cell to its quiet beams: below 30 dB no leak of 50 dB shows."""
+"""Smallest ratio of a row's brightest cell to its quiet beams; below 30 dB, a leak of -50 dB is not visible."""
 
 MEDIAN_ABOVE_MEAN_DB = float(10 * np.log10(np.log(2)) + 10 / np.log(10) * np.euler_gamma)
-"""Median of exponential intensities in dB less the mean of their dB: 0.91."""
+"""Median of exponential intensities in dB minus the mean of their dB values: 0.91."""
 
 
 def decibels(intensity: ArrayLike, least_db: float = -200.0) -> Array:
-    """Return levels of intensities [dB], not below ``least_db``, of the same shape."""
+    """Convert intensities to levels [dB], not below ``least_db``, of the same shape."""
     value = np.maximum(np.asarray(intensity, dtype=float), 10 ** (least_db / 10))
     return np.asarray(10 * np.log10(value), dtype=np.float64)
 
 
-# ---------------------------------------------------------------- range of levels
+# ---------------- Range of levels
 
 
 def percentile_span_db(level_db: ArrayLike, low: float = 1.0, high: float = 99.9) -> float:
-    """Return the distance of two percentiles of all levels [dB]."""
+    """Return the difference of two percentiles of all levels [dB]."""
     below, above = np.percentile(np.asarray(level_db, dtype=float), [low, high])
     return float(above - below)
 
 
 def bright_over_median_db(level_db: ArrayLike) -> float:
-    """Return how far the 99.9th percentile of all levels is above their median [dB]."""
+    """Return the 99.9th percentile of all levels relative to their median [dB]."""
     return percentile_span_db(level_db, 50.0, 99.9)
 
 
 def zero_share(values: ArrayLike) -> float:
-    """Return the part of the cells whose value is exactly 0."""
+    """Return the fraction of cells whose value is exactly 0."""
     return float(np.mean(np.asarray(values) == 0))
 
 
-# ---------------------------------------------------------------- grain
+# ---------------- Grain
 
 
 def local_mean(values: ArrayLike, window: tuple[int, int] = WINDOW) -> Array:
-    """Return the mean over a window of bins and beams around each cell, of the same shape. Edges repeat their values."""
+    """Return the mean over a window of bins and beams around each cell, of the same shape. Edge values are repeated."""
     values = np.asarray(values, dtype=float)
     size = (*(1 for _ in values.shape[:-2]), *window)
     return np.asarray(ndimage.uniform_filter(values, size, mode="nearest"), dtype=np.float64)
 
 
 def detrended(level_db: ArrayLike, window: tuple[int, int] = WINDOW) -> Array:
-    """Return levels less their local mean [dB], of the same shape."""
+    """Subtract the local mean from levels [dB], preserving the shape."""
     return np.asarray(np.asarray(level_db, dtype=float) - local_mean(level_db, window), dtype=np.float64)
 
 
 def local_std_db(level_db: ArrayLike, window: tuple[int, int] = WINDOW) -> float:
-    """Return the root of the mean square of detrended levels [dB]; 5.57 of exponential intensities.
+    """Return the root mean square of detrended levels [dB]; 5.57 for exponential intensities.
 
-    The mean of n cells takes 1 / n of the variance of grain without memory, which is put back.
+    Subtracting the mean of n cells removes 1 / n of the variance of uncorrelated grain, which is corrected for.
     """
     cells = window[0] * window[1]
     return float(np.sqrt(np.mean(detrended(level_db, window) ** 2) * cells / (cells - 1)))
 
 
 def window_values(values: ArrayLike, window: tuple[int, int] = WINDOW) -> Array:
-    """Return the values of windows that do not overlap ``(windows, cells)``; what is left at the ends is dropped."""
+    """Return the values of non-overlapping windows ``(windows, cells)``; incomplete windows at the ends are dropped."""
     values = np.asarray(values, dtype=float)
     frames, bins, beams = values.shape
     tall, wide = min(window[0], bins), min(window[1], beams)
@@ -122,9 +125,9 @@ def window_values(values: ArrayLike, window: tuple[int, int] = WINDOW) -> Array:
 
 
 def intensity_contrast(intensity: ArrayLike, window: tuple[int, int] = WINDOW) -> Array:
-    """Return standard deviation over mean of the intensities of each window ``(windows,)``, those without any left out.
+    """Return the standard deviation of the intensities over their mean in each window with any intensity ``(windows,)``.
 
-    Exponential intensities have 1. The median over windows is the number of a picture.
+    Exponential intensities have a contrast of 1. The median over windows characterises a picture.
     """
     parts = window_values(intensity, window)
     mean = parts.mean(axis=1)
@@ -132,27 +135,27 @@ def intensity_contrast(intensity: ArrayLike, window: tuple[int, int] = WINDOW) -
     return np.asarray(parts[kept].std(axis=1, ddof=1) / mean[kept], dtype=np.float64)
 
 
-# ---------------------------------------------------------------- memory
+# ---------------- Correlation between frames and cells
 
 
 def _correlation(one: Array, other: Array) -> float:
-    """Return the correlation of two arrays; 0 where one of them does not vary."""
+    """Return the correlation of two arrays; 0 if one of them is constant."""
     one, other = one - one.mean(), other - other.mean()
     power = float(np.sqrt(np.mean(one * one) * np.mean(other * other)))
     return float(np.mean(one * other)) / power if power > 0 else 0.0
 
 
 def frame_correlation(level_db: ArrayLike) -> float:
-    """Return the mean correlation of consecutive frames, of levels as they are (or detrended before); nan of one frame."""
+    """Return the mean correlation of consecutive frames, without detrending them; nan for a single frame."""
     level = np.asarray(level_db, dtype=float)
     pairs = [_correlation(one, other) for one, other in pairwise(level)]
     return float(np.mean(pairs)) if pairs else float("nan")
 
 
 def correlation_by_level(level_db: ArrayLike, parts: int = 10, window: tuple[int, int] = WINDOW) -> tuple[Array, Array]:
-    """Return the correlation of consecutive detrended frames, by the local mean of the level.
+    """Return the correlation of consecutive detrended frames as a function of the local mean level.
 
-    Cells are sorted by their local mean over both frames, so that the grain itself does not choose.
+    Cells are sorted by the mean of their local means in both frames, so that the grain does not affect the selection.
 
     Returns:
         Mean level of each part [dB], and correlation within it ``(parts,)``, darkest first.
@@ -171,14 +174,14 @@ def correlation_by_level(level_db: ArrayLike, parts: int = 10, window: tuple[int
 
 
 def autocorrelation(level_db: ArrayLike, axis: int, lags: tuple[int, ...] = (1, 2)) -> Array:
-    """Return the correlation of detrended levels with those some cells away ``(lags,)``.
+    """Return the correlation of detrended levels with those a number of cells away ``(lags,)``.
 
-    The coherence c of a complex Gaussian field gives Li2(c^2) / (pi^2 / 6) here, with the dilogarithm Li2.
+    A complex Gaussian field of coherence c gives Li2(c^2) / (pi^2 / 6), where Li2 is the dilogarithm.
 
     Args:
         level_db: ``(frames, bins, beams)``.
-        axis: 1 over range, 2 over beams.
-        lags: cells.
+        axis: 1 for range, 2 for beams.
+        lags: distances [cells].
     """
     grain = detrended(level_db)
     cells = grain.shape[axis]
@@ -186,14 +189,14 @@ def autocorrelation(level_db: ArrayLike, axis: int, lags: tuple[int, ...] = (1, 
     return np.array([_correlation(one, other) for one, other in pairs])
 
 
-# ---------------------------------------------------------------- the instrument
+# ---------------- Effects of the instrument
 
 
 def beam_stripes_db(level_db: ArrayLike, window: int = 9) -> float:
-    """Return the standard deviation of the beams' own gains [dB], 0 where beams agree.
+    """Return the standard deviation of the gains of individual beams [dB]; 0 if beams agree.
 
-    A beam's gain is what its mean over a block of bins exceeds that of its neighbours by. Only what blocks of bins agree on
-    counts: speckle differs from block to block.
+    The gain of a beam is the median of its levels over a block of bins, relative to its neighbours. Only the part shared by
+    different blocks counts, since speckle differs from block to block.
     """
     level = np.asarray(level_db, dtype=float).mean(axis=0)
     blocks = np.stack([np.median(part, axis=0) for part in np.array_split(level, STRIPE_BLOCKS)])
@@ -205,14 +208,14 @@ def beam_stripes_db(level_db: ArrayLike, window: int = 9) -> float:
 
 
 def range_profile_db(level_db: ArrayLike) -> Array:
-    """Return the level of the mean intensity of each bin over frames and beams ``(bins,)`` [dB]."""
+    """Return the mean intensity of each bin over frames and beams, as a level ``(bins,)`` [dB]."""
     return decibels(np.mean(10 ** (np.asarray(level_db, dtype=float) / 10), axis=(0, 2)))
 
 
 def near_glow_db(level_db: ArrayLike) -> Array:
-    """Return how far the first bins exceed the trend of the bins behind them ``(GLOW_BINS,)`` [dB].
+    """Return the excess of the first bins over the trend of the bins behind them ``(GLOW_BINS,)`` [dB].
 
-    The level of a bin is the median over frames and beams, the trend a straight line through the next ones.
+    The level of a bin is the median over frames and beams. The trend is a straight line through the next bins.
     """
     profile = np.median(np.asarray(level_db, dtype=float), axis=(0, 2))
     glow = min(GLOW_BINS, len(profile) // 3)
@@ -222,9 +225,9 @@ def near_glow_db(level_db: ArrayLike) -> Array:
 
 
 def edge_steps_db(level_db: ArrayLike, part: float = 0.05) -> tuple[float, float]:
-    """Return the largest rise and the largest fall of the range profile over a part of the window, both positive [dB].
+    """Return the largest rise and the largest fall of the range profile over a fraction of the window, both positive [dB].
 
-    These are the edges of the lit patch. The first bins, where real sonars glow, are left out.
+    These are the edges of the lit patch. The first bins, where real sonars glow, are excluded.
     """
     profile = ndimage.uniform_filter1d(range_profile_db(level_db), 5, mode="nearest")[GLOW_BINS:]
     lag = max(1, round(part * len(profile)))
@@ -232,14 +235,14 @@ def edge_steps_db(level_db: ArrayLike, part: float = 0.05) -> tuple[float, float
     return float(max(step.max(), 0.0)), float(max(-step.min(), 0.0))
 
 
-# ---------------------------------------------------------------- smear
+# ---------------- Smear across beams
 
 
 def _rows_and_neighbours(values: Array) -> tuple[Array, Array, Array]:
-    """Return rows that have neighbours on both sides, and two means of these, ``(frames, rows, beams)`` each.
+    """Return the rows with neighbours on both sides, and two means of these neighbours, each ``(frames, rows, beams)``.
 
-    The means are of every other neighbour: one chooses quiet beams, the other is what rows are compared with. A single mean
-    would choose beams by its own grain.
+    The means are over alternate neighbours: one selects the quiet beams, the other is compared with the rows. A single mean
+    would select beams by its own grain.
     """
     reach = LEAK_GUARD + LEAK_BINS
     rows = values.shape[1] - 2 * reach
@@ -249,12 +252,12 @@ def _rows_and_neighbours(values: Array) -> tuple[Array, Array, Array]:
 
 
 class _Rows(NamedTuple):
-    """Rows that may leak most, ``(rows,)`` each, and what rows do by chance.
+    """Rows with the strongest potential leak, ``(rows,)`` each, and the variation expected by chance.
 
     Attributes:
-        excess: of the sum over the other beams.
-        lift: median of the quiet beams over their neighbours, in medians of exponential intensities of mean 1.
-        level: mean of the quiet beams' neighbours.
+        excess: sum of the excess over the other beams.
+        lift: median ratio of the quiet beams to their neighbours, in units of exponential intensities of mean 1.
+        level: mean of the neighbours of the quiet beams.
         top: the largest cell.
         chance: standard error of the median lift.
     """
@@ -267,22 +270,25 @@ class _Rows(NamedTuple):
 
 
 def _leaking_rows(intensity: Array) -> _Rows | None:
-    """Return the rows of each frame that may leak most; None where none can leak."""
+    """Return the rows of each frame with the strongest potential leak; None if no row can leak."""
     if intensity.shape[1] < 4 * (LEAK_GUARD + LEAK_BINS):
         return None
     row, chooser, around = _rows_and_neighbours(intensity)
+    # Quiet beams are the darkest 40 % by one mean of the neighbours; ratios are taken to the other mean.
     quiet = (chooser <= np.percentile(chooser, 40, axis=2, keepdims=True)) & (around > 0)
     excess = np.where(quiet, 0, row - around).sum(axis=2)
     ratio = np.divide(row, around, out=np.full_like(row, np.nan), where=quiet)
     with np.errstate(all="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a row without a quiet beam is nan, and not used
+        warnings.simplefilter("ignore", RuntimeWarning)  # a row without a quiet beam is nan, and is not used
         median, level = np.nanmedian(ratio, axis=2), np.nanmean(np.where(quiet, around, np.nan), axis=2)
+    # Only rows whose brightest cell is far above their quiet beams can show a leak.
     top = row.max(axis=2)
     can = np.isfinite(median) & (level > 0) & (excess > 0) & (top > LEAK_CONTRAST * level)
     if not can.any():
         return None
-    lift = median * np.log(2) / np.nanmedian(median)  # the mean of few neighbours lifts all ratios
+    lift = median * np.log(2) / np.nanmedian(median)  # normalised, since the mean of few neighbours raises all ratios
     spread = 1.4826 * np.nanmedian(np.abs(lift - np.log(2)))
+    # Select the rows of each frame whose excess is largest relative to their quiet beams.
     score = np.where(can, excess / np.where(level > 0, level, 1), -np.inf)
     best = np.argsort(score, axis=1)[:, -LEAK_ROWS:]
     kept = np.take_along_axis(can, best, axis=1)
@@ -291,7 +297,7 @@ def _leaking_rows(intensity: Array) -> _Rows | None:
 
 
 def _steady_power(median: float) -> float:
-    """Return the power of a steady wave that lifts the median of exponential intensities of mean 1 to ``median``."""
+    """Return the power of a steady wave that raises the median of exponential intensities of mean 1 to ``median``."""
     if median <= np.log(2):
         return 0.0
     miss = lambda power: stats.ncx2.median(2, 2 * power) / 2 - median  # noqa: E731
@@ -299,14 +305,14 @@ def _steady_power(median: float) -> float:
 
 
 def leak_power(intensity: ArrayLike, limit: float = np.inf) -> float:
-    """Return the power that leaks into every beam over the sum of the intensities of all beams.
+    """Return the power that leaks into every beam, relative to the summed intensity of all beams.
 
-    In rows with a strong target the quiet beams are compared with the same beams in rows before and behind. Of complex
-    Gaussian noise and a steady wave the median tells the wave. Rows with a cell at ``limit`` or above it are left out: what
-    is clipped is not known.
+    In rows with a strong target, the quiet beams are compared with the same beams in rows before and behind. The median of
+    complex Gaussian noise plus a steady wave determines the power of the wave. Rows with a cell at or above ``limit`` are
+    excluded, since their clipped intensity is unknown.
 
     Returns:
-        The median over the strongest rows; 0 where quiet beams rise by no more than chance.
+        The median over the strongest rows; 0 if quiet beams rise by no more than chance.
     """
     intensity = np.asarray(intensity, dtype=float)
     rows = _leaking_rows(intensity)
@@ -319,7 +325,7 @@ def leak_power(intensity: ArrayLike, limit: float = np.inf) -> float:
 
 
 def smear_db(level_db: ArrayLike) -> float:
-    """Return what the quiet beams beside the brightest target of each frame exceed the rows around by, the median [dB]."""
+    """Return the median excess of the quiet beams beside the brightest target of each frame over the rows around it [dB]."""
     level = np.asarray(level_db, dtype=float)
     if level.shape[1] < 4 * (LEAK_GUARD + LEAK_BINS):
         return 0.0

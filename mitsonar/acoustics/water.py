@@ -1,7 +1,7 @@
-"""Sea water and fresh water: absorption and speed of sound, and where their formulas hold.
+"""Compute sound absorption and sound speed in sea water and fresh water, with the validity of the formulas.
 
-Absorption is in dB per metre of path, one way. Above 1 MHz both formulas extrapolate; what remains there is the viscosity of
-pure water, which grows with the square of the frequency.
+Absorption is in dB per metre of path, one way. Above 1 MHz both formulas extrapolate; the dominant term there is the
+viscosity of pure water, which grows with the square of the frequency.
 """
 
 from __future__ import annotations
@@ -41,14 +41,17 @@ __all__ = [
 Formula = Literal["francois-garrison", "ainslie-mccolm"]
 
 FORMULAS = ("francois-garrison", "ainslie-mccolm")
-"""Formulas of the absorption, the default first."""
+"""Absorption formulas, the default first."""
 
 SALTY_PSU = 1.0
-"""Salinity below which water counts as fresh: salts then add little to the absorption [psu]."""
+"""Salinity below which water counts as fresh, since salts then add little to the absorption [psu]."""
 
 
 class Water(CheckedModel):
-    """The water that sound travels in. The default is a cool sea at its surface; ``salinity_psu`` 0 is a lake or a tank."""
+    """Properties of the water that sound travels through; the default is a cool sea at its surface.
+
+    A ``salinity_psu`` of 0 is a lake or a tank.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -61,22 +64,22 @@ class Water(CheckedModel):
 
     @classmethod
     def create(cls, **fields: float) -> Self:
-        """Create water with these fields.
+        """Create water from its fields.
 
         Raises:
-            MitsonarError: an unknown key, a value outside its limits.
+            MitsonarError: an unknown key, or a value outside its limits.
         """
         return cls(**fields)
 
 
-# ---------------------------------------------------------------- absorption
+# ---------------- Absorption
 
 
 def absorption_db_per_m(frequency_hz: AnyArray, water: Water, formula: Formula = "francois-garrison") -> AnyArray:
     """Compute the absorption of sound in water [dB/m], one way.
 
-    The frequency enters by ``+ * /`` only, so NumPy, torch and Dr.Jit give the same bits. :func:`absorption_warning` says
-    whether the formula holds.
+    The frequency enters only through ``+ * /``, so NumPy, torch and Dr.Jit give the same bits. Use
+    :func:`absorption_warning` to check whether the formula is valid.
 
     Args:
         frequency_hz: above 0, a number or an array ``(...)`` of any library.
@@ -89,7 +92,7 @@ def absorption_db_per_m(frequency_hz: AnyArray, water: Water, formula: Formula =
         Like ``frequency_hz``.
 
     Raises:
-        MitsonarError: unknown formula, or a number that is no frequency.
+        MitsonarError: unknown formula, or a number that is not a valid frequency.
     """
     _check_frequency(frequency_hz)
     match formula:
@@ -103,7 +106,7 @@ def absorption_db_per_m(frequency_hz: AnyArray, water: Water, formula: Formula =
     square = khz * khz
     total = viscous * square
     for strength, relaxation_khz in relaxations:
-        if strength > 0:  # fresh water has no salts
+        if strength > 0:  # fresh water has no salts, hence no relaxation
             total = total + strength * relaxation_khz * square / (square + relaxation_khz * relaxation_khz)
     return total * 1e-3
 
@@ -135,15 +138,15 @@ def _ainslie_mccolm(water: Water) -> tuple[list[tuple[float, float]], float]:
 
 
 def absorption_warning(frequency_hz: float, water: Water, formula: Formula = "francois-garrison") -> str | None:
-    """Say in one sentence where the absorption lies outside the band of its formula; None where it holds.
+    """Return a one-sentence warning if the absorption formula is outside its validity range, else None.
 
-    Bands of Francois and Garrison, 5 % in error: 10 to 500 kHz at -2..22 deg C, 30..35 psu, to 3,500 m; above 500 kHz at
-    0..30 deg C, 0..40 psu, to 10,000 m; from 0.2 kHz to 1 MHz as a whole. Ainslie and McColm stay within 10 % of them from
-    0.1 kHz to 1 MHz at -6..35 deg C, 5..50 psu, pH 7.7..8.3, to 7,000 m. Both as quoted by the National Physical Laboratory,
+    Validity of Francois and Garrison, to within 5 %: 10 to 500 kHz at -2..22 deg C, 30..35 psu, to 3,500 m; above 500 kHz at
+    0..30 deg C, 0..40 psu, to 10,000 m; overall from 0.2 kHz to 1 MHz. Ainslie and McColm stay within 10 % of them from 0.1
+    kHz to 1 MHz at -6..35 deg C, 5..50 psu, pH 7.7..8.3, to 7,000 m. Both as quoted by the National Physical Laboratory,
     Underlying physics and mechanisms for the absorption of sound in seawater (second hand).
 
     Raises:
-        MitsonarError: unknown formula, or a number that is no frequency.
+        MitsonarError: unknown formula, or a number that is not a valid frequency.
     """
     _check_frequency(frequency_hz)
     if formula not in FORMULAS:
@@ -172,7 +175,7 @@ def absorption_warning(frequency_hz: float, water: Water, formula: Formula = "fr
     return _outside(water, bands, f"absorption by {name} at {khz:,.4g} kHz")
 
 
-# ---------------------------------------------------------------- speed
+# ---------------- Sound speed
 
 PURE = (1402.388, 5.03711, -5.80852e-2, 3.3420e-4, -1.47800e-6, 3.1464e-9)
 PURE_1 = (0.153563, 6.8982e-4, -8.1788e-6, 1.3621e-7, -6.1185e-10)
@@ -184,19 +187,19 @@ SALT_2 = (-3.9064e-7, 9.1041e-9, -1.6002e-10, 7.988e-12)
 SALT_3 = (1.100e-10, 6.649e-12, -3.389e-13)
 ROOT, ROOT_1 = (-1.922e-2, -4.42e-5), (7.3637e-5, 1.7945e-7)
 SQUARE, SQUARE_1 = (1.727e-3,), (-7.9836e-6,)
-"""Polynomials of the temperature; ``_k`` multiplies the pressure's k-th power (Fofonoff and Millard, 1983)."""
+"""Polynomials of the temperature (Fofonoff and Millard, 1983); ``_k`` marks the factor of the k-th power of pressure."""
 
 
 def sound_speed_m_s(water: Water) -> float:
-    """Compute the speed of sound [m/s], in the sea and in fresh water.
+    """Compute the speed of sound in sea water and fresh water [m/s].
 
-    The formula is that of Chen and Millero, J. Acoust. Soc. Am. 62 (1977), 1129-1135, as UNESCO took it over: Fofonoff and
+    The formula is that of Chen and Millero, J. Acoust. Soc. Am. 62 (1977), 1129-1135, as adopted by UNESCO: Fofonoff and
     Millard, Algorithms for computation of fundamental properties of seawater, UNESCO technical papers in marine science 44
-    (1983). Its temperature is on the scale of 1968, 1.00024 times that of 1990. The pressure follows from the depth by
+    (1983). Its temperature is on the 1968 scale, 1.00024 times that of 1990. The pressure is computed from the depth by
     Saunders, J. Phys. Oceanogr. 11 (1981), 573-574, at 45 deg latitude.
 
     Args:
-        water: the water; its pH has no effect. :func:`sound_speed_warning` says whether the formula holds.
+        water: the water; its pH has no effect. Use :func:`sound_speed_warning` to check whether the formula is valid.
     """
     return unesco_speed_m_s(1.00024 * water.temperature_c, water.salinity_psu, pressure_bar(water.depth_m))
 
@@ -205,9 +208,9 @@ def unesco_speed_m_s(temperature_68_c: float, salinity_psu: float, pressure_bar:
     """Compute the speed of sound by Chen and Millero [m/s].
 
     Args:
-        temperature_68_c: on the scale of 1968 [deg C].
+        temperature_68_c: temperature on the 1968 scale [deg C].
         salinity_psu: practical salinity [psu].
-        pressure_bar: above that of the air [bar].
+        pressure_bar: pressure above atmospheric [bar].
     """
     t, s, p = temperature_68_c, salinity_psu, pressure_bar
     pure = _polynomial((_polynomial(one, t) for one in (PURE, PURE_1, PURE_2, PURE_3)), p)
@@ -218,25 +221,25 @@ def unesco_speed_m_s(temperature_68_c: float, salinity_psu: float, pressure_bar:
 
 
 def pressure_bar(depth_m: float, latitude_deg: float = 45.0) -> float:
-    """Compute the pressure above that of the air [bar] at a depth in the sea, by Saunders (1981)."""
+    """Compute the pressure above atmospheric [bar] at a depth in the sea, by Saunders (1981)."""
     linear = 1 - (5.92e-3 + 5.25e-3 * math.sin(math.radians(latitude_deg)) ** 2)
     return (linear - math.sqrt(linear * linear - 8.84e-6 * depth_m)) / 4.42e-6 / 10
 
 
 def sound_speed_warning(water: Water) -> str | None:
-    """Say in one sentence where the speed of sound lies outside the band of its formula; None where it holds.
+    """Return a one-sentence warning if the sound speed formula is outside its validity range, else None.
 
-    The band is 0..40 deg C, 0..40 psu and 0..1,000 bar, which is 9,700 m (Fofonoff and Millard, 1983).
+    The range is 0..40 deg C, 0..40 psu and 0..1,000 bar, which is 9,700 m (Fofonoff and Millard, 1983).
     """
     bands: dict[str, tuple[float, float]] = {"temperature_c": (0, 40), "salinity_psu": (0, 40), "depth_m": (0, 9700)}
     return _outside(water, bands, "speed of sound by Chen and Millero")
 
 
-# ---------------------------------------------------------------- helpers
+# ---------------- Helpers
 
 
 def _polynomial(coefficients: Iterable[float], x: float) -> float:
-    """Evaluate a polynomial, the constant first."""
+    """Evaluate a polynomial with the constant coefficient first."""
     total = 0.0
     for one in reversed(tuple(coefficients)):
         total = total * x + one
@@ -244,7 +247,7 @@ def _polynomial(coefficients: Iterable[float], x: float) -> float:
 
 
 def _outside(water: Water, bands: dict[str, tuple[float, float]], what: str) -> str | None:
-    """Name the first field of the water that lies outside its band."""
+    """Describe the first field of the water that lies outside its band; None if all lie within."""
     for key, (low, high) in bands.items():
         value = getattr(water, key)
         if not low <= value <= high:
@@ -253,7 +256,7 @@ def _outside(water: Water, bands: dict[str, tuple[float, float]], what: str) -> 
 
 
 def _check_frequency(frequency_hz: AnyArray) -> None:
-    """Refuse a number that is no frequency; arrays are taken as they are."""
+    """Reject a number that is not a valid frequency; arrays are not checked."""
     if isinstance(frequency_hz, int | float) and not 0 < frequency_hz < math.inf:
         raise MitsonarError(f"a frequency must be a finite number of Hz above 0: got {shortened(frequency_hz)}")
 
@@ -263,18 +266,18 @@ def _unknown(formula: object) -> MitsonarError:
     return MitsonarError(f"unknown formula of absorption {shortened(formula)}: known: {known}{meant(formula, FORMULAS)}")
 
 
-# ---------------- What the water takes from a sonar's echoes, and what the sonar's gain gives back
+# ---------------- Absorption, gain and noise of a sonar
 
 
 EXTRAPOLATED_HZ = 1e6
-"""Carrier above which the formula extrapolates by the viscosity of pure water."""
+"""Carrier above which the formula extrapolates with the viscosity of pure water [Hz]."""
 
 
 def water_of(sonar: Sonar) -> Water:
     """Return the water around a sonar.
 
     Raises:
-        MitsonarError: no such water.
+        MitsonarError: properties outside their limits.
     """
     return Water.create(
         temperature_c=sonar.temperature_c, salinity_psu=sonar.salinity_psu, depth_m=sonar.water_depth_m, ph=sonar.ph
@@ -282,7 +285,11 @@ def water_of(sonar: Sonar) -> Water:
 
 
 def sonar_absorption(sonar: Sonar) -> float:
-    """Return the absorption one way [dB/m]: as given; else by carrier and water; 0 with hard boxes (see Sonar.pattern)."""
+    """Return the one-way absorption of a sonar [dB/m].
+
+    This is ``absorption_db_per_m`` if given, 0 with box patterns (see Sonar.pattern) or without a carrier, and otherwise the
+    absorption at the carrier in the sonar's water.
+    """
     if sonar.absorption_db_per_m is not None:
         return sonar.absorption_db_per_m
     if sonar.beam_pattern == "box" or sonar.frequency_hz is None:
@@ -291,17 +298,17 @@ def sonar_absorption(sonar: Sonar) -> float:
 
 
 def loss_notes(sonar: Sonar) -> list[str]:
-    """Return a sentence where carrier or water lie outside the band of the absorption's formula."""
+    """Return a one-sentence note if carrier or water lie outside the validity range of the absorption formula."""
     if sonar.absorption_db_per_m is not None or sonar.beam_pattern == "box" or sonar.frequency_hz is None:
         return []
-    if sonar.frequency_hz > EXTRAPOLATED_HZ:  # so is that of every imaging sonar above 1 MHz: no warning, but a line
+    if sonar.frequency_hz > EXTRAPOLATED_HZ:  # common to imaging sonars: reported by absorption_line instead of a warning
         return []
     note = absorption_warning(sonar.frequency_hz, water_of(sonar))
     return [] if note is None else [f"{note}; or give absorption_db_per_m"]
 
 
 def absorption_line(sonar: Sonar) -> str | None:
-    """Return a line on the absorption that follows from carrier and water; None where it is given or absent."""
+    """Return a line that reports the absorption derived from carrier and water; None if it is given or absent."""
     if sonar.absorption_db_per_m is not None or sonar.beam_pattern == "box" or sonar.frequency_hz is None:
         return None
     beyond = ", extrapolated: Francois and Garrison hold to 1 MHz" if sonar.frequency_hz > EXTRAPOLATED_HZ else ""
@@ -309,24 +316,25 @@ def absorption_line(sonar: Sonar) -> str | None:
 
 
 def loss_of(sonar: Sonar) -> NDArray[np.float64]:
-    """Return what absorption leaves of the intensity, there and back ``(bins,)``."""
+    """Return the fraction of the intensity that remains after two-way absorption ``(bins,)``."""
     return np.asarray(10 ** (-2 * sonar_absorption(sonar) * sonar.range_m / 10), dtype=np.float64)
 
 
 def undone_absorption(sonar: Sonar) -> NDArray[np.float64]:
-    """Return the gain of intensities that undoes absorption ``(bins,)``, or ones."""
+    """Return the intensity gain that compensates absorption ``(bins,)``; ones without ``gain_absorption``."""
     return 1 / loss_of(sonar) if sonar.gain_absorption else np.ones(sonar.range_bins)
 
 
 def gain_of(sonar: Sonar) -> NDArray[np.float64]:
-    """Return the time-varying gain of intensities ``(bins,)``: R^gain_exponent, and absorption where it is undone."""
+    """Return the time-varying intensity gain ``(bins,)``: R^gain_exponent, and the compensation of absorption if enabled."""
     return np.asarray(sonar.range_m**sonar.gain_exponent * undone_absorption(sonar), dtype=np.float64)
 
 
 def noise_of(sonar: Sonar) -> NDArray[np.float64]:
-    """Return the mean power of the receiver's noise in each bin, after the gain ``(bins,)``; 0 without noise.
+    """Return the mean power of the receiver noise in each bin after the gain ``(bins,)``; 0 without noise.
 
-    It is relative to the source, as echoes are. Glow near the sonar counts as that of a beam halfway from the middle.
+    It is relative to the source, as echoes are. The glow near the sonar is that of a beam halfway between the middle and the
+    edge of the fan.
     """
     if sonar.noise_level_db is None:
         return np.zeros(sonar.range_bins)

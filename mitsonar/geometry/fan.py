@@ -1,4 +1,4 @@
-"""Scan conversion of images: from (range, bearing) to metres."""
+"""Convert sonar images from (range, bearing) to metres, and points in space to range and bearing."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class CartesianImage:
-    """A fan in metres.
+    """A scan-converted image (a fan) in metres.
 
     Attributes:
-        image: ``(rows, columns)`` float32, row 0 the farthest forward, column 0 most to port; nan outside the fan.
-        extent: starboard from, to, forward from, to [m] of the image's edges (as matplotlib's ``extent``).
+        image: ``(rows, columns)`` float32, with row 0 farthest forward and column 0 farthest to port; nan outside the fan.
+        extent: limits of the image [m]: starboard from, to, forward from, to (as matplotlib's ``extent``).
     """
 
     image: NDArray[np.float32]
@@ -45,11 +45,11 @@ class CartesianImage:
 
 @dataclass(frozen=True)
 class CartesianMap:
-    """Cells and weights of each pixel of a fan, bilinear between the cells' centres, for many images of one sonar.
+    """Bilinear interpolation of the pixels of a fan from the cells of an image, reusable for many images of one sonar.
 
     Attributes:
-        index: of four cells in the flattened image ``(4, rows, columns)`` int64.
-        weight: of each, adding up to 1; all 0 outside the fan ``(4, rows, columns)`` float32.
+        index: indices of four cells in the flattened image ``(4, rows, columns)`` int64.
+        weight: their weights, which add up to 1; all 0 outside the fan ``(4, rows, columns)`` float32.
         extent: as in :class:`CartesianImage`.
     """
 
@@ -59,11 +59,11 @@ class CartesianMap:
     _kept: dict[str, list[AnyArray]] = field(default_factory=dict, repr=False, compare=False)
 
     def apply(self, image: AnyArray) -> AnyArray:
-        """Convert images ``(..., bins, beams)`` of NumPy or torch to fans ``(..., rows, columns)``; 0 outside the fan."""
+        """Convert images ``(..., bins, beams)``, NumPy or torch, to fans ``(..., rows, columns)``; 0 outside the fan."""
         xp = array_namespace(image)
         flat = xp.reshape(image, (-1, image.shape[-2] * image.shape[-1]))
         where = f"{xp.__name__} {device(image)}"
-        if where not in self._kept:  # once on each device
+        if where not in self._kept:  # once per device
             self._kept[where] = [xp.asarray(table, device=device(image)) for table in (self.index, self.weight)]
         index, weight = self._kept[where]
         fan = None
@@ -74,10 +74,10 @@ class CartesianMap:
 
 
 def nearest_cells(fan: CartesianMap, image: NDArray[np.generic], outside: object) -> NDArray[np.generic]:
-    """Return the value of the nearest cell in each pixel of a fan, for labels, which must not be mixed.
+    """Return the value of the cell nearest to each pixel of a fan, for labels, which must not be interpolated.
 
     Args:
-        fan: of the image's ranges and bearings.
+        fan: scan conversion for the ranges and bearings of the image.
         image: ``(bins, beams)`` of any type.
         outside: value of the pixels outside the fan.
 
@@ -90,32 +90,35 @@ def nearest_cells(fan: CartesianMap, image: NDArray[np.generic], outside: object
 
 
 def cartesian_map(range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -> CartesianMap:
-    """Make the map of scan conversion: x = r sin b to starboard, y = r cos b forward.
+    """Compute the map of a scan conversion: x = r sin b to starboard, y = r cos b forward.
 
     Args:
-        range_m: centres of the bins [m], rising.
-        bearing_rad: axes of the beams [rad], rising, not necessarily even.
-        rows: pixels in the forward direction; pixels are square.
+        range_m: centres of the bins [m], increasing.
+        bearing_rad: axes of the beams [rad], increasing, not necessarily evenly spaced.
+        rows: number of pixels in the forward direction; pixels are square.
 
     Raises:
-        MitsonarError: ranges or bearings that do not rise.
+        MitsonarError: ranges or bearings that do not increase.
     """
     range_m, bearing_rad = (np.asarray(a, dtype=float) for a in (range_m, bearing_rad))
     if (np.diff(range_m) <= 0).any() or (np.diff(bearing_rad) <= 0).any():
         raise MitsonarError("range_m and bearing_rad must rise: sort the image's rows and columns")
     range_edges, bearing_edges = _edges(range_m), _edges(bearing_rad)
+    # Bounding box of the fan: its extremes lie at the edges, or where the fan crosses an axis.
     near, far = range_edges[[0, -1]]
     port, starboard = bearing_edges[[0, -1]]
     turns = np.clip([port, starboard, 0.0, -np.pi / 2, np.pi / 2], port, starboard)
     corners = np.array([near, far])[:, None]
     x, y = corners * np.sin(turns), corners * np.cos(turns)
     left, right, low, high = x.min(), x.max(), y.min(), y.max()
+    # Polar coordinates of the pixel centres, farthest row first.
     pixel = (high - low) / rows
     columns = max(1, round((right - left) / pixel))
     forward = high - (np.arange(rows)[:, None] + 0.5) * pixel
     across = left + (np.arange(columns) + 0.5) * (right - left) / columns
     radius, angle = np.hypot(across, forward), np.arctan2(across, forward)
     inside = (radius >= near) & (radius <= far) & (angle >= port) & (angle <= starboard)
+    # Bilinear weights of the four cells around each pixel.
     bin_, over_bin = _cell(_fractional_index(radius, range_m, range_edges), range_m.size)
     beam, over_beam = _cell(_fractional_index(angle, bearing_rad, bearing_edges), bearing_rad.size)
     index, weight = [], []
@@ -132,7 +135,7 @@ def to_cartesian(image: ArrayLike, range_m: ArrayLike, bearing_rad: ArrayLike, r
     """Convert one image ``(bins, beams)`` to a fan in metres; see :func:`~mitsonar.geometry.fan.cartesian_map`.
 
     Raises:
-        MitsonarError: shapes that do not fit, or ranges or bearings that do not rise.
+        MitsonarError: inconsistent shapes, or ranges or bearings that do not increase.
     """
     image = np.asarray(image, dtype=float)
     wanted = np.size(range_m), np.size(bearing_rad)
@@ -144,14 +147,14 @@ def to_cartesian(image: ArrayLike, range_m: ArrayLike, bearing_rad: ArrayLike, r
 
 
 def _cell(index: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Split a fractional index into a cell and the part beyond it. Values of border cells hold beyond their centres."""
+    """Split a fractional index into a cell and the remainder, clamped to the centres of the outermost cells."""
     held = np.clip(index, 0, count - 1)
     whole = np.minimum(held.astype(np.int64), max(count - 2, 0))
     return whole, held - whole
 
 
 def _edges(centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the borders half-way between centres, and as far out at both ends."""
+    """Return the borders midway between centres, extrapolated by the same distance at both ends."""
     if centres.size == 1:
         return np.array([centres[0] * 0.99 - 1e-3, centres[0] * 1.01 + 1e-3])
     middle = (centres[1:] + centres[:-1]) / 2
@@ -166,23 +169,22 @@ def _fractional_index(
     return np.asarray(np.interp(value, known, np.concatenate([[-0.5], np.arange(centres.size), [centres.size - 0.5]])))
 
 
-# ---------------- Points in space as a sonar receives them: range and bearing, their derivatives, and the points back
-# from a height
+# ---------------- Projection of points in space
 
 
 Array = NDArray[np.float64]
 
 STEP = 1e-6
-"""Step of an angle for the derivative of a rotation [rad]."""
+"""Step of the finite differences for the derivative of a rotation [rad]."""
 
 
 class Views(NamedTuple):
-    """Poses with their rotations, from which points are looked at.
+    """Poses from which points are viewed, with their rotations.
 
     Attributes:
         poses: x, y, z [m], pitch, roll, heading [rad] ``(n, 6)``.
-        rotations: from (starboard, forward, up) to the world ``(n, 3, 3)``.
-        turns: their derivatives by pitch, roll and heading ``(n, 3, 3, 3)``: the second axis is the angle.
+        rotations: rotations from (starboard, forward, up) to the world ``(n, 3, 3)``.
+        turns: their derivatives by pitch, roll and heading ``(n, 3, 3, 3)``; the second axis is the angle.
     """
 
     poses: Array
@@ -204,12 +206,12 @@ class Views(NamedTuple):
         return cls(table, rotations, turns)
 
     def take(self, index: NDArray[np.intp]) -> Views:
-        """Return the views of given numbers, one a row."""
+        """Return the views at given indices."""
         return Views(self.poses[index], self.rotations[index], self.turns[index])
 
 
 class Projection(NamedTuple):
-    """Range [m] and bearing [rad] ``(n, 2)``, their derivatives by the point ``(n, 2, 3)`` and by the pose ``(n, 2, 6)``."""
+    """Range [m] and bearing [rad] ``(n, 2)``, with derivatives by the point ``(n, 2, 3)`` and by the pose ``(n, 2, 6)``."""
 
     polar: Array
     by_point: Array
@@ -217,10 +219,10 @@ class Projection(NamedTuple):
 
 
 def polar_of(points: Array, views: Views, bearing: Bearing) -> Array:
-    """Compute range [m] and bearing [rad] ``(..., 2)`` of points ``(..., 3)``; one view, or one for each row of points."""
+    """Compute the range [m] and bearing [rad] ``(..., 2)`` of points ``(..., 3)``, for one view or one per row of points."""
     shape = (len(views.poses), *(1,) * (points.ndim - 2))
     away = points - views.poses[:, :3].reshape(*shape, 3)
-    # away @ R, for each view
+    # away @ R for each view: world to sonar axes
     local = np.einsum("n...a,nab->n...b", away, np.broadcast_to(views.rotations, (len(away), 3, 3)))
     radius = np.sqrt((local * local).sum(axis=-1))
     starboard = local[..., 0]
@@ -229,10 +231,12 @@ def polar_of(points: Array, views: Views, bearing: Bearing) -> Array:
 
 
 def projection_of(points: Array, views: Views, bearing: Bearing) -> Projection:
-    """Compute range and bearing of points ``(n, 3)`` and their derivatives; one view, or one for each point."""
+    """Compute range and bearing of points ``(n, 3)`` and their derivatives, for one view or one per point."""
+    # 1. Coordinates of the points in the sonar's axes.
     away = points - views.poses[:, :3]
     local = np.einsum("na,nab->nb", away, np.broadcast_to(views.rotations, (len(away), 3, 3)))
     radius = np.sqrt((local * local).sum(axis=1))
+    # 2. Gradients of range and bearing with respect to these coordinates.
     along = local / radius[:, None]
     if bearing == "azimuth":
         level = local[:, 0] ** 2 + local[:, 1] ** 2
@@ -242,6 +246,7 @@ def projection_of(points: Array, views: Views, bearing: Bearing) -> Projection:
         sine = along[:, 0]
         angle = np.arcsin(sine)
         across = (np.array([1.0, 0.0, 0.0]) - sine[:, None] * along) / (radius * np.sqrt(1 - sine * sine))[:, None]
+    # 3. Chain rule: by the point, and by the angles of the pose. The position of the sonar acts opposite to the point.
     by_local = np.stack([along, across], axis=1)
     by_point = np.einsum("nib,nab->nia", by_local, np.broadcast_to(views.rotations, (len(away), 3, 3)))
     turning = np.einsum("na,nkab->nkb", away, np.broadcast_to(views.turns, (len(away), 3, 3, 3)))
@@ -250,16 +255,16 @@ def projection_of(points: Array, views: Views, bearing: Bearing) -> Projection:
 
 
 def points_at(polar: Array, height_m: Array, views: Views, bearing: Bearing) -> Array:
-    """Compute the points ``(..., 3)`` [m] that have a range, a bearing and a height.
+    """Compute the points ``(..., 3)`` [m] with a given range, bearing and height.
 
     Args:
         polar: range [m] and bearing [rad] ``(n, ..., 2)``.
-        height_m: of the points over the origin of the world ``(n, ...)``.
-        views: one, or one for each row.
-        bearing: kind of the bearing, ``azimuth`` or ``cone``.
+        height_m: heights of the points in the world ``(n, ...)``.
+        views: one view, or one per row.
+        bearing: type of bearing, ``azimuth`` or ``cone``.
 
     Returns:
-        Of two points with these numbers the one nearer to the sonar's axis; nan where there is none.
+        If two points match, the one closer to the sonar's axis; nan if there is none.
     """
     shape = (len(views.poses), *(1,) * (polar.ndim - 2))
     radius, angle = polar[..., 0], polar[..., 1]

@@ -1,4 +1,4 @@
-"""Level ground: the ground point of each cell of a sonar image, and its motion with the sonar."""
+"""Project the cells of a sonar image onto level ground, and estimate the sonar's height and attitude over it."""
 
 from __future__ import annotations
 
@@ -37,18 +37,20 @@ __all__ = [
 
 
 SMALL = 1e-4
-"""Step of differences [m, rad]."""
+"""Step of finite differences [m, rad]."""
 
 
 @dataclass(frozen=True)
 class GroundGeometry:
-    """A sonar over level ground. Ground points are (starboard, forward) [m] in level axes that turn with its heading.
+    """Geometry of a sonar over level ground.
+
+    Ground points are (starboard, forward) [m] in level axes that rotate with the sonar's heading.
 
     Attributes:
-        range_m: of the cells ``(bins,)`` [m].
-        bearing_rad: of the cells ``(beams,)`` [rad].
-        bearing: kind of that angle, ``azimuth`` or ``cone``.
-        height_m: of the sonar over the ground.
+        range_m: ranges of the cells ``(bins,)`` [m].
+        bearing_rad: bearings of the cells ``(beams,)`` [rad].
+        bearing: type of bearing, ``azimuth`` or ``cone``.
+        height_m: height of the sonar over the ground [m].
         pitch_rad: > 0 points down.
         roll_rad: > 0 puts starboard down.
     """
@@ -62,45 +64,47 @@ class GroundGeometry:
 
     @cached_property
     def turn(self) -> NDArray[np.float64]:
-        """Return the sonar's starboard, forward and up in level axes, as columns ``(3, 3)``."""
+        """Return the sonar's starboard, forward and up axes in level axes, as columns ``(3, 3)``."""
         return _turn(self.pitch_rad, self.roll_rad)
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
-        """Return the ground points of the cells ``(bins, beams, 2)`` [m]; nan where a cell's arc does not meet the ground.
+        """Return the ground points of the cells ``(bins, beams, 2)`` [m]; nan where the arc of a cell misses the ground.
 
-        An arc can meet the ground in two points. The one nearer to the sonar's axis in elevation counts.
+        An arc can intersect the ground at two points. The one closer to the sonar's axis in elevation is returned.
         """
         radius, b = np.meshgrid(self.range_m, self.bearing_rad, indexing="ij")
         e = arc_elevation(self.bearing, b, -self.height_m / radius, self.turn[2])
         return np.asarray((directions(self.bearing, b, e) * radius[..., None] @ self.turn.T)[..., :2])
 
     def to_polar(self, points: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Compute range [m] and bearing [rad] of ground points ``(..., 2)``."""
+        """Compute the range [m] and bearing [rad] of ground points ``(..., 2)``."""
         s, f, u = self._in_sonar(points)
         radius = np.sqrt(s * s + f * f + u * u)
         return radius, np.arctan2(s, f) if self.bearing == "azimuth" else np.arcsin(s / radius)
 
     def elevation(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Compute the elevation [rad] in the sonar's frame of ground points ``(..., 2)``."""
+        """Compute the elevation [rad] of ground points ``(..., 2)`` in the sonar's frame."""
         s, f, u = self._in_sonar(points)
         return np.asarray(np.arctan2(u, np.hypot(s, f) if self.bearing == "azimuth" else f))
 
     @cached_property
     def derivative(self) -> NDArray[np.float64]:
-        """Return the derivative of range [m] and bearing [rad] of each cell's ground point by the motion, at rest.
+        """Return the derivative of range [m] and bearing [rad] of each cell's ground point by the motion, at zero motion.
 
         The motion is sideways, forward [m], yaw [rad] (Almanza-Medina, eq. 3.4). Shape: ``(bins, beams, 2, 3)``.
         """
         x, y = np.moveaxis(self.points, -1, 0)
         s, f, u = self._in_sonar(self.points)
         radius = np.sqrt(s * s + f * f + u * u)
+        # Rows: the gradients of range and bearing with respect to the ground point.
         along = np.stack([x, y], axis=-1) / radius[..., None]
         aside, ahead = self.turn[:2, 0], self.turn[:2, 1]
         if self.bearing == "azimuth":
             turning = (f[..., None] * aside - s[..., None] * ahead) / (s * s + f * f)[..., None]
         else:
             turning = (aside - (s / radius)[..., None] * along) / np.sqrt(radius * radius - s * s)[..., None]
+        # Chain rule with the derivative of the ground point by the motion.
         one, none = np.ones_like(x), np.zeros_like(x)
         point = np.stack([np.stack([-one, none, -y], axis=-1), np.stack([none, -one, x], axis=-1)], axis=-2)
         return np.asarray(np.stack([along, turning], axis=-2) @ point)
@@ -122,27 +126,30 @@ class GroundGeometry:
         return np.stack([along, turning], axis=-1)
 
     def motions_of_lean(self, along: int, half_rad: float) -> NDArray[np.float64]:
-        """Compute the motions that a change of height, pitch and roll looks like from one ping to the next.
+        """Compute the apparent motion caused by a change of height, pitch or roll between two pings.
 
-        The motion that moves the lit ground's ranges and bearings most alike, by least squares: ranges in bins, bearings in
-        beams.
+        It is the planar motion that best reproduces, in least squares, the changes of range (in bins) and bearing (in beams)
+        over the lit ground.
 
         Args:
-            along: how many ranges and bearings of the cells count.
-            half_rad: half the opening of the beams, which limits the lit ground [rad].
+            along: number of ranges and of bearings at which the ground is sampled.
+            half_rad: half the elevation field of view, which limits the lit ground [rad].
 
         Returns:
-            Sideways, forward [m], yaw [rad] a metre of height, a radian of pitch and of roll, as columns ``(3, 3)``; 0 where
-            the ground that is lit does not tell a motion.
+            Sideways, forward [m], yaw [rad] per metre of height and per radian of pitch and of roll, as columns ``(3, 3)``;
+            0 if the lit ground does not determine a motion.
         """
+        # Sample a coarse grid of cells, of which only those on lit ground count.
         bin_m, beam_rad = (float(np.median(np.abs(np.diff(axis)))) for axis in (self.range_m, self.bearing_rad))
         ranges, bearings = (np.linspace(axis[0], axis[-1], along) for axis in (self.range_m, self.bearing_rad))
         few = replace(self, range_m=ranges, bearing_rad=bearings)
         lit = np.isfinite(few.points).all(axis=-1) & (np.abs(few.elevation(few.points)) <= half_rad)
         if lit.sum() < 3:
             return np.zeros((3, 3))
+        # Express derivatives by the motion in bins and beams, so that both have equal weight.
         scale, points = np.array([bin_m, beam_rad]), few.points[lit]
         by_motion = few.derivative[lit] / scale[:, None]
+        # Differentiate numerically by height, pitch and roll, and fit the motion.
         changes = []
         for name in ("height_m", "pitch_rad", "roll_rad"):
             ends = [replace(few, **{name: getattr(few, name) + sign * SMALL}).to_polar(points) for sign in (-1, 1)]
@@ -151,7 +158,7 @@ class GroundGeometry:
         return np.asarray(found)
 
     def _in_sonar(self, points: NDArray[np.floating]) -> tuple[NDArray[np.floating], ...]:
-        """Return starboard, forward, up of ground points in the sonar's own axes."""
+        """Return the starboard, forward and up coordinates of ground points in the sonar's axes."""
         x, y, turn = points[..., 0], points[..., 1], self.turn.astype(points.dtype)
         below = points.dtype.type(self.height_m)
         starboard, forward, up = (x * turn[0, k] + y * turn[1, k] - below * turn[2, k] for k in range(3))
@@ -160,7 +167,7 @@ class GroundGeometry:
 
 @lru_cache(maxsize=16)
 def _turn(pitch: float, roll: float) -> NDArray[np.float64]:
-    """Return the axes of a sonar; kept, since many geometries differ by their height alone."""
+    """Return the axes of a sonar, cached since many geometries differ only in height."""
     axes = np.asarray(vehicle_rotation(Pose(0, 0, 0, pitch, roll, 0)).as_matrix()[0], dtype=np.float64)
     axes.setflags(write=False)
     return axes
@@ -169,23 +176,23 @@ def _turn(pitch: float, roll: float) -> NDArray[np.float64]:
 def arc_elevation(
     bearing: Bearing, angle: NDArray[np.float64], rise: NDArray[np.float64], upward: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Compute the elevation [rad] at which the arc of a cell meets a level.
+    """Compute the elevation [rad] at which the arc of a cell meets a horizontal plane.
 
     Args:
-        bearing: kind of the angle, ``azimuth`` or ``cone``.
+        bearing: type of bearing, ``azimuth`` or ``cone``.
         angle: bearings of the cells [rad].
-        rise: height of the level over the sonar, as part of the range of each cell; like ``angle``.
-        upward: how much of the sonar's starboard, forward and up points up ``(..., 3)``.
+        rise: height of the plane over the sonar, as a fraction of the range of each cell; like ``angle``.
+        upward: vertical components of the sonar's starboard, forward and up axes ``(..., 3)``.
 
     Returns:
-        Of the two points where an arc may meet the level, the one nearer to the sonar's axis; nan where there is none.
+        The elevation closer to the sonar's axis, if the arc meets the plane at two points; nan if there is none.
     """
     starboard, forward, up = np.moveaxis(np.asarray(upward), -1, 0)
     if bearing == "azimuth":
         fixed, ahead, above = 0.0, starboard * np.sin(angle) + forward * np.cos(angle), np.broadcast_to(up, angle.shape)
     else:
         fixed, ahead, above = starboard * np.sin(angle), forward * np.cos(angle), up * np.cos(angle)
-    # fixed + ahead cos e + above sin e = rise
+    # solve fixed + ahead cos e + above sin e = rise for the elevation e
     lean = np.arctan2(above, ahead)
     with np.errstate(invalid="ignore", divide="ignore"):
         swing = np.arccos((rise - fixed) / np.hypot(ahead, above))
@@ -194,9 +201,10 @@ def arc_elevation(
 
 
 def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Find for each node the node whose values it takes.
+    """Find for each node the node that supplies its values.
 
-    A node on the ground takes its own. Another takes those of the first one farther out, in the nearest column with any.
+    A node on the ground supplies its own values. Any other node takes those of the first ground node farther out, in the
+    nearest column that has one.
 
     Args:
         known: whether a node meets the ground ``(ranges, bearings)``.
@@ -217,8 +225,9 @@ def moved(points: AnyArray, motion: AnyArray) -> AnyArray:
     """Compute the positions of ground points relative to a sonar that has moved (Almanza-Medina, eq. 3.4).
 
     Args:
-        points: starboard, forward [m] ``(..., 2)``, of NumPy or torch.
-        motion: sideways, forward [m], yaw [rad]; three numbers, or an array whose leading axes broadcast with the points'.
+        points: starboard, forward [m] ``(..., 2)``, NumPy or torch.
+        motion: sideways, forward [m], yaw [rad]; three numbers, or an array whose leading axes broadcast with those of
+            ``points``.
     """
     xp = array_namespace(points)
     motion = xp.astype(motion if is_array_api_obj(motion) else xp.asarray(motion), points.dtype, copy=False)
@@ -232,37 +241,37 @@ def _within_pi(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
-# ---------------- The ground that a sonar lights: its outline moves with the sonar, and biases estimates of motion to
-# zero
+# ---------------- Outline of the lit ground
+# The outline moves with the sonar, which biases motion estimates towards zero.
 
 
 MOSTLY = 0.5
-"""Part of the window that must show lit ground for the outline of the light to be left in."""
+"""Fraction of the window that must show lit ground for the outline of the light to be retained."""
 
 NEARLY_ALL = 0.85
-"""Part of the window beyond which the outline costs little to leave out, as in a grazing look at a hull."""
+"""Fraction of the window above which removing the outline costs little, as in a grazing view of a hull."""
 
 LIT = 0.9
-"""Part of the field of view's elevation that is free of its outline."""
+"""Fraction of the elevation field of view that is free of its outline."""
 
 
 def margin_of_light(
     ground: GroundGeometry, attitude: Attitude, elevation_fov_deg: float, mostly: float = MOSTLY
 ) -> NDArray[np.float64] | None:
-    """Compute how far inside the light the ground of each cell lies, where its outline must be left out of a match.
+    """Compute how far inside the light each cell's ground lies, if the outline must be excluded from matching.
 
-    That is where the ground is even, where most of the fan is not lit, and where nearly all of it is. Else rocks blur the
-    outline, and those that rise beyond it help.
+    The outline is excluded where the ground is even, where most of the fan is unlit, and where nearly all of it is lit.
+    Otherwise rocks blur the outline, and those that rise beyond it improve the match.
 
     Args:
-        ground: of the cells, at the height of the attitude.
-        attitude: of the sonar.
-        elevation_fov_deg: of the sonar.
-        mostly: part of the window that must be lit for the outline to be left in.
+        ground: ground of the cells, at the height of the attitude.
+        attitude: attitude of the sonar.
+        elevation_fov_deg: elevation field of view of the sonar [deg].
+        mostly: fraction of the window that must be lit for the outline to be retained.
 
     Returns:
-        Part of the half field of view ``(bins, beams)``, > 0 inside the light, -1 where a cell meets no ground; None: the
-        outline is left in.
+        Margin as a fraction of the half field of view ``(bins, beams)``, > 0 inside the light, -1 where a cell misses the
+        ground; None if the outline is retained.
     """
     margin = _margin(ground, elevation_fov_deg)
     lit = (margin >= 0).mean()
@@ -270,67 +279,68 @@ def margin_of_light(
         return margin
     if lit <= NEARLY_ALL:
         return None
-    # tubes answer first and hide how high the sonar is over the plate that carries the outline
+    # on a hull, first echoes from tubes hide the height over the plate that carries the outline
     return _margin(replace(ground, height_m=attitude.floor_m), elevation_fov_deg)
 
 
 def _margin(ground: GroundGeometry, elevation_fov_deg: float) -> NDArray[np.float64]:
-    """Return the margin of each cell ``(bins, beams)``."""
+    """Return the margin of each cell as a fraction of the half field of view ``(bins, beams)``."""
     with np.errstate(invalid="ignore"):
         elevation = np.abs(ground.elevation(ground.points))
     return np.asarray(np.nan_to_num(1 - elevation / (LIT * np.radians(elevation_fov_deg) / 2), nan=-1.0))
 
 
-# ---------------- Height of the sonar over the visible surface by the first and the last echoes of each beam, and
-# whether it is level
-# The steepest rays of a beam meet the scene first, the shallowest ones last. So the ranges of the first and of the last
-# echo measure the height at the near and at the far end of the lit ground. Over level ground both are alike, but for a
-# skirt of the light, which makes the first too small and the last too large. Where the last is much smaller, the ground
-# rises.
+# ---------------- Height from the first and last echoes
+# The steepest rays of a beam meet the scene first, the shallowest last. The ranges of the first and last echoes therefore
+# measure the height at the near and far ends of the lit ground. Over level ground the two agree, except that a skirt of the
+# light makes the first too small and the last too large. If the last is much smaller, the ground rises.
 
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 TOPS = 0.5
-"""Height of the contrast above the mean of the first echoes, as part of the height between that mean and their lowest tenth.
+"""Height of the contrast above the mean first echo, relative to the height of that mean above the lowest tenth.
 
-On rocky fields of 30 and 60 rocks of each kind a side the error is 0.06 and 0.04 m rms. Where 130 rocks hide the floor it is
-0.10 m.
+On rocky fields with 30 and 60 rocks of each kind per side, the error is 0.06 and 0.04 m rms. Where 130 rocks hide the floor
+it is 0.10 m.
 """
 
 EVEN = 0.005
-"""Largest distance of the quartiles of the height under the steepest rays on even ground, as part of the height."""
+"""Largest interquartile range of the height under the steepest rays over even ground, as a fraction of the height."""
 
 BLUR = 2.0
 """Standard deviation of the blur along range [bins]."""
 
 CLEAR = 90
-"""Percentile of the beams by last echo: shadows of rocks end the light of the others early."""
+"""Percentile over the beams of the height by last echoes; shadows of rocks end the light of other beams early."""
 
 NEAREST = 0.5
-"""Least range at which the profile of a skirt is computed, as part of that of the first echoes."""
+"""Smallest range at which the profile of a skirt is computed, as a fraction of that of the first echoes."""
 
 ROUNDS = 4
-"""Rounds of the height that the profile of a skirt tells."""
+"""Number of iterations for the height from the profile of a skirt."""
 
 FEWEST_BEAMS = 8
 
 FAINTEST = 1e-9
-"""Level, as part of full scale, below which nothing is an echo."""
+"""Level below which nothing counts as an echo, as a fraction of full scale."""
 
 SHARE, SHARE_OF_SKIRT = 0.15, 0.5
-"""Level of an echo, as part of that in the middle of the window. Side lobes look straight down and answer before a skirt."""
+"""Level of an echo as a fraction of that in the middle of the window.
+
+The second is for beams with a skirt, whose side lobes look straight down and return echoes before the skirt.
+"""
 
 EDGE = 15
-"""Bins at the near or far side of the window that show what no echo looks like."""
+"""Number of bins at the near or far end of the window that define the level without echoes."""
 
 STEEP = 0.2
-"""Least median sine of the angle at which the shallowest rays go down: below it echoes end because they are faint."""
+"""Smallest median of the downward component of the shallowest rays; below it, echoes end because they are faint."""
 
 
 class FirstEchoes(NamedTuple):
-    """Height from the first echoes, the contrast's height above their mean [m], and whether the ground is even."""
+    """Height by the first echoes, height of the contrast above their mean [m], and whether the ground is even."""
 
     height_m: float
     tops_m: float
@@ -338,13 +348,13 @@ class FirstEchoes(NamedTuple):
 
 
 class EchoHeights(NamedTuple):
-    """Heights [m] by the ends of the light; None where the window does not show them.
+    """Heights [m] from both ends of the light; None if the window does not show them.
 
     Attributes:
-        first: by the first echoes.
-        last_m: mean by the last echoes.
-        ends_m: mean by both.
-        last_clear_m: by the last echoes of those beams that shadows cut least.
+        first: result from the first echoes.
+        last_m: mean from the last echoes.
+        ends_m: mean from both.
+        last_clear_m: from the last echoes of the beams that are least cut by shadows.
     """
 
     first: FirstEchoes | None
@@ -354,20 +364,21 @@ class EchoHeights(NamedTuple):
 
 
 def echo_heights(frames: SonarFrames, pitch_rad: float, roll_rad: float) -> EchoHeights:
-    """Measure how far below the sonar the steepest and the shallowest ray of each beam end.
+    """Measure how far below the sonar the steepest and shallowest rays of the beams end.
 
-    It is measured on levels: codings such as ``dB`` and ``gamma`` lift the skirt of the light to a height like the ground's.
+    Levels are used, since codings such as ``dB`` and ``gamma`` raise the skirt of the light to a height similar to that of
+    the ground.
 
     Args:
-        frames: whose mean is looked at.
-        pitch_rad: of the sonar, > 0 points down.
+        frames: frames whose mean is evaluated.
+        pitch_rad: pitch of the sonar, > 0 points down.
         roll_rad: > 0 puts starboard down.
     """
     if frames.level == "contrast":
-        return EchoHeights(None)  # its dark parts are no water without echoes
+        return EchoHeights(None)  # dark contrast does not mean water without echoes
     edged = frames.sonar.vertical_pattern == "box"
     image = frames.linear_values().mean(axis=0, dtype=np.float32)
-    across = (3, 0.5) if edged else (13, 2.0)  # speckle crosses a threshold early: more of it is averaged
+    across = (3, 0.5) if edged else (13, 2.0)  # speckle crosses a threshold early, so average more of it
     smooth = cv2.GaussianBlur(image, (across[0], 13), sigmaX=across[1], sigmaY=BLUR, borderType=cv2.BORDER_REPLICATE)
     steepest = _down(frames, pitch_rad, roll_rad, far=False)
     near = _ends(smooth, frames.range_m, steepest, SHARE if edged else SHARE_OF_SKIRT)
@@ -375,7 +386,7 @@ def echo_heights(frames: SonarFrames, pitch_rad: float, roll_rad: float) -> Echo
         near = near.scaled(_skirt(frames, pitch_rad, near))
     first = _first_echoes(near.received) if near.shown else None
     down = _down(frames, pitch_rad, roll_rad, far=True)
-    if np.median(down) < STEEP or not edged:  # the light of a beam with a skirt fades: its last echo tells nothing
+    if np.median(down) < STEEP or not edged:  # the light of a beam with a skirt fades, so its last echo is not informative
         return EchoHeights(first)
     far = _ends(smooth[::-1], frames.range_m[::-1], down)
     if not far.shown:
@@ -385,21 +396,22 @@ def echo_heights(frames: SonarFrames, pitch_rad: float, roll_rad: float) -> Echo
 
 
 def _down(frames: SonarFrames, pitch: float, roll: float, *, far: bool) -> Doubles:
-    """Return how much of the shallowest (``far``) or steepest ray of each beam points down ``(beams,)``."""
+    """Return the downward component of the shallowest (``far``) or steepest ray of each beam ``(beams,)``."""
     half = np.radians(frames.sonar.elevation_fov_deg) / 2
     ray = directions(frames.sonar.bearing, frames.bearing_rad, half if far else -half)
     return np.asarray(-vehicle_rotation(Pose(0, 0, 0, pitch, roll, 0)).apply(ray)[:, 2])
 
 
 class _Ends(NamedTuple):
-    """How far below the sonar beams' first echoes lie [m].
+    """Depths of the first echoes of the beams below the sonar [m].
 
     Attributes:
-        received: of all beams with an echo.
-        ended: of those whose first echo lies within the window.
-        shown: whether these are enough.
+        received: depths of all beams with an echo.
+        ended: depths of beams whose first echo lies within the window.
+        shown: whether there are enough of the latter.
         range_m: median range of the first echoes.
-        threshold: level of a first echo over the dark, as part of the mean level of the middle of the window over it.
+        threshold: level of a first echo, as a fraction of the mean level in the middle of the window; both above the dark
+            level.
     """
 
     received: Doubles
@@ -409,7 +421,7 @@ class _Ends(NamedTuple):
     threshold: float
 
     def scaled(self, factor: float) -> _Ends:
-        """Return the ends of rays that point down so many times as much."""
+        """Return the ends for rays whose downward component is scaled by a factor."""
         return self._replace(received=self.received * factor, ended=self.ended * factor)
 
 
@@ -417,20 +429,22 @@ def _ends(smooth: Floats, range_m: Doubles, down: Doubles, share: float = SHARE)
     """Measure how far below the sonar the first echoes of the beams lie.
 
     Args:
-        smooth: levels ``(bins, beams)``; rows in the order in which they are searched.
-        range_m: of the rows.
-        down: part of each beam's ray that points down ``(beams,)``.
-        share: level of an echo over the dark, as part of that of the middle of the window.
+        smooth: levels ``(bins, beams)``, with rows in search order.
+        range_m: ranges of the rows.
+        down: downward component of each beam's ray ``(beams,)``.
+        share: level of an echo as a fraction of that in the middle of the window, both above the dark level.
     """
     bins = len(smooth)
+    # Set the threshold well above the spread of the bins without echoes, and at a share of the lit level.
     darkest, dark = (float(level) for level in np.percentile(smooth[:EDGE], [5, 25]))
-    spread = (dark - darkest) / 0.97  # quartile to twentieth of a Gaussian, in standard deviations
+    spread = (dark - darkest) / 0.97  # 25th minus 5th percentile of a Gaussian, in standard deviations
     bright = float(smooth[bins // 4 : 3 * bins // 4].mean())
     over_dark = max(5 * spread, share * (bright - dark), FAINTEST)
+    # Find the first bin of each beam above the threshold; the light must not be cut off by the window.
     over = smooth > dark + over_dark
     first = over.argmax(axis=0)
     received = over.any(axis=0)
-    ended = received & (first > 2)  # else the window cuts the light
+    ended = received & (first > 2)  # otherwise the window cuts off the light
     drop = range_m[first] * down
     shown = bool(ended.sum() >= max(FEWEST_BEAMS, len(down) // 4))
     middle_m = float(np.median(range_m[first[received]])) if received.any() else 0.0
@@ -438,39 +452,42 @@ def _ends(smooth: Floats, range_m: Doubles, down: Doubles, share: float = SHARE)
 
 
 def _skirt(frames: SonarFrames, pitch_rad: float, near: _Ends) -> float:
-    """Return how much steeper the ray of a first echo goes down than the edge of the light, for beams with a skirt.
+    """Return the downward component of a first-echo ray over that of the edge of the light, for beams with a skirt.
 
-    The profile of level ground under the pattern of a uniform aperture, blurred as the frames are, crosses the same
-    threshold somewhere; the height at which it does so where the frames do is the fixed point of a few rounds.
+    The profile of level ground under the pattern of a uniform aperture, blurred like the frames, crosses the same threshold
+    at some range. The height at which this range equals that of the frames is found by fixed-point iteration.
     """
     sonar, bin_m = frames.sonar, float(np.diff(frames.range_m).mean())
     before = np.arange(frames.range_m[0] - bin_m, NEAREST * near.range_m, -bin_m)[
         ::-1
-    ]  # a skirt may begin before the window
+    ]  # a skirt may start before the window
     range_m, window = (
         np.append(before, frames.range_m),
         slice(len(before) + len(frames.range_m) // 4, -(len(frames.range_m) // 4)),
     )
+    # Start from the height at which the first echo lies on the edge of the light.
     power = 4 if sonar.vertical_pattern == "two_way" else 2
     half = math.radians(sonar.elevation_fov_deg) / 2
     edge_down = math.sin(min(pitch_rad + half, math.pi / 2))
     height = near.range_m * edge_down
     for _ in range(ROUNDS):
+        # Compute the level profile of level ground at this height, blurred like the frames.
         sine = np.clip(height / range_m, 0.0, 0.999)
         off_axis = np.sin(pitch_rad - np.arcsin(sine)) / math.sin(half)
         pattern = np.abs(shaded_sinc(half_power((), power) * off_axis, ())) ** power
         level = np.where(height < range_m, pattern * range_m ** (sonar.gain_exponent - 5) / np.sqrt(1 - sine**2), 0.0)
         level = cv2.GaussianBlur(level, (1, 13), sigmaX=1e-3, sigmaY=BLUR, borderType=cv2.BORDER_REPLICATE).ravel()
+        # Find where the profile crosses the threshold, and scale the height by the ratio of the ranges.
         below = level[: level.argmax() + 1] <= near.threshold * level[window].mean()
         if not below.any():
             return 1.0
-        crossing = range_m[np.flatnonzero(below)[-1] + 1]  # that of the main lobe: side lobes straight down are narrow
+        crossing = range_m[np.flatnonzero(below)[-1] + 1]  # crossing of the main lobe; side lobes straight down are narrow
         height *= near.range_m / float(crossing)
     return height / (near.range_m * edge_down)
 
 
 def _first_echoes(drop: Doubles) -> FirstEchoes | None:
-    """Return the height by first echoes that lie so far below the sonar [m]; None where it is not above 0."""
+    """Return the height from the depths of first echoes below the sonar [m]; None if it is not positive."""
     low, high, lowest = np.percentile(drop, [25, 75, 90])
     height = float(drop.mean() - TOPS * (lowest - drop.mean()))
     if not height > 0:
@@ -478,40 +495,42 @@ def _first_echoes(drop: Doubles) -> FirstEchoes | None:
     return FirstEchoes(height, float(drop.mean()) - height, bool(high - low < EVEN * height))
 
 
-# ---------------- Height of the sonar over the visible surface, measured from the first echoes or given by the user
-# Registration scales motions by the height over the surface that carries the contrast, not over the floor. On rocks of
-# 0.45 m, from 2.5 m, the two heights differ by up to 0.45 m, and forward motions by 10 %. The steepest rays of a beam
-# meet the scene first. So the range of the first echo measures the height there, and no altimeter is needed. Where
-# there is one, both must agree. Where the last echoes tell a much smaller height, the ground rises, and the mean of
-# both ends counts.
+# ---------------- Attitude: measured and given heights
+# Registration scales motions by the height over the surface that carries the contrast, not over the floor. Over rocks of
+# 0.45 m, seen from 2.5 m, the two heights differ by up to 0.45 m, and forward motions by 10 %. The first echoes measure the
+# height over the surface without an altimeter. If there is an altimeter, the two must agree. If the last echoes give a much
+# smaller height, the ground rises, and the mean of both ends is used.
 
 
 DOUBTFUL = 3.0
-"""Standard deviations of both beyond which first echoes contradict a given height, and do not count."""
+"""Combined standard deviations beyond which first echoes contradict a given height and are ignored."""
 
 SAME = 1e-9
-"""Differences of heights [m] and angles [rad] of frames that are none."""
+"""Differences in height [m] and angle [rad] between frames that count as zero."""
 
 STD_MEASURED, STD_GIVEN = 0.02, 0.05
-"""Standard deviation of the height over the visible surface, as part of it: with first echoes, and without."""
+"""Relative standard deviation of the height over the visible surface, with and without first echoes."""
 
 RISING, RISING_EVEN = 0.15, 0.03
-"""By how much the height at the far end of the light is smaller than at the near end, as part of it, where ground rises.
+"""Relative decrease of the height from the near to the far end of the light above which the ground is taken to rise.
 
-Rocks on level ground make -0.05 to 0.07 in the mean, 0.14 at most; on a slope of 10 deg 0.17 in a fan of 29 deg and 0.43 in
-one of 130 deg. Level ground without relief makes -0.01 to 0.01, a slope of 5 deg 0.05.
+Rocks on level ground give -0.05 to 0.07 on average and 0.14 at most; on a slope of 10 deg they give 0.17 in a fan of 29 deg
+and 0.43 in one of 130 deg. Level ground without relief gives -0.01 to 0.01, a slope of 5 deg 0.05.
 """
 
 STD_RISING = 0.29
-"""Standard deviation of the height over rising ground besides, as part of that difference: it may be any between both."""
+"""Additional standard deviation of the height over rising ground, as a fraction of the difference between the two ends.
+
+The height may have any value between both.
+"""
 
 
 STEEPEST = 2.0
-"""How many times higher or lower than at the ends of the light a sonar may be over rising ground straight below it."""
+"""Largest factor by which a given height over rising ground may lie above or below the heights at the ends of the light."""
 
 
 class Apart(NamedTuple):
-    """Height [m], pitch and roll [rad] of a frame, less those of the mean of the frames."""
+    """Deviation of a frame's height [m], pitch and roll [rad] from the mean of the frames."""
 
     height_m: float
     pitch_rad: float
@@ -521,15 +540,16 @@ class Apart(NamedTuple):
 NOT_APART = Apart(0.0, 0.0, 0.0)
 
 UNKNOWN_PER_S = Apart(0.06, math.radians(4.0), math.radians(4.0))
-"""How fast height [m/s], pitch and roll [rad/s] of a vehicle change on a calm day, root mean square.
+"""Rms rate of change of the height [m/s], pitch and roll [rad/s] of a vehicle on a calm day.
 
-Heave of 4 cm in 3 s, pitch and roll of 2 deg in 2.2 s. What nothing tells may change as fast."""
+Heave of 4 cm in 3 s, pitch and roll of 2 deg in 2.2 s. Quantities that are not measured are assumed to change this fast.
+"""
 
 UNKNOWN_MOST = Apart(0.04, math.radians(2.0), math.radians(2.0))
-"""How far they are apart in frames that are far apart in time, root mean square."""
+"""Rms difference in height, pitch and roll between frames that are far apart in time."""
 
 COARSE = 12
-"""Ranges and bearings at which the apparent motion of a heave, a pitch and a roll is computed."""
+"""Number of ranges and bearings at which the apparent motion of heave, pitch and roll is computed."""
 
 
 @dataclass(frozen=True)
@@ -537,17 +557,17 @@ class Attitude:
     """Height and attitude of the sonar over the visible surface.
 
     Attributes:
-        height_m: over the visible surface [m].
+        height_m: height over the visible surface [m].
         height_std_m: its standard deviation [m].
         pitch_rad: > 0 points down.
         roll_rad: > 0 puts starboard down.
-        reason: why the given geometry is rejected; empty where it is not.
+        reason: why the geometry is rejected; empty if it is accepted.
+        doubt: how echoes contradict the given height, which is used unless the ground rises; empty if they agree.
         even: whether first echoes show ground without relief.
-        given_m: height over the ground as given [m]; None: it was not.
-        first: height by first echoes; None where they do not show it, or contradict the height as given.
-        doubt: how echoes contradict the height as given, which counts unless the ground rises; empty where they do not.
-        apart: height, pitch and roll of each frame, less their mean; empty where they are not known, or all the same.
-        unsure: standard deviation of their change from one frame to the other; 0 where it is known.
+        given_m: given height over the ground [m]; None if not given.
+        first: height by first echoes; None if they do not show it, or contradict the given height.
+        apart: deviations of each frame's height, pitch and roll from their mean; empty if unknown or all equal.
+        unsure: standard deviation of their change between the frames; 0 where it is known.
     """
 
     height_m: float
@@ -564,30 +584,33 @@ class Attitude:
 
     @property
     def floor_m(self) -> float:
-        """Height over the floor, where the fan begins to light it [m]: as given, but there may be a rock straight below."""
+        """Return the height over the floor where the fan starts to light it [m].
+
+        This is the given height, although a rock may lie straight below, but at least ``height_m``.
+        """
         return self.height_m if self.given_m is None else max(self.given_m, self.height_m)
 
     @property
     def tops_m(self) -> float:
-        """Height of the contrast above the mean of the first echoes [m]; 0 where they did not tell the height."""
+        """Return the height of the contrast above the mean first echo [m]; 0 if first echoes were not used."""
         return 0.0 if self.first is None else self.first.tops_m
 
     @property
     def about(self) -> dict[str, str]:
-        """Return what an estimate must report of the attitude: a doubt, if there is one."""
+        """Return notes on the attitude that an estimate must report: a doubt, if there is one."""
         return {"doubt": self.doubt} if self.doubt else {}
 
     def of_frame(self, number: int, lift_m: float = 0.0) -> tuple[float, float, float]:
-        """Return height [m], pitch and roll [rad] of one of the frames, over ground that is raised by ``lift_m``."""
+        """Return the height [m], pitch and roll [rad] of a frame, over ground that is raised by ``lift_m``."""
         apart = self.apart[number] if self.apart else NOT_APART
         return self.height_m + apart.height_m - lift_m, self.pitch_rad + apart.pitch_rad, self.roll_rad + apart.roll_rad
 
     def widened(self, covariance: NDArray[np.float64], frames: SonarFrames) -> NDArray[np.float64]:
-        """Return the covariance of a motion ``(3, 3)`` with what unknown heave, pitch and roll add.
+        """Return the covariance of a motion ``(3, 3)``, enlarged for unknown heave, pitch and roll.
 
         Args:
-            covariance: of sideways, forward [m], yaw [rad], were height and attitude the same in both frames.
-            frames: both.
+            covariance: covariance of sideways, forward [m], yaw [rad], assuming equal height and attitude in both frames.
+            frames: the two frames.
         """
         std = np.array(self.unsure)
         if not std.any():
@@ -596,7 +619,7 @@ class Attitude:
         return np.asarray(covariance + seen @ seen.T)
 
     def ground(self, frames: SonarFrames, number: int | None = None) -> GroundGeometry:
-        """Return the level ground that the cells show, of the mean of the frames or of one of them."""
+        """Return the level ground that the cells show, for the mean attitude or that of one frame."""
         pose = (self.height_m, self.pitch_rad, self.roll_rad) if number is None else self.of_frame(number)
         return GroundGeometry(frames.range_m, frames.bearing_rad, frames.sonar.bearing, *pose)
 
@@ -604,19 +627,20 @@ class Attitude:
 def attitude_of(
     frames: SonarFrames, name: str, height_m: float | None, pitch_rad: float | None, relief_m: float | None = None
 ) -> Attitude:
-    """Estimate height, pitch and roll of the frames' mean.
+    """Estimate the mean height, pitch and roll of frames.
 
-    First echoes measure the height, unless the relief is given. Else the given height counts, then that of the frames.
+    First echoes measure the height, unless the relief is given. Otherwise the given height is used, or else that of the
+    frames.
 
     Args:
         frames: consecutive frames.
-        name: of the estimator, for errors.
-        height_m: over the ground [m]; None: from the frames.
-        pitch_rad: None: from the frames.
-        relief_m: mean height of the visible surface over the ground [m]; None: from the first echoes, where there are any.
+        name: name of the estimator in error messages.
+        height_m: height over the ground [m]; None: from the frames.
+        pitch_rad: pitch [rad]; None: from the frames.
+        relief_m: mean height of the visible surface over the ground [m]; None: from the first echoes, if there are any.
 
     Raises:
-        MitsonarError: no pitch; a height neither given nor measured, or not above 0 or the relief.
+        MitsonarError: no pitch; a height that is neither given nor measured, or that is not above 0 or the relief.
     """
     leans = _leans(frames)
     lean = None if leans is None else leans.mean(axis=0)
@@ -651,7 +675,7 @@ def attitude_of(
 
 
 def _rises(found: EchoHeights, given_m: float | None) -> bool:
-    """Return whether the far end of the light lies so much higher than its near end that the ground must rise."""
+    """Return whether the far end of the light lies so much higher than the near end that the ground must rise."""
     if found.last_clear_m is None:
         return False
     first_m = found.first.height_m + found.first.tops_m if found.first is not None else given_m
@@ -661,7 +685,7 @@ def _rises(found: EchoHeights, given_m: float | None) -> bool:
 
 
 def _over_rising(found: EchoHeights, given_m: float | None, pitch: float, roll: float) -> Attitude:
-    """Return the attitude over ground that rises: the mean height of both ends of the light counts."""
+    """Return the attitude over rising ground, using the mean height of both ends of the light."""
     assert found.ends_m is not None
     assert found.last_m is not None
     first = found.first
@@ -677,7 +701,7 @@ def _over_rising(found: EchoHeights, given_m: float | None, pitch: float, roll: 
 
 
 def _over_level(first: FirstEchoes | None, given_m: float | None, pitch: float, roll: float) -> Attitude:
-    """Return the attitude over level ground: the height as given, by first echoes, or both by their weights."""
+    """Return the attitude over level ground, using the given height, that of first echoes, or their weighted mean."""
     if first is None:
         assert given_m is not None
         return Attitude(given_m, STD_GIVEN * given_m, pitch, roll, given_m=given_m)
@@ -696,7 +720,7 @@ def _over_level(first: FirstEchoes | None, given_m: float | None, pitch: float, 
 
 
 def _apart(frames: SonarFrames) -> tuple[Apart, ...]:
-    """Return height, pitch and roll of each frame less their mean; empty where they are not known, or all the same."""
+    """Return the deviation of each frame's height, pitch and roll from their mean; empty if unknown or all equal."""
     leans = _leans(frames)
     if leans is None:
         return ()
@@ -707,7 +731,10 @@ def _apart(frames: SonarFrames) -> tuple[Apart, ...]:
 
 
 def _unsure(frames: SonarFrames) -> Apart:
-    """Return how far the frames may be apart in what nothing tells. One pitch and roll for all frames tells no change."""
+    """Return the standard deviation of the unmeasured changes of height, pitch and roll between the frames.
+
+    A pitch and roll that are the same in all frames do not count as a measurement of their change, unless heights are known.
+    """
     time_s = frames.time_s if frames.time_s.ndim == 1 else frames.time_s.mean(axis=1)
     step_s = abs(float(time_s[-1] - time_s[0]))
     leans = _leans(frames)
@@ -718,7 +745,7 @@ def _unsure(frames: SonarFrames) -> Apart:
 
 
 def _leans(frames: SonarFrames) -> NDArray[np.float64] | None:
-    """Return pitch and roll of each frame ``(frames, 2)``, by the poses or the sonar's own sensors; None where unknown."""
+    """Return the pitch and roll of each frame ``(frames, 2)`` from poses or the sonar's sensors; None if unknown."""
     table, columns = (frames.attitude_rad, slice(0, 2)) if frames.poses is None else (frames.poses, slice(3, 5))
     if table is None or not np.isfinite(table[:, columns]).all():
         return None

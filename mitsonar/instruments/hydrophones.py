@@ -1,4 +1,4 @@
-"""The instrument of impulse responses: a transmitter and receivers, their fields of view, and the band of the signal."""
+"""Define the instrument of impulse responses: transmitter, receivers, fields of view, and the signal band."""
 
 from __future__ import annotations
 
@@ -24,12 +24,14 @@ ChannelModel = Literal["scatterers", "rays"]
 SEE = " (see docs/guides/impulse-responses.md)"
 
 PADDING = 2
-"""Factor by which the frequency response is sampled finer than asked. Tails of pulses before t = 0 then wrap into a part
-that is cropped."""
+"""Oversampling factor of the frequency response.
+
+Pulse tails before t = 0 then wrap into a part that is cropped.
+"""
 
 
 class Maths(NamedTuple):
-    """The functions of an array library that fields of view are computed with."""
+    """Functions of the array library with which fields of view are computed."""
 
     asin: Callable[..., AnyArray]
     atan2: Callable[..., AnyArray]
@@ -44,11 +46,13 @@ NUMPY = Maths(np.arcsin, np.arctan2, np.cos, np.clip, np.where)
 class FieldOfView(CheckedModel):
     """Field of view of a transducer in the vehicle's axes (starboard, forward, up), and its sensitivity.
 
-    Shapes: ``rectangular``, ``across_deg`` wide across a vertical plane and ``along_deg`` in it; ``circular``, a cone of
-    ``across_deg``; ``all``, every direction. The middle points ``tilt_deg`` away from straight down, to ``heading_deg``.
+    Shapes: ``rectangular`` extends ``across_deg`` across a vertical plane and ``along_deg`` within it; ``circular`` is a
+    cone of diameter ``across_deg``; ``all`` covers every direction. The centre is tilted by ``tilt_deg`` from straight down,
+    towards ``heading_deg``.
 
-    Sensitivity (of amplitudes) is 1 in the middle and 0 at the edges. It falls as half a period of a cosine over the outer
-    part ``taper`` of each half width. ``taper`` 0 is a hard edge; such an edge acts as an echo that moves with the vehicle.
+    The amplitude sensitivity is 1 in the centre and 0 at the edges. It falls like half a period of a cosine over the outer
+    fraction ``taper`` of each half width. A ``taper`` of 0 is a hard edge, which acts as an echo that moves with the
+    vehicle.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -64,7 +68,10 @@ class FieldOfView(CheckedModel):
 
     @property
     def axes(self) -> NDArray[np.float64]:
-        """Return its axes in the vehicle's, rows of ``(3, 3)``: the middle, the side (clockwise from above), upwards."""
+        """Return the axes of the field of view in the vehicle's axes, as rows ``(3, 3)``.
+
+        The rows are the centre, the side (clockwise seen from above), and up.
+        """
         turn, tilt = math.radians(self.heading_deg), math.radians(self.tilt_deg)
         level = np.array([math.sin(turn), math.cos(turn), 0.0])
         side = np.array([math.cos(turn), -math.sin(turn), 0.0])
@@ -72,7 +79,7 @@ class FieldOfView(CheckedModel):
         return np.stack([math.sin(tilt) * level - math.cos(tilt) * up, side, math.cos(tilt) * level + math.sin(tilt) * up])
 
     def sensitivity(self, ahead: AnyArray, aside: AnyArray, above: AnyArray, maths: Maths = NUMPY) -> AnyArray:
-        """Return the sensitivity 0..1 to sound from a unit direction, given along :attr:`axes`."""
+        """Return the sensitivity 0..1 to sound from a unit direction, given in components along :attr:`axes`."""
         if self.shape == "all":
             return ahead * 0 + 1
         half_across = math.radians(self.across_deg) / 2
@@ -86,21 +93,21 @@ class FieldOfView(CheckedModel):
         )
 
     def may_see(self, ahead: AnyArray, aside: AnyArray, above: AnyArray, margin: AnyArray) -> NDArray[np.bool_]:
-        """Return whether a point within ``margin`` [rad] of a unit direction, given along :attr:`axes`, may lie in it."""
+        """Return whether a point within ``margin`` [rad] of a unit direction, in :attr:`axes` components, may be in view."""
         if self.shape == "all":
             return np.ones(np.shape(ahead), dtype=bool)
         half_across = math.radians(self.across_deg) / 2
         if self.shape == "circular":
             return np.asarray(np.arctan2(np.hypot(aside, above), ahead) <= half_across + margin)
         across = np.abs(np.arcsin(np.clip(aside, -1, 1)))
-        # far aside, one degree of direction is more than one degree of the angle along
+        # far to the side, a degree of direction spans more than a degree of the angle along
         level = np.cos(np.minimum(across + margin, np.pi / 2))
         wider = np.where(level > np.sin(margin), np.arcsin(np.minimum(np.sin(margin) / np.maximum(level, 1e-9), 1)), np.pi)
         along = np.abs(np.arctan2(above, ahead))
         return np.asarray((across <= half_across + margin) & (along <= math.radians(self.along_deg) / 2 + wider))
 
     def _fall(self, angle: AnyArray, maths: Maths) -> AnyArray:
-        """Return the taper at an angle in half widths: 1 in the middle, 0 from 1 on."""
+        """Return the taper at an angle in units of the half width: 1 in the centre, 0 from 1 on."""
         if self.taper == 0:
             return maths.where(angle <= 1, angle * 0 + 1, 0)
         ramp = maths.clip((angle - (1 - self.taper)) * (1 / self.taper), 0, 1)
@@ -108,7 +115,7 @@ class FieldOfView(CheckedModel):
 
 
 class Hydrophone(CheckedModel):
-    """A receiver: its name, its position from the transmitter in the vehicle's axes, and its field of view."""
+    """A receiver: its name, its position relative to the transmitter in the vehicle's axes, and its field of view."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -128,15 +135,15 @@ class Hydrophone(CheckedModel):
 
 
 LOOKS = {"front": 0.0, "left": -90.0, "back": 180.0, "right": 90.0}
-"""Receivers 1 to 4 of Almanza-Medina, 5.4, and their headings [deg]."""
+"""Headings of receivers 1 to 4 of Almanza-Medina, 5.4 [deg]."""
 
 
 def four_receivers(distance_m: float = 0.1, **field: FieldValue) -> tuple[Hydrophone, ...]:
-    """Create Almanza-Medina's receivers (5.4): forward, left, back and right of the transmitter, each pointing away from it.
+    """Create Almanza-Medina's receivers (5.4): forward, left, back and right of the transmitter, each pointing outwards.
 
     Args:
-        distance_m: from the transmitter [m].
-        field: fields of :class:`FieldOfView`, the same for all.
+        distance_m: distance from the transmitter [m].
+        field: fields of :class:`FieldOfView`, common to all receivers.
     """
     made = []
     for name, heading in LOOKS.items():
@@ -157,9 +164,9 @@ def _few_digits(sampling_hz: float, taps: int) -> int:
 
 
 class ChannelSonar(Instrument):
-    """A transmitter that sends continuously, and receivers whose channels are measured continuously (Almanza-Medina, ch. 5).
+    """A continuous transmitter, and receivers whose channels are measured continuously (Almanza-Medina, ch. 5).
 
-    Angles in degrees (the edge of the program), all else SI. The same names are the XML properties of the sensor
+    Angles are in degrees, all other quantities in SI units. The same names serve as XML properties of the sensor
     ``channel_sonar`` (docs/guides/impulse-responses.md).
 
     Raises:
@@ -262,17 +269,17 @@ class ChannelSonar(Instrument):
 
     @property
     def lattice_pitch_m(self) -> float:
-        """Return the pitch of the points on surfaces without cells [m]."""
+        """Return the spacing of the points on surfaces without cells [m]."""
         return self.points_per_m2**-0.5 if self.scatterer_spacing_m is None else self.scatterer_spacing_m
 
     @property
     def spreads(self) -> bool:
-        """Return whether amplitudes fall with distance."""
+        """Return whether amplitudes decrease with distance."""
         return self.model == "scatterers" if self.spreading is None else self.spreading
 
     @property
     def field_of_view(self) -> dict[str, FieldOfView]:
-        """Return the field of view of each receiver by name. In ``rays`` it has no taper, as in Almanza-Medina."""
+        """Return the field of view of each receiver by name; without taper in the model ``rays``, as in Almanza-Medina."""
         hard = {"taper": 0.0} if self.model == "rays" else {}
         return {one.name: one.field.model_copy(update=hard) for one in self.receivers}
 
@@ -282,7 +289,7 @@ class ChannelSonar(Instrument):
         return np.array([receiver.position for receiver in self.receivers], dtype=float)
 
     def receiver_number(self, receiver: int | str) -> int:
-        """Return the number of a receiver, of its name or itself.
+        """Return the index of a receiver that is given by name or by index.
 
         Raises:
             MitsonarError: no such receiver.
@@ -300,7 +307,7 @@ class ChannelSonar(Instrument):
     def raised_cosine(self, frequency_hz: NDArray[np.floating]) -> NDArray[np.float64]:
         """Compute the raised cosine X_R at baseband frequencies [Hz] (Almanza-Medina, eq. 5.16, corrected).
 
-        X_R is 1 up to c = (1 - alpha) F_d / 2, 0 from a = (1 + alpha) F_d / 2 on, and half a period of a cosine between.
+        X_R is 1 up to c = (1 - alpha) F_d / 2, 0 from a = (1 + alpha) F_d / 2 on, and half a period of a cosine in between.
         """
         flat = (1 - self.rolloff) * self.bandwidth_hz / 2
         width = self.rolloff * self.bandwidth_hz
@@ -313,7 +320,7 @@ class ChannelSonar(Instrument):
         """Compute the response to one echo of amplitude 1 at delay 0: the transform of X_R over the sampling rate.
 
         Args:
-            delay_s: at which the response is taken [s].
+            delay_s: delays at which the response is evaluated [s].
         """
         t = np.asarray(delay_s, dtype=float) * self.bandwidth_hz
         edge = 1 - (2 * self.rolloff * t) ** 2

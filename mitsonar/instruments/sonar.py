@@ -1,4 +1,4 @@
-"""The imaging sonar: field of view, beams, rays, window, and the model that is computed."""
+"""Define the imaging sonar: its field of view, beams, rays, range window and signal model."""
 
 from __future__ import annotations
 
@@ -49,36 +49,37 @@ __all__ = [
 ]
 
 
-# ---------------- Number of rays for an accuracy, and the measured error of each quality
-# Errors of the physical model, from ``benchmarks/bench_quality.py``:
+# ---------------- Ray counts and measured errors of a quality
+# Sources of error in the physical model, measured by ``benchmarks/bench_quality.py``:
 #
-# Plain ground: a ray spreads its level evenly over the ranges that its cell of elevation covers. Cells join without
-# gap, so only the slope of the level within a cell is lost. The error grows with the cell's length along range as a
-# part of the range, ``dR / R = de / tan(grazing angle)``, whatever the range bins are. It falls faster than 1 / rays,
-# and more rays across lower the part of the error that is jitter.
+# Plain ground: a ray spreads its level evenly over the ranges that its elevation cell covers. Neighbouring cells join
+# without gaps, so only the slope of the level within a cell is lost. The error grows with the relative length of a cell
+# along range, ``dR / R = de / tan(grazing angle)``, whatever the range bins are. It falls faster than 1 / rays. More rays
+# across the beam reduce the part of the error that comes from jitter.
 #
-# Textured ground, where a ray's cell is larger than a cell of the texture: each ray reads one value at random. The
-# error is the texture's contrast over the square root of the rays in one bin. These are ``rays_across`` until an
-# elevation cell is shorter than a bin. The error falls as 1 / sqrt(rays), and faster once rays are denser than the
-# texture. Rays jitter anew each ping, so a sonar at rest sees this error change. It looks like speckle, and is none.
+# Textured ground, where a ray's cell is larger than a texture cell: each ray samples one random value. The error is the
+# contrast of the texture over the square root of the number of rays per bin. That number is ``rays_across`` until an
+# elevation cell is shorter than a bin. The error falls as 1 / sqrt(rays), and faster once the rays are denser than the
+# texture. Rays are jittered anew for each ping, so even a stationary sonar sees this error fluctuate. It resembles speckle
+# but is a sampling error.
 
 
 FAR_GRAZING_RAD = math.asin(0.2)
-"""Grazing angle on the reference ground at the window's far end [rad]; the sonar is a fifth of that range above it."""
+"""Grazing angle on the reference ground at the far end of the window [rad]: the sonar's height is a fifth of that range."""
 
 STEEPEST_RAD = math.radians(75)
-"""Bearing beyond which a beam's width has no effect [rad]: the ground leaves the window there."""
+"""Bearing beyond which the width of a beam has no effect [rad], since the ground leaves the window there."""
 
 MOST_ACROSS = 4096
 
 
 class RayCounts(NamedTuple):
-    """Requirements of a quality on the rays.
+    """Ray sampling requirements of a quality.
 
     Attributes:
-        reach: longest range interval of one ray's cell on the reference ground, as a part of the range.
-        apart_m: distance of rays across a beam at the far end of the window [m].
-        across: rays across a beam at most, unless ``reach`` needs more.
+        reach: longest range interval that the cell of one ray may cover on the reference ground, as a fraction of the range.
+        apart_m: spacing of the rays across a beam at the far end of the window [m].
+        across: largest number of rays across a beam, unless ``reach`` requires more.
     """
 
     reach: float
@@ -91,7 +92,7 @@ QUALITIES: dict[str, RayCounts] = {
     "standard": RayCounts(0.01, 0.0075, 4),
     "fine": RayCounts(0.0025, 0.00375, 8),
 }
-"""Requirements of each quality, coarsest first."""
+"""Ray sampling requirements by quality, coarsest first."""
 
 
 def _known(name: object) -> object:
@@ -104,19 +105,21 @@ Quality = Annotated[Literal["draft", "standard", "fine"], BeforeValidator(_known
 
 
 def rays_over_elevation(quality: str, elevation_fov_rad: float) -> int:
-    """Compute the number of rays over a beam's elevation. It is even, since segments halve the field of view.
+    """Compute the number of rays over the elevation of a beam.
 
-    A cell of height ``de`` covers ``de / tan(grazing)`` of the range. At the far end of the window it may cover ``reach``.
+    The number is even, since segments halve the field of view. A cell of height ``de`` covers the fraction
+    ``de / tan(grazing)`` of the range, which may be at most ``reach`` at the far end of the window.
     """
     needed = elevation_fov_rad / (math.tan(FAR_GRAZING_RAD) * QUALITIES[quality].reach)
     return 2 * math.ceil(needed / 2)
 
 
 def rays_across(quality: str, beam_width_rad: float, azimuth_fov_rad: float, range_max: float) -> int:
-    """Compute the number of rays across a beam's width.
+    """Compute the number of rays across the width of a beam.
 
-    Texture needs rays ``apart_m`` apart at the far end. At the edge of a wide fan the ground's range changes across a beam
-    by the part ``tan(bearing)`` times the beam's width. Each ray may cover twice ``reach`` of it.
+    Texture requires a ray spacing of ``apart_m`` at the far end of the window. Near the edge of a wide fan, the range to the
+    ground varies across a beam by the fraction ``tan(bearing)`` times the beam width. Each ray may cover twice ``reach`` of
+    that variation.
     """
     wanted = QUALITIES[quality]
     texture = min(wanted.across, math.ceil(beam_width_rad * range_max / wanted.apart_m))
@@ -125,15 +128,16 @@ def rays_across(quality: str, beam_width_rad: float, azimuth_fov_rad: float, ran
 
 
 class Measured(NamedTuple):
-    """Measured errors of a quality of a preset.
+    """Measured errors of a preset at one quality.
 
     Attributes:
-        rays_per_beam: over elevation.
-        rays_across: across a beam.
-        plain_percent: rms error of a ping's bins on plain ground, in % of their level.
-        textured_percent: on ground of 15 mm cells with reflectivities spread evenly over 0..1, in % of the level of plain
-            ground of the same mean.
-        still_correlation: of the levels of two pings of a sonar at rest over that ground, relative to plain ground.
+        rays_per_beam: rays over elevation.
+        rays_across: rays across a beam.
+        plain_percent: rms error of the bins of a ping on plain ground, in % of their level.
+        textured_percent: the same on ground of 15 mm cells with reflectivities uniform in 0..1, in % of the level of plain
+            ground with the same mean.
+        still_correlation: correlation of the levels of two pings from a stationary sonar over that ground, relative to plain
+            ground.
     """
 
     rays_per_beam: int
@@ -145,7 +149,7 @@ class Measured(NamedTuple):
 
 @cache
 def measured_errors() -> tuple[str, dict[str, dict[str, Measured]]]:
-    """Read the machine and date of the measurement, and the measured errors by preset and quality."""
+    """Return the machine and date of the measurement, and the measured errors by preset and quality."""
     table = yaml.safe_load(files("mitsonar.instruments").joinpath("quality.yaml").read_text(encoding="utf-8"))
     found = {
         preset: {quality: Measured(**numbers) for quality, numbers in rows.items()}
@@ -154,17 +158,17 @@ def measured_errors() -> tuple[str, dict[str, dict[str, Measured]]]:
     return f"{table['machine']}, {table['date']}", found
 
 
-# ---------------- Frames that take time: groups of beams that ping one after another, and heads that turn from beam
-# to beam
-# A frame of a DIDSON is 8 pings of 12 beams, one of an ARIS 4 to 8 pings. A mechanically scanned sonar has one beam and
-# turns it: its frame is a sweep, each beam of which is a ping of its own. The time of a frame is the middle of its pings.
+# ---------------- Timing: ping groups and scanning heads
+# A frame may take several pings: 8 pings of 12 beams for a DIDSON, 4 to 8 pings for an ARIS. A mechanically scanned sonar
+# rotates a single beam. Its frame is a sweep in which each beam is a separate ping. The time of a frame is the middle of its
+# pings.
 
 
 GroupOrder: TypeAlias = Literal["interleaved", "sequential"]
 
 
 def check_groups(sonar: Sonar) -> None:
-    """Check the ping groups of a sonar.
+    """Check that a sonar has no more ping groups than beams.
 
     Raises:
         ValueError: more groups than beams.
@@ -177,41 +181,45 @@ def check_groups(sonar: Sonar) -> None:
 
 
 def scans(sonar: Sonar) -> bool:
-    """Return whether each beam is a ping of its own: a head that turns."""
+    """Return whether the sonar has a rotating head, so that each beam is a separate ping."""
     return 1 < sonar.beams == sonar.ping_groups
 
 
 def group_of_beams(sonar: Sonar) -> NDArray[np.int64]:
-    """Return the number of the group of each beam ``(beams,)``; groups ping in the order of their numbers."""
+    """Return the index of the ping group of each beam ``(beams,)``; groups ping in the order of their indices."""
     beam = np.arange(sonar.beams)
     return beam % sonar.ping_groups if sonar.group_order == "interleaved" else beam * sonar.ping_groups // sonar.beams
 
 
 def ping_interval_s(sonar: Sonar) -> float:
-    """Return the time from the ping of one group to that of the next [s]: as given, or echo and overhead."""
+    """Return the time between the pings of consecutive groups [s].
+
+    This is ``group_interval_s`` if given, and otherwise the duration of the echo plus ``group_overhead_s``.
+    """
     if sonar.group_interval_s is not None:
         return sonar.group_interval_s
     return 2 * sonar.range_max / sonar.sound_speed + sonar.group_overhead_s
 
 
 def frame_period_s(sonar: Sonar) -> float:
-    """Return the time from frame to frame [s]: one over the frame rate, of a head that turns its sweep."""
+    """Return the time between frames [s]: the length of a sweep for a rotating head, else the inverse of the frame rate."""
     return sonar.ping_groups * ping_interval_s(sonar) if scans(sonar) else 1 / sonar.frame_rate_hz
 
 
 def scanned(sonar: Sonar, *, sector_deg: float = 360.0, step_deg: float = 0.9, overhead_s: float = 0.0) -> Sonar:
-    """Return the sonar whose beams are the steps of a head that turns a one-beam sonar from port to starboard.
+    """Return a scanning sonar whose beams are the steps of a one-beam head that rotates from port to starboard.
 
-    Each step is a ping with its own time and pose. It lasts ``2 range_max / sound_speed + overhead_s``. A frame is a sweep.
+    Each step is a ping with its own time and pose. It lasts ``2 range_max / sound_speed + overhead_s``. A frame is one
+    sweep.
 
     Args:
-        sonar: with one beam; ``beam_width_deg``, or its ``azimuth_fov_deg``, is the width of the beam.
-        sector_deg: that is swept, at most 360 [deg]; 0 deg is ahead, in its middle.
-        step_deg: from beam to beam [deg]; the sector must be a whole number of them.
-        overhead_s: for turning and reporting, a step [s].
+        sonar: a sonar with one beam; its ``beam_width_deg``, or else its ``azimuth_fov_deg``, is the beam width.
+        sector_deg: sector to sweep, at most 360 [deg], centred on 0 deg, which is straight ahead.
+        step_deg: angle between beams [deg]; the sector must be a whole number of steps.
+        overhead_s: time for rotation and reporting per step [s].
 
     Raises:
-        MitsonarError: more beams than one; a sector that is no whole number of steps.
+        MitsonarError: the sonar has more than one beam, or the sector is not a whole number of steps.
     """
     if sonar.beams != 1:
         raise MitsonarError(f"a head that turns has one beam: got {sonar.beams}; give a sonar with beams 1")
@@ -238,19 +246,19 @@ def scanned(sonar: Sonar, *, sector_deg: float = 360.0, step_deg: float = 0.9, o
 
 
 def one_beam(sonar: Sonar) -> Sonar:
-    """Return the one beam that a head turns, of a sonar that scans."""
+    """Return the single-beam sonar that the head of a scanning sonar rotates."""
     width = math.degrees(sonar.beam_width_rad)
     return sonar.replace(beams=1, azimuth_fov_deg=width, beam_width_deg=width, ping_groups=1)
 
 
 @dataclass(frozen=True)
 class TimedPath:
-    """The pings of all frames.
+    """Times and poses of the pings of all frames.
 
     Attributes:
-        frames: pose and time of each frame, the middle of its pings.
-        time_s: of each ping ``(frames, groups)``, or ``(frames,)`` where a frame is one ping [s].
-        poses: of each ping ``(frames, groups, 6)``, or ``(frames, 6)`` [m, rad].
+        frames: pose and time of each frame, at the middle of its pings.
+        time_s: time of each ping ``(frames, groups)``, or ``(frames,)`` if a frame is one ping [s].
+        poses: pose at each ping ``(frames, groups, 6)``, or ``(frames, 6)`` [m, rad].
     """
 
     frames: Trajectory
@@ -258,7 +266,7 @@ class TimedPath:
     poses: NDArray[np.float64]
 
     def of_beams(self, sonar: Sonar) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-        """Return the time of each beam ``(frames, beams)`` and its pose; ``(frames,)`` and None for one ping a frame."""
+        """Return the time ``(frames, beams)`` and pose of each beam; ``(frames,)`` and None if a frame is one ping."""
         if self.time_s.ndim == 1:
             return self.time_s, None
         group = group_of_beams(sonar)
@@ -266,17 +274,18 @@ class TimedPath:
 
 
 def timed_path(sonar: Sonar, path: Trajectory) -> TimedPath:
-    """Return the pings of all frames along a path.
+    """Compute the times and poses of all pings along a path.
 
-    A frame is due at each time of the path. Poses of its pings lie between those of the path; before its first and after
-    its last one the vehicle goes on as beside it. A head that turns sweeps without a pause from the path's begin on, as
-    often as the path is long; along a single pose it sweeps once.
+    A frame is due at each time of the path. The poses of its pings are interpolated along the path, and extrapolated at
+    constant velocity before its first and after its last pose. A scanning sonar sweeps continuously from the start of the
+    path for as many whole sweeps as fit. Along a single pose it sweeps once.
 
     Raises:
-        MitsonarError: a path that is too short for a sweep, or whose times do not grow.
+        MitsonarError: the path is too short for a sweep, or its times do not increase.
     """
     if sonar.ping_groups == 1:
         return TimedPath(path, path.time_s, path.poses)
+    # Times of the pings relative to the time of their frame.
     offsets = (np.arange(sonar.ping_groups) - (sonar.ping_groups - 1) / 2) * ping_interval_s(sonar)
     due = path.time_s
     if scans(sonar) and len(path) > 1:
@@ -284,7 +293,9 @@ def timed_path(sonar: Sonar, path: Trajectory) -> TimedPath:
         lasts = path.time_s[-1] - path.time_s[0]
         if lasts < sweep * (1 - 1e-9):
             raise MitsonarError(f"a sweep lasts {sweep:.4g} s and the path {lasts:.4g} s: give a longer path")
+        # A scanning sonar sweeps without pauses, as often as the path allows.
         due = path.time_s[0] + (np.arange(int(lasts / sweep + 1e-9)) + 0.5) * sweep
+    # Extend the path, since the outer pings of the first and last frame lie beyond its ends.
     longer = path.lengthened(-offsets[0])
     time = due[:, None] + offsets
     poses = longer.at(time.ravel()).reshape(*time.shape, 6)
@@ -293,10 +304,10 @@ def timed_path(sonar: Sonar, path: Trajectory) -> TimedPath:
 
 
 def first_sweeps(sonar: Sonar, path: Trajectory, count: int) -> Trajectory:
-    """Return the part of a path along which a head that turns makes its first ``count`` sweeps.
+    """Return the part of a path that covers the first ``count`` sweeps of a scanning sonar.
 
     Raises:
-        MitsonarError: the path is shorter; a single pose counts as one sweep.
+        MitsonarError: the path is too short; a single pose counts as one sweep.
     """
     sweep, lasts = frame_period_s(sonar), float(path.time_s[-1] - path.time_s[0])
     if lasts < count * sweep * (1 - 1e-9) and (len(path) > 1 or count > 1):
@@ -312,11 +323,11 @@ def first_sweeps(sonar: Sonar, path: Trajectory, count: int) -> Trajectory:
 
 
 def overlap_notes(sonar: Sonar, time_s: NDArray[np.float64]) -> list[str]:
-    """Return what to tell where the pings of a frame last longer than the time to the next frame: no instrument pings so.
+    """Return a warning if the pings of a frame last beyond the start of the next frame, which no real instrument allows.
 
     Args:
-        sonar: whose frames follow each other.
-        time_s: of the frames ``(frames,)`` [s].
+        sonar: the instrument that makes the frames.
+        time_s: times of the frames ``(frames,)`` [s].
     """
     lasts = sonar.ping_groups * ping_interval_s(sonar)
     apart = np.diff(time_s).min(initial=np.inf)
@@ -330,13 +341,13 @@ def overlap_notes(sonar: Sonar, time_s: NDArray[np.float64]) -> list[str]:
 
 
 def _down(value: float) -> str:
-    """Return a number to three digits, rounded down."""
+    """Format a number with three significant digits, rounded down."""
     step = 10.0 ** (math.floor(math.log10(value)) - 2)
     return f"{math.floor(value / step) * step:.3g}"
 
 
 def turned_heads(sonar: Sonar, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the poses of the head of a sonar that scans, from those of the vehicle, both ``(frames, beams, 6)``."""
+    """Return the head poses of a scanning sonar from the vehicle poses, both ``(frames, beams, 6)``."""
     found = np.empty_like(poses)
     group = group_of_beams(sonar)
     for beam, bearing in enumerate(sonar.bearing_rad):
@@ -344,38 +355,38 @@ def turned_heads(sonar: Sonar, poses: NDArray[np.float64]) -> NDArray[np.float64
     return found
 
 
-# ---------------- imaging sonar
+# ---------------- Imaging sonar
 
 
 FieldValue: TypeAlias = Any
-"""The value of an instrument's field, before pydantic checks it."""
+"""Value of an instrument field before pydantic validates it."""
 
 Model = Literal["coherent", "physical", "thesis"]
 Coding = Literal["linear", "dB", "gamma"]
 Bearing = Literal["azimuth", "cone"]
 SEE = " (see `mitsonar presets --help` and docs/guides/sonars.md)"
 RAYS = ("rays_per_beam", "rays_across")
-"""Fields that follow from ``quality`` where they are not given."""
+"""Fields that are derived from ``quality`` unless given."""
 
 LEAST_APERTURE = 0.5
-"""Shortest aperture of a pattern of beams [wavelengths]."""
+"""Shortest aperture that has a beam pattern [wavelengths]."""
 
 MOST_COHERENT_DEG = 170
-"""Largest field of view of the model coherent: its fan is even in the sine and the tangent of angles [deg]."""
+"""Largest field of view of the coherent model, whose rays are evenly spaced in the sine and tangent of angles [deg]."""
 
 THESIS_ACROSS = 4
-"""Value of ``rays_across`` in the model ``thesis``, which traces one ray."""
+"""Value of ``rays_across`` in the ``thesis`` model, which nevertheless traces one ray."""
 
 
 def _rays_over_elevation(given: dict[str, FieldValue]) -> int:
-    """Derive the rays over elevation from the other fields."""
+    """Derive the number of rays over elevation from the other fields."""
     if given["model"] == "thesis":
         return int(given["thesis_rays"])
     return rays_over_elevation(given["quality"], math.radians(given["elevation_fov_deg"]))
 
 
 def _rays_across(given: dict[str, FieldValue]) -> int:
-    """Derive the rays across a beam from the other fields."""
+    """Derive the number of rays across a beam from the other fields."""
     if given["model"] == "thesis":
         return THESIS_ACROSS
     fov = math.radians(given["azimuth_fov_deg"])
@@ -384,39 +395,39 @@ def _rays_across(given: dict[str, FieldValue]) -> int:
 
 
 UNNAMED = "custom"
-"""Name of an instrument that was given none."""
+"""Name of an instrument for which none was given."""
 
 
 class Instrument(CheckedModel):
-    """Base of all instruments."""
+    """Base class of all instruments."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(UNNAMED, description="what the instrument is called")
 
-    if TYPE_CHECKING:  # each has its own, at its own position among the keys
+    if TYPE_CHECKING:  # subclasses define these at different positions among their fields
         model: str
         frame_rate_hz: float
 
     @property
     def title(self) -> str:
-        """Return the name for titles and sentences; of an instrument without one, what it is: ``unnamed sonar``."""
+        """Return the name for titles and sentences, or ``unnamed`` with the type of instrument: ``unnamed sonar``."""
         return f"unnamed {self.called}" if self.name == UNNAMED else self.name
 
     @classmethod
     def create(cls, **fields: FieldValue) -> Self:
-        """Create an instrument with these fields.
+        """Create an instrument from its fields.
 
         Raises:
-            MitsonarError: an unknown key, a value outside its limits.
+            MitsonarError: an unknown key, or a value outside its limits.
         """
         return cls(**fields)
 
     def replace(self, **fields: FieldValue) -> Self:
-        """Return a copy with some fields changed; all fields are checked.
+        """Return a copy with some fields changed; all fields are validated.
 
         Raises:
-            MitsonarError: an unknown key, a value outside its limits.
+            MitsonarError: an unknown key, or a value outside its limits.
         """
         return self.create(**{**self.model_dump(), **fields})
 
@@ -425,16 +436,16 @@ class Instrument(CheckedModel):
 
 
 class Sonar(Instrument):
-    """An imaging sonar. Angles in degrees (the edge of the program), all else SI.
+    """An imaging sonar, with angles in degrees and all other quantities in SI units.
 
-    The same names are the XML properties of the sensor ``imaging_sonar`` and the keys of a sonar's YAML file
+    The same names serve as XML properties of the sensor ``imaging_sonar`` and as keys of a sonar's YAML file
     (``docs/guides/sonars.md``).
 
-    In the physical model ``rays_per_beam`` and ``rays_across`` follow from ``quality``. In the model ``thesis`` they are
-    ``thesis_rays`` and one. Numbers that are given take precedence.
+    In the physical and coherent models, ``rays_per_beam`` and ``rays_across`` are derived from ``quality``. In the
+    ``thesis`` model they are ``thesis_rays`` and one. Explicit values take precedence.
 
     Raises:
-        MitsonarError: through :meth:`create`, for an unknown key or a value outside its limits.
+        MitsonarError: from :meth:`create`, for an unknown key or a value outside its limits.
     """
 
     called: ClassVar[str] = "sonar"
@@ -643,10 +654,10 @@ class Sonar(Instrument):
             )
 
     def replace(self, **fields: FieldValue) -> Self:
-        """Return a copy with some fields changed; all fields are checked.
+        """Return a copy with some fields changed; all fields are validated.
 
-        Numbers of rays that follow from other fields are derived anew. In the physical model a ``quality`` replaces numbers
-        of rays that were given before. Numbers given together with it take precedence.
+        Ray counts that are derived from other fields are recomputed. Except in the ``thesis`` model, a new ``quality`` also
+        replaces ray counts that were set explicitly. Ray counts passed together with it take precedence.
         """
         kept = self.model_dump()
         renewed = "quality" in fields and fields.get("model", self.model) != "thesis"
@@ -660,19 +671,19 @@ class Sonar(Instrument):
 
     @property
     def beam_pattern(self) -> Pattern:
-        """Return the pattern of the beams."""
+        """Return the beam pattern across the beams."""
         if self.model == "thesis":
             return "box"
         return self.pattern or ("two_way" if self.model == "coherent" else "box")
 
     @property
     def vertical_pattern(self) -> Pattern:
-        """Return the pattern over elevation."""
+        """Return the beam pattern over elevation."""
         return "box" if self.model == "thesis" else self.elevation_pattern or self.beam_pattern
 
     @property
     def aperture(self) -> Aperture:
-        """Return the array across the beams."""
+        """Return the aperture of the array across the beams."""
         return Aperture(self.beam_width_rad, self.shading, self.beam_pattern != "receive")
 
     @property
@@ -684,39 +695,39 @@ class Sonar(Instrument):
 
     @property
     def value_coding(self) -> Coding:
-        """Return how values stand for levels. With hard edges they are linear."""
+        """Return how image values encode levels; box patterns are always linear."""
         if self.beam_pattern == "box":
             return "linear"
         return self.coding or ("dB" if self.model == "coherent" else "linear")
 
     @property
     def across(self) -> int:
-        """Return the rays across a beam that are traced: ``rays_across``, or one in the model ``thesis``."""
+        """Return the number of rays traced across a beam: ``rays_across``, or one in the ``thesis`` model."""
         return 1 if self.model == "thesis" else self.rays_across
 
     @property
     def jittered(self) -> bool:
-        """Return whether rays move within their cells."""
+        """Return whether rays are jittered within their cells."""
         return self.model != "thesis" if self.jitter is None else self.jitter
 
     @property
     def columns(self) -> int:
-        """Return the number of rays side by side: the width of the film."""
+        """Return the number of rays side by side, which is the width of the film."""
         return self.beams * self.across
 
     @property
     def rays(self) -> int:
-        """Return the number of rays of a ping."""
+        """Return the number of rays per ping."""
         return self.columns * self.rays_per_beam
 
     @property
     def beam_spacing_rad(self) -> float:
-        """Return the field of view over the beams [rad]: the angle from one beam's axis to the next where they are even."""
+        """Return the azimuth field of view per beam [rad]; for even beams, the angle between neighbouring axes."""
         return math.radians(self.azimuth_fov_deg) / self.beams
 
     @property
     def beam_width_rad(self) -> float:
-        """Return the width of the fan of rays of one beam [rad]. In the model ``thesis`` it is the spacing of the beams."""
+        """Return the width of the ray fan of one beam [rad], which is the beam spacing in the ``thesis`` model."""
         if self.beam_width_deg is None or self.model == "thesis":
             return self.beam_spacing_rad
         return math.radians(self.beam_width_deg)
@@ -733,7 +744,7 @@ class Sonar(Instrument):
 
     @property
     def bearing_rad(self) -> NDArray[np.float64]:
-        """Return the bearings of the beams' axes ``(beams,)`` [rad], most to port first."""
+        """Return the bearings of the beam axes ``(beams,)`` [rad], from port to starboard."""
         part = (np.arange(self.beams) + 0.5) / self.beams * 2 - 1  # -1..1 across the fan
         half = math.radians(self.azimuth_fov_deg) / 2
         axes = part * half if self.beam_layout == "even" else np.arcsin(part * math.sin(half))

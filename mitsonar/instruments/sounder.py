@@ -1,4 +1,4 @@
-"""Sounders: instruments made of one fan at several mounts, such as a side-scan, an altimeter, a profiler, a DVL."""
+"""Define sounders, such as side-scan, altimeter, profiler and DVL, and load instruments by name or from files."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ Kind = Literal["sidescan", "altimeter", "profiler", "dvl", "range-image"]
 KINDS: tuple[str, ...] = get_args(Kind)
 
 FEWEST_BEAMS = 3
-"""Beams that a velocity in three directions takes."""
+"""Smallest number of beams that determine a velocity in three dimensions."""
 
 SEE = " (see docs/guides/instruments.md)"
 
 Mount = tuple[float, float, float, float, float, float]
-"""Place of a fan in the vehicle: starboard, forward, up [m], pitch, roll, heading [deg]."""
+"""Pose of a fan in the vehicle: starboard, forward, up [m], pitch, roll, heading [deg]."""
 
 
 class Sounder(CheckedModel):
-    """An instrument made of equal fans. All of them ping at once, and do not hear each other.
+    """An instrument made of identical fans, which all ping at once and do not receive each other.
 
-    ``rows`` above 1 stacks fans on each mount, ``elevation_fov_deg`` of the fan apart: a 2-D array. With the bearing
-    ``cone`` the rows share their cones, as those of such an array do.
+    A value of ``rows`` above 1 stacks fans on each mount, spaced by the ``elevation_fov_deg`` of the fan: a 2-D array. With
+    the bearing ``cone`` the rows share their cones, like those of such an array.
 
     Raises:
         MitsonarError: an unknown key, or a value outside its limits.
@@ -81,10 +81,10 @@ class Sounder(CheckedModel):
 
     @classmethod
     def create(cls, **fields: Any) -> Self:
-        """Create an instrument; keys of the fan stand beside its own.
+        """Create an instrument from its fields and those of its fan, given together.
 
         Raises:
-            MitsonarError: an unknown key, a value outside its limits.
+            MitsonarError: an unknown key, or a value outside its limits.
         """
         own = set(cls.model_fields) - {"fan"}
         wrong = sorted(set(fields) - own - set(Sonar.model_fields))
@@ -96,10 +96,10 @@ class Sounder(CheckedModel):
         return cls(fan=fan, **{key: value for key, value in fields.items() if key in own})
 
     def replace(self, **fields: Any) -> Self:
-        """Return a copy with some keys changed, of its own or of the fan; all are checked.
+        """Return a copy with some fields of the instrument or of its fan changed; all fields are validated.
 
         Raises:
-            MitsonarError: as :meth:`create`.
+            MitsonarError: as for :meth:`create`.
         """
         own = set(type(self).model_fields) - {"fan"}
         fan = self.fan.replace(**{key: value for key, value in fields.items() if key in Sonar.model_fields})
@@ -132,7 +132,7 @@ class Sounder(CheckedModel):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Return the names of the fans, mount by mount, the highest row first."""
+        """Return the names of the fans, mount by mount, from the highest row."""
         if self.rows == 1:
             return tuple(self.mounts)
         return tuple(f"{name}-{row}" for name in self.mounts for row in range(self.rows))
@@ -144,31 +144,31 @@ class Sounder(CheckedModel):
         if self.rows == 1:
             return bases
         step = math.radians(self.fan.elevation_fov_deg)
-        pitch = (np.arange(self.rows) + 0.5 - self.rows / 2) * step  # the first row looks up
+        pitch = (np.arange(self.rows) + 0.5 - self.rows / 2) * step  # the first row points up
         rows = [mounted(bases, Pose.from_row((0, 0, 0, float(one), 0, 0))) for one in pitch]
         return np.stack(rows, axis=1).reshape(-1, 6)
 
     @property
     def axes(self) -> NDArray[np.float64]:
-        """Return the unit vectors of the fans' axes ``(channels, 3)`` as (starboard, forward, up) of the vehicle."""
+        """Return the unit vectors of the fan axes ``(channels, 3)`` as (starboard, forward, up) of the vehicle."""
         return np.asarray(vehicle_rotation(self.mount_poses).apply([0.0, 1.0, 0.0]))
 
     @property
     def looks_ahead(self) -> bool:
-        """Return whether all fans look ahead, so that the instrument's poses are those of a forward-looking sonar."""
+        """Return whether all fans look ahead, so that the poses are those of a forward-looking sonar."""
         return bool((self.axes[:, 1] > math.cos(math.radians(45))).all())
 
     def fan_poses(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the poses of all fans in the world ``(pings, channels, 6)`` for poses of the vehicle ``(pings, 6)``."""
+        """Return the poses of all fans in the world ``(pings, channels, 6)`` for vehicle poses ``(pings, 6)``."""
         return np.stack([mounted(poses, Pose.from_row(mount)) for mount in self.mount_poses], axis=1)
 
     def directions(self) -> NDArray[np.float64]:
-        """Return the beams' axes in the frame of their fan ``(beams, 3)`` as (starboard, forward, up)."""
+        """Return the beam axes in the frame of their fan ``(beams, 3)`` as (starboard, forward, up)."""
         return directions(self.fan.bearing, self.fan.bearing_rad, 0.0)
 
 
-# ---------------- Sounders that can be named: one YAML file each in ``sounders/``, every number with the document
-# that it comes from
+# ---------------- Sounder presets
+# One YAML file per preset in ``sounders/``, with the source document of every number.
 
 
 OF_KIND = {
@@ -178,20 +178,21 @@ OF_KIND = {
     "dvl": "a50",
     "range-image": "sonar-3d-15",
 }
-"""The preset that the name of a kind stands for."""
+"""Default preset of each kind of sounder."""
 
 
 @cache
 def named_sounders() -> dict[str, NamedSonar]:
-    """Return all presets by name, from the files of the package."""
+    """Return all sounder presets of the package, by name."""
     return presets_in("sounders")
 
 
 def load_sounder(name_or_file: str | Path) -> Sounder:
-    """Load a preset by its name or its kind's, or an instrument from a YAML file (its keys, and ``preset``).
+    """Load a preset by its name or kind, or an instrument from a YAML file (its keys, and ``preset``).
 
     Raises:
-        MitsonarError: unknown preset (with the nearest names), unreadable file, unknown key, value out of limits.
+        MitsonarError: unknown preset (suggesting the nearest names), unreadable file, unknown key, or value outside its
+            limits.
     """
     text = str(name_or_file)
     if not text.lower().endswith((".yaml", ".yml")):
@@ -203,7 +204,7 @@ def load_sounder(name_or_file: str | Path) -> Sounder:
 
 
 def _preset(name: str) -> Sounder:
-    """Return the instrument of a preset, or of the kind that stands for one."""
+    """Return the instrument of a preset, given by its name or its kind."""
     known = named_sounders()
     found = OF_KIND.get(name, name)
     if found not in known:
@@ -212,21 +213,21 @@ def _preset(name: str) -> Sounder:
     return Sounder.create(name=found, **fields)
 
 
-# ---------------- Sonars that can be named: one YAML file each in ``presets/``, every number with the document that
-# it comes from
-# In a source ``(not seen)`` marks a number that is widely quoted from a data sheet which could not be read when this
-# was written, ``second hand`` one that a third party quotes from the named sheet, ``ours`` a choice. Real instruments
-# measure the angle to a line array (``bearing: cone``). Their users set the window, so a preset's window is ours,
-# inside the instrument's limits.
+# ---------------- Sonar presets
+# One YAML file per preset in ``presets/``, with the source document of every number. In a source, ``(not seen)`` marks a
+# number that is widely quoted from a data sheet that could not be consulted, ``second hand`` a number that a third party
+# quotes from the named sheet, and ``ours`` a choice of this project. Real instruments measure the angle to a line array
+# (``bearing: cone``). Their users set the window, so the window of a preset is a choice of this project, within the limits
+# of the instrument.
 
 
 class NamedSonar(NamedTuple):
     """A preset.
 
     Attributes:
-        about: which instrument, in which mode.
-        values: of the fields of :class:`Sonar`, by name.
-        sources: where each value comes from.
+        about: the instrument and its mode.
+        values: values of the fields, by name.
+        sources: source of each value.
     """
 
     about: str
@@ -236,12 +237,12 @@ class NamedSonar(NamedTuple):
 
 @cache
 def named_sonars() -> dict[str, NamedSonar]:
-    """Return all presets by name, from the files of the package."""
+    """Return all sonar presets of the package, by name."""
     return presets_in("presets")
 
 
 def presets_in(folder: str) -> dict[str, NamedSonar]:
-    """Return the presets in a folder of the package by name."""
+    """Return the presets in a folder of the package, by name."""
     found = {}
     for path in sorted((files("mitsonar.instruments") / folder).iterdir(), key=lambda path: path.name):
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -255,7 +256,7 @@ def preset(name: str) -> Sonar:
     """Return the sonar of a preset.
 
     Raises:
-        MitsonarError: unknown name, with the nearest ones.
+        MitsonarError: unknown name, suggesting the nearest ones.
     """
     known = named_sonars()
     if name not in known:
@@ -266,10 +267,11 @@ def preset(name: str) -> Sonar:
 def load_sonar(name_or_file: str | Path) -> Sonar:
     """Load a preset by its name, or a sonar from a YAML file (keys: the fields of :class:`Sonar`, and ``preset``).
 
-    Files after a comma are laid over it: ``didson300,noise.yaml`` is the preset with the fields of ``noise.yaml`` replaced.
+    Files after a comma override fields: ``didson300,noise.yaml`` is the preset with the fields of ``noise.yaml`` replaced.
 
     Raises:
-        MitsonarError: unknown preset (with the nearest names), unreadable file, unknown key, value out of limits.
+        MitsonarError: unknown preset (suggesting the nearest names), unreadable file, unknown key, or value outside its
+            limits.
     """
     text = str(name_or_file)
     if "," in text and not os.path.exists(text):
@@ -292,11 +294,11 @@ def fields_in(text: str, what: str = "a sonar", page: str = "sonars") -> dict[st
 
     Args:
         text: path of the file.
-        what: whose they are, for errors.
-        page: of the guides that tells of them.
+        what: owner of the fields, for error messages.
+        page: guide that describes them, for error messages.
 
     Raises:
-        MitsonarError: unreadable, or no `key: value` lines.
+        MitsonarError: an unreadable file, or one without `key: value` lines.
     """
     try:
         fields = read_yaml(text, f"{what.split()[-1]} file")
@@ -309,7 +311,7 @@ def fields_in(text: str, what: str = "a sonar", page: str = "sonars") -> dict[st
 
 
 def sonar_from(fields: dict[str, Any]) -> Sonar:
-    """Make a sonar from its fields, the key ``preset`` (optional) naming the one they change."""
+    """Create a sonar from its fields; the optional key ``preset`` names a preset that they modify."""
     fields = dict(fields)
     base = fields.pop("preset", None)
     if not all(isinstance(key, str) for key in fields) or not isinstance(base, str | None):

@@ -1,4 +1,4 @@
-"""A vehicle as a YAML file says it: its sensors with their mounts, and the bodies that move around it."""
+"""Read a vehicle from a YAML file: its sensors with their mounts, and the moving bodies around it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ SEE = " (see docs/guides/several-sensors.md)"
 Mount = tuple[float, float, float, float, float, float]
 
 KINDS = ("sonar", "instrument", "hydrophones", "camera")
-"""Keys, one of which a sensor has."""
+"""Keys of the sensor types, of which each sensor has exactly one."""
 
 
 class CameraKeys(BaseModel):
-    """A pinhole camera that looks ahead."""
+    """A forward-looking pinhole camera."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -33,7 +33,7 @@ class CameraKeys(BaseModel):
 
 
 class SensorKeys(BaseModel):
-    """One sensor of a vehicle: one of ``sonar``, ``instrument``, ``hydrophones``, ``camera``, and its mount."""
+    """One sensor of a vehicle: one of ``sonar``, ``instrument``, ``hydrophones``, ``camera``, with its mount."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -52,7 +52,7 @@ class SensorKeys(BaseModel):
 
 
 class VehicleRecipe(BaseModel):
-    """The sensors of a vehicle by name, and what moves."""
+    """The sensors of a vehicle by name, and the moving bodies."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -64,7 +64,7 @@ def load_vehicle_recipe(file: str | Path) -> VehicleRecipe:
     """Read a YAML file with ``sensors`` and, optionally, ``moving``.
 
     Raises:
-        MitsonarError: unreadable, an unknown key, a value outside its limits.
+        MitsonarError: an unreadable file, an unknown key, or a value outside its limits.
     """
     fields = read_yaml(file, "vehicle file")
     if not (isinstance(fields, dict) and all(isinstance(key, str) for key in fields)):
@@ -92,10 +92,10 @@ def _sensor(name: str, keys: Any, file: str | Path) -> SensorKeys:
 
 
 def check_sensor_name(name: str) -> None:
-    """Check that a sensor's name can be that of its folder.
+    """Check that the name of a sensor is valid as the name of its folder.
 
     Raises:
-        MitsonarError: it cannot.
+        MitsonarError: an invalid name.
     """
     if not name or name.startswith(".") or not all(one.isalnum() or one in "-_. " for one in name):
         raise MitsonarError(f"a sensor's name is that of its folder, letters, digits, - and _: got {name!r}; give it an id")

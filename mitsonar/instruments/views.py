@@ -1,6 +1,6 @@
-"""Views of a ping: an image of its whole field of view, of a portion of it, or at a receiver elsewhere.
+"""Define the views of a ping: the whole field of view, a segment of it, or the image of a separate receiver.
 
-Portions (Almanza-Medina, 4.3) are those of a sonar that points straight down. Its bearing runs fore-aft (positive forward),
+Segments (Almanza-Medina, 4.3) are those of a sonar that points straight down. Its bearing runs fore-aft (positive forward),
 its elevation across (negative to starboard): a mount of pitch 90 and heading -90 deg.
 """
 
@@ -33,22 +33,25 @@ SEGMENTS = {
     "c3": (-1, +1),
     "c4": (+1, +1),
 }
-"""Signs of bearing and elevation. Quadrants run from fore-starboard clockwise; c1 to c4 are the cones inscribed in them."""
+"""Signs of bearing and elevation of each segment.
+
+Quadrants run clockwise from fore-starboard; c1 to c4 are the cones inscribed in them.
+"""
 
 CONES = ("c1", "c2", "c3", "c4")
-"""The segments whose border is a circle."""
+"""Segments with a circular border."""
 
 FEWEST_ACROSS = 8
-"""Jittered rays of the transmitter across a receiver's beam; with fewer, images have stripes."""
+"""Smallest number of jittered transmitter rays across a receiver beam; with fewer, images show stripes."""
 
 
 class View(Protocol):
-    """One image of a ping; all views of a simulator are made from one trace.
+    """One image of a ping; a simulator computes all views from a single trace.
 
     Attributes:
-        name: of the view.
-        sonar: gives the image its range bins, model and gain.
-        bearing_rad: axes of its beams ``(beams,)`` [rad].
+        name: name of the view.
+        sonar: sonar that defines the range bins, model and gain of the image.
+        bearing_rad: axes of the beams ``(beams,)`` [rad].
     """
 
     name: str
@@ -57,11 +60,11 @@ class View(Protocol):
 
     @property
     def rays_a_beam(self) -> NDArray[np.int64] | None:
-        """Return the number of rays of each beam ``(beams,)``; None where it differs from ping to ping."""
+        """Return the number of rays of each beam ``(beams,)``; None if it differs from ping to ping."""
 
 
 class Whole:
-    """The whole field of view, in the sonar's own beams, or at measured bearings ``(beams,)`` [rad]."""
+    """The whole field of view, in the sonar's beams or at measured bearings ``(beams,)`` [rad]."""
 
     name = "image"
 
@@ -72,14 +75,14 @@ class Whole:
 
 
 class Segment:
-    """One portion of the field of view. A ray belongs to it by the middle of its cell, so it is the same in every ping.
+    """A segment of the field of view. Rays belong to it by the centre of their cell, so they are the same in every ping.
 
     Args:
-        sonar: the looking-down sonar, with an even number of beams and of rays a beam.
-        name: of :data:`SEGMENTS`.
+        sonar: the downward-looking sonar, with an even number of beams and of rays per beam.
+        name: one of :data:`SEGMENTS`.
 
     Raises:
-        MitsonarError: unknown name; odd beams or rays, which a quadrant would have to halve.
+        MitsonarError: unknown name, or an odd number of beams or rays, which a quadrant would have to halve.
     """
 
     def __init__(self, sonar: Sonar, name: str) -> None:
@@ -99,7 +102,7 @@ class Segment:
 
     @cached_property
     def rays_a_beam(self) -> NDArray[np.int64] | None:
-        """Return the number of its rays in each beam ``(beams,)``."""
+        """Return the number of the segment's rays in each beam ``(beams,)``."""
         sonar = self.sonar
         counts = self.member.reshape(sonar.rays_per_beam, sonar.beams, sonar.across).sum(axis=(0, 2))
         own: NDArray[np.int64] = counts[self.beams].astype(np.int64)
@@ -107,7 +110,7 @@ class Segment:
 
     @cached_property
     def member(self) -> NDArray[np.bool_]:
-        """Return which pixels of the film belong to it ``(rays_per_beam * columns,)``."""
+        """Return which pixels of the film belong to the segment ``(rays_per_beam * columns,)``."""
         sonar = self.sonar
         beam = np.repeat(np.arange(sonar.beams), sonar.across)[None, :]
         row = np.arange(sonar.rays_per_beam)[:, None]
@@ -121,12 +124,14 @@ class Segment:
         return member.ravel()
 
     def _inside_cone(self, fore: int, up: int) -> NDArray[np.bool_]:
-        """Return the directions that are no farther from the quadrant's middle than its nearest border."""
+        """Return the directions that are no farther from the centre of the quadrant than its nearest border."""
         sonar = self.sonar
+        # Directions of the centres of all cells.
         inner = (np.arange(sonar.across) + 0.5) / sonar.across - 0.5
         bearing = (sonar.bearing_rad[:, None] + inner * sonar.beam_width_rad).ravel()[None, :]
         rows = (np.arange(sonar.rays_per_beam)[:, None] + 0.5) / sonar.rays_per_beam
         elevation = (0.5 - rows) * np.radians(sonar.elevation_fov_deg)
+        # The cone around the centre of the quadrant touches the nearest point of its four borders.
         quarter = np.radians([sonar.azimuth_fov_deg, sonar.elevation_fov_deg]) / 4
         b, e = fore * quarter[0], up * quarter[1]
         axis = directions(sonar.bearing, b, e)
@@ -138,25 +143,25 @@ class Segment:
 
 
 class Receiver:
-    """One receiver of a bistatic sonar.
+    """A receiver of a bistatic sonar.
 
-    A ray of the transmitter A hits P. The image's range is half of |P - A| + |B - P|; its beam is the bearing of P in B's
-    frame. P does not count outside B's field of view, hidden from B, or lit on its other side. The ground point of a cell
-    lies on an ellipsoid with foci A and B.
+    A ray of the transmitter A hits P. The range in the image is half of |P - A| + |B - P|; the beam is the bearing of P in
+    the frame of B. P is ignored if it is outside the field of view of B, hidden from B, or lit on its far side. The ground
+    point of a cell lies on an ellipsoid with foci A and B.
 
-    Level, ``thesis``: C times the transmitter's cosine. ``physical``: C cos(theta_B) dOmega r^g / R_B^2. The cosine is the
-    receiver's, since the transmitter's cancels in the lit area dA = R_A^2 dOmega / cos(theta_A). Where B is A this is the
-    monostatic level.
+    Level, ``thesis``: C times the transmitter's cosine. ``physical``: C cos(theta_B) dOmega r^g / R_B^2. The cosine is that
+    of the receiver, since that of the transmitter cancels in the lit area dA = R_A^2 dOmega / cos(theta_A). If B coincides
+    with A, this is the monostatic level.
 
     Args:
-        transmitter: its rays are traced. It needs at least eight jittered columns across one of the receiver's beams.
-        sonar: of the receiver: its field of view, beams and range bins; model and gain as the transmitter's.
+        transmitter: sonar whose rays are traced. It needs at least eight jittered columns across each beam of the receiver.
+        sonar: field of view, beams and range bins of the receiver; model and gain as for the transmitter.
         offset: pose of the receiver in the transmitter's axes (starboard, forward, up).
-        name: of the view.
+        name: name of the view.
 
     Raises:
-        MitsonarError: too few columns, beams that overlap, another model or gain than the transmitter's, a window that
-            begins nearer than half the distance between transmitter and receiver.
+        MitsonarError: too few columns, overlapping beams, a model or gain that differs from the transmitter's, or a window
+            that begins nearer than half the distance between transmitter and receiver.
     """
 
     rays_a_beam: NDArray[np.int64] | None = None
@@ -182,16 +187,16 @@ class Receiver:
             raise MitsonarError(f"receiver {name}: range_min must exceed half its distance from the transmitter")
 
 
-# ---------------- Directions of beams in the sonar's frame
+# ---------------- Directions in the sonar's frame
 
 
 def directions(bearing: Bearing, bearing_rad: ArrayLike, elevation_rad: ArrayLike) -> NDArray[np.float64]:
-    """Compute unit vectors ``(..., 3)`` as (starboard, forward, up) of the sonar's frame, for both kinds of bearing.
+    """Compute unit vectors ``(..., 3)`` as (starboard, forward, up) in the sonar's frame, for both types of bearing.
 
     Args:
         bearing: ``azimuth``, or ``cone``, the angle that a line array measures.
-        bearing_rad: of the directions [rad].
-        elevation_rad: of the directions [rad]; the two are broadcast.
+        bearing_rad: bearings [rad].
+        elevation_rad: elevations [rad], broadcast against the bearings.
     """
     b, e = np.broadcast_arrays(np.asarray(bearing_rad, dtype=float), np.asarray(elevation_rad, dtype=float))
     if bearing == "azimuth":

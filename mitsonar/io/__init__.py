@@ -1,1 +1,1 @@
-"""Files that are whole or absent, object storage, and the folder of a run."""
+"""Atomic file writing, object storage, and run folders."""

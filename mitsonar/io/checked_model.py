@@ -1,4 +1,4 @@
-"""Models of pydantic whose mistakes are one sentence, also where they are created by their class."""
+"""Provide the base of pydantic models whose validation errors are single sentences, even when created directly."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from mitsonar.errors import MitsonarError, complaint
 __all__ = ["CheckedModel"]
 
 
-if TYPE_CHECKING:  # editors and mypy read the fields of a model, not the arguments of its metaclass
+if TYPE_CHECKING:  # editors and mypy then infer arguments from the fields of a model, not from its metaclass
     Checked = BaseModel
 else:
 
     class OneSentence(type(BaseModel)):
-        """The metaclass: it answers mistakes of ``Model(...)``, and leaves models within models to pydantic."""
+        """Metaclass that converts validation errors of ``Model(...)``, and leaves nested models to pydantic."""
 
         def __call__(cls, *args: Any, **fields: Any) -> Any:
             """Create a model.
@@ -30,15 +30,15 @@ else:
                 cls.refuse(error)
 
     class Checked(BaseModel, metaclass=OneSentence):
-        """A model of that metaclass."""
+        """A pydantic model with this metaclass."""
 
 
 class CheckedModel(Checked):
-    """Base of models that users create: a mistake in a field is a :class:`MitsonarError` with one sentence.
+    """Base of models that users create; an invalid field raises a :class:`MitsonarError` with one sentence.
 
     Attributes:
-        called: what owns the fields, in that sentence.
-        see: a page with more, for its end.
+        called: owner of the fields in that sentence.
+        see: reference to a page, for the end of the sentence.
     """
 
     called: ClassVar[str]
@@ -46,9 +46,9 @@ class CheckedModel(Checked):
 
     @classmethod
     def refuse(cls, error: ValidationError) -> NoReturn:
-        """Raise the sentence.
+        """Raise a validation error as a single sentence.
 
         Raises:
-            MitsonarError: the first of pydantic's complaints.
+            MitsonarError: the first of pydantic's errors.
         """
         raise MitsonarError(complaint(error, cls, cls.called, cls.see)) from None

@@ -1,4 +1,4 @@
-"""Tables in CSV files of data sets: columns by name or by place, with checked numbers."""
+"""Read tables from CSV files of data sets, with columns selected by name or index and checked numbers."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from mitsonar.io.files import read_bytes
 __all__ = ["CsvTable"]
 
 LARGEST = 2**29
-"""Bytes of a table, at most."""
+"""Largest size of a table [bytes]."""
 
 
 class CsvTable:
-    """A CSV file with a line of names; all rows have as many words as it."""
+    """A CSV file with a header line; all rows have as many cells as the header."""
 
     def __init__(self, path: Path) -> None:
         """Read a table.
 
         Raises:
-            MitsonarError: no such file, no table, or a row of another length.
+            MitsonarError: no such file, not a table, or a row of another length.
         """
         self.path = path
         text = read_bytes(path, "table", LARGEST).decode("utf-8-sig", "replace")
@@ -50,7 +50,7 @@ class CsvTable:
         return len(self.rows)
 
     def numbers(self, name: str, default: float | None = None) -> NDArray[np.float64]:
-        """Return a column ``(rows,)`` by its name; words that are no numbers are nan.
+        """Return a column ``(rows,)`` by name; cells that are not numbers are nan.
 
         Raises:
             MitsonarError: no such column, and no default.
@@ -62,21 +62,21 @@ class CsvTable:
         return self.at(self.names.index(name))
 
     def whole(self, name: str) -> NDArray[np.int64]:
-        """Return a column of whole numbers ``(rows,)``, to the last digit; words that are none are -1."""
+        """Return a column of integers ``(rows,)`` by name, exact to the last digit; invalid cells are -1."""
         if name not in self.names:
             raise MitsonarError(f"{self.path} has no column {name}: {nearest_names(name, self.names)}")
         return self.whole_at(self.names.index(name))
 
     def at(self, column: int) -> NDArray[np.float64]:
-        """Return a column ``(rows,)`` by its place; words that are no numbers are nan."""
+        """Return a column ``(rows,)`` by index; cells that are not numbers are nan."""
         return np.array([_number(row[column]) for row in self.rows])
 
     def whole_at(self, column: int) -> NDArray[np.int64]:
-        """Return a column of whole numbers ``(rows,)`` by its place; words that are none are -1."""
+        """Return a column of integers ``(rows,)`` by index; invalid cells are -1."""
         return np.array([_whole(row[column]) for row in self.rows], dtype=np.int64)
 
     def columns_at(self, columns: Sequence[int]) -> NDArray[np.float64]:
-        """Return columns ``(rows, columns)`` by their places."""
+        """Return columns ``(rows, columns)`` by index."""
         return np.column_stack([self.at(column) for column in columns])
 
 

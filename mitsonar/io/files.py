@@ -1,4 +1,4 @@
-"""Files that are whole or absent, and readers that check sizes before they allocate."""
+"""Write files atomically, and read files of unknown origin with size checks before any allocation."""
 
 from __future__ import annotations
 
@@ -41,27 +41,27 @@ __all__ = [
 
 
 LARGEST_JSON = 2**27
-"""Bytes of a JSON file, at most."""
+"""Largest size of a JSON file [bytes]."""
 
 LARGEST_YAML = 2**20
-"""Bytes of a YAML file, at most; people write these files."""
+"""Largest size of a YAML file, which is written by hand [bytes]."""
 
 INFLATION = 1032
-"""Largest factor by which deflated data can grow."""
+"""Largest factor by which deflated data can grow on decompression."""
 
 LAST_LETTER = 0x10FFFF
-"""Largest number of a letter in Unicode."""
+"""Largest Unicode code point."""
 
 MOST_PARTS = 10_000
-"""Arrays of an npz file, at most."""
+"""Largest number of arrays in an npz file."""
 
 
 FileArray: TypeAlias = NDArray[Any]
-"""An array of a file: numbers of any type, or texts. Its reader checks which."""
+"""An array read from a file: numbers of any type, or strings. Its reader checks which."""
 
 
 def write_whole(path: str | Path, content: bytes) -> None:
-    """Write a file under another name and rename it. A reader finds the old file, or the whole new one."""
+    """Write a file atomically, by renaming a temporary file: a reader finds either the old or the complete new file."""
     path = Path(path)
     part = path.with_name(f".{path.name}.part")
     with part.open("wb") as file:
@@ -72,15 +72,15 @@ def write_whole(path: str | Path, content: bytes) -> None:
 
 
 def write_json(path: str | Path, value: dict[str, PlainValue]) -> None:
-    """Write a JSON file, whole or absent."""
+    """Write a JSON file atomically."""
     write_whole(path, (json.dumps(value, indent=2) + "\n").encode())
 
 
 def at_most(path: str | Path, limit: int) -> bytes:
-    """Read the bytes of a file, or the first ``limit`` + 1 of them; so also of a device that never ends.
+    """Read a file up to ``limit`` + 1 bytes, which also works for a device that never ends.
 
     Raises:
-        OSError, ValueError: as :func:`open` does.
+        OSError, ValueError: as for :func:`open`.
     """
     parts: list[bytes] = []
     with Path(path).open("rb") as file:
@@ -90,15 +90,15 @@ def at_most(path: str | Path, limit: int) -> bytes:
 
 
 def refuse_irregular(path: str | Path, what: str, limit: int | None = None) -> None:
-    """Refuse what is no file on a disk, such as a device that never ends or a pipe that nobody writes to.
+    """Reject anything but a regular file, such as a device that never ends or a pipe without a writer.
 
     Args:
-        path: that exists.
-        what: kind of file, for errors.
+        path: an existing path.
+        what: type of file, for error messages.
         limit: largest size in bytes.
 
     Raises:
-        MitsonarError: a folder, a device, a pipe or a socket; or larger than the limit.
+        MitsonarError: a folder, a device, a pipe or a socket; or a file larger than the limit.
     """
     try:
         known = Path(path).stat()
@@ -115,8 +115,8 @@ def read_bytes(path: str | Path, what: str, limit: int) -> bytes:
     """Read the bytes of a file up to a limit.
 
     Args:
-        path: of the file.
-        what: kind of file, for errors.
+        path: path of the file.
+        what: type of file, for error messages.
         limit: largest size in bytes.
 
     Raises:
@@ -135,11 +135,11 @@ def read_bytes(path: str | Path, what: str, limit: int) -> bytes:
 
 
 def whole_lines(path: Path, what: str, limit: int) -> list[bytes]:
-    """Read the lines of a file that lines are added to. Cut off one that a kill left half written.
+    """Read the lines of a file that is appended to, and truncate an incomplete last line left by an interrupted run.
 
     Args:
-        path: of the file; where there is none, there are no lines.
-        what: kind of file, for errors.
+        path: path of the file; a missing file has no lines.
+        what: type of file, for error messages.
         limit: largest size in bytes.
 
     Raises:
@@ -159,11 +159,11 @@ def read_json(path: str | Path, *, check: bool = True) -> dict[str, PlainValue]:
     """Read the object in a JSON file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         check: see :func:`~mitsonar.io.files.parse_json`.
 
     Raises:
-        MitsonarError: no such file, not JSON, not an object, or beyond the limits of size.
+        MitsonarError: no such file, not JSON, not an object, or beyond the size limits.
     """
     value = parse_json(read_bytes(path, "file", LARGEST_JSON), str(path), check=check)
     if not isinstance(value, dict):
@@ -175,12 +175,12 @@ def read_yaml(path: str | Path, what: str, also: str = "") -> PlainValue:
     """Read the value in a YAML file.
 
     Args:
-        path: of the file.
-        what: kind of file, for errors.
-        also: alternatives to a file, for errors.
+        path: path of the file.
+        what: type of file, for error messages.
+        also: alternatives to a file, for error messages.
 
     Raises:
-        MitsonarError: no such file, not YAML, or beyond the limits of size.
+        MitsonarError: no such file, not YAML, or beyond the size limits.
     """
     try:
         content = at_most(path, LARGEST_YAML)
@@ -196,12 +196,11 @@ def read_yaml(path: str | Path, what: str, also: str = "") -> PlainValue:
 
 
 def read_npz(path: str | Path) -> dict[str, FileArray]:
-    """Read the arrays of an npz file by name: numbers and texts. Each is checked against its size in the file first.
+    """Read the arrays of an npz file by name, numbers and strings, after checking their declared sizes.
 
     Raises:
-        ValueError: nothing there, a folder, an empty file, another kind of file; a list of parts, a size or a type that
-            cannot be.
-        Exception: damaged bytes raise errors of many kinds. The caller puts them into words.
+        ValueError: a missing or empty file, a folder, another type of file; or an invalid list of parts, size or type.
+        Exception: damaged bytes raise many types of errors, which the caller turns into a message.
     """
     try:
         with Path(path).open("rb") as raw:
@@ -212,9 +211,9 @@ def read_npz(path: str | Path) -> dict[str, FileArray]:
         raise ValueError("it is empty")
     if not zipfile.is_zipfile(path):
         raise ValueError("it is no npz file, or was cut off")
-    with zipfile.ZipFile(path) as file:  # read each part to its end: only then is its checksum tested
+    with zipfile.ZipFile(path) as file:  # each part is read to its end, since only then its checksum is verified
         parts = file.infolist()
-        if any(entry.comment for entry in parts):  # a damaged length of a comment hides other parts
+        if any(entry.comment for entry in parts):  # a damaged comment length hides other parts
             raise ValueError("its list of parts is damaged")
         if len(parts) > MOST_PARTS or len({entry.filename for entry in parts}) < len(parts):
             raise ValueError("its list of parts holds a name twice, or too many")
@@ -230,11 +229,11 @@ def read_npz(path: str | Path) -> dict[str, FileArray]:
 
 
 def refuse_beyond_memory(size: int, source: str) -> None:
-    """Refuse an array that this machine cannot hold.
+    """Reject an array that does not fit into the memory of this machine.
 
     Args:
-        size: of the array in bytes.
-        source: is named in errors.
+        size: size of the array in bytes.
+        source: name of the file in error messages.
 
     Raises:
         MitsonarError: it exceeds half of the machine's memory.
@@ -248,7 +247,7 @@ def refuse_beyond_memory(size: int, source: str) -> None:
 
 
 def _array_in(content: bytes, name: str) -> FileArray:
-    """Read one array of an npz file, after a check of its header."""
+    """Read one array of an npz file, after checking its header."""
     part = io.BytesIO(content)
     versions = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     found = np.lib.format.read_magic(part)
@@ -262,45 +261,45 @@ def _array_in(content: bytes, name: str) -> FileArray:
     values = np.frombuffer(content, kind, math.prod(shape), part.tell()) if kind.itemsize and math.prod(shape) else None
     if values is not None and kind.kind == "U":
         letters = values.view(np.dtype(np.uint32).newbyteorder(kind.byteorder))
-        if (letters > LAST_LETTER).any():  # NumPy makes a text of them, which ends others' readers
+        if (letters > LAST_LETTER).any():  # NumPy accepts these code points, but they make other readers fail
             raise ValueError(f"{name} holds text that is not Unicode")
     made = np.zeros(shape, kind) if values is None else values.reshape(shape, order="F" if fortran_order else "C")
     return np.array(made)  # writable
 
 
-# ---------------- Contents of JSON and YAML files: tables, lists, texts and numbers of a plausible size, without
-# circular references
+# ---------------- Validation of JSON and YAML contents
+# Contents are tables, lists, strings and numbers of plausible size, without circular references.
 
 
 PlainValue: TypeAlias = Any
-"""A value of a file: a table, list, text, number, date or None. Its reader checks which."""
+"""A value of a file: a table, list, string, number, date or None. Its reader checks which."""
 
 DEEPEST = 40
-"""Levels of lists and tables within each other, at most."""
+"""Largest nesting depth of lists and tables."""
 
 MOST_VALUES = 2_000_000
-"""Values of a file, at most. A value that is referred to counts each time."""
+"""Largest number of values in a file, counting a referenced value each time."""
 
 MOST_OF_YAML = 100_000
-"""Values of a YAML file, at most; people write these files."""
+"""Largest number of values in a YAML file, which is written by hand."""
 
 MOST_BRACKETS = 200
-"""Open brackets in a YAML text, at most; those in comments count too."""
+"""Largest number of open brackets in a YAML text, including those in comments."""
 
 LARGEST_INTEGER = 2**64
-"""No seed and no count is larger."""
+"""Largest magnitude of an integer, which no seed or count exceeds."""
 
 LARGEST_COUNT = 2**63 - 1
-"""What NumPy can count to."""
+"""Largest count that NumPy can represent."""
 
 
 def parse_json(text: str | bytes, source: str, *, check: bool = True) -> PlainValue:
     """Parse a JSON text.
 
     Args:
-        text: of the file.
-        source: is named in errors.
-        check: its depth, size and integers; without, :func:`check_plain` is the caller's to call.
+        text: content of the file.
+        source: name of the file in error messages.
+        check: whether to check depth, size and integers; otherwise the caller must call :func:`check_plain`.
 
     Raises:
         MitsonarError: not JSON, or a depth, size or integer beyond the limits of this module.
@@ -317,11 +316,11 @@ def parse_json(text: str | bytes, source: str, *, check: bool = True) -> PlainVa
 
 
 def parse_yaml(text: str, source: str) -> PlainValue:
-    """Parse a YAML text; nothing in it is executed.
+    """Parse a YAML text without executing any of it.
 
     Args:
-        text: of the file.
-        source: is named in errors.
+        text: content of the file.
+        source: name of the file in error messages.
 
     Raises:
         MitsonarError: not YAML, a circular reference, or a depth, size or integer beyond the limits of this module.
@@ -340,7 +339,7 @@ def parse_yaml(text: str, source: str) -> PlainValue:
         raise
     except RecursionError:
         raise MitsonarError(f"{source} is not YAML: it nests more than {DEEPEST} deep") from None
-    except Exception as error:  # constructors of numbers and dates raise errors of many kinds
+    except Exception as error:  # constructors of numbers and dates raise many types of errors
         raise MitsonarError(f"{source} is not YAML: {' '.join(str(error).split())[:300] or type(error).__name__}") from None
     finally:
         if loader is not None:
@@ -350,15 +349,15 @@ def parse_yaml(text: str, source: str) -> PlainValue:
 
 
 def check_plain(value: object, source: str, most: int = MOST_VALUES) -> None:
-    """Check that a value holds only tables, lists, texts, numbers and dates, within limits of depth and size.
+    """Check that a value contains only tables, lists, strings, numbers and dates, within limits of depth and size.
 
     Args:
-        value: from a reader of JSON, YAML or pickles.
-        source: is named in errors.
-        most: largest number of values that it may hold.
+        value: value from a reader of JSON, YAML or pickles.
+        source: name of the file in error messages.
+        most: largest number of values that it may contain.
 
     Raises:
-        MitsonarError: it is not.
+        MitsonarError: other types, or a value beyond the limits.
     """
     rest: list[tuple[object, int]] = [(value, 0)]
     count = 0
@@ -380,10 +379,10 @@ def check_plain(value: object, source: str, most: int = MOST_VALUES) -> None:
 
 
 def whole_number(value: object, name: str, low: int = 0, high: int = LARGEST_COUNT) -> int:
-    """Check that a value of a file is an integer within limits, and return it.
+    """Return a value of a file after checking that it is an integer within limits.
 
     Raises:
-        MitsonarError: it is no integer, or outside ``low`` .. ``high``.
+        MitsonarError: not an integer, or outside ``low`` .. ``high``.
     """
     if type(value) is not int or not low <= value <= high:
         top = "2^63" if high == LARGEST_COUNT else f"{high:,}"
@@ -392,10 +391,10 @@ def whole_number(value: object, name: str, low: int = 0, high: int = LARGEST_COU
 
 
 def finite_number(value: Any, name: str, above: float = -math.inf, below: float = math.inf) -> float:
-    """Check that a value of a file is a finite number, and return it as a float.
+    """Return a value of a file as a float after checking that it is a finite number.
 
     Raises:
-        MitsonarError: it is none, not finite, or not between ``above`` and ``below``.
+        MitsonarError: not a number, not finite, or not between ``above`` and ``below``.
     """
     if type(value) not in (int, float) or not above < value < below or abs(value) > sys.float_info.max:
         over = "" if above == -math.inf else f" above {above:g}"
@@ -405,12 +404,12 @@ def finite_number(value: Any, name: str, above: float = -math.inf, below: float 
 
 
 def _brackets(text: str) -> int:
-    """Return how many brackets are open at most; those in texts and comments count too."""
+    """Return the largest number of open brackets, including those in strings and comments."""
     return max(itertools.accumulate((one in "[{") - (one in "]}") for one in text if one in "[]{}"), default=0)
 
 
 def _check_nodes(node: yaml.Node, source: str) -> None:
-    """Check depth and size of a YAML document before its values are made. An alias counts as all that it refers to."""
+    """Check the depth and size of a YAML document before its values are constructed, counting aliases in full."""
     rest, count = [(node, 0)], 0
     while rest:
         one, depth = rest.pop()

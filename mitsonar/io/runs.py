@@ -1,8 +1,8 @@
-"""The folder of a run: begun, gone on with, replaced or refused. One way for all that write folders.
+"""Manage the folder of a run: start, resume, replace or refuse it, in the same way for all commands that write folders.
 
-A run's folder holds ``run.json``: what kind of run it is, what was asked for, the versions of the packages that decide its
-bits, and notes on how far it is. The file is whole at any moment, so that a run that was killed can go on. It is read as if
-a stranger had written it: every value has its type, or one sentence says which has not.
+The folder of a run holds ``run.json``: the type of run, its settings, the versions of the packages that determine its
+results bit for bit, and notes on its progress. The file is complete at any time, so that an interrupted run can be resumed.
+It is treated as untrusted input: every value is checked for its type, and an invalid one is reported in one sentence.
 """
 
 from __future__ import annotations
@@ -38,27 +38,27 @@ __all__ = [
 ]
 
 
-# ---------------- Provenance of a result: digests, versions of packages, and how they differ from what is asked for now
+# ---------------- Provenance of results
 
 
 MOST_SHOWN = 4
-"""Differences that one sentence names, at most."""
+"""Largest number of differences listed in one sentence."""
 
 LONGEST_SHOWN = 60
-"""Characters of a value in a sentence, at most."""
+"""Largest number of characters of a value in a sentence."""
 
 
-# ---------------------------------------------------------------- had and asked
+# ---------------- Comparison of settings
 
 
 def refuse_other(where: str | Path, had: Mapping[str, object], asked: Mapping[str, object], hint: str = "") -> None:
-    """Refuse to resume a run with other settings than it was begun with.
+    """Refuse to resume a run with settings that differ from those that it was started with.
 
     Args:
         where: path of the run.
-        had: settings of the run.
-        asked: settings that are asked for now.
-        hint: how to ask for the same.
+        had: settings of the existing run.
+        asked: requested settings.
+        hint: how to request the same settings.
 
     Raises:
         MitsonarError: they differ; the message names each difference with both values.
@@ -72,7 +72,7 @@ def refuse_other(where: str | Path, had: Mapping[str, object], asked: Mapping[st
 
 
 def differences(had: Mapping[str, object], asked: Mapping[str, object], within: str = "") -> list[str]:
-    """List the keys whose values differ, dots between the levels, with both values: ``sonar.seed 0, not 5``."""
+    """List the keys whose values differ, with dots between levels and both values: ``sonar.seed 0, not 5``."""
     found: list[str] = []
     for key in [*asked, *(key for key in had if key not in asked)]:
         one, other = had.get(key), asked.get(key)
@@ -84,13 +84,13 @@ def differences(had: Mapping[str, object], asked: Mapping[str, object], within: 
 
 
 def shown(value: object) -> str:
-    """Return a value as a sentence shows it, in one line; a long one is cut."""
+    """Format a value for a sentence, in one line, truncated if long."""
     text = " ".join(str(value).split())
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 
 def plain_json(value: Mapping[str, object]) -> dict[str, PlainValue]:
-    """Return a value as JSON reads it back. Arrays become lists; what JSON does not know becomes its text."""
+    """Convert a value to what JSON returns on reading: arrays become lists, unknown types become strings."""
 
     def known(one: PlainValue) -> PlainValue:
         return one.tolist() if hasattr(one, "tolist") else str(one)
@@ -98,11 +98,11 @@ def plain_json(value: Mapping[str, object]) -> dict[str, PlainValue]:
     return dict(json.loads(json.dumps(value, default=known)))
 
 
-# ---------------------------------------------------------------- digests and versions
+# ---------------- Digests and versions
 
 
 def digest(*contents: bytes | str) -> str:
-    """Return the SHA-256 of bytes and texts, one after another."""
+    """Return the SHA-256 of concatenated bytes and strings."""
     total = hashlib.sha256()
     for content in contents:
         total.update(content.encode() if isinstance(content, str) else content)
@@ -110,18 +110,18 @@ def digest(*contents: bytes | str) -> str:
 
 
 def file_digest(path: str | Path) -> str:
-    """Return the SHA-256 of a file; other files that it names are not read."""
+    """Return the SHA-256 of a file, without the files that it refers to."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def json_digest(value: Mapping[str, object]) -> str:
-    """Return the SHA-256 of a value's JSON; the order of keys does not count."""
+    """Return the SHA-256 of the JSON of a value, independent of the order of keys."""
     return digest(json.dumps(plain_json(value), sort_keys=True))
 
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
-    """Return the installed versions of packages by name."""
+    """Return the installed versions of packages, by name."""
     found = {}
     for package in packages:
         try:
@@ -136,28 +136,28 @@ def other_versions(had: Mapping[str, object], packages: Iterable[str]) -> list[s
     return [f"{name} {had.get(name)} (now {now})" for name, now in versions(packages).items() if had.get(name) != now]
 
 
-# ---------------- run directory
+# ---------------- Run directory
 
 
 RUN_FILE = "run.json"
 
 LEFT_BY_A_KILL = (".part", "writer.lock")
-"""Ends of the names of files that a killed run may leave; a folder that holds only these is free."""
+"""File name suffixes that a killed run may leave behind; a folder with only such files counts as empty."""
 
 
 @dataclass(frozen=True)
 class RunKind:
-    """A kind of run.
+    """A type of run.
 
     Attributes:
-        name: in ``run.json`` and in sentences: ``odometry``.
-        outputs: names (or patterns) of all that a run writes beside ``run.json``. A resumed run keeps them, a replaced one
-            loses them; nothing else in the folder is ever removed.
-        notes: what ``run.json`` may tell of a run, with types: ``int`` is a count from 0, ``list`` holds texts and numbers,
-            ``float | None`` may be null.
-        packages: those whose versions are kept.
-        deciding: those without whose versions a run does not go on, since the rest would differ.
-        replaced: whether its command knows ``--overwrite``.
+        name: name in ``run.json`` and in messages, such as ``odometry``.
+        outputs: names (or patterns) of everything that a run writes besides ``run.json``. A resumed run keeps them and a
+            replaced run deletes them; nothing else in the folder is ever removed.
+        notes: allowed notes in ``run.json``, with types: ``int`` is a non-negative count, ``list`` holds strings and
+            numbers, ``float | None`` may be null.
+        packages: packages whose versions are recorded.
+        deciding: packages whose versions must be unchanged to resume a run, since the results would differ.
+        replaced: whether its command supports ``--overwrite``.
     """
 
     name: str
@@ -170,16 +170,18 @@ class RunKind:
 
 @dataclass
 class RunDirectory:
-    """A run on disk. :meth:`begin` says which, :meth:`start` makes the folder, :meth:`note` and :meth:`finish` go along.
+    """A run on disk.
+
+    :meth:`begin` selects the run, :meth:`start` creates the folder, and :meth:`note` and :meth:`finish` record the progress.
 
     Attributes:
-        path: of the folder.
-        kind: of the run.
-        asked: what was asked for, as JSON gives it back; a run goes on only with the same.
-        versions: of packages, when it was begun.
-        notes: how far it is.
-        finished: whether all outputs are whole.
-        resumed: whether an earlier run goes on.
+        path: path of the folder.
+        kind: type of run.
+        asked: settings of the run, as JSON returns them; a run is resumed only with the same settings.
+        versions: versions of packages when the run was started.
+        notes: progress of the run.
+        finished: whether all outputs are complete.
+        resumed: whether an earlier run is continued.
     """
 
     path: Path
@@ -196,17 +198,18 @@ class RunDirectory:
     def begin(
         cls, path: str | Path, kind: RunKind, asked: Mapping[str, Any], *, resume: bool = False, overwrite: bool = False
     ) -> RunDirectory:
-        """Say which run is meant: a new one, or the one that is there. Nothing is written yet.
+        """Select a new or an existing run, without writing anything.
 
         Args:
-            path: of the folder.
-            kind: of the run.
-            asked: all that decides the results.
-            resume: go on with a run that is there; without one, a new one begins.
-            overwrite: replace a run that is there.
+            path: path of the folder.
+            kind: type of run.
+            asked: all settings that determine the results.
+            resume: resume an existing run; without one, a new run is started.
+            overwrite: replace an existing run.
 
         Raises:
-            MitsonarError: other things are there; a run that is neither resumed nor replaced, or was asked for otherwise.
+            MitsonarError: the folder holds other files, or a run that is neither resumed nor replaced, or has other
+                settings.
         """
         if resume and overwrite:
             raise MitsonarError("--resume and --overwrite contradict each other: give one")
@@ -214,7 +217,7 @@ class RunDirectory:
         if not _holds_a_run(new.path):
             return new
         had = _read(new.path, kind, damaged_will_do=overwrite)
-        if overwrite or (resume and had._replaces):  # killed while what it replaces was removed
+        if overwrite or (resume and had._replaces):  # killed while it removed the run that it replaces
             new._replaces = True
             return new
         if not resume:
@@ -232,7 +235,7 @@ class RunDirectory:
         """Read the run in a folder.
 
         Raises:
-            MitsonarError: none there, of another kind, or its file is damaged.
+            MitsonarError: no run, a run of another type, or a damaged file.
         """
         if not (Path(path) / RUN_FILE).is_file():
             raise MitsonarError(f"{path} holds no {kind.name}: there is no {Path(path) / RUN_FILE}")
@@ -242,7 +245,7 @@ class RunDirectory:
         return _read(Path(path), kind)
 
     def start(self, **notes: Any) -> None:
-        """Make the folder of a new run, without what it replaces; a run that goes on, or has started, stays as it is.
+        """Create the folder of a new run and remove the run that it replaces; no effect if resumed or already started.
 
         Raises:
             MitsonarError: the folder cannot be written.
@@ -261,17 +264,17 @@ class RunDirectory:
             raise MitsonarError(f"cannot write {self.path}: {error.strerror}; choose another -o") from None
 
     def note(self, **notes: Any) -> None:
-        """Keep how far the run is."""
+        """Record the progress of the run."""
         self.notes |= plain_json(notes)
         self._write()
 
     def finish(self, **notes: Any) -> None:
-        """Keep that all outputs are whole."""
+        """Record that all outputs are complete."""
         self.finished = True
         self.note(**notes)
 
     def count(self, name: str, most: int) -> int:
-        """Return a note that counts, 0 where there is none.
+        """Return a note that is a count; 0 if absent.
 
         Raises:
             MitsonarError: it exceeds ``most``.
@@ -282,7 +285,7 @@ class RunDirectory:
             raise self.damage(error) from None
 
     def amount(self, name: str) -> float | None:
-        """Return a note that is a number above 0, None where there is none.
+        """Return a note that is a positive number; None if absent.
 
         Raises:
             MitsonarError: it is 0 or less.
@@ -293,7 +296,7 @@ class RunDirectory:
             raise self.damage(error) from None
 
     def damage(self, said: object) -> MitsonarError:
-        """Return the error that says of what is wrong with the run's file what can be done."""
+        """Return the error for a damaged run file, with its remedies."""
         do = "begin anew with --overwrite" if self.kind.replaced else "remove the folder"
         return MitsonarError(f"{self.path / RUN_FILE} is damaged ({said}): {do}, or choose another -o")
 
@@ -304,14 +307,14 @@ class RunDirectory:
         write_json(self.path / RUN_FILE, {**about, "asked": self.asked, "versions": self.versions, **self.notes})
 
 
-# ---------------------------------------------------------------- what is there
+# ---------------- Existing files and runs
 
 
 def refuse_to_replace(*paths: Path, overwrite: bool, option: str = "-o") -> None:
-    """Keep files that are there, unless they may be replaced.
+    """Check that output files do not exist, unless they may be overwritten.
 
     Raises:
-        MitsonarError: one is there.
+        MitsonarError: a file exists.
     """
     for path in paths:
         if path.exists() and not (overwrite and path.is_file()):
@@ -319,7 +322,7 @@ def refuse_to_replace(*paths: Path, overwrite: bool, option: str = "-o") -> None
 
 
 def kind_of_run(path: str | Path) -> str:
-    """Return the name of the kind of run in a folder, ``odometry``; empty where there is none, or its file is damaged."""
+    """Return the type of the run in a folder, such as ``odometry``; empty without a run or with a damaged file."""
     try:
         kind = read_json(Path(path) / RUN_FILE, check=False).get("kind")
     except MitsonarError:
@@ -328,10 +331,10 @@ def kind_of_run(path: str | Path) -> str:
 
 
 def _holds_a_run(path: Path) -> bool:
-    """Whether a run is in a folder; not in one that is not there, or empty.
+    """Return whether a folder holds a run; a missing or empty folder does not.
 
     Raises:
-        MitsonarError: it holds other things.
+        MitsonarError: the folder holds other files.
     """
     if path.exists() and not path.is_dir():
         raise MitsonarError(f"{path} is a file and is kept as it is: choose a folder as -o")
@@ -342,7 +345,7 @@ def _holds_a_run(path: Path) -> bool:
 
 
 def _read(path: Path, kind: RunKind, *, damaged_will_do: bool = False) -> RunDirectory:
-    """Read the run in a folder, every value of its type; of a damaged one that will be replaced, only the kind."""
+    """Read the run in a folder and check the types of its values; a damaged run to be replaced needs only its type."""
     told = read_json(path / RUN_FILE, check=False)
     if told.get("kind") != kind.name:
         raise MitsonarError(f"{path} holds no {kind.name} of mitsonar and is kept as it is: choose another -o")
@@ -360,16 +363,16 @@ def _read(path: Path, kind: RunKind, *, damaged_will_do: bool = False) -> RunDir
 
 
 OWN: dict[str, type] = {"kind": str, "finished": bool, "replaces": bool, "asked": dict, "versions": dict}
-"""Keys of every run's file."""
+"""Keys of every run file."""
 
 NAMES: dict[type, str] = {bool: "true or false", str: "a text", dict: "an object"}
 
 
 def _check(told: dict[str, Any], kind: RunKind) -> None:
-    """Check that a file's keys are those of a kind of run, and its values what they must be.
+    """Check that the keys of a file are those of a type of run, and that its values have the right types.
 
     Raises:
-        MitsonarError: one is not.
+        MitsonarError: an invalid key or value.
     """
     check_plain(told, "it")
     expected = {**OWN, **kind.notes}
@@ -383,7 +386,7 @@ def _check(told: dict[str, Any], kind: RunKind) -> None:
 
 
 def _check_value(value: Any, name: str, expected: type | UnionType) -> None:
-    """Check that a value of the file is what is expected."""
+    """Check that a value of the file has the expected type."""
     if isinstance(expected, UnionType):
         known, _ = get_args(expected)
         if value is not None:
@@ -403,7 +406,7 @@ def _check_value(value: Any, name: str, expected: type | UnionType) -> None:
 
 
 def _remove(path: Path, outputs: Iterable[str]) -> None:
-    """Remove what an earlier run of the same kind has written."""
+    """Remove the outputs of an earlier run of the same type."""
     for pattern in outputs:
         for one in path.glob(pattern):
             if one.is_dir() and not one.is_symlink():

@@ -1,4 +1,4 @@
-"""Storage of a data set: a folder, or an object storage by its URL (``s3://bucket/data.zarr``), through fsspec."""
+"""Access the storage of a data set through fsspec: a folder, or an object storage by its URL (``s3://bucket/data.zarr``)."""
 
 from __future__ import annotations
 
@@ -26,24 +26,30 @@ __all__ = ["Storage", "refuse_codecs"]
 
 LOCK = "writer.json"
 LOCK_FILE = "writer.lock"
-"""The file whose lock is held on a file system. A folder cannot be locked on network file systems."""
+"""File that is locked on a file system, since folders cannot be locked on network file systems."""
 
 HEARTBEAT_S = 20.0
-"""Period at which the writer to an object storage renews its file; such a storage has no locks that end with their owner."""
+"""Interval at which the writer to an object storage renews its file [s].
+
+An object storage has no locks that end with their owner.
+"""
 
 STALE_S = 90.0
-"""A writer whose file is older has ended."""
+"""Age of the file beyond which its writer is assumed to have ended [s]."""
 
 
 CODECS = ("BytesCodec", "BloscCodec", "Crc32cCodec", "GzipCodec", "ShardingCodec", "TransposeCodec", "ZstdCodec")
-"""Codecs of Zarr that only rearrange bytes. Others come from packages that happen to be installed, or unpickle."""
+"""Zarr codecs that only rearrange bytes.
+
+Others may come from any installed package, or unpickle data.
+"""
 
 
 def refuse_codecs(array: zarr.Array[Any]) -> None:
-    """Refuse an array whose pieces are decoded by other codecs than :data:`CODECS`; nothing of it is decoded before.
+    """Reject an array that needs codecs other than :data:`CODECS`, before any of it is decoded.
 
     Raises:
-        ValueError: it is.
+        ValueError: the array needs another codec.
     """
     rest: list[Any] = list(getattr(array.metadata, "codecs", ()))
     if array.metadata.zarr_format != 3:
@@ -62,7 +68,7 @@ class Storage:
         url: path or URL.
 
     Raises:
-        MitsonarError: unknown kind of storage, or its package is not installed.
+        MitsonarError: an unknown type of storage, or its package is not installed.
     """
 
     def __init__(self, url: str | Path) -> None:
@@ -76,16 +82,16 @@ class Storage:
         self.local = isinstance(self.fs, LocalFileSystem)
 
     def store(self, *, write: bool = False) -> Store:
-        """Open the Zarr store here."""
+        """Open the folder as a Zarr store."""
         if self.local:
             return zarr.storage.LocalStore(self.root, read_only=not write)
         return zarr.storage.FsspecStore.from_url(self.url, read_only=not write)
 
     def sizes(self) -> dict[str, int]:
-        """List the sizes in bytes of all files, by their path here, without the files of the lock.
+        """List the sizes in bytes of all files by relative path, without the lock files.
 
         Raises:
-            MitsonarError: the storage does not answer, or refuses access.
+            MitsonarError: the storage does not respond, or refuses access.
         """
         if self.local and os.path.isfile(self.root):
             raise MitsonarError(f"{self.url} is a file: give a folder, or a URL")
@@ -94,7 +100,7 @@ class Storage:
             found = self.fs.find(self.root, detail=True)
         except FileNotFoundError:
             return {}
-        except Exception as error:  # libraries of storages raise errors of many kinds
+        except Exception as error:  # storage libraries raise many types of errors
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise MitsonarError(
                 f"cannot list {self.url}: {reason}; check the address, and for object storage its endpoint and credentials"
@@ -111,13 +117,13 @@ class Storage:
         self.fs.pipe_file(f"{self.root}/{name}", content)
 
     def remove(self, name: str) -> None:
-        """Remove a file; one that is absent is no error."""
+        """Remove a file, ignoring one that does not exist."""
         with contextlib.suppress(FileNotFoundError):
             self.fs.rm_file(f"{self.root}/{name}")
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[Callable[[], None]]:
-        """Hold the lock of the only writer. Yield a function that raises once the lock is lost; call it now and then.
+        """Hold the exclusive write lock, and yield a function that raises once the lock is lost; call it regularly.
 
         Raises:
             MitsonarError: another process holds the lock.
@@ -127,7 +133,7 @@ class Storage:
 
     @contextlib.contextmanager
     def _locked_folder(self) -> Iterator[Callable[[], None]]:
-        """Hold the kernel's lock on a file. It ends with the process, however that ends."""
+        """Hold a kernel lock on a file, which is released when the process ends for any reason."""
         new = not os.path.exists(self.root)
         os.makedirs(self.root, exist_ok=True)
         path = os.path.join(self.root, LOCK_FILE)
@@ -136,7 +142,7 @@ class Storage:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 if not (os.path.exists(path) and os.path.samestat(os.fstat(handle), os.stat(path))):
-                    raise BlockingIOError  # its last owner has just removed it, or another process has made a new one
+                    raise BlockingIOError  # the last owner has just removed it, or another process has created a new one
             except BlockingIOError:
                 raise MitsonarError(
                     f"another process is writing {self.url}: wait for it to end, or choose another -o; nothing was changed"
@@ -153,18 +159,18 @@ class Storage:
 
     @contextlib.contextmanager
     def _locked_objects(self) -> Iterator[Callable[[], None]]:
-        """Hold a file that its owner renews. Another process takes over a file that is not renewed."""
+        """Hold a file that its owner renews. Another process takes over if the file is not renewed."""
         owner = f"{socket.gethostname()} {os.getpid()} {uuid.uuid4().hex}"
         self._refuse_if_written()
         self._renew(owner)
-        time.sleep(0.5)  # of two that began at the same moment, the last writer keeps the lock
+        time.sleep(0.5)  # of two processes that start at the same time, the last writer gets the lock
         self._refuse_if_written(besides=owner)
         done = threading.Event()
         lost = threading.Event()
 
         def renew() -> None:
             while not done.wait(HEARTBEAT_S):
-                with contextlib.suppress(Exception):  # the storage may be away for a while
+                with contextlib.suppress(Exception):  # the storage may be unreachable for a while
                     if self._owner() != owner:
                         return lost.set()
                     self._renew(owner)
@@ -188,11 +194,11 @@ class Storage:
                     self.remove(LOCK)
 
     def _owner(self) -> str:
-        """Read the name of the writer."""
+        """Read the name of the current writer."""
         return str(parse_json(self.read(LOCK), LOCK)["owner"])
 
     def _renew(self, owner: str) -> None:
-        """Write the owner and the time."""
+        """Write the owner and the current time."""
         self.write(LOCK, json.dumps({"owner": owner, "time": time.time()}).encode())
 
     def _refuse_if_written(self, besides: str = "") -> None:
@@ -200,7 +206,7 @@ class Storage:
             found = parse_json(self.read(LOCK), LOCK)
             age = time.time() - finite_number(found["time"], "time")
             owner = str(found["owner"])
-        except (FileNotFoundError, ValueError, KeyError, TypeError):  # nobody whom we could name
+        except (FileNotFoundError, ValueError, KeyError, TypeError):  # no identifiable writer
             return
         if owner != besides and age < STALE_S:
             host, process, *_ = [*owner.split(), "?"]

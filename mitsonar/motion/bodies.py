@@ -1,4 +1,4 @@
-"""Bodies of a scene that move: whose trajectories they follow, and where each is at a time."""
+"""Describe the moving bodies of a scene: their trajectories, and their poses, velocities and deformation at a time."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ __all__ = [
 ]
 
 
-# ---------------- Bodies whose shape changes while they move: a path, and where the vertices of the mesh are at a time
+# ---------------- Deforming bodies
 
 
 VertexLaw: TypeAlias = Callable[[float], NDArray[Any]]
-"""Vertices ``(vertices, 3)`` [m] in the body's own axes at a time [s], in the order of the shape's mesh."""
+"""Vertices ``(vertices, 3)`` [m] in the body's axes at a time [s], in the order of the shape's mesh."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class Deforming:
     """A body that moves along a path and changes its shape.
 
     Attributes:
-        path: of the body; a single pose: it stays there.
-        vertices: of its mesh at a time.
+        path: path of the body; with a single pose it stays there.
+        vertices: vertices of its mesh as a function of time.
     """
 
     path: Trajectory
@@ -61,12 +61,12 @@ class Deforming:
 
 @dataclass(frozen=True)
 class MeshSequence:
-    """Vertices of meshes that follow one another; between two they move on straight lines.
+    """Vertices of a sequence of meshes, with linear interpolation in between.
 
     Attributes:
         vertices: ``(meshes, vertices, 3)`` [m].
-        rate_hz: meshes a second; the first is at time 0.
-        loop: after the last mesh comes the first; else the last one stays.
+        rate_hz: meshes per second; the first is at time 0.
+        loop: whether the first mesh follows the last; otherwise the last one remains.
     """
 
     vertices: NDArray[np.float32]
@@ -80,7 +80,7 @@ class MeshSequence:
             raise MitsonarError(f"the rate of meshes must be positive: got {self.rate_hz:g}; give meshes a second")
 
     def __call__(self, time_s: float) -> NDArray[np.float32]:
-        """Return the vertices ``(vertices, 3)`` at a time [s]; before time 0 the first mesh holds, or the loop."""
+        """Return the vertices ``(vertices, 3)`` at a time [s]; before time 0, the first mesh or the loop applies."""
         count = len(self.vertices)
         place = time_s * self.rate_hz
         place = place % count if self.loop else min(max(place, 0.0), count - 1.0)
@@ -90,28 +90,28 @@ class MeshSequence:
         return np.asarray(self.vertices[first % count] * (1 - part) + after * part, dtype=np.float32)
 
 
-# ---------------- moving bodies
+# ---------------- Moving bodies
 
 
 Moving: TypeAlias = Mapping[str, Trajectory | str | Path | Deforming | Sequence[Trajectory]]
-"""Trajectories, or their TUM or CSV files, by the ids of the shapes that follow them; several: a shape in several places.
+"""Trajectories, or their TUM or CSV files, by the ids of the shapes that follow them.
 
-The word ``vehicle`` in place of a file stands for the path of the vehicle.
+Several trajectories place a shape several times. The word ``vehicle`` in place of a file selects the path of the vehicle.
 """
 
 VEHICLE = "vehicle"
 
 VELOCITY_STEP_S = 1e-3
-"""Time over which velocities are differences [s]."""
+"""Time step of the finite differences for velocities [s]."""
 
 MOST_BODIES = 100_000
 
 
 class BodyStates(NamedTuple):
-    """Where bodies are, and how they move.
+    """Poses and velocities of bodies.
 
     Attributes:
-        names: of the bodies; none: all is still.
+        names: names of the bodies; empty if nothing moves.
         poses: ``(times, bodies, 6)`` [m, rad].
         velocities: ``(times, bodies, 6)`` [m/s, rad/s], see :meth:`MovingBodies.velocities`.
     """
@@ -121,21 +121,21 @@ class BodyStates(NamedTuple):
     velocities: NDArray[np.float64] | None = None
 
     def fields(self) -> dict[str, Any]:
-        """Return these as fields of :class:`~mitsonar.records.frames.SonarFrames`."""
+        """Return the states as fields of :class:`~mitsonar.records.frames.SonarFrames`."""
         return {"body_names": self.names, "body_poses": self.poses, "body_velocities": self.velocities}
 
 
 @dataclass(frozen=True)
 class MovingBodies:
-    """Rigid bodies, each a shape of the scene at the poses of a trajectory.
+    """Rigid bodies, each of which places a shape of the scene at the poses of a trajectory.
 
-    A body's own axes are those of the scene: a shape lies at pose 0 (x = y = z = 0, heading 0) where the scene has it, its
-    bow along +y, its starboard side along +x. Before its first and after its last time a body stands still.
+    The axes of a body are those of the scene: at pose 0 (x = y = z = 0, heading 0) a shape lies where the scene places it,
+    with its bow along +y and its starboard side along +x. Before its first and after its last time a body is stationary.
 
     Attributes:
-        shapes: id of the shape of each body; bodies of one shape are neighbours.
+        shapes: shape id of each body; bodies of one shape are consecutive.
         paths: trajectory of each body.
-        deforming: vertices at a time of the shapes that deform, by their ids.
+        deforming: vertices of the deforming shapes as a function of time, by shape id.
     """
 
     shapes: tuple[str, ...]
@@ -144,15 +144,15 @@ class MovingBodies:
 
     @classmethod
     def of(cls, moving: Moving, frame: str = "mitsonar", vehicle: Trajectory | None = None) -> MovingBodies:
-        """Collect bodies, and read the trajectories that are files.
+        """Create bodies, and read trajectories that are given as files.
 
         Args:
-            moving: trajectories by the ids of the shapes.
-            frame: convention of files.
+            moving: trajectories by shape id.
+            frame: coordinate convention of the files.
             vehicle: path of the vehicle, for the bodies that follow it.
 
         Raises:
-            MitsonarError: no trajectory for a shape, too many, an unreadable file, or times that do not grow.
+            MitsonarError: no trajectory for a shape, too many bodies, an unreadable file, or times that do not increase.
         """
         shapes: list[str] = []
         paths: list[Trajectory] = []
@@ -174,7 +174,7 @@ class MovingBodies:
                     f"{type(given).__name__ if many else 'none'}"
                 )
             for path in many:
-                path.at(path.time_s[0])  # refuses times that do not grow
+                path.at(path.time_s[0])  # rejects times that do not increase
             shapes += [name] * len(many)
             paths += many
         if len(paths) > MOST_BODIES:
@@ -186,7 +186,7 @@ class MovingBodies:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Return the name of each body: that of its shape, with a number where a shape has several: ``fish 2``."""
+        """Return the name of each body: that of its shape, numbered if a shape has several bodies: ``fish 2``."""
         seen: dict[str, int] = {}
         found = []
         for shape in self.shapes:
@@ -200,10 +200,11 @@ class MovingBodies:
         return np.stack([path.at(time) for path in self.paths], axis=1)
 
     def velocities(self, time_s: ArrayLike) -> NDArray[np.float64]:
-        """Return the velocity of each body at each time ``(times, bodies, 6)`` in the world's axes.
+        """Return the velocity of each body at each time ``(times, bodies, 6)`` in world axes.
 
-        Of its own origin [m/s], and the rotation vector a second [rad/s]: the means over half a millisecond before and
-        after. A body rests before its first and after its last time; at these the motion beside them counts.
+        The components are the velocity of its origin [m/s] and its rotation vector per second [rad/s], as central
+        differences over one millisecond. A body is stationary before its first and after its last time; at these times the
+        one-sided difference is used.
         """
         time = np.atleast_1d(np.asarray(time_s, dtype=float))
         found = np.zeros((len(time), len(self), 6))
@@ -219,25 +220,25 @@ class MovingBodies:
         return found
 
     def states(self, time_s: ArrayLike) -> BodyStates:
-        """Return names, poses and velocities at times."""
+        """Return the names, poses and velocities at given times."""
         return BodyStates(self.names, self.poses(time_s), self.velocities(time_s))
 
     def from_world(self, time_s: ArrayLike) -> NDArray[np.float64]:
-        """Return the first three rows of what turns points of the world to each body's axes ``(times, bodies, 3, 4)``."""
+        """Return the first three rows of the transform from the world to each body's axes ``(times, bodies, 3, 4)``."""
         poses = self.poses(time_s)
         turn = vehicle_rotation(poses.reshape(-1, 6)).as_matrix().reshape(*poses.shape[:2], 3, 3)
         back = turn.swapaxes(-1, -2)
         return np.concatenate([back, -(back @ poses[..., :3, None])], axis=-1)
 
 
-# ---------------- How a scene's bodies move, as a YAML file says it: a path each, and meshes where the body deforms
+# ---------------- Motion of bodies in YAML files
 
 
 SEE = " (see docs/guides/moving.md)"
 
 
 class BodyMotion(BaseModel):
-    """Where one shape of the scene moves, and how it deforms."""
+    """Motion and deformation of one shape of the scene, as given in a YAML file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -269,19 +270,19 @@ class BodyMotion(BaseModel):
 
 
 def read_motions(file: str | Path) -> dict[str, BodyMotion]:
-    """Read a YAML file: ``id: path.tum``, or the keys of :class:`BodyMotion` below the id.
+    """Read a YAML file with lines ``id: path.tum``, or the keys of :class:`BodyMotion` below each id.
 
     Raises:
-        MitsonarError: unreadable, or wrong keys.
+        MitsonarError: an unreadable file, or invalid keys.
     """
     return motions_from(read_yaml(file, "file of moving bodies"), str(file))
 
 
 def motions_from(table: Any, source: str) -> dict[str, BodyMotion]:
-    """Return the motions in a table by the ids of the shapes; ``source`` is named in errors.
+    """Return the motions in a table, by shape id; ``source`` names the file in error messages.
 
     Raises:
-        MitsonarError: no table of ids, or wrong keys.
+        MitsonarError: not a table of ids, or invalid keys.
     """
     if not (isinstance(table, dict) and table and all(isinstance(name, str) for name in table)):
         raise MitsonarError(f"{source} must hold `shape id: path` lines{SEE}")
@@ -289,10 +290,10 @@ def motions_from(table: Any, source: str) -> dict[str, BodyMotion]:
 
 
 def files_of(name: str, folder: Path) -> list[Path]:
-    """Return the file of a name, or the files of a pattern such as ``school/*.tum`` in the order of their names.
+    """Return the file with a name, or the files that match a pattern such as ``school/*.tum``, sorted by name.
 
     Raises:
-        MitsonarError: none matches.
+        MitsonarError: no file matches.
     """
     whole = folder / name
     found = sorted(whole.parent.glob(whole.name)) if "*" in whole.name else [whole]

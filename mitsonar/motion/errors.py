@@ -1,4 +1,4 @@
-"""Errors of motions with names and units, as every table prints them, and their confidence intervals."""
+"""Compute the errors of estimated motions and paths, with units and confidence intervals, as all tables print them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 
 
 class Axis(NamedTuple):
-    """One number of a motion: its name, its printed unit, and the factor from m or rad to that unit."""
+    """One component of a motion: its name, its printed unit, and the factor from m or rad to that unit."""
 
     name: str
     unit: str
@@ -48,10 +48,13 @@ class Axis(NamedTuple):
 
 
 AXES = (Axis("sideways", "mm", 1e3), Axis("forward", "mm", 1e3), Axis("yaw", "deg", 180 / np.pi))
-"""The numbers of a motion, always in this order."""
+"""Components of a motion, always in this order."""
 
 LARGE = 0.5
-"""Motions beyond this part of the largest get a separate error: methods that learned the usual size are worse there."""
+"""Fraction of the largest motion beyond which errors are also reported separately.
+
+Methods that learned the usual size of motions are worse there.
+"""
 
 
 def in_units(motions: ArrayLike) -> Array:
@@ -66,20 +69,20 @@ class MotionErrors:
 
     Attributes:
         pairs: number of motions.
-        failures: number of rejected estimates; they count as zero motion.
-        rmse: root of the mean square.
-        rmse_low: lower end of its 95 % interval (clustered bootstrap), where resamples were given.
-        rmse_high: upper end of that interval.
-        median: of the absolute errors.
-        p95: their 95th percentile.
+        failures: number of rejected estimates, which count as zero motion.
+        rmse: root mean square error.
+        rmse_low: lower limit of its 95 % interval (clustered bootstrap), if resamples were given.
+        rmse_high: upper limit of that interval.
+        median: median absolute error.
+        p95: 95th percentile of the absolute errors.
         bias: mean error.
-        slope: of the estimates over the true motions, by least squares through the origin. 1 is unbiased; below 1 the
+        slope: slope of the estimates over the true motions, by least squares through the origin. 1 is unbiased; below 1 the
             estimates are too small.
-        large: RMSE of motions beyond half the largest, axis by axis.
-        zero: RMSE of the answer zero for every motion.
+        large: RMSE of motions beyond half the largest, per component.
+        zero: RMSE of estimating zero for every motion.
         skill: 1 - rmse / zero.
-        believed: RMSE of the valid estimates alone.
-        nees: normalised estimation error squared, a third of it (1: consistent); nan without covariances.
+        believed: RMSE of the valid estimates only.
+        nees: normalised estimation error squared, divided by three (1: consistent); nan without covariances.
     """
 
     pairs: int
@@ -105,17 +108,17 @@ def motion_errors(
     covariances: Array | None = None,
     resamples: NDArray[np.int64] | None = None,
 ) -> MotionErrors:
-    """Compute the errors of estimated motions against the true ones. Rejected estimates count as zero motion.
+    """Compute the errors of estimated motions against the true ones, counting rejected estimates as zero motion.
 
     Args:
-        estimated: sideways, forward [m], yaw [rad] ``(n, 3)``.
-        true: the same of the true motions.
+        estimated: estimated sideways, forward [m], yaw [rad] ``(n, 3)``.
+        true: true motions, of the same shape.
         valid: False for estimates that the method rejected ``(n,)``.
-        covariances: of the estimates ``(n, 3, 3)``, nan where unknown.
+        covariances: covariances of the estimates ``(n, 3, 3)``, nan where unknown.
         resamples: see :func:`cluster_resamples`.
 
     Raises:
-        MitsonarError: shapes that do not fit, no motions.
+        MitsonarError: inconsistent shapes, or no motions.
     """
     if not len(true) or estimated.shape != true.shape or valid.shape != (len(true),):
         raise MitsonarError(
@@ -153,19 +156,20 @@ def motion_errors(
 def cluster_resamples(scene: ArrayLike, *, count: int = 1000, seed: int = 0) -> NDArray[np.int64]:
     """Draw bootstrap samples by scene, then by sequence.
 
-    Each resample draws as many scenes as there are, with replacement, and from each as many of its sequences. Scenes differ
-    in size. So surplus draws are left out, and missing ones are drawn from the same scenes, until each resample has n.
+    Each resample draws as many scenes as there are, with replacement, and as many sequences from each scene as it has. Since
+    scenes differ in size, surplus draws are dropped and missing ones are drawn from the same scenes, so that each resample
+    has n sequences.
 
-    With few scenes the intervals are too narrow. In a trial whose scenes differed by a factor of 1.8 they held the true RMSE
-    in 73 % of cases with 5 scenes, 79 % with 10 and 88 % with 50.
+    With few scenes the intervals are too narrow. In a simulation with scenes that differed by a factor of 1.8, they
+    contained the true RMSE in 73 % of cases with 5 scenes, 79 % with 10 and 88 % with 50.
 
     Args:
-        scene: of each sequence ``(n,)``.
+        scene: scene of each sequence ``(n,)``.
         count: number of resamples.
-        seed: of the draws.
+        seed: seed of the draws.
 
     Returns:
-        Indices ``(count, n)`` into arrays of one pair a sequence.
+        Indices ``(count, n)`` into arrays with one pair per sequence.
     """
     names, group = np.unique(np.asarray(scene), return_inverse=True)
     total = len(group)
@@ -174,15 +178,17 @@ def cluster_resamples(scene: ArrayLike, *, count: int = 1000, seed: int = 0) -> 
     rng = np.random.default_rng([seed, 7])
     table = np.empty((count, total), dtype=np.int64)
     for row in table:
+        # Draw scenes, each repeated by its size, and fill up or cut to n.
         drawn = rng.integers(len(names), size=len(names))
         of = np.repeat(drawn, size[drawn])
         of = np.concatenate([of, rng.choice(of, size=max(0, total - len(of)))])[:total]
+        # Draw a sequence from each of these scenes.
         row[:] = order[start[of] + (rng.random(total) * size[of]).astype(np.int64)]
     return table
 
 
 def _rms_interval(error: Array, resamples: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return the 95 % interval of the root of the mean square."""
+    """Return the 95 % interval of the root mean square."""
     low, high = np.percentile(np.sqrt((error**2)[resamples].mean(axis=1)), [2.5, 97.5], axis=0)
     return low, high
 
@@ -192,13 +198,13 @@ def _rms_by_column(error: Array) -> Array:
 
 
 def _rms_of_known(error: Array) -> Array:
-    """Return the root of the mean square of the values that are not nan; nan where there are none."""
+    """Return the root mean square of the values that are not nan; nan if there are none."""
     count = np.isfinite(error).sum(axis=0)
     return np.where(count > 0, np.sqrt(np.nansum(error**2, axis=0) / np.maximum(count, 1)), np.nan)
 
 
 def _nees(error: Array, covariances: Array | None, valid: NDArray[np.bool_]) -> float:
-    """Return the mean normalised squared error of the valid estimates that have a covariance, a third of it."""
+    """Return a third of the mean normalised squared error of the valid estimates that have a covariance."""
     if covariances is None:
         return float("nan")
     known = valid & np.isfinite(covariances).all(axis=(1, 2))
@@ -208,21 +214,22 @@ def _nees(error: Array, covariances: Array | None, valid: NDArray[np.bool_]) -> 
     return float((error[known] * solved).sum(axis=1).mean() / 3)
 
 
-# ---------------- Errors of an estimated path: absolute and relative errors as `evo` defines them, and drift at the end
+# ---------------- Errors of an estimated path
+# Absolute and relative errors as `evo` defines them, and drift at the end.
 
 
 Alignment = Literal["none", "first", "plane", "space"]
 """Alignment of an estimated path with the true one.
 
 ``none``: no alignment. ``first``: by the first pose. ``plane``: by the rotation about the vertical and the shift in the
-plane that fit all positions best. ``space``: by the rotation and shift in space that do so (Umeyama, 1991, without scale).
+plane that best fit all positions. ``space``: by the best-fitting rotation and shift in space (Umeyama, 1991, without scale).
 """
 
 DeltaUnit = Literal["frames", "metres"]
 Index = NDArray[np.intp]
 
 SHORTEST_PATH_M = 1e-3
-"""Shortest path for which drift per length is defined."""
+"""Shortest path for which drift per length is defined [m]."""
 
 
 @dataclass(frozen=True)
@@ -231,18 +238,18 @@ class PathErrors:
 
     Attributes:
         frames: number of poses compared.
-        alignment: of the paths, for the absolute errors.
+        alignment: alignment of the paths for the absolute errors.
         path_m: length of the true path [m].
         estimated_path_m: length of the estimated path [m].
-        absolute_rmse_m: absolute trajectory error, root of the mean square [m].
-        absolute_max_m: the largest [m].
-        absolute_angle_rmse_rad: the same for the attitude [rad].
-        delta: length over which the relative errors are taken.
-        unit: of ``delta``: frames, or metres of the true path.
+        absolute_rmse_m: absolute trajectory error, root mean square [m].
+        absolute_max_m: largest absolute trajectory error [m].
+        absolute_angle_rmse_rad: absolute attitude error, root mean square [rad].
+        delta: length over which relative errors are computed.
+        unit: unit of ``delta``: frames, or metres of the true path.
         pairs: number of relative errors.
         relative_rmse_m: relative pose error, translation [m].
         relative_angle_rmse_rad: relative pose error, rotation [rad].
-        end_error_m: at the last pose, with the first poses aligned [m].
+        end_error_m: error of the last pose, with the first poses aligned [m].
         end_heading_rad: heading error accumulated from the first to the last pose [rad], clockwise positive, not wrapped.
     """
 
@@ -263,7 +270,7 @@ class PathErrors:
 
     @property
     def end_drift(self) -> float:
-        """Return the end error as a fraction of the path's length (Almanza-Medina, 5.4.5); nan for a path below 1 mm."""
+        """Return the end error as a fraction of the path length (Almanza-Medina, 5.4.5); nan for a path below 1 mm."""
         return self.end_error_m / self.path_m if self.path_m > SHORTEST_PATH_M else np.nan
 
     @property
@@ -272,7 +279,7 @@ class PathErrors:
         return self.end_heading_rad / self.path_m if self.path_m > SHORTEST_PATH_M else np.nan
 
     def rows(self) -> list[tuple[str, float, str]]:
-        """Return name, value and unit of every error: the one table for console, log and README."""
+        """Return the name, value and unit of every error, as shown in console, log and README."""
         laid = {"none": "as they lie", "first": "first pose aligned", "plane": "aligned in the plane", "space": "aligned"}
         unit = {"frames": "frame", "metres": "m"}[self.unit] + ("s" if self.unit == "frames" and self.delta != 1 else "")
         each = f"over {self.delta:g} {unit}"
@@ -308,21 +315,23 @@ def assess(
     """Compute all errors of an estimated path.
 
     Args:
-        estimated: the path to judge.
-        true: the true path. Its length counts all its poses between the first and the last compared.
-        align: alignment of the paths for the absolute errors; drift always counts from the first pose.
-        delta: length over which relative errors are taken, one after another without overlap.
-        unit: of ``delta``: frames, or metres of the true path.
-        tolerance_s: largest difference in time of the poses that are compared [s].
+        estimated: the estimated path.
+        true: the true path. Its length includes all its poses between the first and the last compared.
+        align: alignment of the paths for the absolute errors; drift is always computed from the first pose.
+        delta: length over which relative errors are computed, in consecutive segments without overlap.
+        unit: unit of ``delta``: frames, or metres of the true path.
+        tolerance_s: largest time difference between compared poses [s].
 
     Raises:
         MitsonarError: fewer than two poses at equal times, a path too short for ``delta``, or one that cannot be aligned.
     """
+    # 1. Match the poses by time.
     mine, theirs = associated(estimated.time_s, true.time_s, tolerance_s)
     if mine.size < 2:
         raise MitsonarError(f"a path's errors need two poses or more at equal times: got {mine.size}; give longer paths")
     whole = Trajectory(true.poses[theirs[0] : theirs[-1] + 1], true.time_s[theirs[0] : theirs[-1] + 1])
     estimated, true = _picked(estimated, mine), _picked(true, theirs)
+    # 2. Compute the absolute, relative and end errors.
     absolute, angle = absolute_errors(estimated, true, align)
     relative, turn = relative_errors(estimated, true, delta, unit)
     ends, _ = absolute_errors(estimated, true, "first")
@@ -346,7 +355,7 @@ def assess(
 
 
 def associated(estimated_s: Array, true_s: Array, tolerance_s: float = 0.01) -> tuple[Index, Index]:
-    """Match poses by time: each is the nearest of the other, within the tolerance.
+    """Match poses by time: mutual nearest neighbours within the tolerance.
 
     Returns:
         Indices ``(matches,)`` into both paths.
@@ -360,7 +369,7 @@ def associated(estimated_s: Array, true_s: Array, tolerance_s: float = 0.01) -> 
     theirs = _nearest(true_s, estimated_s)
     mine = np.arange(len(estimated_s))
     apart = np.abs(true_s[theirs] - estimated_s)
-    # times read from a file differ in their last digit
+    # times read from files may differ in the last digit
     keep = (_nearest(estimated_s, true_s)[theirs] == mine) & (apart <= tolerance_s + 1e-9)
     if not keep.any():
         raise MitsonarError(
@@ -372,20 +381,20 @@ def associated(estimated_s: Array, true_s: Array, tolerance_s: float = 0.01) -> 
 
 
 def path_length(path: Trajectory) -> float:
-    """Sum the distances from pose to pose [m]."""
+    """Compute the length of a path as the sum of distances between poses [m]."""
     return float(distance_driven(path)[-1])
 
 
 def distance_driven(path: Trajectory) -> Array:
-    """Sum the distances from pose to pose up to each pose ``(frames,)`` [m]."""
+    """Compute the distance travelled up to each pose ``(frames,)`` [m]."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.poses[:, :3], axis=0), axis=1))])
 
 
 def aligned(estimated: Trajectory, true: Trajectory, align: Alignment) -> Trajectory:
-    """Align an estimated path with the true one; both have the same frames.
+    """Align an estimated path with the true one, which has the same frames.
 
     Raises:
-        MitsonarError: another number of poses, an unknown alignment, or positions that do not determine the rotation.
+        MitsonarError: different numbers of poses, an unknown alignment, or positions that do not determine the rotation.
     """
     if len(estimated) != len(true):
         raise MitsonarError(
@@ -409,7 +418,7 @@ def aligned(estimated: Trajectory, true: Trajectory, align: Alignment) -> Trajec
 
 
 def absolute_errors(estimated: Trajectory, true: Trajectory, align: Alignment = "first") -> tuple[Array, Array]:
-    """Compute distance [m] and angle [rad] between the poses ``(frames,)`` of two paths after alignment."""
+    """Compute the distance [m] and angle [rad] between the poses ``(frames,)`` of two paths after alignment."""
     fitted = aligned(estimated, true, align)
     angle = (vehicle_rotation(true.poses).inv() * vehicle_rotation(fitted.poses)).magnitude()
     return np.linalg.norm(fitted.poses[:, :3] - true.poses[:, :3], axis=1), np.asarray(angle)
@@ -418,20 +427,20 @@ def absolute_errors(estimated: Trajectory, true: Trajectory, align: Alignment = 
 def relative_errors(
     estimated: Trajectory, true: Trajectory, delta: float = 1, unit: DeltaUnit = "frames", *, overlapping: bool = False
 ) -> tuple[Array, Array]:
-    """Compute the errors of motions over ``delta`` frames, or over so many metres of the true path.
+    """Compute the errors of motions over ``delta`` frames, or over ``delta`` metres of the true path.
 
     Args:
-        estimated: the path to judge.
+        estimated: the estimated path.
         true: the true path, with the same frames.
         delta: length of each motion.
-        unit: of ``delta``: frames or metres.
-        overlapping: whether a motion begins at every frame, or each where the one before ends.
+        unit: unit of ``delta``: frames or metres.
+        overlapping: whether a motion starts at every frame, or only where the previous one ends.
 
     Returns:
         Distance [m] and angle [rad] ``(pairs,)``.
 
     Raises:
-        MitsonarError: another number of poses, or a path that is shorter than ``delta``.
+        MitsonarError: different numbers of poses, or a path shorter than ``delta``.
     """
     if len(estimated) != len(true):
         raise MitsonarError(
@@ -450,7 +459,7 @@ def _pairs(true: Trajectory, delta: float, unit: DeltaUnit, overlapping: bool) -
         ends = index + int(delta)
     elif unit == "metres" and delta > 0:
         driven = distance_driven(true)
-        ends = np.searchsorted(driven, driven + delta * (1 - 1e-9))  # rounding must not lengthen equal steps
+        ends = np.searchsorted(driven, driven + delta * (1 - 1e-9))  # rounding must not add a step where all are equal
     else:
         raise MitsonarError(f"delta must be 1, 2, ... frames or a positive number of metres: got {delta:g} {unit}")
     starts = index[ends < len(true)]
@@ -465,7 +474,7 @@ def _pairs(true: Trajectory, delta: float, unit: DeltaUnit, overlapping: bool) -
 
 
 def _between(path: Trajectory, first: Index, second: Index) -> tuple[Array, Rotation]:
-    """Return positions ``(pairs, 3)`` and attitudes of the second poses, in axes of the first."""
+    """Return positions ``(pairs, 3)`` and attitudes of the second poses, in the axes of the first."""
     turn = vehicle_rotation(path.poses)
     back = turn[first].inv()
     return back.apply(path.poses[second, :3] - path.poses[first, :3]), back * turn[second]
@@ -494,7 +503,7 @@ def _picked(path: Trajectory, index: Index) -> Trajectory:
 
 
 def _nearest(among: Array, wanted: Array) -> Index:
-    """Return the index of the nearest of rising values for each wanted one."""
+    """Return the index of the nearest of increasing values for each wanted one."""
     after = np.clip(np.searchsorted(among, wanted), 1, max(len(among) - 1, 1))
     after = np.minimum(after, len(among) - 1)
     before = np.maximum(after - 1, 0)
@@ -505,23 +514,23 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-# ---------------- Drift over segments of a path, as the KITTI odometry benchmark defines it (Geiger et al., 2012),
-# with intervals
-# Segments of given lengths begin at every frame (KITTI: at every tenth). The error of a segment is the motion between
-# its ends as estimated, seen from the true one: its distance over the length, and its angle over the length. The drift
-# is the mean over all segments of all lengths. KITTI takes lengths of 100 to 800 m; a sonar's path is shorter.
+# ---------------- Drift over segments (KITTI)
 
 
 @dataclass(frozen=True)
 class SegmentDrift:
-    """The errors of all segments of a path.
+    """Errors over segments of a path, as in the KITTI odometry benchmark (Geiger et al., 2012).
+
+    Segments of given lengths start at every frame (KITTI: at every tenth). The error of a segment is that of the estimated
+    motion between its ends: its distance over the length, and its angle over the length. The drift is the mean over all
+    segments of all lengths. KITTI uses lengths of 100 to 800 m; sonar paths are shorter.
 
     Attributes:
         lengths_m: lengths that fit into the path [m].
-        length_m: of each segment ``(n,)`` [m].
-        translation: error of each, as a part of its length ``(n,)``.
-        rotation_rad_per_m: angle between the attitudes over its length ``(n,)`` [rad/m].
-        start_m: distance driven before each begins ``(n,)`` [m].
+        length_m: length of each segment ``(n,)`` [m].
+        translation: translation error of each segment, as a fraction of its length ``(n,)``.
+        rotation_rad_per_m: angle between the attitudes over the length ``(n,)`` [rad/m].
+        start_m: distance travelled before the start of each segment ``(n,)`` [m].
     """
 
     lengths_m: tuple[float, ...]
@@ -532,7 +541,7 @@ class SegmentDrift:
 
     @property
     def percent(self) -> float:
-        """Return the mean translation error in percent of the length."""
+        """Return the mean translation error in percent of the segment length."""
         return 100 * float(self.translation.mean())
 
     @property
@@ -542,14 +551,14 @@ class SegmentDrift:
 
     @property
     def blocks(self) -> NDArray[np.int64]:
-        """Return the block of each segment ``(n,)``: those that begin within one shortest length belong together."""
+        """Return the block of each segment ``(n,)``; a block holds the segments that start within one shortest length."""
         return np.asarray((self.start_m + 1e-9) // min(self.lengths_m), dtype=np.int64)
 
     def intervals(self, *, seed: int = 0) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return 95 % intervals of percent and of deg per 100 m, by a bootstrap over blocks of the path.
 
-        Segments overlap and are no independent draws; blocks are nearly so. With fewer than ten blocks the intervals are
-        too narrow, see :func:`mitsonar.motion.errors.cluster_resamples`.
+        Segments overlap and are not independent; blocks nearly are. With fewer than ten blocks the intervals are too narrow,
+        see :func:`mitsonar.motion.errors.cluster_resamples`.
         """
         drawn = cluster_resamples(self.blocks, seed=seed)
         tables = 100 * self.translation, 100 * np.degrees(self.rotation_rad_per_m)
@@ -558,18 +567,18 @@ class SegmentDrift:
 
 
 def segment_drift(estimated: Trajectory, true: Trajectory, lengths_m: Sequence[float]) -> SegmentDrift | None:
-    """Compute the errors of all segments; one begins at every frame.
+    """Compute the errors of all segments, one of which starts at every frame.
 
     Args:
-        estimated: the path to judge.
+        estimated: the estimated path.
         true: the true path, with the same frames.
-        lengths_m: of the segments [m], along the true path. Those that are longer than the path are left out.
+        lengths_m: lengths of the segments along the true path [m]. Lengths beyond that of the path are ignored.
 
     Returns:
-        The errors; None where no length fits into the path.
+        The errors; None if no length fits into the path.
 
     Raises:
-        MitsonarError: another number of poses, or a length that is not above 0.
+        MitsonarError: different numbers of poses, or a length that is not positive.
     """
     if not lengths_m or min(lengths_m) <= 0:
         raise MitsonarError(f"lengths of segments must be above 0 m: got {list(lengths_m)}")

@@ -1,6 +1,6 @@
-"""Other sensors of a vehicle along a run: gyroscope, velocities (DVL), depth, compass, dead reckoning; all may be missing.
+"""Combine the readings of a vehicle's other sensors: gyroscope, DVL, depth, compass and dead reckoning, all optional.
 
-Readings are put together over the time from frame to frame: they become motions with covariances, and headings and depths.
+Readings are integrated over the time between frames. They yield motions with covariances, and headings and depths.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 UNKNOWN_STD = np.array([10.0, 10.0, np.pi])
-"""Standard deviations of what a sensor does not tell of a motion [m, m, rad]."""
+"""Standard deviations of motion components that a sensor does not measure [m, m, rad]."""
 
 LEAST_STD = 1e-12
-"""Least standard deviation of a reading: its inverse square must be a number."""
+"""Smallest standard deviation of a reading, whose inverse square must be finite."""
 
 LONGEST_GAP_S = 1.0
-"""Time between two readings beyond which nothing is known in between, unless they are slower throughout."""
+"""Longest time between two readings that still cover the time in between, unless readings are slower throughout [s]."""
 
 SLOWER = 3.0
-"""Gaps of so many usual steps count as gaps."""
+"""Number of median steps beyond which a step counts as a gap."""
 
 
 class Headings(NamedTuple):
-    """Absolute headings of poses: their numbers ``(n,)``, the headings [rad] and the standard deviations [rad]."""
+    """Absolute headings of poses: their indices ``(n,)``, the headings [rad] and the standard deviations [rad]."""
 
     pose: Index
     heading: Array
@@ -61,22 +61,22 @@ class Headings(NamedTuple):
 
     @classmethod
     def none(cls) -> Self:
-        """Return no headings."""
+        """Return an empty set of headings."""
         return cls(np.zeros(0, np.intp), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings of one quantity.
+    """Readings of one quantity over time.
 
     Attributes:
-        time_s: of the readings ``(n,)``, increasing.
+        time_s: times of the readings ``(n,)``, increasing.
         values: ``(n,)``.
-        std: of their independent errors ``(n,)``; of a gyroscope the noise density (rad/s per root Hz, which is rad per root
-            second).
+        std: standard deviations of their independent errors ``(n,)``; for a gyroscope the noise density (rad/s per root Hz,
+            which is rad per root second).
 
     Raises:
-        MitsonarError: other shapes, numbers that are not finite, times that do not increase, deviations not above 0.
+        MitsonarError: other shapes, non-finite numbers, times that do not increase, or deviations that are not positive.
     """
 
     time_s: Array
@@ -99,7 +99,7 @@ class Readings:
 
     @property
     def edges_s(self) -> Array:
-        """Return the times at which one reading gives way to the next ``(n + 1,)``: each holds around its own time."""
+        """Return the limits of the intervals ``(n + 1,)`` in which each reading applies, around its time."""
         step = np.diff(self.time_s)
         if not step.size:
             return np.asarray(self.time_s[0] + np.array([-0.5, 0.5]) * LONGEST_GAP_S)
@@ -107,22 +107,23 @@ class Readings:
         return np.concatenate([[self.time_s[0] - step[0] / 2], middle, [self.time_s[-1] + step[-1] / 2]])
 
     def means(self, time_s: Array) -> Array:
-        """Return the mean between consecutive times ``(times - 1,)``, of use where readings cover them."""
+        """Return the mean between consecutive times ``(times - 1,)``, which is valid where readings cover them."""
         return np.asarray(_between(self.edges_s, self.values, time_s) / np.diff(time_s))
 
     def variances(self, time_s: Array, *, density: bool) -> Array:
         """Return the variance of the integral between consecutive times ``(times - 1,)``.
 
         Args:
-            time_s: of the frames.
-            density: whether ``std`` is a noise density, per root Hz; else it is that of each reading, and readings average.
+            time_s: times of the frames.
+            density: whether ``std`` is a noise density per root Hz; otherwise it is that of each reading, and readings
+                average.
         """
         edges = self.edges_s
         power = np.asarray(self.std**2 if density else self.std**2 * np.diff(edges))
         return _between(edges, power, time_s)
 
     def covers(self, time_s: Array) -> NDArray[np.bool_]:
-        """Return between which consecutive times readings are without a gap ``(times - 1,)``."""
+        """Return whether readings cover each interval between consecutive times without a gap ``(times - 1,)``."""
         edges, step = self.edges_s, np.diff(self.time_s)
         widest = max(LONGEST_GAP_S, SLOWER * float(np.median(step))) if step.size else LONGEST_GAP_S
         within = (time_s[:-1] >= edges[0] - 1e-6) & (time_s[1:] <= edges[-1] + 1e-6)
@@ -131,16 +132,18 @@ class Readings:
         return np.asarray(within)
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
-        """Return values and standard deviations at times, interpolated; nan where no reading is near ``(times,)`` each.
+        """Return interpolated values and standard deviations at times ``(times,)`` each; nan where no reading is near.
 
-        A reading is near where it is the nearest to that time, and no other time is nearer to it: none counts twice.
+        A reading is near a time if the two are mutual nearest neighbours, so that no reading counts twice.
         """
+        # The reading nearest to each time.
         after = np.clip(np.searchsorted(self.time_s, time_s), 1, max(1, len(self.time_s) - 1)) - 1
         nearest = np.where(
             np.abs(self.time_s[np.minimum(after + 1, len(self.time_s) - 1)] - time_s) < np.abs(self.time_s[after] - time_s),
             np.minimum(after + 1, len(self.time_s) - 1),
             after,
         )
+        # The time nearest to each reading; only mutual nearest neighbours are used.
         off = np.abs(self.time_s[nearest] - time_s)
         best = np.full(len(self.time_s), np.inf)
         np.minimum.at(best, nearest, off)
@@ -150,22 +153,22 @@ class Readings:
 
 
 def _between(edges: Array, rate: Array, time_s: Array) -> Array:
-    """Return the integral of steps ``rate`` (n,) between their ``edges`` (n + 1,), from each time to the next."""
+    """Integrate a step function with values ``rate`` (n,) and limits ``edges`` (n + 1,) between consecutive times."""
     whole = np.concatenate([[0.0], np.cumsum(rate * np.diff(edges))])
     return np.asarray(np.diff(np.interp(time_s, edges, whole)))
 
 
 @dataclass(frozen=True)
 class DeadReckoning:
-    """Poses by the vehicle's own navigation, whose errors grow as a random walk.
+    """Poses from the vehicle's own navigation, with errors that grow as a random walk.
 
     Attributes:
-        path: its poses.
-        walk_m: standard deviation of the position after a second [m per root second].
-        walk_rad: of the heading after a second [rad per root second].
+        path: the poses.
+        walk_m: standard deviation of the position after one second [m per root second].
+        walk_rad: standard deviation of the heading after one second [rad per root second].
 
     Raises:
-        MitsonarError: a walk that is not above 0, or times that do not increase.
+        MitsonarError: a walk that is not positive, or times that do not increase.
     """
 
     path: Trajectory
@@ -181,25 +184,25 @@ class DeadReckoning:
             raise MitsonarError("dead reckoning needs two poses or more, at times that increase: sort them")
 
     def poses_at(self, time_s: Array) -> Array:
-        """Return poses at times, interpolated; held before the first and after the last ``(times, 6)``."""
+        """Return interpolated poses at times ``(times, 6)``, constant before the first and after the last."""
         return straight_poses(self.path, time_s)
 
 
 def straight_poses(path: Trajectory, time_s: Array) -> Array:
-    """Return poses at times along straight lines, headings unwrapped; held beyond the ends ``(times, 6)``."""
+    """Return linearly interpolated poses at times ``(times, 6)``, with unwrapped headings; constant beyond the ends."""
     table = path.poses.copy()
     table[:, 5] = np.unwrap(table[:, 5])
     return np.column_stack([np.interp(time_s, path.time_s, column) for column in table.T])
 
 
 class SensorMotions(NamedTuple):
-    """Motions between frames by one sensor.
+    """Motions between frames measured by one sensor.
 
     Attributes:
-        pair: numbers of the pairs of frames that it covers ``(n,)``.
+        pair: indices of the pairs of frames that it covers ``(n,)``.
         motions: sideways, forward [m], yaw [rad] ``(n, 3)``.
-        covariances: ``(n, 3, 3)``; what the sensor does not tell has the variance of ``UNKNOWN_STD``.
-        bias: error of each motion by a standard deviation of the gyroscope's bias ``(n, 3)``.
+        covariances: ``(n, 3, 3)``; unmeasured components have the variance of ``UNKNOWN_STD``.
+        bias: error of each motion caused by one standard deviation of the gyroscope bias ``(n, 3)``.
     """
 
     pair: NDArray[np.intp]
@@ -210,20 +213,20 @@ class SensorMotions(NamedTuple):
 
 @dataclass(frozen=True)
 class VehicleSensors:
-    """Readings of a vehicle's sensors, all in the vehicle's level axes; None where there is no such sensor.
+    """Readings of a vehicle's sensors, in the vehicle's level axes; None for missing sensors.
 
     Attributes:
-        yaw_rate: of a gyroscope [rad/s], clockwise seen from above; ``std`` is its noise density.
-        sideways: velocity to starboard, of a DVL [m/s].
-        forward: velocity forward [m/s].
-        depth: below the surface [m].
-        heading: of a compass [rad], clockwise from north.
-        dead_reckoning: by other navigation.
-        bias_std: standard deviation of the gyroscope's constant bias [rad/s]; 0: none.
-        name: of the file, for messages.
+        yaw_rate: yaw rate of a gyroscope [rad/s], clockwise seen from above; ``std`` is its noise density.
+        sideways: velocity to starboard from a DVL [m/s].
+        forward: forward velocity from a DVL [m/s].
+        depth: depth below the surface [m].
+        heading: heading of a compass [rad], clockwise from north.
+        dead_reckoning: poses from other navigation.
+        bias_std: standard deviation of the constant gyroscope bias [rad/s]; 0 for none.
+        name: name of the source in messages.
 
     Raises:
-        MitsonarError: no sensor at all, or a bias below 0.
+        MitsonarError: no sensor at all, or a negative bias.
     """
 
     yaw_rate: Readings | None = None
@@ -251,7 +254,7 @@ class VehicleSensors:
 
     @property
     def names(self) -> list[str]:
-        """Return what sensors there are, in words."""
+        """Return the names of the sensors that are present."""
         there = {
             "gyroscope": self.yaw_rate,
             "DVL": self.sideways or self.forward,
@@ -276,7 +279,7 @@ class VehicleSensors:
         return digest.hexdigest()
 
     def motions(self, time_s: Array) -> list[SensorMotions]:
-        """Return the motions between frames at ``time_s`` ``(frames,)`` [s], one item a sensor; errors are independent.
+        """Return the motions between frames at ``time_s`` ``(frames,)`` [s], one item per sensor, with independent errors.
 
         Raises:
             MitsonarError: no sensor covers the time of any frame.
@@ -296,7 +299,7 @@ class VehicleSensors:
             yield _reckoned(self.dead_reckoning, time_s)
 
     def _turned(self, gyro: Readings, time_s: Array) -> SensorMotions:
-        """Return what the gyroscope tells: the yaw."""
+        """Return the yaw measured by the gyroscope."""
         pair, step = np.flatnonzero(gyro.covers(time_s)), np.diff(time_s)
         table = np.zeros((len(step), 3))
         table[:, 2] = gyro.means(time_s) * step
@@ -307,11 +310,13 @@ class VehicleSensors:
         return SensorMotions(pair, table[pair], covariances[pair], bias[pair])
 
     def _moved(self, time_s: Array) -> SensorMotions:
-        """Return what velocities tell: the displacement, in axes of the second heading.
+        """Return the displacement measured by velocities, in the axes of the second heading.
 
-        Velocities are in axes that turn: the displacement lies half a turn before the last axes. The turn is that of the
-        gyroscope or the dead reckoning. Without them it is unknown, and the covariance tells how it bends the displacement.
+        Velocities are in rotating axes, so the displacement lies half the rotation behind the final axes. The rotation is
+        taken from the gyroscope or the dead reckoning. Without them it is unknown, and the covariance describes how it bends
+        the displacement.
         """
+        # 1. Integrate each velocity over the intervals that it covers; the other components remain unknown.
         step = np.diff(time_s)
         moved, variance = np.zeros((2, len(step))), np.tile(UNKNOWN_STD[:2, None] ** 2, (1, len(step)))
         covered = np.zeros(len(step), dtype=bool)
@@ -321,9 +326,11 @@ class VehicleSensors:
                 moved[axis] = np.where(there, sensor.means(time_s) * step, 0.0)
                 variance[axis] = np.where(there, sensor.variances(time_s, density=False), variance[axis])
                 covered |= there
+        # 2. Rotate the displacement by half the yaw into the axes of the second heading.
         yaw = self._yaws(time_s)
         sin, cos = np.sin(yaw / 2), np.cos(yaw / 2)
         sideways, forward = moved[0] * cos - moved[1] * sin, moved[0] * sin + moved[1] * cos
+        # 3. Propagate the variances, including that of the yaw, through this rotation.
         none, one = np.zeros_like(sin), np.ones_like(sin)
         turn = np.array([[cos, -sin, -forward / 2], [sin, cos, sideways / 2], [none, none, one]]).transpose(2, 0, 1)
         own = np.stack([*variance, UNKNOWN_STD[2] ** 2 * one], axis=1)
@@ -333,7 +340,7 @@ class VehicleSensors:
         return SensorMotions(pair, table[pair], covariances[pair], np.zeros((len(pair), 3)))
 
     def _yaws(self, time_s: Array) -> Array:
-        """Return the yaw between frames by the gyroscope, or else by dead reckoning; else 0."""
+        """Return the yaw between frames from the gyroscope, or else from dead reckoning; otherwise 0."""
         step = np.diff(time_s)
         if self.yaw_rate is not None:
             return np.where(self.yaw_rate.covers(time_s), self.yaw_rate.means(time_s) * step, 0.0)
@@ -342,14 +349,15 @@ class VehicleSensors:
         return np.zeros_like(step)
 
     def priors(self, time_s: Array) -> list[MotionPrior] | None:
-        """Return what the sensors tell of each motion together ``(frames - 1,)``; None where they tell of none.
+        """Return the combined sensor estimate of each motion ``(frames - 1,)``; None if no sensor measures any.
 
         Raises:
-            MitsonarError: as :meth:`motions`.
+            MitsonarError: as for :meth:`motions`.
         """
         told = self.motions(time_s)
         if not told:
             return None
+        # Weight each sensor by its information, starting from a weak prior, so that the result is always defined.
         information = np.tile(np.diag(1 / UNKNOWN_STD**2), (len(time_s) - 1, 1, 1))
         weighted = np.zeros((len(time_s) - 1, 3, 1))
         for one in told:
@@ -364,7 +372,7 @@ class VehicleSensors:
         ]
 
     def headings(self, time_s: Array) -> Headings:
-        """Return the headings of frames by the compass; frames without a reading near are left out."""
+        """Return the compass headings of frames; frames without a nearby reading are omitted."""
         if self.heading is None:
             return Headings.none()
         smooth = Readings(self.heading.time_s, np.unwrap(self.heading.values), self.heading.std)
@@ -373,12 +381,12 @@ class VehicleSensors:
         return Headings(known, wrapped(heading[known]), std[known])
 
     def rises(self, time_s: Array) -> Array | None:
-        """Return how far each frame is above the first, by the depth ``(frames,)`` [m]; None where it is not known."""
+        """Return the rise of each frame above the first, from the depth ``(frames,)`` [m]; None if not known."""
         depth = self.depths(time_s)
         return None if depth is None else np.asarray(depth[0] - depth)
 
     def depths(self, time_s: Array) -> Array | None:
-        """Return the depth of each frame below the surface ``(frames,)`` [m]; None where it is not known."""
+        """Return the depth of each frame below the surface ``(frames,)`` [m]; None if not known."""
         if self.depth is None:
             return None
         covered = time_s[0] >= self.depth.edges_s[0] - 1e-6 and time_s[-1] <= self.depth.edges_s[-1] + 1e-6
@@ -386,14 +394,14 @@ class VehicleSensors:
 
 
 def _inverse(matrices: Array) -> Array:
-    """Invert covariances or information ``(n, 3, 3)`` whose components differ by many orders."""
+    """Invert covariances or information matrices ``(n, 3, 3)`` whose components differ by many orders of magnitude."""
     scale = 1 / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
     both = scale[:, :, None] * scale[:, None]
     return np.asarray(both * np.linalg.inv(matrices * both))
 
 
 def _reckoned(dead: DeadReckoning, time_s: Array) -> SensorMotions:
-    """Return what dead reckoning tells: whole motions."""
+    """Return the motions measured by dead reckoning."""
     step, known = np.diff(time_s), dead.path.time_s
     table = motions(dead.poses_at(time_s))
     covered = (time_s[:-1] >= known[0] - 1e-6) & (time_s[1:] <= known[-1] + 1e-6)
@@ -403,16 +411,15 @@ def _reckoned(dead: DeadReckoning, time_s: Array) -> SensorMotions:
 
 
 def wrapped(angle: Array) -> Array:
-    """Return angles within -pi..pi [rad]."""
+    """Wrap angles to -pi..pi [rad]."""
     return np.asarray(angle - 2 * np.pi * np.rint(angle / (2 * np.pi)))
 
 
-# ---------------- Files of a vehicle's sensors: CSV, columns by name with their unit; cells may be empty where
-# sensors have other times
+# ---------------- CSV files of sensors
 
 
 ROOT_HOUR = float(np.radians(1) / 60)
-"""One deg/h^0.5 as rad per root second: the noise of a gyroscope."""
+"""One deg/h^0.5 in rad per root second, the unit of gyroscope noise."""
 
 DEG = float(np.radians(1))
 
@@ -424,43 +431,43 @@ COLUMNS = {
     "heading_deg": ("heading_std_deg", DEG, DEG),
     "compass_deg": ("compass_std_deg", DEG, DEG),
 }
-"""Columns of readings; the column of their noise; the factors of both to m, rad and s."""
+"""Columns of readings; for each the column of its noise, and the factors of both to m, rad and s."""
 
 RECKONED = ("reckoned_x_m", "reckoned_y_m", "reckoned_heading_deg")
 WALKS = ("reckoned_walk_m_rts", "reckoned_walk_deg_rts")
-"""Columns of poses by dead reckoning, and of their random walk per root second."""
+"""Columns of the random walk of dead reckoning per root second; ``RECKONED`` are those of its poses."""
 
 OF_POSES = {name for axis in "xy" for name in ALIASES[axis]}
-"""Columns of positions. Beside them ``heading_deg`` is the heading of a pose, which may be the true one."""
+"""Columns of positions. In a file that has them, ``heading_deg`` is the heading of a pose, which may be the true one."""
 
 BIAS = "yaw_rate_bias_deg_h"
 TIMES = ("time_s", "time", "timestamp")
 
 LARGEST = 1e12
-"""Largest number of a file; times may be those of Unix."""
+"""Largest number in a file; times may be Unix times."""
 
 
 def load_sensors(path: str | Path) -> VehicleSensors:
     """Load the readings of sensors from a CSV file.
 
-    Its first line names the columns: ``time_s`` (or ``time``, ``timestamp``), and those of the sensors there are. A sensor's
-    noise is a column of its own; its first number counts where later ones are missing. Other columns are not read: the file
-    may be a trajectory (:meth:`mitsonar.Trajectory.load`), whose poses may be the true ones.
+    Its first line names the columns: ``time_s`` (or ``time``, ``timestamp``), and those of the available sensors. The noise
+    of a sensor has a separate column, whose first number replaces missing ones. Other columns are ignored: the file may be a
+    trajectory (:meth:`mitsonar.Trajectory.load`), whose poses may be the true ones.
 
     | sensor | columns | columns of its noise |
     |---|---|---|
     | gyroscope | ``yaw_rate_deg_s``, clockwise seen from above | ``yaw_rate_noise_deg_rth`` (deg/h^0.5) |
-    | | | ``yaw_rate_bias_deg_h``; none: 0 |
-    | DVL | ``sideways_m_s`` to starboard, ``forward_m_s`` | ``sideways_std_m_s``, ``forward_std_m_s``, of a reading |
+    | | | ``yaw_rate_bias_deg_h``; default: 0 |
+    | DVL | ``sideways_m_s`` to starboard, ``forward_m_s`` | ``sideways_std_m_s``, ``forward_std_m_s``, per reading |
     | depth | ``depth_m`` | ``depth_std_m`` |
     | compass | ``heading_deg``, clockwise from north | ``heading_std_deg`` |
-    | | or ``compass_deg``; beside columns of poses only this | ``compass_std_deg`` |
-    | dead reckoning | ``reckoned_x_m``, ``reckoned_y_m`` | ``reckoned_walk_m_rts``, after a second |
+    | | or ``compass_deg``; the only choice in a file with poses | ``compass_std_deg`` |
+    | dead reckoning | ``reckoned_x_m``, ``reckoned_y_m`` | ``reckoned_walk_m_rts``, after one second |
     | | ``reckoned_heading_deg`` | ``reckoned_walk_deg_rts`` |
 
     Raises:
-        MitsonarError: unreadable file, no column of a sensor, one without its noise, words that are no numbers, times that
-            do not increase.
+        MitsonarError: an unreadable file, no sensor column, a sensor without its noise, cells that are not numbers, or times
+            that do not increase.
     """
     table = CsvTable(Path(path))
     time = _column(table, _time_name(table), whole=True)
@@ -488,7 +495,7 @@ def load_sensors(path: str | Path) -> VehicleSensors:
 
 
 def save_sensors(path: str | Path, sensors: VehicleSensors) -> None:
-    """Write sensors to a CSV file that :func:`load_sensors` reads, whole or absent; a row for each time of any sensor."""
+    """Write sensors atomically to a CSV file for :func:`load_sensors`, with a row for each time of any sensor."""
     columns: dict[str, tuple[Array, Array]] = {}
     for name, one in _named(sensors).items():
         noise, unit, noise_unit = COLUMNS[name]
@@ -512,7 +519,7 @@ def save_sensors(path: str | Path, sensors: VehicleSensors) -> None:
 
 
 def _named(sensors: VehicleSensors) -> Mapping[str, Readings]:
-    """Return the readings by the name of their column."""
+    """Return the readings by column name."""
     every = {
         "yaw_rate_deg_s": sensors.yaw_rate,
         "sideways_m_s": sensors.sideways,
@@ -524,7 +531,7 @@ def _named(sensors: VehicleSensors) -> Mapping[str, Readings]:
 
 
 def _sensor_columns(table: CsvTable) -> list[str]:
-    """Return the columns of readings that a table has; beside poses ``heading_deg`` is none."""
+    """Return the sensor columns of a table; in a table with poses, ``heading_deg`` is not one of them."""
     found = [name for name in (*COLUMNS, *RECKONED) if name in table.names]
     if not OF_POSES & set(table.names) or "heading_deg" not in found:
         return found
@@ -543,7 +550,7 @@ def _time_name(table: CsvTable) -> str:
 
 
 def _column(table: CsvTable, name: str, *, whole: bool = False) -> Array:
-    """Return a column; empty cells are nan, and refused where it must be whole."""
+    """Return a column; empty cells are nan, or rejected if the column must be complete."""
     column = table.names.index(name)
     numbers = table.at(column)
     for row, (words, number) in enumerate(zip(table.rows, numbers, strict=True), start=2):
@@ -563,7 +570,7 @@ def _first(table: CsvTable, name: str) -> float:
 
 
 def _readings(table: CsvTable, time: Array, name: str) -> Readings | None:
-    """Return the readings of a column; None where it is empty."""
+    """Return the readings of a column; None if it is empty."""
     noise, unit, noise_unit = COLUMNS[name]
     values = _column(table, name)
     known = np.isfinite(values)

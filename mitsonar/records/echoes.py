@@ -1,4 +1,4 @@
-"""Echoes: the record of every ray, between tracing and all that is computed from it; EXR in and out."""
+"""Store the echo of every traced ray, the input of all later computations, and read and write it as EXR."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ __all__ = ["CHANNELS", "Echoes", "load_exr", "save_exr"]
 
 @dataclass
 class Echoes:
-    """Echoes of rays, one value a ray: Dr.Jit arrays that are not evaluated yet, or NumPy arrays.
+    """Echoes of rays, with one value per ray: Dr.Jit arrays that are not evaluated yet, or NumPy arrays.
 
     Attributes:
-        hit: 1 where the ray met a surface, else 0 and all else 0 (``shape_id`` -1).
-        range_m: distance from the sonar to the point hit [m].
-        near_m: range where the ray's elevation cell begins on the surface (its tangent plane) [m].
-        far_m: range where it ends [m].
-        reflectivity: 0..1; where a material's law is asked, 0..1 / cosine.
+        hit: 1 if the ray met a surface, else 0, in which case all other values are 0 (``shape_id`` -1).
+        range_m: distance from the sonar to the hit point [m].
+        near_m: range at which the ray's elevation cell starts on the surface (its tangent plane) [m].
+        far_m: range at which it ends [m].
+        reflectivity: 0..1, or 0..1 / cosine for the scattering law of a material.
         cosine: |cos(angle of incidence)|.
-        solid_angle_sr: of the ray's cell [sr].
-        x, y, z: point hit in the world [m].
-        nx, ny, nz: geometric normal there.
+        solid_angle_sr: solid angle of the ray's cell [sr].
+        x, y, z: hit point in the world [m].
+        nx, ny, nz: geometric normal at the hit point.
         shape_id: index of the shape in the scene.
-        object_id: number of the object within its mesh (the mesh's attribute ``face_id``), 0 where it has none.
+        object_id: number of the object within its mesh (the mesh's attribute ``face_id``), or 0 without one.
     """
 
     hit: AnyArray
@@ -60,7 +60,7 @@ class Echoes:
         return f"Echoes({hit.size:,} rays, {int(hit.sum()):,} hit{reach})"
 
     def outside(self, sonar: Sonar) -> tuple[float, float] | None:
-        """Return the nearest and farthest echo outside the window [m]; None where all lie inside. NumPy arrays only."""
+        """Return the nearest and farthest echo outside the window [m], or None; requires NumPy arrays."""
         near, far = (self.range_m, self.range_m) if sonar.model == "thesis" else (self.near_m, self.far_m)
         missed = (far < sonar.range_min) | (near >= sonar.range_max)
         found = self.range_m[(self.hit > 0) & missed]
@@ -68,21 +68,21 @@ class Echoes:
 
 
 CHANNELS = tuple(field.name for field in fields(Echoes))
-"""Channels of the integrator ``echo`` and of an EXR of ``echoes/``, in this order; EXR files sort them by name."""
+"""Channels of the integrator ``echo`` and of an EXR file of ``echoes/``, in this order; EXR files sort them by name."""
 
 
 LIMITS = (
     *(("hit", 0, 1), ("reflectivity", 0, 1001), ("cosine", 0, 1.001), ("solid_angle_sr", 0, 13), ("range_m", 0, 1e9)),
     *(("shape_id", -1, 2**24), ("nx", -1.001, 1.001), ("ny", -1.001, 1.001), ("nz", -1.001, 1.001)),
 )
-"""Channels with their least and greatest values."""
+"""Smallest and largest values of the channels."""
 
 INFLATION = 1032
-"""Largest factor by which deflated pixels can grow."""
+"""Largest factor by which deflated pixels can grow on decompression."""
 
 
 def save_exr(path: str | Path, echoes: Echoes, sonar: Sonar) -> None:
-    """Write one frame's echoes ``(rays_per_beam, columns)``, float32, one channel each."""
+    """Write the echoes of one frame ``(rays_per_beam, columns)`` as float32, with one channel per field."""
     import OpenEXR
 
     shape = (sonar.rays_per_beam, sonar.columns)
@@ -93,10 +93,10 @@ def save_exr(path: str | Path, echoes: Echoes, sonar: Sonar) -> None:
 
 
 def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
-    """Read one frame's echoes, film order, as flat float32 arrays.
+    """Read the echoes of one frame as flat float32 arrays, in film order.
 
     Raises:
-        MitsonarError: not an EXR file, channels missing, another size than the sonar's, values out of bounds.
+        MitsonarError: not an EXR file, missing channels, a size that differs from the sonar's, or values out of bounds.
     """
     import OpenEXR
 
@@ -110,7 +110,7 @@ def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
             channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     except MitsonarError as error:
         raise MitsonarError(f"{path} {error}") from None
-    except Exception as error:  # OpenEXR raises bare exceptions of several kinds
+    except Exception as error:  # OpenEXR raises bare exceptions of several types
         raise MitsonarError(f"cannot read echoes {path}: {error}; render them again with --exr") from None
     values: dict[str, NDArray[np.float32]] = {}
     for name in CHANNELS:
@@ -130,10 +130,10 @@ def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
 
 
 def _check_header(header: dict[str, PlainValue], names: list[str], shape: tuple[int, int], size: int) -> None:
-    """Check a file's header before its pixels are read.
+    """Check the header of a file before its pixels are read.
 
     Raises:
-        MitsonarError: another size than the sonar's, or more pixels than its bytes can hold.
+        MitsonarError: a size that differs from the sonar's, or more pixels than the file can contain.
     """
     low, high = (np.asarray(corner).tolist() for corner in header["dataWindow"])
     found = (high[1] - low[1] + 1, high[0] - low[0] + 1)

@@ -1,4 +1,4 @@
-"""Complex channel impulse responses in the one form that all later stages read, and the file ``responses.npz``."""
+"""Store complex channel impulse responses in the common format of ``responses.npz`` that all later stages read."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ COLUMNS = {
 
 @dataclass
 class ImpulseResponses:
-    """Responses of one instrument.
+    """Channel impulse responses of one instrument.
 
     Attributes:
         response: complex baseband ``(pings, receivers, taps)`` complex64; receivers in the order of ``sonar.receivers``.
-        time_s: when each ping was sent ``(pings,)`` [s].
+        time_s: transmission time of each ping ``(pings,)`` [s].
         sonar: the instrument.
-        poses: x, y, z [m], pitch, roll, heading [rad] of the transmitter when it was sent ``(pings, 6)``, where known.
-        velocity: of the vehicle in its own axes, starboard, forward, up [m/s], and its turn to starboard [rad/s]
-            ``(pings, 4)``, where known.
-        height_m: of the transmitter over the ground below ``(pings,)``, where known.
-        echoes: number of echoes in each response ``(pings, receivers)``, where known.
-        dropped: number of echoes from beyond ``range_max`` ``(pings, receivers)``, where known.
-        about: further notes for the file.
+        poses: x, y, z [m], pitch, roll, heading [rad] of the transmitter at transmission ``(pings, 6)``, if known.
+        velocity: velocity of the vehicle in its own axes, starboard, forward, up [m/s], and turn rate to starboard [rad/s]
+            ``(pings, 4)``, if known.
+        height_m: height of the transmitter over the ground below ``(pings,)``, if known.
+        echoes: number of echoes in each response ``(pings, receivers)``, if known.
+        dropped: number of echoes from beyond ``range_max`` ``(pings, receivers)``, if known.
+        about: further metadata for the file.
     """
 
     response: NDArray[np.complex64]
@@ -87,13 +87,13 @@ class ImpulseResponses:
         return self.sonar.delay_s
 
     def select(self, index: slice | NDArray[np.integer] | NDArray[np.bool_]) -> ImpulseResponses:
-        """Select some of the pings."""
+        """Return a subset of the pings."""
         picked = {name: getattr(self, name)[index] for name in PER_PING if getattr(self, name) is not None}
         rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in picked}
         return ImpulseResponses(**picked, **rest)
 
     def arrays(self) -> dict[str, FileArray]:
-        """Return the arrays of ``responses.npz`` by name; ``sonar`` and ``about`` are JSON texts."""
+        """Return the arrays of ``responses.npz`` by name; ``sonar`` and ``about`` are JSON strings."""
         table: dict[str, FileArray] = {"delay_s": self.delay_s}
         table |= {name: getattr(self, name) for name in PER_PING if getattr(self, name) is not None}
         return table | {
@@ -102,7 +102,7 @@ class ImpulseResponses:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write ``.npz``, or a Zarr v3 group where the name ends with ``.zarr``. The npz is whole or absent."""
+        """Write an ``.npz`` file atomically, or a Zarr v3 group if the name ends with ``.zarr``."""
         path = Path(path)
         if path.suffix == ".zarr":
             import zarr
@@ -121,10 +121,10 @@ class ImpulseResponses:
 
     @classmethod
     def load(cls, path: str | Path) -> ImpulseResponses:
-        """Read a file of :meth:`save`, or a folder of ``mitsonar impulse``.
+        """Read a file written by :meth:`save`, or a folder written by ``mitsonar impulse``.
 
         Raises:
-            MitsonarError: no such file, damaged, or not responses.
+            MitsonarError: no such file, or a file that is damaged or does not hold responses.
         """
         path = Path(path)
         if os.path.isdir(path) and path.suffix != ".zarr":
@@ -138,7 +138,7 @@ class ImpulseResponses:
                 table |= {name: one[...] for name, one in table.items() if not isinstance(one, np.ndarray)}
             else:
                 table = read_npz(path)
-        except Exception as error:  # a damaged zip or Zarr raises errors of many kinds
+        except Exception as error:  # a damaged zip or Zarr raises many types of errors
             reason = " ".join(str(error).split())[:300] or type(error).__name__
             raise MitsonarError(f"cannot read responses {path}: {reason}; give what `mitsonar impulse` wrote") from None
         missing = [name for name in ("response", "time_s", "sonar") if name not in table]

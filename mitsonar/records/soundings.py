@@ -1,4 +1,4 @@
-"""Soundings: a range in each beam of each ping, as points in the world, in files of several kinds."""
+"""Store soundings, echograms and DVL readings, convert soundings to points in the world, and read and write the files."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ COLUMNS = ("time_s", "ping", "channel", "beam", "bearing_deg", *MEASURED, "x_m",
 
 @dataclass(frozen=True)
 class Soundings:
-    """Detections of consecutive pings; nan where a beam has none.
+    """Detections of consecutive pings, one per beam; nan where a beam has none.
 
     Attributes:
-        time_s: of the pings ``(pings,)`` [s].
-        poses: of the vehicle ``(pings, 6)`` [m, rad].
+        time_s: times of the pings ``(pings,)`` [s].
+        poses: poses of the vehicle ``(pings, 6)`` [m, rad].
         sounder: the instrument.
         range_m: slant ranges ``(pings, channels, beams)`` [m].
-        level_db: of the strongest bin of each echo, of the same shape [dB].
-        quality: part of a beam's energy above the noise that lies in its echo, 0..1, of the same shape.
+        level_db: level of the strongest bin of each echo, of the same shape [dB].
+        quality: fraction of a beam's energy above the noise that lies in its echo, 0..1, of the same shape.
 
     Raises:
-        MitsonarError: shapes that do not fit.
+        MitsonarError: inconsistent shapes.
     """
 
     time_s: Array
@@ -83,17 +83,19 @@ class Soundings:
         return np.isfinite(self.range_m)
 
     def points(self) -> Array:
-        """Return the places of all soundings in the world ``(pings, channels, beams, 3)`` [m]: on the beams' axes."""
+        """Return the positions of all soundings in the world ``(pings, channels, beams, 3)`` [m], on the beam axes."""
         fans = self.sounder.fan_poses(self.poses)
         turn = vehicle_rotation(fans.reshape(-1, 6)).as_matrix().reshape(*fans.shape[:2], 3, 3)
         way = np.einsum("pcij,bj->pcbi", turn, self.sounder.directions())
         return np.asarray(fans[:, :, None, :3] + self.range_m[..., None] * way)
 
     def save(self, path: str | Path) -> None:
-        """Write a file by its ending, whole or absent: ``.npz``, or of the soundings found ``.csv``, ``.xyz`` or ``.ply``.
+        """Write a file atomically, in the format of its suffix.
+
+        ``.npz`` holds everything; ``.csv``, ``.xyz`` and ``.ply`` hold the valid soundings.
 
         Raises:
-            MitsonarError: another ending; no sounding to write.
+            MitsonarError: another suffix, or no sounding to write.
         """
         path = Path(path)
         if path.suffix == ".npz":
@@ -109,16 +111,16 @@ class Soundings:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read an npz file of :meth:`save`.
+        """Read an npz file written by :meth:`save`.
 
         Raises:
-            MitsonarError: unreadable, or not such a file.
+            MitsonarError: a file that cannot be read or has another format.
         """
         sounder, arrays = load_pings(path, MEASURED)
         return cls(arrays["time_s"], arrays["poses"], sounder, *(arrays[name] for name in MEASURED))
 
     def table(self) -> Array:
-        """Return the soundings found ``(found, columns)``; columns: :data:`mitsonar.records.soundings.COLUMNS`."""
+        """Return the valid soundings ``(found, columns)``, with :data:`mitsonar.records.soundings.COLUMNS`."""
         ping, channel, beam = np.nonzero(self.found)
         bearing = np.degrees(self.sounder.fan.bearing_rad)[beam]
         measured = [getattr(self, name)[self.found] for name in MEASURED]
@@ -136,7 +138,7 @@ class Soundings:
         return text.getvalue().encode()
 
     def _ply(self) -> bytes:
-        """Return a binary PLY of points, grey by their level."""
+        """Return a binary PLY point cloud, in grey values by level."""
         import trimesh
 
         level = self.level_db[self.found]
@@ -147,23 +149,22 @@ class Soundings:
         return bytes(cloud.export(file_type="ply"))
 
 
-# ---------------- Echograms: levels over time and range of instruments with one beam a fan, such as a side-scan's
-# waterfall
+# ---------------- Echograms
 
 
 @dataclass(frozen=True)
 class Echogram:
-    """Consecutive pings.
+    """Levels over time and range of an instrument with one beam per fan, such as a side-scan waterfall.
 
     Attributes:
-        time_s: of the pings ``(pings,)`` [s].
-        poses: of the vehicle ``(pings, 6)`` [m, rad].
+        time_s: times of the pings ``(pings,)`` [s].
+        poses: poses of the vehicle ``(pings, 6)`` [m, rad].
         sounder: the instrument.
-        levels: intensities ``(pings, channels, bins)`` float32, after the instrument's gain over range.
-        height_m: of the first fan over what is straight below it ``(pings,)`` [m]; nan where there is nothing.
+        levels: intensities ``(pings, channels, bins)`` float32, after the range-dependent gain of the instrument.
+        height_m: height of the first fan over the surface straight below ``(pings,)`` [m]; nan if there is none.
 
     Raises:
-        MitsonarError: shapes that do not fit.
+        MitsonarError: inconsistent shapes.
     """
 
     time_s: NDArray[np.float64]
@@ -202,7 +203,7 @@ class Echogram:
         return np.asarray(self.levels[:, self.sounder.channels.index(name)])
 
     def decibels(self, span_db: float = 60.0) -> NDArray[np.float32]:
-        """Return the levels in dB of full scale, 0 to ``-span_db`` ``(pings, channels, bins)``.
+        """Return the levels in dB relative to full scale, 0 to ``-span_db`` ``(pings, channels, bins)``.
 
         Full scale is the 99.9th percentile of all levels.
         """
@@ -211,48 +212,50 @@ class Echogram:
         return np.asarray(10 * np.log10(np.clip(self.levels / np.float32(full), least, 1)), dtype=np.float32)
 
     def save(self, path: str | Path) -> None:
-        """Write an npz file, whole or absent."""
+        """Write an npz file atomically."""
         names = ("time_s", "poses", "levels", "height_m")
         save_pings(path, self.sounder, {name: getattr(self, name) for name in names})
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file of :meth:`save`.
+        """Read a file written by :meth:`save`.
 
         Raises:
-            MitsonarError: unreadable, or not such a file.
+            MitsonarError: a file that cannot be read or has another format.
         """
         sounder, arrays = load_pings(path, ("levels", "height_m"))
         return cls(arrays["time_s"], arrays["poses"], sounder, arrays["levels"], arrays["height_m"])
 
 
-# ---------------- How fast what each pixel shows comes nearer or goes away: the labels' truth of motion
+# ---------------- Range rates of pixels
 
 
 def range_rates(frames: SonarFrames, velocity: Array | None = None) -> NDArray[np.float32]:
-    """Compute the rate of the range of the strongest echo of each pixel, like ``image`` [m/s]; nan where there is none.
+    """Compute the range rate of the strongest echo in each pixel, like ``image`` [m/s]; nan without an echo.
 
-    It is (v_echo - v_sonar) . d: positive where the echo goes away. A still sonar and scene give 0. What deforms moves as
-    the axes of its body do.
+    It is (v_echo - v_sonar) . d, which is positive for a receding echo. A stationary sonar and scene give 0. Deforming
+    objects are assumed to move with the axes of their body.
 
     Args:
-        frames: with poses, and rendered with labels.
-        velocity: of the sonar in the world's axes ``(frames, 3)`` [m/s]; default: from its poses and times.
+        frames: frames with poses, rendered with labels.
+        velocity: velocity of the sonar in world axes ``(frames, 3)`` [m/s]; default: from its poses and times.
 
     Raises:
-        MitsonarError: no labels, no poses, or one frame without a velocity.
+        MitsonarError: no labels, no poses, or a single frame without a velocity.
     """
     if frames.elevation_rad is None or frames.poses is None:
         raise MitsonarError("range rates need labels and poses: render with --labels")
     time = frames.time_s if frames.time_s.ndim == 1 else frames.time_s.mean(axis=1)
     if velocity is None and len(frames) < 2:
         raise MitsonarError("one frame tells no velocity of the sonar: give velocity (1, 3) in m/s")
+    # 1. Velocity of the sonar.
     own = np.gradient(frames.poses[:, :3], time, axis=0) if velocity is None else np.asarray(velocity, dtype=float)
     if own.shape != (len(frames), 3):
         raise MitsonarError(f"the sonar's velocity must be ({len(frames)}, 3) in m/s: got {own.shape}")
     found = np.full(frames.image.shape, np.nan, np.float32)
     bodies = body_of_pixels(frames)
     for number in range(len(frames)):
+        # 2. Direction and position of the echo of each pixel in the world, from its bearing and elevation.
         bins, beams = np.nonzero(np.isfinite(frames.elevation_rad[number]))
         elevation = frames.elevation_rad[number, bins, beams]
         poses = frames.poses[None, number] if frames.beam_poses is None else frames.beam_poses[number]
@@ -260,13 +263,14 @@ def range_rates(frames: SonarFrames, velocity: Array | None = None) -> NDArray[n
         own_axes = directions(frames.sonar.bearing, frames.bearing_rad[beams], elevation)
         way = np.einsum("nij,nj->ni", vehicle_rotation(poses).as_matrix()[one], own_axes)
         place = poses[one, :3] + way * frames.range_m[bins, None]
+        # 3. Relative velocity, projected on the direction.
         moves = _velocity_at(frames, number, bodies[number, bins, beams], place) - own[number]
         found[number, bins, beams] = (moves * way).sum(axis=1)
     return found
 
 
 def body_of_pixels(frames: SonarFrames) -> NDArray[np.int32]:
-    """Return the place in ``body_names`` of the body that each pixel shows, like ``image``; -1: none that moves.
+    """Return the index in ``body_names`` of the body that each pixel shows, like ``image``; -1 for no moving body.
 
     Raises:
         MitsonarError: no labels.
@@ -277,13 +281,13 @@ def body_of_pixels(frames: SonarFrames) -> NDArray[np.int32]:
     for number, name in enumerate(frames.body_names):
         if name in frames.object_names:
             found[frames.object_id == frames.object_names.index(name)] = number
-        if name in frames.shape_names:  # a mesh that numbers its own objects
+        if name in frames.shape_names:  # a mesh that numbers its objects
             found[frames.shape_id == frames.shape_names.index(name)] = number
     return found
 
 
 def _velocity_at(frames: SonarFrames, number: int, body: NDArray[np.int32], place: Array) -> Array:
-    """Return the velocity of what is at places ``(n, 3)`` in one frame: v + w x r of its body, 0 of what is still."""
+    """Return the velocity at positions ``(n, 3)`` in one frame: v + w x r of the body there, or 0 for stationary parts."""
     found = np.zeros_like(place)
     if frames.body_poses is None or frames.body_velocities is None:
         return found
@@ -293,8 +297,7 @@ def _velocity_at(frames: SonarFrames, number: int, body: NDArray[np.int32], plac
     return found
 
 
-# ---------------- Readings of a DVL: range rates of its beams, the velocity and altitude that follow from them, and
-# when they are lost
+# ---------------- DVL readings
 
 
 AXES = ("starboard", "forward", "up")
@@ -302,13 +305,13 @@ AXES = ("starboard", "forward", "up")
 
 @dataclass(frozen=True)
 class DvlReadings:
-    """Readings of consecutive pings; nan where the bottom lock is lost.
+    """DVL readings of consecutive pings; nan where bottom lock is lost.
 
     Attributes:
         soundings: ranges of the beams.
-        range_rate: of the beams, growing ranges positive ``(pings, beams)`` [m/s]; nan without an echo.
-        velocity: of the vehicle in its own axes, starboard, forward, up ``(pings, 3)`` [m/s].
-        covariance: of the velocity ``(pings, 3, 3)``, from the noise of a range rate.
+        range_rate: range rates of the beams, positive for increasing range ``(pings, beams)`` [m/s]; nan without an echo.
+        velocity: velocity of the vehicle in its own axes, starboard, forward, up ``(pings, 3)`` [m/s].
+        covariance: covariance of the velocity ``(pings, 3, 3)``, from the noise of a range rate.
     """
 
     soundings: Soundings
@@ -318,27 +321,27 @@ class DvlReadings:
 
     @classmethod
     def of(cls, soundings: Soundings, range_rate: Array) -> Self:
-        """Compute velocities from range rates ``(pings, beams)``; beams without an echo do not count."""
+        """Compute velocities from range rates ``(pings, beams)``, ignoring beams without an echo."""
         sounder = soundings.sounder
         heard = np.where(soundings.found[..., 0], range_rate, np.nan)
         return cls(soundings, heard, *velocity_of(heard, sounder.axes, sounder.beam_std_m_s))
 
     @property
     def locked(self) -> NDArray[np.bool_]:
-        """Return in which pings the velocity is known ``(pings,)``."""
+        """Return whether the velocity is known in each ping ``(pings,)``."""
         return np.asarray(np.isfinite(self.velocity).all(axis=1), dtype=np.bool_)
 
     @property
     def altitude_m(self) -> Array:
-        """Return the height of the vehicle over the mean of the points that the beams meet ``(pings,)`` [m]."""
+        """Return the height of the vehicle over the mean of the points where the beams hit ``(pings,)`` [m]."""
         depth = self.soundings.poses[:, None, 2] - self.soundings.points()[:, :, 0, 2]
         there = np.isfinite(depth)
         return np.where(there.any(axis=1), np.nansum(depth, axis=1) / np.maximum(there.sum(axis=1), 1), np.nan)
 
     def level(self) -> tuple[Array, Array]:
-        """Return velocities and covariances in level axes: sideways, forward, up ``(pings, 3)`` and ``(pings, 3, 3)``.
+        """Return velocities ``(pings, 3)`` and covariances ``(pings, 3, 3)`` in level axes: sideways, forward, up.
 
-        Pitch and roll are those of the poses, as a DVL with an attitude sensor has them.
+        Pitch and roll are taken from the poses, as in a DVL with an attitude sensor.
         """
         upright = self.soundings.poses.copy()
         upright[:, 3:5] = 0
@@ -346,7 +349,7 @@ class DvlReadings:
         return np.einsum("pij,pj->pi", turn, self.velocity), turn @ self.covariance @ turn.swapaxes(1, 2)
 
     def save(self, path: str | Path) -> None:
-        """Write a CSV file, whole or absent; cells are empty where nothing is known."""
+        """Write a CSV file atomically; unknown values are empty cells."""
         beams = len(self.soundings.sounder.channels)
         std = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         names = [f"{axis}_m_s" for axis in AXES] + [f"{axis}_std_m_s" for axis in AXES] + ["altitude_m"]
@@ -361,15 +364,15 @@ class DvlReadings:
 
 
 def velocity_of(range_rate: Array, axes: Array, std_m_s: float) -> tuple[Array, Array]:
-    """Solve for velocities by least squares: each rate is minus the velocity along its beam.
+    """Solve for velocities by least squares, where each range rate is minus the velocity along its beam.
 
     Args:
-        range_rate: of the beams ``(pings, beams)`` [m/s], nan where there is none.
-        axes: of the beams ``(beams, 3)``, unit vectors.
-        std_m_s: noise of a rate.
+        range_rate: range rates of the beams ``(pings, beams)`` [m/s], nan if missing.
+        axes: axes of the beams ``(beams, 3)``, unit vectors.
+        std_m_s: standard deviation of a range rate [m/s].
 
     Returns:
-        Velocities ``(pings, 3)`` and covariances ``(pings, 3, 3)``, nan with fewer than three beams, or beams in a plane.
+        Velocities ``(pings, 3)`` and covariances ``(pings, 3, 3)``, nan with fewer than three beams or coplanar beams.
     """
     heard = np.isfinite(range_rate)
     weight = heard.astype(float)
@@ -381,11 +384,11 @@ def velocity_of(range_rate: Array, axes: Array, std_m_s: float) -> tuple[Array, 
     return np.einsum("pij,pj->pi", inverse, right), inverse * std_m_s**2
 
 
-# ---------------- The npz files of sounders: arrays of pings with the instrument in JSON, checked when they are read
+# ---------------- npz files of sounders
 
 
 def save_pings(path: str | Path, sounder: Sounder, arrays: dict[str, NDArray[Any]]) -> None:
-    """Write arrays and the instrument to an npz file, whole or absent."""
+    """Write arrays and the instrument, as JSON, to an npz file, atomically."""
     buffer = io.BytesIO()
     told = sounder.model_dump(mode="json", exclude={"fan"}) | {"fan": sounder.fan.model_dump(mode="json")}
     table: dict[str, Any] = {"sounder": np.array(json.dumps(told)), **arrays}
@@ -394,16 +397,18 @@ def save_pings(path: str | Path, sounder: Sounder, arrays: dict[str, NDArray[Any
 
 
 def load_pings(path: str | Path, names: tuple[str, ...]) -> tuple[Sounder, dict[str, NDArray[Any]]]:
-    """Read a file of :func:`save_pings`: the instrument and the named arrays, finite or nan, with the same first length.
+    """Read a file of :func:`save_pings`: the instrument and the named arrays, checked for type and length.
+
+    Infinite values are rejected; nan is allowed.
 
     Raises:
-        MitsonarError: unreadable, or not such a file.
+        MitsonarError: a file that cannot be read or has another format.
     """
     try:
         found = read_npz(path)
     except MitsonarError:
         raise
-    except Exception as error:  # damaged bytes raise errors of many kinds
+    except Exception as error:  # damaged bytes raise many types of errors
         raise MitsonarError(f"cannot read {path}: {error}; give a file that `mitsonar sound` wrote") from None
     lacking = [name for name in (*names, "sounder", "time_s", "poses") if name not in found]
     if lacking:
