@@ -1,11 +1,11 @@
-"""mitsonar: sonar images and impulse responses from Mitsuba 3 scenes, and the motion of the vehicle that received them.
+"""mitsonar: simulate sonar images and impulse responses of Mitsuba 3 scenes, and estimate the vehicle's motion from them.
 
     import mitsonar
     scene = mitsonar.load_scene("sunken_ship")
     frames = mitsonar.Simulator(scene, mitsonar.load_sonar("didson300")).render([mitsonar.Pose(0, 0, 3)])
 
-Importing mitsonar loads no Mitsuba and sets no variant. It registers the plugins (``imaging_sonar``, ``echo`` ...) for the
-variant that is set, now or later.
+Importing mitsonar neither loads Mitsuba nor sets a variant. It registers the plugins (``imaging_sonar``, ``echo`` ...) with
+the current Mitsuba variant, or with whichever variant is set later.
 """
 
 from __future__ import annotations

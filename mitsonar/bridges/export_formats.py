@@ -1,4 +1,4 @@
-"""The layouts by name, and an export from beginning to end."""
+"""How frames are exported in the layouts of other tools: COCO, YOLO, Hugging Face, WebDataset, KITTI, neusis."""
 
 from __future__ import annotations
 
@@ -63,17 +63,19 @@ __all__ = [
 ]
 
 
-# ---------------- COCO and YOLO: pictures with boxes, masks and classes, in parts for training, validation and test
+# ---------------- COCO and YOLO
 
 
 YOLO_PARTS = {"train": "train", "validation": "val", "test": "test"}
 
 
 def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
-    """Write ``images/PART/`` and ``annotations/PART.json``, masks as compressed runs; yield after each frame.
+    """Write COCO's ``images/PART/`` and ``annotations/PART.json``, with masks as compressed runs; yield after each frame.
 
-    Categories are classes, numbered from 1. Attributes of an annotation name its shape and its object.
+    Categories are classes, numbered from 1. The attributes of an annotation name its shape and its object.
     """
+    # 1. Write the pictures, and the records of images and annotations line by line into temporary files: all of them
+    #    together may exceed the memory.
     refuse_unlabelled(source)
     (folder / "annotations").mkdir()
     columns, rows = pictures.size
@@ -99,11 +101,12 @@ def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) 
                 found = _annotation(count, shot.number + 1, region, names, (rows, columns))
                 tables[shot.part][1].write(f"{json_line(found)}\n")
             yield 1
+    # 2. Join the temporary files of each part into one JSON document.
     pictures.refuse_none(source.frames)
     table = [{"id": kind + 1, "name": name, "supercategory": "shape"} for kind, name in enumerate(pictures.classes)]
     about = {"description": source.about or source.name, "contributor": "mitsonar", "picture": pictures.picture_kind}
     for part in parts:
-        with (folder / "annotations" / f"{part}.json").open("w") as whole:  # piece by piece: it may exceed the memory
+        with (folder / "annotations" / f"{part}.json").open("w") as whole:  # line by line
             whole.write(f'{{"info":{json_line(about)},"licenses":[],"categories":{json_line(table)},"images":[')
             _copy(folder / f"{part}.images", whole)
             whole.write('],"annotations":[')
@@ -112,7 +115,7 @@ def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) 
 
 
 def _parts_of(source: ExportSource) -> list[str]:
-    """Return the parts that have frames; a warning names what a detector needs and lacks."""
+    """Return the names of the parts that have frames; warn if training or validation, which a detector needs, has none."""
     parts = [part for part in YOLO_PARTS if (source.part == part).any()]
     lacking = [part for part in ("train", "validation") if part not in parts]
     if lacking:
@@ -121,7 +124,7 @@ def _parts_of(source: ExportSource) -> list[str]:
 
 
 def _regions(source: ExportSource, pictures: LabelledPictures, shot: Shot) -> list[Region]:
-    """Return the regions of a frame, and count them."""
+    """Return the regions of a frame, and add them to the counts of ``pictures``."""
     found = pictures.regions(shot.frames, shot.index, float(source.raised_db[shot.number]))
     pictures.count(shot.part, found)
     return found
@@ -141,7 +144,7 @@ def _annotation(number: int, image: int, region: Region, names: tuple[str, str],
 
 
 def _copy(part: Path, whole: IO[str]) -> None:
-    """Append the lines of a file, with commas between them, and remove it."""
+    """Append the lines of a file to another, separated by commas, and remove the first file."""
     with part.open() as lines:
         for place, line in enumerate(lines):
             whole.write(("," if place else "") + line.rstrip("\n"))
@@ -149,10 +152,10 @@ def _copy(part: Path, whole: IO[str]) -> None:
 
 
 def export_yolo(source: ExportSource, pictures: LabelledPictures, folder: Path, *, polygons: bool = False) -> Iterator[int]:
-    """Write ``images/PART/``, ``labels/PART/`` and ``data.yaml``; yield after each frame.
+    """Write YOLO's ``images/PART/``, ``labels/PART/`` and ``data.yaml``; yield after each frame.
 
-    A line of a label file is the class and the middle and size of the box, or with ``polygons`` the outline, as parts of the
-    picture. Parts are train, val and test; ``data.yaml`` names those that have frames.
+    A line of a label file has the class and the centre and size of the box, or with ``polygons`` the outline, as fractions
+    of the picture's size. Parts are train, val and test; ``data.yaml`` lists those that have frames.
     """
     refuse_unlabelled(source)
     parts = [YOLO_PARTS[part] for part in _parts_of(source)]
@@ -181,42 +184,42 @@ def _yolo_lines(region: Region, size: tuple[int, int], polygons: bool) -> list[s
 
 
 def _outlines(region: Region) -> list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
-    """Return the outer outlines of a region ``(points, 2)`` along its pixels' middles; specks of two pixels have none."""
+    """Return the outer outlines of a region ``(points, 2)`` through pixel centres, without those of fewer than 3 points."""
     import cv2
 
     found, _ = cv2.findContours(region.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     return [one[:, 0, :].astype(float) + 0.5 for one in found if len(one) >= 3]
 
 
-# ---------------- The data set of a detector: random views of a scene or of generated worlds, with labels, noise and
-# three parts
+# ---------------- Recipe of a detector's data set
 
 
 CLEAR_M = 0.3
-"""Distance of the sonar from the box around an object and from the ground, at least [m]."""
+"""Smallest distance of the sonar from the bounding box of an object and from the ground [m]."""
 
 GROUND = 0.9
-"""A shape is ground where it covers this part of the scene's edge."""
+"""Fraction of the scene's edge that a shape covers if it is ground."""
 
 REACH = 0.6
-"""Window of the sonar, at most, as a part of the scene's edge: a fan must find places to lie inside."""
+"""Largest range of the sonar as a fraction of the scene's edge; a longer fan would hardly fit inside the scene."""
 
 SHARES = 0.7, 0.15, 0.15
 FRAMES_OF_WORLD = 10
-"""Frames of a generated world, where there are enough of them."""
+"""Frames per generated world, if there are enough worlds."""
 
 
 @dataclass(frozen=True)
 class DetectorViews:
-    """What the pictures of a detector are taken of.
+    """The views of a detector's data set.
 
     Attributes:
         frames: number of pictures.
-        heights: of the sonar, least and largest [m]; None: 1.5 to 3 m over a scene's ground, or as the recipe says.
-        pitch_deg: least and largest, > 0 down [deg]; None: 10 to 30, or as the recipe says.
-        noise_db: what is added to the noise of the sonar [dB]; each scene, or part of one, takes the next.
+        heights: smallest and largest height of the sonar [m]; None: 1.5 to 3 m above the ground of a scene, or as in the
+            recipe.
+        pitch_deg: smallest and largest pitch, > 0 looks down [deg]; None: 10 to 30, or as in the recipe.
+        noise_db: levels added to the noise of the sonar [dB]; scenes, or parts of one scene, take them in turn.
         split: shares of training, validation and test.
-        seed: of poses, worlds and noise.
+        seed: seed of poses, worlds and noise.
     """
 
     frames: int
@@ -230,24 +233,26 @@ class DetectorViews:
 def detector_recipe(
     scene: str | Path, views: DetectorViews, sonar: str | None = None, changes: Keys | None = None
 ) -> tuple[Recipe, list[tuple[str, str]], list[str]]:
-    """Make the recipe of a detector's data set: one ping a sequence, at random places, with labels of shapes and objects.
+    """Make the recipe of a detector's data set: random views, one ping per sequence, with labels of shapes and objects.
 
-    In a scene file the sonar stays over the ground, and clear of the boxes around all other shapes. Worlds of a recipe are
-    split by scene, views of one scene file by sequence.
+    In a scene file the sonar stays above the ground, and clear of the bounding boxes of all other shapes. Worlds of a recipe
+    are split by scene, views of one scene file by sequence.
 
     Args:
-        scene: a Mitsuba XML file, the name of a shipped scene, or a recipe of a data set, whose worlds are taken.
-        views: how many, from where, and in what noise.
-        sonar: preset or YAML file; default: the sonar of the scene or of the recipe.
+        scene: a Mitsuba XML file, the name of a shipped scene, or the recipe of a data set whose worlds are used.
+        views: number of views, their poses and their noise.
+        sonar: preset or YAML file of a sonar; default: the sonar of the scene or of the recipe.
         changes: keys of the recipe to change, with dots between the levels.
 
     Returns:
-        The recipe; classes that leave out the ground, as rules of
-        :class:`~mitsonar.bridges.export_source.LabelledPictures`; sentences on what was decided.
+        The recipe; rules for :class:`~mitsonar.bridges.export_source.LabelledPictures` that leave out the ground; and
+        sentences that explain automatic choices.
 
     Raises:
-        MitsonarError: fewer frames than parts, no such scene, sonar or ground, a height within the ground.
+        MitsonarError: there are fewer frames than parts; the scene, its sonar or its ground is missing; or a height lies
+            within the ground.
     """
+    # 1. Start from the keys of the recipe, or from those derived from the scene.
     parts = sum(share > 0 for share in views.split)
     if views.frames < parts:
         raise MitsonarError(f"--frames must be at least {parts}, one for each part of --split: got {views.frames}")
@@ -256,6 +261,7 @@ def detector_recipe(
     fields, rules, notes = _of_recipe(str(scene), views) if of_recipe else _of_scene(str(scene), views, sonar, chosen)
     if of_recipe and sonar is not None:
         fields["sonar"] = _sonar_fields(sonar)
+    # 2. Apply the views: isolated pings anywhere, with the requested heights, pitches, noise and split.
     flight = fields["flight"]
     flight |= {"pings": 1, "jump_m": None}
     flight |= {} if views.heights is None else {"height_m": list(views.heights)}
@@ -265,6 +271,7 @@ def detector_recipe(
     train, validation, test = views.split
     fields |= {"frames": 1, "labels": ["shape_id", "object_id"], "noise_db": list(views.noise_db), "seed": views.seed}
     fields["split"] = {**fields["split"], "train": train, "validation": validation, "test": test}
+    # 3. Apply the user's changes. A coherent model labels only what its pictures show, unless the user decides otherwise.
     for key, value in (changes or {}).items():
         set_key(fields, key, value)
     recipe = recipe_from(fields)
@@ -274,20 +281,20 @@ def detector_recipe(
 
 
 def _sonar_fields(name: str) -> Keys:
-    """Return the keys of a sonar, of a preset or a file."""
+    """Return the keys of a sonar, given the name of a preset or a file."""
     if name in named_sonars():
         return {"preset": name}
     return load_sonar(name).model_dump(exclude_unset=True)
 
 
 def _scenes(frames: int, worlds: Sequence[Keys]) -> list[Keys]:
-    """Spread frames evenly over worlds, a sequence a frame."""
+    """Distribute frames evenly over worlds, one sequence per frame; return the scenes of the recipe."""
     counts = np.diff(np.rint(np.linspace(0, frames, len(worlds) + 1)).astype(int))
     return [{"count": 1, "sequences": int(count), "world": world} for count, world in zip(counts, worlds, strict=True)]
 
 
 def _of_recipe(name: str, views: DetectorViews) -> tuple[Keys, list[tuple[str, str]], list[str]]:
-    """Return the keys of a recipe whose worlds a detector shall see; several worlds a part, where they differ."""
+    """Return keys, class rules and notes for the worlds of a recipe; worlds are split by scene if the seed changes them."""
     recipe = load_recipe(name)
     groups = [group for group, one in enumerate(recipe.scenes) for _ in range(one.count)]
     wanted = max(3, len(views.noise_db), views.frames // FRAMES_OF_WORLD)
@@ -303,7 +310,8 @@ def _of_recipe(name: str, views: DetectorViews) -> tuple[Keys, list[tuple[str, s
 def _of_scene(
     name: str, views: DetectorViews, sonar: str | None, chosen: bool
 ) -> tuple[Keys, list[tuple[str, str]], list[str]]:
-    """Return the keys of a recipe of a scene file; the window is cut to the ground unless the user has chosen it."""
+    """Return keys, class rules and notes for a scene file; the range is limited by the ground, unless ``chosen``."""
+    # 1. Separate the ground from the objects.
     path = find_scene(name).resolve()
     loaded = load_scene(path)
     names, boxes = shape_names_in(loaded), shape_boxes_in(loaded)
@@ -311,12 +319,14 @@ def _of_scene(
     objects = [box for box, flat in zip(boxes, ground, strict=True) if not flat]
     if not objects:
         raise MitsonarError(f"{path} holds its ground and no objects: a detector needs some to find")
+    # 2. Keep the sonar above the highest point of the ground.
     top = float(boxes[ground, 1, 2].max())
     heights = views.heights or (top + 1.5, top + 3.0)
     if heights[0] < top + CLEAR_M:
         raise MitsonarError(
             f"--height must be at least {top + CLEAR_M:.3g} m, {CLEAR_M:g} m over the ground of {path}: got {heights[0]:g}"
         )
+    # 3. Choose the sonar, and limit its range to the size of the scene.
     found = sonar_in(loaded)
     if sonar is not None:
         instrument, keys = load_sonar(sonar), _sonar_fields(sonar)
@@ -346,10 +356,14 @@ def _of_scene(
 
 
 def _ground(path: Path, halves: NDArray[np.float64]) -> tuple[float, NDArray[np.bool_]]:
-    """Return the edge of the square around the origin that the widest shape covers [m], and which shapes cover it.
+    """Return the edge of the largest square around the origin that a shape covers [m], and the mask of the ground shapes.
+
+    Args:
+        path: the scene file, for error messages.
+        halves: half the edge of the square that each shape covers ``(shapes,)`` [m].
 
     Raises:
-        MitsonarError: no shape lies around the origin.
+        MitsonarError: no shape covers the origin.
     """
     if not len(halves):
         raise MitsonarError(f"{path} holds no shapes: give a scene with a ground and objects")
@@ -360,7 +374,7 @@ def _ground(path: Path, halves: NDArray[np.float64]) -> tuple[float, NDArray[np.
 
 
 def _within(sonar: Sonar, keys: Keys, size: float) -> tuple[Keys, list[str]]:
-    """Return the keys of a sonar whose window is no longer than its scene allows, and a sentence where it was cut."""
+    """Limit the range of a sonar to what its scene allows; return its keys, and a note if the range was changed."""
     reach = REACH * size
     if sonar.range_max <= reach:
         return keys, []
@@ -373,7 +387,7 @@ def _within(sonar: Sonar, keys: Keys, size: float) -> tuple[Keys, list[str]]:
     return {**keys, "range_max": reach, "range_bins": bins}, [f"{note}; --set sonar.range_max=... changes it"]
 
 
-# ---------------- Hugging Face: an image folder with a metadata.jsonl for each part, a card, and Croissant metadata
+# ---------------- Hugging Face
 
 
 CONTEXT: dict[str, PlainValue] = {
@@ -412,11 +426,15 @@ CONTEXT: dict[str, PlainValue] = {
     "subField": "cr:subField",
     "transform": "cr:transform",
 }
-"""The context that Croissant 1.0 prescribes."""
+"""JSON-LD context prescribed by Croissant 1.0."""
 
 
 def export_hugging_face(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
-    """Write ``data/PART/*.png`` with ``metadata.jsonl``, ``README.md`` and ``croissant.json``; yield after each frame."""
+    """Write an image folder of Hugging Face; yield after each frame.
+
+    Files are ``data/PART/*.png`` with a ``metadata.jsonl`` for each part, the data set's card ``README.md``, and the
+    Croissant metadata ``croissant.json``.
+    """
     counts: dict[str, int] = {}
     keys: dict[str, str] = {}
     with contextlib.ExitStack() as ends:
@@ -441,7 +459,7 @@ def export_hugging_face(source: ExportSource, pictures: LabelledPictures, folder
 
 
 def _card(source: ExportSource, pictures: LabelledPictures, counts: dict[str, int]) -> str:
-    """Return the card of the data set, whose head the hub reads."""
+    """Return the card of the data set, with the header that the hub reads."""
     parts = [{"split": part, "path": f"data/{part}/**"} for part in counts]
     head = {"task_categories": ["object-detection"], "tags": ["sonar", "simulation", "mitsonar"]}
     configs = {"configs": [{"config_name": "default", "data_files": parts}]}
@@ -454,7 +472,7 @@ def _card(source: ExportSource, pictures: LabelledPictures, counts: dict[str, in
 
 
 def _croissant(source: ExportSource, folder: Path, parts: list[str], keys: dict[str, str]) -> dict[str, PlainValue]:
-    """Return the metadata of the layout: a table of each part, and its pictures."""
+    """Return the Croissant metadata: a file and a record set for the table of each part."""
     objects: list[PlainValue] = []
     records: list[PlainValue] = []
     for part in parts:
@@ -483,18 +501,18 @@ def _croissant(source: ExportSource, folder: Path, parts: list[str], keys: dict[
     }
 
 
-# ---------------- WebDataset: tar files of samples, each a picture, its metadata and its label pictures
+# ---------------- WebDataset
 
 
 OF_SHARD = 1000
-"""Samples of a shard."""
+"""Number of samples in a shard."""
 
 
 def export_webdataset(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
-    """Write ``PART-000000.tar`` ... and ``about.json``; yield after each frame.
+    """Write the shards ``PART-000000.tar`` ... of a WebDataset, and ``about.json``; yield after each frame.
 
-    A sample has ``png``, ``json`` (time, pose, sequence, regions), and where there are labels ``shape.png`` and
-    ``object.png``: the label plus one, 16 bit, 0 for no echo.
+    A sample has ``png``, ``json`` (time, pose, sequence, regions), and with labels ``shape.png`` and ``object.png``: the
+    label plus one in 16 bits, 0 for no echo.
     """
     counts: dict[str, int] = {}
     with contextlib.ExitStack() as ends:
@@ -524,18 +542,18 @@ def export_webdataset(source: ExportSource, pictures: LabelledPictures, folder: 
     write_whole(folder / "about.json", as_json(told))
 
 
-# ---------------- Layouts of pictures with poses: KITTI's sequences, and the views of neusis
+# ---------------- KITTI and neusis
 
 
 CAMERA = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""A camera's axes (starboard, down, forward) as columns in (starboard, forward, up)."""
+"""Axes of a camera (starboard, down, forward), as columns in (starboard, forward, up)."""
 
 
 def export_kitti(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
-    """Write ``poses/00.txt``, ``sequences/00/times.txt`` and ``sequences/00/image_0/``; yield after each frame.
+    """Write KITTI's ``poses/00.txt``, ``sequences/00/times.txt`` and ``sequences/00/image_0/``; yield after each frame.
 
-    A line of poses is the first three rows of the matrix from the sonar's axes (x starboard, y down, z forward) to those of
-    the first frame of its sequence. Frames of a sequence follow each other.
+    A line of ``poses`` has the first three rows of the matrix from the sonar's axes (x starboard, y down, z forward) to
+    those of the first frame of its sequence. The frames of a sequence must be consecutive.
     """
     refuse_unposed(source)
     (folder / "poses").mkdir()
@@ -575,9 +593,9 @@ def export_kitti(source: ExportSource, pictures: LabelledPictures, folder: Path)
 def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
     """Write ``Data/000000.pkl`` ... and ``Config.json``, as neusis' ``load_data`` reads them; yield after each frame.
 
-    A pickle holds ``ImagingSonar``, float32 ``(bins, beams)`` in 0..1, row 0 nearest, column 0 most to *starboard*, and
-    ``PoseSensor``, the matrix ``(4, 4)`` from the sonar's axes (x forward, y to port, z up) to the world. In neusis the
-    bearing of a pixel grows to port with its column. Pictures are polar in any case.
+    A pickle contains ``ImagingSonar``, float32 ``(bins, beams)`` in 0..1, with the nearest range in row 0 and the beam
+    farthest to *starboard* in column 0, and ``PoseSensor``, the matrix ``(4, 4)`` from the sonar's axes (x forward, y to
+    port, z up) to the world. In neusis the bearing of a pixel increases to port with its column. Pictures are always polar.
     """
     refuse_unposed(source)
     (folder / "Data").mkdir()
@@ -603,14 +621,14 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
 
 
 def port_matrix(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrix ``(4, 4)`` from (forward, port, up) to the world of a pose [m, rad]."""
+    """Return the matrix ``(4, 4)`` from (forward, port, up) to the world for a pose ``(6,)`` [m, rad]."""
     place, turn = CONVENTIONS["ros-enu"].from_ours(pose[None, :3], vehicle_rotation(pose))
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turn.as_matrix()[0], place[0]
     return matrix
 
 
-# ---------------- named exports
+# ---------------- Exports by name
 
 
 Exporter = Callable[[ExportSource, LabelledPictures, Path], Iterator[int]]
@@ -623,7 +641,7 @@ EXPORTS: dict[str, Exporter] = {
     "kitti": export_kitti,
     "neusis": export_neusis,
 }
-"""What writes each layout; it yields how many more frames are done."""
+"""Writers of the layouts, by name; each yields the number of frames written since its last yield."""
 
 
 def export_to(
@@ -639,27 +657,29 @@ def export_to(
     every_class: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> LabelledPictures:
-    """Write frames in a layout of another tool; the folder is whole or absent, and a few frames at a time are in memory.
+    """Export frames in the layout of another tool.
+
+    The folder is written completely or not at all. Only a few frames are in memory at a time.
 
     Args:
         layout: a name of :data:`EXPORTS`.
-        source: of the frames.
-        out: folder to make.
+        source: frames to export.
+        out: folder to create.
         picture: ``polar`` or ``fan``.
-        classes: globs of names of shapes with their classes; see
+        classes: globs of shape names with their classes; see
             :class:`~mitsonar.bridges.export_source.LabelledPictures`.
-        least: pixels of a region, at least.
-        least_snr_db: signal-to-noise ratio of a region, at least [dB].
-        polygons: outlines in place of boxes; of YOLO.
-        every_class: refuse classes that no picture of the training part shows.
-        progress: is called with how many more frames are done.
+        least: smallest number of pixels of a region.
+        least_snr_db: smallest signal-to-noise ratio of a region [dB].
+        polygons: whether to write outlines instead of boxes; YOLO only.
+        every_class: whether to refuse classes that no picture of the training part shows.
+        progress: called with the number of frames written since the last call.
 
     Returns:
-        What made the pictures, which has counted the regions of COCO and YOLO.
+        The object that made the pictures; for COCO and YOLO it has counted the regions.
 
     Raises:
-        MitsonarError: an unknown layout, a folder that is there, frames that lack what the layout needs, COCO or YOLO
-            without any object.
+        MitsonarError: the layout is unknown, the folder exists, the frames lack what the layout needs, or an export to COCO
+            or YOLO has no object.
     """
     if layout not in EXPORTS:
         raise MitsonarError(f"unknown layout {layout!r}: {nearest_names(layout, EXPORTS)}")

@@ -1,4 +1,4 @@
-"""Frames with labels of a run, a recording or a data set, read some at a time."""
+"""How frames are read for export, with labels and poses, and how recorded frames become a data set."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ __all__ = [
 
 
 AT_ONCE_BYTES = 2**24
-"""Approximate size of the pixels and labels that are read at a time [bytes]."""
+"""Approximate size of the pixels and labels that are read at once [bytes]."""
 
 Read = Callable[[slice], SonarFrames]
 
@@ -84,16 +84,16 @@ class ExportSource:
     """Frames to export; pixels and labels are read on demand.
 
     Attributes:
-        name: of the source.
-        frames: number of them.
+        name: name of the source.
+        frames: number of frames.
         sequence: number of the sequence of each frame ``(frames,)``.
-        like: no frames, but all that is the same for each of them: sonar, ranges, bearings, names of shapes and objects.
-        labels: names of the labels that there are.
+        like: an empty set of frames with their common properties: sonar, ranges, bearings, names of shapes and objects.
+        labels: names of the available labels.
         posed: whether poses are known.
-        part: of each frame, ``train``, ``validation`` or ``test`` ``(frames,)``, as the recipe splits; else ``train``.
-        read: reads frames with labels.
-        about: what made them, for metadata.
-        raised_db: by which the noise of each frame is above that of the sonar ``(frames,)`` [dB].
+        part: part of each frame, ``train``, ``validation`` or ``test`` ``(frames,)``; without a split all are ``train``.
+        read: function that reads a slice of the frames, with labels.
+        about: description of the source, for metadata.
+        raised_db: level added to the noise of the sonar in each frame ``(frames,)`` [dB].
     """
 
     name: str
@@ -112,7 +112,7 @@ class ExportSource:
             object.__setattr__(self, "raised_db", np.zeros(self.frames))
 
     def pieces(self) -> Iterator[tuple[int, SonarFrames]]:
-        """Yield the frames a few at a time, with the number of the first."""
+        """Yield the frames in chunks, each with the number of its first frame."""
         cells = max(1, self.like.image.shape[1] * self.like.image.shape[2])
         many = max(1, AT_ONCE_BYTES // (cells * (4 + 4 * len(self.labels))))
         for first in range(0, self.frames, many):
@@ -126,13 +126,13 @@ def open_export(
 
     Args:
         where: a data set, ``frames.npz``, ``frames.zarr``, the folder of a run, or a recording.
-        view: of a data set; default: the first.
-        split: shares of training, validation and test. Sequences or scenes of a data set are dealt out, as its recipe says;
-            frames of a run or a recording are cut into three stretches of time. Default: the recipe's; of a run all frames
-            are for training.
+        view: view of a data set; default: the first.
+        split: shares of training, validation and test. A data set is divided by sequence or scene, as in its recipe; a run
+            or a recording is cut into three intervals of time. Default: the split of the recipe; for a run or a recording
+            all frames are for training.
 
     Raises:
-        MitsonarError: no frames there, shares that do not add up to 1, too few sequences or frames for them.
+        MitsonarError: there are no frames, the shares do not add up to 1, or there are too few sequences or frames for them.
     """
     if split is not None and not (min(split) >= 0 and abs(sum(split) - 1) < 1e-6):
         raise MitsonarError(f"--split is three shares that add up to 1, 0.7,0.15,0.15 for example: got {split}")
@@ -143,7 +143,7 @@ def open_export(
 
 
 def _of_frames(where: str | Path, view: str | None) -> ExportSource:
-    """Take the frames of a run or of a recording."""
+    """Open the frames of a run or of a recording."""
     if view is not None:
         raise MitsonarError(f"{where} is no data set: --view chooses among the views of one; leave it out")
     path = Path(where)
@@ -161,7 +161,7 @@ def _of_frames(where: str | Path, view: str | None) -> ExportSource:
         index = np.arange(part.start, part.stop)
         frames = source.read(index)
         labels: dict[str, Any] = {name: np.asarray(array[part]) for name, array in stored.items()}
-        # estimators are not given these, and exports are
+        # The source withholds these from estimators; exports include them.
         poses, attitude = (None if values is None else values[part] for values in (source.poses, source.attitude_rad))
         return replace(frames, poses=poses, attitude_rad=attitude, **like, **labels)
 
@@ -171,7 +171,7 @@ def _of_frames(where: str | Path, view: str | None) -> ExportSource:
 
 
 def _in_memory(frames: SonarFrames, name: str) -> ExportSource:
-    """Take frames that are in memory."""
+    """Return frames in memory as a source."""
     if not len(frames):
         raise MitsonarError(f"{name} holds no frames: give those of a finished run")
     labels = tuple(label for label in LABELS if getattr(frames, label) is not None)
@@ -185,7 +185,7 @@ def _all_train(frames: int) -> NDArray[np.str_]:
 
 
 def _labels_of_zarr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the label arrays of a long run, unread, and the names that they refer to."""
+    """Return the label arrays of a long run, not read yet, and the names of shapes and objects that they refer to."""
     found, _ = open_group(path, COLUMNS, "time_s", "frames_done")
     stored = {name: found[name] for name in LABELS if name in found}
     nothing = {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
@@ -197,10 +197,10 @@ def _labels_of_zarr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _stretches(frames: int, split: tuple[float, float, float]) -> NDArray[np.str_]:
-    """Cut frames into a stretch for each part, in the order of time.
+    """Return the part of each frame ``(frames,)`` for a division into consecutive intervals, one for each part.
 
     Raises:
-        MitsonarError: fewer frames than parts.
+        MitsonarError: there are too few frames for the parts.
     """
     wanted = [share > 0 for share in split]
     ends = np.rint(np.cumsum(split) * frames).astype(int)
@@ -214,10 +214,10 @@ def _stretches(frames: int, split: tuple[float, float, float]) -> NDArray[np.str
 
 
 def _of_data_set(url: str, view: str | None, split: tuple[float, float, float] | None) -> ExportSource:
-    """Take all frames of one view of a data set.
+    """Open all frames of one view of a data set.
 
     Raises:
-        MitsonarError: too few sequences or scenes for a split that was given.
+        MitsonarError: there are too few sequences or scenes for the given split.
     """
     store = DataStore.open(url)
     chosen = view_in(store, view)
@@ -248,10 +248,12 @@ def _of_data_set(url: str, view: str | None, split: tuple[float, float, float] |
 
 
 def _parts(store: DataStore, shares: tuple[float, float, float] | None) -> NDArray[np.str_]:
-    """Return the part of each frame by the recipe's split, or by shares; a split of samples does not divide frames.
+    """Return the part of each frame ``(frames,)`` by the recipe's split, or by the given shares.
+
+    A split by sample does not divide frames: all are for training.
 
     Raises:
-        MitsonarError: too few sequences or worlds for shares that were given.
+        MitsonarError: there are too few sequences or worlds for the given shares.
     """
     parts, split = _all_train(len(store)), store.recipe.split
     if shares is not None:
@@ -265,7 +267,7 @@ def _parts(store: DataStore, shares: tuple[float, float, float] | None) -> NDArr
         for name in ("validation", "test"):
             if getattr(split, name) > 0:
                 parts[deal(world, sequence, split, name)] = name
-    except MitsonarError as error:  # too few sequences or worlds for its parts
+    except MitsonarError as error:  # too few sequences or worlds for the parts
         if shares is not None:
             raise
         warnings.warn(f"all frames are for training: {error}", MitsonarWarning, stacklevel=2)
@@ -273,19 +275,21 @@ def _parts(store: DataStore, shares: tuple[float, float, float] | None) -> NDArr
     return parts
 
 
-# ---------------- The folder of an export, whole or absent: it gets its name when all is in it
+# ---------------- Writing an export
 
 
 MARK = ".mitsonar-export"
-"""A file in a folder that is being written: only such a folder is removed."""
+"""Name of a file that marks a folder being written; only marked folders are ever removed."""
 
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """Make a folder beside ``out``, which takes its name in the end; what is left of one that was broken off is removed.
+    """Yield a temporary folder next to ``out`` that is renamed to ``out`` on success, and removed on failure.
+
+    The remains of an interrupted export are removed first.
 
     Raises:
-        MitsonarError: something is there already.
+        MitsonarError: ``out`` exists, or a foreign folder has the temporary name.
     """
     part = out.with_name(f".{out.name}.part")
     if out.exists():
@@ -305,29 +309,29 @@ def new_folder(out: Path) -> Iterator[Path]:
 
 
 def png(picture: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    """Return a grey picture as PNG."""
+    """Return a grey picture as a PNG file."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format="PNG", compress_level=3)
     return buffer.getvalue()
 
 
 def json_line(value: object) -> str:
-    """Return a value as JSON in one line."""
+    """Return a value as one line of JSON."""
     return json.dumps(value, separators=(",", ":"), allow_nan=False)
 
 
 def digest_of(path: Path) -> str:
-    """Return the SHA-256 of a file."""
+    """Return the SHA-256 digest of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-# ---------------- One frame at a time, with what every layout says of it: its pose, and what its regions are
+# ---------------- One frame at a time
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame that is exported: its number, its part, and where it is among those that were read."""
+    """One exported frame: its number, its part, and its index among the frames that were read together."""
 
     number: int
     part: str
@@ -336,22 +340,22 @@ class Shot:
 
     @property
     def name(self) -> str:
-        """Return the name of its files."""
+        """Return the name of the frame's files, without extension."""
         return f"{self.number:06d}"
 
 
 def shots(source: ExportSource) -> Iterator[Shot]:
-    """Yield the frames of a source one by one; a few are in memory."""
+    """Yield the frames of a source one by one; only a few are in memory at a time."""
     for first, frames in source.pieces():
         for index in range(len(frames)):
             yield Shot(first + index, str(source.part[first + index]), frames, index)
 
 
 def refuse_unlabelled(source: ExportSource) -> None:
-    """Refuse frames without labels.
+    """Check that frames have labels.
 
     Raises:
-        MitsonarError: they have no ``shape_id``.
+        MitsonarError: the frames have no ``shape_id``.
     """
     if "shape_id" not in source.labels:
         raise MitsonarError(
@@ -360,17 +364,17 @@ def refuse_unlabelled(source: ExportSource) -> None:
 
 
 def refuse_unposed(source: ExportSource) -> None:
-    """Refuse frames without poses.
+    """Check that frames have poses.
 
     Raises:
-        MitsonarError: they have none.
+        MitsonarError: the frames have no poses.
     """
     if not source.posed:
         raise MitsonarError(f"{source.name} has no poses, which this layout is made of: choose another --to")
 
 
 def regions_of(shot: Shot, pictures: LabelledPictures, source: ExportSource) -> dict[str, list[object]]:
-    """Return boxes, classes and names of a frame's regions as plain lists; empty where there are no labels."""
+    """Return boxes, classes, names and objects of a frame's regions as plain lists; empty without labels."""
     raised_db = float(source.raised_db[shot.number])
     found = pictures.regions(shot.frames, shot.index, raised_db) if "shape_id" in source.labels else []
     return {
@@ -382,7 +386,7 @@ def regions_of(shot: Shot, pictures: LabelledPictures, source: ExportSource) -> 
 
 
 def pose_of(shot: Shot) -> dict[str, float]:
-    """Return time and pose of a frame [s, m, deg]; no pose where it is not known."""
+    """Return the time and the pose of a frame [s, m, deg]; without a known pose, the time alone."""
     time = float(np.mean(shot.frames.time_s[shot.index]))
     if shot.frames.poses is None:
         return {"time_s": time}
@@ -394,12 +398,11 @@ def pose_of(shot: Shot) -> dict[str, float]:
 
 
 def as_json(value: object) -> bytes:
-    """Return a value as JSON for a file."""
+    """Return a value as the content of a JSON file."""
     return (json.dumps(value, indent=2, allow_nan=False) + "\n").encode()
 
 
-# ---------------- Pictures of frames, polar or fan, with the regions that their labels make: a mask, a box and a
-# class each
+# ---------------- Pictures with labelled regions
 
 
 PictureKind: TypeAlias = Literal["polar", "fan"]
@@ -407,22 +410,22 @@ PictureKind: TypeAlias = Literal["polar", "fan"]
 Mask: TypeAlias = NDArray[np.bool_]
 
 LEAST_SNR_DB = 3.0
-"""Signal-to-noise ratio of an object that is marked, at least [dB]."""
+"""Default of the smallest signal-to-noise ratio of a labelled object [dB]."""
 
 NUMBER = re.compile(r"[\s_.-]*\d+$")
-"""The number at the end of a shape's name, with what separates it."""
+"""Pattern of the number at the end of a shape's name, with its separator."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """What one object shows in a picture.
+    """The visible region of one object in a picture.
 
     Attributes:
-        kind: number of its class, from 0; see :attr:`LabelledPictures.classes`.
-        shape: its shape's place in the scene.
-        number: of the object within its shape; 0 for none.
-        mask: of the picture ``(rows, columns)``.
-        box: first column, first row, columns, rows [pixels].
+        kind: number of its class, counted from 0; see :attr:`LabelledPictures.classes`.
+        shape: index of its shape in the scene.
+        number: number of the object within its shape; 0 if there is none.
+        mask: mask of the region ``(rows, columns)``.
+        box: bounding box: first column, first row, number of columns, number of rows [pixels].
     """
 
     kind: int
@@ -433,27 +436,26 @@ class Region:
 
 
 class LabelledPictures:
-    """Makes pictures and regions of frames of one sonar.
+    """Pictures of the frames of one sonar, polar or fan, with the regions of labelled objects.
 
     Args:
-        like: whose ranges and bearings the pictures have, and whose shapes the classes are of.
-        picture: ``polar``, a row a range, nearest above; or ``fan``, forward up, starboard to the right.
-        classes: names of shapes, as globs, and the class of each; an empty class leaves a shape out. The first glob that
-            matches counts. Shapes that none matches have their own names as classes; those whose names differ only by a
-            number at the end share one.
-        least: pixels of a region, at least.
-        least_snr_db: signal-to-noise ratio of a region, at least [dB]; see :meth:`snr_db`. ``-inf`` keeps all.
+        like: frames that define ranges, bearings and shapes.
+        picture: ``polar``, one row per range with the nearest on top; or ``fan``, forward up and starboard to the right.
+        classes: globs of shape names, each with a class; the first matching glob counts, and an empty class leaves a shape
+            out. The class of other shapes is their name; names that differ only by a final number share one class.
+        least: smallest number of pixels of a region.
+        least_snr_db: smallest signal-to-noise ratio of a region [dB]; see :meth:`snr_db`. ``-inf`` accepts all.
 
     Attributes:
         size: columns and rows of the pictures.
-        classes: their names, by number; of shapes without names those that were seen.
-        left_out: names of shapes without a class.
-        boxes: number of regions that were counted, by part and class.
-        faint: number of regions that were left out since their ratio is too low.
-        small: number of those that have too few pixels.
+        classes: names of the classes, by number; for shapes without names, the classes met so far.
+        left_out: names of the shapes without a class.
+        boxes: number of regions counted, by part and class.
+        faint: number of regions left out because their signal-to-noise ratio is too low.
+        small: number of regions left out because they have too few pixels.
 
     Raises:
-        MitsonarError: an unknown picture, a glob that matches no shape, no class that is left.
+        MitsonarError: the kind of picture is unknown, a glob matches no shape, or no class is left.
     """
 
     def __init__(
@@ -485,7 +487,7 @@ class LabelledPictures:
         self.faint = self.small = 0
 
     def _class_names(self, names: Sequence[str]) -> list[str]:
-        """Return the class of each shape; it is empty for one that is left out."""
+        """Return the class of each shape; empty for shapes that are left out."""
         stems = [NUMBER.sub("", name) or name for name in names]
         shared = Counter(stems)
         own = [stem if shared[stem] > 1 else name for name, stem in zip(names, stems, strict=True)]
@@ -495,7 +497,7 @@ class LabelledPictures:
         ]
 
     def _kind_of(self, shape: int) -> int | None:
-        """Return the number of a shape's class; None where it is left out. Classes of shapes without names are added."""
+        """Return the number of a shape's class, None if it is left out; shapes without names add their class."""
         if shape not in self._kinds:
             name = f"shape {shape}"
             kind = next((kind for glob, kind in self._rules if fnmatchcase(name, glob)), name)
@@ -505,28 +507,28 @@ class LabelledPictures:
         return self._kinds[shape]
 
     def picture(self, frames: SonarFrames, index: int) -> NDArray[np.uint8]:
-        """Return the levels of a frame ``(rows, columns)``, 0..255."""
+        """Return the picture of a frame ``(rows, columns)``, with levels 0..255."""
         image = frames.image[index]
         if self.fan is not None:
             return self.fan.picture(image)
         return image if image.dtype == np.uint8 else to_uint8(image)
 
     def label(self, frames: SonarFrames, name: str, index: int) -> NDArray[np.int64]:
-        """Return a label of a frame in the picture ``(rows, columns)``; -1 where there is none.
+        """Return a label of a frame in the layout of the picture ``(rows, columns)``; -1 without a label.
 
         Raises:
-            MitsonarError: the frames lack it.
+            MitsonarError: the frames lack the label.
         """
         shown = _label(frames, name, index)
         return shown if self.fan is None else np.asarray(nearest_cells(self.fan.fan, shown, -1), dtype=np.int64)
 
     def regions(self, frames: SonarFrames, index: int, raised_db: float = 0.0) -> list[Region]:
-        """Return what each object of each shape shows in a frame, by shape and object.
+        """Return the region of each visible object in a frame, ordered by shape and object.
 
         Args:
-            frames: with ``shape_id``.
-            index: of the frame.
-            raised_db: by which its noise is above that of the sonar [dB].
+            frames: frames with the label ``shape_id``.
+            index: index of the frame.
+            raised_db: level added to the noise of the sonar in this frame [dB].
 
         Raises:
             MitsonarError: the frames have no ``shape_id``.
@@ -551,15 +553,16 @@ class LabelledPictures:
         return found
 
     def snr_db(self, frames: SonarFrames, index: int, raised_db: float = 0.0) -> dict[tuple[int, int], float]:
-        """Compute the signal-to-noise ratio of each object in a frame, by shape and object [dB].
+        """Compute the signal-to-noise ratio of each object in a frame [dB], keyed by shape and object.
 
-        The signal is the mean level of the object's cells less the mean level of noise alone there. Noise is known of
-        frames of the model ``coherent``: that of the sonar, after the gain. In other frames it is the mean of the cells
-        without an echo; where these are dark the ratio is infinite. Of images of contrast nothing is known: the answer is
-        empty.
+        The signal is the mean level of the object's cells minus the mean level of the noise in these cells. For the model
+        ``coherent`` the noise is known: that of the sonar, after the gain. For other models it is the mean level of the
+        cells without an echo; if these are dark the ratio is infinite. For contrast images the ratio is unknown, and the
+        result is empty.
         """
         if frames.level == "contrast":
             return {}
+        # 1. Separate the cells with an echo, and determine the mean noise of each range.
         level = frames.select(slice(index, index + 1)).linear_values()[0].astype(float)
         shape = _label(frames, "shape_id", index)
         part = _label(frames, "object_id", index) if frames.object_id is not None else np.zeros_like(shape)
@@ -568,6 +571,7 @@ class LabelledPictures:
         if noise is None:
             dark = level[~echo]
             noise = np.full(len(level), float(dark.mean()) if dark.size else 0.0)
+        # 2. Sum level and noise over the cells of each object; the cell counts cancel in the ratio.
         pairs, place = np.unique(np.stack([shape[echo], part[echo]], axis=-1), axis=0, return_inverse=True)
         place = place.ravel()
         alone = np.bincount(place, np.broadcast_to(noise[:, None], level.shape)[echo])
@@ -577,14 +581,14 @@ class LabelledPictures:
         return {(int(kind), int(number)): float(one) for (kind, number), one in zip(pairs, decibels, strict=True)}
 
     def count(self, part: str, regions: Sequence[Region]) -> None:
-        """Add regions that were written to :attr:`boxes`."""
+        """Add the regions of a written frame to :attr:`boxes`."""
         self.boxes.update((part, self.classes[region.kind]) for region in regions)
 
     def refuse_none(self, frames: int) -> None:
-        """Refuse frames of which no region was counted.
+        """Check that at least one region was counted.
 
         Raises:
-            MitsonarError: there is none.
+            MitsonarError: no region was counted.
         """
         if not self.boxes:
             raise MitsonarError(
@@ -595,7 +599,7 @@ class LabelledPictures:
 
 
 def class_rules(text: str) -> list[tuple[str, str]]:
-    """Parse classes as a command takes them: ``pillar*=pillar,seabed*=``.
+    """Parse the rules for classes of the command line: ``pillar*=pillar,seabed*=``.
 
     Raises:
         MitsonarError: a part is not GLOB=CLASS.
@@ -615,7 +619,7 @@ def _label(frames: SonarFrames, name: str, index: int) -> NDArray[np.int64]:
     """Return a label of a frame ``(bins, beams)``.
 
     Raises:
-        MitsonarError: the frames lack it.
+        MitsonarError: the frames lack the label.
     """
     values = getattr(frames, name)
     if values is None:
@@ -624,7 +628,7 @@ def _label(frames: SonarFrames, name: str, index: int) -> NDArray[np.int64]:
 
 
 def _noise_levels(frames: SonarFrames, raised_db: float) -> NDArray[np.float64] | None:
-    """Return the mean level of the receiver's noise in each bin, relative to full scale ``(bins,)``; None if unknown."""
+    """Return the mean level of the receiver noise in each bin, relative to full scale ``(bins,)``; None if unknown."""
     if frames.sonar.model != "coherent":
         return None
     return noise_of(frames.sonar) * 10 ** (raised_db / 10) / frames.level_scale
@@ -635,11 +639,11 @@ def _box(mask: Mask) -> tuple[int, int, int, int]:
     return int(columns[0]), int(rows[0]), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
 
 
-# ---------------- Masks as COCO stores them: lengths of runs down the columns, as a short text
+# ---------------- Run-length encoding of COCO's masks
 
 
 def runs_of(mask: NDArray[np.bool_]) -> list[int]:
-    """Return the lengths of the runs of a mask ``(rows, columns)``, column by column; the first is of zeros."""
+    """Return the lengths of the runs of a mask ``(rows, columns)``, column by column, starting with a run of zeros."""
     flat = mask.ravel(order="F")
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     edges = np.concatenate([[0], changes, [flat.size]])
@@ -648,7 +652,7 @@ def runs_of(mask: NDArray[np.bool_]) -> list[int]:
 
 
 def compressed(runs: list[int]) -> str:
-    """Return runs as the text that COCO's tools read: differences to the run before the last, 5 bits a letter."""
+    """Encode run lengths in COCO's compressed text: differences to the run two places before, 5 bits per character."""
     letters = []
     for place, run in enumerate(runs):
         value = run - runs[place - 2] if place > 2 else run
@@ -662,20 +666,19 @@ def compressed(runs: list[int]) -> str:
     return "".join(letters)
 
 
-# ---------------- Frames of runs and recordings with their poses, in stretches: what a data set is made of that was
-# not rendered for it
+# ---------------- Recorded frames with known poses
 
 
 Array = NDArray[np.float64]
 
 TENTH = 0.1
-"""Largest distance of a bin or beam from its place in the sonar, as part of the step from one to the next."""
+"""Largest deviation of a bin or beam from its place in the sonar, as a fraction of the step to the next."""
 
 EXACT = 1e-6
-"""The same, below which axes are those of the sonar: files round them."""
+"""Deviation, as such a fraction, below which ranges and bearings are those of the sonar; files round them."""
 
 SAME = 1e-3
-"""Largest difference of numbers of one sonar in two files, as part of them."""
+"""Largest relative difference of numbers of one sonar between two files."""
 
 OTHER = ("name", "seed", "frame_rate_hz", "quality", "thesis_rays", "rays_per_beam", "rays_across", "jitter", *NOISE_FIELDS)
 """Fields of a sonar in which frames of one data set may differ."""
@@ -686,12 +689,12 @@ AXES = ("range_min", "range_max", "azimuth_fov_deg", "beam_layout")
 
 @dataclass(frozen=True)
 class Axes:
-    """The sonar of frames, whose window and bins are theirs.
+    """The sonar of frames, with their window and bins.
 
     Attributes:
-        sonar: the instrument.
-        bearing_rad: axes of the beams ``(beams,)`` [rad], where they are not those of the sonar.
-        level: how pixels stand for levels.
+        sonar: the sonar.
+        bearing_rad: bearings of the beams ``(beams,)`` [rad]; None if they are those of the sonar.
+        level: coding of levels in the pixels.
     """
 
     sonar: Sonar
@@ -700,11 +703,11 @@ class Axes:
 
     @property
     def bearings(self) -> Array:
-        """Return the axes of the beams ``(beams,)`` [rad]."""
+        """Return the bearings of the beams ``(beams,)`` [rad]."""
         return self.sonar.bearing_rad if self.bearing_rad is None else self.bearing_rad
 
     def other(self, than: Axes) -> list[str]:
-        """List what differs from another sonar, with both values: ``range_bins 128, not 256``."""
+        """Return the differences from another sonar, with both values: ``range_bins 128, not 256``."""
         mine, its = ({**one.sonar.model_dump(), "level": one.level} for one in (self, than))
         keys = [key for key in mine if key not in (*OTHER, *AXES) and not _same(mine[key], its[key])]
         if self.sonar.range_bins == than.sonar.range_bins and not _near(self.sonar.range_m, than.sonar.range_m, TENTH):
@@ -717,14 +720,14 @@ class Axes:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive frames of a part, two or more, each with a pose.
+    """Two or more consecutive frames of a part of a recording, each with a pose.
 
     Attributes:
-        part: of a recording.
+        part: part of the recording.
         first: number of the first frame in the part.
-        time_s: of the frames ``(frames,)`` [s].
-        poses: of the sonar ``(frames, 6)`` [m, rad].
-        height_m: over the ground ``(frames,)``; nan where unknown.
+        time_s: times of the frames ``(frames,)`` [s].
+        poses: poses of the sonar ``(frames, 6)`` [m, rad].
+        height_m: heights above the ground ``(frames,)`` [m]; nan if unknown.
     """
 
     part: Part
@@ -738,23 +741,23 @@ class Stretch:
         return len(self.time_s)
 
     def read(self, here: slice) -> SonarFrames:
-        """Read some of the frames, by their numbers in the stretch."""
+        """Read a slice of the frames, counted from the start of the stretch."""
         return self.part.read(np.arange(self.first + here.start, self.first + here.stop))
 
 
 @dataclass(frozen=True)
 class FramesWithPoses:
-    """What was taken from one file or run.
+    """The frames with poses of one file or run.
 
     Attributes:
-        name: of the file, as it was given.
-        format: in words.
-        poses: where the poses come from.
-        axes: of its frames.
+        name: name of the file, as given.
+        format: description of the format.
+        poses: origin of the poses.
+        axes: sonar of the frames.
         level_scale: level of a pixel of 1.
         stretches: the frames.
-        left_out: number of frames without a pose, of another geometry, or with no neighbour.
-        notes: sentences on the recording.
+        left_out: number of frames without a pose, of another geometry, or without a neighbour.
+        notes: notes on the recording, one sentence each.
     """
 
     name: str
@@ -767,7 +770,7 @@ class FramesWithPoses:
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        """Return the number of frames that were taken."""
+        """Return the number of frames in all stretches."""
         return sum(map(len, self.stretches))
 
 
@@ -780,20 +783,20 @@ def frames_with_poses(
     cut: int | None = None,
     geometry: str | Path | None = None,
 ) -> FramesWithPoses:
-    """Find the frames of a file or run whose poses are known. No pixels are read.
+    """Find the frames of a file or run whose poses are known, without reading pixels.
 
-    Of a recording in several parts those are taken that have the geometry of the longest.
+    If a recording has several parts, only parts with the geometry of the longest are used.
 
     Args:
         where: a recording of a real sonar, ``frames.npz``, ``frames.zarr``, or the folder of a run.
         path: file of poses, TUM or CSV; None: the poses of the frames.
         frame: convention of that file.
-        height_m: over the ground [m], for frames without one.
-        cut: frames of a stretch, at most.
-        geometry: file that tells how the pictures of a recording are laid out.
+        height_m: height above the ground for frames that have none [m].
+        cut: largest number of frames in a stretch.
+        geometry: file that describes the layout of a recording's pictures.
 
     Raises:
-        MitsonarError: no frames there, no poses, a sonar that a data set cannot hold.
+        MitsonarError: there are no frames or no poses, or a data set cannot represent the sonar.
     """
     if is_data_set(where):
         raise MitsonarError(f"{where} is a data set already: give runs or recordings")
@@ -817,14 +820,14 @@ def frames_with_poses(
 
 
 def axes_of(like: SonarFrames, name: str) -> Axes:
-    """Return the sonar of frames, fitted to their ranges and bearings where it has others.
+    """Return the sonar of frames, fitted to their ranges and bearings if they differ from its own.
 
     Args:
-        like: frames, or none of them: their axes count.
-        name: for errors.
+        like: frames, possibly none; only their ranges and bearings matter.
+        name: name of the frames, for error messages.
 
     Raises:
-        MitsonarError: frames of contrast; ranges at uneven steps.
+        MitsonarError: the frames contain contrast, or their ranges are not evenly spaced.
     """
     if like.level == "contrast":
         raise MitsonarError(f"{name} holds contrast, no levels: give the frames before their contrast")
@@ -844,11 +847,13 @@ def axes_of(like: SonarFrames, name: str) -> Axes:
 
 
 def _stretches_of(part: Part, name: str, path: Trajectory | None, height_m: float | None, cut: int | None) -> list[Stretch]:
-    """Return the stretches of a part whose frames have poses."""
+    """Return the stretches of consecutive frames with poses in a part of a recording."""
+    # 1. Determine the time of each frame; a frame with several times gets their mean.
     time = np.asarray(part.time_s, dtype=float)
     time = time.mean(axis=1) if time.ndim == 2 else time
     if not np.isfinite(time).all() or not (np.diff(time) > 0).all():
         raise MitsonarError(f"the times of {name} do not rise: its frames have no order")
+    # 2. Take the poses from the path, or from the frames.
     if path is not None:
         poses, known = poses_at(path, time, name, part.attitude_rad)
     elif part.poses is None:
@@ -859,6 +864,7 @@ def _stretches_of(part: Part, name: str, path: Trajectory | None, height_m: floa
     else:
         poses = np.asarray(part.poses, dtype=float)
         known = np.asarray(np.isfinite(poses).all(axis=1))
+    # 3. Fill in missing heights, and cut stretches that are too long.
     height = np.full(len(time), np.nan) if part.height_m is None else np.array(part.height_m, dtype=float)
     height = np.where(np.isfinite(height) | (height_m is None), height, np.nan if height_m is None else height_m)
     found = []
@@ -871,21 +877,21 @@ def _stretches_of(part: Part, name: str, path: Trajectory | None, height_m: floa
 
 
 def as_pixels(image: NDArray[np.generic], pixel: str, name: str) -> NDArray[np.generic]:
-    """Return images as a data set stores them: uint8 as they are, or float32 in 0..1.
+    """Convert images to the pixels of a data set: uint8 unchanged, or float32 in 0..1.
 
     Raises:
-        MitsonarError: values outside 0..1.
+        MitsonarError: values are outside 0..1.
     """
     if pixel == "uint8" and image.dtype == np.uint8:
         return image
     values = to_float32(image)
-    if not (values.size and values.min() >= 0 and values.max() <= 1):  # also of nan
+    if not (values.size and values.min() >= 0 and values.max() <= 1):  # also true of nan
         raise MitsonarError(f"{name} has pixels {values.min():g}..{values.max():g}, allowed 0..1: it is damaged")
     return values
 
 
 def _near(one: Array, other: Array, part: float) -> bool:
-    """Return whether two axes agree, within this part of their least step."""
+    """Return whether two axes agree within the fraction ``part`` of the smallest step."""
     if len(one) != len(other):
         return False
     step = float(np.diff(other).min()) if len(other) > 1 else max(abs(float(other[0])), 1.0)
@@ -898,23 +904,22 @@ def _same(one: object, other: object) -> bool:
     return one == other
 
 
-# ---------------- A data set of frames that were not rendered for it: of runs, and of recordings of real sonars, with
-# known poses
+# ---------------- Data set of recorded frames
 
 
 OTHER_GAIN = 0.01
-"""Difference of the level scales of two files, as part of them, that the user is told of."""
+"""Relative difference of the level scales of two files above which a note mentions it."""
 
 
 @dataclass(frozen=True)
 class RecordedDataSet:
-    """What was written.
+    """A data set that was written from recorded frames.
 
     Attributes:
-        path: of the data set.
-        frames: of it.
-        sequences: of it.
-        notes: a sentence each.
+        path: folder of the data set.
+        frames: number of frames.
+        sequences: number of sequences.
+        notes: notes for the user, one sentence each.
     """
 
     path: Path
@@ -930,18 +935,20 @@ def write_recorded(
     begun: Callable[[int, int], None] = lambda frames, done: None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> RecordedDataSet:
-    """Write frames with their poses as a data set, whole or absent; a shard at a time is in memory.
+    """Write recorded frames with their poses as a data set.
 
-    Each source is a scene, each stretch of it a sequence. Pixels, levels and bearings stay as they are.
+    Each source becomes a scene, and each of its stretches a sequence. Pixels, levels and bearings are unchanged. The folder
+    is written completely or not at all; one shard at a time is in memory.
 
     Args:
         sources: files and runs of one sonar.
-        out: folder to make.
-        begun: called with the number of frames of the data set, and 0.
-        progress: called with the number of frames that were added.
+        out: folder to create.
+        begun: called at the start, with the number of frames of the data set and 0.
+        progress: called with the number of frames written since the last call.
 
     Raises:
-        MitsonarError: something is there, no sources, sonars that differ, no heights, frames that cannot be read.
+        MitsonarError: the folder exists, there are no sources, their sonars differ, heights are unknown, or frames cannot be
+            read.
     """
     if "://" in str(out):
         raise MitsonarError(f"-o must name a folder here: got {out}; copy the finished data set to its storage")
@@ -963,11 +970,12 @@ def write_recorded(
 
 
 def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
-    """Return the recipe of a data set of these frames.
+    """Return the recipe of a data set of recorded frames.
 
     Raises:
-        MitsonarError: no sources, sonars that differ, a name that occurs twice, no heights.
+        MitsonarError: there are no sources, their sonars differ, a name occurs twice, or heights are unknown.
     """
+    # 1. Check that the sources fit together.
     if not sources:
         raise MitsonarError("a data set needs frames: give a run or a recording, or more")
     first = sources[0]
@@ -981,6 +989,7 @@ def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise MitsonarError(f"{twice[0]} is given twice: its frames would be in training and in validation")
+    # 2. Derive mount and flight from the poses: median attitude, range of heights, largest motion between frames.
     stretches = [stretch for source in sources for stretch in source.stretches]
     poses = np.concatenate([one.poses for one in stretches])
     moved = np.abs(np.concatenate([motions(one.poses) for one in stretches])).max(axis=0)
@@ -1016,7 +1025,7 @@ def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
 
 
 def _source(one: FramesWithPoses) -> dict[str, str | int | float]:
-    """Return the keys of a source in the recipe."""
+    """Return the keys that describe a source in the recipe."""
     return {
         "name": one.name,
         "format": one.format,
@@ -1029,10 +1038,10 @@ def _source(one: FramesWithPoses) -> dict[str, str | int | float]:
 
 
 def _heights(stretches: Sequence[Stretch]) -> tuple[float, float]:
-    """Return the lowest and highest height over the ground [m]; over z = 0 where no frame tells one.
+    """Return the lowest and the highest height above the ground [m], or above z = 0 if no frame has a height.
 
     Raises:
-        MitsonarError: no frame tells a height, and z = 0 is not below all of them.
+        MitsonarError: no frame has a height, and not all poses lie above z = 0.
     """
     told = np.concatenate([one.height_m for one in stretches])
     told = told[np.isfinite(told) & (told > 0)]
@@ -1044,7 +1053,7 @@ def _heights(stretches: Sequence[Stretch]) -> tuple[float, float]:
 
 
 def _plan(sources: Sequence[FramesWithPoses]) -> Plan:
-    """Return the poses of all frames, in the order in which they are stored."""
+    """Return the plan of the data set: scenes, sequences, times, poses and motions of all frames in stored order."""
     stretches = [stretch for source in sources for stretch in source.stretches]
     counts = [len(one) for one in stretches]
     scene = [number for number, source in enumerate(sources) for _ in source.stretches]
@@ -1063,7 +1072,7 @@ def _plan(sources: Sequence[FramesWithPoses]) -> Plan:
 
 
 def _values(store: DataStore, stretches: Sequence[Stretch], here: slice) -> dict[str, Values]:
-    """Read the frames of a shard. Return what is stored of them, by name."""
+    """Read the frames of a shard, and return their stored arrays, keyed by name."""
     images, heights, first = [], [], 0
     for one in stretches:
         part = slice(max(here.start - first, 0), min(here.stop - first, len(one)))
@@ -1083,7 +1092,7 @@ def _values(store: DataStore, stretches: Sequence[Stretch], here: slice) -> dict
 
 
 def _notes(sources: Sequence[FramesWithPoses], sequences: int) -> list[str]:
-    """Return what the user should know, a sentence each."""
+    """Return notes for the user, one sentence each."""
     notes = [f"{one.name}: {note}" for one in sources for note in one.notes]
     notes += [
         f"{one.name}: left out: {counted(one.left_out, 'frame')} without a pose, of another geometry, or with no neighbour"

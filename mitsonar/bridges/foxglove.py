@@ -1,4 +1,4 @@
-"""A live sonar on a Foxglove WebSocket: poses in; fan, polar image, transform, pose and timing out."""
+"""How a live sonar is served to Foxglove: poses come in; fan, polar image, transform, pose and timing go out."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = ["SONAR_FRAME", "WORLD_FRAME", "FoxgloveServer"]
 SONAR_FRAME, WORLD_FRAME, POSE_TOPIC = "sonar", "world", "/pose"
 
 FAREWELL_S = 1.0
-"""How long :meth:`FoxgloveServer.close` waits for the clients' farewell [s]."""
+"""Longest time that :meth:`FoxgloveServer.close` waits for clients to disconnect [s]."""
 
 NUMBERS = ("number", "dropped", "pose_ns", "published_ns", "render_ms", "latency_ms")
 TIMING = {
@@ -45,22 +45,22 @@ TIMING = {
 
 
 class FoxgloveServer:
-    """Publishes pings to Foxglove clients, and puts the poses that they publish on ``/pose`` into a mailbox.
+    """A server that publishes pings to Foxglove clients, and puts the poses that they publish on ``/pose`` into a mailbox.
 
     Args:
-        mailbox: where poses go.
+        mailbox: mailbox for the poses.
         host: address to listen on.
-        port: to listen on; 0: a free one.
+        port: port to listen on; 0 chooses a free one.
 
     Attributes:
-        port: it listens on.
+        port: port that the server listens on.
 
     Raises:
-        MitsonarError: the address cannot be listened on.
+        MitsonarError: the server cannot listen on the address.
     """
 
     def __init__(self, mailbox: PoseMailbox, host: str = "127.0.0.1", port: int = 8765) -> None:
-        context = self._context = foxglove.Context()  # channels close with it
+        context = self._context = foxglove.Context()  # the channels are closed with it
         self._fan = CompressedImageChannel("/sonar/fan", context=context)
         schema = foxglove.Schema(name=PROJECTED_TYPE, encoding="ros2msg", data=PROJECTED.encode())
         self._polar = foxglove.Channel("/sonar/image", schema=schema, message_encoding="cdr", context=context)
@@ -86,7 +86,7 @@ class FoxgloveServer:
         self.port = int(self._server.port)
 
     def publish(self, ping: LivePing) -> None:
-        """Publish a ping, its fan first: TCP may hold back what follows. What nobody listens to is not encoded."""
+        """Publish a ping, the fan first, because TCP may delay what follows; topics without subscribers are not encoded."""
         frames, when = ping.frames, ping.time_ns
         stamp = Timestamp(sec=when // 10**9, nsec=when % 10**9)
         if self._fan.has_sinks():
@@ -111,18 +111,18 @@ class FoxgloveServer:
         self._timing.log(json.dumps(timing(ping)).encode(), log_time=when)
 
     def complain(self, sentence: str) -> None:
-        """Send all clients a warning, which Foxglove lists under problems."""
+        """Send all clients a warning, which Foxglove lists in its problems panel."""
         self._server.publish_status(sentence, foxglove.StatusLevel.Warning)
 
     def close(self) -> None:
-        """End all connections, and wait a moment for it: a client that no longer reads never takes leave."""
+        """Close all connections, and wait at most :data:`FAREWELL_S`: a client that stopped reading never disconnects."""
         stopping = threading.Thread(target=self._server.stop, daemon=True)
         stopping.start()
         stopping.join(FAREWELL_S)
 
 
 class _Poses(ServerListener):
-    """Reads poses in the server's threads. A pose that cannot be read is refused with one sentence."""
+    """Listener that reads poses in the server's threads; a pose that cannot be read gives a warning."""
 
     def __init__(self, mailbox: PoseMailbox, complain: Any) -> None:
         self.mailbox, self.complain = mailbox, complain

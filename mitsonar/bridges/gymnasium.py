@@ -1,4 +1,4 @@
-"""One vehicle as an environment of Gymnasium."""
+"""How vehicles with a sonar become environments of Gymnasium, one (SonarEnv) or many at once (SonarVectorEnv)."""
 
 from __future__ import annotations
 
@@ -54,35 +54,35 @@ __all__ = [
 ]
 
 
-# ---------------- Vehicles with a sonar each, in one scene: they move, and ping together in one launch
+# ---------------- Fleet of vehicles
 
 
 SonarSource: TypeAlias = "Simulator | mi.Scene | str | Path"
-"""What pings: a simulator, a scene, or its file or name."""
+"""Source of pings: a simulator, a scene, or the file or name of a scene."""
 
 FIRST_PINGS = 2**31
-"""Numbers of first pings that episodes draw from."""
+"""Upper limit of the number of an episode's first ping, which is drawn at random."""
 
 
 class SonarFleet:
-    """Vehicles in one scene. What one of them sees does not depend on the others.
+    """Vehicles with one sonar each in one scene; they ping together in one launch.
 
-    An episode draws from its vehicle's own generator: six numbers for the start, and the number of its first ping, of which
-    jitter and noise are functions.
+    The observations of a vehicle do not depend on the others. An episode draws from the generator of its vehicle: six
+    numbers for the start, and the number of its first ping, which determines jitter and noise.
 
     Args:
-        source: of the pings.
-        sonar: the instrument, or its name; default: the scene's.
-        count: of vehicles.
-        moving: bodies that move in the scene, by the time of the episode.
-        task: what the vehicles may do.
+        source: simulator, scene, or the file or name of a scene.
+        sonar: sonar or its name; default: that of the scene.
+        count: number of vehicles.
+        moving: bodies that move in the scene, by the time since the start of the episode.
+        task: start, limits and rewards of the vehicles.
 
     Attributes:
-        poses: of the vehicles' sonars ``(count, 6)`` [m, rad].
-        steps: of each since the begin of its episode ``(count,)``.
+        poses: poses of the vehicles' sonars ``(count, 6)`` [m, rad].
+        steps: number of steps since the start of each episode ``(count,)``.
 
     Raises:
-        MitsonarError: no vehicle, a source that is no scene, no start, or one where every episode ends.
+        MitsonarError: there are no vehicles, the source is no scene, there is no start, or every episode would end at once.
 
     Warns:
         MitsonarWarning: the start seems to lie below the seabed.
@@ -106,7 +106,7 @@ class SonarFleet:
         self.sonar, self.task = self.simulator.sonar, task
         refuse_noise(task.noise, self.sonar)
         self.step_s = 1 / self.sonar.frame_rate_hz if task.step_s is None else task.step_s
-        from mitsonar.simulation.tracing import Clearance  # now that the simulator has set a variant
+        from mitsonar.simulation.tracing import Clearance  # needs the variant that the simulator has set
 
         self._clearance = Clearance(self.simulator.tracer)
         self._span = self._start_of(task)
@@ -118,13 +118,13 @@ class SonarFleet:
 
     @property
     def clearance(self) -> Clearance:
-        """Return what measures the clearance in the scene as it is now."""
-        if self._clearance.tracer is not self.simulator.tracer:  # the simulator has followed a change of the scene
+        """Return the object that measures clearances in the current state of the scene."""
+        if self._clearance.tracer is not self.simulator.tracer:  # the simulator has updated to a changed scene
             self._clearance = type(self._clearance)(self.simulator.tracer)
         return self._clearance
 
     def _start_of(self, task: SonarTask) -> Table:
-        """Return the poses between which episodes begin."""
+        """Return the two poses between which episodes begin ``(2, 6)`` [m, rad]."""
         if task.start is not None:
             return task.span
         found = sonar_in(self.simulator.tracer.scene)
@@ -135,7 +135,7 @@ class SonarFleet:
         return span
 
     def _check_start(self) -> None:
-        """Refuse a start at whose ends the vehicle collides; warn where it seems to lie below the seabed."""
+        """Refuse a start whose two poses both collide; warn if it seems to lie below the seabed."""
         places = self._span[:, :3]
         clearance_m = self.clearance.of(places, places, np.zeros(2))
         if (clearance_m < self.task.clearance_m).all():
@@ -153,12 +153,12 @@ class SonarFleet:
             )
 
     def _gain(self) -> float:
-        """Return the constant gain by eight poses between those of the start, always the same."""
+        """Return the constant gain, determined from eight poses between those of the start, always the same ones."""
         part = np.random.Generator(np.random.PCG64(0)).random((8, 6))
         return constant_gain(self.simulator.pings(self._span[0] + part * np.ptp(self._span, axis=0)))[0]
 
     def renew(self, which: NDArray[np.bool_], generators: Sequence[np.random.Generator]) -> None:
-        """Begin new episodes of the vehicles ``which`` ``(count,)``."""
+        """Begin new episodes for the vehicles selected by the mask ``which`` ``(count,)``."""
         for number in map(int, np.flatnonzero(which)):
             part = generators[number].random(6)
             self.poses[number] = self._span[0] + part * (self._span[1] - self._span[0])
@@ -168,7 +168,7 @@ class SonarFleet:
     def look(self) -> tuple[NDArray[np.uint8], Table]:
         """Ping from all vehicles in one launch; return images ``(count, bins, beams)`` and altitudes ``(count,)`` [m].
 
-        In the model ``coherent`` they ping one after the other.
+        With the model ``coherent`` the vehicles ping one after the other.
         """
         numbers = [int(number) for number in self._first + self.steps]
         batches = list(self.simulator.pings(self.poses, first=numbers, time_s=self.time_s))
@@ -181,22 +181,23 @@ class SonarFleet:
 
     @property
     def time_s(self) -> Table:
-        """Return the time of each vehicle since the begin of its episode ``(count,)`` [s]."""
+        """Return the time of each vehicle since the start of its episode ``(count,)`` [s]."""
         return np.asarray(self.steps * self.step_s, dtype=float)
 
     def advance(
         self, action: ArrayLike, renewed: NDArray[np.bool_], generators: Sequence[np.random.Generator]
     ) -> Transition:
-        """Move all vehicles by their actions, but those ``renewed`` to the begin of a new episode; then ping.
+        """Move all vehicles by their actions, or to the start of a new episode, then ping.
 
         Args:
-            action: ``(count, 4)``, clipped to -1..1.
-            renewed: vehicles whose episode has ended ``(count,)``.
-            generators: of the vehicles.
+            action: actions ``(count, 4)``, clipped to -1..1.
+            renewed: mask of the vehicles that begin a new episode and ignore their action ``(count,)``.
+            generators: random number generators of the vehicles.
 
         Raises:
-            MitsonarError: an action of another shape, or that is not finite.
+            MitsonarError: the actions have a wrong shape, or are not finite.
         """
+        # 1. Move all vehicles, and put those with a new episode at its start.
         given = np.asarray(action, dtype=float)
         if given.shape != (len(self.poses), 4) or not np.isfinite(given).all():
             raise MitsonarError(f"an action is four finite numbers for each of {len(self.poses)}: got {_wrong(given)}")
@@ -205,6 +206,7 @@ class SonarFleet:
         self.steps += 1
         self.renew(renewed, generators)
         before[renewed] = self.poses[renewed]
+        # 2. Ping, and find the clearance along the whole step, so that no vehicle passes through a thin surface.
         image, altitude_m = self.look()
         clearance_m = self.clearance.of(before[:, :3], self.poses[:, :3], self.time_s)
         low, high = self.task.box
@@ -216,7 +218,7 @@ class SonarFleet:
         """Return the rewards of a step ``(count,)``.
 
         Raises:
-            MitsonarError: the reward function gives other than one finite number for each vehicle, or for all.
+            MitsonarError: the reward function returns neither one finite number per vehicle nor one for all.
         """
         if self.task.reward is None:
             return np.zeros(len(self.poses))
@@ -227,32 +229,32 @@ class SonarFleet:
 
 
 def _wrong(given: Table) -> str:
-    """Return what is wrong with numbers: one that is not finite, with its place, else their shape."""
+    """Describe the fault of an array: its first value that is not finite, with its index, otherwise its shape."""
     bad = np.argwhere(~np.isfinite(given))
     place = bad[0].tolist() if len(bad) else []
     return f"{given[tuple(place)]} at {place}" if len(bad) else f"the shape {given.shape}"
 
 
-# ---------------- Spaces of actions and observations, and observations in their layout
+# ---------------- Spaces and observations
 
 
 Array: TypeAlias = NDArray[np.generic]
 Observation: TypeAlias = "Array | dict[str, Array]"
-"""The image, or several arrays by name."""
+"""The image, or several arrays keyed by name."""
 
 FARTHEST = 1e9
-"""No number of a pose is larger [m, rad]."""
+"""Bound of the numbers of a pose in the observation space [m, rad]."""
 
 PICTURE_ROWS = 400
 
 
 def action_space() -> spaces.Box:
-    """Return the space of actions: starboard, forward, up, turn, each as a part of its largest value."""
+    """Return the space of actions: starboard, forward, up and turn, each as a fraction of its largest value."""
     return spaces.Box(-1.0, 1.0, (4,), np.float32)
 
 
 def observation_space(fleet: SonarFleet) -> spaces.Space[Observation]:
-    """Return the space of one vehicle's observation: ``(bins, beams, 1)`` uint8, or a dictionary with it."""
+    """Return the observation space of one vehicle: the image ``(bins, beams, 1)`` uint8, or a dictionary with it."""
     sonar, task = fleet.sonar, fleet.task
     known: dict[str, spaces.Space[Array]] = {
         "image": spaces.Box(0, 255, (sonar.range_bins, sonar.beams, 1), np.uint8),
@@ -265,7 +267,7 @@ def observation_space(fleet: SonarFleet) -> spaces.Space[Observation]:
 
 
 def observed(fleet: SonarFleet, image: NDArray[np.uint8], altitude_m: Table) -> Observation:
-    """Return the observations of all vehicles, with the vehicle as the first axis."""
+    """Return the observations of all vehicles; the first axis is the vehicle."""
     known: dict[str, Array] = {
         "image": image[..., None].copy(),
         "altitude": altitude_m[:, None].astype(np.float32),
@@ -276,33 +278,34 @@ def observed(fleet: SonarFleet, image: NDArray[np.uint8], altitude_m: Table) -> 
 
 
 def fan_of(sonar: Sonar) -> CartesianMap:
-    """Return the map from images to pictures of the fan."""
+    """Return the map from images ``(bins, beams)`` to pictures of the fan."""
     return cartesian_map(sonar.range_m, sonar.bearing_rad, PICTURE_ROWS)
 
 
 def fan_picture(fan: CartesianMap, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a picture of the fan ``(rows, columns, 3)`` uint8, forward up, of one image ``(bins, beams)``."""
+    """Draw an image ``(bins, beams)`` as a picture of the fan ``(rows, columns, 3)`` uint8, forward up."""
     grey = np.rint(fan.apply(image.astype(np.float32))).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=-1)
 
 
-# ---------------- sonar env
+# ---------------- Environment of one vehicle
 
 
 class SonarEnv(gymnasium.Env[Observation, Array]):
-    """A vehicle with a sonar: the action is its velocity, the observation the sonar's image.
+    """A vehicle with a sonar: the action is its velocity, the observation is the sonar's image.
 
-    It collides and ends near a surface, and ends outside its bounds. :class:`SonarVectorEnv` steps many at once.
+    An episode ends when the vehicle comes too near to a surface, or leaves its bounds. :class:`SonarVectorEnv` steps many
+    vehicles at once.
 
     Args:
         scene: a scene, its file or name, or a :class:`Simulator`.
-        sonar: the instrument, or its name; default: the scene's.
-        moving: bodies that move, by the time since the begin of the episode.
+        sonar: sonar or its name; default: that of the scene.
+        moving: bodies that move, by the time since the start of the episode.
         render_mode: ``rgb_array`` for pictures of the fan; default: none.
         task: fields of :class:`mitsonar.bridges.gymnasium.SonarTask`: ``start``, ``bounds``, ``reward`` ...
 
     Raises:
-        MitsonarError: a value that is not allowed.
+        MitsonarError: a value is not allowed.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # as Gymnasium has it
@@ -330,7 +333,7 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         return repr(self)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; return the first observation, and the info: the ``pose`` (6,) [m, rad]."""
+        """Begin an episode; return the first observation, and the info with the ``pose`` (6,) [m, rad]."""
         super().reset(seed=seed, options=options)
         self.fleet.renew(np.array([True]), [self.np_random])
         image, altitude_m = self.fleet.look()
@@ -341,13 +344,13 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         """Move by the action ``(4,)``, then ping.
 
         Returns:
-            observation, reward, terminated, truncated, info, as Gymnasium has them: terminated where the vehicle collided or
-            left its bounds, truncated after ``max_steps``. The info holds ``pose`` (6,) [m, rad], ``clearance_m``,
-            ``collided`` and ``outside``.
+            observation, reward, terminated, truncated, info, as Gymnasium defines them. The episode is terminated if the
+            vehicle collided or left its bounds, and truncated after ``max_steps``. The info contains ``pose`` (6,) [m, rad],
+            ``clearance_m``, ``collided`` and ``outside``.
 
         Raises:
-            gymnasium.error.ResetNeeded: before the first reset.
-            MitsonarError: an action of another shape, or that is not finite.
+            gymnasium.error.ResetNeeded: :meth:`reset` has not been called yet.
+            MitsonarError: the action has a wrong shape, or is not finite.
         """
         if self._image is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
@@ -366,7 +369,10 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         return _first(observed(fleet, moved.image, moved.altitude_m)), reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return a picture of the last ping's fan ``(rows, columns, 3)``, forward up; None before it, or without a mode."""
+        """Return a picture of the last ping's fan ``(rows, columns, 3)``, forward up.
+
+        Return None before the first ping, and if ``render_mode`` is None.
+        """
         if self.render_mode is None or self._image is None:
             return None
         return fan_picture(fan_of(self.fleet.sonar), self._image)
@@ -377,33 +383,33 @@ def _first(many: Observation) -> Observation:
     return {name: values[0] for name, values in many.items()} if isinstance(many, dict) else many[0]
 
 
-# ---------------- What the vehicles of an environment may do, and what ends an episode
+# ---------------- Task of the vehicles
 
 
 Table: TypeAlias = NDArray[np.float64]
 
 OBSERVABLE = ("image", "altitude", "pose")
-"""What can be observed."""
+"""Names of the observations that an environment can return."""
 
 VELOCITY = ("starboard", "forward", "up", "turn")
 
 FULL_TURNS = np.array([np.pi, np.pi, 4 * np.pi])
-"""Largest pitch, roll and heading of a start [rad]; a heading may be drawn across 360 deg."""
+"""Largest pitch, roll and heading of a start [rad]; the interval of headings may cross 360 deg."""
 
 
 @dataclass(frozen=True)
 class Transition:
-    """A step of all vehicles, from which rewards follow.
+    """One step of all vehicles, from which a reward function computes the rewards.
 
     Attributes:
-        action: clipped to -1..1 ``(n, 4)``: starboard, forward, up, turn to starboard.
-        before: poses before ``(n, 6)`` [m, rad].
-        poses: after ``(n, 6)``.
-        image: of the sonar ``(n, bins, beams)`` uint8.
-        altitude_m: over what is straight below ``(n,)`` [m].
-        clearance_m: to the nearest surface ``(n,)`` [m].
-        collided: whether that is too near ``(n,)``.
-        outside: whether the vehicle has left its bounds ``(n,)``.
+        action: actions, clipped to -1..1 ``(n, 4)``: starboard, forward, up, turn to starboard.
+        before: poses before the step ``(n, 6)`` [m, rad].
+        poses: poses after the step ``(n, 6)`` [m, rad].
+        image: images of the sonars ``(n, bins, beams)`` uint8.
+        altitude_m: heights above the surface straight below ``(n,)`` [m].
+        clearance_m: distances to the nearest surface ``(n,)`` [m].
+        collided: whether each clearance is too small ``(n,)``.
+        outside: whether each vehicle has left its bounds ``(n,)``.
     """
 
     action: Table
@@ -417,11 +423,11 @@ class Transition:
 
 
 Reward: TypeAlias = Callable[[Transition], ArrayLike]
-"""Gives the reward of each vehicle ``(n,)``, or one number for all."""
+"""Function that returns the reward of each vehicle ``(n,)``, or one number for all."""
 
 
 class TaskFields(TypedDict, total=False):
-    """Fields of a :class:`SonarTask` as arguments of an environment."""
+    """Fields of a :class:`SonarTask`, as keyword arguments of an environment."""
 
     start: ArrayLike | None
     bounds: Sequence[Sequence[float]] | NDArray[Any] | None
@@ -438,24 +444,26 @@ class TaskFields(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class SonarTask:
-    """What vehicles may do. They are level, and move with the velocity of the action.
+    """The task of an environment: start, limits, observations and rewards.
+
+    Vehicles are level, and move with the velocity of the action.
 
     Attributes:
-        start: pose of the sonar at the begin of an episode, or two poses between which it is drawn, number by number
-            [m, rad]; default: the pose of the scene's sonar.
-        bounds: lowest and highest x, y, z [m]; who leaves them has ended. Default: none.
-        max_velocity: of the actions -1 and 1: starboard, forward, up [m/s], turn [rad/s].
+        start: pose of the sonar at the start of an episode, or two poses between which each number is drawn [m, rad];
+            default: the pose of the scene's sonar.
+        bounds: lowest and highest x, y, z [m]; an episode ends outside them. Default: none.
+        max_velocity: velocity of the action 1: starboard, forward, up [m/s], turn [rad/s].
         step_s: duration of a step [s]; default: 1 / ``frame_rate_hz``.
         clearance_m: distance to a surface below which a vehicle has collided [m].
-        max_steps: steps after which an episode is cut off; default: none.
-        observe: of :data:`OBSERVABLE`; the image alone is a box, several are a dictionary.
-        reward: of each step, by its :class:`Transition`; default: 0.
-        gain: of the image; default: by eight poses of ``start``.
-        noise: of the image; default: none.
-        altimeter_m: an altitude beyond is told as this [m].
+        max_steps: number of steps after which an episode is truncated; default: none.
+        observe: names of :data:`OBSERVABLE`; the image alone gives a box, several give a dictionary.
+        reward: reward function of a :class:`Transition`; default: 0.
+        gain: gain of the image; default: determined from eight poses of ``start``.
+        noise: noise of the image; default: none.
+        altimeter_m: largest altitude that is reported [m].
 
     Raises:
-        MitsonarError: a value that is not allowed.
+        MitsonarError: a value is not allowed.
     """
 
     start: ArrayLike | None = None
@@ -491,10 +499,10 @@ class SonarTask:
         self.refuse_outside(self.span)
 
     def refuse_outside(self, span: Table) -> None:
-        """Refuse poses where episodes begin ``(2, 6)`` that lie outside the bounds, or whose angles are no radians.
+        """Check that the poses between which episodes begin ``(2, 6)`` lie within the bounds, with angles in radians.
 
         Raises:
-            MitsonarError: one does, or is.
+            MitsonarError: a pose lies outside the bounds, or its angles are too large for radians.
         """
         low, high = self.box
         for pose in span[np.isfinite(span).all(axis=1)]:
@@ -509,20 +517,24 @@ class SonarTask:
 
     @classmethod
     def create(cls, given: dict[str, Any], own: Sequence[str] = ()) -> Self:
-        """Create a task from its fields by name; ``own`` are other arguments of an environment, for the message.
+        """Create a task from its fields.
+
+        Args:
+            given: fields, keyed by name.
+            own: other arguments of the environment, named in the error message for an unknown field.
 
         Raises:
-            MitsonarError: an unknown field, or a value that is not allowed.
+            MitsonarError: a field is unknown, or a value is not allowed.
         """
         refuse_unknown(given, (*(field.name for field in fields(cls)), *own), "an environment")
         return cls(**given)
 
     @property
     def span(self) -> Table:
-        """Return the two poses between which episodes begin ``(2, 6)``; of nan without a start.
+        """Return the two poses between which episodes begin ``(2, 6)`` [m, rad]; nan without a start.
 
         Raises:
-            MitsonarError: not one or two finite poses.
+            MitsonarError: ``start`` is not one or two finite poses.
         """
         if self.start is None:
             return np.full((2, 6), np.nan)
@@ -533,10 +545,10 @@ class SonarTask:
 
     @property
     def box(self) -> Table:
-        """Return the lowest and the highest place ``(2, 3)`` [m].
+        """Return the lowest and the highest position ``(2, 3)`` [m]; infinite without bounds.
 
         Raises:
-            MitsonarError: they are not two places, the lower first.
+            MitsonarError: ``bounds`` are not two positions, the lower one first.
         """
         if self.bounds is None:
             return np.array([[-np.inf] * 3, [np.inf] * 3])
@@ -547,10 +559,10 @@ class SonarTask:
 
 
 def _numbers(name: str, value: object) -> Table:
-    """Return numbers as a table.
+    """Convert a value to an array of numbers.
 
     Raises:
-        MitsonarError: they are none.
+        MitsonarError: it does not consist of numbers.
     """
     try:
         return np.asarray(value, dtype=float)
@@ -558,26 +570,26 @@ def _numbers(name: str, value: object) -> Table:
         raise MitsonarError(f"{name} is made of numbers, rows of one length: got {value!r}") from None
 
 
-# ---------------- Many vehicles as one vector environment of Gymnasium: a step of all is one launch
+# ---------------- Vector environment of many vehicles
 
 
 class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
-    """Vehicles with a sonar each in one scene, stepped together. They do not see each other.
+    """Vehicles with one sonar each in one scene, stepped together in one launch. They do not see each other.
 
-    Vehicle k with the seed s sees, to the bit, what :class:`SonarEnv` with the seed s + k sees, whatever ``num_envs`` is.
-    An episode that has ended begins anew with the next step, whose action for it counts for nothing.
+    Vehicle k with the seed s observes, to the bit, what :class:`SonarEnv` with the seed s + k observes, for any
+    ``num_envs``. After an episode ends, the next step begins a new one and ignores that vehicle's action.
 
     Args:
         scene: a scene, its file or name, or a :class:`Simulator`.
-        sonar: the instrument, or its name; default: the scene's.
-        num_envs: vehicles.
-        moving: bodies that move, by the time since the begin of each episode.
+        sonar: sonar or its name; default: that of the scene.
+        num_envs: number of vehicles.
+        moving: bodies that move, by the time since the start of each episode.
         render_mode: ``rgb_array`` for pictures of the fans; default: none.
         autoreset_mode: ``NextStep``, or ``Disabled`` for ``reset(options={"reset_mask": ...})``.
         task: fields of :class:`mitsonar.bridges.gymnasium.SonarTask`: ``start``, ``bounds``, ``reward`` ...
 
     Raises:
-        MitsonarError: a value that is not allowed.
+        MitsonarError: a value is not allowed.
     """
 
     metadata = {  # noqa: RUF012  # as Gymnasium has it
@@ -628,14 +640,14 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode of all vehicles, or of those of ``options["reset_mask"]`` ``(num_envs,)``.
+        """Begin an episode for all vehicles, or for those in ``options["reset_mask"]`` ``(num_envs,)``.
 
         Args:
-            seed: vehicle k has the seed ``seed + k``, or that of a list; default: generators go on.
-            options: may hold ``reset_mask``.
+            seed: vehicle k has the seed ``seed + k``, or item k of a list; default: the generators continue.
+            options: may contain ``reset_mask``.
 
         Raises:
-            MitsonarError: another number of seeds, or no mask of booleans.
+            MitsonarError: the number of seeds or the shape of the mask is wrong, or the mask is not boolean.
         """
         seeds = [seed + place for place in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
         seeds = [None] * self.num_envs if seeds is None else list(seeds)
@@ -656,13 +668,13 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         """Move all vehicles by their actions ``(num_envs, 4)``, then ping in one launch.
 
         Returns:
-            observations, rewards, terminated, truncated, infos, as Gymnasium has them, each ``(num_envs, ...)``: terminated
-            where a vehicle collided or left its bounds, truncated after ``max_steps``. The infos hold ``pose``,
-            ``clearance_m``, ``collided`` and ``outside``, and a mask of each with ``_`` before its name.
+            observations, rewards, terminated, truncated, infos, as Gymnasium defines them, each ``(num_envs, ...)``. An
+            episode is terminated if its vehicle collided or left its bounds, and truncated after ``max_steps``. The infos
+            contain ``pose``, ``clearance_m``, ``collided`` and ``outside``, and a mask for each, named with a leading ``_``.
 
         Raises:
-            gymnasium.error.ResetNeeded: before the first reset.
-            MitsonarError: an episode has ended and resets are yours to do.
+            gymnasium.error.ResetNeeded: :meth:`reset` has not been called yet.
+            MitsonarError: an episode has ended, and automatic resets are disabled.
         """
         if self._image is None:
             raise ResetNeeded("call reset() before step()")
@@ -678,7 +690,10 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         return observed(fleet, moved.image, moved.altitude_m), rewards, terminated, truncated, _infos(moved, ~renewed)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each fan ``(rows, columns, 3)``, forward up; None before a ping, or without a mode."""
+        """Return a picture of each vehicle's fan ``(rows, columns, 3)``, forward up.
+
+        Return None before the first ping, and if ``render_mode`` is None.
+        """
         if self.render_mode is None or self._image is None:
             return None
         fan = fan_of(self.fleet.sonar)
@@ -686,14 +701,14 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
 
 
 def _infos(moved: Transition, which: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return what is known of the vehicles beside their observations."""
+    """Return the infos of a step; ``which`` masks the vehicles for which clearance and ends are valid."""
     whole = _masked({"pose": moved.poses.copy()}, np.ones(len(which), dtype=bool))
     table = {"clearance_m": moved.clearance_m.copy(), "collided": moved.collided.copy(), "outside": moved.outside.copy()}
     return whole | _masked(table, which)
 
 
 def _masked(values: dict[str, Array], which: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return arrays by name, each with the mask of the vehicles that it holds for, as Gymnasium has it."""
+    """Add to each array the mask of the vehicles for which it is valid, in Gymnasium's convention."""
     return values | {f"_{name}": which.copy() for name in values}
 
 

@@ -1,4 +1,4 @@
-"""The loop of a live sonar: the newest pose becomes a ping, and the ping is published. A path is played where none comes."""
+"""How a live sonar works: it renders a ping for the newest pose and publishes it, or plays a path while no pose arrives."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ __all__ = [
 
 
 LOOK_S = 0.25
-"""How long the loop waits for a pose before it looks again whether it shall end [s]."""
+"""Longest wait for a pose before the loop checks again whether it should end [s]."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class LivePing:
 
     Attributes:
         frames: one frame, with its pose.
-        number: of the ping since the start.
-        time_ns: wall clock when the pose came, or when the path's turn came [ns].
-        source: ``client``, or ``path`` that is played.
-        mark: what the client's pose had in ``id``.
-        dropped: poses that came since the ping before and that no ping took.
-        render_s: time for the frame [s].
+        number: number of the ping since the start.
+        time_ns: wall clock time when the pose arrived, or was taken from the path [ns].
+        source: origin of the pose: ``client``, or ``path`` for the path that is played.
+        mark: value of ``id`` in the client's pose.
+        dropped: number of poses that arrived since the previous ping and were not rendered.
+        render_s: rendering time of the frame [s].
     """
 
     frames: SonarFrames
@@ -74,20 +74,20 @@ class LivePing:
 
 
 class LivePublisher(Protocol):
-    """Takes pings to those who listen: a Foxglove server, or a ROS 2 node."""
+    """Protocol of a publisher of pings, such as a Foxglove server or a ROS 2 node."""
 
     def publish(self, ping: LivePing) -> None:
-        """Publish a ping to all who listen."""
+        """Publish a ping to all subscribers."""
 
     def complain(self, sentence: str) -> None:
-        """Tell all who listen what was refused."""
+        """Send all subscribers a warning, for example about a pose that was refused."""
 
     def close(self) -> None:
         """End all connections."""
 
 
 class Pinger(Protocol):
-    """What the loop needs of a simulator."""
+    """Protocol of the simulator that the loop needs."""
 
     def step(self, pose: ArrayLike, *, noise: NoiseModel | None = None, seed: int = 0) -> SonarFrames:
         """Render the next ping."""
@@ -105,30 +105,31 @@ def live_pings(
     quiet_s: float = 2.0,
     ends: Event | None = None,
 ) -> Iterator[LivePing]:
-    """Ping until told to end, and publish each ping; yield it afterwards.
+    """Render and publish pings until ``ends`` is set, and yield each one after it is published.
 
-    A client's pose is rendered at once. The path is played in a circle until the first pose comes, and goes on when none
-    came for a while. A path of a single pose is one ping.
+    The pose of a client is rendered at once. The path is played in a loop until the first pose arrives, and continues when
+    no pose has arrived for ``quiet_s``. A path of a single pose gives one ping.
 
     Args:
-        simulator: of the scene and the sonar.
-        mailbox: where poses arrive.
-        publisher: of the pings.
-        path: is played where no pose comes.
-        rate_hz: pings a second of the path [Hz].
-        noise: drawn from (seed, number of the ping, cell); default none.
-        seed: of the noise.
-        quiet_s: time without a pose after which the path goes on [s].
-        ends: ends the loop between two pings, once it is set; an exception within a ping would leave the renderer broken.
+        simulator: simulator of the scene and the sonar.
+        mailbox: mailbox in which poses arrive.
+        publisher: publisher of the pings.
+        path: path to play while no pose arrives.
+        rate_hz: rate of the pings along the path [Hz].
+        noise: noise, a function of (seed, number of the ping, cell); default: none.
+        seed: seed of the noise.
+        quiet_s: time without a pose after which the path continues [s].
+        ends: event that ends the loop between two pings; an exception within a ping would leave the renderer broken.
 
     Raises:
-        MitsonarError: a rate or a time that is not positive.
+        MitsonarError: the rate or the time is not positive.
     """
     if not (rate_hz > 0 and quiet_s > 0):
         raise MitsonarError(f"rate_hz and quiet_s must be positive: got {rate_hz:g}, {quiet_s:g}")
     ends = Event() if ends is None else ends
     numbers, next_in_path, heard, due = count(), 0, -float("inf"), time.monotonic()
     while not ends.is_set():
+        # 1. Wait for a pose. While the path plays, wait no longer than until its next ping is due.
         now = time.monotonic()
         playing = now - heard > quiet_s and (len(path) > 1 or next_in_path == 0)
         delivered, source = mailbox.take(min(LOOK_S, max(0.0, due - now)) if playing else LOOK_S), "client"
@@ -137,9 +138,10 @@ def live_pings(
         elif playing and time.monotonic() >= due:
             delivered, source = _played(path, next_in_path), "path"
             next_in_path += 1
-            due = max(due, time.monotonic() - 1 / rate_hz) + 1 / rate_hz
+            due = max(due, time.monotonic() - 1 / rate_hz) + 1 / rate_hz  # at most one late ping is caught up
         else:
             continue
+        # 2. Render the pose, and publish the ping. A pose that cannot be rendered gives a warning.
         begun = time.perf_counter()
         try:
             frames = simulator.step(delivered.asked.pose, noise=noise, seed=seed)
@@ -152,38 +154,38 @@ def live_pings(
 
 
 def _ping(frames: SonarFrames, number: int, delivered: Delivered, source: str, render_s: float) -> LivePing:
-    """Return a ping with what is known of its pose."""
+    """Combine a frame, its delivered pose and the rendering time into a ping."""
     return LivePing(frames, number, delivered.came_ns, source, delivered.asked.mark, delivered.dropped, render_s)
 
 
 def _played(path: Trajectory, number: int) -> Delivered:
-    """Return the pose of a path that is played in a circle."""
+    """Return the next pose of a path that is played in a loop, delivered at the current time."""
     pose = path.poses[number % len(path)]
     return Delivered(AskedPose(Pose.from_row(float(value) for value in pose)), time.time_ns(), 0)
 
 
-# ---------------- Poses as messages: JSON of six numbers, or of ROS and Foxglove, in and out
+# ---------------- Messages with poses
 
 
 SIX = ("x", "y", "z", "pitch", "roll", "heading")
 ALSO = ("id", "header", "timestamp", "frame_id", "pose")
 
 FARTHEST_M = 1e6
-"""No pose lies farther from the origin [m]: single precision would round it to decimetres."""
+"""Largest coordinate of a pose [m]; beyond it single precision would round to decimetres."""
 
 LONGEST = 2**16
-"""Bytes of a message that asks for a ping, at most."""
+"""Largest size of a message with a pose [bytes]."""
 
 ROS = CONVENTIONS["ros-enu"]
 
 
 @dataclass(frozen=True)
 class AskedPose:
-    """A pose that a client asks for.
+    """A pose requested by a client.
 
     Attributes:
-        pose: of the sonar [m, rad].
-        mark: what the client's message has in ``id``, which the timing of the ping returns.
+        pose: pose of the sonar [m, rad].
+        mark: value of ``id`` in the client's message; the timing of the ping returns it.
     """
 
     pose: Pose
@@ -191,15 +193,17 @@ class AskedPose:
 
 
 def asked_pose(message: bytes) -> AskedPose:
-    """Read a pose from JSON.
+    """Parse a pose from JSON.
 
-    Two forms are read. ``{"x", "y", "z", "pitch", "roll", "heading"}`` are mitsonar's own, in m and deg; what is left out is
-    0. ``{"pose": {"position": {"x", "y", "z"}, "orientation": {"x", "y", "z", "w"}}}``, as ``foxglove.PoseInFrame`` and
-    ``geometry_msgs/PoseStamped`` have it, follows REP 103: x forward, y to port, z up.
+    There are two forms. ``{"x", "y", "z", "pitch", "roll", "heading"}`` follows mitsonar's conventions, in m and deg;
+    missing keys are 0. ``{"pose": {"position": {"x", "y", "z"}, "orientation": {"x", "y", "z", "w"}}}``, as in
+    ``foxglove.PoseInFrame`` and ``geometry_msgs/PoseStamped``, follows REP 103: x forward, y to port, z up.
 
     Raises:
-        MitsonarError: not JSON, unknown or missing keys, no numbers, a turn of length 0, or beyond 1000 km.
+        MitsonarError: the message is not JSON, a key is unknown or missing, a value is no finite number, the quaternion has
+            length 0, or the position lies beyond 1000 km.
     """
+    # 1. Parse the JSON, and check its keys and its id.
     if len(message) > LONGEST:
         raise MitsonarError(f"a pose is at most {LONGEST:,} bytes: got {len(message):,}")
     table = parse_json(message, "the pose")
@@ -215,6 +219,7 @@ def asked_pose(message: bytes) -> AskedPose:
     mark = table.get("id")
     if not isinstance(mark, int | float | str | None) or (isinstance(mark, float) and not math.isfinite(mark)):
         raise MitsonarError(f"id of a pose is a finite number or a text: got {shortened(mark)}")
+    # 2. Read the form of REP 103.
     if "pose" in table:
         both = [key for key in SIX if key in table]
         if both:
@@ -223,6 +228,7 @@ def asked_pose(message: bytes) -> AskedPose:
         position = _numbers(inner.get("position", {}), "position", ("x", "y", "z"))
         turn = _numbers(inner.get("orientation", {"w": 1.0}), "orientation", ("x", "y", "z", "w"))
         return AskedPose(pose_from_ros(position, turn), mark)
+    # 3. Read the form of six numbers.
     if not any(key in table for key in SIX):
         raise MitsonarError(f"a pose has none of {', '.join(SIX)}, and no pose: give numbers in m and deg")
     values = _numbers({key: table[key] for key in SIX if key in table}, "pose", SIX)
@@ -230,14 +236,14 @@ def asked_pose(message: bytes) -> AskedPose:
 
 
 def pose_from_ros(position: ArrayLike, quaternion: ArrayLike) -> Pose:
-    """Return mitsonar's pose for one of REP 103.
+    """Convert a pose from the conventions of REP 103 to mitsonar's.
 
     Args:
-        position: x, y, z [m], z up.
-        quaternion: x, y, z, w, from (forward, port, up) to the world.
+        position: x, y, z ``(3,)`` [m], z up.
+        quaternion: x, y, z, w ``(4,)``, the rotation from (forward, port, up) to the world.
 
     Raises:
-        MitsonarError: a quaternion of length 0, or a position beyond 1000 km.
+        MitsonarError: the quaternion has length 0, or the position lies beyond 1000 km.
     """
     turn = np.asarray(quaternion, dtype=float)
     length = float(np.linalg.norm(turn))
@@ -248,17 +254,17 @@ def pose_from_ros(position: ArrayLike, quaternion: ArrayLike) -> Pose:
 
 
 def pose_in_ros(pose: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return position ``(3,)`` [m] and quaternion ``(4,)`` x, y, z, w of a pose, after REP 103."""
+    """Convert a pose ``(6,)`` [m, rad] to REP 103: position ``(3,)`` [m] and quaternion ``(4,)`` x, y, z, w."""
     table = np.atleast_2d(np.asarray(pose, dtype=float))
     position, rotation = ROS.from_ours(table[:, :3], vehicle_rotation(table))
     return position[0], rotation.as_quat(canonical=True)[0]
 
 
 def _near(pose: Pose) -> Pose:
-    """Return a pose whose numbers can be rendered.
+    """Return the pose, after checking that it is near enough to the origin to be rendered.
 
     Raises:
-        MitsonarError: they cannot.
+        MitsonarError: the pose is too far away.
     """
     if max(abs(value) for value in pose[:3]) > FARTHEST_M:
         raise MitsonarError(
@@ -268,10 +274,10 @@ def _near(pose: Pose) -> Pose:
 
 
 def _table(value: PlainValue, name: str, keys: tuple[str, ...]) -> dict[str, PlainValue]:
-    """Return a table with known keys only.
+    """Return a JSON object, after checking that it has known keys only.
 
     Raises:
-        MitsonarError: it is no table, or has others.
+        MitsonarError: the value is no object, or has unknown keys.
     """
     if not isinstance(value, dict):
         raise MitsonarError(f"{name} must be an object with {', '.join(keys)}: got {shortened(value)}")
@@ -282,10 +288,10 @@ def _table(value: PlainValue, name: str, keys: tuple[str, ...]) -> dict[str, Pla
 
 
 def _numbers(value: PlainValue, name: str, keys: tuple[str, ...]) -> list[float]:
-    """Return the numbers of a table; 0 where a key is left out.
+    """Return the numbers of a JSON object in the order of ``keys``; missing ones are 0.
 
     Raises:
-        MitsonarError: other keys, or no finite numbers.
+        MitsonarError: a key is unknown, or a value is no finite number.
     """
     table = _table(value, name, keys)
     for key, number in table.items():
@@ -295,17 +301,17 @@ def _numbers(value: PlainValue, name: str, keys: tuple[str, ...]) -> list[float]
     return [float(table.get(key, 0.0)) for key in keys]
 
 
-# ---------------- The place where poses arrive and the loop takes the newest: older ones that no ping took are dropped
+# ---------------- Mailbox of poses
 
 
 @dataclass(frozen=True)
 class Delivered:
-    """A pose and when it came.
+    """A pose and the time of its arrival.
 
     Attributes:
-        asked: what a client asked for.
-        came_ns: wall clock at its arrival [ns].
-        dropped: poses that came before it and that no ping took.
+        asked: the requested pose.
+        came_ns: wall clock time of its arrival [ns].
+        dropped: number of earlier poses that it replaced before they were rendered.
     """
 
     asked: AskedPose
@@ -314,14 +320,14 @@ class Delivered:
 
 
 class PoseMailbox:
-    """Holds the newest pose. Threads of a server put, the loop takes."""
+    """A mailbox that contains only the newest pose: threads of a server put poses, and the loop takes them."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._newest: Delivered | None = None
 
     def put(self, asked: AskedPose) -> None:
-        """Deliver a pose in place of the one that waits."""
+        """Deliver a pose, and drop the one that is still waiting, if any."""
         with self._changed:
             waiting = self._newest
             dropped = 0 if waiting is None else waiting.dropped + 1
@@ -329,7 +335,7 @@ class PoseMailbox:
             self._changed.notify_all()
 
     def take(self, wait_s: float) -> Delivered | None:
-        """Return the newest pose and empty the box; wait for one at most that long [s]. None: none came."""
+        """Return the newest pose and empty the mailbox; return None if no pose arrives within ``wait_s`` [s]."""
         with self._changed:
             if self._newest is None and wait_s > 0:
                 self._changed.wait(wait_s)
@@ -337,7 +343,7 @@ class PoseMailbox:
             return taken
 
 
-# ---------------- A ping as messages: the fan as JPEG, the polar image as ROS 2 has it, its timing
+# ---------------- Messages of a ping
 
 
 PROJECTED_TYPE = "marine_acoustic_msgs/msg/ProjectedSonarImage"
@@ -377,16 +383,18 @@ PROJECTED = "\n".join(
         "",
     )
 )
-"""Definition of the message as ROS 2 writes it, without constants and comments."""
+"""Definition of the message in the format of ROS 2, without constants and comments."""
 
 UINT8 = 0
 
 
 class FanEncoder:
-    """Encodes frames of one sonar as JPEG fans: those of :class:`FanPictures` to one step of 255, by a sparse matrix.
+    """An encoder of the frames of one sonar as JPEG pictures of the fan.
+
+    A sparse matrix maps cells to pixels. The pictures equal those of :class:`FanPictures` to within one step of 255.
 
     Args:
-        quality: of JPEG, 1..95.
+        quality: quality of the JPEG, 1..95.
     """
 
     def __init__(self, quality: int = 85) -> None:
@@ -394,13 +402,14 @@ class FanEncoder:
         self._inside: NDArray[np.intp] | None = None
 
     def jpeg(self, frames: SonarFrames, index: int = 0) -> bytes:
-        """Return one frame's fan, forward up, starboard to the right, grey; black outside the fan."""
+        """Return the fan of one frame as a grey JPEG: forward up, starboard to the right, black outside the fan."""
         buffer = io.BytesIO()
         Image.fromarray(self.picture(frames, index)).save(buffer, format="JPEG", quality=self.quality)
         return buffer.getvalue()
 
     def picture(self, frames: SonarFrames, index: int = 0) -> NDArray[np.uint8]:
-        """Return one frame's fan ``(rows, columns)``, 0..255."""
+        """Return the fan of one frame ``(rows, columns)``, 0..255."""
+        # The first frame sets up the matrix: each row has the four cells and weights of a pixel inside the fan.
         if self._inside is None:
             fan = FanPictures(frames).fan
             self._shape = fan.index.shape[1:]
@@ -411,7 +420,7 @@ class FanEncoder:
             size = (len(cells), frames.image[0].size)
             self._matrix = csr_array((parts.ravel(), cells.ravel().astype(np.int32), rows), shape=size)
         image = frames.image[index]
-        levels = image if image.dtype == np.uint8 else to_uint8(image)  # beam by beam, as sonars send them
+        levels = image if image.dtype == np.uint8 else to_uint8(image)  # quantised in polar coordinates, as sonars send them
         picture = np.zeros(self._shape, np.uint8)
         picture.reshape(-1)[self._inside] = self._matrix @ levels.reshape(-1).astype(np.float32) + np.float32(0.5)
         return picture
@@ -420,14 +429,14 @@ class FanEncoder:
 def projected_image(frames: SonarFrames, time_ns: int, frame_id: str, index: int = 0) -> bytes:
     """Encode a frame as ``marine_acoustic_msgs/msg/ProjectedSonarImage`` in CDR, little-endian.
 
-    Beams lie in the message's own axes: z forward, x up, y to starboard. Data are 8 bit, all beams of the nearest range
-    first.
+    Beam directions have the axes of the message: z forward, x up, y to starboard. Data are 8 bit, with all beams of the
+    nearest range first.
 
     Args:
-        frames: whose frame it is.
-        time_ns: of the ping [ns].
-        frame_id: name of the sonar's axes.
-        index: of the frame.
+        frames: frames to encode from.
+        time_ns: time of the ping [ns].
+        frame_id: name of the sonar's coordinate frame.
+        index: index of the frame.
     """
     sonar, image = frames.sonar, frames.image[index]
     bearing = np.asarray(frames.bearing_rad, dtype=float)
@@ -447,7 +456,7 @@ def projected_image(frames: SonarFrames, time_ns: int, frame_id: str, index: int
 
 
 def timing(ping: LivePing, published_ns: int | None = None) -> dict[str, PlainValue]:
-    """Return number, pose, source and times of a ping, as JSON can hold them."""
+    """Return the number, source, times and pose of a ping (m, deg) as a JSON object."""
     assert ping.frames.poses is not None
     six = ping.frames.poses[0]
     angles = np.degrees(six[3:])
@@ -471,7 +480,7 @@ def timing(ping: LivePing, published_ns: int | None = None) -> dict[str, PlainVa
 
 
 class _Cdr:
-    """Writes the common data representation: values aligned to their own size, counted from after the first 4 bytes."""
+    """Writer of the common data representation (CDR): values are aligned to their size, relative to the fifth byte."""
 
     def __init__(self) -> None:
         self.content = bytearray(b"\x00\x01\x00\x00")
@@ -480,7 +489,7 @@ class _Cdr:
         self.content += bytes(-(len(self.content) - 4) % size)
 
     def pack(self, form: str, *values: float) -> None:
-        """Append numbers of one size."""
+        """Append numbers, aligned to the size of the first."""
         self.align(struct.calcsize(form[:2]))
         self.content += struct.pack(form, *values)
 
@@ -490,7 +499,7 @@ class _Cdr:
         self.content += encoded
 
     def array(self, values: NDArray[Any], length: int | None = None) -> None:
-        """Append an array with its length; ``length`` where its elements are rows."""
+        """Append an array after its length, which is ``length`` if its elements are rows."""
         self.pack("<I", values.size if length is None else length)
         if values.size:
             self.align(values.itemsize)

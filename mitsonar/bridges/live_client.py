@@ -1,4 +1,4 @@
-"""A client of a live sonar, in plain Python: poses in, messages out; text is JSON, binary is a message."""
+"""How a plain Python client talks to a live sonar: it publishes poses and receives messages."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ POSES, MESSAGE = 1, 1
 
 
 class LiveMessage(NamedTuple):
-    """What came on a channel.
+    """A message received on a channel.
 
     Attributes:
-        topic: of the channel.
-        time_ns: of the ping [ns].
-        content: bytes of the message, in the channel's encoding.
+        topic: topic of the channel.
+        time_ns: time of the ping [ns].
+        content: bytes of the message, in the encoding of the channel.
     """
 
     topic: str
@@ -38,21 +38,23 @@ class LiveMessage(NamedTuple):
 
 
 class LiveClient:
-    """Subscribes to topics of ``mitsonar serve`` and publishes poses, over the Foxglove WebSocket protocol.
+    """A client that subscribes to topics of ``mitsonar serve`` and publishes poses, over Foxglove's WebSocket protocol.
+
+    In this protocol text frames are JSON, and binary frames are messages.
 
     Args:
-        address: of the server, ``ws://127.0.0.1:8765``.
-        topics: to subscribe to.
-        pose_topic: to publish poses on.
-        encoding: of the poses; the server reads ``json``.
+        address: address of the server, such as ``ws://127.0.0.1:8765``.
+        topics: topics to subscribe to.
+        pose_topic: topic to publish poses on.
+        encoding: encoding of the poses; the server reads ``json``.
 
     Attributes:
-        channels: that the server has, by topic, as it advertises them.
-        status: sentences that the server said, such as why it refused a pose.
-        info: what the server says of itself.
+        channels: channels as the server advertises them, keyed by topic.
+        status: status messages of the server, such as the reason why it refused a pose.
+        info: the server's description of itself.
 
     Raises:
-        MitsonarError: no server answers there, or it lacks a topic.
+        MitsonarError: no server answers at the address, or it lacks a topic.
     """
 
     def __init__(
@@ -89,10 +91,10 @@ class LiveClient:
         self._socket.send(struct.pack("<BI", MESSAGE, POSES) + content)
 
     def receive(self, timeout_s: float = 30.0) -> LiveMessage:
-        """Wait for the next message. Sentences on the way are added to ``status``.
+        """Wait for the next message and return it; status messages received meanwhile are added to ``status``.
 
         Raises:
-            TimeoutError: none came in time.
+            TimeoutError: no message arrived in time.
         """
         end = time.monotonic() + timeout_s
         while True:
@@ -106,10 +108,10 @@ class LiveClient:
                 self._text(got)
 
     def wait_for_status(self, timeout_s: float = 10.0) -> str:
-        """Wait for the next sentence of the server and return it. Messages on the way are lost.
+        """Wait for the next status message of the server and return it; other messages received meanwhile are lost.
 
         Raises:
-            TimeoutError: none came in time.
+            TimeoutError: no status message arrived in time.
         """
         known, end = len(self.status), time.monotonic() + timeout_s
         while len(self.status) == known:
@@ -117,7 +119,7 @@ class LiveClient:
         return self.status[known]
 
     def close(self) -> None:
-        """Leave."""
+        """Close the connection."""
         self._ends.close()
 
     def __enter__(self) -> Self:
@@ -127,15 +129,15 @@ class LiveClient:
         self.close()
 
     def _acknowledge(self) -> None:
-        """Acknowledge at once: the server's TCP holds a small message back until the one before is, for 40 ms otherwise."""
-        with contextlib.suppress(AttributeError, OSError):  # Linux has the option
+        """Make TCP acknowledge at once; the server delays a small message until the previous one is acknowledged (40 ms)."""
+        with contextlib.suppress(AttributeError, OSError):  # the option exists on Linux only
             self._socket.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
     def _send(self, **words: PlainValue) -> None:
         self._socket.send(json.dumps(words))
 
     def _text(self, got: str | bytes) -> None:
-        """Take what the server says in JSON; a message is left out."""
+        """Process a JSON frame of the server; ignore binary messages."""
         if isinstance(got, bytes):
             return
         table = json.loads(got)
@@ -148,10 +150,10 @@ class LiveClient:
 
 
 def image_of(content: bytes) -> bytes:
-    """Take the picture's bytes out of a ``foxglove.CompressedImage``: field 2 of the protobuf message.
+    """Return the bytes of the picture in a ``foxglove.CompressedImage``: field 2 of the protobuf message.
 
     Raises:
-        MitsonarError: the message is none.
+        MitsonarError: the message is not of this type.
     """
     place = 0
     try:
@@ -167,7 +169,7 @@ def image_of(content: bytes) -> bytes:
 
 
 def _varint(content: bytes, place: int) -> tuple[int, int]:
-    """Return a number of protobuf, and where the next one begins."""
+    """Return a variable-length integer of protobuf, and the offset of what follows."""
     value = shift = 0
     while True:
         byte = content[place]

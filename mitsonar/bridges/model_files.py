@@ -1,4 +1,4 @@
-"""Bodies of a scene of another simulator: links or prims with a place and geometries of their own."""
+"""How the files of another simulator's scene are read safely: bodies, primitives, model files, file search, XML."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ __all__ = [
 
 
 Matrix: TypeAlias = NDArray[np.float64]
-"""From the axes of a body to others, ``(4, 4)``; lengths in m."""
+"""Homogeneous transform from the axes of a body to others ``(4, 4)``; lengths in m."""
 
 SECTIONS = 96
-"""Corners around a cylinder: its side is flat to 0.05 % of its radius."""
+"""Corners around a cylinder; its facets deviate by 0.05 % of its radius."""
 
 SUBDIVISIONS = 4
-"""Halvings of the edges of a sphere, which is then flat to 0.1 % of its radius."""
+"""Number of times that the edges of a sphere's mesh are halved; its facets deviate by 0.1 % of its radius."""
 
 PLANE_M = 100.0
 """Edge of a plane without a size [m]."""
@@ -51,13 +51,13 @@ PLANE_M = 100.0
 
 @dataclass(frozen=True)
 class Body:
-    """A link or prim.
+    """A link or prim with geometries.
 
     Attributes:
-        name: becomes the id of its shape.
-        pose: from its axes to the world.
-        pieces: in its axes.
-        within: names of what it belongs to: models, prims above it, the robot.
+        name: name of the body, from which the id of its shape is made.
+        pose: transform from its axes to the world.
+        pieces: geometries, in its axes.
+        within: names of the models, prims or robot that contain it.
     """
 
     name: str
@@ -68,12 +68,12 @@ class Body:
 
 @dataclass
 class ReadScene:
-    """What was read of a file.
+    """The contents of a scene file.
 
     Attributes:
-        bodies: with geometries.
-        frames: pose of each name that a body may have or lie within.
-        left_out: what was not read, by kind, and how often.
+        bodies: bodies with geometries.
+        frames: poses of all links, models and prims, keyed by name.
+        left_out: number of elements that were not read, keyed by kind.
     """
 
     bodies: list[Body] = field(default_factory=list)
@@ -81,12 +81,12 @@ class ReadScene:
     left_out: dict[str, int] = field(default_factory=dict)
 
     def leave_out(self, kind: str) -> None:
-        """Count something that is not read."""
+        """Count an element that is not read."""
         self.left_out[kind] = self.left_out.get(kind, 0) + 1
 
 
 def placed(position: ArrayLike, rotation: Rotation | None = None) -> Matrix:
-    """Return the matrix of a position ``(3,)`` [m] and a rotation."""
+    """Return the transform of a position ``(3,)`` [m] and a rotation, by default none."""
     matrix = np.eye(4)
     matrix[:3, 3] = position
     if rotation is not None:
@@ -95,7 +95,7 @@ def placed(position: ArrayLike, rotation: Rotation | None = None) -> Matrix:
 
 
 def rigid(matrix: Matrix) -> Matrix:
-    """Return the nearest matrix that only turns and moves; scales, shears and mirrors are taken out."""
+    """Return the nearest rigid transform, without scale, shear or reflection."""
     first, _, last = np.linalg.svd(matrix[:3, :3])
     turn = first @ np.diag([1, 1, np.linalg.det(first @ last)]) @ last
     return placed(matrix[:3, 3], Rotation.from_matrix(turn))
@@ -145,20 +145,20 @@ PRIMITIVES: dict[str, Callable[[Mapping[str, float]], trimesh.Trimesh]] = {
     "cone": _cone,
     "plane": _plane,
 }
-"""Primitives about their middle, cylinders, capsules and cones along z; ``length`` of a capsule is that of its cylinder."""
+"""Primitives around their centre; cylinders, capsules and cones along z. A capsule's ``length`` is that of its cylinder."""
 
 
 def primitive(kind: str, size: Mapping[str, float], reflectivity: float, source: str) -> Piece:
     """Return a primitive of :data:`PRIMITIVES`.
 
     Args:
-        kind: its name.
+        kind: name of the primitive.
         size: ``x``, ``y``, ``z``, or ``radius`` and ``length`` [m].
-        reflectivity: of all of it, 0..1.
-        source: what names it, for errors.
+        reflectivity: uniform reflectivity, 0..1.
+        source: file and element that define it, for error messages.
 
     Raises:
-        MitsonarError: a size is not above 0.
+        MitsonarError: a size is not in 1e-6..1e6 m.
     """
     wrong = [f"{name} {value:g}" for name, value in size.items() if not 1e-6 <= value <= 1e6]
     if wrong:
@@ -169,10 +169,10 @@ def primitive(kind: str, size: Mapping[str, float], reflectivity: float, source:
 
 
 class Shapes:
-    """Reads geometries, each file once, and bounds their number.
+    """A reader of geometries that reads each file once, and limits the total number of triangles.
 
     Args:
-        value: ``red``, ``luminance`` or a number: what of a colour is the reflectivity.
+        value: reflectivity of a colour: ``red``, ``luminance`` or a number.
     """
 
     def __init__(self, value: str | float) -> None:
@@ -181,10 +181,10 @@ class Shapes:
         self._triangles = 0
 
     def counted(self, pieces: list[Piece], source: str) -> list[Piece]:
-        """Return pieces, and count their triangles.
+        """Count the triangles of geometries, and return the geometries.
 
         Raises:
-            MitsonarError: all together have too many.
+            MitsonarError: there are too many triangles in total.
         """
         self._triangles += sum(len(piece.faces) for piece in pieces)
         if self._triangles > MOST_TRIANGLES:
@@ -192,15 +192,15 @@ class Shapes:
         return pieces
 
     def of_file(self, path: Path, scale: ArrayLike, reflectivity: float | None) -> list[Piece]:
-        """Return the geometries of a model file, z upwards, in m.
+        """Return the geometries of a model file, with z upwards, in m.
 
         Args:
-            path: of the file; glTF has y upwards, and COLLADA tells its unit.
-            scale: along its axes ``(3,)``.
-            reflectivity: of all of it, in place of its colours; default: by its colours.
+            path: model file; glTF has y upwards, and COLLADA states its unit.
+            scale: scale along the axes of the result ``(3,)``.
+            reflectivity: uniform reflectivity instead of the file's colours; default: from the colours.
 
         Raises:
-            MitsonarError: it cannot be read.
+            MitsonarError: the file cannot be read, or there are too many triangles in total.
         """
         if path not in self._files:
             self._files[path] = read_pieces(path, self.value)
@@ -212,7 +212,7 @@ class Shapes:
 
 
 def _unit_m(path: Path) -> float:
-    """Return the unit of a COLLADA file [m]."""
+    """Return the length of the unit of a COLLADA file [m]; 1 if it is missing or implausible."""
     for element in read_xml(path, "COLLADA file").iter():
         if element.tag.endswith("}unit") or element.tag == "unit":
             unit = number_of(path, element, element.get("meter"), 1.0)
@@ -220,29 +220,28 @@ def _unit_m(path: Path) -> float:
     return 1.0
 
 
-# ---------------- Files that a scene names: found within its own folder and the folders that the user allows, and
-# nowhere else
+# ---------------- File search
 
 
 LONGEST = 1024
-"""Letters of a file's name in a scene, at most."""
+"""Largest length of a file name in a scene [characters]."""
 
 PACKAGES = ("model://", "package://")
-"""Begin of names whose next word is the name of a folder, of Gazebo and ROS."""
+"""Schemes of Gazebo and ROS, which are followed by the name of a folder."""
 
 
 class ModelSearch:
-    """Finds the files that a scene names.
+    """A search for the files that a scene names, within the scene's folder and the folders that the user allows.
 
     Args:
-        file: of the scene.
-        folders: where models and packages lie as well.
+        file: file of the scene.
+        folders: further folders with models and packages.
 
     Attributes:
-        roots: folders within which a file must lie, without links.
+        roots: folders that a file must lie in, with symbolic links resolved.
 
     Raises:
-        MitsonarError: the file, or one of the folders, is not there.
+        MitsonarError: the file or one of the folders does not exist.
     """
 
     def __init__(self, file: Path, folders: Sequence[str | Path] = ()) -> None:
@@ -252,18 +251,19 @@ class ModelSearch:
         if missing:
             raise MitsonarError(f"there is no folder {missing[0]} to search: give a folder that holds models or packages")
         roots = (_without_links(file).parent, *(_without_links(folder) for folder in folders))
-        self.roots = list(dict.fromkeys(roots))  # each once
+        self.roots = list(dict.fromkeys(roots))  # without duplicates
 
     def find(self, name: str, beside: Path) -> Path:
-        """Return the file or folder that a scene names.
+        """Find the file or folder that a scene names.
 
         Args:
-            name: a path, or ``model://``, ``package://`` or ``file://`` and one. ``model://NAME/...`` is the folder NAME
-                within a folder that is searched, or that folder itself.
-            beside: file that names it; a path without a scheme counts from there, then from the folders that are searched.
+            name: a path, possibly with the scheme ``model://``, ``package://`` or ``file://``. In ``model://NAME/...`` NAME
+                is a folder within a searched folder, or the searched folder itself.
+            beside: file that contains the name; a path without a scheme is relative to its folder, or else to the searched
+                folders.
 
         Raises:
-            MitsonarError: it is not there, lies outside the folders, or is an address of the net.
+            MitsonarError: the file does not exist, lies outside the folders, or is a network address.
         """
         name = name.strip()
         if len(name) > LONGEST or "\0" in name or not name:
@@ -288,7 +288,7 @@ class ModelSearch:
         )
 
     def _candidates(self, name: str, scheme: str, beside: Path) -> list[Path]:
-        """List where a file may lie."""
+        """Return the paths where a file may be, in the order of preference."""
         path = Path(name.removeprefix(scheme) if scheme else name.removeprefix("file://"))
         if not scheme:
             return [beside.parent / path, *(root / path for root in self.roots)]
@@ -300,11 +300,11 @@ class ModelSearch:
 
 
 def _without_links(path: str | Path) -> Path:
-    """Return a path without links. One that leads to itself stays as it is, where :meth:`Path.resolve` raises."""
+    """Return a path with symbolic links resolved; circular links are kept, for which :meth:`Path.resolve` raises."""
     return Path(os.path.realpath(path))
 
 
-# ---------------- XML of strangers: no document types, so no entities; a bounded size, depth and number of elements
+# ---------------- XML from untrusted sources
 
 
 DEEPEST = 100
@@ -317,11 +317,11 @@ LARGEST = 2**28
 """Largest size of a file [bytes]."""
 
 FARTHEST = 1e9
-"""Largest number that a file may give [m, rad]."""
+"""Largest magnitude of a number in a file [m, rad]."""
 
 
 class _Bounded(TreeBuilder):
-    """Builds a tree of a bounded depth and size, and no document type."""
+    """A tree builder with limits of depth and size that accepts no document type."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -341,19 +341,21 @@ class _Bounded(TreeBuilder):
         return super().end(tag)
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> NoReturn:
-        """Refuse a document type before anything of it is read: entities may name files, or grow without bound."""
+        """Refuse a document type before it is read: its entities may refer to files, or expand without limit."""
         raise ValueError("it has a document type (<!DOCTYPE>), which scenes do not need")
 
 
 def read_xml(path: Path, what: str) -> Element:
-    """Read the tree of an XML file.
+    """Read the element tree of an XML file that may be hostile.
+
+    Document types are refused, and with them entities. Size, depth and number of elements are limited.
 
     Args:
-        path: of the file.
-        what: kind of file, for errors: ``URDF file``.
+        path: XML file.
+        what: kind of file, for error messages, such as ``URDF file``.
 
     Raises:
-        MitsonarError: it is unreadable, no XML, has a document type, or is too large or too deep.
+        MitsonarError: the file is unreadable, is no XML, has a document type, or is too large or too deep.
     """
     parser = XMLParser(target=_Bounded())
     try:
@@ -368,17 +370,17 @@ def read_xml(path: Path, what: str) -> Element:
 
 
 def refused(path: Path, element: Element, reason: str) -> MitsonarError:
-    """Return the error for an element of a file; ``reason`` is what, got, allowed."""
+    """Return an error for an element of a file; ``reason`` states what is wrong, what was found and what is allowed."""
     name = element.get("name")
     where = f"<{element.tag[:40]}{f' name={shortened(name)}' if name else ''}>"
     return MitsonarError(f"{path}, {where}: {reason}")
 
 
 def attribute_of(path: Path, element: Element, key: str) -> str:
-    """Return an attribute that must be there.
+    """Return a mandatory attribute.
 
     Raises:
-        MitsonarError: it is missing or empty.
+        MitsonarError: the attribute is missing or empty.
     """
     value = element.get(key)
     if not value:
@@ -387,17 +389,17 @@ def attribute_of(path: Path, element: Element, key: str) -> str:
 
 
 def numbers_of(path: Path, element: Element, text: str | None, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the numbers of an attribute or of the text of an element, separated by spaces.
+    """Parse the numbers of an attribute or of an element's text, separated by spaces.
 
     Args:
-        path: of the file, for errors.
-        element: for errors.
-        text: of the numbers; None or empty: ``default``.
-        count: how many.
-        default: numbers where there is no text.
+        path: the file, for error messages.
+        element: the element, for error messages.
+        text: text to parse; None or empty gives ``default``.
+        count: number of numbers.
+        default: numbers to return without text.
 
     Raises:
-        MitsonarError: not that many finite numbers, or too large ones.
+        MitsonarError: the text does not have ``count`` finite numbers, or one is too large.
     """
     if text is None or not text.strip():
         return default
@@ -411,10 +413,10 @@ def numbers_of(path: Path, element: Element, text: str | None, count: int, defau
 
 
 def number_of(path: Path, element: Element, text: str | None, default: float | None = None) -> float:
-    """Return one number, as :func:`numbers_of` reads it.
+    """Parse a single number, as :func:`numbers_of` does.
 
     Raises:
-        MitsonarError: it is no finite number, or missing and without a default.
+        MitsonarError: the text is no finite number, or is missing without a default.
     """
     if default is None and (text is None or not text.strip()):
         raise refused(path, element, "a number is missing")

@@ -1,4 +1,4 @@
-"""Where the sonar of an imported scene stands: a few metres from its objects, not from its ground."""
+"""How a scene of another simulator (URDF, SDF, USD) becomes a world, with a sonar that looks at its objects."""
 
 from __future__ import annotations
 
@@ -29,31 +29,31 @@ Point: TypeAlias = NDArray[np.float64]
 Groups: TypeAlias = Mapping[str, Sequence[Piece]]
 
 REACH = {"didson300": 15.0, "oculus-m1200d-1200khz": 40.0}
-"""Farthest range at which each preset is used [m], within the limits of its instrument; the nearest first."""
+"""Largest range at which each preset is used [m], within the limits of its instrument, in ascending order."""
 
 NEAREST_M = 1.0
-"""The sonar keeps this distance [m]."""
+"""Smallest distance of the sonar from its target [m]."""
 
 PART_M = 1.2
-"""Radius of the part that is looked at where no shape fits [m]."""
+"""Radius of the part of a shape that the sonar looks at if no shape fits into its view [m]."""
 
 FLAT, LOW, WIDE = 1e-3, 0.2, 0.5
-"""Ground is flat, or low and wide: height over diagonal, and part of the area of all shapes."""
+"""Limits for ground: a flat shape's height over its diagonal; a low shape's, and its share of the area of all shapes."""
 
 TURNS_DEG = (0, 45, -45, 90, -90, 135, -135, 180)
-"""Directions that are tried, about the vertical; 0 looks along +y."""
+"""Headings of the view in the order in which they are tried [deg]; 0 looks along +y."""
 
 TRIANGLES = 2**17
-"""Triangles that a ray meets at once, a bound of memory."""
+"""Number of triangles intersected with a ray at once, to bound the memory."""
 
 
 class ImportedView(NamedTuple):
-    """What the sonar looks at.
+    """The view of the sonar in an imported scene.
 
     Attributes:
-        stand: of the sonar.
-        about: what it sees, in words.
-        part: whether no shape fits, so that it sees a part of one.
+        stand: position and window of the sonar.
+        about: description of what the sonar sees.
+        part: whether the sonar sees only a part of a shape, because no shape fits into its view.
     """
 
     stand: Standpoint
@@ -62,14 +62,16 @@ class ImportedView(NamedTuple):
 
 
 def view_of_objects(groups: Groups) -> ImportedView:
-    """Return the view of all objects, of the largest one that a sonar takes in, or of a part.
+    """Choose a view of all objects, of the largest object that fits into a sonar's view, or of a part of one.
 
     Args:
-        groups: the geometries of each shape, in the axes of the world [m].
+        groups: geometries of each shape, in the axes of the world [m].
     """
+    # 1. Ignore the ground, unless there is nothing else.
     boxes = {name: _box(pieces) for name, pieces in groups.items()}
     objects = {name: box for name, box in boxes.items() if not _is_ground(box, _union(list(boxes.values())))}
     objects = objects or boxes
+    # 2. Choose the target: everything, the largest object that fits, or a part of the largest object.
     whole = _union(list(objects.values()))
     fitting = {name: box for name, box in objects.items() if _fits(box)}
     if _fits(whole):
@@ -85,7 +87,7 @@ def view_of_objects(groups: Groups) -> ImportedView:
 
 
 def _box(pieces: Sequence[Piece]) -> Point:
-    """Return the lowest and the highest corner of geometries ``(2, 3)`` [m]."""
+    """Return the lowest and the highest corner of the geometries' bounding box ``(2, 3)`` [m]."""
     corners = np.concatenate([piece.vertices[np.unique(piece.faces)] for piece in pieces])
     return np.array([corners.min(axis=0), corners.max(axis=0)])
 
@@ -99,7 +101,7 @@ def _radius(box: Point) -> float:
 
 
 def _fits(box: Point) -> bool:
-    """Return whether a sonar of :data:`REACH` takes it in."""
+    """Return whether a box fits into the view of a sonar of :data:`REACH`."""
     return _overview(box).window[1] <= max(REACH.values())
 
 
@@ -118,7 +120,7 @@ def _is_ground(box: Point, whole: Point) -> bool:
 
 
 def _part(pieces: Sequence[Piece], box: Point) -> Point:
-    """Return the box around the place that a ray along the view, through the middle, meets first."""
+    """Return the box of a part of a shape, around the first hit of a ray along the view through the shape's centre."""
     middle, along = box.mean(axis=0), _forward(0)
     begin = middle - 2 * _radius(box) * along
     met = begin + _first_hit(pieces, begin, along) * along
@@ -127,7 +129,7 @@ def _part(pieces: Sequence[Piece], box: Point) -> Point:
 
 
 def _clear_view(groups: Groups, box: Point) -> tuple[Standpoint, float]:
-    """Return the view of a box from the first direction without anything before it, and its distance [m]."""
+    """Return the view of a box from the first heading with a free line of sight, and its distance [m]."""
     base = _overview(box)
     target = np.array(base.target)
     away = float(np.linalg.norm(target - np.array(base.origin)))
@@ -144,13 +146,16 @@ def _clear_view(groups: Groups, box: Point) -> tuple[Standpoint, float]:
 
 
 def _forward(turn_deg: float) -> Point:
-    """Return the direction of a view 30 deg down, turned about the vertical."""
+    """Return the direction of a view that looks down at 30 deg, with a given heading ``(3,)``."""
     turn, down = np.radians(turn_deg), np.radians(30)
     return np.array([np.sin(turn) * np.cos(down), np.cos(turn) * np.cos(down), -np.sin(down)])
 
 
 def _first_hit(pieces: Sequence[Piece], origin: Point, along: Point) -> float:
-    """Return the distance at which a ray meets triangles first [m], inf where it meets none (Moeller, Trumbore 1997)."""
+    """Return the distance along a ray to the first triangle [m], inf if it hits none (Moeller, Trumbore 1997).
+
+    A ray meets a triangle where its barycentric coordinates u, v satisfy u >= 0, v >= 0 and u + v <= 1.
+    """
     nearest = np.inf
     for piece in pieces:
         for first in range(0, len(piece.faces), TRIANGLES):
@@ -169,13 +174,13 @@ def _first_hit(pieces: Sequence[Piece], origin: Point, along: Point) -> float:
     return nearest
 
 
-# ---------------- A world from the scene of another simulator: URDF, SDF or USD
+# ---------------- World of an imported scene
 
 
 SCENE_FORMATS = (".urdf", ".sdf", ".world", ".usd", ".usda", ".usdc", ".usdz")
 
 MOST_SHAPES = 5_000
-"""Shapes of a scene, at most: each costs time in every launch."""
+"""Largest number of shapes of a scene; each costs time in every launch."""
 
 FARTHEST_M = 1e6
 """Largest distance of a vertex from the origin [m]."""
@@ -192,27 +197,29 @@ def imported_world(
     own_axes: Sequence[str] = (),
     seabed_z: float | None = None,
 ) -> World:
-    """Build the world of a scene of another simulator: one shape for each link or prim, where the file has it.
+    """Build the world of a scene of another simulator, with one shape for each link or prim.
 
-    The axes of the world stay: x and y of the file are mitsonar's, z is up (USD stages with y up are turned), in metres.
+    The axes of the world are kept: x and y of the file are mitsonar's, z is up (USD stages with y up are rotated), and
+    lengths are in metres.
 
     Args:
-        path: ``.urdf``, ``.sdf``, ``.world``, ``.usd``, ``.usda``, ``.usdc`` or ``.usdz``.
-        joints: values of joints of URDF and SDF by name [rad, m]; others are at 0.
-        search: folders that hold models and packages; files elsewhere are refused, except beside the scene and below.
-        collision: read the collision shapes, in place of the visual ones.
-        reflectivity: ``luminance`` or ``red`` of diffuse colours, or one number for all; without a colour 0.5.
-        materials: acoustic material by the name of a link, model or prim.
-        own_axes: links, models or prims that are written about the origin, bow along +y, each as one shape: they follow a
-            trajectory, ``moving={name: path}``.
-        seabed_z: height of a seabed of random cells that is added [m]; default: none.
+        path: ``.urdf``, ``.sdf``, ``.world``, ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
+        joints: values of joints of URDF and SDF, keyed by name [rad, m]; others are at 0.
+        search: folders with models and packages; files outside them and outside the scene's folder are refused.
+        collision: whether to read the collision shapes instead of the visual ones.
+        reflectivity: ``luminance`` or ``red`` of diffuse colours, or one number for all; 0.5 without a colour.
+        materials: acoustic materials, keyed by the name of a link, model or prim.
+        own_axes: links, models or prims to write around the origin with the bow along +y, each as one shape, so that they
+            can follow a trajectory, ``moving={name: path}``.
+        seabed_z: height of a seabed of random cells to add [m]; default: none.
 
     Raises:
-        MitsonarError: the file is damaged, names what is not there or not allowed, or holds no geometry.
+        MitsonarError: the file is damaged, refers to something that is missing or not allowed, or contains no geometry.
 
     Warns:
-        MitsonarWarning: geometries that are not read.
+        MitsonarWarning: geometries are left out, or the sonar sees only a part of a shape.
     """
+    # 1. Read the scene.
     path = Path(path)
     shapes, search_in = Shapes(reflectivity_of(reflectivity)), ModelSearch(path, search)
     joints = dict(joints or {})
@@ -225,12 +232,14 @@ def imported_world(
     if read.left_out:
         told = ", ".join(f"{count} {kind[:40]}" for kind, count in sorted(read.left_out.items()))
         warnings.warn(f"{path}: these are not read and left out: {told}", MitsonarWarning, stacklevel=2)
+    # 2. Make one shape of each body, or of each name in `own_axes`.
     groups = _groups(path, read, own_axes)
     made, content = _meshes(path, groups, _checked_materials(path, read, materials or {}))
     still = np.concatenate([mesh.vertices[np.unique(mesh.faces)] for mesh in made])
     low, high = still.min(axis=0), still.max(axis=0)
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.05)
     half = float(np.abs([low, high])[:, :2].max()) + 3 * radius
+    # 3. Place the sonar in front of the objects that do not move, if there are any.
     kind = "collision" if collision else "visual"
     view = view_of_objects({name: pieces for name, pieces in groups.items() if name not in own_axes} or groups)
     if view.part:
@@ -247,7 +256,7 @@ def imported_world(
 
 
 def _read(path: Path, search: ModelSearch, shapes: Shapes, joints: Mapping[str, float], collision: bool) -> ReadScene:
-    """Read a file by its ending."""
+    """Read a file with the reader of its extension."""
     suffix = path.suffix.lower()
     if suffix not in SCENE_FORMATS:
         known = ", ".join(SCENE_FORMATS)
@@ -267,14 +276,14 @@ def _read(path: Path, search: ModelSearch, shapes: Shapes, joints: Mapping[str, 
 
 
 def _groups(path: Path, read: ReadScene, own_axes: Sequence[str]) -> dict[str, list[Piece]]:
-    """Return the geometries of each shape: of each body in the world, or of a name in its own axes."""
+    """Return the geometries of each shape: in the axes of the world, or for a name of ``own_axes`` in those of its body."""
     groups: dict[str, list[Piece]] = {}
     for name in own_axes:
         if name not in read.frames:
             raise MitsonarError(f"{path} has no link, model or prim {name[:80]}: {nearest_names(name, read.frames)}"[:400])
         groups[name] = []
     to_ours = np.eye(4)
-    to_ours[:3, :3] = np.array(CONVENTIONS["ros-enu"].body).T  # forward, left, up to starboard, forward, up
+    to_ours[:3, :3] = np.array(CONVENTIONS["ros-enu"].body).T  # from (forward, left, up) to (starboard, forward, up)
     for body in read.bodies:
         owner = next((name for name in own_axes if name == body.name or name in body.within), None)
         place: Matrix = body.pose if owner is None else to_ours @ np.linalg.inv(rigid(read.frames[owner])) @ body.pose
@@ -287,7 +296,7 @@ def _groups(path: Path, read: ReadScene, own_axes: Sequence[str]) -> dict[str, l
 
 
 def _meshes(path: Path, groups: dict[str, list[Piece]], materials: dict[str, str]) -> tuple[list[Mesh], dict[str, bytes]]:
-    """Return the meshes of all shapes, and their pictures."""
+    """Return the meshes of all shapes, and their pictures as files, keyed by name."""
     if len(groups) > MOST_SHAPES:
         raise MitsonarError(f"{path} has {len(groups):,} shapes, more than {MOST_SHAPES:,}: merge them before the export")
     made: list[Mesh] = []
@@ -311,7 +320,7 @@ def _meshes(path: Path, groups: dict[str, list[Piece]], materials: dict[str, str
 
 
 def _free_id(name: str, taken: set[str]) -> str:
-    """Return the id of a shape: its name with letters that XML and Mitsuba leave alone, and a number where it is taken."""
+    """Return an unused id for a shape: its name without special characters, with a number if the name is taken."""
     base = re.sub(r"[^A-Za-z0-9_:/.-]", "_", name)[:200] or "shape"
     found, number = base, 2
     while found in taken:
@@ -321,7 +330,7 @@ def _free_id(name: str, taken: set[str]) -> str:
 
 
 def _checked_materials(path: Path, read: ReadScene, materials: Mapping[str, str]) -> dict[str, str]:
-    """Return the material of each body, by the name of itself or of what it lies within; the nearest name wins."""
+    """Return the material of each body, given for its own name or that of a model around it; the innermost name wins."""
     known = {name for body in read.bodies for name in (body.name, *body.within)}
     for name, material in materials.items():
         if name not in known:

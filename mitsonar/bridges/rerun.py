@@ -1,4 +1,4 @@
-"""Frames, scene and paths as a recording of Rerun: fan, polar image, levels, meshes, the wedge of the beams, poses."""
+"""How frames, scene and paths become a recording of Rerun: fan, polar image, levels, meshes, beams and poses."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ from mitsonar.simulation.scene import Triangles
 __all__ = ["Shown", "first_eye", "lit_corners", "wedge_lines", "write_recording"]
 
 AT_ONCE = 16
-"""Frames that are read at once."""
+"""Number of frames that are read at once."""
 
 BOXED, TRUE, ESTIMATED, BEAMS = (110, 110, 140), (90, 200, 90), (240, 140, 40), (80, 170, 250)
 WHOLE = ((168, 158, 132), (128, 132, 138), (160, 118, 92))
-"""Colours of the shapes in turn: one colour for all hides a wreck on its seabed."""
+"""Colours that shapes take in turn; in a single colour a wreck would not stand out from its seabed."""
 
 BEHIND = np.array([0.54, -0.64, 0.54])
-"""Direction of the eye at first, to starboard, forward and up of a sonar that is level."""
+"""Initial direction from the sonar to the eye, in the axes (starboard, forward, up) of a level sonar."""
 
 HALF_VIEW_RAD = np.radians(27.5)
-"""Half of the viewer's field of view."""
+"""Half of the viewer's field of view [rad]."""
 
 LINE = rr.Radius.ui_points(1.5)
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a recording shows.
+    """The content of a recording.
 
     Attributes:
-        name: of what is shown.
-        source: the frames; None: only the scene.
-        sonar: the instrument, for the wedge of its beams; None: no wedge.
-        path: of the sonar; None: the poses of the frames.
-        shapes: of the scene.
-        estimated: paths beside the true one, by name.
+        name: name of the content, for messages.
+        source: frames; None: only the scene.
+        sonar: sonar whose beams are drawn as a wedge; None: no wedge.
+        path: path of the sonar; None: the poses of the frames.
+        shapes: shapes of the scene.
+        estimated: further paths, keyed by name.
     """
 
     name: str
@@ -61,18 +61,18 @@ class Shown:
 
 
 def write_recording(shown: Shown, path: Path | None, progress: Callable[[int], None] = lambda done: None) -> list[str]:
-    """Write what is shown as a recording (.rrd), whole or absent; without a path, open the viewer and send it there.
+    """Write a recording (.rrd), completely or not at all; without a path, open the viewer and send the recording to it.
 
     Args:
-        shown: frames, scene and paths.
-        path: of the file.
-        progress: is called with how many more frames are done.
+        shown: frames, scene and paths to show.
+        path: file to write, or None.
+        progress: called with the number of frames written since the last call.
 
     Returns:
-        Names of the shapes of which only boxes are shown.
+        Names of the shapes that are shown as boxes only.
 
     Raises:
-        MitsonarError: nothing to show.
+        MitsonarError: there is nothing to show.
     """
     if shown.source is None and not shown.shapes and shown.path is None:
         raise MitsonarError(f"{shown.name} has no frames, no scene and no path: there is nothing to show")
@@ -104,7 +104,7 @@ def write_recording(shown: Shown, path: Path | None, progress: Callable[[int], N
 
 
 def _blueprint(shown: Shown) -> rrb.Blueprint:
-    """Arrange the views: the world beside fan, polar image and levels, of what there is."""
+    """Arrange the views: the world next to fan, polar image and levels, as far as they exist."""
     places = first_eye(shown)
     eye = None if places is None else rrb.EyeControls3D(position=places[0], look_target=places[1], eye_up=(0, 0, 1))
     world = [rrb.Spatial3DView(origin="world", name="world", eye_controls=eye)]
@@ -121,10 +121,11 @@ def _blueprint(shown: Shown) -> rrb.Blueprint:
 
 
 def first_eye(shown: Shown) -> NDArray[np.float64] | None:
-    """Return where the eye is at first and at what it looks ``(2, 3)`` [m]; None: there is no pose to look at.
+    """Return the initial position of the eye and its target ``(2, 3)`` [m], or None without a pose to look at.
 
-    It sees path and beams from behind and above: the scene may be many times as large.
+    The eye sees paths and beams from behind and above. It does not try to see the whole scene, which may be far larger.
     """
+    # 1. Collect all poses, and the volume of the beams at the first, middle and last one.
     known = [] if shown.path is None else [shown.path.poses]
     if shown.source is not None and shown.source.poses is not None:
         known.append(shown.source.poses)
@@ -135,6 +136,7 @@ def first_eye(shown: Shown) -> NDArray[np.float64] | None:
     edges = np.zeros((1, 3)) if shown.sonar is None else np.concatenate(wedge_lines(shown.sonar))
     seen = [vehicle_rotation(pose).apply(edges) + pose[:3] for pose in poses[[0, len(poses) // 2, -1]]]
     points = np.concatenate([poses[:, :3], *seen])
+    # 2. Move the eye back until a sphere around all points fits into the viewer's field of view.
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = float(np.linalg.norm(points - centre, axis=1).max())
     if radius == 0:
@@ -144,7 +146,13 @@ def first_eye(shown: Shown) -> NDArray[np.float64] | None:
 
 
 def wedge_lines(sonar: Sonar, steps: int = 16) -> list[NDArray[np.float64]]:
-    """Return the edges of the volume that the beams see, as lines ``(points, 3)`` [m] in (starboard, forward, up)."""
+    """Return the edges of the volume that the beams cover, as lines ``(points, 3)`` [m] in (starboard, forward, up).
+
+    Args:
+        sonar: the sonar.
+        steps: number of points of an arc.
+    """
+    # Two arcs across and two arcs up at both the nearest and the farthest range, then the four straight edges between them.
     half = sonar.bearing_rad[[0, -1]] + np.array([-0.5, 0.5]) * sonar.beam_width_rad
     elevation = np.radians(sonar.elevation_fov_deg) / 2 * np.array([-1, 1])
     across, up = np.linspace(half[0], half[1], steps), np.linspace(elevation[0], elevation[1], steps)
@@ -158,16 +166,17 @@ def wedge_lines(sonar: Sonar, steps: int = 16) -> list[NDArray[np.float64]]:
 
 
 def _direction(sonar: Sonar, b: NDArray[np.float64], e: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return unit vectors ``(n, 3)`` of bearings and elevations [rad], as the sonar measures bearings."""
+    """Return unit vectors ``(n, 3)`` for bearings ``b`` and elevations ``e`` [rad], in the sonar's definition of bearing."""
     if sonar.bearing == "azimuth":
         return np.stack([np.cos(e) * np.sin(b), np.cos(e) * np.cos(b), np.sin(e)], -1)
     return np.stack([np.sin(b), np.cos(b) * np.cos(e), np.cos(b) * np.sin(e)], -1)
 
 
 def lit_corners(shape: Triangles) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return three corners of each face ``(3 faces, 3)`` [m] and the unit normal of the face at each of them.
+    """Return the three corners of each face ``(3 faces, 3)`` [m], and the face's unit normal at each of them.
 
-    Without normals the viewer draws all faces in one colour, so that no relief shows. A face without area has none: zero.
+    Without normals the viewer draws all faces in one colour, and no relief is visible. The normal of a face without area is
+    0.
     """
     corners = shape.vertices[shape.faces.astype(np.intp)]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -177,7 +186,7 @@ def lit_corners(shape: Triangles) -> tuple[NDArray[np.float32], NDArray[np.float
 
 
 def _log_still(recording: rr.RecordingStream, shown: Shown) -> None:
-    """Log what does not move: scene, wedge in the sonar's axes, paths."""
+    """Log the static content: the scene, the wedge of the beams in the sonar's axes, and the paths."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for number, one in enumerate(shown.shapes):
         colour = WHOLE[number % len(WHOLE)] if one.whole else BOXED
@@ -198,7 +207,7 @@ def _log_still(recording: rr.RecordingStream, shown: Shown) -> None:
 
 
 def _log_frames(recording: rr.RecordingStream, source: FrameSource, progress: Callable[[int], None]) -> None:
-    """Log frames a few at a time, each at its time: fan, polar image, levels, pose."""
+    """Log each frame at its time: fan, polar image, levels and pose; a few frames are in memory at a time."""
     encoder = FanEncoder()
     for first in range(0, len(source), AT_ONCE):
         index = np.arange(first, min(first + AT_ONCE, len(source)))
@@ -206,7 +215,7 @@ def _log_frames(recording: rr.RecordingStream, source: FrameSource, progress: Ca
         for place, number in enumerate(index):
             recording.set_time("frame", sequence=int(number))
             recording.set_time("time", duration=float(source.time_s[number]))
-            if source.poses is not None:  # those of the frames that are read hide position and heading from estimators
+            if source.poses is not None:  # the frames themselves withhold position and heading from estimators
                 _log_pose(recording, source.poses[number])
             _log_image(recording, encoder, frames, place)
         progress(len(index))
@@ -221,7 +230,7 @@ def _log_image(recording: rr.RecordingStream, encoder: FanEncoder, frames: Sonar
     image = frames.image[place]
     levels = image if image.dtype == np.uint8 else to_uint8(image)
     recording.log("fan", rr.EncodedImage(contents=encoder.jpeg(frames, place), media_type="image/jpeg"))
-    recording.log("polar", rr.Image(levels[::-1]))  # far ranges above, as in the fan
+    recording.log("polar", rr.Image(levels[::-1]))  # far ranges on top, as in the fan
     shares = levels.astype(np.float32) / 255
     recording.log("levels/mean", rr.Scalars(float(shares.mean())))
     recording.log("levels/brightest", rr.Scalars(float(shares.max())))

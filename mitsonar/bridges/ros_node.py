@@ -1,4 +1,4 @@
-"""A live sonar as a ROS 2 node: the same topics as the Foxglove server, where rclpy is installed."""
+"""How a live sonar becomes a ROS 2 node, with the topics of the Foxglove server; it needs rclpy."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ __all__ = ["RosNode"]
 
 
 class RosNode:
-    """Publishes pings as ROS 2 messages, and puts the poses of the topic ``pose`` into a mailbox.
+    """A ROS 2 node that publishes pings, and puts the poses of the topic ``pose`` into a mailbox.
 
-    ``sonar/image`` is published where ``marine_acoustic_msgs`` is installed.
+    ``sonar/image`` is published only if ``marine_acoustic_msgs`` is installed.
 
     Args:
-        mailbox: where poses go.
-        name: of the node.
+        mailbox: mailbox for the poses.
+        name: name of the node.
 
     Raises:
         MitsonarError: rclpy or the standard messages are not installed.
@@ -57,7 +57,7 @@ class RosNode:
         self._spinning.start()
 
     def publish(self, ping: LivePing) -> None:
-        """Publish a ping. The polar image goes as its bytes, which rclpy takes in place of a message."""
+        """Publish a ping; the polar image is published as serialized bytes, which rclpy accepts instead of a message."""
         frames, when = ping.frames, ping.time_ns
         assert frames.poses is not None
         place, turn = pose_in_ros(frames.poses[0])
@@ -82,24 +82,24 @@ class RosNode:
         self._timing.publish(self._text.String(data=json.dumps(timing(ping))))
 
     def complain(self, sentence: str) -> None:
-        """Log a warning of the node."""
+        """Log a warning."""
         self.node.get_logger().warning(sentence)
 
     def close(self) -> None:
-        """End the node."""
+        """Shut the node down."""
         self._rclpy.try_shutdown()
         self._spinning.join(timeout=2)
 
     def _spin(self) -> None:
-        """Take messages until the node is shut down; Ctrl-C is the main thread's."""
+        """Process messages until the node is shut down; the main thread handles Ctrl-C."""
         try:
             self._rclpy.spin(self.node)
-        except Exception:  # rclpy raises its own ExternalShutdownException, of a name that versions change
+        except Exception:  # the name of rclpy's ExternalShutdownException depends on the version
             if self._rclpy.ok():
                 raise
 
     def _take(self, message: Any) -> None:
-        """Take a pose, or refuse it with one sentence."""
+        """Put a received pose into the mailbox, or log why it was refused."""
         place, turn = message.pose.position, message.pose.orientation
         try:
             pose = pose_from_ros([place.x, place.y, place.z], [turn.x, turn.y, turn.z, turn.w])
@@ -113,7 +113,7 @@ def _ros(name: str) -> Any:
     """Import a module of ROS 2.
 
     Raises:
-        MitsonarError: it is not installed.
+        MitsonarError: the module is not installed.
     """
     try:
         return importlib.import_module(name)

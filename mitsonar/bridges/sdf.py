@@ -1,4 +1,4 @@
-"""SDF: the links of a world's models, of models within models, and of included files."""
+"""How an SDF file is read: the links of a world's models, of nested models, and of included files."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from mitsonar.worlds.meshes import UNCOLOURED, Piece, one_number
 __all__ = ["Scope", "pose_of", "read_sdf"]
 
 
-# ---------------- Frames of SDF: poses relative to named frames, within models and models within these
+# ---------------- Frames
 
 
 OWN = ("__model__", "world", "")
-"""Names of the frame of a scope itself."""
+"""Names that refer to the frame of the scope itself."""
 
 DEEPEST = 1000
-"""Longest chain of frames that are relative to one another."""
+"""Largest length of a chain of frames that are relative to one another."""
 
 
 def pose_of(path: Path, element: Element) -> tuple[Matrix, str]:
-    """Return the child ``pose`` of an element, and the name of the frame that it is relative to; empty: the default.
+    """Return the pose of an element, and the name of the frame that it is relative to (empty: the default frame).
 
     Raises:
-        MitsonarError: no finite numbers, or an unknown format.
+        MitsonarError: the child ``pose`` has no finite numbers, or an unknown format.
     """
     pose = element.find("pose")
     if pose is None:
@@ -69,10 +69,10 @@ class Scope:
     """The frames of one model, or of the world.
 
     Args:
-        path: of the file, for errors.
+        path: the file, for error messages.
 
     Attributes:
-        nested: the models in it, by their names.
+        nested: scopes of the nested models, keyed by name.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,17 +82,17 @@ class Scope:
         self._known: dict[str, Matrix] = {}
 
     def add(self, name: str, base: str, pose: Matrix) -> None:
-        """Add a frame; ``base`` names the frame that its pose is relative to.
+        """Add a frame whose pose is relative to the frame ``base``.
 
         Raises:
-            MitsonarError: the name is taken.
+            MitsonarError: the name is already in use.
         """
         if name in self._given or name in OWN:
             raise MitsonarError(f"{self.path}: the name {shortened(name)} is given twice, or means the model itself")
         self._given[name] = (base, pose)
 
     def pose(self, name: str) -> Matrix:
-        """Return the pose of a frame in the axes of the scope; ``model::frame`` is one of a model in it.
+        """Return the pose of a frame in the axes of the scope; ``model::frame`` is a frame of a nested model.
 
         Raises:
             MitsonarError: there is no such frame, or frames are relative to each other in a circle.
@@ -113,7 +113,7 @@ class Scope:
         return pose
 
     def _step(self, name: str) -> tuple[str, Matrix]:
-        """Return the frame that a frame is given in, and its pose there."""
+        """Return the name of the frame that a frame is relative to, and its pose there."""
         if name in self._given:
             return self._given[name]
         model, _, inner = name.partition("::")
@@ -122,14 +122,14 @@ class Scope:
         raise MitsonarError(f"{self.path} names the frame {shortened(name)}, which is not there")
 
 
-# ---------------- sdf file
+# ---------------- Models, links and geometries
 
 
 MOST_INCLUDES = 20
-"""Longest chain of files that include one another, and of models within models."""
+"""Largest depth of nested includes, and of nested models."""
 
 MOST_MODELS = 10_000
-"""Models of a file with all that it includes: a short chain of files may place one very often."""
+"""Largest number of models including those of included files, since a few files can place a model very often."""
 
 NOT_READ = ("heightmap", "polyline", "image")
 """Geometries that are left out."""
@@ -137,14 +137,14 @@ NOT_READ = ("heightmap", "polyline", "image")
 
 @dataclass
 class _Model:
-    """A model while it is read.
+    """A model that is being read.
 
     Attributes:
-        name: with those of the models around it: ``rov::arm``.
-        file: that its files are named in.
-        element: its XML.
-        scope: its frames.
-        models: within it.
+        name: name with those of the models around it, such as ``rov::arm``.
+        file: file that contains the model; the names of its meshes are relative to it.
+        element: XML element of the model.
+        scope: frames of the model.
+        models: nested models, keyed by name.
     """
 
     name: str
@@ -155,7 +155,7 @@ class _Model:
 
 
 class _Reader:
-    """Reads a file and those that it includes."""
+    """A reader of an SDF file and the files that it includes."""
 
     def __init__(self, search: ModelSearch, shapes: Shapes, joints: Mapping[str, float], collision: bool) -> None:
         self.search, self.shapes, self.joints, self.collision = search, shapes, dict(joints), collision
@@ -163,10 +163,10 @@ class _Reader:
         self.joint_names: list[str] = []
         self.models = 0
 
-    # ---------------------------------------------------------------- models and their frames
+    # ---------------- Models and their frames
 
     def model(self, file: Path, element: Element, name: str, files: tuple[Path, ...], depth: int) -> _Model:
-        """Read the frames of a model, and of the models in it; geometries are read later."""
+        """Read the frames of a model and of its nested models; geometries are read later."""
         if depth > MOST_INCLUDES:
             raise refused(file, element, f"models lie within each other more than {MOST_INCLUDES} deep")
         self.models += 1
@@ -186,7 +186,7 @@ class _Reader:
         return made
 
     def _frame(self, model: _Model, child: Element) -> None:
-        """Add the frame of a link, a joint or a frame."""
+        """Add the frame that a link, joint or frame element defines."""
         name = attribute_of(model.file, child, "name")
         pose, base = pose_of(model.file, child)
         if not base and child.tag == "frame":
@@ -196,7 +196,7 @@ class _Reader:
         model.scope.add(name, base, pose)
 
     def _nest(self, model: _Model, inner: _Model, own: str, placing: Element, file: Path) -> None:
-        """Place a model in another: where the element that places it says, by its placement frame."""
+        """Place a model in another, at the pose of the element ``placing``; the pose applies to the placement frame."""
         has_pose = placing.find("pose") is not None
         pose, base = pose_of(file, placing if has_pose else inner.element)
         frame = placing.get("placement_frame") or placing.findtext("placement_frame") or inner.element.get("placement_frame")
@@ -225,10 +225,10 @@ class _Reader:
         inner = self.model(file, element, _joined(model.name, own), (*files, file), depth)
         self._nest(model, inner, own, include, model.file)
 
-    # ---------------------------------------------------------------- links
+    # ---------------- Links
 
     def collect(self, model: _Model, place: Matrix, within: tuple[str, ...]) -> None:
-        """Collect the links of a model that lies at a place in the world, and of the models in it."""
+        """Collect the links of a model and of its nested models; ``place`` is the pose of the model in the world."""
         groups = (*within, model.name) if model.name else within
         if model.name:
             self.found.frames[model.name] = place
@@ -248,7 +248,8 @@ class _Reader:
             self.collect(inner, place @ model.scope.pose(own), groups)
 
     def _moved_links(self, model: _Model) -> dict[str, Matrix]:
-        """Return the poses of links in their model; joints with a value move their child and all that hangs on it."""
+        """Return the poses of links in their model; joints with a value move their child and everything attached to it."""
+        # 1. Collect the parent of each link, and the motion of the joint between them in the axes of the model.
         links = [attribute_of(model.file, link, "name") for link in model.element.findall("link")]
         poses = {link: model.scope.pose(link) for link in links}
         joints: dict[str, tuple[str, Matrix]] = {}
@@ -260,6 +261,7 @@ class _Reader:
             value = self.joints.get(_joined(model.name, name), self.joints.get(name, 0.0))
             at = model.scope.pose(name)
             joints[child] = (parent, at @ self._turn(model, joint, value) @ np.linalg.inv(at))
+        # 2. Apply the motions of all joints between each link and the root.
         if not self.joints:
             return poses
         for link in links:
@@ -273,7 +275,7 @@ class _Reader:
         return poses
 
     def _turn(self, model: _Model, joint: Element, value: float) -> Matrix:
-        """Return the motion of a joint in its own axes."""
+        """Return the transform by which a joint moves its child, in the axes of the joint."""
         axis = joint.find("axis/xyz")
         if axis is None or value == 0:
             along: tuple[float, ...] = (0.0, 0.0, 1.0)
@@ -285,10 +287,10 @@ class _Reader:
                 along = tuple((turn @ along).tolist())
         return joint_motion(model.file, joint, joint.get("type", ""), along, value)
 
-    # ---------------------------------------------------------------- what links look like
+    # ---------------- Geometries and colours of links
 
     def _pieces(self, file: Path, part: Element, scope: Scope, link: str) -> list[Piece]:
-        """Return the geometry of a visual or collision in the axes of its link."""
+        """Return the geometries of a visual or collision element, in the axes of its link."""
         geometry = part.find("geometry")
         kind = None if geometry is None else next(iter(geometry), None)
         if kind is None or kind.tag == "empty":
@@ -313,7 +315,7 @@ class _Reader:
         return [piece.moved(pose[:3, :3], -pose[:3, 3]) for piece in pieces]
 
     def _reflectivity(self, file: Path, part: Element) -> float | None:
-        """Return the reflectivity of a visual's own diffuse colour; None without one."""
+        """Return the reflectivity of the diffuse colour of a visual; None without a colour."""
         if not isinstance(self.shapes.value, str):
             return float(self.shapes.value)
         text = part.findtext("material/diffuse")
@@ -326,17 +328,17 @@ class _Reader:
 def read_sdf(
     path: Path, search: ModelSearch, shapes: Shapes, joints: Mapping[str, float], collision: bool = False
 ) -> ReadScene:
-    """Read the links of an SDF file, of a world or of models.
+    """Read the links of an SDF file, which contains a world or models.
 
     Args:
-        path: of the file.
-        search: finds its meshes, and the models that it includes.
-        shapes: reads geometries.
-        joints: value of joints by name [rad, m], ``arm`` or ``rov::arm``; others are at 0.
-        collision: whether the collision shapes are read, in place of the visual ones.
+        path: SDF file.
+        search: search for its meshes, and for the models that it includes.
+        shapes: reader of geometries.
+        joints: values of joints, keyed by name such as ``arm`` or ``rov::arm`` [rad, m]; others are at 0.
+        collision: whether to read the collision shapes instead of the visual ones.
 
     Raises:
-        MitsonarError: the file is damaged, or names what is not there.
+        MitsonarError: the file is damaged, or refers to something that is missing.
     """
     root = _root(path)
     worlds = root.findall("world")
@@ -365,7 +367,7 @@ def _joined(model: str, name: str) -> str:
 
 
 def _sdf_in(found: Path, search: ModelSearch) -> Path:
-    """Return the SDF file of a model's folder: the newest that its model.config names, or model.sdf."""
+    """Return an SDF file, or that of a model's folder: the newest one in its model.config, or model.sdf."""
     if found.is_file():
         return found
     config = found / "model.config"
@@ -380,7 +382,7 @@ def _sdf_in(found: Path, search: ModelSearch) -> Path:
 
 
 def _size(path: Path, kind: Element) -> dict[str, float]:
-    """Return the sizes of a primitive."""
+    """Return the sizes of a primitive [m], keyed by name."""
     if kind.tag == "box":
         return dict(zip("xyz", numbers_of(path, kind, kind.findtext("size"), 3, (1.0, 1.0, 1.0)), strict=True))
     if kind.tag == "ellipsoid":
@@ -396,7 +398,7 @@ def _size(path: Path, kind: Element) -> dict[str, float]:
 
 
 def _upon(path: Path, kind: Element, normal: tuple[float, ...]) -> Matrix:
-    """Return the turn of a plane whose normal is not z."""
+    """Return the rotation that turns the normal z of a plane to the given normal."""
     length = float(np.linalg.norm(normal))
     if not length >= 1e-9:
         raise refused(path, kind, "its normal has length 0")

@@ -1,7 +1,7 @@
-"""URDF: the links of a robot where its joints put them.
+"""How a URDF file is read: the links of a robot, placed by its joints.
 
-The reader is our own: URDF and SDF share geometries, colours and poses, no package of Python's registry reads SDF, and those
-for URDF (yourdfpy, urchin) open any path that a file names.
+mitsonar has its own reader because URDF and SDF share geometries, colours and poses, no package on PyPI reads SDF, and the
+packages for URDF (yourdfpy, urchin) open any path that a file names.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ from mitsonar.worlds.meshes import UNCOLOURED, Piece, one_number
 __all__ = ["check_joint_names", "joint_motion", "read_urdf"]
 
 MOVING = ("revolute", "continuous", "prismatic")
-"""Types of joints that have one value; others are read as fixed."""
+"""Types of joints with a single value; others are read as fixed."""
 
 MOST_MIMICS = 20
 
 FULL_TURN = 6.3
-"""Angles beyond this are told [rad]."""
+"""Angle above which a warning suspects degrees [rad]."""
 
 
 def read_urdf(
     path: Path, search: ModelSearch, shapes: Shapes, joints: Mapping[str, float], collision: bool = False
 ) -> ReadScene:
-    """Read the links of a URDF file; its root link lies at the origin.
+    """Read the links of a URDF file; the root link lies at the origin.
 
     Args:
-        path: of the file; xacro must be expanded.
-        search: finds its meshes.
-        shapes: reads geometries.
-        joints: value of joints by name [rad, m]; others are at 0, or follow the joint that they mimic.
-        collision: whether the collision shapes are read, in place of the visual ones.
+        path: URDF file; xacro must be expanded.
+        search: search for its meshes.
+        shapes: reader of geometries.
+        joints: values of joints, keyed by name [rad, m]; others are at 0, or follow the joint that they mimic.
+        collision: whether to read the collision shapes instead of the visual ones.
 
     Raises:
-        MitsonarError: the file is damaged, or names what is not there.
+        MitsonarError: the file is damaged, or refers to something that is missing.
     """
     robot = read_xml(path, "URDF file")
     if robot.tag != "robot":
@@ -79,7 +79,7 @@ def read_urdf(
 
 
 def _by_name(path: Path, parent: Element, tag: str) -> dict[str, Element]:
-    """Return the elements of a kind by their names."""
+    """Return the children with a given tag, keyed by their names, which must be unique."""
     found: dict[str, Element] = {}
     for element in parent.findall(tag):
         name = attribute_of(path, element, "name")
@@ -89,13 +89,14 @@ def _by_name(path: Path, parent: Element, tag: str) -> dict[str, Element]:
     return found
 
 
-# ---------------------------------------------------------------- where links are
+# ---------------- Poses of links
 
 
 def _link_poses(
     path: Path, links: dict[str, Element], joints: dict[str, Element], asked: Mapping[str, float]
 ) -> dict[str, Matrix]:
-    """Return the pose of each link relative to the root, which is the one link that is no joint's child."""
+    """Return the pose of each link relative to the root, the only link that is no joint's child."""
+    # 1. Collect the parent of each link, and the link's pose in the axes of its parent.
     check_joint_names(path, asked, [name for name, joint in joints.items() if joint.get("type") in MOVING])
     parents: dict[str, tuple[str, Matrix]] = {}
     for name, joint in joints.items():
@@ -108,10 +109,12 @@ def _link_poses(
         along = (1.0, 0.0, 0.0) if axis is None else numbers_of(path, axis, axis.get("xyz"), 3, (1.0, 0.0, 0.0))
         kind = joint.get("type", "fixed")
         parents[ends[1]] = (ends[0], origin @ joint_motion(path, joint, kind, along, value))
+    # 2. Find the root.
     roots = [link for link in links if link not in parents]
     if len(roots) != 1:
         told = "none" if not roots else f"{len(roots)}: {', '.join(roots[:3])[:80]}"
         raise MitsonarError(f"{path}: one link must be the child of no joint, the root of the tree: got {told}")
+    # 3. Follow each link up to one with a known pose, then multiply the poses on the way back down.
     poses = {roots[0]: np.eye(4)}
     for link in links:
         chain: dict[str, None] = {}
@@ -127,10 +130,15 @@ def _link_poses(
 
 
 def check_joint_names(path: Path, asked: Mapping[str, float], known: list[str]) -> None:
-    """Check that joints are there, can move, and have finite values.
+    """Check that requested joints exist, can move, and have finite values.
+
+    Args:
+        path: the file, for error messages.
+        asked: requested values of joints, keyed by name [rad, m].
+        known: names of the joints that can move.
 
     Raises:
-        MitsonarError: one is not.
+        MitsonarError: a joint does not exist or cannot move, or a value is not finite.
     """
     for name, value in asked.items():
         if name not in known:
@@ -152,7 +160,7 @@ def _end(path: Path, joint: Element, tag: str, links: dict[str, Element]) -> str
 
 
 def _value_of(path: Path, name: str, joints: dict[str, Element], asked: Mapping[str, float]) -> float:
-    """Return the value of a joint: that which is asked for, that of the joint that it mimics, or 0."""
+    """Return the value of a joint: the requested value, that of the joint that it mimics, or 0 [rad, m]."""
     factor, offset = 1.0, 0.0
     for _ in range(MOST_MIMICS):
         joint = joints[name]
@@ -177,17 +185,17 @@ def _value_of(path: Path, name: str, joints: dict[str, Element], asked: Mapping[
 
 
 def joint_motion(path: Path, joint: Element, kind: str, axis: tuple[float, ...], value: float) -> Matrix:
-    """Return how a joint moves its child, in the axes of the joint.
+    """Return the transform by which a joint moves its child, in the axes of the joint.
 
     Args:
-        path: of the file, for errors.
-        joint: for errors.
-        kind: its type; those without a single value do not move.
-        axis: of the joint ``(3,)``.
-        value: of the joint [rad, m].
+        path: the file, for error messages.
+        joint: the joint, for error messages.
+        kind: type of the joint; types without a single value do not move.
+        axis: axis of the joint ``(3,)``.
+        value: value of the joint [rad, m].
 
     Raises:
-        MitsonarError: the axis has no direction.
+        MitsonarError: the axis has length 0.
     """
     if kind not in MOVING or value == 0:
         return np.eye(4)
@@ -199,7 +207,7 @@ def joint_motion(path: Path, joint: Element, kind: str, axis: tuple[float, ...],
 
 
 def _warn_of_degrees(what: str, angles: Iterable[float]) -> None:
-    """Warn of angles [rad] beyond a turn: they look like degrees."""
+    """Warn if an angle [rad] exceeds a full turn, because it is probably in degrees."""
     largest = max(map(abs, angles))
     if largest > FULL_TURN:
         told = f"{what} is in radians and holds {largest:g}, more than a turn: are these degrees?"
@@ -207,7 +215,7 @@ def _warn_of_degrees(what: str, angles: Iterable[float]) -> None:
 
 
 def _origin(path: Path, element: Element) -> Matrix:
-    """Return the pose in the child ``origin`` of an element; rpy are turns about the fixed axes x, y, z."""
+    """Return the pose in the child ``origin`` of an element; rpy are rotations about the fixed axes x, y, z."""
     origin = element.find("origin")
     if origin is None:
         return np.eye(4)
@@ -217,11 +225,11 @@ def _origin(path: Path, element: Element) -> Matrix:
     return placed(position, Rotation.from_euler("xyz", rpy))
 
 
-# ---------------------------------------------------------------- what links look like
+# ---------------- Geometries and colours of links
 
 
 def _pieces(path: Path, part: Element, search: ModelSearch, shapes: Shapes, colours: dict[str, Element]) -> list[Piece]:
-    """Return the geometry of a visual or collision in the axes of its link."""
+    """Return the geometries of a visual or collision element, in the axes of its link."""
     geometry = part.find("geometry")
     kind = None if geometry is None else next(iter(geometry), None)
     if kind is None:
@@ -240,7 +248,7 @@ def _pieces(path: Path, part: Element, search: ModelSearch, shapes: Shapes, colo
 
 
 def _size(path: Path, kind: Element) -> dict[str, float]:
-    """Return the sizes of a primitive."""
+    """Return the sizes of a primitive [m], keyed by name."""
     if kind.tag == "box":
         return dict(zip("xyz", numbers_of(path, kind, attribute_of(path, kind, "size"), 3, ()), strict=True))
     keys = {"sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
@@ -250,7 +258,7 @@ def _size(path: Path, kind: Element) -> dict[str, float]:
 
 
 def _reflectivity(path: Path, part: Element, shapes: Shapes, colours: dict[str, Element]) -> float | None:
-    """Return the reflectivity of a visual's own colour, or of the robot's colour that it names; None without one."""
+    """Return the reflectivity of the colour of a visual, or of the robot's material that it names; None without a colour."""
     if not isinstance(shapes.value, str):
         return float(shapes.value)
     material = part.find("material")

@@ -1,4 +1,4 @@
-"""USD: the prims of a stage, read by a process of its own."""
+"""How a USD stage is read: its prims are read in a separate process, which damaged files may end."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from mitsonar.worlds.meshes import LUMINANCE, UNCOLOURED, UP, Piece
 __all__ = ["read_usd"]
 
 SECONDS = 600
-"""Time that a stage may take."""
+"""Longest time for reading a stage [s]."""
 
 
 def read_usd(path: Path, search: ModelSearch, shapes: Shapes, collision: bool = False) -> ReadScene:
-    """Read the meshes and primitives of a USD stage, at its first time; z upwards, in m.
+    """Read the meshes and primitives of a USD stage at its first time, with z upwards, in m.
 
     Args:
-        path: of a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
-        search: has the folders within which its layers must lie.
-        shapes: reads geometries.
-        collision: whether the prims that bodies bump into are read, in place of those that are seen.
+        path: ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
+        search: search with the folders that its layers must lie in.
+        shapes: reader of geometries.
+        collision: whether to read the collision prims instead of the visible ones.
 
     Raises:
-        MitsonarError: the stage is damaged, names layers elsewhere, or usd-core is not installed.
+        MitsonarError: the stage is damaged, has layers outside the folders, or usd-core is not installed.
     """
     if find_spec("pxr") is None:
         raise explain_missing(ModuleNotFoundError(name="pxr"))
@@ -43,6 +43,8 @@ def read_usd(path: Path, search: ModelSearch, shapes: Shapes, collision: bool = 
     metres, up = told["metres"], told["up"]
     if not (np.isfinite(metres) and 1e-9 <= metres <= 1e9) or up not in UP:
         raise MitsonarError(f"{path}: metersPerUnit must lie in 1e-9..1e9 and upAxis be X, Y or Z: got {metres:g}, {up}")
+    # Frames and geometries have z upwards: `lift` leads from the stage's axes and units to the world, and `back` from axes
+    # with z upwards to those of the stage.
     lift = np.eye(4)
     lift[:3, :3] = np.asarray(UP[up], dtype=float) * metres
     found = ReadScene(left_out={str(kind): int(count) for kind, count in told["left_out"].items()})
@@ -54,20 +56,20 @@ def read_usd(path: Path, search: ModelSearch, shapes: Shapes, collision: bool = 
         own = {key.partition(":")[2]: value for key, value in arrays.items() if key.startswith(f"{number}:")}
         piece = _piece(path, body, own, shapes)
         if len(piece.faces):
-            turned = piece.moved(back[:3, :3].T, np.zeros(3))  # the axes of frames have z upwards
+            turned = piece.moved(back[:3, :3].T, np.zeros(3))  # to axes with z upwards
             parents = [str(parent) for parent in Path(name).parents][-2::-1]
             found.bodies.append(Body(name, found.frames[name], shapes.counted([turned], str(path)), tuple(parents)))
     return found
 
 
 def _read_apart(path: Path, search: ModelSearch, collision: bool) -> tuple[PlainValue, dict[str, NDArray[Any]]]:
-    """Read a stage in another process; return what it tells of the prims, and their arrays."""
+    """Read a stage in another process; return its report on the prims, and their arrays, keyed by name."""
     if not os.path.isfile(path):
         raise MitsonarError(f"no such file: {path}")
     asked = {"path": str(path.resolve()), "roots": [str(root) for root in search.roots], "collision": collision}
     settings = {name: value for name, value in os.environ.items() if not name.startswith(("PXR_", "USD_"))}
     with tempfile.TemporaryDirectory() as folder:
-        # -P: modules beside the scene, in the folder that the command runs in, are a stranger's
+        # -P: do not import modules from the current folder, which may be that of an untrusted scene
         command = [sys.executable, "-P", "-m", "mitsonar.bridges.usd_reading", f"{folder}/prims.npz"]
         try:
             done = subprocess.run(
@@ -86,10 +88,10 @@ def _read_apart(path: Path, search: ModelSearch, collision: bool) -> tuple[Plain
 
 
 def _finite(path: Path, name: str, matrix: Matrix) -> Matrix:
-    """Return the pose of a prim.
+    """Return the pose of a prim, after checking that its numbers are finite and not too large.
 
     Raises:
-        MitsonarError: it is not finite, or flat.
+        MitsonarError: a number is not finite, or too large.
     """
     if not np.isfinite(matrix).all() or not np.abs(matrix).max() <= 1e9:
         raise MitsonarError(f"{path}: the pose of the prim {name[:80]} is not finite, or too large; export the stage again")
@@ -97,7 +99,7 @@ def _finite(path: Path, name: str, matrix: Matrix) -> Matrix:
 
 
 def _piece(path: Path, body: PlainValue, arrays: dict[str, NDArray[Any]], shapes: Shapes) -> Piece:
-    """Return the geometry of a prim in its own axes and units."""
+    """Return the geometry of a prim, in the axes and units of the prim."""
     if body["kind"] != "mesh":
         made = primitive(body["kind"], body["sizes"], UNCOLOURED, f"{path}, {body['path'][:80]}")
         made = made.moved(np.asarray(UP[body["axis"]], dtype=float).T, np.zeros(3))

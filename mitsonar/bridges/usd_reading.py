@@ -1,8 +1,10 @@
-"""The process that reads a USD stage: its C++ library may end on a damaged file, and it opens what a stage names.
+"""How the separate process reads a USD stage.
 
-    python -m mitsonar.bridges.usd_reading OUT.npz < asked.json
+    python -m mitsonar.bridges.usd_reading OUT.npz < request.json
 
-It writes arrays, and a list of prims as JSON; :mod:`mitsonar.bridges.usd` starts it and reads them.
+The C++ library of USD may crash on a damaged file, and opens any file that a stage names. Therefore a process with limited
+memory and time checks and reads the stage. It writes arrays to ``OUT.npz``, and a report on the prims as JSON to standard
+output. :mod:`mitsonar.bridges.usd` starts the process and reads both.
 """
 
 from __future__ import annotations
@@ -21,13 +23,13 @@ from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 __all__: list[str] = []
 
 Prim: TypeAlias = Any
-"""A prim, attribute or layer of USD, which has no types."""
+"""A prim, attribute or layer of USD, whose Python bindings have no types."""
 
 MEMORY = 2**34
-"""Bytes of address space that a stage may take."""
+"""Limit of the address space [bytes]."""
 
 SECONDS = 300
-"""Processor time that a stage may take."""
+"""Limit of the processor time [s]."""
 
 MOST_LAYERS = 10_000
 MOST_PRIMS = 200_000
@@ -41,17 +43,17 @@ GPRIMS = {
     "Cone": ("cone", ("radius", "height")),
     "Plane": ("plane", ("width", "length")),
 }
-"""Prims with sizes: the primitive of each, and its attributes."""
+"""Primitive and attributes of each type of prim that is defined by sizes."""
 
 WHEN = Usd.TimeCode.EarliestTime()
 
 
 class RefusedError(Exception):
-    """What is wrong with a stage, in words."""
+    """A fault of a stage; the message describes it."""
 
 
 def main() -> None:
-    """Read the stage that standard input asks for; print ``{"error": ...}`` where it cannot be read."""
+    """Read the stage that is requested on standard input; print a report, or ``{"error": ...}`` if it cannot be read."""
     for kind, most in ((resource.RLIMIT_AS, MEMORY), (resource.RLIMIT_CPU, SECONDS), (resource.RLIMIT_CORE, 0)):
         known = [limit for limit in resource.getrlimit(kind) if limit != resource.RLIM_INFINITY]
         resource.setrlimit(kind, (min([most, *known]), min([most, *known])))
@@ -72,14 +74,18 @@ def main() -> None:
     json.dump(told, sys.stdout)
 
 
-# ---------------------------------------------------------------- what a stage names
+# ---------------- Layers
 
 
 def check_layers(path: str, roots: list[Path]) -> None:
-    """Check that all layers that a stage is composed of lie within folders, before any but the first is opened.
+    """Check that all layers of a stage lie within the allowed folders, each before it is opened.
+
+    Args:
+        path: file of the stage, whose own layer is always opened.
+        roots: allowed folders.
 
     Raises:
-        RefusedError: one does not, is not there, or cannot be read.
+        RefusedError: a layer lies elsewhere, is missing, or cannot be read; or a prim has value clips.
     """
     waiting, seen = [path], {path}
     while waiting:
@@ -106,7 +112,7 @@ def check_layers(path: str, roots: list[Path]) -> None:
 
 
 def _allowed(layer: Prim, asset: str, roots: list[Path]) -> str:
-    """Return where a layer lies that another names."""
+    """Return the path of a layer that another layer names."""
     if "://" in asset or "`" in asset:
         raise RefusedError(f"it names the layer {short(asset)}: only files beside it, or in folders of --search, are read")
     found = str(Sdf.ComputeAssetPathRelativeToLayer(layer, asset))
@@ -121,18 +127,27 @@ def _allowed(layer: Prim, asset: str, roots: list[Path]) -> str:
 
 
 def short(name: str) -> str:
-    """Return a name for a message."""
+    """Return a name, shortened for a message."""
     return repr(name if len(name) <= 80 else f"{name[:80]}...")
 
 
-# ---------------------------------------------------------------- prims
+# ---------------- Prims
 
 
 def read_stage(stage: Prim, collision: bool, arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the prims with geometries; their arrays are put into ``arrays``.
+    """Return a report on the prims with geometries, and add their arrays to ``arrays``.
+
+    Args:
+        stage: the stage to read.
+        collision: whether to read the collision prims instead of the visible ones.
+        arrays: filled with the arrays of the meshes, keyed by ``NUMBER:NAME``.
+
+    Returns:
+        ``bodies`` with kind, path, sizes and colour; ``frames``, the poses of all prims; ``left_out``, the number of prims
+        that were not read, by type; ``up``, the vertical axis; and ``metres``, the length of the unit [m].
 
     Raises:
-        RefusedError: a geometry is damaged, or there are too many.
+        RefusedError: a geometry is damaged, or there are too many prims or triangles.
     """
     cache = UsdGeom.XformCache(WHEN)
     bodies: list[dict[str, Any]] = []
@@ -166,7 +181,7 @@ def read_stage(stage: Prim, collision: bool, arrays: dict[str, NDArray[Any]]) ->
 
 
 def prims_of(stage: Prim) -> Iterator[Prim]:
-    """Yield the prims of a stage and those of its instances; the prototypes of a point instancer are not placed by it."""
+    """Yield the prims of a stage, including those of instances, but not the prototypes below a point instancer."""
     whole = iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)))
     for prim in whole:
         if prim.GetTypeName() == "PointInstancer":
@@ -175,7 +190,7 @@ def prims_of(stage: Prim) -> Iterator[Prim]:
 
 
 def _wanted(prim: Prim, collision: bool) -> bool:
-    """Return whether a prim is seen, or, for collision shapes, bumped into."""
+    """Return whether a prim is visible, or, for collision shapes, takes part in collisions."""
     imageable = UsdGeom.Imageable(prim)
     if not imageable:
         return False
@@ -186,7 +201,7 @@ def _wanted(prim: Prim, collision: bool) -> bool:
 
 
 def _gprim(prim: Prim, kind: str) -> dict[str, Any]:
-    """Return a prim with sizes."""
+    """Return the kind, the sizes and the axis of a prim that is defined by sizes."""
     primitive, names = GPRIMS[kind]
     values = [float(prim.GetAttribute(name).Get(WHEN)) for name in names]
     sizes: dict[str, float] = dict(zip(("radius", "length"), values, strict=False))
@@ -199,11 +214,12 @@ def _gprim(prim: Prim, kind: str) -> dict[str, Any]:
 
 
 def read_mesh(prim: Prim) -> tuple[dict[str, NDArray[Any]], int]:
-    """Return vertices, triangles and colours of a mesh, and the number of triangles; faces are cut into fans.
+    """Return the vertices, triangles and colours of a mesh, keyed by name, and the number of triangles.
 
     Raises:
-        RefusedError: its arrays do not belong together.
+        RefusedError: the arrays of the mesh contradict each other, or points are not finite.
     """
+    # 1. Read the arrays, and check that they fit together.
     mesh = UsdGeom.Mesh(prim)
     points = np.array(mesh.GetPointsAttr().Get(WHEN) or [], dtype=np.float64).reshape(-1, 3)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get(WHEN) or [], dtype=np.int64)
@@ -215,6 +231,8 @@ def read_mesh(prim: Prim) -> tuple[dict[str, NDArray[Any]], int]:
         raise RefusedError(f"a face of {what} names a point that is not there")
     if not np.isfinite(points).all():
         raise RefusedError(f"{what} has points that are not finite")
+    # 2. Split each face of n corners into a fan of n - 2 triangles: `face` is the face of each triangle, `place` its number
+    #    in the fan, and `begin` the index of the face's first corner.
     cut = np.maximum(counts - 2, 0)
     face = np.repeat(np.arange(len(counts)), cut)
     place = np.arange(int(cut.sum())) - np.repeat(np.cumsum(cut) - cut, cut)
@@ -222,6 +240,7 @@ def read_mesh(prim: Prim) -> tuple[dict[str, NDArray[Any]], int]:
     fan = np.stack([begin, begin + place + 1, begin + place + 2], -1)
     if mesh.GetOrientationAttr().Get(WHEN) == UsdGeom.Tokens.leftHanded:
         fan = fan[:, ::-1]
+    # 3. Give each triangle the colour of its face.
     shape = {"vertices": points, "faces": corners[fan].reshape(-1, 3)}
     colours = _own_colours(prim, counts, corners, len(points))
     if colours is not None:
@@ -229,13 +248,14 @@ def read_mesh(prim: Prim) -> tuple[dict[str, NDArray[Any]], int]:
     return shape, len(fan)
 
 
-# ---------------------------------------------------------------- colours
+# ---------------- Colours
 
 
 def _own_colours(
     prim: Prim, counts: NDArray[np.int64], corners: NDArray[np.int64], points: int
 ) -> NDArray[np.float64] | None:
-    """Return the linear colours of faces ``(faces, 3)``, by materials, else by ``displayColor``; None without any."""
+    """Return the linear colours of faces ``(faces, 3)`` from materials, otherwise from ``displayColor``, or None."""
+    # Materials of subsets take precedence over that of the whole mesh.
     colours = np.full((len(counts), 3), np.nan)
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
         colour = _material_colour(subset.GetPrim())
@@ -252,7 +272,8 @@ def _own_colours(
 def _display_colours(
     prim: Prim, counts: NDArray[np.int64], corners: NDArray[np.int64], points: int
 ) -> NDArray[np.float64] | None:
-    """Return the ``displayColor`` of each face ``(faces, 3)``: the mean of its corners."""
+    """Return the ``displayColor`` of each face ``(faces, 3)``, averaged over its corners, or None."""
+    # The colours may be one for all, one per face, one per point or one per corner.
     primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
     values = primvar.ComputeFlattened(WHEN) if primvar and primvar.HasValue() else None
     if values is None or not len(values):
@@ -271,7 +292,7 @@ def _display_colours(
 
 
 def _colour_of_all(prim: Prim) -> list[float] | None:
-    """Return the one colour of a primitive."""
+    """Return the uniform colour of a primitive, or None."""
     colour = _material_colour(prim)
     if colour is None:
         painted = _display_colours(prim, np.array([1]), np.array([0]), 1)
@@ -280,7 +301,7 @@ def _colour_of_all(prim: Prim) -> list[float] | None:
 
 
 def _material_colour(prim: Prim) -> NDArray[np.float64] | None:
-    """Return the diffuse colour of the material that a prim is bound to, where it is one colour."""
+    """Return the diffuse colour of the material bound to a prim, if it is uniform, or None."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     if not material:
         return None

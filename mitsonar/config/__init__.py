@@ -1,1 +1,1 @@
-"""Keys of recipes of data sets and trainings, checked; pure data."""
+"""Recipes of data sets and trainings: validated data models without behaviour."""

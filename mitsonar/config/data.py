@@ -1,4 +1,7 @@
-"""Recipes of data sets: small YAML files, checked. Those of Almanza-Medina's data sets are shipped."""
+"""Which keys the recipe of a data set has, and how it is read from YAML and validated.
+
+The recipes of Almanza-Medina's data sets are shipped.
+"""
 
 from __future__ import annotations
 
@@ -58,27 +61,30 @@ __all__ = [
 ]
 
 
-# ---------------- Keys of a recipe: read from YAML, and changed one by one
+# ---------------- Reading and changing keys
 
 
 Keys: TypeAlias = dict[str, Any]
-"""Keys and values of a recipe or of a part of it, as YAML holds them; a model checks them."""
+"""Keys and values of a recipe or of a part of it, as read from YAML; a model validates them."""
 
 
 def recipe_fields(
     name_or_file: str | Path, shipped: dict[str, Path], what: str, model: type[BaseModel], else_: str = ""
 ) -> tuple[Keys, Path]:
-    """Read the keys of a YAML file, or of the shipped one of that name, and return them with the file.
+    """Read the keys of a recipe from a YAML file, or from the shipped recipe of that name.
 
     Args:
-        name_or_file: ``rocky-field``, or ``mine.yaml``.
-        shipped: files by name.
-        what: kind of recipe, for errors.
-        model: its fields are the known keys.
-        else_: alternatives to a YAML file, for errors.
+        name_or_file: name of a shipped recipe, such as ``rocky-field``, or a file, such as ``mine.yaml``.
+        shipped: files of the shipped recipes, keyed by name.
+        what: kind of recipe, for error messages.
+        model: model of the recipe, whose fields are the known keys.
+        else_: alternatives to a YAML file, for error messages.
+
+    Returns:
+        The keys, not validated, and the file.
 
     Raises:
-        MitsonarError: no such recipe, not YAML, or not a table.
+        MitsonarError: there is no such recipe, or the file is not YAML or not a table.
     """
     path = Path(name_or_file)
     if path.suffix.lower() not in (".yaml", ".yml"):
@@ -96,12 +102,12 @@ def recipe_fields(
 
 
 def set_key(fields: Keys, key: str, value: object) -> None:
-    """Set a key of a recipe.
+    """Set a key of a recipe in place.
 
     Args:
-        fields: the keys of the recipe; changed in place.
-        key: with dots between the levels.
-        value: its value.
+        fields: keys of the recipe; modified in place.
+        key: name of the key, with dots between the levels.
+        value: value to set.
 
     Raises:
         MitsonarError: a level is not a group of keys.
@@ -114,12 +120,11 @@ def set_key(fields: Keys, key: str, value: object) -> None:
     fields[last] = value
 
 
-# ---------------- The parts of a data set's recipe: scenes, mount, receivers, flight, split, and frames that were
-# taken from elsewhere
+# ---------------- Parts of a recipe
 
 
 class RecipePart(BaseModel):
-    """Keys of a recipe that are checked; unknown ones are refused."""
+    """A validated part of a recipe; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -141,11 +146,11 @@ def _as_mirrors(given: object) -> object:
 
 
 MirrorKeys: TypeAlias = Annotated[dict[str, tuple[float, float]] | Literal["materials"] | None, BeforeValidator(_as_mirrors)]
-"""Reflection coefficient of pressures and rms height [m] by the ids of shapes, or ``materials``; None: no mirrors."""
+"""Pressure reflection coefficient and rms height [m], keyed by shape id; or ``materials``; None: no mirrors."""
 
 
 class Scenes(RecipePart):
-    """A group of scenes of one kind; each has its own seed."""
+    """A group of similar scenes, each with a different seed."""
 
     count: int = Field(1, ge=1, le=100_000, description="how many scenes")
     sequences: int = Field(ge=1, le=10**7, description="sequences in each")
@@ -153,7 +158,7 @@ class Scenes(RecipePart):
 
 
 class Mount(RecipePart):
-    """Pose of the sonar in the vehicle's axes (starboard, forward, up); the vehicle itself is level."""
+    """Pose of the sonar in the vehicle's axes (starboard, forward, up); the vehicle is level."""
 
     starboard_m: float = Field(0.0, allow_inf_nan=False)
     forward_m: float = Field(0.0, allow_inf_nan=False)
@@ -164,7 +169,7 @@ class Mount(RecipePart):
 
     @property
     def pose(self) -> Pose:
-        """Return the pose in metres and radians."""
+        """Return the mount as a pose in metres and radians."""
         return Pose(
             self.starboard_m,
             self.forward_m,
@@ -174,7 +179,7 @@ class Mount(RecipePart):
 
 
 RESERVED = ("frames", "label")
-"""Names that samples use beside those of their views."""
+"""Names that samples use for other purposes, so that no view may have them."""
 
 
 def _fits_name(name: str) -> str:
@@ -186,7 +191,7 @@ def _fits_name(name: str) -> str:
 
 
 class ReceiverSpec(Mount):
-    """A receiver beside the transmitter: its pose in the transmitter's axes, and keys of its sonar that differ."""
+    """A receiver of a bistatic sonar: its pose in the transmitter's axes, and the keys of its sonar that differ."""
 
     name: Annotated[str, AfterValidator(_fits_name)]
     sonar: Keys = Field(default_factory=dict, description="keys of the receiver's sonar that differ")
@@ -210,7 +215,7 @@ _Box = Annotated[tuple[float, float, float, float, float, float], AfterValidator
 
 
 class Flight(RecipePart):
-    """Motion of the vehicle: sequences of pings at a constant rate with jumps between them, or named runs."""
+    """Motion of the vehicle: sequences of pings at a constant rate, with jumps between the sequences, or named runs."""
 
     kind: Literal["random", "runs", "recorded"] = Field(
         "random", description="random sequences, the runs of chapters 2 and 4, or paths of recorded frames"
@@ -236,7 +241,7 @@ class Flight(RecipePart):
 
     @model_serializer(mode="wrap")
     def _without_absent(self, handler: SerializerFunctionWrapHandler) -> Keys:
-        """Leave out what later versions added where it is not used: stores and checkpoints keep their digests."""
+        """Omit unused keys that later versions added, so that the digests of stores and checkpoints do not change."""
         return {key: value for key, value in handler(self).items() if key not in ("pitch_deg", "keep_out") or value}
 
     @model_validator(mode="after")
@@ -249,16 +254,16 @@ class Flight(RecipePart):
 
     @property
     def heights(self) -> tuple[float, float]:
-        """Return lowest and highest height [m]."""
+        """Return the lowest and the highest height [m]."""
         return (self.height_m, self.height_m) if isinstance(self.height_m, float | int) else self.height_m
 
 
 SPLITS = ("sequence", "scene", "sample")
-"""Names of splits, as :attr:`Split.by`."""
+"""Allowed values of :attr:`Split.by`."""
 
 
 class Split(RecipePart):
-    """Division of the frames into training, validation and test, unless a reader asks for another."""
+    """Default division of the frames into training, validation and test; a reader may choose another."""
 
     by: Literal["sequence", "scene", "sample"] = Field(
         "sequence", description="what is dealt out: sequences, whole scenes, or samples, which leaks (but test: sequences)"
@@ -278,12 +283,12 @@ class Split(RecipePart):
 
     @property
     def unseen(self) -> str:
-        """Return the part for evaluation: test where there is one, else validation."""
+        """Return the name of the part for evaluation: ``test`` if there is one, otherwise ``validation``."""
         return "test" if self.test > 0 else "validation"
 
 
 class RecordedSource(RecipePart):
-    """A file, or a run, whose frames are one scene of a data set."""
+    """A recording or a run whose frames form one scene of a data set."""
 
     name: str = Field(min_length=1, description="of the file or folder, as it was given")
     format: str = Field(description="in words: ARIS 5 (.aris), run of mitsonar")
@@ -295,7 +300,7 @@ class RecordedSource(RecipePart):
 
 
 class Recorded(RecipePart):
-    """Frames that were not rendered by the recipe: of runs and of recordings with known poses."""
+    """Frames that the recipe does not render: from runs, and from recordings with known poses."""
 
     sources: list[RecordedSource] = Field(min_length=1, description="a scene each, in this order")
     level: Literal["linear", "dB", "gamma"] = Field("linear", description="how pixels stand for levels")
@@ -312,26 +317,27 @@ class Recorded(RecipePart):
 
     @property
     def bearing_rad(self) -> NDArray[np.float64] | None:
-        """Return the axes of the beams ``(beams,)`` [rad]; None where they are those of the sonar."""
+        """Return the bearings of the beams ``(beams,)`` [rad], or None if they are those of the sonar."""
         return None if self.bearings is None else np.array(self.bearings)
 
 
-# ---------------- data recipe
+# ---------------- The recipe of a data set
 
 
 _Made = TypeVar("_Made", bound=RecipePart)
 
 ADDED = ("recorded", "mirrors", "bodies", "noise_db", "visible_labels")
-"""Keys that are not written where they are null or empty."""
+"""Keys that are omitted from a written recipe if they are null or empty."""
 
 
 class Recipe(RecipePart):
-    """A data set. Angles are in degrees and motions in millimetres; all other values are SI.
+    """The recipe of a data set.
 
-    The keys are documented in docs/guides/data-sets.md.
+    Angles are in degrees and motions in millimetres; all other values have SI units. The keys are documented in
+    docs/guides/data-sets.md.
 
     Raises:
-        MitsonarError: through :func:`load_recipe`, an unknown key or a value outside its limits.
+        MitsonarError: through :func:`load_recipe`, a key is unknown or a value is outside its limits.
     """
 
     name: str = Field("custom", description="what the data set is called")
@@ -375,13 +381,13 @@ class Recipe(RecipePart):
 
     @model_serializer(mode="wrap")
     def _without_absent(self, handler: SerializerFunctionWrapHandler) -> Keys:
-        """Leave out what later versions added where it is not used: stores and checkpoints keep their digests."""
+        """Omit unused keys that later versions added, so that the digests of stores and checkpoints do not change."""
         return {key: value for key, value in handler(self).items() if key not in ADDED or value}
 
     @model_validator(mode="before")
     @classmethod
     def _level(cls, fields: object) -> object:
-        """Give a channel sonar the attitude of its vehicle."""
+        """Make the default mount of a channel sonar level, with the vehicle's own attitude."""
         if isinstance(fields, dict) and fields.get("channel") is not None:
             return {"mount": Mount(), **fields}
         return fields
@@ -414,10 +420,10 @@ class Recipe(RecipePart):
         return self
 
     def _check_recorded(self) -> None:
-        """Check the keys of recorded frames.
+        """Check the keys for recorded frames.
 
         Raises:
-            MitsonarError: they contradict each other.
+            MitsonarError: keys contradict each other.
         """
         if (self.recorded is None) != (self.flight.kind != "recorded"):
             raise MitsonarError(
@@ -437,7 +443,7 @@ class Recipe(RecipePart):
             raise MitsonarError(f"recorded.bearings has {len(self.recorded.bearings):,} of {self.instrument.beams:,} beams")
 
     def _check_images(self) -> None:
-        """Check the keys of images.
+        """Check the keys for images.
 
         Raises:
             MitsonarError: keys contradict each other.
@@ -466,10 +472,10 @@ class Recipe(RecipePart):
             check_image_mirrors(self.instrument, self.views, bool(self.mirrors))
 
     def _check_responses(self) -> None:
-        """Check the keys of responses.
+        """Check the keys for impulse responses.
 
         Raises:
-            MitsonarError: a key of the instrument is not valid, or a key belongs to images.
+            MitsonarError: a key of the instrument is not valid, or a key applies to images only.
         """
         check_channel_mirrors(self.channel_sonar, bool(self.mirrors), "give the recipe the key mirrors")
         plain = {
@@ -495,10 +501,10 @@ class Recipe(RecipePart):
 
     @cached_property
     def instrument(self) -> Sonar:
-        """Return the sonar; of a bistatic data set, the transmitter.
+        """Return the sonar; for a bistatic data set, the transmitter.
 
         Raises:
-            MitsonarError: it is a data set of impulse responses.
+            MitsonarError: the data set contains impulse responses.
         """
         if self.sonar is None:
             raise MitsonarError(
@@ -512,7 +518,7 @@ class Recipe(RecipePart):
         """Return the transmitter and receivers of a data set of impulse responses.
 
         Raises:
-            MitsonarError: it is a data set of images.
+            MitsonarError: the data set contains images.
         """
         if self.channel is None:
             raise MitsonarError(f"the data set {self.name} is of images: read it with SonarPairs, this needs responses")
@@ -520,10 +526,10 @@ class Recipe(RecipePart):
 
     @cached_property
     def views(self) -> list[View]:
-        """Return the views: one for each image of a ping.
+        """Return the views, one for each image of a ping.
 
         Raises:
-            MitsonarError: there are both receivers and segments.
+            MitsonarError: the recipe has both receivers and segments.
         """
         sonar = self.instrument
         if self.receivers and self.segments:
@@ -537,27 +543,27 @@ class Recipe(RecipePart):
         return made or [Whole(sonar, None if self.recorded is None else self.recorded.bearing_rad)]
 
     def digest(self, *more: object) -> str:
-        """Return a digest of all values that are not defaults, and of more values: 16 hexadecimal digits.
+        """Return a digest of all values that are not defaults, and of the values ``more``: 16 hexadecimal digits.
 
-        A key that a later version adds leaves the digest of other recipes as it is.
+        New keys of later versions do not change the digest of recipes that do not use them.
         """
         values = self.model_dump(mode="json", exclude_defaults=True)
         return digest(json.dumps([values, *more]))[:16]
 
     def suffix(self, view: str) -> str:
-        """Return the suffix of the names of a view's arrays; it is empty where there is one view."""
+        """Return the suffix of the names of a view's arrays; empty if there is only one view."""
         return f"_{view}" if len(self.views) > 1 else ""
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Return what is stored of each view: ``image``, ``vector``, or both."""
+        """Return the kinds of arrays stored for each view: ``image``, ``vector``, or both."""
         return {"images": ("image",), "vectors": ("vector",), "both": ("image", "vector")}[self.store]
 
     def family(self, group: int) -> Family:
-        """Return the family of a group of scenes.
+        """Return the family of worlds of a group of scenes.
 
         Raises:
-            MitsonarError: the family is missing or unknown, or a number is outside its limits; frames were recorded.
+            MitsonarError: the family is missing or unknown, a number is outside its limits, or the frames are recorded.
         """
         if self.recorded is not None:
             raise MitsonarError(
@@ -572,12 +578,12 @@ class Recipe(RecipePart):
         return create_family(str(fields.pop("family")), **fields)
 
     def noise_raised_db(self, scene: ArrayLike) -> NDArray[np.float64]:
-        """Return what scenes add to the sonar's noise, by their numbers ``(...)`` [dB]."""
+        """Return the levels that scenes add to the noise of the sonar ``(...)`` [dB], given the scenes' numbers."""
         numbers = np.asarray(scene)
         return np.asarray(np.array(self.noise_db or [0.0])[numbers % max(1, len(self.noise_db))], dtype=np.float64)
 
     def level_of(self, view: View) -> str:
-        """Return how pixels of a view stand for levels: that of recorded frames, or of its sonar."""
+        """Return the coding of levels in the pixels of a view: that of the recorded frames, or of the view's sonar."""
         return view.sonar.value_coding if self.recorded is None else self.recorded.level
 
     @property
@@ -587,7 +593,7 @@ class Recipe(RecipePart):
 
 
 def array_names(recipe: Recipe) -> dict[str, tuple[str, str]]:
-    """Return the stored arrays: name -> (kind, view). A name ends with the view's where there are several views."""
+    """Return the stored arrays as name -> (kind, view); names end with the view's name if there are several views."""
     names = {}
     for view in recipe.views:
         kinds = [*recipe.kinds, *(["nonzero"] if "vector" in recipe.kinds else []), *recipe.labels]
@@ -597,20 +603,20 @@ def array_names(recipe: Recipe) -> dict[str, tuple[str, str]]:
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """Return the recipes of the package by name."""
+    """Return the files of the shipped recipes, keyed by name."""
     folder = Path(str(files("mitsonar.config"))) / "recipes"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
 def load_recipe(name_or_file: str | Path, changes: Keys | None = None) -> Recipe:
-    """Load the recipe of a YAML file, or the shipped one of that name.
+    """Load the recipe of a data set from a YAML file, or the shipped recipe of that name.
 
     Args:
-        name_or_file: ``rocky-field``, or ``mine.yaml``.
+        name_or_file: name of a shipped recipe, such as ``rocky-field``, or a file, such as ``mine.yaml``.
         changes: keys to change, with dots between the levels: ``{"sonar.range_bins": 256}``.
 
     Raises:
-        MitsonarError: no such recipe, not YAML, an unknown key, or a value outside its limits.
+        MitsonarError: there is no such recipe, the file is not YAML, a key is unknown, or a value is outside its limits.
     """
     fields, path = recipe_fields(
         name_or_file, shipped_recipes(), "recipe", Recipe, " or a name of `mitsonar dataset recipes`"
@@ -622,19 +628,19 @@ def load_recipe(name_or_file: str | Path, changes: Keys | None = None) -> Recipe
 
 
 def recipe_from(fields: Keys) -> Recipe:
-    """Check keys and return their recipe.
+    """Create a recipe from its keys, after validation.
 
     Raises:
-        MitsonarError: an unknown key, or a value outside its limits.
+        MitsonarError: a key is unknown, or a value is outside its limits.
     """
     return _checked(Recipe, "recipe", fields)
 
 
 def split_from(fields: Keys) -> Split:
-    """Check keys and return their split.
+    """Create a split from its keys, after validation.
 
     Raises:
-        MitsonarError: an unknown key, or a value outside its limits.
+        MitsonarError: a key is unknown, or a value is outside its limits.
     """
     return _checked(Split, "split", fields)
 
@@ -649,7 +655,7 @@ def _checked(part: type[_Made], what: str, fields: Keys) -> _Made:
 
 
 def _find_files(fields: Keys, folder: Path) -> None:
-    """Resolve scene files relative to the folder of the recipe."""
+    """Resolve the scene files in ``fields`` relative to the folder of the recipe, in place."""
     groups = fields.get("scenes")
     for world in [
         fields.get("world"),

@@ -1,4 +1,7 @@
-"""Recipes of trainings: small YAML files, checked. One for each row of Almanza-Medina's tables is shipped."""
+"""Which keys the recipe of a training has, and how it is read from YAML and validated.
+
+A recipe for each row of Almanza-Medina's tables is shipped.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,7 @@ Noise = Annotated[str, AfterValidator(_known_noise)]
 class Input(_Part):
     """How frames become inputs of the network: arguments of :class:`~mitsonar.datasets.samples.SonarPairs`.
 
-    Of impulse responses only ``frames`` and ``leak`` apply, the arguments of
+    For impulse responses only ``frames`` and ``leak`` apply, which are the arguments of
     :class:`~mitsonar.datasets.responses.ImpulsePairs`.
     """
 
@@ -126,12 +129,14 @@ class Optimiser(_Part):
         return self
 
     def rate_at(self, step: int, epoch_steps: int, steps: int) -> float:
-        """Return the learning rate of a step; it depends on the step alone.
+        """Return the learning rate of a step.
+
+        It is a function of the step alone, so that a resumed training continues with the same rates.
 
         Args:
-            step: counted from 0.
-            epoch_steps: steps of an epoch.
-            steps: planned steps of the whole training.
+            step: number of the step, counted from 0.
+            epoch_steps: number of steps in an epoch.
+            steps: planned number of steps of the whole training.
         """
         rise = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
         match self.schedule:
@@ -157,10 +162,10 @@ class Validate(_Part):
 
 
 class TrainingRecipe(_Part):
-    """A training; each key has its description.
+    """The recipe of a training; the descriptions of the fields document the keys.
 
     Raises:
-        MitsonarError: through :func:`load_training_recipe`, an unknown key or a value outside its limits.
+        MitsonarError: through :func:`load_training_recipe`, a key is unknown or a value is outside its limits.
     """
 
     about: str = Field("", description="a sentence on it")
@@ -225,22 +230,22 @@ class TrainingRecipe(_Part):
 
     @property
     def validation(self) -> Validate:
-        """Return the key ``validate``, a name that pydantic reserves."""
+        """Return the value of the key ``validate``, a name that pydantic reserves."""
         return self.validate_
 
     @property
     def noises(self) -> list[str]:
-        """Return the levels of noise in training."""
+        """Return the levels of noise in training, as a list."""
         return [self.noise] if isinstance(self.noise, str) else list(self.noise)
 
     @property
     def noise_said(self) -> str:
-        """Return the noise in training, in words."""
+        """Return a description of the noise in training."""
         return " or ".join(self.noises)
 
     @cached_property
     def split_of(self) -> str | Split:
-        """Return the split for SonarPairs."""
+        """Return the split, as the argument of SonarPairs."""
         return split_from(self.split) if isinstance(self.split, dict) else self.split
 
     def arrangement(self) -> Keys:
@@ -258,34 +263,34 @@ class TrainingRecipe(_Part):
         return self.steps or max(1, round((self.epochs or 0) * epoch_steps))
 
     def plain(self) -> Keys:
-        """Return all keys with plain values, as the recipe file of a run holds them."""
+        """Return all keys with plain values, as in the recipe file of a run."""
         return self.model_dump(mode="json", by_alias=True)
 
     def replace(self, **fields: object) -> TrainingRecipe:
-        """Return a copy with some keys changed, after all checks.
+        """Return a validated copy with some keys changed.
 
         Raises:
-            MitsonarError: an unknown key, or a value outside its limits.
+            MitsonarError: a key is unknown, or a value is outside its limits.
         """
         return training_recipe_from({**self.plain(), **fields})
 
 
 def shipped_training_recipes() -> dict[str, Path]:
-    """Return the training recipes of the package by name."""
+    """Return the files of the shipped training recipes, keyed by name."""
     if find_spec("mitsonar.recipes") is None:
         return {}
     return {path.stem: path for path in sorted(Path(str(files("mitsonar.recipes"))).glob("*.yaml"))}
 
 
 def load_training_recipe(name_or_file: str | Path, changes: Keys | None = None) -> TrainingRecipe:
-    """Load the training recipe of a YAML file, or the shipped one of that name.
+    """Load a training recipe from a YAML file, or the shipped recipe of that name.
 
     Args:
-        name_or_file: ``mine.yaml``, or a shipped name.
+        name_or_file: a file, such as ``mine.yaml``, or the name of a shipped recipe.
         changes: keys to change, with dots between the levels: ``{"optimiser.rate": 1e-3}``.
 
     Raises:
-        MitsonarError: no such recipe, not YAML, an unknown key, or a value outside its limits.
+        MitsonarError: there is no such recipe, the file is not YAML, a key is unknown, or a value is outside its limits.
     """
     fields, path = recipe_fields(name_or_file, shipped_training_recipes(), "training recipe", TrainingRecipe)
     if isinstance(fields.get("network"), str):
@@ -293,15 +298,15 @@ def load_training_recipe(name_or_file: str | Path, changes: Keys | None = None) 
     for key, value in (changes or {}).items():
         set_key(fields, key, value)
     if isinstance(fields.get("data"), str) and fields["data"].lower().endswith((".yaml", ".yml")):
-        fields["data"] = os.path.realpath(path.parent / fields["data"])  # named from where the recipe is
+        fields["data"] = os.path.realpath(path.parent / fields["data"])  # relative to the folder of the recipe
     return training_recipe_from(fields)
 
 
 def training_recipe_from(fields: Keys) -> TrainingRecipe:
-    """Check keys and return their training recipe.
+    """Create a training recipe from its keys, after validation.
 
     Raises:
-        MitsonarError: an unknown key, or a value outside its limits.
+        MitsonarError: a key is unknown, or a value is outside its limits.
     """
     try:
         return TrainingRecipe(**fields)

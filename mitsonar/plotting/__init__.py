@@ -1,1 +1,1 @@
-"""Figures of what they are handed."""
+"""Figures, pictures and videos of results."""

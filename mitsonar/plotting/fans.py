@@ -1,4 +1,4 @@
-"""Figures."""
+"""How sonar frames become pictures: figures with axes, plain fan pictures with label maps, and videos."""
 
 from __future__ import annotations
 
@@ -26,11 +26,17 @@ __all__ = ["CODECS", "FanPictures", "coded_in_decibels", "fan_figure", "save_fan
 
 
 GAMMA = 0.6
-"""Power that levels are shown with, so that faint ground can be seen beside bright faces; the colour bar says it."""
+"""Exponent applied to levels in figures, so that faint ground is visible next to bright faces; the colour bar states it."""
 
 
 def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "") -> Figure:
-    """One frame as a fan with metre axes: forward up, starboard to the right."""
+    """Draw one frame as a fan with axes in metres: forward up, starboard to the right.
+
+    Args:
+        frames: frames to draw from.
+        index: index of the frame.
+        title: title of the figure.
+    """
     from matplotlib.colors import Normalize, PowerNorm
     from matplotlib.figure import Figure
 
@@ -56,7 +62,7 @@ def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "") -> Figur
 
 
 def save_fan(path: str | Path, frames: SonarFrames, index: int = 0, *, title: str = "") -> None:
-    """Write :func:`fan_figure` as PNG; whole or not at all."""
+    """Write :func:`fan_figure` as a PNG file, completely or not at all."""
     import io
 
     from mitsonar.io.files import write_whole
@@ -66,8 +72,7 @@ def save_fan(path: str | Path, frames: SonarFrames, index: int = 0, *, title: st
     write_whole(path, buffer.getvalue())
 
 
-# ---------------- Plain fan pictures: pixels in metres without axes or colours, and label maps beside them that mix
-# nothing
+# ---------------- Plain fan pictures and label maps
 
 
 LABELS: dict[str, tuple[str, type[np.uint8] | type[np.uint16]]] = {
@@ -75,17 +80,19 @@ LABELS: dict[str, tuple[str, type[np.uint8] | type[np.uint16]]] = {
     "object_id": ("object", np.uint16),
     "shadow": ("shadow", np.uint8),
 }
-"""Label maps that become pictures: the picture's name and type. Identifiers are stored plus one: 0 is no echo."""
+"""Name and pixel type of the picture of each label map. Identifiers are stored plus one, since 0 means no echo."""
 
 
 class FanPictures:
-    """Fan pictures of frames of one sonar, forward up and starboard to the right; a pixel is as long as a range bin.
+    """Plain fan pictures of the frames of one sonar, without axes or colours: forward up, starboard to the right.
+
+    A pixel is as long as a range bin.
 
     Args:
-        frames: whose ranges and bearings the pictures have.
+        frames: frames whose ranges and bearings define the fan.
 
     Attributes:
-        fan: which cells make each pixel.
+        fan: map from cells (bin, beam) to pixels.
         pixel_m: edge of a pixel [m].
     """
 
@@ -97,11 +104,11 @@ class FanPictures:
         self.pixel_m = (high - low) / self.fan.index.shape[1]
 
     def picture(self, image: NDArray[Any]) -> NDArray[np.uint8]:
-        """Return the levels of one frame ``(bins, beams)``, 0..1 or 0..255, as ``(rows, columns)``; 0 outside the fan."""
+        """Return the picture of one image ``(bins, beams)``, 0..1 or 0..255, as ``(rows, columns)``; 0 outside the fan."""
         return to_uint8(np.asarray(self.fan.apply(to_float32(image))))
 
     def labels(self, frames: SonarFrames, index: int) -> dict[str, NDArray[Any]]:
-        """Return the label pictures of one frame by name, each pixel the label of the nearest cell."""
+        """Return the label pictures of one frame, keyed by name; each pixel has the label of the nearest cell."""
         found = {}
         for label, (name, kind) in LABELS.items():
             values = getattr(frames, label)
@@ -111,7 +118,16 @@ class FanPictures:
         return found
 
     def save(self, folder: Path, frames: SonarFrames, index: int, number: int) -> None:
-        """Write ``NUMBER.png`` and ``NUMBER.LABEL.png`` of one frame, and ``fan.json`` once, each whole or not at all."""
+        """Write ``NUMBER.png`` and ``NUMBER.LABEL.png`` of one frame, and ``fan.json`` unless it exists.
+
+        Each file is written completely or not at all.
+
+        Args:
+            folder: folder of the pictures.
+            frames: frames to draw from.
+            index: index of the frame.
+            number: number of the frame in the file names.
+        """
         pictures = {"": self.picture(frames.image[index]), **self.labels(frames, index)}
         for name, values in pictures.items():
             buffer = io.BytesIO()
@@ -122,11 +138,11 @@ class FanPictures:
             write_json(folder / "fan.json", {"pixel_m": self.pixel_m, "starboard_m": starboard, "forward_m": forward})
 
 
-# ---------------- Videos of fans (MP4, AVI), written frame by frame
+# ---------------- Videos of fans
 
 
 CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
-"""Codec by the ending of the name."""
+"""Codec by file extension."""
 
 Picture = NDArray[np.uint8]
 
@@ -141,24 +157,24 @@ def write_fan_video(
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> int:
-    """Write frames of one geometry as a video: forward up, starboard right, with number and time since the first.
+    """Write frames of one geometry as a video of fans: forward up, starboard to the right.
 
-    The file is whole or absent.
+    Each picture shows the number of its frame and the time since the first. The file is written completely or not at all.
 
     Args:
-        chunks: the frames, some at a time.
-        path: of the video, ``.mp4`` or ``.avi``.
-        rate_hz: frames a second.
-        span_db: levels from full scale down that are shown [dB].
+        chunks: frames, in chunks of any size.
+        path: video file, ``.mp4`` or ``.avi``.
+        rate_hz: frames per second of the video [Hz].
+        span_db: range of levels shown, downwards from full scale [dB].
         rows: height of the picture [px].
-        overwrite: replace a file that is there.
-        progress: called with how many more frames are written.
+        overwrite: whether to replace an existing file.
+        progress: called with the number of frames written since the last call.
 
     Returns:
-        The number of frames.
+        The number of frames written.
 
     Raises:
-        MitsonarError: a file that is there, another ending, no frames, or OpenCV cannot write the codec.
+        MitsonarError: the file exists, its extension is unknown, there are no frames, or OpenCV cannot write the codec.
     """
     path = Path(path)
     if path.suffix.lower() not in CODECS:
@@ -213,7 +229,7 @@ def _write(
 
 
 def _colours() -> Picture:
-    """Return blue, green, red of each value ``(256, 3)``, those of the other figures."""
+    """Return the colour map of the other figures as blue, green, red of each value ``(256, 3)``."""
     from matplotlib import colormaps
 
     table = np.asarray(colormaps["copper"](np.arange(256)))[:, 2::-1]
@@ -221,18 +237,20 @@ def _colours() -> Picture:
 
 
 def _even(picture: Picture) -> Picture:
-    """Return a picture with an even number of columns, as codecs want it."""
+    """Pad a picture to an even number of columns, which codecs require."""
     return np.ascontiguousarray(np.pad(picture, ((0, 0), (0, picture.shape[1] % 2), (0, 0))))
 
 
-# ---------------- Frames of any coding with values that are decibels, for pictures
+# ---------------- Decibel coding
 
 
 def coded_in_decibels(frames: SonarFrames, span_db: float) -> SonarFrames:
-    """Return frames whose values 0..1, float32, are the ``span_db`` decibels below full scale; what is lower is 0.
+    """Convert frames of any coding to decibels: values 0..1, float32, span the ``span_db`` decibels below full scale.
+
+    Lower levels become 0.
 
     Raises:
-        MitsonarError: a span that is not above 0.
+        MitsonarError: the span is not in 0..300 dB.
     """
     if not 0 < span_db <= 300:
         raise MitsonarError(f"the span must lie in 0..300 dB: got {span_db:g}")

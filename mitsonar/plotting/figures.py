@@ -1,4 +1,4 @@
-"""Figures of mosaics and paths."""
+"""How results become figures: mosaics, paths, impulse responses, soundings, data sets and Cramer-Rao bounds."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ __all__ = [
 
 
 ALMANZA_COLOURS = {"estimated": ("red", "darkblue"), "true": ("limegreen", "cyan")}
-"""Line and arrows of a path (Almanza-Medina, fig. 2.9 and 3.7)."""
+"""Colours of the line and of the arrows of a path (Almanza-Medina, fig. 2.9 and 3.7)."""
 
 OTHER_COLOURS = (("tab:orange", "tab:brown"), ("tab:purple", "tab:pink"), ("tab:olive", "tab:gray"))
 
 ARROWS = 20
-"""Number of headings drawn along a path, about."""
+"""Approximate number of headings drawn along a path."""
 
 UNSEEN = "0.9"
 """Grey of cells that no frame observed."""
@@ -68,13 +68,13 @@ BAND = 2
 
 
 def mosaic_figure(mosaic: Mosaic, paths: Mapping[str, Trajectory] | None = None, *, title: str = "") -> Figure:
-    """Draw the mean level of a mosaic in metres, with a scale bar, and paths of the sonar with arrows along its heading.
+    """Draw the mean level of a mosaic with a scale bar, and paths of the sonar with arrows along its heading.
 
     Args:
-        mosaic: to draw.
-        paths: by name, for the legend; ``estimated`` and ``true`` have the colours of Almanza-Medina's figures: red line and
-            dark blue arrows, green line and cyan arrows.
-        title: of the figure.
+        mosaic: mosaic to draw.
+        paths: paths to draw, keyed by their names in the legend. ``estimated`` and ``true`` have the colours of
+            Almanza-Medina's figures: red line with dark blue arrows, and green line with cyan arrows.
+        title: title of the figure.
     """
     from matplotlib.colors import PowerNorm
 
@@ -89,7 +89,7 @@ def mosaic_figure(mosaic: Mosaic, paths: Mapping[str, Trajectory] | None = None,
 
 
 def quality_figure(mosaic: Mosaic, *, title: str = "") -> Figure:
-    """Draw the standard deviation of the frames that observed each cell, and their number."""
+    """Draw the standard deviation of the levels of the frames that observed each cell, and the number of these frames."""
     figure, (left, right) = _maps(2, mosaic, None)
     spread = mosaic.std
     top = float(np.nanpercentile(spread, 99.5)) if np.isfinite(spread).any() else 1.0
@@ -110,18 +110,18 @@ def path_figure(
     pose_covariances: Mapping[str, NDArray[np.float64]] | None = None,
     title: str = "",
 ) -> Figure:
-    """Draw paths from above, and over time the heading and the motion between frames on each axis (eq. 3.4).
+    """Draw paths from above, and their heading and motion between frames over time (eq. 3.4).
 
     Args:
-        paths: by name; colours as in :func:`mosaic_figure`.
-        motion_covariances: of (sideways, forward [m], yaw [rad]) ``(frames - 1, 3, 3)`` of the paths that have them; nan
-            where unknown. Bands show two standard deviations.
-        pose_covariances: of (x, y [m], heading [rad]) ``(frames, 3, 3)``, for ellipses along the path and the band of the
-            heading; two standard deviations too.
-        title: of the figure.
+        paths: paths to draw, keyed by name; colours as in :func:`mosaic_figure`.
+        motion_covariances: covariances of the motions (sideways, forward [m], yaw [rad]) ``(frames - 1, 3, 3)``, keyed by
+            path; nan where unknown. Bands show two standard deviations.
+        pose_covariances: covariances of the poses (x, y [m], heading [rad]) ``(frames, 3, 3)``, keyed by path. Ellipses
+            along the path and the band of the heading show two standard deviations.
+        title: title of the figure.
 
     Raises:
-        MitsonarError: no path, a covariance of an unknown path, or one whose shape does not fit its path.
+        MitsonarError: there is no path, a covariance names an unknown path, or its shape does not fit its path.
     """
     from matplotlib.figure import Figure
 
@@ -150,10 +150,12 @@ def path_figure(
 
 
 def save_figure(path: str | Path, figure: Figure, *, dpi: int = 130) -> None:
-    """Write a figure, whole or not at all, in the format of the name's ending: ``.png``, ``.pdf``, ``.svg``.
+    """Write a figure in the format of the file's extension, such as ``.png``, ``.pdf`` or ``.svg``.
+
+    The file is written completely or not at all.
 
     Raises:
-        MitsonarError: the ending is no format of figures.
+        MitsonarError: the extension is no format of figures.
     """
     kind = Path(path).suffix.lstrip(".").lower()
     known = figure.canvas.get_supported_filetypes()
@@ -164,11 +166,11 @@ def save_figure(path: str | Path, figure: Figure, *, dpi: int = 130) -> None:
     write_whole(path, buffer.getvalue())
 
 
-# ---------------------------------------------------------------- maps
+# ---------------- Maps
 
 
 def _maps(panels: int, mosaic: Mosaic, paths: Mapping[str, Trajectory] | None) -> tuple[Figure, list[Axes]]:
-    """Create a figure of maps side by side, with the proportions of the ground and the paths."""
+    """Create a figure of maps side by side, with the aspect ratio of the mosaic and the paths."""
     from matplotlib.figure import Figure
 
     west, east, south, north = _view(mosaic, paths or {})
@@ -180,7 +182,7 @@ def _maps(panels: int, mosaic: Mosaic, paths: Mapping[str, Trajectory] | None) -
 
 
 def _view(mosaic: Mosaic, paths: Mapping[str, Trajectory]) -> tuple[float, float, float, float]:
-    """Return west, east, south, north of a map and its paths [m], with a margin."""
+    """Return the west, east, south and north limits of a map and its paths [m], with a margin."""
     west, east, south, north = mosaic.extent
     places = [np.array([[west, south], [east, north]]), *(path.poses[:, :2] for path in paths.values())]
     low, high = np.min([p.min(axis=0) for p in places], axis=0), np.max([p.max(axis=0) for p in places], axis=0)
@@ -199,7 +201,7 @@ def _finish_map(axes: Axes, mosaic: Mosaic, paths: Mapping[str, Trajectory], tit
 
 
 def _scale_bar(axes: Axes, width_m: float) -> None:
-    """Draw a bar of a round length, about a fifth of the map."""
+    """Draw a scale bar of a round length, about a fifth of the map's width."""
     from matplotlib.patches import Rectangle
 
     length = _round_length(width_m / 5)
@@ -213,12 +215,12 @@ def _scale_bar(axes: Axes, width_m: float) -> None:
 
 
 def _round_length(wanted: float) -> float:
-    """Return the largest 1, 2 or 5 times a power of ten that is not above ``wanted``."""
+    """Return the largest number <= ``wanted`` that is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(wanted))
     return max(step * power for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
 
 
-# ---------------------------------------------------------------- paths
+# ---------------- Paths
 
 
 def _colours(paths: Mapping[str, Trajectory]) -> Iterator[tuple[str, str, str]]:
@@ -257,12 +259,12 @@ def _draw_paths(axes: Axes, paths: Mapping[str, Trajectory]) -> None:
 
 
 def _some(frames: int) -> NDArray[np.intp]:
-    """Select the frames with arrows and ellipses."""
+    """Return the numbers of the frames that get arrows and ellipses, evenly spread."""
     return np.unique(np.linspace(0, frames - 1, min(ARROWS, frames)).astype(np.intp))
 
 
 def _draw_ellipses(axes: Axes, place: NDArray[np.float64], covariance: NDArray[np.float64], colour: str) -> None:
-    """Draw ellipses of two standard deviations around some of the positions ``(frames, 2)``."""
+    """Draw ellipses of two standard deviations around some of the positions ``(frames, 2)`` [m]."""
     from matplotlib.patches import Ellipse
 
     for one in _some(len(place)):
@@ -276,10 +278,16 @@ def _draw_ellipses(axes: Axes, place: NDArray[np.float64], covariance: NDArray[n
 def _checked(
     paths: Mapping[str, Trajectory], covariances: Mapping[str, NDArray[np.float64]], what: str, fewer: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Return covariances as arrays, after a check that they fit their paths.
+    """Return covariances as arrays, after checking that they fit their paths.
+
+    Args:
+        paths: paths, keyed by name.
+        covariances: covariances, keyed by path.
+        what: name of the argument, for error messages.
+        fewer: number of frames minus number of covariances.
 
     Raises:
-        MitsonarError: an unknown path, or another shape.
+        MitsonarError: a covariance names an unknown path, or has a wrong shape.
     """
     for name, values in covariances.items():
         if name not in paths:
@@ -303,15 +311,15 @@ def _banded(
         axes.fill_between(time, value - BAND * std, value + BAND * std, color=colour, alpha=0.2, linewidth=0)
 
 
-# ---------------- Figures of impulse responses
+# ---------------- Impulse responses
 
 
 FAINT_DB = -40.0
-"""Lower end of the waterfall's scale [dB]."""
+"""Lower end of the scale of a waterfall [dB]."""
 
 
 def response_figure(responses: ImpulseResponses, ping: int = 0) -> Figure:
-    """Draw magnitude, real and imaginary part of one ping over taps and range (Almanza-Medina, fig. 5.4)."""
+    """Draw the magnitude, real and imaginary parts of one ping over taps and range (Almanza-Medina, fig. 5.4)."""
     from matplotlib.figure import Figure
 
     sonar, count = responses.sonar, len(responses.sonar.receivers)
@@ -336,7 +344,7 @@ def response_figure(responses: ImpulseResponses, ping: int = 0) -> Figure:
 
 
 def waterfall_figure(responses: ImpulseResponses) -> Figure:
-    """Draw the magnitude over time and delay at each receiver, in dB of the largest."""
+    """Draw the magnitude over time and delay at each receiver, in dB relative to the largest of all."""
     from matplotlib.figure import Figure
 
     sonar, count = responses.sonar, len(responses.sonar.receivers)
@@ -345,7 +353,7 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
     decibel = 20 * np.log10(np.maximum(level / max(float(level.max()), 1e-30), 10 ** (FAINT_DB / 20)))
     time = responses.time_s
     half = 0.5 * (time[1] - time[0]) if len(time) > 1 else 0.5 / sonar.frame_rate_hz
-    # a row is drawn around its time
+    # Each row is centred on the time of its ping.
     extent = (1e3 * begin / sonar.sampling_hz, 1e3 * end / sonar.sampling_hz, time[-1] + half, time[0] - half)
     figure = Figure(figsize=(2.6 * count + 1.6, 4.5), layout="constrained")
     grid = figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0]
@@ -361,17 +369,17 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
 
 
 def response_png(responses: ImpulseResponses) -> bytes:
-    """Return the PNG of :func:`response_figure` for the first ping."""
+    """Return :func:`response_figure` of the first ping as a PNG file."""
     return _png(response_figure(responses))
 
 
 def waterfall_png(responses: ImpulseResponses) -> bytes:
-    """Return the PNG of :func:`waterfall_figure`."""
+    """Return :func:`waterfall_figure` as a PNG file."""
     return _png(waterfall_figure(responses))
 
 
 def _strong_taps(responses: ImpulseResponses) -> tuple[int, int]:
-    """Return the first tap with a visible level, and the tap after the last one, with a margin."""
+    """Return the first tap with a visible level and the end of the last one (exclusive), with a margin."""
     level = np.abs(responses.response).max(axis=(0, 1))
     loud = np.flatnonzero(level > level.max() * 10 ** (FAINT_DB / 20))
     if not level.max() > 0:
@@ -392,25 +400,27 @@ def _png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-# ---------------- Overview of a data set of impulse responses: pings of some samples, phase changes, labels and mean
-# energy
+# ---------------- Overview of a data set of impulse responses
 
 
 SAMPLED_PINGS = 200
-"""Pings that means are taken over, about."""
+"""Approximate number of pings that a mean is taken over."""
 
 
 def response_sheet(store: DataStore, *, samples: int = 4, receiver: str | None = None, seed: int = 0) -> Figure:
-    """Draw the first and last ping of samples, the phase between them and the label; below, mean energy and labels.
+    """Draw an overview of a data set of impulse responses.
+
+    Each row shows a sample: its first and last ping, the phase between them, and its label. The last row shows the mean
+    energy of the taps, and the distribution of the labels.
 
     Args:
-        store: a data set of impulse responses.
+        store: data set of impulse responses.
         samples: number of samples to draw.
-        receiver: its name; default: the first.
-        seed: of the draw of the samples.
+        receiver: name of the receiver; default: the first.
+        seed: seed of the choice of samples.
 
     Raises:
-        MitsonarError: no such receiver, or no sequence with the recipe's number of pings.
+        MitsonarError: there is no such receiver, or no sequence with the recipe's number of pings.
     """
     names = [one.name for one in store.recipe.channel_sonar.receivers]
     receiver = receiver or names[0]
@@ -435,7 +445,7 @@ def response_sheet(store: DataStore, *, samples: int = 4, receiver: str | None =
 
 
 def _response_sample(axes: NDArray[np.object_], store: DataStore, receiver: int, start: int, pings: int) -> None:
-    """Draw magnitudes, the phase from first to last ping where the response is strong, and the label."""
+    """Draw the magnitudes, the phase from the first to the last ping where the response is strong, and the label."""
     delay_ms = 1e3 * store.read("delay_s")
     response = store.read("response", slice(start, start + pings))[:, receiver]
     for place, style in ((0, "-"), (pings - 1, ":")):
@@ -473,31 +483,30 @@ def _response_summary(axes: NDArray[np.object_], store: DataStore, names: list[s
 
 
 def _decibels(energy: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return levels over the largest [dB]."""
+    """Return levels relative to the largest [dB]."""
     largest = energy.max() if energy.size and energy.max() > 0 else 1.0
     return np.asarray(10 * np.log10(np.maximum(energy / largest, 1e-12)))
 
 
-# ---------------- Figures of what sounders give: waterfalls, echograms, soundings from above, range images,
-# velocities of a DVL
+# ---------------- Echo sounders, side-scan sonars and DVLs
 
 
 SPAN_DB = 50.0
-"""Span of pictures of levels below full scale [dB]."""
+"""Range of levels shown, downwards from full scale [dB]."""
 
 MOST_POINTS = 200_000
-"""Points that are drawn of a cloud, at most."""
+"""Approximate largest number of points drawn of a point cloud."""
 
 
 def save_sounding_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as a PNG, whole or absent."""
+    """Write a figure as a PNG file, completely or not at all."""
     part = path.with_name(f".{path.name}.part")
     figure.savefig(part, dpi=110, format="png", metadata={"Software": None})
     part.replace(path)
 
 
 def waterfall_figure_of(echogram: Echogram) -> Figure:
-    """Draw a side-scan's waterfall: port to the left, slant range athwart, the first ping below."""
+    """Draw the waterfall of a side-scan sonar: slant range across with port to the left, the first ping at the bottom."""
     figure, axes = _figure(8.4, 5.2)
     level, channels = echogram.decibels(SPAN_DB), echogram.sounder.channels
     port, starboard = (level[:, channels.index(side)] for side in ("port", "starboard"))
@@ -513,7 +522,7 @@ def waterfall_figure_of(echogram: Echogram) -> Figure:
 
 
 def echogram_figure(echogram: Echogram, soundings: Soundings | None = None) -> Figure:
-    """Draw the levels of the first fan over time and range, and the detections over them."""
+    """Draw the levels of the first channel over time and range, with the detections on top."""
     figure, axes = _figure(8.4, 3.8)
     time_s, fan = echogram.time_s, echogram.sounder.fan
     half = 0.5 * (time_s[-1] - time_s[0]) / max(1, len(time_s) - 1) or 0.5 / fan.frame_rate_hz
@@ -557,11 +566,11 @@ def range_figure(soundings: Soundings, ping: int = 0) -> Figure:
 
 
 def dvl_figure(readings: DvlReadings, true: NDArray[np.float64] | None = None) -> Figure:
-    """Draw velocities with twice their standard deviation, and the altitude.
+    """Draw the velocities of a DVL with bands of two standard deviations, and the altitude.
 
     Args:
-        readings: of the DVL.
-        true: velocities of the vehicle ``(pings, 3)`` [m/s], where known.
+        readings: readings of the DVL.
+        true: true velocities of the vehicle ``(pings, 3)`` [m/s], if known.
     """
     from matplotlib.figure import Figure
 
@@ -595,7 +604,7 @@ def _figure(width: float, height: float) -> tuple[Figure, Any]:
 
 
 def _along(echogram: Echogram) -> tuple[float, float]:
-    """Return the first and the last edge of the pings along the path [m]; of a vehicle at rest they count pings."""
+    """Return where the first ping begins and the last one ends along the path [m], or in pings for a vehicle at rest."""
     steps = np.linalg.norm(np.diff(echogram.poses[:, :3], axis=0), axis=1)
     length = float(steps.sum())
     if length < 1e-9:
@@ -604,32 +613,32 @@ def _along(echogram: Echogram) -> tuple[float, float]:
     return -half, length + half
 
 
-# ---------------- Overview of a data set: a sheet of samples, labels and mean image, and a table of its contents
+# ---------------- Overview of a data set of images
 
 
 SAMPLED_FRAMES = 200
-"""Frames that means are taken over, about."""
+"""Approximate number of frames that a mean is taken over."""
 
 Table: TypeAlias = dict[str, Any]
-"""Contents of a data set by name: numbers, words, lists of words, or tables of them."""
+"""Description of a data set: numbers, words, lists of words, or nested tables, keyed by name."""
 
 Stored: TypeAlias = "NDArray[np.uint8] | NDArray[np.float32]"
-"""Pixels or vectors as they are stored."""
+"""Pixels or vectors in their stored type."""
 
 
 def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None, seed: int = 0) -> Figure:
-    """Draw samples with their labels, the distribution of the labels, and the mean image.
+    """Draw an overview of a data set: samples with their labels, the mean image, and the distribution of the labels.
 
-    Data sets of responses get a :func:`~mitsonar.plotting.figures.response_sheet`.
+    For a data set of impulse responses, draw :func:`~mitsonar.plotting.figures.response_sheet` instead.
 
     Args:
-        store: the data set.
+        store: data set to draw.
         samples: number of samples to draw.
         view: name of a view or receiver; default: the first.
-        seed: of the draw of the samples.
+        seed: seed of the choice of samples.
 
     Raises:
-        MitsonarError: no such view, or no sequence with the recipe's number of frames.
+        MitsonarError: there is no such view, or no sequence with the recipe's number of frames.
     """
     if store.recipe.channel is not None:
         return response_sheet(store, samples=samples, receiver=view, seed=seed)
@@ -640,6 +649,7 @@ def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None,
     frames, name = store.recipe.frames, names[view]
     sequence = store.read("sequence")
     first = np.arange(max(0, len(sequence) - frames + 1))
+    # A sample starts where all of its frames belong to one sequence.
     first = first[sequence[first] == sequence[first + frames - 1]]
     if not len(first):
         raise MitsonarError(f"{store.place.url} has no {frames} frames in one sequence: nothing to show")
@@ -659,14 +669,14 @@ def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None,
 
 
 def _extent(store: DataStore, view: str) -> tuple[float, float, float, float]:
-    """Return bearing [deg] and range [m] at the borders of an image, nearest at the bottom."""
+    """Return the limits of an image, bearing [deg] and range [m], as Matplotlib's extent with the nearest range below."""
     shown = next(v for v in store.recipe.views if v.name == view)
     port, starboard = np.degrees(shown.bearing_rad[[0, -1]])
     return float(port), float(starboard), shown.sonar.range_min, shown.sonar.range_max
 
 
 def _draw(axes: Axes, store: DataStore, values: NDArray[np.float64], view: str, title: str, *, top: float = 1.0) -> None:
-    """Draw an image with gamma 0.6 and ``top`` white, or a vector as a line; axes in degrees and metres."""
+    """Draw an image with gamma 0.6 and ``top`` as white, or a vector as a line; axes in degrees and metres."""
     if values.ndim == 1:
         axes.plot(store.read("range_m"), values, lw=0.7)
         axes.set(xlabel="range (m)", ylabel="sum of levels")
@@ -678,12 +688,12 @@ def _draw(axes: Axes, store: DataStore, values: NDArray[np.float64], view: str, 
 
 
 def _levels(values: Stored) -> NDArray[np.float64]:
-    """Return pixels as fractions of the maximum; vectors as they are."""
+    """Return 8-bit pixels as fractions of 255, and other values unchanged."""
     return np.asarray(values, dtype=float) / (255 if values.dtype == np.uint8 else 1)
 
 
 def _sample(axes: Axes, store: DataStore, name: str, view: str, start: int, place: int, frames: int) -> None:
-    """Draw one panel of a sample: a frame, after the last frame the difference, then the label."""
+    """Draw one panel of a sample: a frame, then the difference of the last and the first, then the label."""
     if place < frames:
         title = f"frame {start + place}, scene {store.read('scene')[start + place]}"
         _draw(axes, store, _levels(store.read(name, start + place)), view, title)
@@ -705,7 +715,7 @@ def _sample(axes: Axes, store: DataStore, name: str, view: str, start: int, plac
 
 
 def _label(store: DataStore, start: int, frames: int) -> str:
-    """Return motion and height of a sample in words."""
+    """Return a text with the motion and the height of a sample."""
     motion, height = store.read("motion")[start], store.read("height_m")[start]
     text = f"over z = 0  {store.read('pose')[start, 2]:.3f} m\nover what is below {height:.3f} m"
     if frames == 1:
@@ -715,7 +725,7 @@ def _label(store: DataStore, start: int, frames: int) -> str:
 
 
 def _summary(axes: NDArray[np.object_], store: DataStore, name: str, view: str) -> None:
-    """Draw the mean image, and histograms of the labels."""
+    """Draw the mean image and histograms of the labels."""
     mean = _levels(_sampled(store, name)).mean(axis=0)
     top = float(mean.max()) or 1.0
     _draw(axes[0], store, mean, view, "mean of frames" + (f" (white {top:.3g})" if mean.ndim == 2 else ""), top=top)
@@ -735,7 +745,7 @@ def _summary(axes: NDArray[np.object_], store: DataStore, name: str, view: str) 
 
 
 def _sampled(store: DataStore, name: str) -> Stored:
-    """Read some frames of the whole data set: whole chunks, evenly spread."""
+    """Read a sample of the frames: whole chunks, evenly spread over the data set."""
     chunk = int(store.about["chunk_frames"])
     starts = np.arange(0, len(store), chunk)
     some = starts[np.unique(np.linspace(0, len(starts) - 1, max(1, SAMPLED_FRAMES // chunk)).astype(int))]
@@ -743,7 +753,7 @@ def _sampled(store: DataStore, name: str) -> Stored:
 
 
 def _level(store: DataStore, name: str, view: str) -> Table:
-    """Measure the part of the pixels with an echo, their mean level, and its ratio to the scale of each noise."""
+    """Measure the fraction of pixels with an echo, their mean level, and its ratio to the scale of each noise model."""
     some = _levels(_sampled(store, name))
     if some.ndim == 2:  # sums over the beams
         beams = next(len(v.bearing_rad) for v in store.recipe.views if v.name == view)
@@ -756,13 +766,13 @@ def _level(store: DataStore, name: str, view: str) -> Table:
 
 
 def _levels_of(store: DataStore) -> Table:
-    """Measure the level of each view of a finished data set."""
+    """Measure the levels of each view of a data set, keyed by view; empty while the data set is unfinished."""
     names = array_names(store.recipe).items() if store.finished else ()
     return {view: _level(store, name, view) for name, (kind, view) in names if kind == store.recipe.kinds[0]}
 
 
 def info(store: DataStore) -> Table:
-    """Describe the contents of a data set by name; values are numbers, words, or tables of them."""
+    """Return a description of a data set: its state, sizes, arrays and levels, keyed by name."""
     about, sizes = store.about, store.place.sizes()
     arrays = {}
     for name, stored in store.modality.stored.items():
@@ -792,15 +802,15 @@ def info(store: DataStore) -> Table:
     }
 
 
-# ---------------- The figure of Cramer-Rao bounds
+# ---------------- Cramer-Rao bounds
 
 
 Report: TypeAlias = Mapping[str, Any]
-"""A report of :mod:`mitsonar.estimation.crlb.report`: its keys, with rows of bounds under ``rows``."""
+"""A report of :mod:`mitsonar.estimation.crlb.report`, with the bounds under the key ``rows``."""
 
 
 def crlb_png(report: Report) -> bytes:
-    """Draw the bounds of two frames against the variable, or for each pose, and return the PNG."""
+    """Return a figure of the bounds for two frames, over the varied quantity or over the poses, as a PNG file."""
     from matplotlib.figure import Figure
 
     name = report["vary"]

@@ -1,4 +1,4 @@
-"""The families of worlds by name."""
+"""Which families of worlds there are, and how each builds its worlds."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ if TYPE_CHECKING:
 __all__ = ["FAMILIES", "FlatObjects", "Pattern", "RockyField", "ShipHull", "create_family", "perlin_reflectivity"]
 
 
-# ---------------- The world ``pattern``: blocks that form a T and pairs of parallel bars, on one of six seabeds
+# ---------------- World ``pattern``: a T of blocks, and bars
 
 
 PHOTO_M = 2.0
-"""Edge of the seabed in a shipped picture [m]; the picture is repeated."""
+"""Edge of the piece of seabed that a shipped picture covers [m]; the picture is repeated."""
 
 T = np.array([(-1, 0.5), (0, 0.5), (1, 0.5), (0, -0.5)])
-"""Centres of the blocks, in steps: three across, one below the middle."""
+"""Centres of the blocks, in block steps: three across, and one below the middle one."""
 
 
 class Pattern(BuiltFamily):
@@ -81,11 +81,11 @@ class Pattern(BuiltFamily):
 
     @property
     def seeded(self) -> bool:
-        """Return whether the seabed is random."""
+        """Return whether the seabed is random; the pictures are not."""
         return not self.texture.startswith("photo")
 
     def build(self, seed: int) -> World:
-        """Build the field with the seabed of a seed."""
+        """Build the field, with the seabed for a seed."""
         blocks = np.column_stack([T * self.block_step_m, np.full(len(T), self.block_m[2] / 2)])
         meshes = [self._boxes("blocks", 1, np.tile(self.block_m, (len(T), 1)), blocks)]
         meshes.append(self._boxes("bars", 1 + len(T), *self._bars()))
@@ -104,7 +104,7 @@ class Pattern(BuiltFamily):
         return Mesh(name, placed.vertices, placed.faces, reflectivity, first_id + placed.number)
 
     def _bars(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return sizes and centres of the eight bars [m]: fore, aft, port, starboard, the inner first."""
+        """Return sizes and centres of the eight bars ``(8, 3)`` [m]: fore, aft, starboard, port, the inner bar first."""
         sizes, centres = [], []
         for axis, (length, inner) in ((1, self.bars_across_m), (0, self.bars_along_m)):
             for sign in (1, -1):
@@ -118,7 +118,7 @@ class Pattern(BuiltFamily):
         return np.array(sizes), np.array(centres)
 
     def _seabed(self, seed: int) -> str:
-        """Return the floor's texture; random ones have the grain of the shipped scene ``pattern`` at any size."""
+        """Return the XML of the floor's texture; random ones keep the grain of the shipped scene ``pattern`` at any size."""
         a_metre = self.size_m / 12
         if self.texture == "gaussian":
             numbers = {"cells": 800 * a_metre, "mean": 0.45, "std": 0.2}
@@ -146,7 +146,7 @@ def _texture(kind: str, numbers: dict[str, float], seed: int, more: str) -> str:
             </texture>"""
 
 
-# ---------------- The world ``rocky-field``: cubes, cylinders and capsules on a flat seabed of random cells
+# ---------------- World ``rocky-field``: rocks on a seabed
 
 
 class _Kind(NamedTuple):
@@ -183,7 +183,7 @@ class RockyField(BuiltFamily):
         return self.size_m / 2
 
     def build(self, seed: int) -> World:
-        """Build the field of a seed."""
+        """Build the field for a seed."""
         kinds = [
             _Kind("cubes", box(), self.cubes_a_side),
             _Kind("cylinders", cylinder(), self.cylinders_a_side),
@@ -208,7 +208,7 @@ class RockyField(BuiltFamily):
         )
 
     def _rocks(self, kind: _Kind, a_side: int, first_id: int, rng: np.random.Generator) -> Mesh:
-        """Build all rocks of one kind."""
+        """Build all rocks of one kind as one mesh; their objects are numbered from ``first_id``."""
         count = a_side**2
         centre = np.column_stack([shifted_grid(self.half_m, a_side, rng), draw(rng, self.centre_height_m, count)])
         size = draw(rng, self.rock_size_m, count, 3)
@@ -218,7 +218,7 @@ class RockyField(BuiltFamily):
         return Mesh(kind.name, rocks.vertices, rocks.faces, reflectivity, first_id + rocks.number)
 
 
-# ---------------- The world ``ship-hull``: groups of flat tubes and anodes on a plate of random cells
+# ---------------- World ``ship-hull``: tubes and anodes on a plate
 
 
 class ShipHull(BuiltFamily):
@@ -251,7 +251,7 @@ class ShipHull(BuiltFamily):
         return self.size_m / 2
 
     def build(self, seed: int) -> World:
-        """Build the hull of a seed."""
+        """Build the hull for a seed."""
         meshes: list[Mesh] = []
         counts: list[str] = []
         first_id = 1
@@ -272,22 +272,26 @@ class ShipHull(BuiltFamily):
         )
 
     def _tubes(self, rng: np.random.Generator) -> Copies:
-        """Build all tubes; those of a group lie side by side, along one direction."""
+        """Build all tubes; the tubes of a group lie side by side and share one direction."""
+        # 1. Draw the groups, and how many tubes each has.
         middle = shifted_grid(self.half_m, whole(rng, self.groups_a_side), rng)
         groups = len(middle)
         counts = whole(rng, self.tubes_a_group, groups)
         of_group = np.repeat(np.arange(groups), counts)
         total = len(of_group)
+        # 2. Draw the tubes' sizes, and one heading for each group.
         width, height = draw(rng, self.tube_width_m, total), draw(rng, self.tube_height_m, total)
         length = draw(rng, self.tube_length_m, total)
         heading = draw(rng, (0, np.pi), groups)[of_group]
+        # 3. Place the tubes of a group without gaps, centred on the group: `before` is the running sum of widths, and
+        #    `begin` and `end` are its values at the two edges of the tube's group.
         before = np.cumsum(width) - width
         last = (np.cumsum(counts) - 1)[of_group]
         begin, end = before[last + 1 - counts[of_group]], np.cumsum(width)[last]
         aside = before + width / 2 - (begin + end) / 2
         across = np.column_stack([np.cos(heading), np.sin(heading)])
         centre = np.column_stack([middle[of_group] + across * aside[:, None], height / 2])
-        # a cylinder along z laid down: its length along y, its height along z
+        # 4. Lay the cylinder, whose axis is z, on the plate: its length along y, its height along z. Then turn it.
         laid = Rotation.from_euler("z", heading[:, None]) * Rotation.from_euler("x", -np.pi / 2)
         return place(cylinder(12, 12), np.column_stack([width, height, length]), laid, centre)
 
@@ -301,11 +305,11 @@ class ShipHull(BuiltFamily):
         return place(cylinder(16, 1), size, turn, np.column_stack([middle, height / 2]))
 
 
-# ---------------- The world ``flat-objects``: thin rectangles and ellipses on a flat seabed of random cells
+# ---------------- World ``flat-objects``: rectangles and ellipses
 
 
 STEP_M = 5e-6
-"""Height difference of objects that overlap [m]: of two at one height the ray tracer would hit either at random."""
+"""Height difference between overlapping objects [m]; at equal heights the ray tracer would hit either one at random."""
 
 
 class FlatObjects(BuiltFamily):
@@ -331,12 +335,14 @@ class FlatObjects(BuiltFamily):
         return self.size_m / 2
 
     def build(self, seed: int) -> World:
-        """Build the field of a seed."""
+        """Build the field for a seed."""
+        # All draws of one kind come from its own generator, so that the counts of one kind leave the other unchanged.
         kinds = (("rectangles", slab(), self.rectangles), ("ellipses", cylinder(24, 1), self.ellipses))
         streams = [stream(seed, 1, number) for number in range(len(kinds))]
         counts = [whole(rng, self.objects) if kind[2] is None else kind[2] for rng, kind in zip(streams, kinds, strict=True)]
         places = [draw(rng, (-self.half_m, self.half_m), n, 2) for rng, n in zip(streams, counts, strict=True)]
         sides = [draw(rng, self.side_m, n, 2) for rng, n in zip(streams, counts, strict=True)]
+        # Objects that overlap differ slightly in height, whatever their kinds.
         height = self.thickness_m + STEP_M * _levels(np.concatenate(places), np.concatenate(sides))
         meshes: list[Mesh] = []
         ends = np.cumsum(counts)
@@ -358,13 +364,22 @@ class FlatObjects(BuiltFamily):
 
 
 def _levels(middle: NDArray[np.float64], side: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the lowest level of each object that differs from the levels of all objects that it may overlap ``(n,)``."""
+    """Return a height level for each object ``(n,)``, such that objects that may overlap have different levels.
+
+    Objects get the lowest free level, in their order. Two objects may overlap if their circumscribed circles do.
+
+    Args:
+        middle: centres of the objects ``(n, 2)`` [m].
+        side: length and width of the objects ``(n, 2)`` [m].
+    """
     radius = np.hypot(*side.T) / 2
     level = np.zeros(len(middle), dtype=np.int64)
     if len(middle) < 2:
         return level
+    # Pairs within twice the largest radius are candidates; keep those whose own circles meet.
     near = cKDTree(middle).query_pairs(2 * radius.max(), output_type="ndarray")
     near = near[np.hypot(*(middle[near[:, 0]] - middle[near[:, 1]]).T) < radius[near].sum(axis=1)]
+    # Colour the graph of overlaps greedily.
     earlier: list[list[int]] = [[] for _ in middle]
     for first, second in np.sort(near, axis=1):
         earlier[second].append(first)
@@ -374,7 +389,7 @@ def _levels(middle: NDArray[np.float64], side: NDArray[np.float64]) -> NDArray[n
     return level
 
 
-# ---------------- families
+# ---------------- Families by name
 
 
 FAMILIES: dict[str, type[Family]] = {
@@ -383,14 +398,14 @@ FAMILIES: dict[str, type[Family]] = {
 
 
 def create_family(name: str, **fields: object) -> Family:
-    """Create the family of a name; ``scene`` is a file of the user's own.
+    """Create the family of a given name.
 
     Args:
-        name: of :data:`FAMILIES`, or ``scene``.
-        fields: numbers of the family; the others are Almanza-Medina's.
+        name: a key of :data:`FAMILIES`, or ``scene`` for a scene file of the user.
+        fields: options of the family; the defaults are Almanza-Medina's values.
 
     Raises:
-        MitsonarError: unknown name or key, or a number outside its limits.
+        MitsonarError: the name or a key is unknown, or a value is outside its limits.
     """
     known: dict[str, type[Family]] = {**FAMILIES, SceneFile.called: SceneFile}
     if name not in known:
@@ -398,33 +413,34 @@ def create_family(name: str, **fields: object) -> Family:
     return known[name].create(**fields)
 
 
-# ---------------- Perlin's noise in plain NumPy, for reflectivities that are stored with a mesh: the same bits on
-# every machine
+# ---------------- Perlin noise
+# Reflectivities are stored with a mesh, so the noise uses plain NumPy without transcendental functions: it has the same bits
+# on every machine.
 
 
 PERIOD = 256
 OCTAVES = 2
 CONTRAST = 1.5
-BLOCK = 2**15  # points at a time: their data fit the cache
+BLOCK = 2**15  # points per block: their data fit the cache
 GRADIENTS = np.array(
     [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) == 2], dtype=float
 )
-"""The twelve edges of a cube: no sine is needed, so nothing depends on a machine's mathematics library."""
+"""Gradients, along the twelve edges of a cube: they need no sine, whose bits depend on the mathematics library."""
 
 
 def perlin_reflectivity(
     places: NDArray[np.float64], cell_m: float, span: tuple[float, float], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Compute reflectivities by Perlin's noise (Improving Noise, 2002): two octaves, contrast 1.5.
+    """Compute reflectivities from Perlin noise (Improving Noise, 2002) of two octaves, with contrast 1.5.
 
     Args:
         places: points ``(n, 3)`` [m].
         cell_m: edge of a lattice cell of the first octave [m]; the lattice repeats after 256 cells.
-        span: range of the reflectivity.
-        rng: draws the lattice.
+        span: lowest and highest reflectivity.
+        rng: generator of the lattice.
 
     Returns:
-        One value for each point ``(n,)``.
+        One reflectivity for each point ``(n,)``.
     """
     order = np.argsort(rng.random(PERIOD)).astype(np.int16)
     kinds = (rng.random(PERIOD) * len(GRADIENTS)).astype(np.int16)
@@ -439,12 +455,15 @@ def perlin_reflectivity(
 
 
 def _noise(places: NDArray[np.float64], order: NDArray[np.int16], kinds: NDArray[np.int16]) -> NDArray[np.float64]:
-    """Compute one octave, about -1..1, at ``places`` in lattice cells."""
+    """Compute one octave of noise, about -1..1, at ``places`` ``(n, 3)`` in lattice cells."""
+    # 1. Split the coordinates into the lattice cell and the position inside it, and ease the latter by Perlin's quintic,
+    #    whose first and second derivatives vanish at the cell's faces.
     x, y, z = places.T
     corner = [np.floor(axis) for axis in (x, y, z)]
     inside = [axis - low for axis, low in zip((x, y, z), corner, strict=True)]
     ease = [t * t * t * (t * (t * 6 - 15) + 10) for t in inside]
     whole = [low.astype(np.int64) for low in corner]
+    # 2. Sum over the eight corners: each contributes the linear ramp of its hashed gradient, with trilinear weights.
     value = np.zeros(len(places))
     for dx in (0, 1):
         first = order[(whole[0] + dx) % PERIOD]

@@ -1,4 +1,4 @@
-"""Geometries of model files with their reflectivity: glTF, OBJ, STL, COLLADA and PLY."""
+"""How a model file (glTF, OBJ, STL, COLLADA, PLY) becomes geometries with reflectivities, and a world."""
 
 from __future__ import annotations
 
@@ -38,25 +38,33 @@ __all__ = [
 
 FORMATS = (".glb", ".gltf", ".obj", ".stl", ".dae", ".ply")
 UNCOLOURED = 0.5
-"""Reflectivity of a model without colours, as that of BSDFs without reflectance."""
+"""Reflectivity of a model without colours, equal to that of a BSDF without reflectance."""
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 UP = {"x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)), "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "z": np.eye(3)}
-"""Rows of the rotation that turns each axis upwards: even permutations, which do not mirror."""
+"""Rows of the rotation that turns each axis upwards; none of them mirrors."""
 
 MOST_TRIANGLES = 50_000_000
-"""Largest number of triangles of a model, with all copies."""
+"""Largest number of triangles of a model, including all copies."""
 
 MOST_PIXELS = 2**26
-"""Largest number of pixels of a model's picture."""
+"""Largest number of pixels of a picture of a model."""
 
 LARGEST_FILE = 2**32
-"""Largest size of a model's file [bytes]."""
+"""Largest size of a model file [bytes]."""
 
 
 @dataclass(frozen=True)
 class Piece:
-    """One geometry of a model: triangles with one reflectivity each, or with uv and a picture."""
+    """One geometry of a model: triangles with one reflectivity each, or with texture coordinates and a picture.
+
+    Attributes:
+        vertices: vertex positions ``(vertices, 3)``.
+        faces: vertex indices of the triangles ``(faces, 3)``.
+        reflectivity: reflectivity of each face ``(faces,)``, unless a picture gives it.
+        uv: texture coordinates ``(vertices, 2)``, v from the top row as in Mitsuba; only with a picture.
+        picture: reflectivity as a grey PNG file.
+    """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
@@ -65,20 +73,20 @@ class Piece:
     picture: bytes | None = None
 
     def moved(self, turn: NDArray[np.float64], shift: NDArray[np.float64]) -> Self:
-        """Return the geometry with vertices ``turn @ v - shift``. Where ``turn`` mirrors, triangles keep their fronts."""
+        """Return the geometry with vertices ``turn @ v - shift``; triangles keep their front side where ``turn`` mirrors."""
         faces = self.faces[:, ::-1] if np.linalg.det(turn) < 0 else self.faces
         return replace(self, vertices=self.vertices @ turn.T - shift, faces=faces)
 
     def uniform(self, reflectivity: float) -> Self:
-        """Return the geometry with one reflectivity, without picture."""
+        """Return the geometry with the same reflectivity everywhere, and without a picture."""
         return replace(self, reflectivity=np.full(len(self.faces), reflectivity), uv=None, picture=None)
 
 
 def reflectivity_of(reflectivity: str | float) -> str | float:
-    """Return ``red``, ``luminance``, or a number 0..1.
+    """Validate the choice of a reflectivity: return ``red``, ``luminance``, or a number 0..1.
 
     Raises:
-        MitsonarError: it is none of these.
+        MitsonarError: the value is none of these.
     """
     if reflectivity in ("red", "luminance"):
         return reflectivity
@@ -95,7 +103,15 @@ def reflectivity_of(reflectivity: str | float) -> str | float:
 
 
 def read_pieces(path: Path, value: str | float) -> list[Piece]:
-    """Read the geometries of a file with their reflectivity."""
+    """Read the geometries of a model file with their reflectivity.
+
+    Args:
+        path: glTF, OBJ, STL, COLLADA or PLY file.
+        value: ``red``, ``luminance``, or one reflectivity for all triangles, as :func:`reflectivity_of` returns it.
+
+    Raises:
+        MitsonarError: the file is missing, damaged, too large, or has no triangles.
+    """
     geometries = _geometries(path)
     try:
         return [_piece(geometry, value) for geometry in geometries]
@@ -105,7 +121,7 @@ def read_pieces(path: Path, value: str | float) -> list[Piece]:
 
 
 def _geometries(path: Path) -> list[trimesh.Trimesh]:
-    """Read the triangles of a file, transformed by its scene graph."""
+    """Read the triangle meshes of a file, transformed by its scene graph."""
     if not os.path.isfile(path):
         raise MitsonarError(f"no model file {path}: give a {', '.join(FORMATS)} file")
     if path.suffix.lower() not in FORMATS:
@@ -136,10 +152,10 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
 
 
 def _check_file(path: Path) -> None:
-    """Check the counts in a file against its size, before a reader allocates memory.
+    """Check the counts in a file against its size, before a reader allocates memory for them.
 
     Raises:
-        ValueError: the file promises more than it has.
+        ValueError: the file is too large, or its header announces more data than it has.
     """
     size = path.stat().st_size
     if size > LARGEST_FILE:
@@ -147,14 +163,14 @@ def _check_file(path: Path) -> None:
     kind = path.suffix.lower()
     if kind == ".ply":
         check_counts(path)
-    if kind == ".dae" and b"<!DOCTYPE" in path.read_bytes().replace(b"\0", b""):  # zeros: UTF-16
+    if kind == ".dae" and b"<!DOCTYPE" in path.read_bytes().replace(b"\0", b""):  # without zero bytes, to recognise UTF-16
         raise ValueError("it has a document type (<!DOCTYPE>), which models do not need")
     if kind in (".glb", ".gltf"):
         _check_gltf(path, size)
 
 
 def _check_gltf(path: Path, size: int) -> None:
-    """Check that the accessors of a glTF file point into its bytes."""
+    """Check that the accessors and buffers of a glTF file fit into its bytes."""
     content = path.read_bytes()
     if path.suffix.lower() == ".glb":
         (length,) = struct.unpack_from("<I", content, 12)
@@ -173,7 +189,7 @@ def _check_gltf(path: Path, size: int) -> None:
 
 
 def _check_copies(scene: trimesh.Scene) -> None:
-    """Check the size of a scene graph, which may copy a geometry many times, and of its pictures."""
+    """Check the number of triangles of a scene graph, which may copy a geometry many times, and the size of its pictures."""
     total = 0
     for node in scene.graph.nodes_geometry:
         geometry = scene.geometry[scene.graph[node][1]]
@@ -188,7 +204,7 @@ def _check_copies(scene: trimesh.Scene) -> None:
 
 
 def _piece(geometry: trimesh.Trimesh, value: str | float) -> Piece:
-    """Return a geometry with its reflectivity."""
+    """Return a geometry with the reflectivity of its texture, its vertices or its faces."""
     vertices, faces = np.asarray(geometry.vertices, dtype=float), np.asarray(geometry.faces)
     if not isinstance(value, str):
         return Piece(vertices, faces, np.full(len(faces), value))
@@ -199,7 +215,7 @@ def _piece(geometry: trimesh.Trimesh, value: str | float) -> Piece:
         factor = _tint(material, value)
         if picture is None or visual.uv is None or len(visual.uv) != len(vertices):
             return Piece(vertices, faces, np.full(len(faces), factor))
-        # trimesh counts v upwards, Mitsuba's bitmaps from the top row
+        # In trimesh v points upwards; Mitsuba's bitmaps count it from the top row.
         uv = np.asarray(visual.uv, dtype=float) * (1, -1) + (0, 1)
         return Piece(vertices, faces, uv=uv, picture=_grey_png(picture, value, factor))
     if visual.kind is None:
@@ -210,8 +226,8 @@ def _piece(geometry: trimesh.Trimesh, value: str | float) -> Piece:
 
 
 def _tint(material: trimesh.visual.material.Material, value: str) -> float:
-    """Return the reflectivity of a material's own colour, 0..1; a picture is multiplied by it."""
-    if isinstance(material, trimesh.visual.material.PBRMaterial):  # glTF: linear already, white where it is not given
+    """Return the reflectivity 0..1 of a material's base colour, which multiplies a picture."""
+    if isinstance(material, trimesh.visual.material.PBRMaterial):  # glTF: linear values; the default is white
         factor = material.baseColorFactor
         colour = np.ones(3) if factor is None else _colours(factor)[0]
         return float(colour[0] if value == "red" else colour @ LUMINANCE)
@@ -221,14 +237,14 @@ def _tint(material: trimesh.visual.material.Material, value: str) -> float:
 
 
 def _colours(values: ArrayLike) -> NDArray[np.float64]:
-    """Return RGB in 0..1 ``(n, 3)`` of 8-bit or fractional RGB(A)."""
+    """Convert 8-bit or fractional RGB(A) to RGB in 0..1 ``(n, 3)``."""
     table = np.atleast_2d(np.asarray(values))
     scale = 255 if np.issubdtype(table.dtype, np.integer) else 1
     return np.clip(table[:, :3].astype(float) / scale, 0, 1)
 
 
 def one_number(colours: NDArray[np.float64], value: str) -> NDArray[np.float64]:
-    """Reduce stored colours ``(..., 3)`` to one number each: red, or the luminance of their linear light (sRGB)."""
+    """Reduce stored sRGB colours ``(..., 3)`` to one number each: the red channel, or the luminance of linear light."""
     if value == "red":
         return colours[..., 0]
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
@@ -236,7 +252,7 @@ def one_number(colours: NDArray[np.float64], value: str) -> NDArray[np.float64]:
 
 
 def _grey_png(picture: Image.Image, value: str, factor: float) -> bytes:
-    """Return the picture's reflectivity as a 16-bit grey PNG."""
+    """Return the reflectivity of a picture, times ``factor``, as a 16-bit grey PNG."""
     grey = one_number(_colours(np.asarray(picture.convert("RGB")).reshape(-1, 3)), value) * factor
     pixels = np.rint(grey * 65535).astype(np.uint16).reshape(picture.height, picture.width)
     buffer = io.BytesIO()
@@ -247,21 +263,24 @@ def _grey_png(picture: Image.Image, value: str, factor: float) -> bytes:
 def merged(
     pieces: list[Piece], name: str = "model", textured: str = "textured", first_id: int = 1, shape_id: str | None = None
 ) -> tuple[list[Mesh], dict[str, bytes]]:
-    """Merge all plain pieces into one mesh, and those of each picture into another; also return the pictures as files.
+    """Merge all untextured pieces into one mesh, and the pieces that share a picture into one mesh per picture.
 
     Args:
-        pieces: in the axes of the scene [m]; they are numbered as objects, in their order.
-        name: of the mesh of the plain ones.
-        textured: begin of the names of the others.
-        first_id: number of the first piece as an object.
-        shape_id: id of the shapes; default: their names.
+        pieces: geometries in the axes of the scene [m]; each becomes one object, numbered in order.
+        name: name of the untextured mesh.
+        textured: prefix of the names of the textured meshes.
+        first_id: object number of the first piece.
+        shape_id: id of the untextured shape and prefix of the ids of the others; default: the names of the meshes.
+
+    Returns:
+        The meshes, the untextured one first, and the pictures as files, keyed by their name in the world's folder.
     """
     groups: dict[bytes | None, list[tuple[int, Piece]]] = {}
     for number, piece in enumerate(pieces, start=first_id):
         groups.setdefault(piece.picture, []).append((number, piece))
     meshes: list[Mesh] = []
     content: dict[str, bytes] = {}
-    for picture, members in sorted(groups.items(), key=lambda group: group[0] is not None):  # the plain ones first
+    for picture, members in sorted(groups.items(), key=lambda group: group[0] is not None):  # untextured first
         vertices = np.concatenate([piece.vertices for _, piece in members])
         first = np.cumsum([0, *(len(piece.vertices) for _, piece in members)])
         faces = np.concatenate([piece.faces + start for (_, piece), start in zip(members, first, strict=False)])
@@ -278,7 +297,7 @@ def merged(
     return meshes, content
 
 
-# ---------------- A world from a user's own model, with or without textures
+# ---------------- World of a model
 
 
 LARGEST_M = 1e6
@@ -297,20 +316,21 @@ def mesh_world(
     floor: bool = True,
     floor_m: float | None = None,
 ) -> World:
-    """Build the world of a model: z upwards, scaled, its lowest point on a seabed at z = 0, centred on the origin.
+    """Build the world of a model file: scaled, z upwards, and centred above the origin with its lowest point at z = 0.
 
     Args:
-        path: glTF, OBJ, STL, COLLADA or PLY.
-        scale: metres in a unit of the file.
-        up: the file's axis that points up, x, y or z; default: y for glTF, z otherwise.
+        path: glTF, OBJ, STL, COLLADA or PLY file.
+        scale: metres per unit of the file.
+        up: axis of the file that points up, x, y or z; default: y for glTF, z otherwise.
         reflectivity: ``luminance`` (of linear light, as Mitsuba computes it), ``red`` (the stored red channel, as in
-            Almanza-Medina), or one number for all.
-        floor: whether a seabed of random cells of 15 mm lies below.
+            Almanza-Medina), or one number for the whole model.
+        floor: whether to add a seabed of random cells of 15 mm at z = 0.
         floor_m: edge of that seabed [m]; default: three times the model's diagonal.
 
     Raises:
-        MitsonarError: the model is unreadable, broken or empty; scale, axis or reflectivity is not allowed.
+        MitsonarError: the model is unreadable, broken or empty; or scale, axis or reflectivity is not allowed.
     """
+    # 1. Read the model. Only vertices that a triangle uses count for its extent.
     path = Path(path)
     up = up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z")
     _check_options(up, scale, floor_m)
@@ -318,9 +338,11 @@ def mesh_world(
     turn = np.array(UP[up], dtype=float) * scale
     corners = np.concatenate([(piece.vertices @ turn.T)[np.unique(piece.faces)] for piece in pieces])
     _check_extent(path, corners, scale)
+    # 2. Centre the model above the origin, on z = 0.
     low, high = corners.min(axis=0), corners.max(axis=0)
     shift = np.array([*(low + high)[:2] / 2, low[2]])
     meshes, content = merged([piece.moved(turn, shift) for piece in pieces])
+    # 3. Add the seabed, and a sonar that sees the whole model.
     radius = float(np.linalg.norm(high - low)) / 2
     half = 3 * radius if floor_m is None else floor_m / 2
     return World(
@@ -337,7 +359,7 @@ def _check_options(up: str, scale: float, floor_m: float | None) -> None:
     """Check the options of :func:`mesh_world`.
 
     Raises:
-        MitsonarError: one of them is not allowed.
+        MitsonarError: an option is not allowed.
     """
     if up not in UP:
         raise MitsonarError(f"{argument('up')} must be x, y or z: got {up!r}{meant(up, UP)}")
@@ -348,10 +370,10 @@ def _check_options(up: str, scale: float, floor_m: float | None) -> None:
 
 
 def _check_extent(path: Path, corners: NDArray[np.float64], scale: float) -> None:
-    """Check that the corners of a model ``(n, 3)`` [m] are finite, and neither one point nor too far apart.
+    """Check that the corners of a model ``(n, 3)`` [m] are finite, do not all coincide, and are not too far apart.
 
     Raises:
-        MitsonarError: they are not.
+        MitsonarError: a check fails.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         extent = float(np.ptp(corners, axis=0).max())
@@ -365,18 +387,20 @@ def _check_extent(path: Path, corners: NDArray[np.float64], scale: float) -> Non
 
 
 def random_seabed(half_m: float, z_m: float = 0.0) -> Floor:
-    """Return a square seabed of random cells of 15 mm; ``half_m`` is half its edge [m]."""
+    """Return a square seabed of random cells of 15 mm, with half an edge of ``half_m`` [m], at height ``z_m`` [m]."""
     return Floor(half_m, Floor.cells(int(np.clip(round(2 * half_m / 0.015), 1, 2**20)), (0, 1), 0), z_m)
 
 
 def overview(radius: float, height: float, foot: ArrayLike = (0.0, 0.0, 0.0), *, nearest: float = 0.0) -> Standpoint:
-    """Return a sonar 30 deg above, at the distance at which the model fills a field of view of 29 deg.
+    """Return a standpoint from which the sonar sees a whole model, looking down at 30 deg.
+
+    At its distance the model fills a field of view of 29 deg.
 
     Args:
-        radius: of the model [m].
-        height: of the model [m].
-        foot: the point below its middle, at its lowest height ``(3,)`` [m].
-        nearest: the sonar keeps this distance [m].
+        radius: half the diagonal of the model's bounding box [m].
+        height: height of the model [m].
+        foot: point below the model's centre, at its lowest height ``(3,)`` [m].
+        nearest: smallest distance of the sonar [m].
     """
     away = max(1.1 * radius / np.tan(np.radians(14.5)), nearest)
     x, y, z = (float(value) for value in np.asarray(foot))

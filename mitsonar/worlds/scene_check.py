@@ -1,4 +1,7 @@
-"""Check a scene that Mitsuba has parsed, before it creates its objects: names, numbers, references and files."""
+"""Whether a scene is safe to load: its XML text, its parsed objects, and the files that they name.
+
+Mitsuba ends the process, or allocates without limit, on some damaged scenes and files. The checks find these first.
+"""
 
 from __future__ import annotations
 
@@ -41,35 +44,38 @@ __all__ = [
 
 
 DEEPEST = 100
-"""Largest depth of objects that hold or refer to each other."""
+"""Largest depth of objects that contain or refer to each other."""
 
 MOST_WAYS = 10**8
-"""Ways from objects to those that they hold, at most: Mitsuba goes each of them."""
+"""Largest number of paths along references from object to object; Mitsuba follows every one."""
 
 MOST_PIXELS = 2**28
-"""Pixels of all pictures of a scene, at most."""
+"""Largest number of pixels of all pictures of a scene."""
 
 BYTES_A_PIXEL = 28
-"""What Mitsuba takes to read a picture: the pixels as they are, and as single precision."""
+"""Memory that Mitsuba needs to read a pixel [bytes]: its stored value, and its value in single precision."""
 
 PICTURES = ("bitmap", "envmap")
 
 CONTAINERS = {"blendbsdf": "bsdf", "merge": "shape", "shapegroup": "shape", "volume": "volume"}
-"""Objects that consist of others, and of what."""
+"""Plugins that consist of other objects, and the type of those objects."""
 
 REFRACTING = ("material", "int_ior", "ext_ior")
-"""Properties that name a file of ``data/ior``, without its ending."""
+"""Properties that name a file of ``data/ior``, without its extension."""
 
 
 def check_parsed(state: mi.parser.ParserState) -> None:
-    """Check a parsed scene, whose included files and parameters are resolved. Mitsuba must search in the scene's folders.
+    """Check a scene that Mitsuba has parsed, before it creates the objects: names, numbers, references and files.
+
+    Included files and parameters are resolved at this stage. Mitsuba's file resolver must search the scene's folders.
 
     Args:
-        state: of the scene; no object is created yet.
+        state: parsed state of the scene.
 
     Raises:
-        MitsonarError: a type that is no name; a number that is not finite; objects that refer to each other too often; a
-            damaged mesh or picture; a file that is none; a bitmap without a file, an empty group.
+        MitsonarError: a plugin name is invalid, a number is not finite, objects refer to each other too often or in a
+            circle, a mesh or a picture is damaged, a named file is not a regular file, a bitmap has no file, or a group is
+            empty.
     """
     import mitsuba as mi
 
@@ -94,7 +100,10 @@ def check_parsed(state: mi.parser.ParserState) -> None:
 
 
 def _check_numbers(props: mi.Properties, name: str) -> None:
-    """Check that a property is finite; what lies beyond the reach of single precision vanishes without a word."""
+    """Check that a number is not nan, and that transforms, vectors and colours are finite and not too large.
+
+    Objects with coordinates beyond single precision would vanish silently.
+    """
     import mitsuba as mi
 
     kinds = mi.Properties.Type
@@ -111,7 +120,7 @@ def _check_numbers(props: mi.Properties, name: str) -> None:
 
 
 def _check_file(node: mi.parser.SceneNode, name: str) -> int:
-    """Check the file that a property names, if there is one; return how many pixels of a picture it holds."""
+    """Check the file that a property names, if any; return its number of pixels, 0 unless it is a picture."""
     import mitsuba as mi
 
     if node.props.type(name) != mi.Properties.Type.String:
@@ -144,7 +153,7 @@ def _check_ellipsoids(path: Path) -> None:
 
 
 def _files(value: str, name: str) -> Iterator[Path]:
-    """Yield what Mitsuba finds under a name."""
+    """Yield the files that Mitsuba finds for the value of a property."""
     if "\0" in value:
         raise MitsonarError("a value holds a zero byte: remove it")
     values = [f"data/ior/{value}.{part}.spd" for part in ("eta", "k")] if name in REFRACTING else [value]
@@ -153,13 +162,13 @@ def _files(value: str, name: str) -> Iterator[Path]:
         try:
             if one and found.exists():
                 yield found
-        except OSError:  # such as a name too long
+        except OSError:  # for example a name that is too long
             if name == "filename":
                 raise MitsonarError(f"there cannot be a file of the name {shortened(value)}") from None
 
 
 def _refuse_incomplete(state: mi.parser.ParserState) -> None:
-    """Refuse objects without what they consist of, on which Mitsuba ends the process or fails late."""
+    """Refuse objects that lack their parts: Mitsuba ends the process on them, or fails late."""
     import mitsuba as mi
 
     kinds = mi.Properties.Type
@@ -173,9 +182,13 @@ def _refuse_incomplete(state: mi.parser.ParserState) -> None:
 
 
 def _check_references(state: mi.parser.ParserState) -> None:
-    """Check how deep objects hold each other, and in how many ways: Mitsuba's search for circles goes all of them."""
+    """Check the depth of references between objects, and the number of paths along them.
+
+    Mitsuba's search for circular references follows every path.
+    """
     import mitsuba as mi
 
+    # 1. List the objects that each object contains or refers to.
     kinds = mi.Properties.Type
     ids = state.id_to_index
     children: list[list[int]] = []
@@ -188,6 +201,8 @@ def _check_references(state: mi.parser.ParserState) -> None:
             elif kind == kinds.Reference and node.props[name].id() in ids:
                 held.append(int(ids[node.props[name].id()]))
         children.append(held)
+    # 2. Count paths and depth of each object after those of its children: a depth-first search without recursion. An object
+    #    that is met again while it is `waiting` closes a circle.
     ways, depths = [0] * len(children), [0] * len(children)
     for root in range(len(children)):
         path = [] if ways[root] else [(root, iter(children[root]))]
@@ -211,11 +226,11 @@ def _check_references(state: mi.parser.ParserState) -> None:
         raise MitsonarError(f"its objects refer to each other in more than {MOST_WAYS:,} ways: it is no scene")
 
 
-# ---------------- The world ``scene``: a Mitsuba XML file of the user's own
+# ---------------- World ``scene``: a file of the user
 
 
 class SceneFile(Family):
-    """A scene that exists already; the seed determines only the motion of the vehicle."""
+    """An existing Mitsuba XML file of the user; the seed determines only the motion of the vehicle."""
 
     called: ClassVar[str] = "scene"
     described: ClassVar[str] = "docs/guides/data-sets.md, `A scene of your own`"
@@ -226,7 +241,7 @@ class SceneFile(Family):
 
     @property
     def half_m(self) -> float:
-        """Return half the edge of the square to stay inside [m]."""
+        """Return half the edge of the square that the vehicle stays inside [m]."""
         return self.size_m / 2
 
     @property
@@ -235,11 +250,11 @@ class SceneFile(Family):
         return False
 
     def refuse_smaller(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-        """Refuse a ``size_m`` whose square reaches beyond the file's shapes: frames there would be empty.
+        """Refuse a ``size_m`` whose square reaches beyond the shapes of the file: frames there would be empty.
 
         Args:
-            low: least x, y, z of the scene ``(3,)`` [m].
-            high: largest ``(3,)`` [m].
+            low: smallest x, y, z of the scene ``(3,)`` [m].
+            high: largest x, y, z of the scene ``(3,)`` [m].
 
         Raises:
             MitsonarError: the square is too large, or the scene has no shapes.
@@ -255,7 +270,7 @@ class SceneFile(Family):
             )
 
     def build(self, seed: int) -> World:
-        """Refuse: the scene exists already.
+        """Raise an error: the scene exists already.
 
         Raises:
             MitsonarError: always.
@@ -273,41 +288,38 @@ class SceneFile(Family):
         return Path(self.file), self.parameters
 
 
-# ---------------- Check a scene's XML before Mitsuba reads it: how deep it nests, what it includes, how its
-# parameters grow
-# Mitsuba's parser recurses, follows every include and copies every parameter without a limit. The check reads the text
-# as that parser does, once from its beginning to its end.
+# ---------------- XML text
 
 
 LARGEST = 2**28
-"""Largest size of a scene's XML with all that it includes [bytes]."""
+"""Largest size of a scene's XML, including all files that it includes [bytes]."""
 
 LARGEST_SPECTRUM = 2**22
-"""Largest size of the file of a spectrum [bytes]."""
+"""Largest size of a spectrum file [bytes]."""
 
 MOST_ELEMENTS = 2_000_000
 """Largest number of elements."""
 
 MOST_FILES = 1_000
-"""Largest number of times that files are included."""
+"""Largest number of files read, counting repeated includes."""
 
 MOST_INCLUDED = 15
-"""Largest depth of files that include each other: Mitsuba's own."""
+"""Largest depth of nested includes, the same as Mitsuba's limit."""
 
 MOST_PARAMETERS = 1_000
-"""Largest number of parameters: Mitsuba compares each with each."""
+"""Largest number of parameters; Mitsuba compares each with each."""
 
 LONGEST_VALUE = 2**16
-"""Largest length of an attribute whose parameters are replaced."""
+"""Largest length of an attribute after its parameters are replaced [characters]."""
 
 MOST_WORK = 2**31
-"""Letters that Mitsuba may compare and move to replace parameters: about a second."""
+"""Largest number of characters that Mitsuba may compare and move to replace parameters: about a second."""
 
 SEARCH = 300
-"""What a search for a parameter takes, in letters."""
+"""Cost of one search for a parameter, as an equivalent number of characters."""
 
 SKIPPED = {b"<!--": b"-->", b"<![CDATA[": b"]]>", b"<?": b"?>"}
-"""Begin and end of what is no element."""
+"""Start and end markers of markup that is not an element."""
 
 NAME = rb"[A-Za-z_:\x80-\xff][A-Za-z0-9_:.\x80-\xff-]*+"
 OPENED = re.compile(rb"<(" + NAME + rb")((?:\s*+" + NAME + rb"\s*+=\s*+(?:\"[^\"]*+\"|'[^']*+'))*+)\s*+(/?)>")
@@ -320,30 +332,34 @@ ENTITIES = {"amp": "&", "lt": "<", "gt": ">", "quot": '"', "apos": "'"}
 
 
 def check_text(path: Path, parameters: dict[str, str], folders: list[Path]) -> None:
-    """Check a scene's XML file and what it includes.
+    """Check the XML file of a scene, and the files that it includes, before Mitsuba reads them.
+
+    Mitsuba's parser recurses, follows every include and copies every parameter without a limit. The check reads the text
+    as that parser does, in one pass.
 
     Args:
-        path: of the file.
-        parameters: values of the scene's ``$name``.
-        folders: that Mitsuba searches for the files that the scene names.
+        path: XML file of the scene.
+        parameters: values of the scene's parameters ``$name``, keyed by name.
+        folders: folders that Mitsuba searches for the files that the scene names.
 
     Raises:
-        MitsonarError: it is no XML, nests too deep, is too large, includes too much, or reads something that is no file.
+        MitsonarError: the text is malformed, nests too deeply, is too large, includes too much, or names something that is
+            not a regular file.
     """
     _Text(dict(parameters)).check(path, folders, 0)
 
 
 @dataclass
 class _Text:
-    """What is known of a scene's text so far.
+    """State of the check of a scene's text.
 
     Attributes:
-        values: of the parameters, by their names.
-        size: of the files read [bytes].
-        files: how many were read.
-        elements: how many there were.
-        work: letters compared and moved to replace parameters.
-        longest_first: names of the parameters, in the order in which Mitsuba replaces them.
+        values: values of the parameters, keyed by name.
+        size: total size of the files read [bytes].
+        files: number of files read.
+        elements: number of elements read.
+        work: characters compared and moved to replace parameters.
+        longest_first: names of the parameters in the order in which Mitsuba replaces them, the longest first.
     """
 
     values: dict[str, str]
@@ -358,7 +374,7 @@ class _Text:
         self._count(len(self.values))
 
     def check(self, path: Path, folders: list[Path], depth: int) -> None:
-        """Check a file and what it includes; ``folders`` are searched for the files that it names."""
+        """Check a file and its includes, and search ``folders`` for the files that it names; ``<path>`` adds a folder."""
         if depth >= MOST_INCLUDED:
             raise MitsonarError(
                 f"{path} is included {depth} files deep: {MOST_INCLUDED} are the most; does it include itself?"
@@ -389,7 +405,7 @@ class _Text:
                         refuse_irregular(found, "spectrum", LARGEST_SPECTRUM)
 
     def _elements(self, content: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
-        """Yield name and attributes of the elements."""
+        """Yield the name and the attributes of each element."""
         opened: list[bytes] = []
         before, place = self.elements, content.find(b"<")
         while place >= 0:
@@ -416,14 +432,14 @@ class _Text:
             elif (found := CLOSED.match(content, place)) is not None:
                 if not opened or opened.pop() != found[1]:
                     raise _malformed(path, content, place, "an element is closed that is not open")
-            elif opened or (found := DOCTYPE.match(content, place)) is None:  # a document type may define entities
+            elif opened or (found := DOCTYPE.match(content, place)) is None:  # a longer document type may define entities
                 raise _malformed(path, content, place, "the XML of an element or of one of its attributes is malformed")
             place = content.find(b"<", found.end())
         if opened:
             raise _malformed(path, content, len(content), f"<{opened[-1].decode('utf-8', 'replace')[:40]}> is not closed")
 
     def _expanded(self, attributes: bytes, path: Path) -> dict[str, str]:
-        """Return attributes, their parameters replaced as Mitsuba replaces them."""
+        """Return attributes by name, with their parameters replaced as Mitsuba replaces them."""
         found: dict[str, str] = {}
         for name, double, single in ATTRIBUTE.findall(attributes):
             raw = (double or single).replace(b"\r\n", b" ").translate(SPACES)
@@ -458,7 +474,7 @@ class _Text:
             raise MitsonarError(f"a scene may have {MOST_PARAMETERS:,} parameters: got more; write the values themselves")
 
     def _add(self, name: str, value: str) -> None:
-        """Add the default of a parameter; a value that was given stays."""
+        """Add the default of a parameter, unless the parameter already has a value."""
         if name in self.values or not name:
             return
         self.values[name] = value
@@ -468,14 +484,14 @@ class _Text:
 
 
 SPACES = bytes.maketrans(b"\t\r\n", b"   ")
-"""White space in an attribute reads as blanks."""
+"""Translation of white space in an attribute to blanks."""
 
 READ = (b"default", b"include", b"path", b"spectrum")
-"""Elements that are followed while the text is read."""
+"""Elements whose attributes the check evaluates."""
 
 
 def _utf8(content: bytes, path: Path) -> bytes:
-    """Return a text as UTF-8, also of the other encodings that Mitsuba knows by a mark or a declaration."""
+    """Convert text to UTF-8 from UTF-16 with a byte order mark, or from Latin-1 with an XML declaration."""
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         try:
             content = content.decode("utf-16").encode()
@@ -489,7 +505,7 @@ def _utf8(content: bytes, path: Path) -> bytes:
 
 
 def _character(found: re.Match[str]) -> str:
-    """Return the character of an entity."""
+    """Return the character that an entity stands for."""
     decimal, hexadecimal, name = found.groups()
     if name:
         return ENTITIES[name]
@@ -501,12 +517,12 @@ def _character(found: re.Match[str]) -> str:
 
 
 def _found(name: str, folders: list[Path]) -> Path | None:
-    """Return the file that Mitsuba finds for a name, None where there is none."""
+    """Return the file that Mitsuba finds for a name, or None."""
     if not name or "\0" in name:
         return None
     try:
         return next((path for path in [*(folder / name for folder in folders), Path(name)] if path.exists()), None)
-    except OSError:  # such as a name too long
+    except OSError:  # for example a name that is too long
         raise MitsonarError(f"there cannot be a file of the name {shortened(name)}") from None
 
 
@@ -515,37 +531,37 @@ def _malformed(path: Path, content: bytes, place: int, reason: str) -> MitsonarE
     return MitsonarError(f"{path}, line {line:,}: {reason}")
 
 
-# ---------------- Check a mesh before Mitsuba reads it: it checks no indices, and a wrong index ends the process
+# ---------------- Meshes: common checks
 
 
 LARGEST_COORDINATE = 1e12
-"""Largest coordinate of vertices, normals and textures: beyond it single precision overflows."""
+"""Largest magnitude of vertices, normals and texture coordinates; beyond it single precision overflows."""
 
 LONGEST_MESH_HEADER = 2**16
 """Largest size of a PLY header [bytes]."""
 
 MESH_INFLATION = 1032
-"""Largest ratio of inflated to deflated data."""
+"""Largest possible ratio of inflated to deflated data."""
 
 TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4"},
     **{"double": "f8", "float64": "f8"},
 }
-"""Types of PLY properties to NumPy's types."""
+"""NumPy types by the names of PLY's types."""
 
 ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 class _FaultError(ValueError):
-    """A fault of a mesh file, in words."""
+    """A fault of a mesh file; the message describes it."""
 
 
 @dataclass
 class _Element:
-    """An element of a PLY header: its name, its count, and names and types of its properties.
+    """An element of a PLY header: its name, its count, and the types of its properties, keyed by name.
 
-    A list has the type of its count in ``counted``, and holds three values.
+    For a list, ``scalars`` has the type of its values and ``counted`` the type of its count. Lists have three values.
     """
 
     name: str
@@ -554,7 +570,7 @@ class _Element:
     counted: dict[str, str] = field(default_factory=dict)
 
     def dtype(self, order: str) -> np.dtype[np.void]:
-        """Return the type of one row of a binary file; a list is a count and three values."""
+        """Return the NumPy type of one row of a binary file; a list becomes a count and three values."""
         parts: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
         for name, kind in self.scalars.items():
             if name in self.counted:
@@ -565,14 +581,16 @@ class _Element:
 
 
 def check_mesh(path: str | Path, kind: str) -> None:
-    """Check a mesh file, once in a process: counts against its size, indices against vertices, finite numbers.
+    """Check a mesh file: counts against the file's size, indices against the number of vertices, and finite numbers.
+
+    Mitsuba checks no indices, and a wrong index ends the process. An unchanged file is checked once per process.
 
     Args:
-        path: of the file.
+        path: mesh file.
         kind: name of the Mitsuba plugin that reads it: ``ply``, ``obj`` or ``serialized``.
 
     Raises:
-        MitsonarError: it is damaged, or has no triangles.
+        MitsonarError: the file is unreadable, damaged, or has no triangles.
     """
     refuse_irregular(path, "mesh")
     try:
@@ -584,7 +602,7 @@ def check_mesh(path: str | Path, kind: str) -> None:
 
 @functools.lru_cache(maxsize=1024)
 def _check_once(path: str, kind: str, size: int, modified_ns: int) -> None:
-    del size, modified_ns  # part of the key: a changed file is checked again
+    del size, modified_ns  # part of the cache's key: a changed file is checked again
     content = Path(path).read_bytes()
     try:
         CHECKS[kind](content)
@@ -599,27 +617,27 @@ FOREIGN_FORMATS = {
     **{"glb": "glTF", "gltf": "glTF", "dae": "COLLADA", "stl": "STL", "fbx": "FBX", "blend": "Blender", "3mf": "3MF"},
     **{"usd": "USD", "usda": "USD", "usdc": "USD", "usdz": "USD", "urdf": "URDF", "sdf": "SDF", "step": "STEP"},
 }
-"""Formats of models that Mitsuba does not read, by the end of a file's name."""
+"""Model formats that Mitsuba does not read, by file extension."""
 
 BEGINNINGS = {
     **{b"glTF": "glTF", b"ply": "PLY", b"solid": "STL", b"Kaydara FBX": "FBX", b"BLENDER": "Blender"},
     **{b"PXR-USDC": "USD", b"#usda": "USD", b"ISO-10303": "STEP"},
 }
-"""Formats by the first bytes of a file."""
+"""Model formats by the first bytes of a file."""
 
 
 def refuse_foreign_format(kind: str, filename: str) -> None:
-    """Refuse a shape whose type is a format of models that Mitsuba lacks, such as ``glb``.
+    """Refuse a shape whose type is a model format that Mitsuba does not read, such as ``glb``.
 
     Raises:
-        MitsonarError: it is; the message says how to make a scene of the file.
+        MitsonarError: the type is such a format; the message explains how to convert the file to a scene.
     """
     if kind in FOREIGN_FORMATS:
         raise MitsonarError(_foreign(filename, FOREIGN_FORMATS[kind], kind))
 
 
 def _format_of(path: Path, content: bytes) -> str:
-    """Return the format of a model by its first bytes, else by the end of its name; empty where it is unknown."""
+    """Return the format of a model by its content, else by its file extension; empty if unknown."""
     for begin, name in BEGINNINGS.items():
         if content.startswith(begin):
             return name
@@ -634,7 +652,7 @@ def _format_of(path: Path, content: bytes) -> str:
 
 
 def _foreign(path: str, name: str, kind: str) -> str:
-    """Describe what to do with a model in a format that Mitsuba's plugin does not read."""
+    """Return a message that explains what to do with a model in a format that Mitsuba's plugin does not read."""
     reads = f"Mitsuba's shape {kind} does not read it" if kind in CHECKS else f"Mitsuba has no shape {kind}"
     make = {
         "PLY": "name the shape ply",
@@ -647,7 +665,7 @@ def _foreign(path: str, name: str, kind: str) -> str:
 
 
 def _check_triangles(indices: NDArray[np.generic], vertices: int, what: str = "a triangle names vertex") -> None:
-    """Check that indices, which count from 0, name vertices."""
+    """Check that indices, counted from 0, refer to existing vertices."""
     if not indices.size:
         raise _FaultError("it has no triangles")
     low, high = int(indices.min()), int(indices.max())
@@ -660,14 +678,14 @@ def _check_mesh_numbers(values: NDArray[np.generic], what: str) -> None:
         raise _FaultError(f"{what} must be finite and at most {LARGEST_COORDINATE:g}")
 
 
-# ---------------------------------------------------------------- PLY
+# ---------------- Meshes: PLY
 
 
 def check_counts(path: Path) -> None:
-    """Check that a PLY file has at least the bytes that its header promises; faces may have any number of corners.
+    """Check that a PLY file has at least as many bytes as its header announces; faces may have any number of corners.
 
     Raises:
-        ValueError: it has fewer.
+        ValueError: the file is too short.
     """
     with path.open("rb") as file:
         order, elements, start = _ply_header(file.read(LONGEST_MESH_HEADER), strict=False)
@@ -680,7 +698,7 @@ def check_counts(path: Path) -> None:
 
 
 def _check_ply(content: bytes) -> None:
-    """Check a file in Stanford's PLY, binary or text."""
+    """Check a PLY file, binary or text."""
     order, elements, start = _ply_header(content)
     counts = {element.name: element.count for element in elements}
     if min(counts.get("vertex", 0), counts.get("face", 0)) < 1:
@@ -697,7 +715,7 @@ def _check_ply(content: bytes) -> None:
 
 
 def _ply_header(content: bytes, strict: bool = True) -> tuple[str | None, list[_Element], int]:
-    """Return byte order (None: text), elements, and offset of the data."""
+    """Parse a PLY header; return the byte order (None: text), the elements, and the offset of the data."""
     end = content.find(b"end_header", 0, LONGEST_MESH_HEADER)
     stop = content.find(b"\n", end)
     if not content.startswith(b"ply") or end < 0 or stop < 0 or content[end + 10 : stop].strip():
@@ -761,7 +779,7 @@ def _ply_rows(content: bytes, start: int, elements: list[_Element], order: str) 
         if element.counted and element.name != "face" and (rows[-1][f"count of {next(iter(element.counted))}"] != 3).any():
             raise _FaultError(f"lists of {element.name} must have 3 entries")
         if {"vertex", "face"} <= {one.name for one in elements[: len(rows)]}:
-            break  # Mitsuba reads no further
+            break  # Mitsuba ignores what follows
     if len(rows) == len(elements) and content[start:].strip(b" \t\r\n\0"):
         raise _FaultError(f"{len(content) - start:,} bytes are left over after what its header promises")
     return rows
@@ -785,7 +803,7 @@ def _ply_rows_of_text(text: bytes, elements: list[_Element]) -> list[NDArray[np.
 
 
 def _as_table(numbers: NDArray[np.float64], element: _Element) -> NDArray[np.void]:
-    """Return the columns of an element by name, and check that integers are whole numbers."""
+    """Return the numbers of an element as a table with named columns; check that integer columns are whole numbers."""
     kinds: list[tuple[str, type] | tuple[str, type, tuple[int]]] = []
     for name in element.scalars:
         listed = name in element.counted
@@ -797,16 +815,18 @@ def _as_table(numbers: NDArray[np.float64], element: _Element) -> NDArray[np.voi
     return table
 
 
-# ---------------------------------------------------------------- OBJ
+# ---------------- Meshes: OBJ
 
 
 def _check_obj(content: bytes) -> None:
-    """Check a file in Wavefront OBJ, whose faces name positions, texture coordinates and normals from 1."""
+    """Check a Wavefront OBJ file, whose faces refer to positions, texture coordinates and normals, counted from 1."""
+    # 1. Collect the lines of each kind.
     lines: dict[bytes, list[list[bytes]]] = {b"v": [], b"vt": [], b"vn": [], b"f": []}
     for line in content.splitlines():
         words = line.partition(b"#")[0].split()
         if words and words[0] in lines:
             lines[words[0]].append(words[1:])
+    # 2. Check positions, texture coordinates and normals.
     for name in (b"v", b"vt", b"vn"):
         fewest = 2 if name == b"vt" else 3
         if any(len(words) < fewest for words in lines[name]):
@@ -814,6 +834,7 @@ def _check_obj(content: bytes) -> None:
         _check_mesh_numbers(
             np.array([words[:fewest] for words in lines[name]], dtype=np.float64), f"numbers of {name.decode()}"
         )
+    # 3. Check the indices of the faces; texture coordinates and normals are optional.
     if not lines[b"f"]:
         raise _FaultError("it has no triangles")
     if any(len(words) < 3 for words in lines[b"f"]):
@@ -830,11 +851,11 @@ def _check_obj(content: bytes) -> None:
             _check_triangles(indices, len(lines[name]), f"a face names, of its {name.decode()}, number")
 
 
-# ---------------------------------------------------------------- Mitsuba's own
+# ---------------- Meshes: Mitsuba's serialized format
 
 
 def _check_serialized(content: bytes) -> None:
-    """Check a file of Mitsuba's serialized meshes: several deflated meshes, with a table of offsets at the end."""
+    """Check a file in Mitsuba's serialized format: deflated meshes, followed by a table of their offsets."""
     if len(content) < 8:
         raise _FaultError("it is too short")
     (count,) = struct.unpack_from("<I", content, len(content) - 4)
@@ -851,12 +872,14 @@ def _check_serialized(content: bytes) -> None:
 
 
 def _check_one_serialized(content: bytes) -> None:
-    """Check one serialized mesh."""
+    """Check one serialized mesh: a version, then deflated flags, name, counts, columns of numbers and triangles."""
     ours, number = struct.unpack_from("<HH", content)
     if ours != 0x041C or number not in (3, 4):
         raise _FaultError("it is no serialized mesh of version 3 or 4")
+    # 1. Inflate the data, up to the largest possible size.
     unpack = zlib.decompressobj()
     data = unpack.decompress(content[4:], max_length=MESH_INFLATION * len(content))
+    # 2. Read flags and counts; a mesh of version 4 has its name between them. The flags determine precision and columns.
     (flags,) = struct.unpack_from("<I", data)
     start = 4 if number == 3 else data.index(b"\0", 4) + 1
     vertices, triangles = struct.unpack_from("<QQ", data, start)
@@ -865,40 +888,43 @@ def _check_one_serialized(content: bytes) -> None:
     columns = 3 + 3 * bool(flags & 0x0001) + 2 * bool(flags & 0x0002) + 3 * bool(flags & 0x0008)
     if vertices * columns * size + triangles * 12 > len(data) - start:
         raise _FaultError(f"{vertices:,} vertices and {triangles:,} triangles need more bytes than are there")
+    # 3. Check the values.
     numbers = np.frombuffer(data, f"<f{size}", vertices * columns, start)
     _check_mesh_numbers(numbers, "its numbers")
     _check_triangles(np.frombuffer(data, "<u4", triangles * 3, start + numbers.nbytes), vertices)
 
 
 CHECKS = {"ply": _check_ply, "obj": _check_obj, "serialized": _check_serialized}
-"""Checks by the name of the Mitsuba plugin that reads the file."""
+"""Checks of mesh files, by the name of the Mitsuba plugin that reads the file."""
 
 
-# ---------------- Check pictures, grids and tables of a scene by their headers, before Mitsuba allocates what these
-# promise
+# ---------------- Pictures, grids and tables of tensors
+# Their headers are checked before Mitsuba allocates what they announce.
 
 
 LONGEST_PICTURE_HEADER = 2**20
 """Bytes at the beginning of a picture that are searched for its size."""
 
 PICTURE_INFLATION = 1100
-"""Largest ratio of a picture's pixels to the bytes of its file, in bits of one channel: that of deflated data."""
+"""Largest ratio of the pixels of a picture, at one bit of one channel each, to its file's size: that of deflated data."""
 
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Markers of JPEG after which the size stands."""
+"""JPEG markers of the segments that contain the size."""
 
 TENSORS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 8, 8: 8, 9: 2, 10: 4, 11: 8}
-"""Bytes of the types of a table of tensors."""
+"""Size of a value [bytes], by the type number in a table of tensors."""
 
 
 def pixels_of(path: Path) -> int:
-    """Return how many pixels a picture has, by its header: PNG, JPEG, OpenEXR, RGBE, PFM, PPM, BMP or TGA.
+    """Return the number of pixels of a picture from its header: PNG, JPEG, OpenEXR, RGBE, PFM, PPM, BMP or TGA.
+
+    A picture of more than three channels counts once for every three channels or part thereof.
 
     Args:
-        path: of the file.
+        path: picture file.
 
     Raises:
-        MitsonarError: no picture of these formats, one without pixels, or more of them than its bytes can hold.
+        MitsonarError: the file is no picture of these formats, has no pixels, or more than its size allows.
     """
     refuse_irregular(path, "picture")
     size = path.stat().st_size
@@ -916,7 +942,7 @@ def pixels_of(path: Path) -> int:
 
 
 def _shape(head: bytes, tail: bytes) -> tuple[int, int, int]:
-    """Return width, height and channels of a picture from the beginning and the end of its file."""
+    """Return the width, height and number of channels of a picture from the first and last bytes of its file."""
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
         wide, high = struct.unpack_from(">II", head, 16)
         return wide, high, 3
@@ -935,7 +961,7 @@ def _shape(head: bytes, tail: bytes) -> tuple[int, int, int]:
         if found is None:
             raise ValueError
         return int(found[1]), int(found[2]), 3
-    if tail != b"TRUEVISION-XFILE.\0":  # TGA tells itself by its end
+    if tail != b"TRUEVISION-XFILE.\0":  # TGA is recognised by its footer
         raise ValueError
     wide, high = struct.unpack_from("<HH", head, 12)
     return wide, high, 3
@@ -947,7 +973,7 @@ def _jpeg_shape(head: bytes) -> tuple[int, int, int]:
         if head[place] != 0xFF:
             raise ValueError
         marker = head[place + 1]
-        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD7:  # filling, or without a length
+        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD7:  # padding, or a marker without a length
             place += 1 if marker == 0xFF else 2
             continue
         length, _, high, wide, channels = struct.unpack_from(">HBHHB", head, place + 2)
@@ -957,7 +983,9 @@ def _jpeg_shape(head: bytes) -> tuple[int, int, int]:
 
 
 def _exr_shape(head: bytes) -> tuple[int, int, int]:
-    """Return the size of the data window, or of the tiles where they are larger, and the number of channels."""
+    """Return the width and height of the largest of data window, display window and tile, and the number of channels."""
+    # Attributes follow the magic number and the version. Each has a name, a type, a length and a value; an empty name ends
+    # the list.
     place, wide, high, channels, tile = 8, 0, 0, 0, 0
     while head[place] != 0:
         name_end = head.index(b"\0", place)
@@ -982,10 +1010,10 @@ def _exr_shape(head: bytes) -> tuple[int, int, int]:
 
 
 def check_grid(path: Path) -> None:
-    """Check a grid in Mitsuba's ``.vol``: its counts against the bytes of its file.
+    """Check a grid in Mitsuba's ``.vol`` format: its counts against the size of its file.
 
     Raises:
-        MitsonarError: it has no such header, or other bytes than it promises.
+        MitsonarError: the header is invalid, or its counts do not match the size of the file.
     """
     refuse_irregular(path, "grid")
     size = path.stat().st_size
@@ -1001,10 +1029,10 @@ def check_grid(path: Path) -> None:
 
 
 def check_tensors(path: Path) -> None:
-    """Check a table of tensors, as ``measured`` reads it: place and size of each against the bytes of its file.
+    """Check a table of tensors, as the BSDF ``measured`` reads it: offset and size of each against the size of the file.
 
     Raises:
-        MitsonarError: it has no such header, or a tensor reaches beyond its end.
+        MitsonarError: the header is invalid, or a tensor extends beyond the end of the file.
     """
     refuse_irregular(path, "table")
     size = path.stat().st_size

@@ -1,4 +1,4 @@
-"""The world ``sea-surface``: waves of a wind over a flat seabed of random cells, or a flat surface."""
+"""How the sea surface and what drifts below it are made: wave spectra, the world ``sea-surface``, particles, nets."""
 
 from __future__ import annotations
 
@@ -32,42 +32,44 @@ __all__ = [
 ]
 
 
-# ---------------- Spectra of wind waves: Pierson and Moskowitz's of a fully developed sea, JONSWAP's of a limited fetch
-# S(omega) = alpha g^2 omega^-5 exp(-5/4 (omega_p / omega)^4) gamma^r,  r = exp(-(omega - omega_p)^2 / (2 s^2 omega_p^2))
-#
-# with s = 0.07 below the peak and 0.09 above it. A Pierson-Moskowitz spectrum has gamma = 1 (Pierson and Moskowitz, J.
-# Geophys. Res. 69 (1964), 5181-5190; Hasselmann et al., Measurements of wind-wave growth and swell decay during the Joint
-# North Sea Wave Project, Deutsche Hydrogr. Z. A8 (12), 1973). Waves obey omega^2 = g k tanh(k d).
+# ---------------- Wave spectra
 
 
 GRAVITY = 9.81
-"""[m/s^2]"""
+"""Gravitational acceleration g [m/s^2]."""
 
 TO_19_5_M = 1.026
-"""Wind at 19.5 m, of Pierson and Moskowitz, over wind at 10 m (Stewart, Introduction to Physical Oceanography, 16.4)."""
+"""Ratio of the wind speeds at 19.5 m, which Pierson and Moskowitz use, and at 10 m (Stewart, Introduction to Physical
+Oceanography, 16.4)."""
 
 LOWEST = 0.3
-"""Waves of less than this part of the peak's frequency have no energy: exp(-154)."""
+"""Lowest frequency of an integral, relative to the peak; waves below it have no energy: exp(-154)."""
 
 HIGHEST = 1000.0
-"""Frequency over the peak's beyond which waves count no more: 1e-12 of the variance."""
+"""Highest frequency of an integral, relative to the peak; waves above it have 1e-12 of the variance."""
 
 REACH = (100.0, 17_000.0)
-"""Fetch times g over the wind's square, least and largest: there the peak is that of a fully developed sea."""
+"""Smallest and largest dimensionless fetch g x / U^2; at the largest, the peak is that of a fully developed sea."""
 
 STEPS = 4000
-"""Steps of a sum over a factor of ten in frequency."""
+"""Steps of a numerical integral per decade of frequency."""
 
 
 @dataclass(frozen=True)
 class WaveSpectrum:
-    """A spectrum of wave heights.
+    """A spectrum of the heights of wind waves: JONSWAP's, or Pierson and Moskowitz's with gamma = 1.
+
+    S(omega) = alpha g^2 omega^-5 exp(-5/4 (omega_p / omega)^4) gamma^r,  r = exp(-(omega - omega_p)^2 / (2 s^2 omega_p^2))
+
+    with s = 0.07 below the peak and 0.09 above it (Pierson and Moskowitz, J. Geophys. Res. 69 (1964), 5181-5190; Hasselmann
+    et al., Measurements of wind-wave growth and swell decay during the Joint North Sea Wave Project, Deutsche Hydrogr. Z. A8
+    (12), 1973). The dispersion relation is omega^2 = g k tanh(k d).
 
     Attributes:
         scale: Phillips' constant alpha.
         peak_rad_s: frequency of the peak omega_p [rad/s].
-        enhancement: gamma of the peak, 1 or more.
-        depth_m: of the water, for the dispersion alone [m]; infinite by default.
+        enhancement: peak enhancement factor gamma, 1 or more.
+        depth_m: depth d of the water, used by the dispersion relation alone [m]; infinite by default.
     """
 
     scale: float
@@ -76,7 +78,7 @@ class WaveSpectrum:
     depth_m: float = math.inf
 
     def density(self, omega: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the density S of variance over frequency ``(...)`` [m^2 s].
+        """Return the variance density S(omega) ``(...)`` [m^2 s].
 
         Args:
             omega: frequencies above 0 ``(...)`` [rad/s].
@@ -87,53 +89,53 @@ class WaveSpectrum:
         return np.asarray(self.scale * GRAVITY**2 * omega**-5.0 * np.exp(-1.25 * over**-4.0) * peak)
 
     def frequency(self, wavenumber: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the frequency of waves ``(...)`` [rad/s], given wavenumbers ``(...)`` [rad/m]."""
+        """Return the frequencies ``(...)`` [rad/s] of wavenumbers ``(...)`` [rad/m]."""
         return np.asarray(np.sqrt(GRAVITY * wavenumber * np.tanh(wavenumber * self.depth_m)))
 
     def wavenumber(self, omega: float) -> float:
-        """Return the wavenumber of a frequency [rad/m], by Newton's method on the dispersion."""
+        """Return the wavenumber of a frequency [rad/m], by Newton's method on the dispersion relation."""
         k = omega**2 / GRAVITY
         if math.isinf(self.depth_m):
             return k
-        k = max(k, omega / math.sqrt(GRAVITY * self.depth_m))  # from above: the method then falls to the root
+        k = max(k, omega / math.sqrt(GRAVITY * self.depth_m))  # start above the root: the iterates then decrease to it
         for _ in range(50):
             slope, found = self.group_speed(np.array(k)), self.frequency(np.array(k))
             k -= float((found - omega) / slope)
         return k
 
     def group_speed(self, wavenumber: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return d omega / d k ``(...)`` [m/s]."""
-        twice = np.minimum(2 * wavenumber * self.depth_m, 100.0)  # beyond it the water is deep
+        """Return the group speed d omega / d k ``(...)`` [m/s]."""
+        twice = np.minimum(2 * wavenumber * self.depth_m, 100.0)  # 2 k d; above 100 the water is deep, and sinh overflows
         return np.asarray(self.frequency(wavenumber) / (2 * wavenumber) * (1 + twice / np.sinh(twice)))
 
     def density_of_wavenumber(self, wavenumber: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the density of variance over the length of the wave vector ``(...)`` [m^3]."""
+        """Return the variance density over the wavenumber, S(omega) d omega / d k ``(...)`` [m^3]."""
         return self.density(self.frequency(wavenumber)) * self.group_speed(wavenumber)
 
     @property
     def peak_wavelength_m(self) -> float:
-        """Return the length of the waves at the peak [m]."""
+        """Return the wavelength at the peak [m]."""
         return 2 * math.pi / self.wavenumber(self.peak_rad_s)
 
     @property
     def significant_height_m(self) -> float:
-        """Return four times the rms height of all waves [m]."""
+        """Return the significant wave height, four times the rms height of all waves [m]."""
         return 4 * math.sqrt(self.variance())
 
     def variance(self, shortest_m: float = 0.0, longest_m: float = math.inf) -> float:
-        """Return the variance of the waves of a range of lengths [m^2]."""
+        """Return the variance of the waves whose lengths lie in an interval [m^2]."""
         omega = self._band(shortest_m, longest_m)
         return float(np.trapezoid(self.density(omega) * omega, np.log(omega)))
 
     def mean_square_slope(self, shortest_m: float) -> float:
-        """Return the mean square of the slope of all waves down to a length, both axes together."""
+        """Return the mean square slope of all waves down to a wavelength, summed over both axes."""
         omega = self._band(shortest_m, math.inf)
         low, high = (self.wavenumber(float(end)) for end in (omega[0], omega[-1]))
         k = np.geomspace(low, high, len(omega))
         return float(np.trapezoid(self.density_of_wavenumber(k) * k**3, np.log(k)))
 
     def _band(self, shortest_m: float, longest_m: float) -> NDArray[np.float64]:
-        """Return frequencies of waves between two lengths, evenly on a log axis."""
+        """Return the frequencies of the waves between two lengths, logarithmically spaced."""
         low, high = LOWEST * self.peak_rad_s, HIGHEST * self.peak_rad_s
         if longest_m < math.inf:
             low = max(low, float(self.frequency(np.array(2 * math.pi / longest_m))))
@@ -145,26 +147,27 @@ class WaveSpectrum:
 
 
 def pierson_moskowitz(wind_m_s: float, depth_m: float = math.inf) -> WaveSpectrum:
-    """Return the spectrum of a fully developed sea: alpha 0.0081, beta 0.74.
+    """Return the spectrum of a fully developed sea, with alpha = 0.0081 and beta = 0.74.
 
     Args:
         wind_m_s: speed of the wind 10 m above the sea, above 0 [m/s].
-        depth_m: of the water, for the dispersion [m].
+        depth_m: depth of the water, for the dispersion relation [m].
     """
     peak = (0.8 * 0.74) ** 0.25 * GRAVITY / (TO_19_5_M * wind_m_s)
     return WaveSpectrum(0.0081, peak, 1.0, depth_m)
 
 
 def jonswap(wind_m_s: float, fetch_m: float, depth_m: float = math.inf) -> WaveSpectrum:
-    """Return the spectrum of a sea that grows with the fetch: gamma 3.3.
+    """Return the spectrum of a sea that grows with the fetch, with gamma = 3.3.
 
     Args:
         wind_m_s: speed of the wind 10 m above the sea, above 0 [m/s].
-        fetch_m: way over which the wind blows [m].
-        depth_m: of the water, for the dispersion [m].
+        fetch_m: distance over which the wind blows [m].
+        depth_m: depth of the water, for the dispersion relation [m].
 
     Raises:
-        MitsonarError: a fetch below what was measured, or at which the peak would lie below that of a fully developed sea.
+        MitsonarError: the fetch is shorter than those measured, or so long that the peak frequency would lie below that of a
+            fully developed sea.
     """
     least, grown = (reach * wind_m_s**2 / GRAVITY for reach in REACH)
     if not least <= fetch_m <= grown:
@@ -178,41 +181,42 @@ def jonswap(wind_m_s: float, fetch_m: float, depth_m: float = math.inf) -> WaveS
 
 
 def spreading(angle: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:
-    """Return the share of the waves by direction, ``cos^2s(angle / 2)`` times what makes its integral 1 ``(...)`` [1/rad].
+    """Return the directional distribution of the waves, ``cos^2s(angle / 2)`` normalised to integral 1 ``(...)`` [1/rad].
 
-    It is that of Longuet-Higgins, Cartwright and Smith (Ocean Wave Spectra, 1963), with one s at all frequencies.
+    This is the model of Longuet-Higgins, Cartwright and Smith (Ocean Wave Spectra, 1963), with the same s at all
+    frequencies.
 
     Args:
-        angle: from the direction that the wind blows to ``(...)`` [rad].
-        exponent: s, 0 or more; 0: all directions alike.
+        angle: angle from the direction towards which the wind blows ``(...)`` [rad].
+        exponent: s, 0 or more; 0 spreads the waves evenly over all directions.
     """
     s = exponent
     log_factor = (2 * s - 1) * math.log(2) - math.log(math.pi) + 2 * math.lgamma(s + 1) - math.lgamma(2 * s + 1)
     return np.asarray(math.exp(log_factor) * np.cos(angle / 2) ** (2 * s))
 
 
-# ---------------- sea surface
+# ---------------- World ``sea-surface``
 
 
 MOST_TRIANGLES = 2_000_000
-"""Triangles of a surface, at most: those of a mirror in impulse responses."""
+"""Largest number of triangles of a surface, the limit of mirrors in impulse responses."""
 
 FEWEST_STEPS = 8
-"""Steps along the edge, at least."""
+"""Smallest number of steps along the edge."""
 
 MATERIAL = "surface.yaml"
-"""File of the surface's material, beside the scene."""
+"""File of the surface's material, in the folder of the scene."""
 
 
 class SeaState(NamedTuple):
-    """What a surface holds, and what it leaves to the loss of its mirror part.
+    """Wave heights of a surface: those that its mesh resolves, and those that roughen its mirror reflection.
 
     Attributes:
         significant_height_m: four times the rms height of all waves of the spectrum [m].
-        peak_wavelength_m: length of the waves at the peak of the spectrum [m]; infinite where there are none.
-        shortest_m: length of the shortest waves of the mesh [m].
-        rms_m: rms height of the waves of the mesh [m].
-        roughness_m: rms height of the shorter waves, which the mesh does not hold [m].
+        peak_wavelength_m: wavelength at the peak of the spectrum [m]; infinite without waves.
+        shortest_m: wavelength of the shortest waves in the mesh [m].
+        rms_m: rms height of the waves in the mesh [m].
+        roughness_m: rms height of the shorter waves, which the mesh does not resolve [m].
     """
 
     significant_height_m: float
@@ -280,15 +284,15 @@ class SeaSurface(Family):
 
     @property
     def seeded(self) -> bool:
-        """Return whether waves or seabed are random."""
+        """Return whether the waves or the seabed are random."""
         return self.wind_m_s > 0 or self.seabed_cells > 0
 
     @property
     def waves(self) -> WaveSpectrum:
-        """Return the spectrum of the waves; there is none without wind.
+        """Return the spectrum of the waves; it is undefined without wind.
 
         Raises:
-            MitsonarError: a fetch that does not fit the wind.
+            MitsonarError: the fetch does not fit the wind.
         """
         if self.spectrum == "jonswap":
             return jonswap(self.wind_m_s, 1000 * self.fetch_km, self.water_m)
@@ -296,7 +300,7 @@ class SeaSurface(Family):
 
     @property
     def state(self) -> SeaState:
-        """Return heights of the waves, those of the mesh and those that it does not hold."""
+        """Return the wave heights, split into those in the mesh and those that are too short for it."""
         shortest = SHORTEST * self.step_m
         if self.wind_m_s == 0:
             return SeaState(0.0, math.inf, shortest, 0.0, 0.0)
@@ -305,22 +309,23 @@ class SeaSurface(Family):
         return SeaState(height, peak, shortest, math.sqrt(held), math.sqrt(left))
 
     def save(self, path: str | Path, seed: int = 0, time_s: float | None = None) -> None:
-        """Write the surface of a seed as a PLY file, for a scene of one's own.
+        """Write the surface for a seed as a PLY file, for use in another scene.
 
         Args:
-            path: of the file; one that is there is replaced.
-            seed: of the waves.
-            time_s: its time [s]; default: that of the family.
+            path: PLY file to write; an existing file is replaced.
+            seed: seed of the waves.
+            time_s: time of the surface [s]; default: that of the family.
         """
         write_whole(path, self.surface(seed, time_s).ply())
 
     def surface(self, seed: int, time_s: float | None = None) -> Mesh:
-        """Build the surface of a seed.
+        """Build the surface for a seed.
 
         Args:
-            seed: of the waves.
-            time_s: its time [s]; default: that of the family.
+            seed: seed of the waves.
+            time_s: time of the surface [s]; default: that of the family.
         """
+        # 1. Sample the heights on a square grid; a flat surface needs only one cell.
         cells = 1 if self.wind_m_s == 0 else round(self.size_m / self.step_m)
         place = np.linspace(-self.half_m, self.half_m, cells + 1)
         heights = np.zeros((cells + 1, cells + 1))
@@ -328,6 +333,7 @@ class SeaSurface(Family):
             sea = Sea(self.waves, math.radians(self.towards_deg), self.spreading)
             time = self.time_s if time_s is None else time_s
             heights = wave_heights(sea, cells + 1, self.size_m / cells, seed, time)
+        # 2. Split each cell into two triangles.
         x, y = np.meshgrid(place, place)
         vertices = np.stack([x, y, self.water_m + heights], axis=-1).reshape(-1, 3)
         number = np.arange((cells + 1) ** 2).reshape(cells + 1, -1)
@@ -336,7 +342,10 @@ class SeaSurface(Family):
         return Mesh("surface", np.rint(vertices / GRID_M) * GRID_M, faces, material=MATERIAL)
 
     def material(self) -> str:
-        """Return the YAML of the surface's material: it reflects -1, and what its short waves take is scattered evenly."""
+        """Return the YAML of the surface's material.
+
+        Its reflection coefficient is -1. What the short waves take from the mirror reflection is scattered by Lambert's law.
+        """
         return (
             "name: sea surface\n"
             "law: lambert\n"
@@ -349,7 +358,7 @@ class SeaSurface(Family):
         )
 
     def build(self, seed: int) -> World:
-        """Build surface and seabed of a seed."""
+        """Build the surface and the seabed for a seed."""
         state = self.state
         about = f"sea-surface, seed {seed}: flat"
         if self.wind_m_s > 0:
@@ -371,28 +380,25 @@ class SeaSurface(Family):
         )
 
 
-# ---------------- One realisation of a sea: Gaussian heights on a grid at a time, of a spectrum and a seed
-# Waves of the grid's own wave vectors are summed by an FFT. The innermost 9 x 9 of these vectors, among them what is
-# longer than the grid, are divided in three in each direction, again and again, until the rest has no energy. So long
-# swells heave and tilt a small patch, and nothing repeats within it.
+# ---------------- Realisations of a sea
 
 
 SHORTEST = 4
-"""Steps of the grid in the shortest wave that it holds."""
+"""Grid steps per wavelength of the shortest wave that a grid resolves."""
 
 INNER = 4
-"""Wave vectors of up to this index along both axes are divided."""
+"""Largest index along both axes of the wave vectors that are subdivided."""
 
 CALM = 0.4
-"""No wave vector below this part of the peak's is divided further: it has 1e-20 of the variance."""
+"""Wave vectors below this fraction of the peak's are not subdivided further: they have 1e-20 of the variance."""
 
 
 class Sea(NamedTuple):
-    """What the waves are like.
+    """Parameters of a random sea.
 
     Attributes:
-        spectrum: of the heights.
-        towards_rad: where the wind blows to, from +y towards +x [rad].
+        spectrum: spectrum of the heights.
+        towards_rad: direction towards which the wind blows, from +y towards +x [rad].
         spread: exponent s of :func:`~mitsonar.worlds.sea.spreading`.
     """
 
@@ -402,7 +408,7 @@ class Sea(NamedTuple):
 
 
 class _Waves(NamedTuple):
-    """Waves of a square lattice of wave vectors: x and y of the vectors ``(n,)`` [rad/m], and the lattice's step."""
+    """Wave vectors of a square lattice: their x and y ``(n,)`` [rad/m], and the step of the lattice [rad/m]."""
 
     x: NDArray[np.float64]
     y: NDArray[np.float64]
@@ -410,18 +416,24 @@ class _Waves(NamedTuple):
 
 
 def wave_heights(sea: Sea, count: int, step_m: float, seed: int, time_s: float) -> NDArray[np.float64]:
-    """Return heights on a square grid whose middle is the origin ``(count, count)``, y first [m].
+    """Return one realisation of Gaussian wave heights on a square grid around the origin ``(count, count)`` [m], y first.
 
-    Waves from :data:`SHORTEST` steps on are there. Their amplitudes are functions of the seed, so surfaces of one seed at
-    several times belong to one sea.
+    The heights contain all waves of at least :data:`SHORTEST` grid steps. Their amplitudes depend on the seed alone, so
+    surfaces of one seed at several times belong to one sea.
+
+    An FFT sums the waves of the grid's own wave vectors. The innermost 9 x 9 of these vectors, which include all waves
+    longer than the grid, are divided in three in each direction, repeatedly, until the remainder has no energy. Long swells
+    therefore heave and tilt a small patch, and nothing repeats within it.
 
     Args:
-        sea: the waves.
+        sea: parameters of the sea.
         count: points along an edge.
-        step_m: of the grid [m].
-        seed: of the amplitudes.
-        time_s: the time [s].
+        step_m: step of the grid [m].
+        seed: seed of the amplitudes.
+        time_s: time of the surface [s].
     """
+    # 1. Choose the wave vectors of the FFT: outside the innermost ones, and no shorter than the grid resolves. The grid is
+    #    enlarged to a size whose FFT is fast.
     points = _smooth(count)
     lattice = 2 * math.pi / (points * step_m)
     index = np.rint(np.fft.fftfreq(points) * points)
@@ -430,9 +442,11 @@ def wave_heights(sea: Sea, count: int, step_m: float, seed: int, time_s: float) 
         & (lattice * np.hypot(index[:, None], index) <= 2 * math.pi / (SHORTEST * step_m))
     )
     own = _Waves(index[columns] * lattice, index[rows] * lattice, lattice)
+    # 2. Sum their waves by an inverse FFT, and cut out the grid.
     values = np.zeros((points, points), np.complex128)
     values[rows, columns] = _amplitudes(sea, own, seed, 0, time_s)
     heights = (np.fft.ifft2(values) * points**2).real[:count, :count]
+    # 3. Add the long waves one lattice at a time. They are few, so that a product of two matrices is cheap.
     place = np.arange(count) * step_m
     for number, waves in enumerate(_long_waves(sea, lattice, step_m), 1):
         amplitude = _amplitudes(sea, waves, seed, number, time_s)
@@ -442,7 +456,7 @@ def wave_heights(sea: Sea, count: int, step_m: float, seed: int, time_s: float) 
 
 
 def _long_waves(sea: Sea, lattice: float, step_m: float) -> list[_Waves]:
-    """Return the waves within the innermost vectors of a lattice, in ever finer lattices."""
+    """Return the wave vectors that replace the innermost ones of a lattice, in successively finer lattices."""
     calm = CALM * sea.spectrum.wavenumber(sea.spectrum.peak_rad_s)
     found = []
     outer = 3 * INNER + 1
@@ -457,17 +471,17 @@ def _long_waves(sea: Sea, lattice: float, step_m: float) -> list[_Waves]:
 
 
 def _amplitudes(sea: Sea, waves: _Waves, seed: int, number: int, time_s: float) -> NDArray[np.complex128]:
-    """Return the complex amplitudes of waves at a time ``(n,)`` [m]: Gaussian numbers of the seed, of their own variance."""
+    """Return the complex amplitudes of waves at a time ``(n,)`` [m]: Gaussian numbers with the variance of each wave."""
     wavenumber = np.hypot(waves.x, waves.y)
     rng = stream(seed, 1, number)
-    # by Box and Muller: of the generator only the plain doubles are used, whose bits do not change
+    # Box-Muller transform: it uses only the generator's plain doubles, whose bits do not change between versions
     length, turn = np.sqrt(-2 * np.log(1 - rng.random(len(wavenumber)))), 2 * np.pi * rng.random(len(wavenumber))
     turn -= sea.spectrum.frequency(wavenumber) * time_s
     return np.asarray(np.sqrt(_variance(sea, waves)) * length * np.exp(1j * turn))
 
 
 def _variance(sea: Sea, waves: _Waves) -> NDArray[np.float64]:
-    """Return the variance of each cell of a lattice of wave vectors ``(n,)`` [m^2], by Gauss' rule of four points."""
+    """Return the variance of each cell of a lattice of wave vectors ``(n,)`` [m^2], by four-point Gauss quadrature."""
     total = np.zeros(len(waves.x))
     aside = waves.step / math.sqrt(12)
     for right in (-aside, aside):
@@ -480,7 +494,7 @@ def _variance(sea: Sea, waves: _Waves) -> NDArray[np.float64]:
 
 
 def _smooth(count: int) -> int:
-    """Return the least number of at least ``count`` that 2, 3 and 5 divide away: its FFT is fast."""
+    """Return the smallest number >= ``count`` that has no prime factors but 2, 3 and 5: its FFT is fast."""
     while True:
         rest = count
         for prime in (2, 3, 5):
@@ -491,30 +505,30 @@ def _smooth(count: int) -> int:
         count += 1
 
 
-# ---------------- What drifts and hangs in the water as one mesh each: a cloud of particles, and a net of thin bars
+# ---------------- Particles and fishing nets
 
 
 Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
-"""Vertices ``(vertices, 3)`` [m] and triangles ``(faces, 3)``, outward."""
+"""Vertices ``(vertices, 3)`` [m] and outward triangles ``(faces, 3)``."""
 
 MOST = 5_000_000
-"""Particles or bars at most."""
+"""Largest number of particles or bars."""
 
 
 def particle_mesh(count: int, size_m: tuple[float, float, float], radius_m: float, seed: int = 0) -> Triangles:
-    """Make octahedra at random places and attitudes in a box about the origin.
+    """Make a cloud of particles: octahedra with random positions and attitudes in a box centred on the origin.
 
     An octahedron of radius a has the surface 4 sqrt(3) a^2. With Lambert's mu its mean backscattering cross-section is mu
-    times a sixth of the surface, as of every convex body.
+    times a sixth of the surface, as for every convex body.
 
     Args:
-        count: of the particles.
-        size_m: of the box, east, north, up.
-        radius_m: from the middle of a particle to its corners.
-        seed: of places and attitudes.
+        count: number of particles.
+        size_m: edges of the box, east, north, up [m].
+        radius_m: distance from the centre of a particle to its corners [m].
+        seed: seed of the positions and attitudes.
 
     Raises:
-        MitsonarError: no particles, or too many; a size that is not positive.
+        MitsonarError: there are no particles or too many, or a size is not positive.
     """
     if not 1 <= count <= MOST or not min(*size_m, radius_m) > 0:
         raise MitsonarError(f"particles are 1..{MOST:,} of positive size: got {count} of {radius_m:g} m in {size_m} m")
@@ -528,16 +542,18 @@ def particle_mesh(count: int, size_m: tuple[float, float, float], radius_m: floa
 
 
 def fishing_net_mesh(width_m: float, height_m: float, opening_m: float, twine_m: float) -> Triangles:
-    """Make a net of square openings in the plane y = 0, from the origin to east and up, of bars with three sides.
+    """Make a fishing net with square openings, in the plane y = 0, from the origin to the east and up.
+
+    Its bars are prisms with three sides.
 
     Args:
-        width_m: of the net, a whole number of openings at least.
-        height_m: of the net.
-        opening_m: from bar to bar.
-        twine_m: diameter of the bars.
+        width_m: width of the net, rounded to a whole number of openings [m].
+        height_m: height of the net, rounded likewise [m].
+        opening_m: distance from bar to bar [m].
+        twine_m: diameter of the bars [m].
 
     Raises:
-        MitsonarError: sizes that make no net.
+        MitsonarError: the sizes make no net, or there are too many bars.
     """
     if not 0 < twine_m < opening_m <= min(width_m, height_m):
         raise MitsonarError(
@@ -546,10 +562,12 @@ def fishing_net_mesh(width_m: float, height_m: float, opening_m: float, twine_m:
     across, up = (round(size / opening_m) for size in (width_m, height_m))
     if (across + 1) * up + (up + 1) * across > MOST:
         raise MitsonarError(f"a net has at most {MOST:,} bars: enlarge opening_m, got {opening_m:g}")
+    # 1. Place the knots. From each, one bar rises and one leads east, except at the upper and the eastern edge.
     x, z = (a.ravel() for a in np.meshgrid(np.arange(across + 1), np.arange(up + 1), indexing="ij"))
     knots = np.column_stack([x, np.zeros_like(x), z]) * opening_m
     begins = np.concatenate([knots[z < up], knots[x < across]])
     ways = np.repeat([[0, 0, opening_m], [opening_m, 0, 0]], [(z < up).sum(), (x < across).sum()], axis=0)
+    # 2. Put a triangular ring around both ends of each bar, and join the two rings.
     turn = 2 * np.pi * np.arange(3) / 3
     round_ = 0.5 * twine_m * np.column_stack([np.cos(turn), np.sin(turn)])
     side = np.cross(ways / opening_m, [0.0, 1.0, 0.0])
@@ -560,5 +578,5 @@ def fishing_net_mesh(width_m: float, height_m: float, opening_m: float, twine_m:
 
 
 def _copied(faces: NDArray[np.int64], vertices: int, count: int) -> NDArray[np.int64]:
-    """Return the triangles of copies of a shape with so many vertices."""
+    """Return the triangles of ``count`` copies of a shape that has the given number of vertices."""
     return np.asarray((faces[None] + vertices * np.arange(count)[:, None, None]).reshape(-1, 3), dtype=np.int64)

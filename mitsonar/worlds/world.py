@@ -1,4 +1,4 @@
-"""A world in memory, and as files: a Mitsuba XML scene with its meshes (PLY) and textures."""
+"""How a world is described in memory, and written as a Mitsuba XML scene with PLY meshes and textures."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _rising(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 Interval = Annotated[tuple[float, float], AfterValidator(_rising)]
-"""Lowest and highest value, both finite."""
+"""Lowest and highest value of an interval, both finite."""
 
 
 def _counting(pair: tuple[int, int]) -> tuple[int, int]:
@@ -60,17 +60,17 @@ def _counting(pair: tuple[int, int]) -> tuple[int, int]:
 
 
 Counts = Annotated[tuple[int, int], AfterValidator(_counting)]
-"""Lowest and highest number of objects; the number is drawn from both and all between."""
+"""Lowest and highest number of objects; the number is drawn from this closed interval."""
 
 
 SURFACE_MARGIN_M = 25.0
-"""What a sea surface reaches beyond the world [m]."""
+"""Distance by which a sea surface extends beyond the world on each side [m]."""
 
 
 class Family(CheckedModel):
-    """A family of worlds: its options are the fields, and :meth:`build` makes a world from a seed.
+    """A family of worlds: its fields are the options, and :meth:`build` makes a world from a seed.
 
-    A mistake is one sentence, with the name of the family and where its options are described.
+    An invalid option raises an error of one sentence that names the family and where its options are described.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -79,19 +79,19 @@ class Family(CheckedModel):
 
     @classmethod
     def create(cls, **fields: object) -> Self:
-        """Create a family with these fields.
+        """Create a family with the given options.
 
         Raises:
-            MitsonarError: an unknown key, a value outside its limits, or numbers that do not fit each other.
+            MitsonarError: a key is unknown, a value is outside its limits, or values contradict each other.
         """
         return cls(**fields)
 
     @classmethod
     def refuse(cls, error: ValidationError) -> NoReturn:
-        """Raise the sentence.
+        """Raise a validation error of pydantic as an error of mitsonar.
 
         Raises:
-            MitsonarError: the first of pydantic's complaints.
+            MitsonarError: always; the message is the first of pydantic's complaints.
         """
         described = cls.described or f"`mitsonar world {cls.called} --help`"
         raise MitsonarError(complaint(error, cls, cls.called, f" (see {described})")) from None
@@ -106,36 +106,39 @@ class Family(CheckedModel):
 
     @property
     def seeded(self) -> bool:
-        """Return whether another seed gives another world."""
+        """Return whether the world depends on the seed."""
         return True
 
     def build(self, seed: int) -> World:
-        """Build the world of a seed; the same seed gives the same bytes."""
+        """Build the world for a seed; the same seed gives the same bytes."""
         raise NotImplementedError
 
     def refuse_smaller(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-        """Refuse a scene that is smaller than the square of its frames; a world that is built is never smaller.
+        """Refuse a scene that is smaller than the square in which frames are taken; built worlds never are.
 
         Args:
-            low: least x, y, z of the scene ``(3,)`` [m].
-            high: largest ``(3,)`` [m].
+            low: smallest x, y, z of the scene ``(3,)`` [m].
+            high: largest x, y, z of the scene ``(3,)`` [m].
 
         Raises:
-            MitsonarError: it is smaller.
+            MitsonarError: the scene is smaller.
         """
 
     def prepare(self, seed: int, folder: Path) -> tuple[Path, dict[str, str]]:
-        """Write the world of a seed into a new folder, and return its XML file and the parameters to load it with."""
+        """Write the world for a seed into a new folder; return its XML file and the parameters to load it with."""
         return self.build(seed).write(folder), {}
 
 
 def stream(seed: int, *purpose: int) -> np.random.Generator:
-    """Return the generator of random numbers of a seed and a purpose."""
+    """Return the random number generator for a seed and a purpose."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, *purpose])))
 
 
 def draw(rng: np.random.Generator, span: tuple[float, float], *shape: int) -> NDArray[np.float64]:
-    """Draw uniform numbers of an interval; only the generator's plain doubles are used, whose bits do not change."""
+    """Draw uniform numbers from an interval, as an array of ``shape``.
+
+    Only the generator's plain doubles are used: their bits do not change between versions of NumPy.
+    """
     low, high = span
     return np.asarray(low + (high - low) * rng.random(shape), dtype=np.float64)
 
@@ -145,16 +148,21 @@ def whole(rng: np.random.Generator, span: tuple[int, int]) -> int: ...
 @overload
 def whole(rng: np.random.Generator, span: tuple[int, int], first: int, /, *shape: int) -> NDArray[np.int64]: ...
 def whole(rng: np.random.Generator, span: tuple[int, int], *shape: int) -> int | NDArray[np.int64]:
-    """Draw whole numbers of a closed interval: one without a shape, else an array of that shape."""
+    """Draw integers from a closed interval: a single one without a shape, otherwise an array of that shape."""
     values = span[0] + np.floor(rng.random(shape) * (span[1] + 1 - span[0])).astype(int)
     return values if shape else int(values)
 
 
 def shifted_grid(half_m: float, a_side: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw the vertices of a square grid, each displaced within its grid step (Almanza-Medina, 3.2.1).
+    """Draw the vertices of a square grid, each displaced at random within one grid step (Almanza-Medina, 3.2.1).
+
+    Args:
+        half_m: half the edge of the field [m].
+        a_side: vertices along an edge.
+        rng: generator of the displacements.
 
     Returns:
-        Points over the field ``(a_side^2, 2)`` [m].
+        Points of the field ``(a_side^2, 2)`` [m].
     """
     step = 2 * half_m / max(a_side, 1)
     vertex = np.stack(np.meshgrid(*[np.arange(a_side)] * 2, indexing="ij"), -1).reshape(-1, 2) * step - half_m
@@ -166,15 +174,15 @@ class Mesh:
     """One mesh of a world.
 
     Attributes:
-        name: of the shape and its file.
-        vertices: ``(vertices, 3)`` [m].
-        faces: ``(faces, 3)``.
-        reflectivity: of each face ``(faces,)`` 0..1, where no texture gives it.
-        object_id: of each face ``(faces,)``, from 1; one number for each object.
-        uv: of each vertex ``(vertices, 2)``, with a texture.
+        name: name of the shape and of its file.
+        vertices: vertex positions ``(vertices, 3)`` [m].
+        faces: vertex indices of the triangles ``(faces, 3)``.
+        reflectivity: reflectivity of each face ``(faces,)`` 0..1, unless a texture gives it.
+        object_id: number of the object that each face belongs to ``(faces,)``, counted from 1.
+        uv: texture coordinates of each vertex ``(vertices, 2)``; only with a texture.
         texture: picture of the reflectivity, a file within the world's folder.
         shape_id: id of the shape; default: its name.
-        material: name of an ``acoustic_material``, whose law the surface then has; default: a diffuse surface.
+        material: name of an ``acoustic_material`` that gives the surface its scattering law; default: a diffuse surface.
     """
 
     name: str
@@ -188,7 +196,8 @@ class Mesh:
     material: str | None = None
 
     def ply(self) -> bytes:
-        """Return the mesh as binary PLY, with the attribute names that Mitsuba reads."""
+        """Return the mesh as a binary PLY file, with the attribute names that Mitsuba reads."""
+        # 1. Collect the columns of vertices and faces, and declare them in the header.
         vertex = {"x": self.vertices[:, 0], "y": self.vertices[:, 1], "z": self.vertices[:, 2]}
         if self.uv is not None:
             vertex |= {"u": self.uv[:, 0], "v": self.uv[:, 1]}
@@ -201,6 +210,7 @@ class Mesh:
         head += [f"property float {name}" for name in vertex]
         head += [f"element face {len(self.faces)}", "property list uchar int vertex_indices"]
         head += [f"property float {name}" for name in face]
+        # 2. Pack the columns into tables of little-endian rows.
         points = np.empty(len(self.vertices), [(name, "<f4") for name in vertex])
         for name, values in vertex.items():
             points[name] = values
@@ -236,9 +246,10 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Floor:
-    """A square plane around the origin; ``texture`` is the XML of what gives its reflectivity.
+    """A square plane around the origin, at height ``z_m``; ``texture`` is the XML of its reflectivity.
 
-    It rises along +y by ``slope_deg``, turned at height ``z_m`` about the line to starboard through the origin.
+    The plane rises along +y by ``slope_deg``. The rotation is about the x axis, which points to starboard, and follows the
+    translation to ``z_m``.
     """
 
     half_m: float
@@ -249,7 +260,7 @@ class Floor:
 
     @staticmethod
     def cells(count: int, span: tuple[float, float], seed: int) -> str:
-        """Return the XML of a texture of independent cells, ``count`` along each edge, uniform within ``span``."""
+        """Return the XML of a texture of independent cells, ``count`` along each edge, uniformly drawn from ``span``."""
         return f"""<texture type="cell_noise" name="reflectance">
                 <float name="cells" value="{count}"/>
                 <float name="low" value="{span[0]!r}"/>
@@ -273,7 +284,7 @@ class Floor:
 
 
 class BuiltFamily(Family):
-    """A family whose worlds are built, below a flat sea surface where one is asked for."""
+    """A family whose worlds are built, optionally below a flat sea surface."""
 
     surface_m: float | None = Field(
         None, gt=0, le=12_000, description="height of a flat sea surface, shape surface, over z = 0 [m]; without: none"
@@ -282,7 +293,10 @@ class BuiltFamily(Family):
 
     @property
     def surface(self) -> Floor | None:
-        """Return the sea surface, if there is one; it reaches beyond the world, whose border it mirrors as well."""
+        """Return the sea surface, or None.
+
+        It extends :data:`SURFACE_MARGIN_M` beyond the world, so that it mirrors the world's border as well.
+        """
         if self.surface_m is None:
             return None
         texture = f'<spectrum name="reflectance" value="{self.surface_reflectivity!r}"/>'
@@ -291,7 +305,7 @@ class BuiltFamily(Family):
 
 @dataclass(frozen=True)
 class Standpoint:
-    """The sonar in a world: its position, the point on its axis, its window of ranges [m], and its preset."""
+    """The initial sonar of a world: its position, a point on its axis, its range window [m], and its preset."""
 
     origin: tuple[float, float, float]
     target: tuple[float, float, float]
@@ -313,16 +327,16 @@ class Standpoint:
 
 @dataclass(frozen=True)
 class World:
-    """Meshes, a floor and a sonar to begin with.
+    """A world: meshes, a floor, a sea surface and an initial sonar.
 
     Attributes:
-        about: family and seed, for the head of the file.
-        meshes: of the world.
-        stand: the sonar in it.
-        floor: below the meshes, if any.
-        surface: of the sea above them, if any; the last shape.
-        pictures: files to copy into the world's folder, by their name there.
-        content: files to write into the world's folder, by their name there.
+        about: family and seed, written as a comment at the head of the file.
+        meshes: meshes of the world.
+        stand: initial position and window of the sonar.
+        floor: plane below the meshes, if any.
+        surface: sea surface above the meshes, if any; it is the last shape.
+        pictures: files to copy into the world's folder, keyed by their name there.
+        content: files to write into the world's folder, keyed by their name there.
     """
 
     about: str
@@ -335,14 +349,14 @@ class World:
 
     @property
     def shape_names(self) -> tuple[str, ...]:
-        """Return the ids of the shapes, in the order of the file."""
+        """Return the ids of the shapes, in the order of the XML file."""
         flat = ([one.name] if one else [] for one in (self.floor, self.surface))
         below, above = flat
         return (*below, *(mesh.shape_id or mesh.name for mesh in self.meshes), *above)
 
     @property
     def size_m(self) -> float:
-        """Return the longest edge of the box around the meshes [m]."""
+        """Return the longest edge of the bounding box of the meshes [m]."""
         vertices = np.concatenate([mesh.vertices for mesh in self.meshes])
         return float(np.ptp(vertices, axis=0).max())
 
@@ -366,7 +380,9 @@ class World:
 """
 
     def write(self, folder: str | Path) -> Path:
-        """Write ``scene.xml``, ``meshes/`` and ``textures/``, the scene last, and return its path.
+        """Write ``meshes/``, ``textures/`` and, last, ``scene.xml`` into a folder; return the path of the scene.
+
+        The folder appears complete or not at all.
 
         Raises:
             MitsonarError: the folder is not empty.
@@ -374,7 +390,7 @@ class World:
         folder = Path(folder)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise MitsonarError(f"{folder} exists and is kept as it is: choose another -o")
-        part = folder.with_name(f".{folder.name}.part")  # whole or absent, as a folder too
+        part = folder.with_name(f".{folder.name}.part")  # renamed at the end: the folder is complete or absent
         shutil.rmtree(part, ignore_errors=True)
         for below in ("meshes", "textures"):
             (part / below).mkdir(parents=True)
@@ -396,11 +412,14 @@ def _numbers(values: tuple[float, ...]) -> str:
     return ", ".join(f"{value:.9g}" for value in values)
 
 
-# ---------------- A world on a slope: all of it turned about the line to starboard through the origin
+# ---------------- Sloped worlds
 
 
 def sloped(world: World, slope_deg: float) -> World:
-    """Tilt a world so that its ground rises forward, along +y, by an angle [deg]; its standpoint stays where it is."""
+    """Tilt a world so that its ground rises forward, along +y, by an angle [deg].
+
+    Floor and meshes turn about the x axis, which points to starboard. The sonar's standpoint and a sea surface do not move.
+    """
     turn = Rotation.from_euler("x", slope_deg, degrees=True)
 
     def tilted(mesh: Mesh) -> Mesh:
@@ -411,20 +430,20 @@ def sloped(world: World, slope_deg: float) -> World:
     return replace(world, about=f"{world.about}, rising forward by {slope_deg:g} deg", meshes=meshes, floor=floor)
 
 
-# ---------------- Shapes of one unit in each direction, and many copies of a shape as a single mesh
+# ---------------- Unit shapes and their copies
 
 
 GRID_M = 1e-6
-"""Grid of the vertices [m]: rounding to it removes the last bits of a library's sine from the file."""
+"""Grid that vertices are rounded to [m]: it removes differences in the last bits between mathematics libraries."""
 
 
 @dataclass(frozen=True)
 class Copies:
-    """Copies of one shape.
+    """Copies of one shape, merged into a single mesh.
 
     Attributes:
-        vertices: ``(vertices, 3)`` [m].
-        faces: ``(faces, 3)``.
+        vertices: vertices of all copies ``(vertices, 3)`` [m].
+        faces: vertex indices of all triangles ``(faces, 3)``.
         number: index of the copy that each face belongs to ``(faces,)``.
         count: number of copies.
     """
@@ -441,21 +460,21 @@ class Copies:
 
 
 def box() -> trimesh.Trimesh:
-    """Return a cube of 48 triangles, eight a side."""
+    """Return a unit cube of 48 triangles, eight per side."""
     import trimesh
 
     return cast("trimesh.Trimesh", trimesh.creation.box().subdivide())
 
 
 def slab() -> trimesh.Trimesh:
-    """Return a cube of 12 triangles."""
+    """Return a unit cube of 12 triangles."""
     import trimesh
 
     return cast("trimesh.Trimesh", trimesh.creation.box())
 
 
 def cylinder(sections: int = 12, rings: int = 2) -> trimesh.Trimesh:
-    """Return a cylinder along z, its side cut into ``rings``."""
+    """Return a unit cylinder along z whose side is divided into ``rings``."""
     import trimesh
 
     side = [(0.5, z) for z in np.linspace(-0.5, 0.5, rings + 1)]
@@ -463,7 +482,7 @@ def cylinder(sections: int = 12, rings: int = 2) -> trimesh.Trimesh:
 
 
 def capsule(sections: int = 12) -> trimesh.Trimesh:
-    """Return a capsule along z: half spheres of two bands, twice as long as wide, squeezed to one unit."""
+    """Return a capsule along z, of two half spheres with two bands each: twice as long as wide, scaled to one unit."""
     import trimesh
 
     turn = np.radians([-90, -45, 0])
@@ -473,7 +492,14 @@ def capsule(sections: int = 12) -> trimesh.Trimesh:
 
 
 def place(shape: trimesh.Trimesh, size: ArrayLike, turn: Rotation, centre: ArrayLike) -> Copies:
-    """Copy a unit shape: scale it to ``size`` ``(n, 3)`` [m], turn it, move it to ``centre`` ``(n, 3)`` [m]."""
+    """Copy a unit shape ``n`` times, each copy scaled, rotated and translated.
+
+    Args:
+        shape: shape of one unit in each direction, centred on the origin.
+        size: edges of each copy, before the rotation ``(n, 3)`` [m].
+        turn: the n rotations.
+        centre: centre of each copy ``(n, 3)`` [m].
+    """
     size, centre = np.asarray(size, dtype=float), np.asarray(centre, dtype=float)
     count, each = len(size), len(shape.vertices)
     placed = (np.asarray(shape.vertices) * size[:, None]) @ turn.as_matrix().transpose(0, 2, 1) + centre[:, None]
