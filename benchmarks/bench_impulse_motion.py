@@ -54,7 +54,8 @@ from mitsonar import (
 from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.plan import scenes_of, sequences_of
-from mitsonar.datasets.responses import ImpulsePairs, with_noise
+from mitsonar.datasets.responses import with_noise
+from mitsonar.datasets.samples import ImpulsePairs
 from mitsonar.estimation.crlb.channel import channel_crlb
 from mitsonar.estimation.named import create_estimator
 from mitsonar.estimation.regressors import REGRESSORS, flattened, score_all

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from mitsonar.config.data import load_recipe
     from mitsonar.datasets.make import make_dataset
     from mitsonar.datasets.rendered import RenderedPairs
-    from mitsonar.datasets.responses import ImpulsePairs
-    from mitsonar.datasets.samples import SonarPairs
+    from mitsonar.datasets.samples import ImpulsePairs, SonarPairs
     from mitsonar.datasets.store import DataStore
     from mitsonar.errors import MitsonarError, MitsonarWarning
     from mitsonar.estimation.compare import Comparison, compare
@@ -135,7 +134,7 @@ _MODULES = {
     "Echogram": "records.soundings",
     "Effort": "training.reproduce",
     "Estimate": "estimation.estimator",
-    "ImpulsePairs": "datasets.responses",
+    "ImpulsePairs": "datasets.samples",
     "ImpulseResponses": "records.responses",
     "MitsonarError": "errors",
     "MitsonarWarning": "errors",

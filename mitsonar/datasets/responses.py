@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
-from torch.utils.data import Dataset
 
-from mitsonar.acoustics.noise import snr_of, snr_said
+from mitsonar.acoustics.noise import snr_of
 from mitsonar.config.data import Recipe
 from mitsonar.datasets.arrangement import WHICH_LEVEL, Labels
-from mitsonar.datasets.modality import Fields
-from mitsonar.datasets.samples import AnySplit, Batch, Device, Part, RawSample, StoredBatches
+from mitsonar.datasets.sample_index import AnySplit, Part
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import motions
 from mitsonar.records.responses import ImpulseResponses
 
-__all__ = ["ImpulsePairs", "ImpulseSamples", "Leak", "Packing", "displacement_labels", "noise_power", "packed", "with_noise"]
+__all__ = ["ImpulseSamples", "Leak", "Packing", "displacement_labels", "noise_power", "packed", "with_noise"]
 
 
 SIGNAL_ENERGY = (0.01, 0.99)
@@ -253,60 +249,3 @@ class ImpulseSamples:
     def _per_ping(self) -> dict[str, NDArray[np.float64]]:
         """Read the small arrays of the whole store, which are stored as single chunks."""
         return {name: self.store.read(name) for name in ("time_s", "velocity", "height_m")}
-
-
-# ---------------- Samples for torch
-
-
-class ImpulsePairs(ImpulseSamples, StoredBatches, Dataset[Batch]):
-    """Samples of impulse responses for torch; ``pairs[i]`` is ``(input, label)``, float32 tensors.
-
-    The input is ``(1, taps, 2 M Q)``: for each of M receivers the real parts of its Q responses, then their imaginary parts,
-    one column each, divided by the largest magnitude of the sample (Almanza-Medina, 5.2.5). The label is the displacement
-    from the first ping to the last: sideways, forward, and yaw if the recipe has yaw. See :class:`ImpulseSamples` for
-    arguments and errors.
-    """
-
-    @property
-    def noise_seed(self) -> int:
-        """Return the seed of the noise, which changes with the epoch."""
-        return self.epoch_seed
-
-    def raw(self, index: int) -> RawSample:
-        """Read a sample as stored: the responses ``(Q, M, taps)``, the numbers of the pings, and the label."""
-        here = self.frame_numbers(index)
-        label = self.labels.encode(self.target(index))
-        return {"frames": np.arange(here.start, here.stop), "response": self.response(index), "label": label}
-
-    def finished(self, batch: dict[str, Tensor], device: Device = None) -> Batch:
-        """Compute the matrices and labels of a batch of raw samples on a device."""
-        response, numbers = (torch.as_tensor(batch[name]).cpu().numpy() for name in ("response", "frames"))
-        inputs = torch.from_numpy(self.arrange(response, numbers, self.noise_seed))
-        return inputs.to(device, non_blocking=True), torch.as_tensor(batch["label"]).to(device, non_blocking=True)
-
-    def at_noise(self, level: str) -> Packing:
-        """Return the packing with a single noise level.
-
-        Raises:
-            MitsonarError: unknown level.
-        """
-        return replace(self.arrange, levels=(snr_of(level),))
-
-    def described(self) -> Fields:
-        """Return the description for a checkpoint; see :meth:`~mitsonar.datasets.samples.Batches.described`."""
-        low, high = self.recipe.flight.heights
-        return {
-            "arrangement": {
-                "frames": self.frames,
-                "views": list(self.arrange.receivers),
-                "kind": "response",
-                "layout": "columns",
-                "coordinates": "delay",
-                "cartesian_rows": self.sonar.taps,
-                "ground": False,
-            },
-            "sonar": {"channel": self.sonar.model_dump(mode="json")},
-            "trained_at": {"height_m": [low, high], "pitch_deg": 0.0, "roll_deg": 0.0},
-            "model": self.sonar.model,
-            "noise": "; ".join(map(snr_said, self.arrange.levels)),
-        }

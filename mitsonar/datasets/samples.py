@@ -13,11 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, load_noise
-from mitsonar.config.data import SPLITS, Recipe, Split, array_names, split_from
+from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, load_noise, snr_of, snr_said
+from mitsonar.config.data import Recipe, array_names
 from mitsonar.datasets.arrangement import Arrangement, Labels, arrangement_of
 from mitsonar.datasets.modality import Fields, Values
-from mitsonar.datasets.store import DataStore, deal, deal_samples, world_of
+from mitsonar.datasets.responses import ImpulseSamples, Packing
+from mitsonar.datasets.sample_index import AnySplit, Part
+from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, refuse_unknown
 from mitsonar.geometry.ground import Attitude, GroundGeometry, attitude_of, margin_of_light, nearest_known
 from mitsonar.instruments.sonar import Bearing
@@ -27,14 +29,13 @@ from mitsonar.records.frames import SonarFrames
 __all__ = [
     "NODES",
     "SEED_STEP",
-    "AnySplit",
     "ArrangementOptions",
     "Batch",
     "Batches",
     "Device",
+    "ImpulsePairs",
     "Inputs",
     "JoinedPairs",
-    "Part",
     "RawSample",
     "SampleOptions",
     "Samples",
@@ -43,7 +44,6 @@ __all__ = [
     "ground_at",
     "ground_of",
     "light_of",
-    "split_for",
 ]
 
 
@@ -714,101 +714,58 @@ def _what_must_agree(pairs: SonarPairs) -> Fields:
     }
 
 
-# ---------------- Samples of one part of a data set
+# ---------------- Samples of impulse responses
 
 
-AnySplit: TypeAlias = str | Split | Fields | None
-"""A split as a name, an object, or the keys of a recipe; None: the recipe's split."""
+class ImpulsePairs(ImpulseSamples, StoredBatches, Dataset[Batch]):
+    """Samples of impulse responses for torch; ``pairs[i]`` is ``(input, label)``, float32 tensors.
 
-
-@dataclass(frozen=True)
-class Part:
-    """The samples in one part of a data set; the frames of a sample are consecutive and belong to one sequence.
-
-    Attributes:
-        split: assignment of the frames to parts.
-        frames: number of frames per sample.
-        first: first frame of each sample ``(samples,)``.
-        scene, sequence: numbers of scene and sequence of each frame of the store ``(frames,)``.
-        pose: of the sonar ``(frames, 6)`` [m, rad].
-        motion: to the next frame ``(frames, 3)`` [m, m, rad].
+    The input is ``(1, taps, 2 M Q)``: for each of M receivers the real parts of its Q responses, then their imaginary parts,
+    one column each, divided by the largest magnitude of the sample (Almanza-Medina, 5.2.5). The label is the displacement
+    from the first ping to the last: sideways, forward, and yaw if the recipe has yaw. See :class:`~mitsonar.datasets.responses.ImpulseSamples` for
+    arguments and errors.
     """
 
-    split: Split
-    frames: int
-    first: NDArray[np.int64]
-    scene: NDArray[np.int32]
-    sequence: NDArray[np.int32]
-    pose: NDArray[np.float64]
-    motion: NDArray[np.float64]
+    @property
+    def noise_seed(self) -> int:
+        """Return the seed of the noise, which changes with the epoch."""
+        return self.epoch_seed
 
-    @classmethod
-    def of(
-        cls,
-        store: DataStore,
-        part: str,
-        split: AnySplit,
-        frames: int,
-        *,
-        seed: int = 0,
-        one_a_sequence: bool = False,
-    ) -> Part:
-        """Find the samples of a part.
+    def raw(self, index: int) -> RawSample:
+        """Read a sample as stored: the responses ``(Q, M, taps)``, the numbers of the pings, and the label."""
+        here = self.frame_numbers(index)
+        label = self.labels.encode(self.target(index))
+        return {"frames": np.arange(here.start, here.stop), "response": self.response(index), "label": label}
 
-        Args:
-            store: of the data set.
-            part: ``train``, ``validation``, ``test``, or ``all``.
-            split: see :func:`split_for`.
-            frames: number of frames per sample.
-            seed: of the random choice of one sample per sequence.
-            one_a_sequence: whether to take only one sample from each sequence.
+    def finished(self, batch: dict[str, Tensor], device: Device = None) -> Batch:
+        """Compute the matrices and labels of a batch of raw samples on a device."""
+        response, numbers = (torch.as_tensor(batch[name]).cpu().numpy() for name in ("response", "frames"))
+        inputs = torch.from_numpy(self.arrange(response, numbers, self.noise_seed))
+        return inputs.to(device, non_blocking=True), torch.as_tensor(batch["label"]).to(device, non_blocking=True)
+
+    def at_noise(self, level: str) -> Packing:
+        """Return the packing with a single noise level.
 
         Raises:
-            MitsonarError: the part or split is unknown, or the part has no samples.
+            MitsonarError: unknown level.
         """
-        dealt = split_for(split, store.recipe)
-        scene, sequence, pose, motion = (store.read(name) for name in ("scene", "sequence", "pose", "motion"))
-        first = np.arange(max(0, len(sequence) - frames + 1))
-        first = first[sequence[first] == sequence[first + frames - 1]]
-        if dealt.by == "sample":
-            first = first[deal_samples(sequence[first], dealt, part)]
-        else:
-            first = first[deal(world_of(store.recipe, store.scenes)[scene], sequence, dealt, part)[first]]
-        if not len(first):
-            raise MitsonarError(
-                f"{store.place.url} has no sample of {frames} frames in part {part!r}: its sequences have "
-                f"{np.bincount(sequence).max()} frames; ask for fewer frames, or another part"
-            )
-        if one_a_sequence:
-            rank = np.random.default_rng([seed, 5]).permutation(len(first))
-            order = np.lexsort((rank, sequence[first]))
-            first = np.sort(first[order][np.unique(sequence[first][order], return_index=True)[1]])
-        return cls(dealt, frames, first, scene, sequence, pose, motion)
+        return replace(self.arrange, levels=(snr_of(level),))
 
-    def frame_numbers(self, index: int) -> slice:
-        """Return the slice of the store's frames that a sample holds."""
-        first = int(self.first[index])
-        return slice(first, first + self.frames)
-
-
-def split_for(split: AnySplit, recipe: Recipe) -> Split:
-    """Return the split of a data set of this recipe; see :class:`SonarPairs` for the choices.
-
-    Raises:
-        MitsonarError: unknown name or key.
-    """
-    if isinstance(split, Split):
-        return split
-    if isinstance(split, dict):
-        return split_from(split)
-    match split:
-        case None:
-            return recipe.split
-        case "sequence":
-            return recipe.split if recipe.split.by == "sequence" else Split()
-        case "scene":
-            return recipe.split if recipe.split.by == "scene" else Split(by="scene", train=0.8, validation=0.1, test=0.1)
-        case "sample":
-            return recipe.split if recipe.split.by == "sample" else Split(by="sample", train=0.9, validation=0.05, test=0.05)
-        case _:
-            raise MitsonarError(f"split must be {', '.join(SPLITS)}, or keys as in a recipe: got {split!r}")
+    def described(self) -> Fields:
+        """Return the description for a checkpoint; see :meth:`~mitsonar.datasets.samples.Batches.described`."""
+        low, high = self.recipe.flight.heights
+        return {
+            "arrangement": {
+                "frames": self.frames,
+                "views": list(self.arrange.receivers),
+                "kind": "response",
+                "layout": "columns",
+                "coordinates": "delay",
+                "cartesian_rows": self.sonar.taps,
+                "ground": False,
+            },
+            "sonar": {"channel": self.sonar.model_dump(mode="json")},
+            "trained_at": {"height_m": [low, high], "pitch_deg": 0.0, "roll_deg": 0.0},
+            "model": self.sonar.model,
+            "noise": "; ".join(map(snr_said, self.arrange.levels)),
+        }

@@ -26,7 +26,8 @@ from mitsonar.datasets.modality import samples_of
 from mitsonar.datasets.plan import modality_of, scenes_of
 from mitsonar.datasets.rendered import re_rendered
 from mitsonar.datasets.responses import ImpulseSamples
-from mitsonar.datasets.samples import SonarPairs, split_for
+from mitsonar.datasets.sample_index import split_for
+from mitsonar.datasets.samples import SonarPairs
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, argument, counted, meant
 from mitsonar.estimation.crlb.image import bounds_at, overall

@@ -26,7 +26,8 @@ from torch import Tensor, nn
 from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.arrangement import LABELS, Coordinates, Labels, Layout
 from mitsonar.datasets.modality import Fields
-from mitsonar.datasets.samples import Batches, Part, ground_at, split_for
+from mitsonar.datasets.sample_index import Part, split_for
+from mitsonar.datasets.samples import Batches, ground_at
 from mitsonar.errors import MitsonarError, meant, nearest_names, shortened
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar

@@ -18,8 +18,7 @@ from mitsonar.config.data import Recipe, load_recipe
 from mitsonar.config.training import TrainingRecipe
 from mitsonar.datasets.make import calibrate
 from mitsonar.datasets.rendered import RawStream, RenderedPairs
-from mitsonar.datasets.responses import ImpulsePairs
-from mitsonar.datasets.samples import JoinedPairs, SonarPairs
+from mitsonar.datasets.samples import ImpulsePairs, JoinedPairs, SonarPairs
 from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import digest
 from mitsonar.simulation.device import ensure_variant

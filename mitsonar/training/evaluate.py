@@ -15,8 +15,8 @@ from torch.utils.data import default_collate
 
 from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.plan import modality_of
-from mitsonar.datasets.responses import ImpulsePairs
-from mitsonar.datasets.samples import SonarPairs, split_for
+from mitsonar.datasets.sample_index import split_for
+from mitsonar.datasets.samples import ImpulsePairs, SonarPairs
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, counted
 from mitsonar.estimation.compare import Answers, chosen, markdown, rows_of

@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from mitsonar.config.data import Recipe, load_recipe, recipe_from
 from mitsonar.config.training import TrainingRecipe, load_training_recipe
 from mitsonar.datasets.make import make_dataset
-from mitsonar.datasets.samples import split_for
+from mitsonar.datasets.sample_index import split_for
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, argument, complaint, nearest_names
 from mitsonar.io.files import read_json, write_json, write_whole

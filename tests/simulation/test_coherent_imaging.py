@@ -322,9 +322,9 @@ def test_absorption_and_gain(flat: mi.Scene) -> None:
 def test_noise_has_its_level_and_is_a_function_of_the_ping(flat: mi.Scene) -> None:
     sonar = SONAR.replace(source_level_db=200.0, noise_level_db=80.0)
     source = imager(flat, sonar)
-    draws = np.stack([source.noise(ping) for ping in range(12)])
+    draws = np.stack([source.receiver.noise(ping) for ping in range(12)])
     assert 10 * np.log10((np.abs(draws) ** 2).mean()) == pytest.approx(-120, abs=0.1)
-    np.testing.assert_array_equal(draws[3], source.noise(3))
+    np.testing.assert_array_equal(draws[3], source.receiver.noise(3))
     across = np.abs((draws[:, :, 1:] * draws[:, :, :-1].conj()).mean()) / (np.abs(draws) ** 2).mean()
     u = np.linspace(-0.2, 0.2, 100_001)
     length = sonar.aperture.length
@@ -349,7 +349,7 @@ def test_volume_reverberation_has_its_level(flat: mi.Scene) -> None:
 def test_near_glow_falls_evenly_in_decibels(flat: mi.Scene) -> None:
     sonar = SONAR.replace(range_min=0.2, range_max=1.1, noise_level_db=-120.0, near_glow_db=30.0, near_glow_m=0.8)
     source = imager(flat, sonar)
-    made = 10 * np.log10((np.abs(np.stack([source.noise(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2)))
+    made = 10 * np.log10((np.abs(np.stack([source.receiver.noise(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2)))
     truth = -120 + 30 * np.maximum(0, 1 - sonar.range_m / 0.8)
     assert np.abs((made - truth).reshape(-1, 16).mean(axis=1)).max() < 0.3
 

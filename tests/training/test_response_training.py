@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves
 
 from mitsonar.config.training import Optimiser, load_training_recipe, shipped_training_recipes  # noqa: E402
 from mitsonar.config.training import training_recipe_from as recipe_of  # noqa: E402
-from mitsonar.datasets.responses import ImpulsePairs  # noqa: E402
+from mitsonar.datasets.samples import ImpulsePairs  # noqa: E402
 from mitsonar.estimation.learned import ResponseNetwork  # noqa: E402
 from mitsonar.estimation.named import create_estimator  # noqa: E402
 from mitsonar.networks.blocks import SameAverage  # noqa: E402
