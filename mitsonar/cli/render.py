@@ -89,10 +89,11 @@ def render(
         typer.Option("--moving", help="ID=FILE.tum: the shape ID follows that path; or FILE.yaml (docs/guides/moving.md)."),
     ] = None,
     all_sensors: Annotated[
-        bool, typer.Option("--all-sensors", help="All sonars and cameras of the scene, on one vehicle (several-sensors.md).")
+        bool,
+        typer.Option("--all-sensors", help="All sonars and cameras of the scene, on one vehicle (docs/guides/bridges.md)."),
     ] = False,
     vehicle: Annotated[
-        Path | None, typer.Option(help="All sensors of a vehicle, a YAML file; see docs/guides/several-sensors.md.")
+        Path | None, typer.Option(help="All sensors of a vehicle, a YAML file; see docs/guides/bridges.md.")
     ] = None,
     rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,

@@ -13,7 +13,7 @@ from mitsonar.motion.bodies import BodyMotion, motions_from
 
 __all__ = ["CameraKeys", "SensorKeys", "VehicleRecipe", "check_sensor_name", "load_vehicle_recipe"]
 
-SEE = " (see docs/guides/several-sensors.md)"
+SEE = " (see docs/guides/bridges.md)"
 
 Mount = tuple[float, float, float, float, float, float]
 
