@@ -722,8 +722,8 @@ class ImpulsePairs(ImpulseSamples, StoredBatches, Dataset[Batch]):
 
     The input is ``(1, taps, 2 M Q)``: for each of M receivers the real parts of its Q responses, then their imaginary parts,
     one column each, divided by the largest magnitude of the sample (Almanza-Medina, 5.2.5). The label is the displacement
-    from the first ping to the last: sideways, forward, and yaw if the recipe has yaw. See :class:`~mitsonar.datasets.responses.ImpulseSamples` for
-    arguments and errors.
+    from the first ping to the last: sideways, forward, and yaw if the recipe has yaw. Arguments and
+    errors are those of :class:`~mitsonar.datasets.responses.ImpulseSamples`.
     """
 
     @property

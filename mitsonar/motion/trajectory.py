@@ -156,7 +156,8 @@ class Trajectory:
 
         Args:
             path: path of the file.
-            frame: convention of the file: ``mitsonar``, ``ros-enu`` or ``ned`` (:class:`~mitsonar.motion.trajectory.Convention`).
+            frame: convention of the file: ``mitsonar``, ``ros-enu`` or ``ned``;
+                see :class:`~mitsonar.motion.trajectory.Convention`.
             looks_ahead: False if the sonar points down from a level vehicle; only affects the warning.
 
         Raises:
