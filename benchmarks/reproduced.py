@@ -34,7 +34,7 @@ Written by `python benchmarks/reproduced.py` from `benchmarks/results/reproduced
 sideways mm / forward mm / yaw deg, without noise; heights in cm. *By pair*: pairs dealt out one by one, as in the document,
 whose training has seen pairs of the same sequences. *Other sequences*: of the same scenes. *Unseen*: scenes that no network
 has seen. What comes out of it: [What these networks learn](../docs/guides/what-networks-learn.md),
-[Benchmarks](README.md#networks).
+[Results in full](RESULTS.md#networks).
 """
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ QUICK_TABLES = ("3.2", "4.12", "5.2")
 """A table of images, of vectors, and of impulse responses."""
 
 EARLIER = "earlier.json"
-"""Cells of rows that were trained before rows were kept, from the tables of README.md."""
+"""Cells of rows that were trained before rows were kept, from the tables of RESULTS.md."""
 
 
 def main() -> None:

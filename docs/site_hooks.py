@@ -26,6 +26,7 @@ NOTEBOOKS = ("01_render", "02_dataset", "03_odometry", "04_networks")
 
 PAGES = {
     "benchmarks/README.md": "benchmarks.md",
+    "benchmarks/RESULTS.md": "results.md",
     "benchmarks/REPRODUCED.md": "reproduced.md",
     "CHANGELOG.md": "changelog.md",
     "SECURITY.md": "security.md",

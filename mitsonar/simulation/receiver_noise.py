@@ -205,7 +205,7 @@ def with_crosstalk(sonar: Sonar, image: NDArray[Any]) -> NDArray[Any]:
     """Return echoes ``(bins, beams)`` with the sum of all beams, weighted by ``crosstalk_db``, added to each beam."""
     if sonar.crosstalk_db is None:
         return image
-    return image + np.float32(10 ** (sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
+    return np.asarray(image + np.float32(10 ** (sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True))
 
 
 def _correlation(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
