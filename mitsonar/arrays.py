@@ -1,7 +1,6 @@
-"""Type aliases for arrays whose library is not known.
+"""Type aliases for arrays of NumPy, torch or Dr.Jit.
 
-No type checker can express that a function returns an array of the same library as its argument, across NumPy, torch and
-Dr.Jit. These aliases document it for the reader.
+No type checker can express that a function returns arrays of the same library as its arguments. These aliases document it.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from typing import Any, TypeAlias
 __all__ = ["AnyArray", "DeviceArray"]
 
 AnyArray: TypeAlias = Any
-"""An array of NumPy, torch or Dr.Jit. Functions return arrays of the library that they receive."""
+"""An array of NumPy, torch or Dr.Jit. A function returns arrays of the same library as its arguments."""
 
 DeviceArray: TypeAlias = Any
-"""A Dr.Jit array in the current variant, possibly not evaluated yet; also a number where Dr.Jit broadcasts it."""
+"""A Dr.Jit array in the current variant, possibly not evaluated yet, or a number that Dr.Jit broadcasts."""

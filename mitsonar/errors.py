@@ -51,27 +51,27 @@ EXTRAS = {
     "small_gicp": ("bench", "the estimator cfar-gicp"),
     "pystackreg": ("bench", "the estimator stackreg"),
 }
-"""Optional packages: the extras that install each, and the tasks that need it."""
+"""Optional packages, with the extras that install each and the tasks that need it."""
 
 LONGEST_KEY = 60
-"""Largest number of characters of a key in a message, since keys of foreign files may be of any length."""
+"""Maximum number of characters of a key in a message; keys in input files may be arbitrarily long."""
 
 MARK = "\x1f"
-"""Delimiter of an argument's name within a message; never displayed."""
+"""Control character that delimits argument names in messages; never displayed."""
 
 
 class MitsonarError(ValueError):
-    """An input that mitsonar cannot work with. The command line prints it and exits with code 2."""
+    """Error caused by invalid or unusable input. The command line prints the message and exits with code 2."""
 
     def __str__(self) -> str:
         return self.said({})
 
     def said(self, options: Mapping[str, str]) -> str:
-        """Return the message with arguments named as the reader knows them.
+        """Return the message with the names of marked arguments replaced by command-line options.
 
         Args:
-            options: command-line option for each argument that :func:`mitsonar.errors.argument` marks, such as
-                ``{"height_m": "--height"}``. Other arguments appear under their Python names.
+            options: command-line options, keyed by the argument that :func:`mitsonar.errors.argument` marks, such as
+                ``{"height_m": "--height"}``. Other arguments keep their Python names.
         """
 
         def typed(found: re.Match[str]) -> str:
@@ -83,23 +83,24 @@ class MitsonarError(ValueError):
 def argument(name: str) -> str:
     """Mark the name of an argument in the message of a :class:`MitsonarError`.
 
-    If the command line has an option for the argument, it prints the option instead.
+    The command line replaces it by the corresponding option, if there is one.
 
     Args:
-        name: name of the argument. Preceding words state its owner, as in ``sonar model``; an option replaces them too.
+        name: name of the argument, optionally after a word that says what it belongs to, as in ``sonar model``. The option
+            replaces both.
     """
     return f"{MARK}{name}{MARK}"
 
 
 class MitsonarWarning(UserWarning):
-    """A fact about a valid result that the user should know."""
+    """Warning about a result that is valid, but has a limitation that the user should know."""
 
 
 def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
-    """Return an error that names the extra which installs a missing optional package.
+    """Return an error that states which extra installs a missing optional package.
 
     Raises:
-        ModuleNotFoundError: the original error, if no extra installs that module.
+        ModuleNotFoundError: the original error, if no extra installs the module.
     """
     package = (error.name or "").partition(".")[0]
     if package not in EXTRAS:
@@ -110,7 +111,7 @@ def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
 
 
 def nearest_names(wrong: str, names: Iterable[str]) -> str:
-    """List the known names for the end of an error message, starting with those similar to ``wrong``."""
+    """Format the known names for the end of an error message, after a suggestion of those similar to ``wrong``."""
     known = list(names)
     near = [name for name in known if wrong and wrong.lower() in name.lower()]
     near = near or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
@@ -123,7 +124,7 @@ def counted(number: int, noun: str, plural: str = "") -> str:
 
 
 def meant(wrong: object, names: Iterable[str]) -> str:
-    """Suggest the most similar of some names, for the end of a message that lists them; empty if none is similar."""
+    """Format a suggestion of the most similar name, for the end of a message; empty if no name is similar."""
     near = difflib.get_close_matches(str(wrong).lower(), [str(name) for name in names], n=1, cutoff=0.5)
     return f"; did you mean {near[0]}?" if near else ""
 
@@ -132,12 +133,12 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str], owner: str) -> No
     """Reject keyword arguments with unknown names.
 
     Args:
-        given: names given.
-        known: valid names.
-        owner: owner of the arguments, for the message.
+        given: names of the given arguments.
+        known: names of the valid arguments.
+        owner: function or class that takes the arguments, for the message.
 
     Raises:
-        MitsonarError: an unknown name, with the most similar one and all valid ones.
+        MitsonarError: a name is unknown; the message suggests similar names and lists all valid ones.
     """
     names = list(known)
     for name in given:
@@ -146,15 +147,17 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str], owner: str) -> No
 
 
 def complaint(error: ValidationError, model: type[BaseModel], what: str, see: str = "") -> str:
-    """Turn the first error of a pydantic validation into one sentence: what is wrong, what was given, what is allowed.
+    """Format a pydantic validation error as one sentence: what is wrong, what was given, what is allowed.
+
+    Only the first error is reported; unknown keys come first.
 
     Args:
         error: the error raised by pydantic.
         model: model whose fields are the valid keys.
-        what: owner of the keys, for the sentence, such as ``sonar``.
-        see: reference to a page, for the end of the sentence.
+        what: noun for the object that the keys describe, such as ``sonar``.
+        see: end of the sentence, such as a reference to a documentation page.
     """
-    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")  # a mistyped key explains a missing one
+    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")  # a misspelt key also makes one missing
     where = [str(part) for part in first["loc"]]
     key = ".".join(part if len(part) <= LONGEST_KEY else f"{part[:LONGEST_KEY]}..." for part in where)
     if first["type"] == "extra_forbidden":
@@ -177,7 +180,7 @@ def _meant(error: ErrorDetails) -> str:
 
 
 def shortened(value: object) -> str:
-    """Return the repr of a value, truncated if long. The value may be huge, or refer to itself."""
+    """Return the repr of a value, truncated if it is long. Huge and self-referential values are safe."""
     if isinstance(value, int) and abs(value) > 10**40:
         return f"an integer of {value.bit_length():,} bits"
     brief = reprlib.Repr()

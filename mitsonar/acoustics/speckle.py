@@ -1,4 +1,4 @@
-"""Model the statistics of speckle intensity, and draw its random patches.
+"""Model the statistics of speckle intensity, and tabulate the amplitudes of random patches.
 
 Many scatterers in a resolution cell form a complex Gaussian field with exponential intensity. Patches of unequal strength
 give the K distribution (Jakeman and Pusey 1976, IEEE Trans. AP-24:806): the product of a Gamma and an exponential variable.
@@ -25,34 +25,35 @@ BLENDED = 4 / 9
 
 
 def contrast(nu: float | None) -> float:
-    """Return the standard deviation of the intensity over its mean.
+    """Return the standard deviation of the intensity divided by its mean.
 
     Args:
-        nu: shape of the K distribution; None: exponential.
+        nu: shape parameter of the K distribution; None: exponential distribution.
     """
     return 1.0 if nu is None else math.sqrt(1 + 2 / nu)
 
 
 def intensity_tail(intensity: ArrayLike, nu: float | None) -> NDArray[np.float64]:
-    """Return the probability that an intensity of mean 1 exceeds a value, of the same shape.
+    """Return the probability that an intensity of mean 1 exceeds a threshold ``(...)``.
 
     Args:
-        intensity: threshold values, 0 or more.
-        nu: shape of the K distribution; None: exponential.
+        intensity: threshold, 0 or more ``(...)``.
+        nu: shape parameter of the K distribution; None: exponential distribution.
     """
     x = np.asarray(intensity, dtype=float)
     if nu is None:
         return np.asarray(np.exp(-x), dtype=np.float64)
-    least = max(1e-5, (nu - 1) / 100)  # below, the tail is 1 within 0.3 % and the Bessel function overflows
+    least = max(1e-5, (nu - 1) / 100)  # below it, the tail is 1 within 0.3 % and the Bessel function overflows
     z = np.maximum(2 * np.sqrt(nu * x), least)
     return np.asarray(2 * (z / 2) ** nu * special.kv(nu, z) / special.gamma(nu), dtype=np.float64)
 
 
 def patch_amplitudes(nu: float | None) -> NDArray[np.float32]:
-    """Return a table that maps a uniform number to the amplitude of a patch ``(ENTRIES,)``, or ``(1,)`` ones without ``nu``.
+    """Return a lookup table ``(ENTRIES,)`` from a uniform random number to a patch amplitude; ones ``(1,)`` without ``nu``.
 
-    It holds the square root of a Gamma variable of shape ``nu`` and mean 1 at the midpoints of ENTRIES equal probability
-    intervals. The coherent model draws patches of shape :data:`BLENDED` times ``nu``, since it interpolates between patches.
+    The table contains the square root of a Gamma variable with shape parameter ``nu`` and mean 1, at the midpoints of
+    ENTRIES intervals of equal probability. The coherent model uses the shape parameter :data:`BLENDED` times ``nu``, because
+    it interpolates between patches.
     """
     if nu is None:
         return np.ones(1, np.float32)
@@ -74,14 +75,14 @@ NODES = 80
 """Number of nodes of the Gauss-Hermite quadrature along each axis of the complex plane."""
 
 DECADES = (-5.0, 5.0)
-"""Limits of the tables, as powers of ten of q. Beyond them the asymptotic limits hold within 1e-5."""
+"""Limits of the tables, as decimal logarithms of q. Beyond them the asymptotic limits hold within 1e-5."""
 
 A_DECADE = 16
-"""Number of table entries per decade."""
+"""Number of table entries per decade of q."""
 
 
 class ScoreShares(NamedTuple):
-    """Signed square roots of the shares of a score's variance; their squares add up to 1 or less.
+    """Decomposition of a score: signed square roots of the shares of its variance. Their squares sum to at most 1.
 
     Attributes:
         linear: share of Re n, in phase with the echo ``(...)``.
@@ -110,7 +111,7 @@ def rician_information(power: ArrayLike, noise: ArrayLike) -> NDArray[np.float64
 
 
 def score_shares(power: ArrayLike, noise: ArrayLike) -> ScoreShares:
-    """Decompose the score of an amplitude into polynomials of the noise; arguments as for :func:`rician_information`."""
+    """Decompose the score of an amplitude into polynomials of the noise. Arguments: see :func:`rician_information`."""
     least, most = (10.0**end for end in DECADES)
     q = np.clip(np.asarray(power, dtype=float) / np.asarray(noise, dtype=float), least, most)
     table = _tables()

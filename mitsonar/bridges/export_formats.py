@@ -70,12 +70,12 @@ YOLO_PARTS = {"train": "train", "validation": "val", "test": "test"}
 
 
 def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
-    """Write COCO's ``images/PART/`` and ``annotations/PART.json``, with masks as compressed runs; yield after each frame.
+    """Write COCO's ``images/PART/`` and ``annotations/PART.json``, with run-length encoded masks; yield after each frame.
 
-    Categories are classes, numbered from 1. The attributes of an annotation name its shape and its object.
+    Category ids are class indices plus 1. The attributes of an annotation give the names of its shape and its object.
     """
-    # 1. Write the pictures, and the records of images and annotations line by line into temporary files: all of them
-    #    together may exceed the memory.
+    # 1. Write the pictures. Write the records of images and annotations line by line into temporary files, because all of
+    #    them together may exceed the memory.
     refuse_unlabelled(source)
     (folder / "annotations").mkdir()
     columns, rows = pictures.size
@@ -106,7 +106,7 @@ def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) 
     table = [{"id": kind + 1, "name": name, "supercategory": "shape"} for kind, name in enumerate(pictures.classes)]
     about = {"description": source.about or source.name, "contributor": "mitsonar", "picture": pictures.picture_kind}
     for part in parts:
-        with (folder / "annotations" / f"{part}.json").open("w") as whole:  # line by line
+        with (folder / "annotations" / f"{part}.json").open("w") as whole:  # streamed, without a copy in memory
             whole.write(f'{{"info":{json_line(about)},"licenses":[],"categories":{json_line(table)},"images":[')
             _copy(folder / f"{part}.images", whole)
             whole.write('],"annotations":[')
@@ -191,33 +191,33 @@ def _outlines(region: Region) -> list[np.ndarray[tuple[int, ...], np.dtype[np.fl
     return [one[:, 0, :].astype(float) + 0.5 for one in found if len(one) >= 3]
 
 
-# ---------------- Recipe of a detector's data set
+# ---------------- Data set recipe for a detector
 
 
 CLEAR_M = 0.3
 """Smallest distance of the sonar from the bounding box of an object and from the ground [m]."""
 
 GROUND = 0.9
-"""Fraction of the scene's edge that a shape covers if it is ground."""
+"""Smallest fraction of the scene's edge that a shape covers if it counts as ground."""
 
 REACH = 0.6
 """Largest range of the sonar as a fraction of the scene's edge; a longer fan would hardly fit inside the scene."""
 
 SHARES = 0.7, 0.15, 0.15
 FRAMES_OF_WORLD = 10
-"""Frames per generated world, if there are enough worlds."""
+"""Number of frames per generated world, if there are enough worlds."""
 
 
 @dataclass(frozen=True)
 class DetectorViews:
-    """The views of a detector's data set.
+    """Random views for a detector's data set.
 
     Attributes:
         frames: number of pictures.
         heights: smallest and largest height of the sonar [m]; None: 1.5 to 3 m above the ground of a scene, or as in the
             recipe.
         pitch_deg: smallest and largest pitch, > 0 looks down [deg]; None: 10 to 30, or as in the recipe.
-        noise_db: levels added to the noise of the sonar [dB]; scenes, or parts of one scene, take them in turn.
+        noise_db: levels added to the noise of the sonar [dB], assigned in turn to scenes, or to parts of one scene.
         split: shares of training, validation and test.
         seed: seed of poses, worlds and noise.
     """
@@ -233,16 +233,16 @@ class DetectorViews:
 def detector_recipe(
     scene: str | Path, views: DetectorViews, sonar: str | None = None, changes: Keys | None = None
 ) -> tuple[Recipe, list[tuple[str, str]], list[str]]:
-    """Make the recipe of a detector's data set: random views, one ping per sequence, with labels of shapes and objects.
+    """Create a data set recipe for a detector: random views, one ping per sequence, with labels of shapes and objects.
 
-    In a scene file the sonar stays above the ground, and clear of the bounding boxes of all other shapes. Worlds of a recipe
-    are split by scene, views of one scene file by sequence.
+    In a scene file the sonar stays above the ground, and outside the bounding boxes of all other shapes. The worlds of a
+    recipe are split by scene, the views of one scene file by sequence.
 
     Args:
         scene: a Mitsuba XML file, the name of a shipped scene, or the recipe of a data set whose worlds are used.
         views: number of views, their poses and their noise.
         sonar: preset or YAML file of a sonar; default: the sonar of the scene or of the recipe.
-        changes: keys of the recipe to change, with dots between the levels.
+        changes: recipe values to change, keyed by dotted path.
 
     Returns:
         The recipe; rules for :class:`~mitsonar.bridges.export_source.LabelledPictures` that leave out the ground; and
@@ -294,7 +294,7 @@ def _scenes(frames: int, worlds: Sequence[Keys]) -> list[Keys]:
 
 
 def _of_recipe(name: str, views: DetectorViews) -> tuple[Keys, list[tuple[str, str]], list[str]]:
-    """Return keys, class rules and notes for the worlds of a recipe; worlds are split by scene if the seed changes them."""
+    """Return keys, class rules and notes for the worlds of a recipe. Worlds that depend on a seed are split by scene."""
     recipe = load_recipe(name)
     groups = [group for group, one in enumerate(recipe.scenes) for _ in range(one.count)]
     wanted = max(3, len(views.noise_db), views.frames // FRAMES_OF_WORLD)
@@ -310,7 +310,7 @@ def _of_recipe(name: str, views: DetectorViews) -> tuple[Keys, list[tuple[str, s
 def _of_scene(
     name: str, views: DetectorViews, sonar: str | None, chosen: bool
 ) -> tuple[Keys, list[tuple[str, str]], list[str]]:
-    """Return keys, class rules and notes for a scene file; the range is limited by the ground, unless ``chosen``."""
+    """Return keys, class rules and notes for a scene file. The ground limits the range, unless it was ``chosen``."""
     # 1. Separate the ground from the objects.
     path = find_scene(name).resolve()
     loaded = load_scene(path)
@@ -374,7 +374,7 @@ def _ground(path: Path, halves: NDArray[np.float64]) -> tuple[float, NDArray[np.
 
 
 def _within(sonar: Sonar, keys: Keys, size: float) -> tuple[Keys, list[str]]:
-    """Limit the range of a sonar to what its scene allows; return its keys, and a note if the range was changed."""
+    """Limit the range of a sonar to the size of its scene. Return its keys, and a note if the range was changed."""
     reach = REACH * size
     if sonar.range_max <= reach:
         return keys, []
@@ -430,10 +430,10 @@ CONTEXT: dict[str, PlainValue] = {
 
 
 def export_hugging_face(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
-    """Write an image folder of Hugging Face; yield after each frame.
+    """Write a Hugging Face image folder; yield after each frame.
 
-    Files are ``data/PART/*.png`` with a ``metadata.jsonl`` for each part, the data set's card ``README.md``, and the
-    Croissant metadata ``croissant.json``.
+    It contains ``data/PART/*.png`` with a ``metadata.jsonl`` for each part, the dataset card ``README.md``, and Croissant
+    metadata in ``croissant.json``.
     """
     counts: dict[str, int] = {}
     keys: dict[str, str] = {}
@@ -459,7 +459,7 @@ def export_hugging_face(source: ExportSource, pictures: LabelledPictures, folder
 
 
 def _card(source: ExportSource, pictures: LabelledPictures, counts: dict[str, int]) -> str:
-    """Return the card of the data set, with the header that the hub reads."""
+    """Return the dataset card, with the YAML header that the Hugging Face Hub reads."""
     parts = [{"split": part, "path": f"data/{part}/**"} for part in counts]
     head = {"task_categories": ["object-detection"], "tags": ["sonar", "simulation", "mitsonar"]}
     configs = {"configs": [{"config_name": "default", "data_files": parts}]}
@@ -472,7 +472,7 @@ def _card(source: ExportSource, pictures: LabelledPictures, counts: dict[str, in
 
 
 def _croissant(source: ExportSource, folder: Path, parts: list[str], keys: dict[str, str]) -> dict[str, PlainValue]:
-    """Return the Croissant metadata: a file and a record set for the table of each part."""
+    """Return the Croissant metadata: one file object and one record set for the table of each part."""
     objects: list[PlainValue] = []
     records: list[PlainValue] = []
     for part in parts:
@@ -511,8 +511,8 @@ OF_SHARD = 1000
 def export_webdataset(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
     """Write the shards ``PART-000000.tar`` ... of a WebDataset, and ``about.json``; yield after each frame.
 
-    A sample has ``png``, ``json`` (time, pose, sequence, regions), and with labels ``shape.png`` and ``object.png``: the
-    label plus one in 16 bits, 0 for no echo.
+    A sample consists of ``png``, ``json`` (time, pose, sequence, regions), and, if there are labels, ``shape.png`` and
+    ``object.png``: 16-bit labels plus one, 0 for no echo.
     """
     counts: dict[str, int] = {}
     with contextlib.ExitStack() as ends:
@@ -552,8 +552,8 @@ CAMERA = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 def export_kitti(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
     """Write KITTI's ``poses/00.txt``, ``sequences/00/times.txt`` and ``sequences/00/image_0/``; yield after each frame.
 
-    A line of ``poses`` has the first three rows of the matrix from the sonar's axes (x starboard, y down, z forward) to
-    those of the first frame of its sequence. The frames of a sequence must be consecutive.
+    Each line of ``poses`` contains the first three rows of the matrix from the sonar's axes (x starboard, y down, z forward)
+    to those of the first frame in the sequence. The frames of a sequence must be consecutive.
     """
     refuse_unposed(source)
     (folder / "poses").mkdir()
@@ -595,7 +595,7 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
 
     A pickle contains ``ImagingSonar``, float32 ``(bins, beams)`` in 0..1, with the nearest range in row 0 and the beam
     farthest to *starboard* in column 0, and ``PoseSensor``, the matrix ``(4, 4)`` from the sonar's axes (x forward, y to
-    port, z up) to the world. In neusis the bearing of a pixel increases to port with its column. Pictures are always polar.
+    port, z up) to the world. In neusis the bearing of a pixel increases to port with its column. Pictures must be polar.
     """
     refuse_unposed(source)
     (folder / "Data").mkdir()
@@ -659,7 +659,7 @@ def export_to(
 ) -> LabelledPictures:
     """Export frames in the layout of another tool.
 
-    The folder is written completely or not at all. Only a few frames are in memory at a time.
+    The folder is written completely or not at all. Only a few frames are kept in memory at a time.
 
     Args:
         layout: a name of :data:`EXPORTS`.
@@ -671,15 +671,15 @@ def export_to(
         least: smallest number of pixels of a region.
         least_snr_db: smallest signal-to-noise ratio of a region [dB].
         polygons: whether to write outlines instead of boxes; YOLO only.
-        every_class: whether to refuse classes that no picture of the training part shows.
+        every_class: whether to raise an error if a class appears in no picture of the training part.
         progress: called with the number of frames written since the last call.
 
     Returns:
-        The object that made the pictures; for COCO and YOLO it has counted the regions.
+        The object that rendered the pictures; for COCO and YOLO with the counts of the regions.
 
     Raises:
-        MitsonarError: the layout is unknown, the folder exists, the frames lack what the layout needs, or an export to COCO
-            or YOLO has no object.
+        MitsonarError: the layout is unknown, the folder exists, the frames lack labels or poses that the layout needs, or an
+            export to COCO or YOLO contains no object.
     """
     if layout not in EXPORTS:
         raise MitsonarError(f"unknown layout {layout!r}: {nearest_names(layout, EXPORTS)}")

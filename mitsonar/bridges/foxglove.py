@@ -1,4 +1,4 @@
-"""How a live sonar is served to Foxglove: poses come in; fan, polar image, transform, pose and timing go out."""
+"""How a live sonar is served to Foxglove: it receives poses, and publishes fan, polar image, transform, pose and timing."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ TIMING = {
 
 
 class FoxgloveServer:
-    """A server that publishes pings to Foxglove clients, and puts the poses that they publish on ``/pose`` into a mailbox.
+    """WebSocket server that publishes pings to Foxglove clients, and receives the poses that they publish on ``/pose``.
 
     Args:
-        mailbox: mailbox for the poses.
+        mailbox: mailbox that the received poses are put into.
         host: address to listen on.
         port: port to listen on; 0 chooses a free one.
 
@@ -86,7 +86,10 @@ class FoxgloveServer:
         self.port = int(self._server.port)
 
     def publish(self, ping: LivePing) -> None:
-        """Publish a ping, the fan first, because TCP may delay what follows; topics without subscribers are not encoded."""
+        """Publish a ping.
+
+        Images are encoded only for subscribers. The fan is sent first, because TCP may delay later messages.
+        """
         frames, when = ping.frames, ping.time_ns
         stamp = Timestamp(sec=when // 10**9, nsec=when % 10**9)
         if self._fan.has_sinks():
@@ -111,18 +114,18 @@ class FoxgloveServer:
         self._timing.log(json.dumps(timing(ping)).encode(), log_time=when)
 
     def complain(self, sentence: str) -> None:
-        """Send all clients a warning, which Foxglove lists in its problems panel."""
+        """Send a warning to all clients; Foxglove shows it in its Problems panel."""
         self._server.publish_status(sentence, foxglove.StatusLevel.Warning)
 
     def close(self) -> None:
-        """Close all connections, and wait at most :data:`FAREWELL_S`: a client that stopped reading never disconnects."""
+        """Close all connections. Wait at most :data:`FAREWELL_S`: a client that has stopped reading never disconnects."""
         stopping = threading.Thread(target=self._server.stop, daemon=True)
         stopping.start()
         stopping.join(FAREWELL_S)
 
 
 class _Poses(ServerListener):
-    """Listener that reads poses in the server's threads; a pose that cannot be read gives a warning."""
+    """Listener that parses the clients' poses in the server's threads, and answers invalid ones with a warning."""
 
     def __init__(self, mailbox: PoseMailbox, complain: Any) -> None:
         self.mailbox, self.complain = mailbox, complain

@@ -1,6 +1,6 @@
-"""Which keys the recipe of a training has, and how it is read from YAML and validated.
+"""Training recipes: their keys, and how they are read from YAML and validated.
 
-A recipe for each row of Almanza-Medina's tables is shipped.
+A recipe is shipped for each row of Almanza-Medina's tables.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ Noise = Annotated[str, AfterValidator(_known_noise)]
 
 
 class Input(_Part):
-    """How frames become inputs of the network: arguments of :class:`~mitsonar.datasets.samples.SonarPairs`.
+    """Conversion of frames to network input: arguments of :class:`~mitsonar.datasets.samples.SonarPairs`.
 
-    For impulse responses only ``frames`` and ``leak`` apply, which are the arguments of
-    :class:`~mitsonar.datasets.responses.ImpulsePairs`.
+    For impulse responses only ``frames`` and ``leak`` apply, as arguments of
+    :class:`~mitsonar.datasets.samples.ImpulsePairs`.
     """
 
     frames: int = Field(2, ge=1, le=16, description="of a sample; 1: heights are learnt")
@@ -68,7 +68,7 @@ class Input(_Part):
         return self
 
     def words(self) -> Keys:
-        """Return the arguments for SonarPairs and RenderedPairs, or for ImpulsePairs."""
+        """Return the keyword arguments for SonarPairs and RenderedPairs, or for ImpulsePairs."""
         words = self.model_dump()
         if self.kind == "response":
             return {"frames": self.frames, "leak": self.leak}
@@ -129,12 +129,12 @@ class Optimiser(_Part):
         return self
 
     def rate_at(self, step: int, epoch_steps: int, steps: int) -> float:
-        """Return the learning rate of a step.
+        """Return the learning rate at a step.
 
-        It is a function of the step alone, so that a resumed training continues with the same rates.
+        It does not depend on earlier steps, so a resumed training continues with the same rates.
 
         Args:
-            step: number of the step, counted from 0.
+            step: index of the step, from 0.
             epoch_steps: number of steps in an epoch.
             steps: planned number of steps of the whole training.
         """
@@ -153,7 +153,7 @@ class Optimiser(_Part):
 
 
 class Validate(_Part):
-    """Measurements during training; they do not affect it."""
+    """Validation during training, on which the updates of the weights do not depend."""
 
     noise: list[Noise] = Field(default=["none", "high"], min_length=1, description="levels of noise")
     pairs: int | None = Field(500, ge=1, description="samples, always the same; null: all of the part")
@@ -162,10 +162,10 @@ class Validate(_Part):
 
 
 class TrainingRecipe(_Part):
-    """The recipe of a training; the descriptions of the fields document the keys.
+    """A training recipe; the field descriptions document its keys.
 
     Raises:
-        MitsonarError: through :func:`load_training_recipe`, a key is unknown or a value is outside its limits.
+        MitsonarError: from :func:`load_training_recipe`, if a key is unknown or a value is out of bounds.
     """
 
     about: str = Field("", description="a sentence on it")
@@ -230,26 +230,26 @@ class TrainingRecipe(_Part):
 
     @property
     def validation(self) -> Validate:
-        """Return the value of the key ``validate``, a name that pydantic reserves."""
+        """Return the value of the key ``validate``, whose name pydantic reserves."""
         return self.validate_
 
     @property
     def noises(self) -> list[str]:
-        """Return the levels of noise in training, as a list."""
+        """Return the noise levels in training as a list."""
         return [self.noise] if isinstance(self.noise, str) else list(self.noise)
 
     @property
     def noise_said(self) -> str:
-        """Return a description of the noise in training."""
+        """Return the noise levels in training as text."""
         return " or ".join(self.noises)
 
     @cached_property
     def split_of(self) -> str | Split:
-        """Return the split, as the argument of SonarPairs."""
+        """Return the split in the form that SonarPairs accepts."""
         return split_from(self.split) if isinstance(self.split, dict) else self.split
 
     def arrangement(self) -> Keys:
-        """Return the arguments for SonarPairs and RenderedPairs in training."""
+        """Return the keyword arguments for SonarPairs and RenderedPairs in training."""
         noise = self.noises
         return {
             **self.input.words(),
@@ -259,11 +259,11 @@ class TrainingRecipe(_Part):
         }
 
     def length(self, epoch_steps: int) -> int:
-        """Return the number of steps of the whole training, at least one."""
+        """Return the total number of training steps, at least one."""
         return self.steps or max(1, round((self.epochs or 0) * epoch_steps))
 
     def plain(self) -> Keys:
-        """Return all keys with plain values, as in the recipe file of a run."""
+        """Return all keys with JSON-compatible values, as in the recipe file of a run."""
         return self.model_dump(mode="json", by_alias=True)
 
     def replace(self, **fields: object) -> TrainingRecipe:
@@ -283,11 +283,11 @@ def shipped_training_recipes() -> dict[str, Path]:
 
 
 def load_training_recipe(name_or_file: str | Path, changes: Keys | None = None) -> TrainingRecipe:
-    """Load a training recipe from a YAML file, or the shipped recipe of that name.
+    """Load a training recipe from a YAML file, or a shipped recipe by its name.
 
     Args:
         name_or_file: a file, such as ``mine.yaml``, or the name of a shipped recipe.
-        changes: keys to change, with dots between the levels: ``{"optimiser.rate": 1e-3}``.
+        changes: values to change, keyed by dotted path: ``{"optimiser.rate": 1e-3}``.
 
     Raises:
         MitsonarError: there is no such recipe, the file is not YAML, a key is unknown, or a value is outside its limits.
@@ -303,7 +303,7 @@ def load_training_recipe(name_or_file: str | Path, changes: Keys | None = None) 
 
 
 def training_recipe_from(fields: Keys) -> TrainingRecipe:
-    """Create a training recipe from its keys, after validation.
+    """Create a validated training recipe from its keys.
 
     Raises:
         MitsonarError: a key is unknown, or a value is outside its limits.

@@ -40,15 +40,15 @@ class RenderedPairs(IterableDataset[Batch], Samples):
 
     Args:
         recipe: a recipe, its name, or a YAML file.
-        seed: of worlds, flights, jitter and noise.
+        seed: seed of worlds, flights, jitter and noise.
         length: number of samples per epoch over all workers; None: endless.
         sequences_a_world: number of sequences per world.
         buffer: number of samples from which the next one is drawn at random.
-        gain: of the pixels; default: that of the data set of this recipe, which is computed first.
-        arrangement: as for ``SonarPairs``: frames, views, kind, layout, coordinates, noise, labels.
+        gain: gain of the pixels; default: the gain that a data set of this recipe has, computed once at the start.
+        arrangement: options of ``SonarPairs``: frames, views, kind, layout, coordinates, noise, labels.
 
     Attributes:
-        worlds: the recipe with the seed of these worlds, flights and jitter.
+        worlds: the recipe, with the seed of the rendered worlds, flights and jitter.
 
     Raises:
         MitsonarError: the recipe or an option is unknown, or workers were forked.
@@ -74,7 +74,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         if self.frames > recipe.flight.pings:
             raise MitsonarError(f"frames must be at most flight.pings, {recipe.flight.pings}: got {self.frames}")
         own_seed = int(np.random.SeedSequence([self.seed, 9]).generate_state(1)[0] // 2)
-        self.worlds = recipe_from({**recipe.model_dump(), "seed": own_seed})  # built anew: a copy would keep cached values
+        self.worlds = recipe_from({**recipe.model_dump(), "seed": own_seed})  # rebuilt, since a copy keeps cached values
         self.length, self.sequences_a_world, self.buffer, self.gain = length, sequences_a_world, buffer, gain
 
     def __repr__(self) -> str:
@@ -89,15 +89,15 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         """Yield the raw samples of this worker; :meth:`~mitsonar.datasets.samples.Samples.finished` makes a batch of them.
 
         Args:
-            skip: number of samples to skip. They are not rendered, except those between samples that are needed.
-            share: number of this worker and number of workers; default: those of torch.
+            skip: number of samples to skip. They are not rendered, unless they lie between samples that are needed.
+            share: index of this worker and number of workers; default: those of torch.
         """
         # 1. Divide the samples of the epoch among the workers.
         known = self._ready()
         worker, workers = share or known
         self._calibrate()
         mine = None if self.length is None else self.length // workers + (worker < self.length % workers)
-        # 2. Replay the shuffled order up to ``skip``. Rendering starts at the first sample that was not skipped.
+        # 2. Replay the shuffled order up to ``skip``. Rendering starts at the first sample that is not skipped.
         order = self._order(worker, mine)
         skipped: set[int] = set()
         first = 0
@@ -106,7 +106,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             while first in skipped:
                 skipped.remove(first)
                 first += 1
-        # 3. Render in sequence, and hold samples back until the shuffled order calls for them.
+        # 3. Render in sequence, and buffer samples until their turn in the shuffled order.
         rendered = self._rendered(worker, workers, first)
         waiting: dict[int, RawSample] = {}
         for number in order:
@@ -117,7 +117,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             yield waiting.pop(number)
 
     def _order(self, worker: int, length: int | None) -> Iterator[int]:
-        """Yield the numbers of rendered samples in random order, each drawn from a buffer of ``buffer`` numbers."""
+        """Yield sample numbers in shuffled order; each is drawn from a buffer of ``buffer`` numbers."""
         rng = np.random.default_rng([self.seed, 7, self.epoch, worker])
         waiting: list[int] = []
 
@@ -138,8 +138,8 @@ class RenderedPairs(IterableDataset[Batch], Samples):
 
         Args:
             batch_size: number of samples per batch.
-            device: of inputs and labels.
-            workers: number of processes that render; with 0 this process does.
+            device: device of inputs and labels.
+            workers: number of rendering processes; 0: render in this process.
         """
         if workers:  # calibrate once here, not in each worker
             ensure_variant()
@@ -151,7 +151,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             self.gain = calibrate(self.recipe)
 
     def _ready(self) -> tuple[int, int]:
-        """Set up the renderer, and return the number of this worker and the number of workers."""
+        """Set up the renderer, and return the index of this worker and the number of workers."""
         info = get_worker_info()
         if info is None:
             ensure_variant()
@@ -214,10 +214,10 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         Args:
             values: arrays of all frames of the batch, keyed by name.
             vehicle: poses of the vehicle in the sample's sequence ``(pings, 6)`` [m, rad].
-            poses: of the sonar in all frames of the batch ``(frames, 6)`` [m, rad].
-            begin: first frame of the sequence in the batch.
-            first: first frame of the sample in the sequence.
-            number: of the first frame of the batch, which seeds its noise.
+            poses: poses of the sonar in all frames of the batch ``(frames, 6)`` [m, rad].
+            begin: index of the sequence's first frame in the batch.
+            first: index of the sample's first frame in the sequence.
+            number: number of the first frame of the batch, which seeds its noise.
         """
         here = slice(begin + first, begin + first + self.frames)
         if self.frames == 1:
@@ -241,13 +241,13 @@ class RenderedPairs(IterableDataset[Batch], Samples):
 
 
 class RawStream(IterableDataset[RawSample]):
-    """Stream of raw samples for worker processes, which only render.
+    """Stream of raw samples for worker processes, which render but do not compute inputs.
 
     Args:
         pairs: the samples to render.
-        batch_size: of the loader.
-        skip: number of batches already read. The loader continues with the next one if its number of workers is unchanged.
-        share: number of this loader and number of loaders, if several processes train together.
+        batch_size: batch size of the loader.
+        skip: number of batches already read. With the same number of workers, the loader continues with the next one.
+        share: index of this loader and number of loaders, if several processes train together.
     """
 
     def __init__(self, pairs: RenderedPairs, batch_size: int = 1, skip: int = 0, share: tuple[int, int] = (0, 1)) -> None:
@@ -262,7 +262,7 @@ class RawStream(IterableDataset[RawSample]):
         return self.pairs.raw(self.batch_size * had, (loader * workers + worker, loaders * workers))
 
 
-# ---------------- Rendering stored pairs again with a change
+# ---------------- Rendering stored samples again
 
 
 def re_rendered(
@@ -272,16 +272,16 @@ def re_rendered(
     shift: Callable[[int, NDArray[np.float64]], NDArray[np.float64]] | None = None,
     jitter: bool | None = None,
 ) -> Iterator[tuple[int, SonarFrames]]:
-    """Render samples of a data set again with other poses, such as heave between the pings, or other jitter.
+    """Render samples of a data set again, with changed poses (heave between pings, for example) or changed jitter.
 
-    The gain and the noise are those of the store.
+    Gain and noise are as in the store.
 
     Args:
-        pairs: samples of a store with images of one view. Its worlds are built again.
-        numbers: of the samples.
+        pairs: samples of a store with images of one view. Its worlds are rebuilt.
+        numbers: numbers of the samples.
         shift: function of a sample's number and its poses ``(frames, 6)`` [m, rad] that returns the poses to render. The
             frames keep the stored poses, heights and times.
-        jitter: whether rays move at random within their cells in each ping; default: as in the data set.
+        jitter: whether rays are jittered within their cells, differently in each ping; default: as in the data set.
 
     Yields:
         The number of a sample and its frames, scene by scene.

@@ -45,7 +45,7 @@ def noise_power(response: NDArray[np.complexfloating], snr_db: float) -> float:
     """Compute the variance of the complex noise per tap for a signal-to-noise ratio [dB].
 
     The signal power is the mean power over pings, receivers and taps of the responses ``(Q, M, taps)``, from the tap where
-    1 % of the energy has arrived to the tap where 99 % has. Silence before and after these does not count.
+    1 % of the energy has arrived to the tap where 99 % has arrived. Taps outside this interval are ignored.
     """
     energy = (np.abs(response.astype(np.complex128)) ** 2).mean(axis=(0, 1))
     total = np.cumsum(energy)
@@ -58,13 +58,13 @@ def noise_power(response: NDArray[np.complexfloating], snr_db: float) -> float:
 def with_noise(
     response: NDArray[np.complexfloating], numbers: ArrayLike, snr_db: float | None, seed: int
 ) -> NDArray[np.complexfloating]:
-    """Add white complex noise to the responses of one sample; the noise of a ping depends on seed and ping number.
+    """Add white complex noise to the responses of one sample. Its random numbers depend on (seed, ping number).
 
     Args:
-        response: without noise ``(Q, M, taps)``.
-        numbers: of the pings ``(Q,)``.
+        response: responses without noise ``(Q, M, taps)``.
+        numbers: ping numbers ``(Q,)``.
         snr_db: signal-to-noise ratio [dB], see :func:`noise_power`; None: no noise.
-        seed: of the noise.
+        seed: seed of the noise.
     """
     if snr_db is None:
         return response
@@ -77,19 +77,19 @@ def with_noise(
 
 @dataclass(frozen=True)
 class Packing:
-    """Conversion of the responses of a batch to the input of a network.
+    """Conversion of a batch of responses to network input.
 
     Attributes:
         receivers: names of the receivers, in order.
-        levels: signal-to-noise ratios [dB], None for no noise; if there are several, each sample draws one from seed and
-            number of its first ping.
+        levels: signal-to-noise ratios [dB], None for no noise. If there are several, one is drawn for each sample, as a
+            function of the seed and the number of its first ping.
     """
 
     receivers: tuple[str, ...]
     levels: Sequence[float | None] = (None,)
 
     def received(self, response: NDArray[np.complexfloating], numbers: ArrayLike, seed: int) -> NDArray[np.complexfloating]:
-        """Add noise to one sample ``(Q, M, taps)``, at a level that is drawn if there are several."""
+        """Add noise to one sample ``(Q, M, taps)``. If there are several levels, one is drawn."""
         level = 0
         if len(self.levels) > 1:
             level = int(np.random.default_rng([seed, WHICH_LEVEL, int(np.asarray(numbers)[0])]).integers(len(self.levels)))
@@ -99,9 +99,9 @@ class Packing:
         """Pack responses ``(batch, Q, M, taps)`` into matrices ``(batch, 1, taps, 2 M Q)``, with noise.
 
         Args:
-            response: without noise.
-            numbers: of the pings ``(batch, Q)``.
-            seed: of the noise.
+            response: responses without noise.
+            numbers: ping numbers ``(batch, Q)``.
+            seed: seed of the noise.
         """
         rows = zip(response, np.asarray(numbers), strict=True)
         return packed(np.stack([self.received(one, mine, seed) for one, mine in rows]))[:, None]
@@ -117,7 +117,7 @@ LEAKS = ("none", "one_ping", "strangers")
 
 
 def displacement_labels(kind: str, recipe: Recipe, pings: int) -> Labels:
-    """Return the labels for displacements from the first of ``pings`` pings to the last; with yaw if the recipe has yaw."""
+    """Return the labels of displacements from the first of ``pings`` pings to the last, with yaw if the recipe has it."""
     step = Labels.of(kind, recipe, 2)
     count = 3 if recipe.flight.yaw_deg > 0 else 2
     return Labels(kind, (pings - 1) * step.low[:count], (pings - 1) * step.high[:count], step.names[:count])
@@ -129,19 +129,21 @@ class ImpulseSamples:
     Args:
         url: path or URL of the store.
         part: ``train``, ``validation``, ``test``, or ``all``.
-        split: ``scene``, ``sequence``, keys, or a :class:`~mitsonar.config.data.Split`; default: the recipe's split.
-        frames: Q, the number of pings per sample; default: that of the recipe.
+        split: ``scene``, ``sequence``, keys of a recipe's split, or a :class:`~mitsonar.config.data.Split`; default: the
+            split of the recipe.
+        frames: number Q of pings per sample; default: as in the recipe.
         noise: ``none``, a signal-to-noise ratio such as ``20 dB`` (see :func:`noise_power`), or a list of them, from which
-            each sample draws one.
+            one is drawn for each sample.
         labels: ``raw`` (m, m, rad), ``quantised`` or ``normx10``.
-        seed: of the noise.
-        leak: removes the motion from the samples, to test where an estimator finds it. ``one_ping`` repeats the first
-            response; ``strangers`` takes all but the first response from a sample of another scene.
+        seed: seed of the noise.
+        leak: a test that removes the motion from the samples: whatever an estimator still learns has another source.
+            ``one_ping`` repeats the first response; ``strangers`` takes all but the first response from a sample of another
+            scene.
         one_a_sequence: whether to take only one sample from each sequence.
 
     Attributes:
-        sonar: the instrument.
-        arrange: packing and noise.
+        sonar: transmitter and receivers.
+        arrange: packing of the responses, with noise.
 
     Raises:
         MitsonarError: there is no finished data set of responses, an option is unknown, or the part has no samples.
@@ -191,7 +193,7 @@ class ImpulseSamples:
         )
 
     def frame_numbers(self, index: int) -> slice:
-        """Return the slice of the store's pings that a sample holds."""
+        """Return the slice of a sample's pings in the store."""
         return self.chosen.frame_numbers(index)
 
     def target(self, index: int) -> NDArray[np.float64]:
@@ -208,7 +210,7 @@ class ImpulseSamples:
         return np.array([self.target(index) for index in range(len(self))])
 
     def response(self, index: int) -> NDArray[np.complex64]:
-        """Read the responses of a sample ``(Q, M, taps)`` without noise, with the replacement that ``leak`` selects."""
+        """Read the responses of a sample ``(Q, M, taps)`` without noise; ``leak`` selects responses to replace."""
         mine = self.store.read("response", self.frame_numbers(index))
         if self.leak == "one_ping":
             return np.repeat(mine[:1], self.frames, axis=0)
@@ -247,5 +249,5 @@ class ImpulseSamples:
 
     @cached_property
     def _per_ping(self) -> dict[str, NDArray[np.float64]]:
-        """Read the small arrays of the whole store, which are stored as single chunks."""
+        """Read the small arrays for all pings of the store; each is stored as a single chunk."""
         return {name: self.store.read(name) for name in ("time_s", "velocity", "height_m")}

@@ -58,17 +58,17 @@ DECIDING = PACKAGES[:3]
 """Packages whose versions affect the recorded values."""
 
 Kind: TypeAlias = np.dtype[Any]
-"""Data type of an array, with any type of element."""
+"""NumPy data type of an array."""
 
 
 class DataStore:
     """One data set on disk or in object storage; use :meth:`create` or :meth:`open` to get one.
 
     Attributes:
-        place: its storage.
-        group: its Zarr group.
-        recipe: of the data set.
-        modality: of the recipe's instrument.
+        place: storage that contains the data set.
+        group: Zarr group.
+        recipe: recipe of the data set.
+        modality: modality of the recipe's instrument.
     """
 
     def __init__(self, storage: Storage, group: zarr.Group) -> None:
@@ -79,13 +79,13 @@ class DataStore:
 
     @classmethod
     def create(cls, storage: Storage, recipe: Recipe, plan: Plan, about: Fields) -> DataStore:
-        """Create an empty store and write everything that is known before rendering.
+        """Create a store, and write everything that is known before rendering.
 
-        An unfinished attempt at the same place is overwritten.
+        An unfinished store at the same location is overwritten.
 
         Args:
             storage: location of the store.
-            recipe: of the data set.
+            recipe: recipe of the data set.
             plan: all frames of the data set.
             about: further attributes, at least those in the modality's ``settled``.
         """
@@ -124,7 +124,7 @@ class DataStore:
             unfinished: whether to accept a store that is not finished.
 
         Raises:
-            MitsonarError: there is no store, or it is not a mitsonar data set, damaged, or not finished.
+            MitsonarError: there is no store, or it is not a mitsonar data set, is damaged, or is not finished.
         """
         storage = url if isinstance(url, Storage) else Storage(url)
         try:
@@ -199,11 +199,11 @@ class DataStore:
         """Return the array with the given name.
 
         Raises:
-            MitsonarError: its metadata is damaged or missing, or its type, shape or layout does not follow from the recipe.
+            MitsonarError: its metadata is damaged or missing, or its type, shape or layout does not match the recipe.
         """
         if name not in self._arrays:  # cached, because the group reads the metadata at every access
             try:
-                with zarr.config.set({"array.write_empty_chunks": True}):  # a missing file is a missing shard
+                with zarr.config.set({"array.write_empty_chunks": True}):  # so that a missing file is a missing shard
                     found = self.group[name]
                 if isinstance(found, zarr.Array):
                     refuse_codecs(found)
@@ -261,7 +261,7 @@ class DataStore:
             raise ValueError(f"{len(self):,} frames are more than the {stored:,} bytes of their poses can hold")
 
     def _check_array(self, name: str, found: zarr.Array[Any]) -> None:
-        """Check that type, shape and chunks of an array follow from the recipe.
+        """Check that type, shape and chunks of an array match the recipe.
 
         Raises:
             MitsonarError: they do not.
@@ -296,7 +296,7 @@ class DataStore:
 
     @property
     def shard_frames(self) -> int:
-        """Return the number of frames in a shard; the last shard may hold fewer."""
+        """Return the number of frames in a shard; the last shard may contain fewer."""
         return int(self.about["shard_frames"])
 
     @property
@@ -305,7 +305,7 @@ class DataStore:
         return -(-len(self) // self.shard_frames)
 
     def frames_of(self, shard: int) -> slice:
-        """Return the slice of the store's frames that a shard holds."""
+        """Return the slice of a shard's frames in the store."""
         return slice(shard * self.shard_frames, min((shard + 1) * self.shard_frames, len(self)))
 
     @cached_property
@@ -314,12 +314,12 @@ class DataStore:
         return list(self.modality.stored)
 
     def key(self, name: str, shard: int) -> str:
-        """Return the path of the file for one array and shard, relative to the store."""
+        """Return the path of the file of an array's shard, relative to the store."""
         array = self.array(name)
         return f"{name}/{array.metadata.encode_chunk_key((shard, *(0,) * (array.ndim - 1)))}"
 
     def write_shard(self, shard: int, values: dict[str, Values]) -> None:
-        """Write all arrays of a shard, keyed by name, then its seal: the sizes and digests of the files."""
+        """Write all arrays of a shard, given by name, then its seal: the sizes and digests of the files."""
         for name in self.rendered:
             self.place.remove(self.key(name, shard))  # Zarr would read a damaged shard before it overwrites it
             self.array(name)[self.frames_of(shard)] = values[name]
@@ -336,12 +336,12 @@ class DataStore:
         return np.asarray(self.read(SEAL), dtype=np.uint64)
 
     def missing(self, *, verify: bool = False) -> list[int]:
-        """Find the shards that are missing or whose files have changed.
+        """List the shards that are missing or whose files have changed.
 
         A complete shard without a seal is sealed. In a store that is open for reading only, it counts as missing.
 
         Args:
-            verify: whether to compare digests, too, which reads everything; otherwise only sizes are compared.
+            verify: whether to compare digests as well as sizes, which reads all files.
         """
         sizes, seals = self.place.sizes(), self.seals()
         lacking = []
@@ -381,7 +381,7 @@ class DataStore:
         return True
 
     def finish(self) -> None:
-        """Mark the store as finished, with every shard written."""
+        """Mark the store as finished, once every shard has been written."""
         self.group.attrs["finished"] = True
 
     def unfinish(self) -> None:
@@ -390,11 +390,14 @@ class DataStore:
             self.group.attrs["finished"] = False
 
     def other_versions(self) -> list[str]:
-        """List the packages that affect recorded values and whose installed version differs from the store's."""
+        """List the packages that affect recorded values and whose installed versions differ from the recorded ones."""
         return other_versions(self.about["versions"], (*DECIDING, *self.modality.decided_by))
 
     def unplanned(self, plan: Plan) -> list[str]:
-        """List the planned arrays that deviate from the plan by more than 1e-9; processors differ in the last bits."""
+        """List the planned arrays that deviate from the plan by more than 1e-9.
+
+        The tolerance allows for processors that differ in the last bits.
+        """
         wrong = []
         for name, values in planned_arrays(plan, self.modality).items():
             try:
@@ -407,7 +410,7 @@ class DataStore:
         return wrong
 
     def mend_known(self, plan: Plan) -> None:
-        """Rewrite the planned arrays that are damaged."""
+        """Rewrite the planned arrays that are damaged or deviate from the plan."""
         for name in self.unplanned(plan):
             self._arrays.pop(name, None)
             write_planned(self.group, name, planned_arrays(plan, self.modality)[name])
@@ -422,10 +425,10 @@ def digest(content: bytes) -> int:
 
 
 SHARD_BYTES = 32 * 2**20
-"""Approximate size of the recorded values in a shard. A worker holds this much in memory and loses it if it is killed."""
+"""Approximate size of the recorded values in a shard [bytes]. A worker keeps this much in memory, and loses it if killed."""
 
 SEAL = "seal"
-"""Name of the array that holds the sizes and digests of all files."""
+"""Name of the array with the sizes and digests of all files."""
 
 ABOUT = {
     "pose": "sonar: x, y, z [m], pitch, roll, heading [rad]",
@@ -441,7 +444,7 @@ ABOUT = {
 
 @dataclass(frozen=True)
 class ShardLayout:
-    """How frames are divided into files.
+    """Division of the frames into chunks and shards.
 
     Attributes:
         chunk: number of frames that are compressed together; one sequence if sequences are short.
@@ -453,14 +456,14 @@ class ShardLayout:
 
     @classmethod
     def of(cls, recipe: Recipe, plan: Plan) -> ShardLayout:
-        """Choose chunks that hold whole short sequences, and shards of about 32 MiB that hold one scene if possible."""
+        """Choose chunks of one sequence if sequences are short, and shards of about 32 MiB, of one scene if possible."""
         pings = recipe.flight.pings if recipe.flight.kind == "random" else 10
         chunk = pings if pings <= 10 else 10
         each = modality_of(recipe).ping_bytes
         scenes = np.bincount(plan.scene)
         wanted = max(1, min(SHARD_BYTES // each, int(scenes.max())) // chunk)
         # Shards end where scenes end if the sizes allow it, because rendering a shard of two scenes loads both. The
-        # aligned size is taken unless it is less than a third of the wanted size.
+        # aligned size is used unless it is less than a third of the wanted size.
         whole = int(np.gcd.reduce(scenes[scenes > 0])) // chunk
         aligned = max((n for n in range(1, wanted + 1) if whole % n == 0), default=1) if whole else 1
         return cls(chunk, chunk * (aligned if 3 * aligned >= wanted else wanted))
@@ -470,13 +473,13 @@ def create_arrays(group: zarr.Group, plan: Plan, modality: Modality, layout: Sha
     """Create every array of a store, and write those whose values are known before rendering.
 
     Args:
-        group: of the store.
+        group: Zarr group of the store.
         plan: all frames of the data set.
-        modality: of the recipe's instrument.
-        layout: division of the frames into files.
+        modality: modality of the recipe's instrument.
+        layout: division of the frames into chunks and shards.
     """
     for name, stored in modality.stored.items():
-        # Scalars per ping are small, so one chunk holds those of a whole shard.
+        # Scalars per ping are small, so the scalars of a whole shard form one chunk.
         _create_recorded(group, name, len(plan), stored, layout if len(stored.shape) > 0 else ShardLayout(layout.shard, 0))
     for name, axis in modality.axes.items():
         _write_known(group, name, axis.values, (axis.dim,), axis.about)
@@ -498,7 +501,7 @@ def create_arrays(group: zarr.Group, plan: Plan, modality: Modality, layout: Sha
 
 
 def planned_arrays(plan: Plan, modality: Modality) -> dict[str, Values]:
-    """Return the arrays ``(frames, ...)`` that follow from the plan, keyed by name.
+    """Return the arrays ``(frames, ...)`` that are known from the plan, keyed by name.
 
     The vehicle's poses are included if x, y, z or heading of the sonar differ from the vehicle's.
     """
@@ -516,7 +519,7 @@ def write_planned(group: zarr.Group, name: str, values: Values) -> None:
 
 
 def _create_recorded(group: zarr.Group, name: str, frames: int, stored: StoredArray, layout: ShardLayout) -> None:
-    """Create an array that rendering fills.
+    """Create an array that is filled by rendering.
 
     It consists of shards of compressed chunks with checksums, or of unsharded chunks if ``layout.shard`` is 0.
     """
@@ -537,7 +540,7 @@ def _create_recorded(group: zarr.Group, name: str, frames: int, stored: StoredAr
 
 
 def _write_known(group: zarr.Group, name: str, values: Values, dims: tuple[str, ...], about: str) -> None:
-    """Create an array whose values are known from the start, and write it as a single chunk."""
+    """Create an array whose values are known before rendering, and write it as a single chunk."""
     array = group.create_array(
         name,
         shape=values.shape,
@@ -560,17 +563,17 @@ MOST_FRAMES = 10**9
 
 
 def check_attributes(about: Fields, recipe: Recipe, modality: Modality) -> None:
-    """Check the numbers in a store's attributes against each other and against the recipe.
+    """Check that the numbers in a store's attributes agree with each other and with the recipe.
 
     The check runs before any memory is allocated for the number of frames in the attributes.
 
     Args:
         about: attributes of the Zarr group.
-        recipe: of the data set.
-        modality: of the recipe's instrument.
+        recipe: recipe of the data set.
+        modality: modality of the recipe's instrument.
 
     Raises:
-        MitsonarError, KeyError, ValueError: a number is impossible or missing.
+        MitsonarError, KeyError, ValueError: a number is missing, out of bounds or inconsistent.
     """
     sequences = whole_number(about["sequences"], "sequences", 1, recipe.sequences)
     most = MOST_FRAMES
@@ -605,7 +608,7 @@ PARTS = ("train", "validation", "test")
 
 
 def world_of(recipe: Recipe, scenes: dict[int, Scene]) -> NDArray[np.int64]:
-    """Return for each scene number the first scene with the same world; some worlds do not depend on their seed."""
+    """Return, for each scene number, the first scene with the same world; some worlds do not depend on the seed."""
     if recipe.recorded is not None:  # it is unknown whether two recordings show the same place
         return np.arange(max(scenes) + 1)
     known: dict[tuple[type[Family], str, int], int] = {}
@@ -618,13 +621,13 @@ def world_of(recipe: Recipe, scenes: dict[int, Scene]) -> NDArray[np.int64]:
 
 
 def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
-    """Mark the frames ``(frames,)`` of a part.
+    """Return the mask ``(frames,)`` of the frames in a part.
 
-    Whole sequences, or whole worlds with all their frames, are assigned to the parts at random.
+    Sequences, or worlds with all their frames, are assigned to the parts at random, as a whole.
 
     Args:
-        world: of each frame ``(frames,)``.
-        sequence: of each frame ``(frames,)``.
+        world: world number of each frame ``(frames,)``.
+        sequence: sequence number of each frame ``(frames,)``.
         split: shares of the parts, and the seed.
         part: ``train``, ``validation``, ``test`` or ``all``.
 
@@ -653,18 +656,18 @@ def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, pa
 
 
 def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
-    """Mark the samples ``(samples,)`` of a part.
+    """Return the mask ``(samples,)`` of the samples in a part.
 
     Samples are assigned to training and validation one by one, so the two parts share sequences. Samples of a sequence have
-    the same motion, and consecutive ones have a frame in common. The test part, if there is one, holds whole sequences.
+    the same motion, and consecutive ones share a frame. The test part, if there is one, consists of whole sequences.
 
     Args:
-        sequence: of each sample ``(samples,)``.
+        sequence: sequence number of each sample ``(samples,)``.
         split: shares of the parts, and the seed.
         part: ``train``, ``validation``, ``test`` or ``all``.
 
     Raises:
-        MitsonarError: in the same cases as :func:`deal`.
+        MitsonarError: as for :func:`deal`.
     """
     # 1. Without a test part, each sample is assigned as if it were a sequence.
     number = np.arange(len(sequence), dtype=np.int32)
@@ -683,7 +686,7 @@ def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArra
 
 
 def _counts(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Divide ``total`` among the parts by their shares; every part with a share gets at least one."""
+    """Divide ``total`` among the parts by their shares; every part with a positive share gets at least one."""
     counts = np.maximum(np.rint(shares * total).astype(np.int64), (shares > 0).astype(np.int64))
     largest = int(shares.argmax())
     counts[largest] = total - (counts.sum() - counts[largest])
@@ -695,17 +698,17 @@ def _shares(split: Split) -> str:
     return ", ".join(f"{name} {getattr(split, name):.0%}" for name in PARTS)
 
 
-# ---------------- Shape names behind the labels
+# ---------------- Shape names of the labels
 
 
 def names_of_scenes(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArray[np.int32]]]:
-    """Return the names of all shapes of a data set, and the mapping from each scene's ``shape_id`` to these names.
+    """Return the names of all shapes in a data set, and the mapping from each scene's ``shape_id`` to these names.
 
-    The names of a scene file are in the store; worlds that depend on a seed are built again.
+    The store contains the names of scene files. Other worlds are rebuilt.
 
     Returns:
         The names, and for each scene number an array ``(shapes + 1,)`` with the index of each ``shape_id`` among the names,
-        and -1 for -1. The mapping is empty if all scenes number their shapes as the names do. Both are empty if the names
+        and -1 for -1. The mapping is empty if ``shape_id`` is the index in every scene. Both are empty if the names
         are unknown: for recorded frames, and for scene files in stores of earlier versions.
     """
     if store.recipe.recorded is not None:
@@ -725,7 +728,7 @@ def names_of_scenes(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArra
                 built[key] = family.build(scene.seed).shape_names
             found[number] = built[key]
     names = tuple(dict.fromkeys(name for own in found.values() for name in own))
-    if len(set(map(len, found.values()))) == 1 and len(set(found.values())) == 1:  # the scenes number them so
+    if len(set(map(len, found.values()))) == 1 and len(set(found.values())) == 1:  # all scenes agree
         return next(iter(found.values())), {}
     place = {name: at for at, name in enumerate(names)}
     return names, {number: np.array([*map(place.get, own), -1], dtype=np.int32) for number, own in found.items()}

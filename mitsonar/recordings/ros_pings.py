@@ -1,4 +1,4 @@
-"""How do sonar messages become images? Geometry, coding and samples of ``ProjectedSonarImage`` and ``OculusPing``."""
+"""How ROS sonar messages become images: geometry, coding and samples of ``ProjectedSonarImage`` and ``OculusPing``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Index = NDArray[np.intp]
 Samples = NDArray[np.generic]
 
 RED, GREEN, BLUE = 0.299, 0.587, 0.114
-"""Weights of the colours in luminance (ITU-R BT.601)."""
+"""Luminance weights of the colours (ITU-R BT.601)."""
 
 CHANNELS = {
     "mono8": (1.0,),
@@ -33,22 +33,22 @@ CHANNELS = {
 """Channel weights of the supported encodings of ``sensor_msgs/Image``."""
 
 SAME_RANGE = 0.002
-"""Relative change of ranges, caused by drift of the sound speed, up to which a window counts as the same."""
+"""Relative tolerance for equal ranges; drift of the sound speed changes them slightly."""
 
 SAME_BEARING = 1e-4
-"""Change of a bearing up to which it counts as the same [rad]."""
+"""Absolute tolerance for equal bearings [rad]."""
 
 CENTIDEGREE = math.pi / 18_000
-"""Unit of the bearings of an Oculus [rad]."""
+"""Unit of the bearings in Oculus messages [rad]."""
 
 FORWARD_LEFT_UP: Array = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-"""Starboard, forward and up in the axes forward, left, up (REP 103), as columns."""
+"""Unit vectors to starboard, forward and up as columns, in the axes forward, left, up (REP 103)."""
 
 LONGEST = 1e6
 """Largest plausible component of a beam direction; drivers write unit vectors."""
 
 CLEARLY = 0.05
-"""Difference between two correlations that is required to decide on the order of samples."""
+"""Difference between two correlations above which they decide the order of the samples."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,13 @@ class PingLayout:
         bearing_rad: bearings of the beam axes ``(beams,)`` [rad], increasing, starboard positive.
         order: columns of the message in order of bearing ``(beams,)``.
         dtype: NumPy name of the sample type.
-        axes: starboard, forward and up in the axes of the message's frame, as columns ``(3, 3)``.
+        axes: unit vectors to starboard, forward and up as columns, in the axes of the message's frame ``(3, 3)``.
         frame_id: coordinate frame of the message.
-        frequency_hz: carrier [Hz]; 0 if unknown.
+        frequency_hz: carrier frequency [Hz]; 0 if unknown.
         sound_speed: sound speed [m/s]; 0 if unknown.
         elevation_rad: elevation aperture [rad]; 0 if unknown.
-        beam_width_rad: width of one beam [rad]; 0 if unknown.
-        gamma: exponent of the coding: value = amplitude^gamma.
+        beam_width_rad: beam width [rad]; 0 if unknown.
+        gamma: exponent of the amplitude coding: value = amplitude^gamma.
     """
 
     range_m: Array
@@ -87,7 +87,7 @@ class PingLayout:
         return len(self.range_m) * len(self.bearing_rad)
 
     def resembles(self, other: PingLayout) -> bool:
-        """Return whether frames of both layouts belong to the same part."""
+        """Return whether frames of both layouts belong to the same part of a recording."""
         return (
             self.range_m.shape == other.range_m.shape
             and self.bearing_rad.shape == other.bearing_rad.shape
@@ -101,8 +101,12 @@ class PingLayout:
 def layout_of(message: Message, kind: str) -> PingLayout:
     """Return the layout of a message.
 
+    Args:
+        message: decoded message.
+        kind: type of the message.
+
     Raises:
-        ValueError: if sizes or numbers are inconsistent, because the message is damaged.
+        ValueError: the message is damaged: its sizes or numbers are inconsistent.
     """
     layout = _projected(message) if kind in PROJECTED else _oculus(message)
     rising = np.all(np.diff(layout.range_m) > 0) and np.all(np.diff(layout.bearing_rad) > 0)
@@ -120,10 +124,10 @@ def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: b
         message: decoded message.
         kind: type of the message.
         layout: layout of the message, or of one that resembles it.
-        beam_major: whether the samples of a beam are contiguous; drivers write those of a range contiguously.
+        beam_major: whether the samples of each beam are contiguous, instead of those of each range, as drivers write them.
 
     Raises:
-        ValueError: if the number of samples does not match the layout, or a picture cannot be decoded.
+        ValueError: the number of samples does not match the layout, or a picture cannot be decoded.
     """
     shape = (len(layout.range_m), len(layout.bearing_rad))
     if kind in PROJECTED:
@@ -139,12 +143,12 @@ def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: b
 
 
 def is_beam_major(flat: Sequence[Samples], bins: int, beams: int) -> bool:
-    """Return whether the samples of a beam are contiguous, judged by their correlation.
+    """Return whether the samples of each beam are contiguous, judging by the correlation of the samples.
 
-    The definition of ``SonarImageData`` speaks of one beam after another. The drivers of Oculus sonars, and the simulators
-    whose files were available, write one range after another. The number of samples is the same for both. Neighbours are
-    correlated, however: they are ``beams`` samples apart if written by range, and ``bins`` samples apart if written by beam.
-    If that does not decide, for instance because there are as many bins as beams, the order of the drivers is assumed.
+    ``SonarImageData`` is defined as one beam after another. However, the drivers of Oculus sonars, and the simulators whose
+    files were available, write one range after another. The number of samples is the same, but neighbouring cells are
+    correlated: they are ``beams`` samples apart if written by range, and ``bins`` samples apart if written by beam. If the
+    correlations do not decide, for instance because there are as many bins as beams, the order of the drivers is assumed.
 
     Args:
         flat: stored samples of several frames, each ``(bins * beams,)``.
@@ -159,7 +163,7 @@ def is_beam_major(flat: Sequence[Samples], bins: int, beams: int) -> bool:
 
 
 def _correlation(values: Samples, lag: int) -> float:
-    """Return the correlation of values with those ``lag`` places later; 0 if they are constant."""
+    """Return the autocorrelation of values at a lag; 0 if they are constant."""
     known = np.nan_to_num(values.astype(np.float64), posinf=0, neginf=0)
     first, second = known[:-lag] - known[:-lag].mean(), known[lag:] - known[lag:].mean()
     power = math.sqrt(float(first @ first) * float(second @ second))
@@ -192,8 +196,8 @@ def _projected(message: Message) -> PingLayout:
 def _bearings(vectors: Array) -> tuple[Array, Array]:
     """Return the bearings of beam directions ``(beams, 3)`` [rad], and starboard, forward and up in their axes as columns.
 
-    Forward is the z axis, as the definition states, or the x axis, as in Gazebo. The y axis points to port in both: the
-    driver of the Oculus (y = -sin) and Gazebo (REP 103) write it so, and ``sonar_image_proc`` draws it so.
+    Forward is the z axis, as the message definition states, or the x axis, as in Gazebo. The y axis points to port in both
+    cases: this is what the Oculus driver (y = -sin) and Gazebo (REP 103) write, and what ``sonar_image_proc`` draws.
     """
     if not len(vectors) or not (np.abs(vectors) < LONGEST).all() or not (np.abs(vectors).max(axis=1) > 0).all():
         raise ValueError("directions of beams are none, or not finite")
@@ -205,7 +209,7 @@ def _bearings(vectors: Array) -> tuple[Array, Array]:
 
 
 def _oculus(message: Message) -> PingLayout:
-    """Return the layout of an ``OculusPing``; its frame is assumed to be forward, left, up (REP 103)."""
+    """Return the layout of an ``OculusPing``. The axes of its frame are assumed to be forward, left, up (REP 103)."""
     bearing = np.asarray(message.bearings, dtype=float) * CENTIDEGREE
     if len(bearing) != int(message.num_beams):
         raise ValueError("bearings are not as many as beams")
@@ -233,7 +237,7 @@ def picture_of(picture: Message) -> NDArray[np.uint8]:
     """Return the grey values ``(rows, columns)`` of a ``sensor_msgs/Image`` or ``CompressedImage``.
 
     Raises:
-        ValueError: if the picture cannot be decoded, or its number of samples does not match its size.
+        ValueError: the picture cannot be decoded, or the number of its samples does not match its size.
     """
     data = np.asarray(picture.data, np.uint8)
     if hasattr(picture, "format"):
@@ -242,7 +246,7 @@ def picture_of(picture: Message) -> NDArray[np.uint8]:
         try:
             with Image.open(io.BytesIO(data.tobytes())) as shown:
                 return np.asarray(shown.convert("L"))
-        except Exception as error:  # damaged pictures raise errors of many kinds
+        except Exception as error:  # damaged pictures raise many kinds of errors
             raise ValueError(f"a picture cannot be decoded: {error}") from None
     rows, columns = int(picture.height), int(picture.width)
     if picture.encoding not in CHANNELS:
@@ -257,7 +261,7 @@ def picture_of(picture: Message) -> NDArray[np.uint8]:
 
 
 def _amount(value: object) -> float:
-    """Return a value as a number if it is finite and positive, otherwise 0."""
+    """Return a value as a float if it is finite and positive, otherwise 0."""
     number = float(value)  # type: ignore[arg-type]
     return number if math.isfinite(number) and number > 0 else 0.0
 
