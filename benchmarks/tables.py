@@ -14,7 +14,7 @@ import json
 import re
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import write_whole
@@ -136,7 +136,7 @@ def require(record: Record, keys: tuple[str, ...], where: str) -> None:
         raise MitsonarError(f"{where} must have a text under {', '.join(map(repr, missing))}")
 
 
-def texts(values: object) -> bool:
+def texts(values: object) -> TypeGuard[list[str]]:
     """Whether these are texts, at least one."""
     return isinstance(values, list) and bool(values) and all(isinstance(value, str) for value in values)
 
