@@ -239,6 +239,34 @@ def test_rendering_works_without_torch() -> None:
     run_python(script, block=("torch", "cv2", "trimesh", "distributed", "dask", "tifffile"))
 
 
+OPTIONAL = ("torch", "cv2", "trimesh", "distributed", "dask", "tifffile", "lightning", "sklearn", "rosbags", "gymnasium")
+"""Packages of the extras that commands could need by accident."""
+
+
+def test_commands_need_no_more_than_their_extra(tmp_path: Path) -> None:
+    """`make demo` installs no extra: what draws and renders needs none, and odometry needs no torch."""
+    script = """
+        import sys
+        from mitsonar.cli import main
+        for words in %r:
+            sys.argv = ["mitsonar", *words]
+            try:
+                main()
+            except SystemExit as end:
+                assert end.code in (0, None), (words, end.code)
+    """
+    flown = ("--from=0,-4,2.5,35,0,0", "--to=0.02,-3.98,2.5,35,0,0", "--frames", "3", "--model", "physical")
+    run = str(tmp_path / "run")
+    plain = [
+        ["render", "objects", *flown, "--set", "beams=24", "--cartesian", "--fan", "--labels", "-o", run],
+        ["impulse", "hydrophones", "--velocity", "1,0.5", "--set", "rays=500", "-o", str(tmp_path / "heard")],
+        ["recording", "info", run],
+    ]
+    run_python(script % plain, block=OPTIONAL)
+    odometry = [["odometry", run, "--workers", "1", "-o", str(tmp_path / "path")]]
+    run_python(script % odometry, block=tuple(name for name in OPTIONAL if name not in ("cv2", "tifffile")))
+
+
 @pytest.mark.parametrize(
     ("package", "use", "extra"),
     [

@@ -384,7 +384,7 @@ def height(
 
     `mitsonar odometry --height-by` passes such heights to the estimators of motion.
     """
-    from mitsonar.estimation.height import height_estimator_from
+    from mitsonar.estimation.named import height_estimator_from
     from mitsonar.mapping.odometry_benchmark import heights_csv, heights_lines
     from mitsonar.mapping.open_source import Reading, frames_for, views_for
     from mitsonar.mapping.sources import measured

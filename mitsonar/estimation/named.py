@@ -26,6 +26,7 @@ from mitsonar.estimation.external import (
     own_class,
     own_estimator,
 )
+from mitsonar.estimation.height import DirectHeight, HeightEstimator
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.estimation.image.flow import Flow
 from mitsonar.estimation.image.phase import Ecc, Phase
@@ -47,6 +48,7 @@ __all__ = [
     "Zero",
     "create_estimator",
     "estimators_for",
+    "height_estimator_from",
     "load_checkpoint",
     "names_checkpoint",
     "options_from",
@@ -263,3 +265,27 @@ def _numbers(made: Callable[..., object]) -> dict[str, tuple[str, str]]:
     kinds = {one.name: str(one.annotation) for one in parameters}
     numbers = {name: kind for name, kind in kinds.items() if ("float" in kind or kind == "bool") and "tuple" not in kind}
     return {name.replace("_rad", "_deg") if name.endswith("_rad") else name: (name, kind) for name, kind in numbers.items()}
+
+
+# ---------------- Height estimators by name
+
+
+def height_estimator_from(text: str) -> HeightEstimator:
+    """Create a height estimator from ``direct``, a checkpoint or the folder of a training run, optionally with options.
+
+    Raises:
+        MitsonarError: a missing checkpoint, one that estimates motions, or an unknown option.
+    """
+    name, *words = text.split(":")
+    if name == "direct":
+        return DirectHeight(**options_from(name, words, DirectHeight))
+    if not names_checkpoint(name):
+        raise MitsonarError(
+            "heights are told by direct, or by the checkpoint or folder of a training: got "
+            f"{name!r}{meant(name, ['direct'])}"
+        )
+    from mitsonar.estimation.height_network import HeightNetwork  # loads torch
+
+    checkpoint = load_checkpoint(name)
+    made = partial(HeightNetwork, checkpoint)
+    return made(**options_from(name, words, made))

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
-import cv2
 import numpy as np
 from array_api_compat import array_namespace, is_array_api_obj
 from numpy.typing import NDArray
@@ -374,6 +373,8 @@ def echo_heights(frames: SonarFrames, pitch_rad: float, roll_rad: float) -> Echo
         pitch_rad: pitch of the sonar, > 0 points down.
         roll_rad: > 0 puts starboard down.
     """
+    import cv2  # of the extra odometry: rendering does without
+
     if frames.level == "contrast":
         return EchoHeights(None)  # dark contrast does not mean water without echoes
     edged = frames.sonar.vertical_pattern == "box"
@@ -467,6 +468,8 @@ def _skirt(frames: SonarFrames, pitch_rad: float, near: _Ends) -> float:
     )
     # Start from the height at which the first echo lies on the edge of the light.
     power = 4 if sonar.vertical_pattern == "two_way" else 2
+    import cv2
+
     half = math.radians(sonar.elevation_fov_deg) / 2
     edge_down = math.sin(min(pitch_rad + half, math.pi / 2))
     height = near.range_m * edge_down

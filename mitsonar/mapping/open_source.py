@@ -21,7 +21,7 @@ from mitsonar.acoustics.noise import NoiseModel, load_noise, snr_of, snr_said
 from mitsonar.datasets.responses import with_noise
 from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator
-from mitsonar.estimation.height import height_estimator_from
+from mitsonar.estimation.named import height_estimator_from
 from mitsonar.mapping.sources import FrameSource, is_recording, measured, open_frames, sequence_in
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames, ViewFrames

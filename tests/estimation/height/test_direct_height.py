@@ -18,7 +18,8 @@ from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.height import DirectHeight, FloorProfile, height_estimator_from
+from mitsonar.estimation.height import DirectHeight, FloorProfile
+from mitsonar.estimation.named import height_estimator_from
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.mapping.open_source import open_views
@@ -254,7 +255,7 @@ class TestNetworks:
     @pytest.mark.thorough
     def test_a_network_tells_the_height(self, heights: Path, tmp_path: Path, mitsonar: Command) -> None:
         from mitsonar.datasets.samples import SonarPairs
-        from mitsonar.estimation.height import HeightNetwork
+        from mitsonar.estimation.height_network import HeightNetwork
         from mitsonar.training.evaluate import predictions
 
         words = {"kind": "vector", "frames": 1, "views": ["whole", "c2"]}
