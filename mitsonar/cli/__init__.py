@@ -1,4 +1,4 @@
-"""The command line: one file a group of commands. A command imports what it needs when it is called."""
+"""The command line, one file per group of commands. A command imports its modules when it is called."""
 
 from __future__ import annotations
 

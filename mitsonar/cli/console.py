@@ -51,7 +51,7 @@ def say(text: str) -> None:
 
 
 def say_json(value: object, indent: int = 2) -> None:
-    """Print a value as JSON. Numbers that JSON has no words for, nan and the infinities, become null."""
+    """Print a value as JSON; nan and infinities become null."""
     say(json.dumps(_with_nulls(value), indent=indent, allow_nan=False))
 
 
@@ -69,15 +69,15 @@ def warn(text: str) -> None:
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM has come: a command ends as after Ctrl-C, with another code."""
+    """Raised at SIGTERM: a command ends as after Ctrl-C, with another exit code."""
 
 
 RESUMES = ("make", "reproduce")
-"""Commands that go on by themselves with what is there; others do with ``--resume``, if they can."""
+"""Commands that resume without an option; others resume with ``--resume``, if they can."""
 
 
 def goes_on(command: Callable[..., object]) -> str:
-    """Return the part of a sentence that says how a command goes on that was stopped; empty where it cannot."""
+    """Return the part of a sentence that explains how to resume a stopped command; empty if it cannot."""
     if command.__name__ in RESUMES:
         return ": what is whole on disk stays, and the same command goes on"
     if "resume" in inspect.signature(command).parameters:
@@ -86,23 +86,23 @@ def goes_on(command: Callable[..., object]) -> str:
 
 
 def say_stopped(command: Callable[..., object], stop: KeyboardInterrupt) -> int:
-    """Print that Ctrl-C or SIGTERM has stopped a command and how it goes on; return the code to exit with."""
+    """Print that Ctrl-C or SIGTERM has stopped a command and how to resume it; return the exit code."""
     _silence_asyncio()
     typer.echo(f"stopped{goes_on(command)}", err=True)
     return 128 + (signal.SIGTERM if isinstance(stop, Terminated) else signal.SIGINT)
 
 
 def _silence_asyncio() -> None:
-    """Leave out what asyncio logs of writes that Zarr has begun in its own thread, and that nobody waits for any more."""
+    """Silence asyncio, which logs writes of Zarr's thread that were abandoned."""
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
 
 
 @contextmanager
 def _signals_stop() -> Iterator[None]:
-    """Let SIGTERM raise :class:`Terminated`, and Ctrl-C KeyboardInterrupt, whatever else comes of it.
+    """Raise :class:`Terminated` at SIGTERM and KeyboardInterrupt at Ctrl-C, whatever exception reaches the caller.
 
-    Native code that calls Python turns the exception of a signal into one of its own, and an import that it breaks off may
-    fail in any way. A second SIGTERM ends the process at once, and so does one in a child that was forked.
+    Native code that calls Python replaces the exception of a signal by its own, and an interrupted import may fail with
+    any exception. A second SIGTERM ends the process at once, and so does one in a child that was forked.
     """
     usual: dict[int, object] = {signal.SIGTERM: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
     ours = [number for number, handler in usual.items() if signal.getsignal(number) is handler]
@@ -152,7 +152,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "import_scene": {"reflectivity": "--reflectivity", "seabed_z": "--seabed-z"},
     "reproduce": {"minutes": "--minutes"},
 }
-"""By command: the option for an argument that a message names (:func:`mitsonar.errors.argument`)."""
+"""Option of an argument that a message names (:func:`mitsonar.errors.argument`), keyed by command."""
 
 
 def command_line(*words: object) -> str:
@@ -249,7 +249,7 @@ def changes_of(pairs: list[str], seed: int | None) -> dict[str, object]:
 def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
     """Show progress on standard error: a bar with rate and time left, or without a terminal a line every ten seconds.
 
-    Yields the function to call with how many more are done.
+    Yields a function that takes the number of newly finished items.
     """
     if not sys.stderr.isatty():
         yield _Log(what, total, unit)
@@ -291,7 +291,7 @@ class _Log:
 
 
 class LaterBar:
-    """A progress bar that begins once its length is known."""
+    """A progress bar that starts once its length is known."""
 
     def __init__(self, what: str, unit: str) -> None:
         self.what, self.unit = what, unit
@@ -299,7 +299,7 @@ class LaterBar:
         self.call: Callable[[int], object] = lambda done: None
 
     def begin(self, total: int, done: int) -> None:
-        """Show the bar, with the parts that are done already."""
+        """Show the bar, with the parts already done."""
         self.inner = progress_bar(self.what, total, self.unit)
         self.call = self.inner.__enter__()
         if done:
@@ -323,7 +323,7 @@ class LaterBar:
 
 
 class Helpful(Protocol):
-    """What a Click command has, in Click itself and in Typer's copy of it."""
+    """Attributes of a Click command, in Click itself and in Typer's copy of it."""
 
     help: str | None
 

@@ -1,4 +1,4 @@
-"""``mitsonar dataset``: make, show and check labelled data sets."""
+"""Commands ``mitsonar dataset`` and ``mitsonar world``: make labelled data sets and random worlds."""
 
 from __future__ import annotations
 
@@ -74,14 +74,14 @@ def make(
         str, typer.Option("-o", "--out", help="Folder or URL (s3://...) of the data set; a stopped one is resumed.")
     ],
     sequences: Annotated[int | None, typer.Option(help="Number of sequences (default: the recipe's).")] = None,
-    scale: Annotated[float | None, typer.Option(help="Part of the recipe's sequences to make, 0..1.")] = None,
+    scale: Annotated[float | None, typer.Option(help="Fraction of the recipe's sequences to make, 0..1.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of worlds, flights and jitter (default: the recipe's).")] = None,
     workers: Annotated[int | None, typer.Option(help="Processes on this machine (default: its cores).")] = None,
-    scheduler: Annotated[str | None, typer.Option(help="Address of a running dask scheduler, whose workers render.")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a running dask scheduler; its workers render.")] = None,
     change: Annotated[
         list[str] | None, typer.Option("--set", help="Change a key of the recipe, KEY=VALUE: sonar.range_bins=256.")
     ] = None,
-    verify: Annotated[bool, typer.Option("--verify", help="Read all stored shards and make damaged ones anew.")] = False,
+    verify: Annotated[bool, typer.Option("--verify", help="Read all stored shards and remake damaged ones.")] = False,
 ) -> None:
     """Make a data set. After a stop at any moment the same command resumes and ends with the same bytes."""
     from mitsonar.config.data import load_recipe
@@ -128,7 +128,7 @@ def _made(recipe: Recipe, out: str, **words: object) -> Made:
 def detector(
     scene: Annotated[
         str,
-        typer.Argument(metavar="SCENE|RECIPE", help="Mitsuba XML file, shipped scene, or recipe whose worlds are taken."),
+        typer.Argument(metavar="SCENE|RECIPE", help="Mitsuba XML file, shipped scene, or recipe of worlds."),
     ],
     out: Out,
     frames: Annotated[int, typer.Option(min=1, help="Number of pictures.")] = 300,
@@ -141,7 +141,7 @@ def detector(
         str | None, typer.Option(help="Least and largest pitch, > 0 down, LOW,HIGH [deg] (default: 10,30).")
     ] = None,
     noise_db: Annotated[
-        str, typer.Option("--noise-db", help="What is added to the sonar's noise, in turn [dB]: 0,6,12.")
+        str, typer.Option("--noise-db", help="Raise the sonar's noise by these levels in turn [dB]: 0,6,12.")
     ] = "",
     classes: Classes = "",
     picture: Picture = "polar",
@@ -155,7 +155,7 @@ def detector(
         list[str] | None, typer.Option("--set", help="Change a key of the recipe, KEY=VALUE: sonar.quality=draft.")
     ] = None,
 ) -> None:
-    """Render random views of a scene, with boxes, in parts for training, validation and test. The same command resumes."""
+    """Render random views of a scene with boxes, split into training, validation and test. The same command resumes."""
     from mitsonar.bridges.export_formats import DetectorViews, detector_recipe
 
     if to not in ("coco", "yolo"):
@@ -189,7 +189,7 @@ def info(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     recipe: Annotated[bool, typer.Option("--recipe", help="Print the recipe as YAML.")] = False,
 ) -> None:
-    """Print what a data set holds: frames, arrays, levels against noise, versions."""
+    """Print the contents of a data set: frames, arrays, levels relative to noise, versions."""
     import yaml
 
     from mitsonar.datasets.store import DataStore
@@ -230,10 +230,10 @@ def show(
     ] = None,
     samples: Annotated[int, typer.Option(min=1, max=16, help="Number of samples to draw.")] = 4,
     view: Annotated[str | None, typer.Option(help="Name of the view (default: the first).")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the choice of samples.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the selection of samples.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
 ) -> None:
-    """Draw a sheet of sample pairs with labels, the distribution of the labels, and the mean image."""
+    """Draw sample pairs with labels, the distribution of the labels, and the mean image."""
     import io
 
     from mitsonar.datasets.store import DataStore
@@ -254,7 +254,7 @@ def show(
 
 @answered
 def check(data: Data) -> None:
-    """Verify checksums, counts, ranges, and that labels agree with poses. All data are read and none changed."""
+    """Verify checksums, counts, ranges, and the agreement of labels with poses. Reads all data and changes none."""
     from mitsonar.datasets.make import check as find_faults
     from mitsonar.datasets.store import DataStore
 
@@ -273,9 +273,9 @@ def check(data: Data) -> None:
 
 @answered
 def recipes(
-    name: Annotated[str | None, typer.Argument(help="Print the YAML of this recipe, to start your own from.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Print the YAML of this recipe, as a start for your own.")] = None,
 ) -> None:
-    """Print the shipped recipes, or one of them."""
+    """List the shipped recipes, or print one of them."""
     from mitsonar.config.data import load_recipe, shipped_recipes
 
     if name is not None:
@@ -302,7 +302,7 @@ def export(
     polygons: Polygons = False,
     view: Annotated[str | None, typer.Option(help="Name of the view (default: the first).")] = None,
 ) -> None:
-    """Write a data set in the layout of another tool, whole or absent."""
+    """Export a data set in the layout of another tool."""
     from mitsonar.mapping.sources import is_data_set
 
     if not is_data_set(data):
@@ -315,7 +315,9 @@ def export(
 def from_frames(
     files: Annotated[
         list[str],
-        typer.Argument(metavar="RUN|FILE...", help="Folders of runs, frames.npz, frames.zarr or recordings, of one sonar."),
+        typer.Argument(
+            metavar="RUN|FILE...", help="Folders of runs, frames.npz, frames.zarr or recordings, all of one sonar."
+        ),
     ],
     out: Annotated[str, typer.Option("-o", "--out", help="Folder of the data set, whole or absent.")],
     poses: Annotated[
@@ -328,11 +330,12 @@ def from_frames(
     frame: Frame = "mitsonar",
     height: Annotated[float | None, typer.Option(help="Height over the ground [m], for frames that lack it.")] = None,
     cut: Annotated[
-        int | None, typer.Option(min=2, help="Cut each file into sequences of so many frames, so that one can be split.")
+        int | None,
+        typer.Option(min=2, help="Cut each file into sequences of this many frames, so that a single file can be split."),
     ] = None,
     geometry: Geometry = None,
 ) -> None:
-    """Make a data set of frames with known poses, of runs and of recordings: to compare, to evaluate, to train on."""
+    """Make a data set from runs and recordings with known poses."""
     from mitsonar.bridges.export_source import frames_with_poses, write_recorded
 
     paths: list[Path | None] = list(poses) if poses else [None]
@@ -369,7 +372,7 @@ WorldOut = Annotated[Path, typer.Option("-o", "--out", help="Folder to make, wit
 
 
 def worlds() -> typer.Typer:
-    """Create the group of commands: one for each family, with an option for each of its fields."""
+    """Create the group of commands: one per family, with an option per field."""
     return typer.Typer(help="Make a world: a Mitsuba scene and its meshes.", no_args_is_help=True, cls=_Families)
 
 
@@ -464,7 +467,7 @@ def _pair(value: FieldValue, field: FieldInfo, key: str) -> FieldValue | tuple[f
 def mesh(
     file: Annotated[Path, typer.Argument(help="Model: glb, gltf, obj, stl, dae or ply.")],
     out: WorldOut,
-    scale: Annotated[float, typer.Option(help="Length of a unit of the file [m]: 0.001 for millimetres.")] = 1.0,
+    scale: Annotated[float, typer.Option(help="Length of the file's unit [m]: 0.001 for millimetres.")] = 1.0,
     up: Annotated[str | None, typer.Option(help="Axis that points up: x, y or z (default: y for glTF, else z).")] = None,
     reflectivity: Annotated[
         str, typer.Option(help="Reflectivity from the texture: red or luminance; or a number 0..1.")
@@ -474,7 +477,7 @@ def mesh(
         float | None, typer.Option(help="Edge of that seabed [m] (default: 3 times the diagonal of the model).")
     ] = None,
 ) -> None:
-    """Make a scene from your own model, with or without textures: on a seabed, with a sonar that looks at it."""
+    """Make a scene from your own model, with a seabed and a sonar facing it."""
     from mitsonar.worlds.meshes import mesh_world
 
     world = mesh_world(file, scale=scale, up=up, reflectivity=reflectivity, floor=floor, floor_m=floor_m)
@@ -491,26 +494,27 @@ def import_scene(
     file: Annotated[Path, typer.Argument(help="Scene: urdf, sdf, world, usd, usda, usdc or usdz.")],
     out: WorldOut,
     joint: Annotated[
-        list[str] | None, typer.Option("--joint", help="NAME=VALUE of a joint [rad, m]; others are at 0 (URDF, SDF).")
+        list[str] | None, typer.Option("--joint", help="Set a joint, NAME=VALUE [rad, m]; others are at 0 (URDF, SDF).")
     ] = None,
     search: Annotated[
         list[Path] | None,
-        typer.Option("--search", help="Folder that holds models and packages; files elsewhere are refused."),
+        typer.Option("--search", help="Folder with models and packages; files elsewhere are refused."),
     ] = None,
-    collision: Annotated[bool, typer.Option("--collision", help="Collision shapes in place of visual ones.")] = False,
+    collision: Annotated[bool, typer.Option("--collision", help="Read collision shapes instead of visual ones.")] = False,
     reflectivity: Annotated[
         str, typer.Option(help="Reflectivity from diffuse colours: luminance or red; or a number 0..1.")
     ] = "luminance",
     material: Annotated[
-        list[str] | None, typer.Option("--material", help="NAME=MATERIAL of a link, model or prim: hull=steel.")
+        list[str] | None,
+        typer.Option("--material", help="Set the material of a link, model or prim, NAME=MATERIAL: hull=steel."),
     ] = None,
     own_axes: Annotated[
         list[str] | None,
-        typer.Option("--own-axes", help="A link, model or prim to write about the origin: it follows --moving NAME=FILE."),
+        typer.Option("--own-axes", help="Centre a link, model or prim on the origin, to follow --moving NAME=FILE."),
     ] = None,
     seabed_z: Annotated[float | None, typer.Option(help="Add a seabed of random cells at this height [m].")] = None,
 ) -> None:
-    """Make a scene from one of another simulator: Gazebo (SDF), ROS (URDF), Isaac Sim (USD). Coordinates stay."""
+    """Import a scene of another simulator: Gazebo (SDF), ROS (URDF), Isaac Sim (USD). Coordinates stay."""
     from mitsonar.bridges.model_import import imported_world
 
     world = imported_world(
@@ -528,7 +532,7 @@ def import_scene(
 
 
 def _pairs(pairs: list[str], option: str, form: str) -> dict[str, str]:
-    """Return what an option that is given several times says, by name; a name may hold ``=``, a value may not."""
+    """Parse the pairs of a repeated option, keyed by name. A name may contain ``=``, a value may not."""
     for pair in pairs:
         if not all(pair.rpartition("=")):
             raise MitsonarError(f"{option} takes {form}: got {pair!r}")
@@ -541,7 +545,7 @@ def _pairs(pairs: list[str], option: str, form: str) -> dict[str, str]:
 
 
 def _joint_values(pairs: list[str]) -> dict[str, float]:
-    """Return the values of joints that --joint says."""
+    """Parse the values of --joint, keyed by joint."""
     given = _pairs(pairs, "--joint", "NAME=VALUE")
     try:
         return {name: float(value) for name, value in given.items()}

@@ -1,4 +1,4 @@
-"""``mitsonar doctor``: check the installation and its results."""
+"""Commands ``mitsonar doctor``, ``presets`` and ``scenes``: check the installation, list what can be named."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PACKAGES = ("mitsonar", "mitsuba", "drjit", "numpy", "scipy", "OpenEXR", "trimes
 
 @answered
 def doctor() -> None:
-    """Check variant, libraries and versions, render a small scene against its closed form, and time it."""
+    """Check variant, libraries and versions, compare small scenes with closed forms, and measure the speed."""
     from mitsonar.simulation.device import backend
 
     say(f"python {platform.python_version()}, {platform.system()} {platform.machine()}")
@@ -109,9 +109,9 @@ def _version(package: str) -> str:
 
 @answered
 def presets(
-    name: Annotated[str | None, typer.Argument(help="One preset: every number with its source.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Print every number of this preset with its source.")] = None,
 ) -> None:
-    """Print the sonars and instruments that can be named, or one of them with the document behind each number."""
+    """List the presets of sonars and instruments, or print one with the source of each number."""
     from mitsonar.instruments.sounder import named_sonars, preset
 
     if name is not None:
@@ -203,7 +203,7 @@ def _accuracy(names: list[str]) -> list[str]:
 
 @answered
 def scenes() -> None:
-    """Print the scenes that are shipped; each has a trajectory (`--trajectory shipped`)."""
+    """List the shipped scenes; each has a trajectory (`--trajectory shipped`)."""
     from mitsonar.simulation.scene import shipped_scenes
 
     for name, path in shipped_scenes().items():

@@ -1,4 +1,4 @@
-"""``mitsonar odometry``: estimate the path of the sonar from its frames or impulse responses."""
+"""Commands ``mitsonar odometry``, ``mosaic``, ``height``, ``crlb``, ``compare`` and ``benchmark``: estimate motion."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ __all__ = ["Frames", "Geometry", "benchmarks", "compare", "crlb", "height", "mos
 Frames = Annotated[
     str,
     typer.Argument(
-        metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, a run's folder, a data set or a recording."
+        metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, the folder of a run, a data set or a recording."
     ),
 ]
 Geometry = Annotated[
-    Path | None, typer.Option(help="YAML file that tells how the pictures of a recording are laid out.", dir_okay=False)
+    Path | None, typer.Option(help="YAML file with the layout of the pictures of a recording.", dir_okay=False)
 ]
 PAIRS_A_WORKER = 50
 """Smallest number of pairs that is worth a process."""
@@ -66,47 +66,45 @@ def odometry(
     ] = None,
     smooth: Annotated[str, typer.Option(help="none, spline or kalman. Invalid motions are bridged in any case.")] = "none",
     scale: Annotated[str | None, typer.Option(help="Factors of sideways,forward,yaw, or `fit` to the true path.")] = None,
-    every: Annotated[int, typer.Option(help="Step between the frames that are used.")] = 1,
+    every: Annotated[int, typer.Option(help="Use every N-th frame.")] = 1,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX} (default: the true one, or 0).")] = None,
     frame: Frame = "mitsonar",
     height: Annotated[float | None, typer.Option(help="Height over the ground [m], for frames that lack it.")] = None,
     height_by: Annotated[
         str | None,
-        typer.Option(help="Estimator of the height of each frame: direct, or a checkpoint that was trained on heights."),
+        typer.Option(help="Estimator of the height of each frame: direct, or a checkpoint trained on heights."),
     ] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
     contrast: Annotated[
         str | None,
         typer.Option(
-            help="What is matched: levels, local (contrast) or moving (local, less the mean of the run). Default: local for "
-            "recordings that tell no height, levels for all others."
+            help="What to match: levels, local (contrast) or moving (local, less the mean of the run). Default: local for "
+            "recordings without heights, levels for all others."
         ),
     ] = None,
     closure: Annotated[
         int | None,
         typer.Option(
-            help="Motions over which loops are closed; covariances are raised to what they leave over. 0: none. Default: 8 "
-            "with contrast, half the motions where there are fewer than 16, else 0."
+            help="Number of motions per closed loop; covariances grow to explain its residual. 0: none. Default: 8 with "
+            "contrast (half the motions if fewer than 16), else 0."
         ),
     ] = None,
     sensors: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file of gyroscope, DVL, depth, compass or dead reckoning, columns by name with unit and noise, also "
-            "beside the poses of a trajectory; or a ROS bag. They join with the frames in a pose graph.",
+            help="CSV file of gyroscope, DVL, depth, compass or dead reckoning, with named columns of values and noise, "
+            "also beside the poses of a trajectory; or a ROS bag. A pose graph adds them to the frames.",
         ),
     ] = None,
     local_map: Annotated[
         bool,
         typer.Option(
             "--map",
-            help="Register frames to a map of the last metres, not to the last frame alone: over rocks paths drift a "
-            "seventh as far or less, without noise.",
+            help="Register frames to a map of the last metres instead of the last frame: over rocks without noise, drift "
+            "falls to a seventh or less.",
         ),
     ] = False,
-    loops: Annotated[
-        bool, typer.Option("--loops", help="Search for places that are seen again, and close the path there.")
-    ] = False,
+    loops: Annotated[bool, typer.Option("--loops", help="Detect revisited places and close the path there.")] = False,
     sequence: Annotated[
         int | None, typer.Option(help="Sequence of a data set, or part of a recording (default: the longest).")
     ] = None,
@@ -217,7 +215,7 @@ def mosaic(
     flatten: Annotated[
         bool, typer.Option("--flatten/--no-flatten", help="Compensate the illumination of the ground.")
     ] = True,
-    true: Annotated[Path | None, typer.Option(help="TUM or CSV file of the true path, which is drawn too.")] = None,
+    true: Annotated[Path | None, typer.Option(help="TUM or CSV file of the true path, to draw as well.")] = None,
     frame: Frame = "mitsonar",
     height: Annotated[float | None, typer.Option(help="Height over the ground [m], for frames that lack it.")] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
@@ -369,7 +367,7 @@ AT_ONCE = 8
 @answered
 def height(
     frames: Frames,
-    by: Annotated[str, typer.Option(help="Estimator: direct, or a checkpoint that was trained on heights.")] = "direct",
+    by: Annotated[str, typer.Option(help="Estimator: direct, or a checkpoint trained on heights.")] = "direct",
     out: Annotated[Path | None, typer.Option("-o", "--out", help="CSV file to write, one line a frame.")] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
@@ -382,7 +380,7 @@ def height(
 ) -> None:
     """Estimate the height over the ground from first return and fall-off, or by a network, and compare it with the truth.
 
-    `mitsonar odometry --height-by` passes such heights to the estimators of motion.
+    `mitsonar odometry --height-by` passes these heights to the estimators of motion.
     """
     from mitsonar.estimation.named import height_estimator_from
     from mitsonar.mapping.odometry_benchmark import heights_csv, heights_lines
@@ -454,7 +452,7 @@ def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | Non
 
 
 class _PosesAsked(TypedDict):
-    """Options that define the poses in a scene."""
+    """Options that define poses in a scene."""
 
     start: str | None
     end: str | None
@@ -468,9 +466,7 @@ def crlb(
     source: Annotated[
         str, typer.Argument(metavar="SCENE|DATA.zarr", help="Mitsuba XML file, a shipped scene's name, or a data set.")
     ],
-    noise: Annotated[
-        str | None, typer.Option(help=f"{NOISE} (default: high; the model coherent has noise of its own).")
-    ] = None,
+    noise: Annotated[str | None, typer.Option(help=f"{NOISE} (default: high; the model coherent adds its own).")] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"Pose: {SIX}.")] = None,
     end: Annotated[
         str | None, typer.Option("--to", help="Last pose. The --poses are evenly spaced from --from to this one.")
@@ -509,7 +505,7 @@ def crlb(
     One frame: scene and first pose are known. Two frames: both are noisy, and the relief is known. Distributions: `pixel`,
     the exact one of clipped, rounded pixels; `gaussian`, with the same mean and variance; `rays`, with the noise of the
     rays of a ping. In the model coherent: `grain`, scatterers known, in the receiver's noise; `ground`, expected level
-    known, with speckle of its own in each frame.
+    known, with independent speckle in each frame.
 
     With --vary the gain is computed for each value. If height, pitch or a field of view varies, both ends of the range
     window follow the nearest and farthest range of the floor. The number of bins stays.
@@ -644,9 +640,7 @@ def compare(
         bool, typer.Option("--prior", help="Add rows with a prior on the size of motions, as networks have.")
     ] = False,
     limit: Annotated[int, typer.Option(min=0, help="Number of pairs for the Cramer-Rao bound (images only); 0: none.")] = 10,
-    reference: Annotated[
-        str | None, typer.Option(help="Estimator that others are compared with (default: the last).")
-    ] = None,
+    reference: Annotated[str | None, typer.Option(help="Estimator to compare others with (default: the last).")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise, choice of pairs and bootstrap.")] = 0,
     out: Annotated[
         Path | None,
@@ -689,7 +683,7 @@ def compare(
 
 def benchmarks() -> typer.Typer:
     """Create the group of commands."""
-    app = typer.Typer(help="Compare methods on sets that everybody can make.", no_args_is_help=True)
+    app = typer.Typer(help="Compare methods on reproducible sets.", no_args_is_help=True)
     app.command("odometry")(answered(odometry_benchmark, {"frames": "--frames"}))
     return app
 
@@ -726,14 +720,15 @@ def odometry_benchmark(
     bound: Annotated[int, typer.Option(min=0, help="Poses of the Cramer-Rao bound of simulated sets; 0: none.")] = 3,
     workers: Annotated[int, typer.Option(min=1, help="Number of processes that estimate.")] = 1,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Add rows to a folder that is there; an interrupted row goes on.")
+        bool, typer.Option("--resume", help="Add rows to an existing folder; an interrupted row resumes.")
     ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a benchmark that is there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing benchmark.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Compare methods of odometry: drift, errors of motions over their bound, failures and time, a row each.
+    """Compare methods of odometry: drift, errors of motions relative to the bound, failures and time, a row each.
 
-    Simulated sets are rendered once into OUT and kept. Each row is written when it is made. The table holds all rows of OUT.
+    Simulated sets are rendered once into OUT and stay there. Each row is written when it is complete. The table holds all
+    rows of OUT.
     """
     from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_lines, benchmark_odometry
 

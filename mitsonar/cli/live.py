@@ -1,4 +1,4 @@
-"""``mitsonar serve``: poses in, sonar out, ping by ping."""
+"""Commands ``mitsonar serve`` and ``mitsonar view``: serve a live sonar, and show frames in Rerun."""
 
 from __future__ import annotations
 
@@ -31,20 +31,24 @@ def serve(
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
     model: Annotated[str | None, typer.Option(help="physical, thesis or coherent.")] = None,
     quality: Annotated[str | None, typer.Option(help="draft, standard or fine (`mitsonar presets`).")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the sonar: range_max=8.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a key of the sonar, KEY=VALUE: range_max=8.")
+    ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the Foxglove WebSocket; 0: a free one.")] = 8765,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0: all of this machine.")] = "127.0.0.1",
-    rate: Annotated[float | None, typer.Option(help="Pings a second of the path (default: the sonar's) [Hz].")] = None,
+    rate: Annotated[float | None, typer.Option(help="Pings per second along the path [Hz] (default: the sonar's).")] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
     trajectory: Annotated[
-        Path | None, typer.Option(help="Path that is played while no pose comes: a TUM or CSV file, or `shipped`.")
+        Path | None, typer.Option(help="Path to play while no pose arrives: a TUM or CSV file, or `shipped`.")
     ] = None,
     frame: Frame = "mitsonar",
     noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
-    pings: Annotated[int | None, typer.Option(min=1, help="End after so many pings (default: never).")] = None,
-    ros: Annotated[bool, typer.Option("--ros", help="A ROS 2 node in place of the Foxglove server; needs rclpy.")] = False,
+    pings: Annotated[int | None, typer.Option(min=1, help="End after this many pings (default: never).")] = None,
+    ros: Annotated[
+        bool, typer.Option("--ros", help="Start a ROS 2 node instead of the Foxglove server; needs rclpy.")
+    ] = False,
 ) -> None:
     """Serve a live sonar: clients publish poses on /pose and get fan, polar image, transform and timing. Ctrl-C ends it."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
@@ -93,7 +97,7 @@ def _set_by_signals() -> Iterator[Event]:
 
 
 def _foxglove(mailbox: PoseMailbox, host: str, port: int) -> LivePublisher:
-    """Start the server and say where it is."""
+    """Start the server and print its address."""
     from mitsonar.bridges.foxglove import FoxgloveServer
 
     server = FoxgloveServer(mailbox, host, port)
@@ -102,7 +106,7 @@ def _foxglove(mailbox: PoseMailbox, host: str, port: int) -> LivePublisher:
 
 
 def _ros_node(mailbox: PoseMailbox) -> LivePublisher:
-    """Start the node and say its topics."""
+    """Start the node and print its topics."""
     from mitsonar.bridges.ros_node import RosNode
 
     node = RosNode(mailbox)
@@ -121,23 +125,25 @@ def view(
             metavar="RUN|FILE|DATA.zarr|SCENE", help="A run, frames, a recording, a data set, or a scene (XML or name)."
         ),
     ],
-    save: Annotated[Path | None, typer.Option("--save", help="Write a recording (.rrd) and open no viewer.")] = None,
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write a recording (.rrd) instead of opening the viewer.")
+    ] = None,
     html: Annotated[
-        Path | None, typer.Option("--html", help="Make a folder: a page with the viewer, for any web server.")
+        Path | None, typer.Option("--html", help="Make a folder with a page and the viewer, for any web server.")
     ] = None,
     path: Annotated[
-        Path | None, typer.Option("--path", help="Estimated path too: the folder of an odometry, a TUM or CSV file.")
+        Path | None, typer.Option("--path", help="Estimated path to add: the folder of an odometry, a TUM or CSV file.")
     ] = None,
     frame: Frame = "mitsonar",
     scene: Annotated[
-        str | None, typer.Option(help="Scene to draw: XML or name (default: that of the run; `none`: no scene).")
+        str | None, typer.Option(help="Scene to draw: XML file or name (default: the run's; `none`: no scene).")
     ] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
     view_: Annotated[str | None, typer.Option("--view", help="View of a data set (default: the first).")] = None,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file or page.")] = False,
 ) -> None:
-    """Show fan, polar image and levels of each frame; scene, wedge of the beams, true and estimated path."""
+    """Show fan, polar image and levels of each frame, with scene, beams, true and estimated path."""
     from mitsonar.bridges.rerun import write_recording
     from mitsonar.bridges.viewer_page import RECORDING, VIEWER, write_page
     from mitsonar.io.runs import refuse_to_replace
@@ -176,7 +182,7 @@ def _shown(
     sequence: int | None,
     view_: str | None,
 ) -> Shown:
-    """Return what to show: frames with the scene they were made of, or a scene with its sonar and its shipped path."""
+    """Return the content to show: frames with their scene, or a scene with its sonar and its shipped path."""
     from mitsonar.bridges.rerun import Shown
     from mitsonar.mapping.sources import is_data_set, is_recording, open_frames
 
@@ -194,7 +200,7 @@ def _shown(
 
 
 def _loaded(scene: str, parameters: dict[str, str]) -> tuple[Any, Any, Any]:
-    """Load a scene: its triangles, its sonar, and the path that lies beside it or the pose of the sonar."""
+    """Load a scene: its triangles, its sonar, and the path beside its file or the pose of the sonar."""
     import numpy as np
 
     from mitsonar.motion.trajectory import Trajectory
@@ -210,7 +216,7 @@ def _loaded(scene: str, parameters: dict[str, str]) -> tuple[Any, Any, Any]:
 
 
 def _scene_of(run: Path) -> tuple[str | None, dict[str, str]]:
-    """Return the scene that a run was made of, where it says it and it is there, and its parameters."""
+    """Return the scene of a run and its parameters, if run.json names the scene and the file exists."""
     from mitsonar.io.files import read_json
     from mitsonar.simulation.scene import find_scene
 
@@ -231,7 +237,7 @@ def _scene_of(run: Path) -> tuple[str | None, dict[str, str]]:
 
 
 def _paths(path: Path | None, frame: str) -> dict[str, Trajectory]:
-    """Load an estimated path; of an odometry's folder the true one as well."""
+    """Load an estimated path; from the folder of an odometry also the true one."""
     from mitsonar.mapping.odometry_run import OdometryFolder
     from mitsonar.motion.trajectory import Trajectory
 

@@ -1,4 +1,4 @@
-"""The path that the options ``--from``, ``--to``, ``--frames``, ``--speed`` and ``--trajectory`` say."""
+"""The path that the options ``--from``, ``--to``, ``--frames``, ``--speed`` and ``--trajectory`` define."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ __all__ = ["FRAMES", "SIX", "SPEED", "Frame", "path_for", "poses_line", "under_v
 
 SIX = "x,y,z,pitch,roll,heading in m and deg"
 FRAMES = (
-    "Number of frames: with --trajectory evenly spaced in time over all of it; of a head that turns (ping360) of sweeps, "
-    "the first ones; of --vehicle of poses."
+    "Number of frames, with --trajectory evenly spaced in time. For a rotating head (ping360) the number of sweeps from the "
+    "start, with --vehicle the number of poses."
 )
 SPEED = "Speed from --from to --to [m/s] (default: a frame every 1 / frame_rate_hz)."
 FAST_M_S = 5.0
-"""Speed above which the vehicle's is told [m/s]: few underwater vehicles reach it."""
+"""Speed above which a warning reports the vehicle's [m/s]: few underwater vehicles reach it."""
 
 TILTED_DEG = 10.0
-"""Pitch or roll of a vehicle above which an instrument that looks down from it is warned of [deg]."""
+"""Pitch or roll of a vehicle above which an instrument that looks down causes a warning [deg]."""
 
 Frame = Annotated[
     str,
-    typer.Option(help="Convention of pose files, read and written: mitsonar, ros-enu or ned (not of --from)."),
+    typer.Option(help="Convention of pose files to read and write: mitsonar, ros-enu or ned; --from is always mitsonar."),
 ]
 
 
@@ -52,7 +52,7 @@ def path_for(
     frame: str,
     speed: float | None = None,
 ) -> Trajectory:
-    """Return the poses that the options say."""
+    """Return the poses that the options define."""
     from mitsonar.instruments.sonar import first_sweeps, frame_period_s, scans
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
@@ -96,8 +96,8 @@ def path_for(
 def under_vehicle(path: Trajectory, sounder: Sounder, file: Path | None) -> Trajectory:
     """Return the path of the vehicle that carries an instrument, for a path that may be that of a forward-looking sonar.
 
-    The trajectories of shipped scenes are those of a sonar that looks ahead and down: an instrument that looks down or aside
-    rides on the level vehicle below it. Of other paths a warning tells where such an instrument is tilted.
+    The trajectories of shipped scenes belong to a sonar that looks ahead and down: an instrument that looks down or aside
+    rides on the level vehicle below it. For other paths a warning reports a tilted instrument.
     """
     if sounder.looks_ahead:
         return path
@@ -116,12 +116,12 @@ def under_vehicle(path: Trajectory, sounder: Sounder, file: Path | None) -> Traj
 
 
 def poses_line(path: Trajectory, mounts: Mapping[str, ArrayLike] | None = None) -> str:
-    """Say whose poses a path holds, with the usual attitude, and how instruments are mounted.
+    """Describe whose poses a path holds, with the median pitch and the mounts of instruments.
 
     Args:
         path: of the sonar or of the vehicle.
-        mounts: poses in the vehicle by name [m, rad]; none of instruments that say themselves where they are. None: the
-            path is that of the sonar itself.
+        mounts: poses in the vehicle by name [m, rad], empty for instruments that define their own; None: the path
+            belongs to the sonar itself.
     """
     pitch = math.degrees(float(np.median(path.poses[:, 3])))
     if mounts is None:
@@ -135,14 +135,14 @@ def poses_line(path: Trajectory, mounts: Mapping[str, ArrayLike] | None = None) 
 
 
 def _ends(sonar: Sonar, frames: int) -> int:
-    """Return the poses of a vehicle that rests for so many frames; those of a head that turns are the sweeps between."""
+    """Return the number of poses of a resting vehicle; a rotating head sweeps between poses, so it has one more."""
     from mitsonar.instruments.sonar import scans
 
     return frames + 1 if scans(sonar) and frames > 1 else frames
 
 
 def warn_of_speed(path: Trajectory, end: str | None, speed: float | None) -> None:
-    """Tell how fast the vehicle is where --from, --to and --frames leave it to the frame rate, and it is faster than any."""
+    """Warn about an implausible speed that follows from --from, --to, --frames and the frame rate."""
     lasts = float(path.time_s[-1] - path.time_s[0])
     if end is None or speed is not None or lasts <= 0:
         return

@@ -1,4 +1,4 @@
-"""``mitsonar recording``: look at recordings of real sonars and at runs, and convert them."""
+"""Commands ``mitsonar recording``, ``sonar`` and ``frames``: show, convert, fit and export frames."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ __all__ = [
 
 
 File = Annotated[
-    str, typer.Argument(metavar="FILE|RUN", help="A recording of a sonar, frames.npz, frames.zarr or a run's folder.")
+    str, typer.Argument(metavar="FILE|RUN", help="A recording of a sonar, frames.npz, frames.zarr or the folder of a run.")
 ]
 PartNumber = Annotated[int | None, typer.Option("--part", help="Part of the recording (default: the longest).")]
 TopicName = Annotated[str | None, typer.Option("--topic", help="Topic of a ROS bag (default: the only sonar's).")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
-Span = Annotated[float, typer.Option("--span-db", help="Levels from full scale down that are shown [dB].")]
+Span = Annotated[float, typer.Option("--span-db", help="Range of levels to show below full scale [dB].")]
 
 
 def recordings() -> typer.Typer:
     """Create the group of commands."""
-    app = typer.Typer(help="Look at recordings of real sonars and at runs, and convert them.", no_args_is_help=True)
+    app = typer.Typer(help="Show and convert recordings of real sonars, and runs.", no_args_is_help=True)
     for command in (
         info,
         show,
@@ -78,15 +78,15 @@ def info(
     geometry: Geometry = None,
     handedness: Annotated[
         bool,
-        typer.Option("--handedness", help="Tell whether pictures are mirrored, by the compass or poses."),
+        typer.Option("--handedness", help="Check whether pictures are mirrored, by compass or poses."),
     ] = False,
     turn_deg: Annotated[
         float | None,
-        typer.Option(help="Turn from the first to the last frame [deg], > 0 to starboard, without a compass."),
+        typer.Option(help="Turn from the first to the last frame [deg], > 0 to starboard, in place of a compass."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Print what a recording holds: frames, parts, window, beams, rate, times, gaps, attitude, facts and notes."""
+    """Print the contents of a recording: frames, parts, window, beams, rate, times, gaps, attitude, facts and notes."""
     from mitsonar.recordings.handedness import handedness_of
     from mitsonar.recordings.open import summary_lines, summary_of
 
@@ -113,7 +113,7 @@ def info(
 def show(
     file: File,
     out: Annotated[Path, typer.Option("-o", "--out", help="PNG to write.")],
-    frame: Annotated[int, typer.Option(min=0, help="Number of the frame in its part.")] = 0,
+    frame: Annotated[int, typer.Option(min=0, help="Index of the frame in its part.")] = 0,
     part: PartNumber = None,
     topic: TopicName = None,
     geometry: Geometry = None,
@@ -138,10 +138,10 @@ def video(
     topic: TopicName = None,
     geometry: Geometry = None,
     span_db: Span = 60.0,
-    rate: Annotated[float | None, typer.Option(help="Frames a second (default: those of the recording).")] = None,
+    rate: Annotated[float | None, typer.Option(help="Frames per second (default: the recording's).")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write the frames as a video of fans."""
+    """Write frames as a video of fans."""
     from mitsonar.plotting.fans import write_fan_video
 
     recording = _opened(file, topic, geometry)
@@ -165,20 +165,22 @@ def convert(
     geometry: Geometry = None,
     picture: Annotated[str, typer.Option(help="Format of the fans in an MCAP file: jpeg or png.")] = "jpeg",
     full: Annotated[
-        bool, typer.Option("--full", help="MCAP: samples bit for bit, float32 where they are, and labels (default: 8 bit).")
+        bool, typer.Option("--full", help="MCAP: write samples bit for bit, uint8 or float32, and labels (default: 8 bit).")
     ] = False,
-    labels: Annotated[bool, typer.Option("--labels", help="MCAP: the points of the labels, where there are.")] = False,
+    labels: Annotated[bool, typer.Option("--labels", help="MCAP: write the points of labels, if any.")] = False,
     beams: Annotated[
         int | None, typer.Option(help="Beams of an ARIS file: 48, 64, 96 or 128 (default: those of the frames).")
     ] = None,
     crop_bins: Annotated[
-        str | None, typer.Option("--crop-bins", help="Bins to keep: first,end, numbered from 0, the end not counted.")
+        str | None, typer.Option("--crop-bins", help="Bins to keep, first,end: numbered from 0, end excluded.")
     ] = None,
-    crop_beams: Annotated[str | None, typer.Option("--crop-beams", help="Beams to keep, likewise, from port.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    crop_beams: Annotated[
+        str | None, typer.Option("--crop-beams", help="Beams to keep, first,end: from port, numbered from 0, end excluded.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped conversion to a folder.")] = False,
 ) -> None:
-    """Convert frames to the folder of a run (frames.npz, or frames.zarr of more than 1,000), to ROS (.mcap) or to .aris."""
+    """Convert frames to the folder of a run (frames.npz, or frames.zarr above 1,000 frames), to ROS (.mcap) or to .aris."""
     from mitsonar.recordings.pictures import write_frames
     from mitsonar.recordings.write_mcap import write_mcap
 
@@ -213,10 +215,10 @@ def convert(
 
 
 def _span(text: str, what: str) -> tuple[int, int]:
-    """Return the numbers of a span.
+    """Parse the two numbers of a span.
 
     Raises:
-        MitsonarError: something else than two whole numbers.
+        MitsonarError: not two whole numbers.
     """
     words = text.split(",")
     if len(words) != 2 or not all(word.strip().isdecimal() for word in words):
@@ -236,7 +238,7 @@ def _say_notes(recording: Recording) -> None:
 
 
 def _to_aris(part: Part, out: Path, *, beams: int | None, overwrite: bool, progress: Callable[[int], None]) -> None:
-    """Write a part as an ARIS file; what had to be changed is warned of."""
+    """Write a part as an ARIS file and warn about necessary changes."""
     from mitsonar.recordings.write_aris import write_aris
 
     refuse_to_replace(out, overwrite=overwrite)
@@ -262,7 +264,7 @@ def _to_aris(part: Part, out: Path, *, beams: int | None, overwrite: bool, progr
 
 def sonars() -> typer.Typer:
     """Create the group of commands."""
-    app = typer.Typer(help="Make a sonar's file from what a real sonar recorded.", no_args_is_help=True)
+    app = typer.Typer(help="Describe a sonar by its recordings.", no_args_is_help=True)
     app.command()(fit)
     app.command("from-recording")(from_recording)
     return app
@@ -270,25 +272,28 @@ def sonars() -> typer.Typer:
 
 @answered
 def fit(
-    frames: Annotated[Path, typer.Argument(help="Frames of the sonar: frames.npz, or a run's folder.")],
+    frames: Annotated[Path, typer.Argument(help="Frames of the sonar: frames.npz, or the folder of a run.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="YAML file to write, for --sonar.")],
     sonar: Annotated[
         str | None,
-        typer.Option(help="Preset or YAML file of what frames do not tell: carrier, beam width, patterns."),
+        typer.Option(help="Preset or YAML file for what frames do not contain: carrier, beam width, patterns."),
     ] = None,
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="A field that is known, frequency_hz=1.8e6 for one."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Set a known field, for example frequency_hz=1.8e6."),
     ] = None,
     measure_coding: Annotated[
-        bool, typer.Option("--measure-coding", help="Take span [dB] or gamma from the grain, not from the frames.")
+        bool,
+        typer.Option(
+            "--measure-coding", help="Measure span [dB] or gamma from the grain instead of reading it from the frames."
+        ),
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
-    """Fit noise, water, coding, stripes, crosstalk and speckle to a recording, and write a sonar that the simulator reads.
+    """Fit noise, water, coding, stripes, crosstalk and speckle to a recording, and write a sonar for the simulator.
 
-    Give frames of a resting or slow sonar whose darkest parts, shadows or black water, are noise. Bright speckle
-    that is new in every frame counts as volume scattering: that holds for a sonar that rests.
+    Give frames of a resting or slow sonar whose darkest parts, shadows or black water, are noise. For a resting sonar,
+    speckle that differs in every frame counts as volume scattering.
     """
     from mitsonar.records.frames import SonarFrames
 
@@ -301,29 +306,29 @@ def fit(
 def from_recording(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording of a real sonar, or frames.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="YAML file to write, for --sonar.")],
-    noise: Annotated[
-        Path | None, typer.Option(help="YAML file to write noise, water and grain to; default: they stand in OUT too.")
-    ] = None,
+    noise: Annotated[Path | None, typer.Option(help="Separate YAML file for noise, water and grain (default: OUT).")] = None,
     sonar: Annotated[
-        str | None, typer.Option(help="Preset or YAML file of what the file does not tell: beam width, patterns.")
+        str | None, typer.Option(help="Preset or YAML file for what the recording does not contain: beam width, patterns.")
     ] = None,
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="A field that is known, frequency_hz=1.8e6 for one."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Set a known field, for example frequency_hz=1.8e6."),
     ] = None,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames from the middle that are read.")] = 12,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Number of frames to read, from the middle.")] = 12,
     part: Annotated[int | None, typer.Option(min=0, help="Part of the recording (default: the longest).")] = None,
     topic: Annotated[str | None, typer.Option(help="Topic of a ROS bag (default: the only one).")] = None,
     geometry: Geometry = None,
     measure_coding: Annotated[
-        bool, typer.Option("--measure-coding", help="Take span [dB] or gamma from the grain, not from the frames.")
+        bool,
+        typer.Option(
+            "--measure-coding", help="Measure span [dB] or gamma from the grain instead of reading it from the frames."
+        ),
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
-    """Make a sonar that records like the one of a recording: its window, bins and beams, and its fitted noise.
+    """Describe the sonar of a recording: its window, bins and beams, and its fitted noise.
 
-    `mitsonar render` and recipes of data sets take it by --sonar. With --noise the files are laid over one another:
-    --sonar sonar.yaml,noise.yaml.
+    `mitsonar render --sonar` reads the file. With --noise name both files: --sonar sonar.yaml,noise.yaml.
     """
     from mitsonar.estimation.sonar_fit import as_instrument
     from mitsonar.mapping.sources import open_frames
@@ -346,7 +351,7 @@ class _Told(NamedTuple):
 
 
 def _told(sonar: str | None, changes: list[str] | None) -> _Told:
-    """Return what the user tells: faults of it are reported before frames are read."""
+    """Return the sonar and fields that the user gives; their faults are reported before frames are read."""
     from mitsonar.instruments.sounder import load_sonar
 
     return _Told(None if sonar is None else load_sonar(sonar), dict(changes_of(changes or [], None)))
@@ -361,7 +366,7 @@ def _fit_and_write(
     *,
     measure_coding: bool,
 ) -> None:
-    """Fit a sonar to frames, write it to OUT, or its noise to another file, and say what was found."""
+    """Fit a sonar to frames, write it to OUT, or its noise to another file, and print the result."""
     from mitsonar.estimation.sonar_fit import NOISE_FIELDS, fit_sonar
 
     found = fit_sonar(frames, told.sonar, measure_coding=measure_coding, **told.fields)
@@ -384,38 +389,38 @@ OF_RUN = 0.7, 0.15, 0.15
 """Shares of training, validation and test of a run's frames."""
 
 LEAST_SNR_DB = 3.0
-"""That of the export, which is not loaded yet."""
+"""Default of the export module, which is not imported yet."""
 
 To = Annotated[str, typer.Option("--to", help="coco, yolo, webdataset, huggingface, kitti or neusis.")]
-Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to make; it is whole or absent.")]
+Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to make; complete or absent.")]
 Picture = Annotated[str, typer.Option(help="polar, or fan: forward up, starboard to the right.")]
-Without = Annotated[list[str] | None, typer.Option("--without", help="Name of a shape that gets no box: the ground.")]
+Without = Annotated[list[str] | None, typer.Option("--without", help="Name of a shape without boxes, such as the ground.")]
 Classes = Annotated[
     str,
     typer.Option(
         "--classes",
-        help="Classes of shapes by name, GLOB=CLASS,...: pillar*=pillar,seabed*= (empty: left out); default: their names, "
-        "one class where only numbers at the end differ.",
+        help="Classes of shapes, GLOB=CLASS,...: pillar*=pillar,seabed*= (empty: left out). Default: their names without "
+        "final numbers.",
     ),
 ]
-Least = Annotated[int, typer.Option(min=1, help="Pixels of an object, at least.")]
+Least = Annotated[int, typer.Option(min=1, help="Minimum number of pixels of an object.")]
 LeastSnr = Annotated[
     float,
-    typer.Option("--least-snr-db", help="Signal-to-noise ratio of an object, at least [dB]; -inf: all that is labelled."),
+    typer.Option("--least-snr-db", help="Minimum signal-to-noise ratio of an object [dB]; -inf: all labelled objects."),
 ]
 Shares = Annotated[
     str | None,
     typer.Option(
         "--split",
-        help="Shares of training, validation and test, default: the recipe's; of a run 0.7,0.15,0.15.",
+        help="Shares of training, validation and test (default: the recipe's; for a run 0.7,0.15,0.15).",
     ),
 ]
-Polygons = Annotated[bool, typer.Option("--polygons", help="YOLO: outlines in place of boxes.")]
+Polygons = Annotated[bool, typer.Option("--polygons", help="YOLO: write outlines instead of boxes.")]
 
 
 def frames() -> typer.Typer:
     """Create the group of commands."""
-    app = typer.Typer(help="Write frames for other tools.", no_args_is_help=True)
+    app = typer.Typer(help="Export frames to other tools.", no_args_is_help=True)
     app.command()(export)
 
     @app.callback()
@@ -427,7 +432,9 @@ def frames() -> typer.Typer:
 
 @answered
 def export(
-    run: Annotated[str, typer.Argument(metavar="RUN|FILE", help="A run's folder, frames.npz, frames.zarr, or a recording.")],
+    run: Annotated[
+        str, typer.Argument(metavar="RUN|FILE", help="The folder of a run, frames.npz, frames.zarr, or a recording.")
+    ],
     to: To,
     out: Out,
     picture: Picture = "polar",
@@ -438,7 +445,7 @@ def export(
     split: Shares = None,
     polygons: Polygons = False,
 ) -> None:
-    """Write frames in the layout of another tool, whole or absent. COCO and YOLO need labels, KITTI and neusis poses."""
+    """Export frames in the layout of another tool. COCO and YOLO need labels, KITTI and neusis poses."""
     from mitsonar.mapping.sources import is_data_set
 
     if is_data_set(run):
@@ -449,17 +456,17 @@ def export(
 
 
 def classes_of(classes: str, without: list[str] | None) -> list[tuple[str, str]]:
-    """Return the rules of classes that options give."""
+    """Parse the rules of classes."""
     from mitsonar.bridges.export_source import class_rules
 
     return [*((name, "") for name in without or []), *class_rules(classes)]
 
 
 def shares_of(split: str | None) -> tuple[float, float, float] | None:
-    """Return the shares of training, validation and test that an option gives.
+    """Parse the shares of training, validation and test.
 
     Raises:
-        MitsonarError: no three numbers.
+        MitsonarError: not three numbers.
     """
     if split is None:
         return None
@@ -468,10 +475,10 @@ def shares_of(split: str | None) -> tuple[float, float, float] | None:
 
 
 def numbers_of(text: str, option: str, count: int | None) -> list[float]:
-    """Return the numbers of an option, with commas between.
+    """Parse comma-separated numbers of an option.
 
     Raises:
-        MitsonarError: something else, or another count of them.
+        MitsonarError: not numbers, or not the given count.
     """
     try:
         numbers = [float(one) for one in text.split(",")]
@@ -495,7 +502,7 @@ def exported(
     view: str | None,
     every_class: bool = False,
 ) -> None:
-    """Export frames and say where they are."""
+    """Export frames and print their folder."""
     from mitsonar.bridges.export_formats import export_to
     from mitsonar.bridges.export_source import PictureKind, open_export
 

@@ -1,4 +1,4 @@
-"""``mitsonar render``: a scene becomes sonar frames on disk."""
+"""Commands ``mitsonar render``, ``impulse``, ``sound`` and ``image``: simulate sonars in a scene."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ __all__ = [
 
 
 NOISE = (
-    "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; no realism, it shows which "
-    "pixels are empty"
+    "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; not realistic, since it "
+    "reveals empty pixels"
 )
 
 
@@ -64,43 +64,52 @@ def render(
     ] = None,
     frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
-    model: Annotated[str | None, typer.Option(help="coherent (as of most presets), physical or thesis.")] = None,
+    model: Annotated[str | None, typer.Option(help="coherent (default of most presets), physical or thesis.")] = None,
     quality: Annotated[
-        str | None, typer.Option(help="draft, standard or fine: rays by the error wanted (`mitsonar presets`).")
+        str | None, typer.Option(help="draft, standard or fine: number of rays by accuracy (`mitsonar presets`).")
     ] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the sonar: range_max=8.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a key of the sonar, KEY=VALUE: range_max=8.")
+    ] = None,
     noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
-    labels: Annotated[bool, typer.Option("--labels", help="Per-pixel elevation, shape id and shadow too.")] = False,
+    labels: Annotated[
+        bool, typer.Option("--labels", help="Write elevation, shape id, object id and shadow of each pixel.")
+    ] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
     label_floor: Annotated[
-        float, typer.Option(min=0, max=1, help="Label only pixels above this part of full scale, before noise.")
+        float, typer.Option(min=0, max=1, help="Label only pixels above this fraction of full scale, before noise.")
     ] = 0.0,
     fan: Annotated[
-        bool, typer.Option("--fan", help="A plain fan picture of each frame, in fan/; with --labels of these as well.")
+        bool, typer.Option("--fan", help="Write a plain fan picture of each frame to fan/; with --labels also of labels.")
     ] = False,
-    cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
-    exr: Annotated[bool, typer.Option("--exr", help="Every ray's echo, one EXR a frame.")] = False,
+    cartesian: Annotated[bool, typer.Option("--cartesian", help="Draw each frame as a fan with axes in metres.")] = False,
+    exr: Annotated[bool, typer.Option("--exr", help="Write the echo of every ray, one EXR file per frame.")] = False,
     mirrors: Annotated[
         bool,
-        typer.Option("--mirrors", help="Smooth materials glint (coherent) and mirror (bounces); docs/guides/multipath.md."),
+        typer.Option(
+            "--mirrors",
+            help="Render glints (coherent) and mirrors (bounces) of smooth materials; see docs/guides/multipath.md.",
+        ),
     ] = False,
     moving: Annotated[
         list[str] | None,
-        typer.Option("--moving", help="ID=FILE.tum: the shape ID follows that path; or FILE.yaml (docs/guides/moving.md)."),
+        typer.Option("--moving", help="ID=FILE.tum: move the shape ID along a path; or FILE.yaml (docs/guides/moving.md)."),
     ] = None,
     all_sensors: Annotated[
         bool,
-        typer.Option("--all-sensors", help="All sonars and cameras of the scene, on one vehicle (docs/guides/bridges.md)."),
+        typer.Option(
+            "--all-sensors", help="Use all sonars and cameras of the scene, on one vehicle (docs/guides/bridges.md)."
+        ),
     ] = False,
     vehicle: Annotated[
-        Path | None, typer.Option(help="All sensors of a vehicle, a YAML file; see docs/guides/bridges.md.")
+        Path | None, typer.Option(help="YAML file with the sensors of a vehicle; see docs/guides/bridges.md.")
     ] = None,
-    rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
+    rays_per_launch: Annotated[int, typer.Option(help="Rays traced at once, about 30 bytes each: limits memory.")] = 2**22,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
 ) -> None:
-    """Render what the sonar receives: frames.npz, images/, poses.tum and run.json in the folder OUT."""
+    """Render sonar frames: frames.npz, images/, poses.tum and run.json in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.acoustics.water import absorption_line
     from mitsonar.instruments.sonar import Sonar
@@ -354,11 +363,13 @@ def impulse(
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
     mirrors: Annotated[
         bool,
-        typer.Option("--mirrors", help="Paths by way of smooth materials; see docs/guides/impulse-responses.md."),
+        typer.Option("--mirrors", help="Add paths reflected by smooth materials; see docs/guides/impulse-responses.md."),
     ] = False,
     mirror: Annotated[
         list[str] | None,
-        typer.Option("--mirror", help="NAME=V,H: reflection of pressures and rms height [m] of a shape: surface=-1,0.002."),
+        typer.Option(
+            "--mirror", help="Reflection coefficient of pressure and rms height [m] of a shape, NAME=V,H: surface=-1,0.002."
+        ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
@@ -512,31 +523,31 @@ def sound(
         typer.Option(help="sidescan, altimeter, profiler, dvl, range-image, a preset (`mitsonar presets`) or a YAML file."),
     ],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/INSTRUMENT).")] = None,
-    frames: Annotated[
-        int | None, typer.Option(help="Number of pings; with --trajectory evenly spaced in time over all of it.")
-    ] = None,
+    frames: Annotated[int | None, typer.Option(help="Number of pings, with --trajectory evenly spaced in time.")] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose of the vehicle: {SIX}.")] = None,
     end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
     speed: Annotated[float | None, typer.Option(help=SPEED)] = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped`, level below the sonar of the scene."),
+        typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped` (levelled)."),
     ] = None,
     frame: Frame = "mitsonar",
-    model: Annotated[str | None, typer.Option(help="coherent, with speckle and noise, or physical.")] = None,
-    quality: Annotated[str | None, typer.Option(help="draft, standard or fine: rays by the error wanted.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the instrument: range_max=20.")] = None,
+    model: Annotated[str | None, typer.Option(help="coherent (speckle and noise) or physical.")] = None,
+    quality: Annotated[str | None, typer.Option(help="draft, standard or fine: number of rays by accuracy.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a key of the instrument, KEY=VALUE: range_max=20.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter, speckle and noise.")] = None,
     moving: Annotated[
         list[str] | None,
-        typer.Option("--moving", help="ID=FILE.tum: the shape ID follows that path; or FILE.yaml (docs/guides/moving.md)."),
+        typer.Option("--moving", help="ID=FILE.tum: move the shape ID along a path; or FILE.yaml (docs/guides/moving.md)."),
     ] = None,
-    rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
+    rays_per_launch: Annotated[int, typer.Option(help="Rays traced at once, about 30 bytes each: limits memory.")] = 2**22,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
 ) -> None:
-    """Simulate an instrument of beams on a vehicle: waterfall, ranges, points or velocities in the folder OUT."""
+    """Simulate a side-scan, altimeter, profiler, DVL or 3-D sonar on a vehicle, and write its records into OUT."""
     from mitsonar.instruments.sounder import load_sounder
     from mitsonar.io.runs import file_digest
     from mitsonar.motion.bodies import MovingBodies
@@ -579,7 +590,7 @@ def sound(
 
 @answered
 def image(
-    run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run that was rendered with --exr.")],
+    run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run rendered with --exr.")],
     bins: Annotated[int | None, typer.Option(help="Number of range bins (default: as rendered).")] = None,
     window: Annotated[str | None, typer.Option("--range", help="Range window from,to [m] (default: as rendered).")] = None,
     noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",

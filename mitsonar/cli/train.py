@@ -1,4 +1,4 @@
-"""``mitsonar train``: train a network by a recipe."""
+"""Commands ``mitsonar train``, ``evaluate``, ``export`` and ``reproduce``: train networks and test them."""
 
 from __future__ import annotations
 
@@ -34,17 +34,15 @@ def train(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the run: network, log, learning curve, state.")],
     data: Annotated[
         list[str] | None,
-        typer.Option(help="Path or URL of a data set; again: others join it. With --render one, for validation only."),
+        typer.Option(help="Path or URL of a data set; repeat to join several. With --render at most one, for validation."),
     ] = None,
-    render: Annotated[bool, typer.Option("--render", help="Render training samples during training.")] = False,
-    minutes: Annotated[
-        float | None, typer.Option(help="Duration after which training stops [min], of all resumed runs together.")
-    ] = None,
+    render: Annotated[bool, typer.Option("--render", help="Render training samples on demand.")] = False,
+    minutes: Annotated[float | None, typer.Option(help="Stop after this duration [min], all resumed runs together.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Resume a run that was stopped or killed.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
-    scale: Annotated[float | None, typer.Option(help="Part of the data to use, 0..1.")] = None,
+    scale: Annotated[float | None, typer.Option(help="Fraction of the data to use, 0..1.")] = None,
     pairs: Annotated[
-        int | None, typer.Option(help="Length of the training in samples, in place of the recipe's epochs.")
+        int | None, typer.Option(help="Length of the training in samples, instead of the recipe's epochs.")
     ] = None,
     change: Annotated[
         list[str] | None, typer.Option("--set", help="Change a key of the recipe, KEY=VALUE: optimiser.rate=1e-3.")
@@ -60,10 +58,10 @@ def train(
         int | None, typer.Option(help="Number of processes that read or render (default: by the machine).")
     ] = None,
     state_minutes: Annotated[
-        float, typer.Option(help="Time between two saved states [min]. A kill loses at most this.")
+        float, typer.Option(help="Interval between saved states [min]; a kill loses at most this.")
     ] = 5.0,
 ) -> None:
-    """Train a network. After a stop at any moment --resume continues; on a CPU the result has the same bits."""
+    """Train a network. After a stop, --resume continues; on a CPU to the same bits."""
     from mitsonar.config.training import load_training_recipe
     from mitsonar.training.run import leads
     from mitsonar.training.run import train as train_network
@@ -99,9 +97,9 @@ def train(
 
 @contextmanager
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C or SIGTERM stop training after its step, with its state saved, and a second one at once.
+    """Stop training after its step at Ctrl-C or SIGTERM, with its state saved; stop at once at the second signal.
 
-    Yields the function that returns whether to stop.
+    Yields a function that returns whether to stop.
     """
     asked, come = threading.Event(), list[int]()
 
@@ -204,15 +202,15 @@ def evaluate(
     part: Annotated[
         str | None, typer.Option(help="train, validation, test (default if the split has one) or all, split as in training.")
     ] = None,
-    pairs: Annotated[int | None, typer.Option(min=1, help="Largest number of pairs, one a sequence.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Allow another sonar than that of training.")] = False,
+    pairs: Annotated[int | None, typer.Option(min=1, help="Maximum number of pairs, one per sequence.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Allow a sonar other than that of training.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise, choice of pairs and bootstrap.")] = 0,
     batch: Annotated[int, typer.Option(min=1, help="Pairs at a time.")] = 16,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for table.md and table.json.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing tables.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Evaluate a trained network beside always answering zero. Bootstrap by scene, then sequence.
+    """Evaluate a trained network and the answer zero. Bootstrap by scene, then sequence.
 
     `large` is the RMSE of motions beyond half the largest (10..20 mm of 20). Almanza-Medina prints yaw in
     deg/100.
@@ -277,14 +275,14 @@ def checkpoint_from(run: str) -> Checkpoint:
 @answered
 def export(
     run: Run,
-    onnx: Annotated[Path | None, typer.Option("--onnx", help="The .onnx file to write.")] = None,
+    onnx: Annotated[Path | None, typer.Option("--onnx", help="ONNX file to write.")] = None,
     half: Annotated[
-        Path | None, typer.Option("--half", help="The .ckpt file to write: the checkpoint with weights of half precision.")
+        Path | None, typer.Option("--half", help="Checkpoint to write, with weights of half precision (.ckpt).")
     ] = None,
-    batch: Annotated[str, typer.Option(help="Samples at a time of ONNX: a number, or `dynamic` for any.")] = "dynamic",
+    batch: Annotated[str, typer.Option(help="Batch size of the ONNX network: a number, or `dynamic` for any.")] = "dynamic",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write a network as ONNX, whose metadata define inputs and outputs, or as a checkpoint of half the size."""
+    """Export a network to ONNX, with metadata on inputs and outputs, or to a checkpoint of half the size."""
     from mitsonar.io.files import write_whole
 
     if batch != "dynamic" and not (batch.isdecimal() and int(batch) > 0):
@@ -309,10 +307,10 @@ def export(
 
 
 def _refuse_place(option: str, path: Path, suffix: str, *, overwrite: bool) -> None:
-    """Refuse a file that has another suffix, lies in no folder, or is there already.
+    """Refuse a file with another suffix, without its folder, or that exists already.
 
     Raises:
-        MitsonarError: it does.
+        MitsonarError: the file is refused.
     """
     from mitsonar.io.runs import refuse_to_replace
 
@@ -331,11 +329,13 @@ def reproduce(
         Path | None, typer.Option("-o", "--out", help="Folder of data, trainings and tables; a stopped run is resumed.")
     ] = None,
     rows: Annotated[str | None, typer.Option(help="Names of rows, separated by commas (default: all).")] = None,
-    scale: Annotated[float, typer.Option(help="Part of the data of Almanza-Medina to make, above 0 and at most 1.")] = 0.02,
-    minutes: Annotated[float, typer.Option(help="Longest training of a row [min]; 0: all epochs of the recipe.")] = 30.0,
+    scale: Annotated[float, typer.Option(help="Fraction of Almanza-Medina's data to make, above 0 and at most 1.")] = 0.02,
+    minutes: Annotated[
+        float, typer.Option(help="Maximum training time of a row [min]; 0: all epochs of the recipe.")
+    ] = 30.0,
     batch: Annotated[
         int | None,
-        typer.Option(help="Pairs of a step (default: the recipe's); the learning rate is scaled by the square root."),
+        typer.Option(help="Pairs per step (default: the recipe's); the learning rate scales with the square root."),
     ] = None,
     change: Annotated[
         list[str] | None,
@@ -346,15 +346,15 @@ def reproduce(
         typer.Option("--data", help="Change a key of all data sets, KEY=VALUE: sonar.range_bins=128, channel.rays=12500."),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Train each row for two steps on a few coarse frames, to see that it runs.")
+        bool, typer.Option("--quick", help="Train each row for two steps on a few coarse frames, as a test.")
     ] = False,
     workers: Annotated[int | None, typer.Option(help="Number of processes that render (default: number of cores).")] = None,
     accelerator: Annotated[str, typer.Option(help="Lightning's accelerator: auto, cpu, gpu ...")] = "auto",
     devices: Annotated[str, typer.Option(help="Lightning's devices: auto, a number, or a list (0,1).")] = "auto",
 ) -> None:
-    """Make the data of a table, train and evaluate its rows, and print them beside the numbers of Almanza-Medina.
+    """Reproduce a table: make its data, train and evaluate its rows, and print them beside the published numbers.
 
-    After a stop at any moment the same command resumes. Several tables may share a folder: common rows are trained once.
+    After a stop the same command resumes. Several tables may share a folder: common rows are trained once.
     """
     if table is None:
         _list()
@@ -417,7 +417,7 @@ class _Console:
         self.bar.close()
 
     def begin(self, what: str, total: int, unit: str) -> Callable[[int], None]:
-        """Close the last bar and show the next one."""
+        """Close the current bar and show the next one."""
         self.bar.close()
         return self.bar.enter_context(progress_bar(what, total, unit))
 
