@@ -168,7 +168,7 @@ class Sounder(CheckedModel):
 
 
 # ---------------- Sounder presets
-# One YAML file per preset in ``sounders/``, with the source document of every number.
+# One YAML file per instrument in ``sounders/``, with the source document of every number.
 
 
 OF_KIND = {
@@ -214,7 +214,8 @@ def _preset(name: str) -> Sounder:
 
 
 # ---------------- Sonar presets
-# One YAML file per preset in ``presets/``, with the source document of every number. In a source, ``(not seen)`` marks a
+# One YAML file per instrument in ``presets/``, with the source document of every number. An instrument of several frequencies
+# has ``modes``: presets that share the keys of the file and hold those that differ. In a source, ``(not seen)`` marks a
 # number that is widely quoted from a data sheet that could not be consulted, ``second hand`` a number that a third party
 # quotes from the named sheet, and ``ours`` a choice of this project. Real instruments measure the angle to a line array
 # (``bearing: cone``). Their users set the window, so the window of a preset is a choice of this project, within the limits
@@ -242,13 +243,14 @@ def named_sonars() -> dict[str, NamedSonar]:
 
 
 def presets_in(folder: str) -> dict[str, NamedSonar]:
-    """Return the presets in a folder of the package, by name."""
+    """Return the presets in a folder of the package, by name: those of a file's ``modes``, or else the file itself."""
     found = {}
     for path in sorted((files("mitsonar.instruments") / folder).iterdir(), key=lambda path: path.name):
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
-        keys = table["keys"].items()
-        values, sources = ({key: one[part] for key, one in keys} for part in ("value", "source"))
-        found[path.name.removesuffix(".yaml")] = NamedSonar(table["about"], values, sources)
+        for name, mode in table.get("modes", {path.name.removesuffix(".yaml"): table}).items():
+            keys = {**table["keys"], **mode["keys"]}.items()
+            values, sources = ({key: one[part] for key, one in keys} for part in ("value", "source"))
+            found[name] = NamedSonar(mode["about"], values, sources)
     return found
 
 
