@@ -50,6 +50,10 @@ def test_another_reader_reads_it(tmp_path: Path) -> None:
     pings = packets[pyxtf.XTFHeaderType.sonar]
     assert [one.data[0].shape for one in pings] == [(50,)] * 3
     assert pings[0].ping_chan_headers[1].SlantRange == pytest.approx(31.5)
+    second = pings[1]
+    assert (second.SensorXcoordinate, second.SensorYcoordinate, second.SensorDepth) == (1.0, 2.5, 3.0)
+    assert (second.Second, second.HSeconds, second.AttitudeTimeTag) == (10, 50, 500)
+    assert second.SensorHeading == pytest.approx(np.degrees(0.3))
 
 
 def test_only_side_scans_are_written(tmp_path: Path) -> None:
