@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mitsonar.bridges.gymnasium import SonarEnv, SonarVectorEnv
     from mitsonar.config.data import load_recipe
     from mitsonar.datasets.make import make_dataset
+    from mitsonar.datasets.overview import sheet_figure
     from mitsonar.datasets.rendered import RenderedPairs
     from mitsonar.datasets.samples import ImpulsePairs, SonarPairs
     from mitsonar.datasets.store import DataStore
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.sensors import VehicleSensors, load_sensors, save_sensors
     from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.plotting.figures import mosaic_figure, path_figure, sheet_figure
+    from mitsonar.plotting.figures import mosaic_figure, path_figure
     from mitsonar.recordings.open import open_recording
     from mitsonar.recordings.write_mcap import write_mcap
     from mitsonar.records.frames import SonarFrames
@@ -184,7 +185,7 @@ _MODULES = {
     "range_rates": "records.soundings",
     "reproduce": "training.reproduce",
     "save_sensors": "motion.sensors",
-    "sheet_figure": "plotting.figures",
+    "sheet_figure": "datasets.overview",
     "shipped_trajectory": "simulation.scene",
     "simulated_sensors": "mapping.sensors",
     "sonar_in": "simulation.scene",

@@ -24,8 +24,8 @@ from PIL import Image
 
 from mitsonar.acoustics.water import noise_of
 from mitsonar.config.data import Recipe, Split, recipe_from
-from mitsonar.datasets.modality import Values
-from mitsonar.datasets.plan import Plan, Scene
+from mitsonar.datasets.modality import Scene, Values
+from mitsonar.datasets.plan import Plan
 from mitsonar.datasets.store import PACKAGES, PARTS, DataStore, deal, names_of_scenes, world_of
 from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
 from mitsonar.estimation.sonar_fit import NOISE_FIELDS, as_instrument

@@ -192,8 +192,8 @@ def info(
     """Print the contents of a data set: frames, arrays, levels relative to noise, versions."""
     import yaml
 
+    from mitsonar.datasets.overview import info as information
     from mitsonar.datasets.store import DataStore
-    from mitsonar.plotting.figures import info as information
 
     store = DataStore.open(data, unfinished=True)
     if recipe:
@@ -236,10 +236,10 @@ def show(
     """Draw sample pairs with labels, the distribution of the labels, and the mean image."""
     import io
 
+    from mitsonar.datasets.overview import sheet_figure
     from mitsonar.datasets.store import DataStore
     from mitsonar.io.files import write_whole
     from mitsonar.io.runs import refuse_to_replace
-    from mitsonar.plotting.figures import sheet_figure
 
     store = DataStore.open(data)
     path = out or Path(Path(store.place.url).stem + ".png")

@@ -18,7 +18,6 @@ from mitsonar.errors import MitsonarError
 if TYPE_CHECKING:
     from mitsonar.acoustics.noise import NoiseModel
     from mitsonar.config.data import Recipe
-    from mitsonar.datasets.plan import Scene
     from mitsonar.instruments.sonar import Instrument
 
 __all__ = [
@@ -26,6 +25,7 @@ __all__ = [
     "Modality",
     "Read",
     "Renderer",
+    "Scene",
     "StoredArray",
     "StoredAxis",
     "Values",
@@ -74,6 +74,23 @@ class StoredAxis:
     values: Array
     dim: str
     about: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One scene of a data set.
+
+    Attributes:
+        number: index of the scene in the data set.
+        group: index of its group in the recipe.
+        seed: of its world.
+        sequences: number of its sequences.
+    """
+
+    number: int
+    group: int
+    seed: int
+    sequences: int
 
 
 class Renderer(Protocol):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, load_noise, snr_of
 from mitsonar.config.data import Flight, Recipe, array_names
-from mitsonar.datasets.modality import Fields, Modality, Read, StoredArray, StoredAxis, Values, ground_reach
+from mitsonar.datasets.modality import Fields, Modality, Read, Scene, StoredArray, StoredAxis, Values, ground_reach
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
 from mitsonar.instruments.sonar import Sonar
@@ -32,7 +32,6 @@ __all__ = [
     "ImageModality",
     "Plan",
     "ResponseModality",
-    "Scene",
     "Sequence",
     "footprint",
     "footprints_at",
@@ -53,23 +52,6 @@ TRIES = 200
 
 FLIGHT, WORLD = 3, 4
 """Keys of the random streams for flights and worlds (see worlds.world.stream)."""
-
-
-@dataclass(frozen=True)
-class Scene:
-    """One scene of a data set.
-
-    Attributes:
-        number: index of the scene in the data set.
-        group: index of its group in the recipe.
-        seed: of its world.
-        sequences: number of its sequences.
-    """
-
-    number: int
-    group: int
-    seed: int
-    sequences: int
 
 
 @dataclass(frozen=True)

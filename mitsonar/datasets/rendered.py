@@ -15,8 +15,8 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from mitsonar.config.data import Recipe, load_recipe, recipe_from
 from mitsonar.datasets.make import SceneRenderer, calibrate
-from mitsonar.datasets.modality import Values
-from mitsonar.datasets.plan import Scene, scenes_of, sequences_of, world_seed
+from mitsonar.datasets.modality import Scene, Values
+from mitsonar.datasets.plan import scenes_of, sequences_of, world_seed
 from mitsonar.datasets.samples import ArrangementOptions, Batch, Device, RawSample, Samples, SonarPairs
 from mitsonar.errors import MitsonarError, refuse_unknown
 from mitsonar.motion.composition import motions

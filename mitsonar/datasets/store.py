@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from mitsonar.config.data import Recipe, Split, recipe_from
-from mitsonar.datasets.modality import Fields, Modality, StoredArray, Values
-from mitsonar.datasets.plan import Plan, Scene, modality_of
+from mitsonar.datasets.modality import Fields, Modality, Scene, StoredArray, Values
+from mitsonar.datasets.plan import Plan, modality_of
 from mitsonar.errors import MitsonarError, meant, shortened
 from mitsonar.io.files import check_plain, finite_number, whole_number
 from mitsonar.io.runs import other_versions

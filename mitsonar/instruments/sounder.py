@@ -217,9 +217,9 @@ def _preset(name: str) -> Sounder:
 # One YAML file per instrument in ``presets/``, with the source document of every number. An instrument with several
 # frequencies has ``modes``: presets that share the keys of the file and hold those that differ. In a source, ``(not seen)``
 # marks a number that is widely quoted from a data sheet that could not be consulted, ``second hand`` a number that a third
-# party quotes from the named sheet, and ``ours`` a choice of this project. Real instruments measure the angle to a line array
-# (``bearing: cone``). Their users set the window, so the window of a preset is a choice of this project, within the limits
-# of the instrument.
+# party quotes from the named sheet, and ``ours`` a choice of this project. Real instruments measure the angle to a line
+# array (``bearing: cone``). Their users set the window, so the window of a preset is a choice of this project, within the
+# limits of the instrument.
 
 
 class NamedSonar(NamedTuple):

@@ -6,16 +6,14 @@ import io
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.noise import NOISE_MODELS
-from mitsonar.config.data import array_names
-from mitsonar.errors import MitsonarError, counted, nearest_names
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.io.files import write_whole
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import AXES
@@ -27,24 +25,18 @@ from mitsonar.records.soundings import DvlReadings, Echogram, Soundings
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from mitsonar.datasets.store import DataStore
-    from mitsonar.mapping.mosaic import Mosaic
-
 __all__ = [
     "crlb_png",
     "dvl_figure",
     "echogram_figure",
-    "info",
     "mosaic_figure",
     "path_figure",
     "quality_figure",
     "range_figure",
     "response_figure",
     "response_png",
-    "response_sheet",
     "save_figure",
     "save_sounding_figure",
-    "sheet_figure",
     "soundings_figure",
     "waterfall_figure",
     "waterfall_figure_of",
@@ -67,7 +59,27 @@ BAND = 2
 """Half width of error bands [standard deviations]."""
 
 
-def mosaic_figure(mosaic: Mosaic, paths: Mapping[str, Trajectory] | None = None, *, title: str = "") -> Figure:
+class LevelMap(Protocol):
+    """A map of levels, such as :class:`mitsonar.mapping.mosaic.Mosaic`; unknown cells are nan."""
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Return the west, east, south and north edge [m]."""
+
+    @property
+    def mean(self) -> NDArray[np.floating]:
+        """Return the mean level of each cell ``(rows, columns)``, with the northernmost row first."""
+
+    @property
+    def std(self) -> NDArray[np.floating]:
+        """Return the standard deviation over frames of the level of each cell, shaped as ``mean``."""
+
+    @property
+    def count(self) -> NDArray[np.integer]:
+        """Return the number of frames that show each cell, shaped as ``mean``."""
+
+
+def mosaic_figure(mosaic: LevelMap, paths: Mapping[str, Trajectory] | None = None, *, title: str = "") -> Figure:
     """Draw the mean level of a mosaic with a scale bar, and paths of the sonar with arrows along its heading.
 
     Args:
@@ -76,8 +88,6 @@ def mosaic_figure(mosaic: Mosaic, paths: Mapping[str, Trajectory] | None = None,
             Almanza-Medina's figures: red line with dark blue arrows, and green line with cyan arrows.
         title: title of the figure.
     """
-    from matplotlib.colors import PowerNorm
-
     figure, (axes,) = _maps(1, mosaic, paths)
     level = mosaic.mean
     norm = PowerNorm(GAMMA, vmin=0, vmax=float(np.nanpercentile(level, 99.9)) or 1.0)
@@ -88,7 +98,7 @@ def mosaic_figure(mosaic: Mosaic, paths: Mapping[str, Trajectory] | None = None,
     return figure
 
 
-def quality_figure(mosaic: Mosaic, *, title: str = "") -> Figure:
+def quality_figure(mosaic: LevelMap, *, title: str = "") -> Figure:
     """Draw the standard deviation of the levels of the frames that observed each cell, and the number of these frames."""
     figure, (left, right) = _maps(2, mosaic, None)
     spread = mosaic.std
@@ -123,8 +133,6 @@ def path_figure(
     Raises:
         MitsonarError: there is no path, a covariance names an unknown path, or its shape does not fit its path.
     """
-    from matplotlib.figure import Figure
-
     if not paths:
         raise MitsonarError("there is no path to draw: give at least one")
     of_motions = _checked(paths, motion_covariances or {}, "motion_covariances", fewer=1)
@@ -161,18 +169,21 @@ def save_figure(path: str | Path, figure: Figure, *, dpi: int = 130) -> None:
     known = figure.canvas.get_supported_filetypes()
     if kind not in known:
         raise MitsonarError(f"a figure's name must end in one of {', '.join(sorted(known))}: got {str(path)!r}")
+    write_whole(path, _encoded(figure, dpi, kind))
+
+
+def _encoded(figure: Figure, dpi: int, kind: str = "png") -> bytes:
+    """Return the bytes of a figure in a format of Matplotlib."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=dpi)
-    write_whole(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 # ---------------- Maps
 
 
-def _maps(panels: int, mosaic: Mosaic, paths: Mapping[str, Trajectory] | None) -> tuple[Figure, list[Axes]]:
+def _maps(panels: int, mosaic: LevelMap, paths: Mapping[str, Trajectory] | None) -> tuple[Figure, list[Axes]]:
     """Create a figure of maps side by side, with the aspect ratio of the mosaic and the paths."""
-    from matplotlib.figure import Figure
-
     west, east, south, north = _view(mosaic, paths or {})
     height = float(np.clip(9.0 * (north - south) / (east - west), 3.5, 9.0))
     width = float(np.clip(height * (east - west) / (north - south), 3.5, 11.0))
@@ -181,7 +192,7 @@ def _maps(panels: int, mosaic: Mosaic, paths: Mapping[str, Trajectory] | None) -
     return figure, axes
 
 
-def _view(mosaic: Mosaic, paths: Mapping[str, Trajectory]) -> tuple[float, float, float, float]:
+def _view(mosaic: LevelMap, paths: Mapping[str, Trajectory]) -> tuple[float, float, float, float]:
     """Return the west, east, south and north limits of a map and its paths [m], with a margin."""
     west, east, south, north = mosaic.extent
     places = [np.array([[west, south], [east, north]]), *(path.poses[:, :2] for path in paths.values())]
@@ -190,7 +201,7 @@ def _view(mosaic: Mosaic, paths: Mapping[str, Trajectory]) -> tuple[float, float
     return low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin
 
 
-def _finish_map(axes: Axes, mosaic: Mosaic, paths: Mapping[str, Trajectory], title: str) -> None:
+def _finish_map(axes: Axes, mosaic: LevelMap, paths: Mapping[str, Trajectory], title: str) -> None:
     """Set limits, labels, scale bar and legend."""
     west, east, south, north = _view(mosaic, paths)
     axes.set(xlim=(west, east), ylim=(south, north), aspect="equal")
@@ -320,8 +331,6 @@ FAINT_DB = -40.0
 
 def response_figure(responses: ImpulseResponses, ping: int = 0) -> Figure:
     """Draw the magnitude, real and imaginary parts of one ping over taps and range (Almanza-Medina, fig. 5.4)."""
-    from matplotlib.figure import Figure
-
     sonar, count = responses.sonar, len(responses.sonar.receivers)
     values = responses.response[ping] / max(float(np.abs(responses.response[ping]).max()), 1e-30)
     begin, end = _strong_taps(responses)
@@ -345,8 +354,6 @@ def response_figure(responses: ImpulseResponses, ping: int = 0) -> Figure:
 
 def waterfall_figure(responses: ImpulseResponses) -> Figure:
     """Draw the magnitude over time and delay at each receiver, in dB relative to the largest of all."""
-    from matplotlib.figure import Figure
-
     sonar, count = responses.sonar, len(responses.sonar.receivers)
     begin, end = _strong_taps(responses)
     level = np.abs(responses.response[:, :, begin:end])
@@ -370,12 +377,12 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
 
 def response_png(responses: ImpulseResponses) -> bytes:
     """Return :func:`response_figure` of the first ping as a PNG file."""
-    return _png(response_figure(responses))
+    return _encoded(response_figure(responses), 110)
 
 
 def waterfall_png(responses: ImpulseResponses) -> bytes:
     """Return :func:`waterfall_figure` as a PNG file."""
-    return _png(waterfall_figure(responses))
+    return _encoded(waterfall_figure(responses), 110)
 
 
 def _strong_taps(responses: ImpulseResponses) -> tuple[int, int]:
@@ -392,100 +399,6 @@ def _title(responses: ImpulseResponses, what: str) -> str:
     sonar = responses.sonar
     bands = f"{sonar.carrier_hz / 1e3:g} kHz, bandwidth {sonar.bandwidth_hz / 1e3:g} kHz"
     return f"{sonar.title}, {sonar.model} model: {bands}; {what}"
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
-
-
-# ---------------- Overview of a data set of impulse responses
-
-
-SAMPLED_PINGS = 200
-"""Approximate number of pings that a mean is taken over."""
-
-
-def response_sheet(store: DataStore, *, samples: int = 4, receiver: str | None = None, seed: int = 0) -> Figure:
-    """Draw an overview of a data set of impulse responses.
-
-    Each row shows a sample: its first and last ping, the phase between them, and its label. The last row shows the mean
-    energy of the taps, and the distribution of the labels.
-
-    Args:
-        store: data set of impulse responses.
-        samples: number of samples to draw.
-        receiver: name of the receiver; default: the first.
-        seed: seed of the choice of samples.
-
-    Raises:
-        MitsonarError: there is no such receiver, or no sequence with the recipe's number of pings.
-    """
-    names = [one.name for one in store.recipe.channel_sonar.receivers]
-    receiver = receiver or names[0]
-    if receiver not in names:
-        raise MitsonarError(f"unknown receiver {receiver}: {nearest_names(receiver, names)}")
-    pings, sequence = store.recipe.frames, store.read("sequence")
-    first = np.arange(max(0, len(sequence) - pings + 1))
-    first = first[sequence[first] == sequence[first + pings - 1]]
-    if not len(first):
-        raise MitsonarError(f"{store.place.url} has no {pings} pings in one sequence: nothing to show")
-    shown = np.sort(np.random.default_rng(seed).choice(first, size=min(samples, len(first)), replace=False))
-    figure = Figure(figsize=(13, 2.6 * (len(shown) + 1)), layout="constrained")
-    axes = figure.subplots(len(shown) + 1, 3, squeeze=False)
-    for row, start in zip(axes, shown.tolist(), strict=False):
-        _response_sample(row, store, names.index(receiver), start, pings)
-    _response_summary(axes[-1], store, names)
-    figure.suptitle(
-        f"{store.recipe.name}, receiver {receiver}: {counted(len(store), 'ping')} in "
-        f"{counted(store.about['sequences'], 'sequence')}"
-    )
-    return figure
-
-
-def _response_sample(axes: NDArray[np.object_], store: DataStore, receiver: int, start: int, pings: int) -> None:
-    """Draw the magnitudes, the phase from the first to the last ping where the response is strong, and the label."""
-    delay_ms = 1e3 * store.read("delay_s")
-    response = store.read("response", slice(start, start + pings))[:, receiver]
-    for place, style in ((0, "-"), (pings - 1, ":")):
-        axes[0].plot(delay_ms, np.abs(response[place]), style, lw=0.8, label=f"ping {start + place}")
-    axes[0].set(xlabel="delay (ms)", ylabel="magnitude", title=f"scene {store.read('scene')[start]}")
-    axes[0].legend(fontsize=7)
-    loud = np.abs(response[0]) > 0.1 * np.abs(response[0]).max(initial=0)
-    turned = np.degrees(np.angle(response[-1] * response[0].conj()))
-    axes[1].plot(delay_ms[loud], turned[loud], ".", ms=3)
-    axes[1].set(xlabel="delay (ms)", ylabel="phase, first to last (deg)", ylim=(-180, 180))
-    axes[2].axis("off")
-    motion, pose = store.read("motion")[start], store.read("pose")[start]
-    text = (
-        f"a ping: sideways {1e3 * motion[0]:+.2f} mm\n        forward  {1e3 * motion[1]:+.2f} mm\n"
-        f"        yaw {np.degrees(motion[2]):+.3f} deg\nover z = 0 {pose[2]:.3f} m"
-    )
-    axes[2].text(0, 0.5, text, fontsize=9, va="center", family="monospace", transform=axes[2].transAxes)
-
-
-def _response_summary(axes: NDArray[np.object_], store: DataStore, names: list[str]) -> None:
-    """Draw the mean energy of the taps of each receiver, and the distribution of the motions."""
-    every = max(1, len(store) // SAMPLED_PINGS)
-    some = store.read("response", slice(None, None, every))
-    for receiver, name in enumerate(names):
-        energy = _decibels((np.abs(some[:, receiver]) ** 2).mean(axis=0))
-        axes[0].plot(1e3 * store.read("delay_s"), energy, lw=0.8, label=name)
-    axes[0].set(xlabel="delay (ms)", ylabel="mean energy (dB)", ylim=(-80, 3))
-    axes[0].legend(fontsize=7)
-    motion = store.read("motion")
-    motion = motion[~np.isnan(motion).any(axis=1)]
-    axes[1].plot(*(1e3 * motion[:, :2].T), ".", ms=2)
-    axes[1].set(xlabel="sideways (mm a ping)", ylabel="forward (mm a ping)", aspect="equal")
-    axes[2].hist(np.degrees(motion[:, 2]), bins=40, color="0.4")
-    axes[2].set(xlabel="yaw (deg a ping)", ylabel="pings")
-
-
-def _decibels(energy: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return levels relative to the largest [dB]."""
-    largest = energy.max() if energy.size and energy.max() > 0 else 1.0
-    return np.asarray(10 * np.log10(np.maximum(energy / largest, 1e-12)))
 
 
 # ---------------- Echo sounders, side-scan sonars and DVLs
@@ -572,8 +485,6 @@ def dvl_figure(readings: DvlReadings, true: NDArray[np.float64] | None = None) -
         readings: readings of the DVL.
         true: true velocities of the vehicle ``(pings, 3)`` [m/s], if known.
     """
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(8.4, 4.6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
     time_s = readings.soundings.time_s
@@ -597,8 +508,6 @@ def dvl_figure(readings: DvlReadings, true: NDArray[np.float64] | None = None) -
 
 def _figure(width: float, height: float) -> tuple[Figure, Any]:
     """Return a figure with one pair of axes."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots()
 
@@ -613,195 +522,6 @@ def _along(echogram: Echogram) -> tuple[float, float]:
     return -half, length + half
 
 
-# ---------------- Overview of a data set of images
-
-
-SAMPLED_FRAMES = 200
-"""Approximate number of frames that a mean is taken over."""
-
-Table: TypeAlias = dict[str, Any]
-"""Description of a data set: numbers, words, lists of words, or nested tables, keyed by name."""
-
-Stored: TypeAlias = "NDArray[np.uint8] | NDArray[np.float32]"
-"""Pixels or vectors in their stored type."""
-
-
-def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None, seed: int = 0) -> Figure:
-    """Draw an overview of a data set: samples with their labels, the mean image, and the distribution of the labels.
-
-    For a data set of impulse responses, draw :func:`~mitsonar.plotting.figures.response_sheet` instead.
-
-    Args:
-        store: data set to draw.
-        samples: number of samples to draw.
-        view: name of a view or receiver; default: the first.
-        seed: seed of the choice of samples.
-
-    Raises:
-        MitsonarError: there is no such view, or no sequence with the recipe's number of frames.
-    """
-    if store.recipe.channel is not None:
-        return response_sheet(store, samples=samples, receiver=view, seed=seed)
-    names = {v: name for name, (kind, v) in array_names(store.recipe).items() if kind == store.recipe.kinds[0]}
-    view = view or next(iter(names))
-    if view not in names:
-        raise MitsonarError(f"unknown view {view}: {nearest_names(view, names)}")
-    frames, name = store.recipe.frames, names[view]
-    sequence = store.read("sequence")
-    first = np.arange(max(0, len(sequence) - frames + 1))
-    # A sample starts where all of its frames belong to one sequence.
-    first = first[sequence[first] == sequence[first + frames - 1]]
-    if not len(first):
-        raise MitsonarError(f"{store.place.url} has no {frames} frames in one sequence: nothing to show")
-    shown = np.sort(np.random.default_rng(seed).choice(first, size=min(samples, len(first)), replace=False))
-    columns = max(frames + 2, 4)
-    figure = Figure(figsize=(3.1 * columns, 2.8 * (len(shown) + 1)), layout="constrained")
-    axes = figure.subplots(len(shown) + 1, columns, squeeze=False)
-    for row, start in enumerate(shown):
-        for place in range(columns):
-            _sample(axes[row, place], store, name, view, int(start), place, frames)
-    _summary(axes[-1], store, name, view)
-    figure.suptitle(
-        f"{store.recipe.name}, view {view}: {counted(len(store), 'frame')} in "
-        f"{counted(store.about['sequences'], 'sequence')}"
-    )
-    return figure
-
-
-def _extent(store: DataStore, view: str) -> tuple[float, float, float, float]:
-    """Return the limits of an image, bearing [deg] and range [m], as Matplotlib's extent with the nearest range below."""
-    shown = next(v for v in store.recipe.views if v.name == view)
-    port, starboard = np.degrees(shown.bearing_rad[[0, -1]])
-    return float(port), float(starboard), shown.sonar.range_min, shown.sonar.range_max
-
-
-def _draw(axes: Axes, store: DataStore, values: NDArray[np.float64], view: str, title: str, *, top: float = 1.0) -> None:
-    """Draw an image with gamma 0.6 and ``top`` as white, or a vector as a line; axes in degrees and metres."""
-    if values.ndim == 1:
-        axes.plot(store.read("range_m"), values, lw=0.7)
-        axes.set(xlabel="range (m)", ylabel="sum of levels")
-    else:
-        norm = PowerNorm(0.6, vmin=0, vmax=top)
-        axes.imshow(values, extent=_extent(store, view), origin="lower", aspect="auto", cmap="copper", norm=norm)
-        axes.set(xlabel="bearing (deg)", ylabel="range (m)")
-    axes.set_title(title, fontsize=8)
-
-
-def _levels(values: Stored) -> NDArray[np.float64]:
-    """Return 8-bit pixels as fractions of 255, and other values unchanged."""
-    return np.asarray(values, dtype=float) / (255 if values.dtype == np.uint8 else 1)
-
-
-def _sample(axes: Axes, store: DataStore, name: str, view: str, start: int, place: int, frames: int) -> None:
-    """Draw one panel of a sample: a frame, then the difference of the last and the first, then the label."""
-    if place < frames:
-        title = f"frame {start + place}, scene {store.read('scene')[start + place]}"
-        _draw(axes, store, _levels(store.read(name, start + place)), view, title)
-    elif place == frames and frames > 1:
-        first, last = (_levels(store.read(name, frame)) for frame in (start, start + frames - 1))
-        if first.ndim == 1:
-            axes.plot(store.read("range_m"), last - first, lw=0.7)
-        else:
-            axes.imshow(
-                last - first, extent=_extent(store, view), origin="lower", aspect="auto", cmap="RdBu_r", vmin=-0.3, vmax=0.3
-            )
-        axes.set_title("last minus first" + (" (+-0.3)" if first.ndim == 2 else ""), fontsize=8)
-    else:
-        axes.axis("off")
-        if place == min(frames + 1, 2 * frames):
-            axes.text(
-                0, 0.5, _label(store, start, frames), fontsize=9, va="center", family="monospace", transform=axes.transAxes
-            )
-
-
-def _label(store: DataStore, start: int, frames: int) -> str:
-    """Return a text with the motion and the height of a sample."""
-    motion, height = store.read("motion")[start], store.read("height_m")[start]
-    text = f"over z = 0  {store.read('pose')[start, 2]:.3f} m\nover what is below {height:.3f} m"
-    if frames == 1:
-        return text
-    sideways, forward, yaw = 1e3 * motion[0], 1e3 * motion[1], np.degrees(motion[2])
-    return f"sideways {sideways:+.2f} mm\nforward  {forward:+.2f} mm\nyaw {yaw:+.3f} deg\n{text}"
-
-
-def _summary(axes: NDArray[np.object_], store: DataStore, name: str, view: str) -> None:
-    """Draw the mean image and histograms of the labels."""
-    mean = _levels(_sampled(store, name)).mean(axis=0)
-    top = float(mean.max()) or 1.0
-    _draw(axes[0], store, mean, view, "mean of frames" + (f" (white {top:.3g})" if mean.ndim == 2 else ""), top=top)
-    motion = store.read("motion")
-    motion = motion[~np.isnan(motion).any(axis=1)]
-    if len(motion):
-        columns = [motion[:, 0] * 1e3, motion[:, 1] * 1e3, np.degrees(motion[:, 2])]
-        names = ["sideways (mm)", "forward (mm)", "yaw (deg)"]
-    else:
-        columns, names = [store.read("pose")[:, 2]], ["height (m)"]
-    for place, axis in enumerate(axes[1:]):
-        if place < len(columns):
-            axis.hist(columns[place], bins=40, color="0.4")
-            axis.set(xlabel=names[place], ylabel="frames")
-        else:
-            axis.axis("off")
-
-
-def _sampled(store: DataStore, name: str) -> Stored:
-    """Read a sample of the frames: whole chunks, evenly spread over the data set."""
-    chunk = int(store.about["chunk_frames"])
-    starts = np.arange(0, len(store), chunk)
-    some = starts[np.unique(np.linspace(0, len(starts) - 1, max(1, SAMPLED_FRAMES // chunk)).astype(int))]
-    return np.concatenate([store.read(name, slice(start, start + chunk)) for start in some])
-
-
-def _level(store: DataStore, name: str, view: str) -> Table:
-    """Measure the fraction of pixels with an echo, their mean level, and its ratio to the scale of each noise model."""
-    some = _levels(_sampled(store, name))
-    if some.ndim == 2:  # sums over the beams
-        beams = next(len(v.bearing_rad) for v in store.recipe.views if v.name == view)
-        echoes, pixels = int(_sampled(store, name.replace("vector", "nonzero", 1)).sum()), some.size * beams
-    else:
-        echoes, pixels = int(np.count_nonzero(some)), some.size
-    mean = float(some.sum()) / max(echoes, 1)
-    noise = {model: mean / NOISE_MODELS[model].scale for model in ("low", "high", "chapter2")}
-    return {"filled": echoes / pixels, "signal_mean": mean, "signal_over_noise": noise}
-
-
-def _levels_of(store: DataStore) -> Table:
-    """Measure the levels of each view of a data set, keyed by view; empty while the data set is unfinished."""
-    names = array_names(store.recipe).items() if store.finished else ()
-    return {view: _level(store, name, view) for name, (kind, view) in names if kind == store.recipe.kinds[0]}
-
-
-def info(store: DataStore) -> Table:
-    """Return a description of a data set: its state, sizes, arrays and levels, keyed by name."""
-    about, sizes = store.about, store.place.sizes()
-    arrays = {}
-    for name, stored in store.modality.stored.items():
-        if stored.shape:
-            size = sum(size for key, size in sizes.items() if key.startswith(f"{name}/"))
-            shape = "x".join(map(str, (len(store), *stored.shape)))
-            arrays[name] = f"{shape} {stored.kind}, {size / max(len(store), 1):,.0f} bytes a {store.modality.what}"
-    done = int((store.seals().any(axis=(1, 2))).sum())
-    return {
-        "name": store.recipe.name,
-        "about": store.recipe.about,
-        "finished": store.finished,
-        "shards": f"{done} of {store.shards}",
-        "frames": len(store),
-        "sequences": about["sequences"],
-        "scenes": len(about["scenes"]),
-        "model": store.modality.sonar.model,
-        "sonar": store.modality.sonar.name,
-        **({"views": list(about["views"])} if "views" in about else {"receivers": about["receivers"]}),
-        "seed": store.recipe.seed,
-        **{name: about[name] for name in ("gain",) if name in store.modality.settled},
-        "bytes": sum(sizes.values()),
-        "arrays": arrays,
-        **({"levels": _levels_of(store)} if store.recipe.channel is None else {}),
-        "variant": about["variant"],
-        "versions": about["versions"],
-    }
-
-
 # ---------------- Cramer-Rao bounds
 
 
@@ -811,8 +531,6 @@ Report: TypeAlias = Mapping[str, Any]
 
 def crlb_png(report: Report) -> bytes:
     """Return a figure of the bounds for two frames, over the varied quantity or over the poses, as a PNG file."""
-    from matplotlib.figure import Figure
-
     name = report["vary"]
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     panels = figure.subplots(1, 3)
@@ -832,6 +550,4 @@ def crlb_png(report: Report) -> bytes:
         panel.grid(alpha=0.3, which="both")
     panels[0].legend(fontsize=7)
     figure.suptitle(f"least standard deviation of two frames, noise {report['noise']}", fontsize=10)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=120)
-    return buffer.getvalue()
+    return _encoded(figure, 120)

@@ -11,7 +11,8 @@ from helpers import HEARD, TINY, Command, essence, refused, tiny_recipe
 
 from mitsonar.config.data import Recipe, load_recipe, recipe_from
 from mitsonar.datasets.make import check, loaded_world, make_dataset
-from mitsonar.datasets.plan import ImageModality, Scene
+from mitsonar.datasets.modality import Scene
+from mitsonar.datasets.plan import ImageModality
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 

@@ -22,13 +22,13 @@ from helpers import PROGRAM, TINY, Command, by_itself, files_of, refused, tiny_r
 
 from mitsonar.config.data import array_names
 from mitsonar.datasets.make import FRAMES_A_SCENE, Queue, SceneRenderer, calibrate, check, forget, make_dataset, make_shard
+from mitsonar.datasets.overview import info, sheet_figure
 from mitsonar.datasets.plan import Plan, sequences_of
 from mitsonar.datasets.store import PACKAGES, DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import versions
 from mitsonar.io.storage import Storage
 from mitsonar.motion.pose import mounted
-from mitsonar.plotting.figures import info, sheet_figure
 from mitsonar.records.frames import to_uint8
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.simulator import Simulator

@@ -15,6 +15,7 @@ from helpers import Command, files_of, impulse_recipe, refused, run_python, tiny
 from mitsonar.acoustics.noise import snr_of
 from mitsonar.config.data import load_recipe, shipped_recipes
 from mitsonar.datasets.make import check, make_dataset
+from mitsonar.datasets.overview import info
 from mitsonar.datasets.plan import Plan, footprints_at, modality_of
 from mitsonar.datasets.responses import ImpulseSamples, Packing, displacement_labels, noise_power, packed, with_noise
 from mitsonar.datasets.store import DataStore
@@ -24,7 +25,6 @@ from mitsonar.estimation.regressors import REGRESSORS, Turned, flattened, score_
 from mitsonar.motion.composition import Motion, compose, motions, steady
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory, velocities
-from mitsonar.plotting.figures import info
 from mitsonar.simulation.scene import load_scene
 
 
