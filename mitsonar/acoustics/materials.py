@@ -19,12 +19,10 @@ import math
 import os
 from collections.abc import Sequence
 from functools import cache, lru_cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
-import yaml
 from array_api_compat import array_namespace, device
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict, Field, model_validator
@@ -35,7 +33,7 @@ from mitsonar.errors import MitsonarError, argument, nearest_names, shortened
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import View, Whole
-from mitsonar.io.checked_model import CheckedModel
+from mitsonar.io.checked_model import CheckedModel, Preset, presets_in
 from mitsonar.io.files import PlainValue, read_yaml
 
 __all__ = [
@@ -48,7 +46,6 @@ __all__ = [
     "Law",
     "Material",
     "MuTable",
-    "NamedMaterial",
     "Sediment",
     "band_warning",
     "check_channel_mirrors",
@@ -473,7 +470,7 @@ LARGEST_MU = {"lambert": 1 / math.pi, "lommel-seeliger": 1 / (4 * math.pi)}
 class Material(CheckedModel):
     """The scattering law of a surface with its parameters, their band and their source."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(allow_inf_nan=False)
 
     called: ClassVar[str] = "material"
 
@@ -499,15 +496,6 @@ class Material(CheckedModel):
     )
     frequency_min_hz: float | None = Field(None, gt=0, le=1e9, description="lowest frequency at which the numbers hold [Hz]")
     frequency_max_hz: float | None = Field(None, gt=0, le=1e9, description="highest frequency at which they hold [Hz]")
-
-    @classmethod
-    def create(cls, **fields: PlainValue) -> Self:
-        """Create a material from its fields.
-
-        Raises:
-            MitsonarError: an unknown key, a value outside its limits, or keys that do not match the law.
-        """
-        return cls(**fields)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -672,29 +660,10 @@ def _number(material: Material, key: str) -> float:
 # ---------------- Named materials
 
 
-class NamedMaterial(NamedTuple):
-    """A material that ships with the package.
-
-    Attributes:
-        about: description of the material.
-        values: values of the fields of :class:`Material`, by name.
-        sources: source of each value.
-    """
-
-    about: str
-    values: dict[str, PlainValue]
-    sources: dict[str, str]
-
-
 @cache
-def named_materials() -> dict[str, NamedMaterial]:
+def named_materials() -> dict[str, Preset]:
     """Return all named materials of the package, by name."""
-    found = {}
-    for path in sorted((files("mitsonar.acoustics") / "materials").iterdir(), key=lambda path: path.name):
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-        values, sources = ({key: one[part] for key, one in table["keys"].items()} for part in ("value", "source"))
-        found[path.name.removesuffix(".yaml")] = NamedMaterial(table["about"], values, sources)
-    return found
+    return presets_in("mitsonar.acoustics", "materials")
 
 
 def material(name_or_file: str | Path) -> Material:

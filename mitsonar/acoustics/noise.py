@@ -14,7 +14,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from array_api_compat import array_namespace, device
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from scipy.special import ndtr
 
 from mitsonar.arrays import AnyArray
@@ -48,8 +48,6 @@ class NoiseModel(CheckedModel):
     network or an estimator can read the exact mask of empty pixels from the noise. Results with it say little about real
     images.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     called: ClassVar[str] = "noise"
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ class Water(CheckedModel):
     A ``salinity_psu`` of 0 is a lake or a tank.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(allow_inf_nan=False)
 
     called: ClassVar[str] = "water"
 
@@ -61,15 +61,6 @@ class Water(CheckedModel):
     salinity_psu: float = Field(35.0, ge=0, le=50, description="salinity [psu]; 0 is fresh water")
     depth_m: float = Field(0.0, ge=0, le=12_000, description="depth below the surface [m]")
     ph: float = Field(8.0, ge=5, le=10, description="pH; it matters below 10 kHz only")
-
-    @classmethod
-    def create(cls, **fields: float) -> Self:
-        """Create water from its fields.
-
-        Raises:
-            MitsonarError: an unknown key, or a value outside its limits.
-        """
-        return cls(**fields)
 
 
 # ---------------- Absorption

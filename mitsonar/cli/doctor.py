@@ -15,7 +15,7 @@ from mitsonar.errors import MitsonarError, nearest_names, shortened
 
 if TYPE_CHECKING:
     from mitsonar.instruments.sonar import Sonar
-    from mitsonar.instruments.sounder import NamedSonar
+    from mitsonar.io.checked_model import Preset
 
 __all__ = ["doctor", "presets", "scenes"]
 
@@ -149,7 +149,7 @@ def _one(name: str) -> None:
         _print_keys(found, sounders[found], sounder.fan, sounder.model_dump(exclude={"name", "fan"}))
 
 
-def _print_keys(name: str, known: NamedSonar, sonar: Sonar, own: dict[str, object] | None = None) -> None:
+def _print_keys(name: str, known: Preset, sonar: Sonar, own: dict[str, object] | None = None) -> None:
     """Print every key with its source: those of an instrument first, then those of its sonar."""
     from mitsonar.acoustics.water import absorption_line
     from mitsonar.instruments.sonar import RAYS

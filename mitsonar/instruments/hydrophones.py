@@ -8,7 +8,7 @@ from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, shortened
@@ -54,8 +54,6 @@ class FieldOfView(CheckedModel):
     fraction ``taper`` of each half width. A ``taper`` of 0 is a hard edge, which acts as an echo that moves with the
     vehicle.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     called: ClassVar[str] = "field of view"
 
@@ -116,8 +114,6 @@ class FieldOfView(CheckedModel):
 
 class Hydrophone(CheckedModel):
     """A receiver: its name, its position relative to the transmitter in the vehicle's axes, and its field of view."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     called: ClassVar[str] = "receiver"
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.beams import Aperture, Pattern, Pulse, Shading
@@ -401,8 +401,6 @@ UNNAMED = "custom"
 class Instrument(CheckedModel):
     """Base class of all instruments."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     name: str = Field(UNNAMED, description="what the instrument is called")
 
     if TYPE_CHECKING:  # subclasses define these at different positions among their fields
@@ -413,15 +411,6 @@ class Instrument(CheckedModel):
     def title(self) -> str:
         """Return the name for titles and sentences, or ``unnamed`` with the type of instrument: ``unnamed sonar``."""
         return f"unnamed {self.called}" if self.name == UNNAMED else self.name
-
-    @classmethod
-    def create(cls, **fields: FieldValue) -> Self:
-        """Create an instrument from its fields.
-
-        Raises:
-            MitsonarError: an unknown key, or a value outside its limits.
-        """
-        return cls(**fields)
 
     def replace(self, **fields: FieldValue) -> Self:
         """Return a copy with some fields changed; all fields are validated.

@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 import os
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import directions
-from mitsonar.io.checked_model import CheckedModel
+from mitsonar.io.checked_model import CheckedModel, Preset, presets_in
 from mitsonar.io.files import read_yaml
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
 
@@ -25,7 +23,6 @@ __all__ = [
     "KINDS",
     "OF_KIND",
     "Kind",
-    "NamedSonar",
     "Sounder",
     "fields_in",
     "load_sonar",
@@ -33,7 +30,6 @@ __all__ = [
     "named_sonars",
     "named_sounders",
     "preset",
-    "presets_in",
     "sonar_from",
 ]
 
@@ -59,8 +55,6 @@ class Sounder(CheckedModel):
     Raises:
         MitsonarError: an unknown key, or a value outside its limits.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     called: ClassVar[str] = "instrument"
     see: ClassVar[str] = SEE
@@ -182,9 +176,9 @@ OF_KIND = {
 
 
 @cache
-def named_sounders() -> dict[str, NamedSonar]:
+def named_sounders() -> dict[str, Preset]:
     """Return all sounder presets of the package, by name."""
-    return presets_in("sounders")
+    return presets_in("mitsonar.instruments", "sounders")
 
 
 def load_sounder(name_or_file: str | Path) -> Sounder:
@@ -222,36 +216,10 @@ def _preset(name: str) -> Sounder:
 # limits of the instrument.
 
 
-class NamedSonar(NamedTuple):
-    """A preset.
-
-    Attributes:
-        about: the instrument and its mode.
-        values: values of the fields, by name.
-        sources: source of each value.
-    """
-
-    about: str
-    values: dict[str, Any]
-    sources: dict[str, str]
-
-
 @cache
-def named_sonars() -> dict[str, NamedSonar]:
+def named_sonars() -> dict[str, Preset]:
     """Return all sonar presets of the package, by name."""
-    return presets_in("presets")
-
-
-def presets_in(folder: str) -> dict[str, NamedSonar]:
-    """Return the presets in a folder of the package, by name: those of a file's ``modes``, or else the file itself."""
-    found = {}
-    for path in sorted((files("mitsonar.instruments") / folder).iterdir(), key=lambda path: path.name):
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-        for name, mode in table.get("modes", {path.name.removesuffix(".yaml"): table}).items():
-            keys = {**table["keys"], **mode["keys"]}.items()
-            values, sources = ({key: one[part] for key, one in keys} for part in ("value", "source"))
-            found[name] = NamedSonar(mode["about"], values, sources)
-    return found
+    return presets_in("mitsonar.instruments", "presets")
 
 
 def preset(name: str) -> Sonar:

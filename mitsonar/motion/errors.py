@@ -128,7 +128,7 @@ def motion_errors(
     answer = in_units(np.where(valid[:, None], estimated, 0.0))
     truth = in_units(true)
     error = answer - truth
-    rmse, zero = _rms_by_column(error), _rms_by_column(truth)
+    rmse, zero = _rms(error), _rms(truth)
     low, high = (rmse, rmse) if resamples is None else _rms_interval(error, resamples)
     size = np.abs(truth)
     large = np.where(size > LARGE * size.max(axis=0), error, np.nan)
@@ -148,7 +148,7 @@ def motion_errors(
         large=_rms_of_known(large),
         zero=zero,
         skill=skill,
-        believed=_rms_by_column(error[valid]) if valid.any() else np.full(3, np.nan),
+        believed=_rms(error[valid]) if valid.any() else np.full(3, np.nan),
         nees=_nees(estimated - true, covariances, valid),
     )
 
@@ -193,7 +193,8 @@ def _rms_interval(error: Array, resamples: NDArray[np.int64]) -> tuple[Array, Ar
     return low, high
 
 
-def _rms_by_column(error: Array) -> Array:
+def _rms(error: Array) -> Array:
+    """Return the root mean square over the first axis."""
     return np.asarray(np.sqrt((error**2).mean(axis=0)))
 
 
@@ -341,14 +342,14 @@ def assess(
         alignment=align,
         path_m=path_length(whole),
         estimated_path_m=path_length(estimated),
-        absolute_rmse_m=_rms(absolute),
+        absolute_rmse_m=float(_rms(absolute)),
         absolute_max_m=float(absolute.max()),
-        absolute_angle_rmse_rad=_rms(angle),
+        absolute_angle_rmse_rad=float(_rms(angle)),
         delta=delta,
         unit=unit,
         pairs=relative.size,
-        relative_rmse_m=_rms(relative),
-        relative_angle_rmse_rad=_rms(turn),
+        relative_rmse_m=float(_rms(relative)),
+        relative_angle_rmse_rad=float(_rms(turn)),
         end_error_m=float(ends[-1]),
         end_heading_rad=float(astray[-1] - astray[0]),
     )
@@ -508,10 +509,6 @@ def _nearest(among: Array, wanted: Array) -> Index:
     after = np.minimum(after, len(among) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(wanted - among[before] <= among[after] - wanted, before, after)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 # ---------------- Drift over segments (KITTI)

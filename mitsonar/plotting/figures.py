@@ -172,10 +172,10 @@ def save_figure(path: str | Path, figure: Figure, *, dpi: int = 130) -> None:
     write_whole(path, _encoded(figure, dpi, kind))
 
 
-def _encoded(figure: Figure, dpi: int, kind: str = "png") -> bytes:
+def _encoded(figure: Figure, dpi: int, kind: str = "png", **options: Any) -> bytes:
     """Return the bytes of a figure in a format of Matplotlib."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=dpi)
+    figure.savefig(buffer, format=kind, dpi=dpi, **options)
     return buffer.getvalue()
 
 
@@ -413,9 +413,7 @@ MOST_POINTS = 200_000
 
 def save_sounding_figure(figure: Figure, path: Path) -> None:
     """Write a figure as a PNG file, completely or not at all."""
-    part = path.with_name(f".{path.name}.part")
-    figure.savefig(part, dpi=110, format="png", metadata={"Software": None})
-    part.replace(path)
+    write_whole(path, _encoded(figure, 110, metadata={"Software": None}))
 
 
 def waterfall_figure_of(echogram: Echogram) -> Figure:

@@ -75,11 +75,6 @@ class Pattern(BuiltFamily):
     object_reflectivity: float = Field(0.6, ge=0, le=1, description="reflectivity of blocks and bars (ours)")
 
     @property
-    def half_m(self) -> float:
-        """Return half the edge of the seabed [m]."""
-        return self.size_m / 2
-
-    @property
     def seeded(self) -> bool:
         """Return whether the seabed is random; the pictures are not."""
         return not self.texture.startswith("photo")
@@ -177,11 +172,6 @@ class RockyField(BuiltFamily):
     rock_reflectivity: Interval = Field((0.0, 1.0), description="what Perlin's -1..1 becomes on rocks")
     perlin_cell_m: float = Field(0.15, gt=0, le=100, description="lattice cell of that noise [m] (ours)")
 
-    @property
-    def half_m(self) -> float:
-        """Return half the edge of the field [m]."""
-        return self.size_m / 2
-
     def build(self, seed: int) -> World:
         """Build the field for a seed."""
         kinds = [
@@ -244,11 +234,6 @@ class ShipHull(BuiltFamily):
     anode_width_m: Interval = Field((0.05, 0.1), description="minor axis of an anode [m]")
     object_reflectivity: Interval = Field((0.0, 1.0), description="what Perlin's -1..1 becomes on tubes and anodes")
     perlin_cell_m: float = Field(0.15, gt=0, le=100, description="lattice cell of that noise [m] (ours)")
-
-    @property
-    def half_m(self) -> float:
-        """Return half the edge of the plate [m]."""
-        return self.size_m / 2
 
     def build(self, seed: int) -> World:
         """Build the hull for a seed."""
@@ -328,11 +313,6 @@ class FlatObjects(BuiltFamily):
     )
     side_m: Interval = Field((0.2, 1.0), description="length and width [m]")
     object_reflectivity: Interval = Field((0.0, 1.0), description="uniform reflectivity of an object")
-
-    @property
-    def half_m(self) -> float:
-        """Return half the edge of the field [m]."""
-        return self.size_m / 2
 
     def build(self, seed: int) -> World:
         """Build the field for a seed."""

@@ -240,11 +240,6 @@ class SceneFile(Family):
     parameters: dict[str, str] = Field(default_factory=dict, description="values of the scene's $names")
 
     @property
-    def half_m(self) -> float:
-        """Return half the edge of the square that the vehicle stays inside [m]."""
-        return self.size_m / 2
-
-    @property
     def seeded(self) -> bool:
         """Return False: the scene is the same for each seed."""
         return False

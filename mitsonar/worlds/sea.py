@@ -278,11 +278,6 @@ class SeaSurface(Family):
         return self
 
     @property
-    def half_m(self) -> float:
-        """Return half the edge of the surface [m]."""
-        return self.size_m / 2
-
-    @property
     def seeded(self) -> bool:
         """Return whether the waves or the seabed are random."""
         return self.wind_m_s > 0 or self.seabed_cells > 0

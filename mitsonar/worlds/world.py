@@ -6,12 +6,12 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, NoReturn, Self, cast, overload
+from typing import TYPE_CHECKING, Annotated, ClassVar, NoReturn, cast, overload
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, complaint
@@ -73,18 +73,10 @@ class Family(CheckedModel):
     An invalid option raises an error of one sentence that names the family and where its options are described.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     described: ClassVar[str] = ""
 
-    @classmethod
-    def create(cls, **fields: object) -> Self:
-        """Create a family with the given options.
-
-        Raises:
-            MitsonarError: a key is unknown, a value is outside its limits, or values contradict each other.
-        """
-        return cls(**fields)
+    if TYPE_CHECKING:  # subclasses define it at different positions among their fields
+        size_m: float
 
     @classmethod
     def refuse(cls, error: ValidationError) -> NoReturn:
@@ -101,8 +93,8 @@ class Family(CheckedModel):
 
     @property
     def half_m(self) -> float:
-        """Return half the edge of the square around the origin that the world fills [m]."""
-        raise NotImplementedError
+        """Return half the edge of the square around the origin in which the vehicle stays [m]."""
+        return self.size_m / 2
 
     @property
     def seeded(self) -> bool:
