@@ -40,6 +40,7 @@ lint: $(VENV)/.tested
 	@mkdir -p build/typed/mitsonar
 	@for one in mitsonar/* plugins scenes; do ln -sfn ../../../$$one build/typed/mitsonar/; done
 	@ln -sfn ../../../benchmarks/recipes build/typed/mitsonar/recipes
+	@ln -sfn ../../../benchmarks/reproduce build/typed/mitsonar/reproduction
 	$(VENV)/bin/mypy -p mitsonar
 	$(VENV)/bin/mypy tests benchmarks docs scenes
 

@@ -30,11 +30,11 @@ from mitsonar.datasets.samples import SonarPairs
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.named import create_estimator
 from mitsonar.mapping.odometry import closure_of
-from mitsonar.mapping.odometry_benchmark import RenderedSet
 from mitsonar.mapping.open_source import LOOP
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import cluster_resamples, in_units, motion_errors
 from mitsonar.records.frames import SonarFrames
+from mitsonar.reproduction.odometry_benchmark import RenderedSet
 
 Array = NDArray[np.float64]
 Pairs = Iterator[tuple[SonarFrames, Array, int]]

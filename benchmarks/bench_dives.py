@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 import mitsonar
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.image.direct import Direct
-from mitsonar.mapping.odometry_benchmark import DIVE_HZ, DIVE_SONARS, FLIGHTS, SETS, TEXTURES, SimulatedSet, dive_course
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import MotionErrors, motion_errors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
+from mitsonar.reproduction.odometry_benchmark import DIVE_HZ, DIVE_SONARS, FLIGHTS, SETS, TEXTURES, SimulatedSet, dive_course
 
 SEED, PLACES, NEAR_M = 201, 5, 2.5
 """Seed of the first world; pairs in each; how far from its middle."""

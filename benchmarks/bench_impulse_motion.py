@@ -58,7 +58,6 @@ from mitsonar.datasets.responses import with_noise
 from mitsonar.datasets.samples import ImpulsePairs
 from mitsonar.estimation.crlb.channel import channel_crlb
 from mitsonar.estimation.named import create_estimator
-from mitsonar.estimation.regressors import REGRESSORS, flattened, score_all
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.open_source import ResponseSource
 from mitsonar.mapping.series import path_of
@@ -67,6 +66,7 @@ from mitsonar.motion.courses import COURSES, course
 from mitsonar.motion.errors import in_units
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory, velocities
+from mitsonar.reproduction.regressors import REGRESSORS, flattened, score_all
 
 SEED, SCENES = 4201, 5
 

@@ -68,7 +68,6 @@ from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named import create_estimator
 from mitsonar.mapping.odometry import odometry
-from mitsonar.mapping.odometry_benchmark import TEXTURES as SONARS
 from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
 from mitsonar.mapping.series import MotionSeries, kalman_smoothed, path_of, pose_covariances, spline_smoothed
 from mitsonar.motion.composition import motions
@@ -76,6 +75,7 @@ from mitsonar.motion.errors import assess, motion_errors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames, to_uint8
+from mitsonar.reproduction.odometry_benchmark import TEXTURES as SONARS
 
 Array = NDArray[np.float64]
 PARTS = ("table21", "trajectories")

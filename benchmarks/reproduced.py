@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import write_whole
-from mitsonar.training.reproduce import DocumentTable, Found, ScriptedTable, TableRow, contents, load_tables, tables_with
+from mitsonar.reproduction.tables import DocumentTable, Found, ScriptedTable, TableRow, contents, load_tables, tables_with
 
 HERE = Path(__file__).resolve().parent
 RESULTS, PAGE = HERE / "results" / "reproduced", HERE / "REPRODUCED.md"
@@ -74,7 +74,7 @@ def quick(every_row: bool) -> None:
     Raises:
         SystemExit: it is not.
     """
-    from mitsonar.training.reproduce import Effort, reproduce
+    from mitsonar.reproduction.tables import Effort, reproduce
 
     done: set[str] = set()
     with tempfile.TemporaryDirectory(prefix="reproduced-") as folder:

@@ -51,12 +51,12 @@ if TYPE_CHECKING:
     from mitsonar.records.frames import SonarFrames
     from mitsonar.records.responses import ImpulseResponses
     from mitsonar.records.soundings import Echogram, Soundings, range_rates
+    from mitsonar.reproduction.tables import Effort, load_tables, reproduce
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.scene import load_meshes, load_motions, load_scene, shipped_trajectory, sonar_in
     from mitsonar.simulation.simulator import Simulator
     from mitsonar.simulation.sounding import SounderSimulator
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle
-    from mitsonar.training.reproduce import Effort, load_tables, reproduce
     from mitsonar.worlds.sea import SeaSurface, fishing_net_mesh, particle_mesh
 
 __all__ = [
@@ -133,7 +133,7 @@ _MODULES = {
     "DataStore": "datasets.store",
     "Deforming": "motion.bodies",
     "Echogram": "records.soundings",
-    "Effort": "training.reproduce",
+    "Effort": "reproduction.tables",
     "Estimate": "estimation.estimator",
     "ImpulsePairs": "datasets.samples",
     "ImpulseResponses": "records.responses",
@@ -173,7 +173,7 @@ _MODULES = {
     "load_sensors": "motion.sensors",
     "load_sonar": "instruments.sounder",
     "load_sounder": "instruments.sounder",
-    "load_tables": "training.reproduce",
+    "load_tables": "reproduction.tables",
     "load_vehicle": "simulation.vehicle",
     "make_dataset": "datasets.make",
     "mosaic_figure": "plotting.figures",
@@ -183,7 +183,7 @@ _MODULES = {
     "path_figure": "plotting.figures",
     "path_of": "mapping.series",
     "range_rates": "records.soundings",
-    "reproduce": "training.reproduce",
+    "reproduce": "reproduction.tables",
     "save_sensors": "motion.sensors",
     "sheet_figure": "datasets.overview",
     "shipped_trajectory": "simulation.scene",

@@ -38,6 +38,7 @@ ROOMS = (
     "estimation",
     "mapping",
     "training",
+    "reproduction",
     "bridges",
     "cli",
     "__main__",

@@ -382,8 +382,8 @@ def height(
 
     `mitsonar odometry --height-by` passes these heights to the estimators of motion.
     """
+    from mitsonar.estimation.height import heights_csv, heights_lines
     from mitsonar.estimation.named import height_estimator_from
-    from mitsonar.mapping.odometry_benchmark import heights_csv, heights_lines
     from mitsonar.mapping.open_source import Reading, frames_for, views_for
     from mitsonar.mapping.sources import measured
 
@@ -730,7 +730,7 @@ def odometry_benchmark(
     Simulated sets are rendered once into OUT and stay there. Each row is written when it is complete. The table holds all
     rows of OUT.
     """
-    from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_lines, benchmark_odometry
+    from mitsonar.reproduction.odometry_benchmark import Wanted, benchmark_lines, benchmark_odometry
 
     asked = {"sets": set_, "textures": texture, "noises": noise, "methods": method}
     wanted = Wanted(

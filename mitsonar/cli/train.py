@@ -361,14 +361,14 @@ def reproduce(
         return
     if workers is not None and workers < 1:
         raise MitsonarError(f"--workers must be at least 1: got {workers}")
-    from mitsonar.training.reproduce import rows_named, table_named
+    from mitsonar.reproduction.tables import rows_named, table_named
 
     wanted = [name.strip() for name in rows.split(",") if name.strip()] if rows is not None else None
     rows_named(table_named(table), wanted)
     if out is None:
         raise MitsonarError(f"table {table} needs a folder: give -o")
-    from mitsonar.training.reproduce import Effort
-    from mitsonar.training.reproduce import reproduce as reproduced
+    from mitsonar.reproduction.tables import Effort
+    from mitsonar.reproduction.tables import reproduce as reproduced
 
     effort = Effort(scale, minutes or None, batch, changes_of(change or [], None), changes_of(data or [], None), quick)
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
@@ -388,7 +388,7 @@ def reproduce(
 
 def _list() -> None:
     """List all tables and figures with their rows, or with the command that makes them."""
-    from mitsonar.training.reproduce import LOUD, NOISES, ScriptedTable, contents
+    from mitsonar.reproduction.tables import LOUD, NOISES, ScriptedTable, contents
 
     printed = [said for noise, said in NOISES.items() if noise != LOUD]
     say(f"RMSE in Almanza-Medina, sideways mm / forward mm / yaw deg: {', '.join(printed)}")

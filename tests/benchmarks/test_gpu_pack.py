@@ -276,7 +276,7 @@ def test_cufinufft_that_does_not_load_is_done_without(monkeypatch: pytest.Monkey
 
 
 def test_rows_are_those_of_the_tables() -> None:
-    from mitsonar.training.reproduce import load_tables
+    from mitsonar.reproduction.tables import load_tables
 
     tables = load_tables()
     assert set(run.TABLE_52) == {row.name for row in tables["5.2"].rows}

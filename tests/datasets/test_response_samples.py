@@ -21,10 +21,10 @@ from mitsonar.datasets.responses import ImpulseSamples, Packing, displacement_la
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.named import create_estimator
-from mitsonar.estimation.regressors import REGRESSORS, Turned, flattened, score_all
 from mitsonar.motion.composition import Motion, compose, motions, steady
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory, velocities
+from mitsonar.reproduction.regressors import REGRESSORS, Turned, flattened, score_all
 from mitsonar.simulation.scene import load_scene
 
 

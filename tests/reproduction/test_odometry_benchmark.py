@@ -17,8 +17,14 @@ from scipy.spatial.transform import Rotation
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.named import Zero, create_estimator
 from mitsonar.instruments.sounder import load_sonar
-from mitsonar.mapping import odometry_benchmark, odometry_run
-from mitsonar.mapping.odometry_benchmark import (
+from mitsonar.mapping import odometry_run
+from mitsonar.mapping.sources import FrameSource
+from mitsonar.motion.composition import motions
+from mitsonar.motion.errors import path_length
+from mitsonar.recordings.write_aris import write_aris
+from mitsonar.records.frames import SonarFrames
+from mitsonar.reproduction import odometry_benchmark
+from mitsonar.reproduction.odometry_benchmark import (
     SETS,
     STEP_M,
     Case,
@@ -30,11 +36,6 @@ from mitsonar.mapping.odometry_benchmark import (
     dive_course,
     measured_row,
 )
-from mitsonar.mapping.sources import FrameSource
-from mitsonar.motion.composition import motions
-from mitsonar.motion.errors import path_length
-from mitsonar.recordings.write_aris import write_aris
-from mitsonar.records.frames import SonarFrames
 from mitsonar.worlds.families import ShipHull
 from mitsonar.worlds.world import Floor, World, sloped
 

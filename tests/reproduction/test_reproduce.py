@@ -21,7 +21,7 @@ from mitsonar.config.data import Recipe, load_recipe
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.errors import in_units
-from mitsonar.training.reproduce import (
+from mitsonar.reproduction.tables import (
     LOUD,
     NOISES,
     Found,
@@ -49,7 +49,7 @@ from mitsonar.config.training import TrainingRecipe, load_training_recipe, shipp
 from mitsonar.datasets.samples import Samples  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
-from mitsonar.training.reproduce import Effort, reproduce, unseen_recipe  # noqa: E402
+from mitsonar.reproduction.tables import Effort, reproduce, unseen_recipe  # noqa: E402
 
 TABLES = load_tables()
 RECIPES = sorted({row.recipe for name, table in TABLES.items() if name[0] == "3" for row in table.rows})

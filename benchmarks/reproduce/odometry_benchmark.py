@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -52,7 +50,6 @@ from mitsonar.worlds.families import RockyField, ShipHull
 from mitsonar.worlds.world import Family, sloped
 
 if TYPE_CHECKING:
-    from mitsonar.estimation.height import HeightEstimate
     from mitsonar.simulation.simulator import Simulator
 
 __all__ = [
@@ -73,8 +70,6 @@ __all__ = [
     "benchmark_lines",
     "benchmark_odometry",
     "dive_course",
-    "heights_csv",
-    "heights_lines",
     "measured_row",
 ]
 
@@ -522,10 +517,10 @@ class Wanted:
     """Rows that are asked for: every method on every set, texture and level of noise.
 
     Attributes:
-        sets: names of :data:`~mitsonar.mapping.odometry_benchmark.SETS`, or paths of recordings and runs. The beginning
+        sets: names of :data:`~mitsonar.reproduction.odometry_benchmark.SETS`, or paths of recordings and runs. The beginning
             of a name up to a hyphen means all of these sets: ``dive``, ``dive-aris3000``.
-        textures: of :data:`~mitsonar.mapping.odometry_benchmark.TEXTURES`, for simulated sets.
-        noises: of :data:`~mitsonar.mapping.odometry_benchmark.NOISES`, for simulated sets; dives have their preset's.
+        textures: of :data:`~mitsonar.reproduction.odometry_benchmark.TEXTURES`, for simulated sets.
+        noises: of :data:`~mitsonar.reproduction.odometry_benchmark.NOISES`, for simulated sets; dives have their preset's.
         methods: as :func:`~mitsonar.estimation.named.create_estimator` takes them; none: :data:`METHODS`, without
             those whose packages are not installed.
         frames: of each set at most; None: 40 of a dive, 260 of another simulated set, all of a recording.
@@ -917,40 +912,3 @@ DIVE_CELLS: Cells = {
 
 COLUMNS = ("method", "drift %", "drift deg / 100 m", "end %", "RMSE", "/ bound", "nees", "fail", "ms")
 CLOSURE_COLUMNS = ("method", "net motion", "closure", "fail", "ms")
-
-
-# ---------------- Measured heights as a table, and in sentences
-
-
-def heights_csv(time_s: Array, estimates: list[HeightEstimate], true: Array | None) -> str:
-    """Return a table with a line a frame; cells are empty where a number is not known.
-
-    Args:
-        time_s: of the frames ``(n,)`` [s].
-        estimates: of the frames.
-        true: true heights ``(n,)`` [m], where known.
-    """
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["frame", "time_s", "height_m", "std_m", "believed", "reason", "true_z_m"])
-    for k, one in enumerate(estimates):
-        numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in (one.height_m, one.std_m)]
-        z = "" if true is None else f"{true[k]:.6g}"
-        table.writerow([k, f"{time_s[k]:.9g}", *numbers, int(one.valid), one.reason, z])
-    return text.getvalue()
-
-
-def heights_lines(estimates: list[HeightEstimate], true: Array | None) -> list[str]:
-    """Return sentences on the heights of all frames; ``true`` holds the true heights ``(n,)`` [m], where known."""
-    valid = np.array([one.valid for one in estimates], dtype=bool)
-    heights = np.array([one.height_m for one in estimates])[valid]
-    lines = []
-    for reason in dict.fromkeys(one.reason for one in estimates if not one.valid):
-        lines.append(f"not believed, {sum(one.reason == reason for one in estimates):,} frames: {reason}")
-    if len(heights):
-        lines.append(f"height {heights.min():.3f} .. {heights.max():.3f} m, median {np.median(heights):.3f} m")
-    if true is not None and len(heights):
-        error = heights - true[valid]
-        rmse, middle = 100 * np.sqrt((error**2).mean()), 100 * np.median(np.abs(error))
-        lines.append(f"against the true z: RMSE {rmse:.2f} cm, median {middle:.2f} cm, bias {100 * error.mean():+.2f} cm")
-    return lines

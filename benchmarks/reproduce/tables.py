@@ -6,7 +6,7 @@ import io
 import json
 import math
 import platform
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import date
@@ -209,7 +209,8 @@ def reproduce(
 ) -> JsonObject:
     """Make the data of the rows of a table, train and evaluate each row, and write the table; or resume this.
 
-    ``out`` holds ``table.md``, ``table.json`` and ``table-NUMBER.png``, which are replaced after each row. ``data/`` holds
+    ``out`` holds ``table.md`` and ``table.json``, which are replaced after each row, and ``table-NUMBER.png`` of the tables
+    with that row. ``data/`` holds
     one training data set for all rows with the same data, and one of unseen scenes. ``runs/`` holds one training a row.
     ``rows/`` holds the result of each row. Several tables may share a folder: a row of both is trained once.
 
@@ -236,12 +237,12 @@ def reproduce(
     with Storage(out).locked():
         bench = TableBuilder(RunDirectory.begin(out, TABLES, asdict(effort), resume=True), effort)
         bench.ask(table, recipes)
-        report = bench.report()
+        report = bench.report([table])
         for name, recipe in recipes.items():
             if name not in bench.found():
                 bench.work(name, recipe, data[name], crew)
-                report = report if effort.quick else bench.report()
-        return bench.report() if effort.quick else report
+                report = report if effort.quick else bench.report(tables_with(name))
+        return bench.report([table]) if effort.quick else report
 
 
 @dataclass(frozen=True)
@@ -367,13 +368,15 @@ class TableBuilder:
                 raise MitsonarError(f"{path} is damaged ({reason}): remove it, and the row is evaluated again") from None
         return rows
 
-    def report(self) -> JsonObject:
-        """Write the tables and figures of the rows that are done, and return the content of ``table.json``."""
+    def report(self, drawn: Collection[str]) -> JsonObject:
+        """Write all tables, and figures of the tables ``drawn``, of the rows that are done; return ``table.json``."""
         found, version = self.found(), versions(("mitsonar",))["mitsonar"]
         tables = [table_named(name) for name in self.tables]
         lines = [f"`mitsonar reproduce`, mitsonar {version}: {self.effort.sentence()}."]
         for table in tables:
             lines += ["", *table_lines(table, found)]
+            if table.name not in drawn:
+                continue
             figure = table_figure(table, found, title=f"{table.kind} {table.name}, {table.title}; {self.effort.sentence()}")
             buffer = io.BytesIO()
             figure.savefig(buffer, format="png", dpi=80)

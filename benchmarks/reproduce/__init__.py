@@ -1,0 +1,1 @@
+"""Reproduction of Almanza-Medina's tables, and the odometry benchmark; installed as ``mitsonar.reproduction``."""
