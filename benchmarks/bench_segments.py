@@ -31,7 +31,7 @@ from bench_impulse import cpu
 
 from mitsonar import load_recipe
 from mitsonar.acoustics.noise import load_noise
-from mitsonar.config.training import TrainingRecipe, load_training_recipe
+from mitsonar.config.training import TrainingRecipe, TrainOptions, load_training_recipe
 from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.estimation.height import DirectHeight
@@ -167,7 +167,7 @@ def row(
 ) -> None:
     """One training, and a line for each of what it is judged by."""
     run = asked.out / "runs" / name
-    checkpoint = train(recipe, learnt, run, resume=run.exists(), minutes=asked.minutes, threads=asked.threads)
+    checkpoint = train(TrainOptions(recipe, learnt, run, resume=run.exists(), minutes=asked.minutes, threads=asked.threads))
     for what, (where, part) in judged.items():
         kept = asked.out / f"{name}-{what.replace(' ', '-')}.json"
         if not kept.exists():

@@ -21,7 +21,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mitsonar.config.data import Recipe, load_recipe, recipe_from
-from mitsonar.config.training import TrainingRecipe, load_training_recipe
+from mitsonar.config.training import TrainingRecipe, TrainOptions, load_training_recipe
 from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.sample_index import split_for
 from mitsonar.datasets.store import DataStore
@@ -340,18 +340,17 @@ class TableBuilder:
     def _trained(self, name: str, recipe: TrainingRecipe, data: Path, crew: Crew) -> Checkpoint:
         """Train the network of a row, or resume its training."""
         run = self._run(name)
+        options = TrainOptions(
+            recipe,
+            data,
+            run,
+            minutes=self.effort.minutes,
+            resume=run.exists(),
+            accelerator=crew.accelerator,
+            devices=crew.devices,
+        )
         with crew.watch.training(name) as (progress, stop):
-            return train(
-                recipe,
-                data,
-                run,
-                minutes=self.effort.minutes,
-                resume=run.exists(),
-                accelerator=crew.accelerator,
-                devices=crew.devices,
-                progress=progress,
-                stop=stop,
-            )
+            return train(options, progress=progress, stop=stop)
 
     def found(self) -> dict[str, Found]:
         """Load the results of the rows that are done.

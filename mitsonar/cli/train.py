@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from mitsonar.networks.checkpoint import Checkpoint
-    from mitsonar.training.run import TrainingReport
+    from mitsonar.training.journal import TrainingReport
 
 __all__ = ["Run", "TrainingBar", "asked_to_stop", "checkpoint_from", "evaluate", "export", "reproduce", "train"]
 
@@ -62,32 +62,15 @@ def train(
     ] = 5.0,
 ) -> None:
     """Train a network. After a stop, --resume continues; on a CPU to the same bits."""
-    from mitsonar.config.training import load_training_recipe
+    given = locals()  # by name the fields of TrainOptions, and the changes of the recipe
+    from mitsonar.config.training import TrainOptions, load_training_recipe
     from mitsonar.training.run import leads
     from mitsonar.training.run import train as train_network
 
-    wanted = load_training_recipe(recipe, changes_of(change or [], None))
+    changes = changes_of(given.pop("change") or [], None)
+    options = TrainOptions(**{**given, "recipe": load_training_recipe(recipe, changes)})
     with asked_to_stop() as stop, TrainingBar() as bar:
-        made = train_network(
-            wanted,
-            data,
-            out,
-            render=render,
-            minutes=minutes,
-            resume=resume,
-            overwrite=overwrite,
-            scale=scale,
-            pairs=pairs,
-            accelerator=accelerator,
-            devices=devices,
-            strategy=strategy,
-            precision=precision,
-            threads=threads,
-            workers=workers,
-            state_minutes=state_minutes,
-            progress=bar,
-            stop=stop,
-        )
+        made = train_network(options, progress=bar, stop=stop)
     if not leads():
         return
     for name, text in made.rows():

@@ -1,4 +1,4 @@
-"""Training recipes: their keys, and how they are read from YAML and validated.
+"""Training recipes and options of a training: their keys, and how they are read from YAML and validated.
 
 A recipe is shipped for each row of Almanza-Medina's tables.
 """
@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
 from importlib.util import find_spec
@@ -19,7 +21,17 @@ from mitsonar.acoustics.noise import load_noise, snr_of
 from mitsonar.config.data import SPLITS, Keys, Split, recipe_fields, set_key, split_from
 from mitsonar.errors import MitsonarError, complaint, shortened
 
-__all__ = ["Input", "Loss", "Optimiser", "TrainingRecipe", "Validate", "load_training_recipe", "shipped_training_recipes"]
+__all__ = [
+    "STATE_MINUTES",
+    "Input",
+    "Loss",
+    "Optimiser",
+    "TrainOptions",
+    "TrainingRecipe",
+    "Validate",
+    "load_training_recipe",
+    "shipped_training_recipes",
+]
 
 Precision = Literal["32-true", "16-mixed", "bf16-mixed"]
 
@@ -315,3 +327,82 @@ def training_recipe_from(fields: Keys) -> TrainingRecipe:
         raise MitsonarError(message.replace("validate_", "validate")) from None
     except TypeError as error:
         raise MitsonarError(f"training recipe keys must be words: {error}") from None
+
+
+# ---------------- Options of a training
+
+
+STATE_MINUTES = 5.0
+"""Time between two states on disk, and so the training that a kill may cost [min]."""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What is trained, on which data, into which folder, and how; the options of ``mitsonar train``.
+
+    Attributes:
+        recipe: training recipe, its name, or a YAML file.
+        data: path or URL of a data set, or of several data sets of one sonar, which are joined, such as one per model.
+        out: folder of the run.
+        render: render samples during training, by the recipe of ``data`` or else by the one that ``recipe`` names.
+        minutes: total duration after which training stops [min], including validation and earlier parts of a resumed run.
+        resume: resume the run in ``out``, or start a new run if there is none.
+        overwrite: replace a run in ``out``.
+        scale: fraction of the data to use, which multiplies ``part_of_data`` of the recipe.
+        pairs: length of the training in samples, which replaces that of the recipe.
+        accelerator: as in Lightning's trainer.
+        devices: as in Lightning's trainer.
+        strategy: as in Lightning's trainer.
+        precision: as in Lightning's trainer; replaces that of the recipe.
+        threads: number of CPU threads.
+        workers: number of processes that read or render; by default it depends on the machine.
+        state_minutes: time between two states on disk [min].
+
+    Raises:
+        MitsonarError: a number is outside its limits.
+    """
+
+    recipe: TrainingRecipe | str | Path
+    data: str | Path | Sequence[str | Path] | None
+    out: str | Path
+    render: bool = False
+    minutes: float | None = None
+    resume: bool = False
+    overwrite: bool = False
+    scale: float | None = None
+    pairs: int | None = None
+    accelerator: str = "auto"
+    devices: str | int = "auto"
+    strategy: str = "auto"
+    precision: str | None = None
+    threads: int | None = None
+    workers: int | None = None
+    state_minutes: float = STATE_MINUTES
+
+    def __post_init__(self) -> None:
+        if self.scale is not None and not 0 < self.scale <= 1:
+            raise MitsonarError(f"--scale must lie in 0..1: got {self.scale:g}")
+        if self.minutes is not None and not self.minutes > 0:
+            raise MitsonarError(f"--minutes must be above 0: got {self.minutes:g}")
+        for name, least in (("threads", 1), ("workers", 0)):
+            count = getattr(self, name)
+            if count is not None and count < least:
+                raise MitsonarError(f"--{name} must be at least {least}: got {count}")
+
+    def changed_recipe(self) -> TrainingRecipe:
+        """Load the recipe and apply ``scale``, ``pairs`` and ``precision``; a run is of the result.
+
+        Raises:
+            MitsonarError: there is no such recipe, or ``pairs`` is less than its batch.
+        """
+        recipe = self.recipe if isinstance(self.recipe, TrainingRecipe) else load_training_recipe(self.recipe)
+        changes: Keys = {}
+        if self.scale is not None:
+            changes["part_of_data"] = self.scale * recipe.part_of_data
+        if self.pairs is not None:
+            if self.pairs < recipe.batch:
+                raise MitsonarError(f"--pairs must be at least a batch, {recipe.batch}: got {self.pairs}")
+            changes |= {"steps": self.pairs // recipe.batch, "epochs": None}
+        if self.precision is not None:
+            changes["precision"] = self.precision
+        return recipe.replace(**changes) if changes else recipe

@@ -23,7 +23,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
-from mitsonar.config.training import TrainingRecipe
+from mitsonar.config.training import TrainingRecipe, TrainOptions
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import whole_number, write_whole
 from mitsonar.io.runs import RUN_FILE, RunDirectory, RunKind
@@ -36,10 +36,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "STATE_MINUTES",
     "TRAINING",
     "Journal",
-    "Pace",
     "RunFolder",
     "StateFile",
     "TrainingReport",
@@ -47,9 +45,6 @@ __all__ = [
     "curve_figure",
 ]
 
-
-STATE_MINUTES = 5.0
-"""Time between two states on disk, and so the training that a kill may cost [min]."""
 
 LOG_SECONDS = 30.0
 """Time between two rows of the log without a validation [s]."""
@@ -91,24 +86,23 @@ class TrainingReport:
     axes: tuple[Axis, ...]
 
 
-@dataclass(frozen=True)
-class Pace:
-    """Options of when a training reports, saves its state and stops; see :func:`mitsonar.training.run.train`."""
-
-    minutes: float | None
-    state_minutes: float
-    progress: Callable[[TrainingReport], None] | None
-    stop: Callable[[], bool] | None
-
-
 class Journal(Callback):
     """Callback that reports, validates, saves states and the best network, and ends training.
 
     It does not affect the result of the next step.
     """
 
-    def __init__(self, folder: RunFolder, module: NetworkTraining, material: Material, pace: Pace) -> None:
-        self.folder, self.module, self.material, self.pace = folder, module, material, pace
+    def __init__(
+        self,
+        folder: RunFolder,
+        module: NetworkTraining,
+        material: Material,
+        options: TrainOptions,
+        progress: Callable[[TrainingReport], None] | None,
+        stop: Callable[[], bool] | None,
+    ) -> None:
+        self.folder, self.module, self.material = folder, module, material
+        self.options, self.progress, self.stop = options, progress, stop
         self.recipe, self.axes = module.recipe, axes_of(material.samples.labels)
         self.scales = np.array([axis.scale for axis in self.axes])
         self.kept = _Kept()
@@ -137,7 +131,7 @@ class Journal(Callback):
         Lightning has replaced the handler by one that ends the process with code 0, and without a state. If the caller can
         stop the training, the caller's handler is restored.
         """
-        if self.pace.stop is not None and threading.current_thread() is threading.main_thread():
+        if self.stop is not None and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, self.on_sigterm)
         self.begun = self.saved = self.validated = self.logged = time.monotonic()
         self.first = trainer.global_step
@@ -162,8 +156,8 @@ class Journal(Callback):
         log = validate or stopped or time.monotonic() - self.logged >= LOG_SECONDS
         if log and trainer.is_global_zero:
             self._log(trainer, step, validate=validate, stopped=stopped)
-        if self.pace.progress is not None and trainer.is_global_zero:
-            self.pace.progress(self._report(step, validated=validate or stopped, logged=log))
+        if self.progress is not None and trainer.is_global_zero:
+            self.progress(self._report(step, validated=validate or stopped, logged=log))
         if save and self._finite():  # every process takes part in writing
             trainer.save_checkpoint(self.folder.state)
             self.saved = time.monotonic()
@@ -177,15 +171,15 @@ class Journal(Callback):
     def _due(self, trainer: lightning.Trainer, step: int) -> tuple[bool, bool, bool]:
         """Return whether training ends, validates, and saves its state; the first process decides for all."""
         now, wanted = time.monotonic(), self.recipe.validation
-        stopped = self.stopped or (self.pace.stop is not None and self.pace.stop())
-        over = self.pace.minutes is not None and self.spent >= self.pace.minutes
+        stopped = self.stopped or (self.stop is not None and self.stop())
+        over = self.options.minutes is not None and self.spent >= self.options.minutes
         end = step >= self.module.steps or over or stopped
         if wanted.every_steps is not None:
             validate = step % wanted.every_steps == 0
         else:
             validate = now - self.validated >= wanted.every_minutes * 60
         validate = validate or (end and not stopped)
-        due = end, stopped, validate, end or validate or now - self.saved >= self.pace.state_minutes * 60
+        due = end, stopped, validate, end or validate or now - self.saved >= self.options.state_minutes * 60
         end, self.stopped, validate, save = due if trainer.world_size == 1 else trainer.strategy.broadcast(due)
         return end, validate, save
 

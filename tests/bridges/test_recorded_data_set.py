@@ -218,7 +218,7 @@ def test_an_aris_file_and_its_path_are_compared(mitsonar: Command, places: dict[
 @pytest.mark.thorough
 def test_a_network_is_trained_on_it_and_evaluated(places: dict[str, Path], tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from mitsonar.config.training import training_recipe_from
+    from mitsonar.config.training import TrainOptions, training_recipe_from
     from mitsonar.networks.checkpoint import Checkpoint
     from mitsonar.training.evaluate import evaluate
     from mitsonar.training.run import train
@@ -237,7 +237,7 @@ def test_a_network_is_trained_on_it_and_evaluated(places: dict[str, Path], tmp_p
             "validate": {"every_steps": 3, "pairs": 4, "noise": ["none"]},
         }
     )
-    train(recipe, data, tmp_path / "net")
+    train(TrainOptions(recipe, data, tmp_path / "net"))
     checkpoint = Checkpoint.load(tmp_path / "net")
     assert checkpoint.data_recipe["recorded"]["level"] == "dB"
     assert np.allclose(checkpoint.trained_at["height_m"], 2.5)

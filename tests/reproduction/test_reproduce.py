@@ -20,7 +20,9 @@ from matplotlib.patches import Rectangle
 from mitsonar.config.data import Recipe, load_recipe
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
+from mitsonar.io.runs import RunDirectory
 from mitsonar.motion.errors import in_units
+from mitsonar.reproduction import tables
 from mitsonar.reproduction.tables import (
     LOUD,
     NOISES,
@@ -49,7 +51,7 @@ from mitsonar.config.training import TrainingRecipe, load_training_recipe, shipp
 from mitsonar.datasets.samples import Samples  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
-from mitsonar.reproduction.tables import Effort, reproduce, unseen_recipe  # noqa: E402
+from mitsonar.reproduction.tables import Effort, TableBuilder, reproduce, unseen_recipe  # noqa: E402
 
 TABLES = load_tables()
 RECIPES = sorted({row.recipe for name, table in TABLES.items() if name[0] == "3" for row in table.rows})
@@ -402,6 +404,14 @@ def test_a_table_from_nothing(whole: Path) -> None:
     assert said + "0.0625" in text
     assert "not trained yet" not in text
     assert (whole / "table-3.6.png").stat().st_size > 10_000
+
+
+def test_only_the_requested_table_is_drawn(tmp_path: Path) -> None:
+    bench = TableBuilder(RunDirectory.begin(tmp_path / "both", tables.TABLES, {}), Effort(quick=True))
+    for name in ("3.2", "3.6"):
+        bench.ask(name, {})
+    assert set(bench.report(["3.6"])["tables"]) == {"3.2", "3.6"}
+    assert [path.name for path in (tmp_path / "both").glob("*.png")] == ["table-3.6.png"]
 
 
 @pytest.mark.thorough

@@ -16,7 +16,7 @@ from mitsonar.errors import MitsonarError
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves")]
 
-from mitsonar.config.training import Optimiser, load_training_recipe, shipped_training_recipes  # noqa: E402
+from mitsonar.config.training import Optimiser, TrainOptions, load_training_recipe, shipped_training_recipes  # noqa: E402
 from mitsonar.config.training import training_recipe_from as recipe_of  # noqa: E402
 from mitsonar.datasets.samples import ImpulsePairs  # noqa: E402
 from mitsonar.estimation.learned import ResponseNetwork  # noqa: E402
@@ -54,7 +54,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
 def run(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small training, unbroken."""
     out = tmp_path_factory.mktemp("run") / "run"
-    train(recipe_of(FIELDS), made, out, threads=1, workers=0)
+    train(TrainOptions(recipe_of(FIELDS), made, out, threads=1, workers=0))
     return out
 
 
@@ -185,8 +185,8 @@ def test_a_training_ends_in_a_checkpoint(made: Path, run: Path) -> None:
 def test_a_broken_training_goes_on_to_the_same_bits(made: Path, run: Path, tmp_path: Path) -> None:
     count = iter(range(100))
     with pytest.raises(KeyboardInterrupt):
-        train(recipe_of(FIELDS), made, tmp_path / "run", threads=1, workers=0, stop=lambda: next(count) >= 4)
-    train(recipe_of(FIELDS), made, tmp_path / "run", threads=1, workers=0, resume=True)
+        train(TrainOptions(recipe_of(FIELDS), made, tmp_path / "run", threads=1, workers=0), stop=lambda: next(count) >= 4)
+    train(TrainOptions(recipe_of(FIELDS), made, tmp_path / "run", threads=1, workers=0, resume=True))
     assert Checkpoint.load(tmp_path / "run").digest == Checkpoint.load(run).digest
 
 
@@ -227,9 +227,11 @@ def test_mistakes_in_recipes_are_answered(changes: dict[str, Any], sentence: str
 
 def test_what_does_not_go_together_is_answered(made: Path, tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="not rendered in training"):
-        train(recipe_of(FIELDS), None, tmp_path / "run", render=True)
+        train(TrainOptions(recipe_of(FIELDS), None, tmp_path / "run", render=True))
     with pytest.raises(MitsonarError, match="of impulse responses, this needs one of images"):
-        train(recipe_of({**FIELDS, "input": {}, "noise": "none", "network": "posenet"}), made, tmp_path / "run")
+        train(
+            TrainOptions(recipe_of({**FIELDS, "input": {}, "noise": "none", "network": "posenet"}), made, tmp_path / "run")
+        )
 
 
 # ---------------------------------------------------------------- estimates

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
+import inspect
 import itertools
 import json
 import os
@@ -35,6 +37,7 @@ from mitsonar.config.training import (  # noqa: E402
     Loss,
     Optimiser,
     TrainingRecipe,
+    TrainOptions,
     load_training_recipe,
     training_recipe_from,
 )
@@ -81,7 +84,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def whole(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small training, unbroken."""
     out = tmp_path_factory.mktemp("whole") / "run"
-    train(recipe(), made, out, threads=1, workers=0)
+    train(TrainOptions(recipe(), made, out, threads=1, workers=0))
     return out
 
 
@@ -321,12 +324,12 @@ def test_two_data_sets_are_learnt_from_as_one(made: Path, other: Path) -> None:
 
 
 def test_a_network_of_two_models_names_both(made: Path, other: Path, tmp_path: Path) -> None:
-    kept = train(recipe(steps=2), [made, other], tmp_path / "run", threads=1, workers=0)
+    kept = train(TrainOptions(recipe(steps=2), [made, other], tmp_path / "run", threads=1, workers=0))
     assert (kept.model, kept.data) == ("thesis and physical", "tiny and other")
     report = evaluate(kept, str(other), part="all", noise=["none"])
     assert not [note for note in report["notes"] if "model" in note]
     with pytest.raises(MitsonarError, match="begun with data tiny and other, not tiny"):
-        train(recipe(steps=2), made, tmp_path / "run", resume=True, threads=1, workers=0)
+        train(TrainOptions(recipe(steps=2), made, tmp_path / "run", resume=True, threads=1, workers=0))
 
 
 def test_data_sets_that_cannot_be_joined_are_refused(made: Path, tmp_path: Path) -> None:
@@ -363,10 +366,16 @@ def test_a_part_of_the_data_is_its_first_frames(made: Path) -> None:
 
 # ---------------------------------------------------------------- runs
 
+
+def test_the_command_has_the_options_of_a_training() -> None:
+    parameters = set(inspect.signature(command).parameters)
+    assert parameters - {"change"} == {one.name for one in dataclasses.fields(TrainOptions)}
+
+
 KILLED = """
     import os, sys
     from mitsonar.io import files
-    from mitsonar.config.training import load_training_recipe
+    from mitsonar.config.training import TrainOptions
     from mitsonar.training.run import train
 
     if __name__ == "__main__":
@@ -386,8 +395,8 @@ KILLED = """
                 states.append(name) if "last.ckpt" in name else None
                 sync(number) if len(states) < 9 else (os.truncate(name, 1000), die())
             os.fsync = counted
-        words = {"threads": 1, "workers": 0}
-        train(told, data or None, out, render=bool(render), resume=True, state_minutes=0, progress=progress, **words)
+        words = {"threads": 1, "workers": 0, "resume": True, "state_minutes": 0}
+        train(TrainOptions(told, data or None, out, render=bool(render), **words), progress=progress)
 """
 
 
@@ -409,7 +418,7 @@ def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: P
     killed(told, made, tmp_path / "broken", "writing")
     assert torch.load(tmp_path / "broken" / "last.ckpt", weights_only=True)["global_step"] == 8
     killed(told, made, tmp_path / "broken", "step 14")
-    train(told, made, tmp_path / "broken", resume=True, threads=1, workers=0)
+    train(TrainOptions(told, made, tmp_path / "broken", resume=True, threads=1, workers=0))
     assert_same(weights(whole), weights(tmp_path / "broken"))
     logs = [list(csv.DictReader((out / "log.csv").open())) for out in (whole, tmp_path / "broken")]
     for one, other in zip(*logs, strict=True):
@@ -426,8 +435,8 @@ def test_killed_runs_that_render_end_with_the_same_bits(tmp_path: Path) -> None:
     told.write_text(yaml.safe_dump({**FIELDS, "data": "tiny.yaml", "steps": 8}))
     killed(told, "", tmp_path / "broken", "step 4", render=True)
     words: dict[str, Any] = {"render": True, "threads": 1, "workers": 0}
-    train(told, None, tmp_path / "whole", **words)
-    made = train(told, None, tmp_path / "broken", resume=True, **words)
+    train(TrainOptions(told, None, tmp_path / "whole", **words))
+    made = train(TrainOptions(told, None, tmp_path / "broken", resume=True, **words))
     assert_same(weights(tmp_path / "whole"), weights(tmp_path / "broken"))
     assert made.data == "tiny"
     assert made.metrics["none"]["pairs"] == 5
@@ -439,7 +448,7 @@ def test_validation_states_and_workers_do_not_touch_the_training(made: Path, who
     torch.manual_seed(7)
     before, threads = torch.get_rng_state(), torch.get_num_threads()
     seldom = {**FIELDS["validate"], "every_steps": 100, "pairs": 2}
-    train(recipe(validate=seldom), made, tmp_path / "seldom", threads=1, workers=1, state_minutes=0)
+    train(TrainOptions(recipe(validate=seldom), made, tmp_path / "seldom", threads=1, workers=1, state_minutes=0))
     assert torch.equal(before, torch.get_rng_state())
     assert torch.get_num_threads() == threads
     assert not torch.are_deterministic_algorithms_enabled()
@@ -468,7 +477,7 @@ def test_a_run_keeps_what_it_promises(
     labels |= {"split": {"train": 0.8, "validation": 0.2}, "validate": {"every_steps": 20, "pairs": None, "noise": ["low"]}}
     told = recipe(**labels, network={"name": "posenet", "width": 0.06, "dropout": 0.0}, part_of_data=0.4)
     out = tmp_path / "run"
-    best = train(told, made, out, progress=reports.append, threads=1)
+    best = train(TrainOptions(told, made, out, threads=1), progress=reports.append)
     rows = list(csv.DictReader((out / "log.csv").open()))
     assert [int(row["step"]) for row in rows] == [20, 40, 60]
     assert [report.step for report in reports] == list(range(1, 61))
@@ -495,7 +504,7 @@ def test_a_stop_leaves_a_network_and_a_row_of_the_log(made: Path, tmp_path: Path
     """Even the first step's; a run without a network, which was killed, asks for more minutes."""
     told = recipe(steps=3, validate={"every_steps": 100, "pairs": 4, "noise": ["none"]})
     with pytest.raises(KeyboardInterrupt):
-        train(told, made, tmp_path / "run", threads=1, stop=lambda: True)
+        train(TrainOptions(told, made, tmp_path / "run", threads=1), stop=lambda: True)
     kept = Checkpoint.load(tmp_path / "run")
     (row,) = csv.DictReader((tmp_path / "run" / "log.csv").open())
     assert (kept.trained["steps"], int(row["step"])) == (1, 1)
@@ -504,34 +513,34 @@ def test_a_stop_leaves_a_network_and_a_row_of_the_log(made: Path, tmp_path: Path
     with pytest.raises(
         MitsonarError, match=r"stopped before it validated once, and has used its 1e-09 minutes .* resume it with more"
     ):
-        train(told, made, tmp_path / "run", resume=True, minutes=1e-9)
-    assert train(told, made, tmp_path / "run", resume=True, minutes=5).trained["steps"] == 3
+        train(TrainOptions(told, made, tmp_path / "run", resume=True, minutes=1e-9))
+    assert train(TrainOptions(told, made, tmp_path / "run", resume=True, minutes=5)).trained["steps"] == 3
 
 
 def test_runs_that_are_there_are_kept(made: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     told = recipe(steps=2)
-    first = train(told, made, out, threads=1)
+    first = train(TrainOptions(told, made, out, threads=1))
     with pytest.raises(MitsonarError, match="--resume goes on with it, --overwrite begins anew"):
-        train(told, made, out)
+        train(TrainOptions(told, made, out))
     with pytest.raises(MitsonarError, match=r"begun with recipe\.optimiser\.rate 0\.001, not 0\.002"):
-        train(recipe(steps=2, optimiser={"rate": 2e-3}), made, out, resume=True)
+        train(TrainOptions(recipe(steps=2, optimiser={"rate": 2e-3}), made, out, resume=True))
     other = tmp_path / "other.zarr"
     make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 10}], seed=3), str(other))
     with pytest.raises(MitsonarError, match="begun with digest"):
-        train(told, other, out, resume=True)
+        train(TrainOptions(told, other, out, resume=True))
     before = weights(out)
-    assert train(told, made, out, resume=True, threads=1).digest == first.digest  # nothing was left to do
+    assert train(TrainOptions(told, made, out, resume=True, threads=1)).digest == first.digest  # nothing was left to do
     assert_same(before, weights(out))
-    assert train(told, made, out, overwrite=True, threads=1).digest == first.digest
+    assert train(TrainOptions(told, made, out, overwrite=True, threads=1)).digest == first.digest
     (out / "last.ckpt").write_bytes((out / "last.ckpt").read_bytes()[:5000])
     with pytest.raises(MitsonarError, match=r"last\.ckpt is damaged"):
-        train(told, made, out, resume=True)
+        train(TrainOptions(told, made, out, resume=True))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("all of it")
     for resume, overwrite in ((False, False), (True, False), (False, True)):
         with pytest.raises(MitsonarError, match=r"holds other things \(thesis\.txt\) and is kept"):
-            train(told, made, tmp_path / "mine", resume=resume, overwrite=overwrite)
+            train(TrainOptions(told, made, tmp_path / "mine", resume=resume, overwrite=overwrite))
 
 
 def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
@@ -549,7 +558,7 @@ def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
     order = list(Order(learnt.numbers, 8, 0, 0, 9, (0, 1)))
     step = next(k for k, batch in enumerate(order) if frame in learnt.samples.first[[number for _, number in batch]])
     with pytest.raises(MitsonarError) as caught:
-        train(told, url, tmp_path / "run", threads=1, state_minutes=0)
+        train(TrainOptions(told, url, tmp_path / "run", threads=1, state_minutes=0))
     said = str(caught.value)
     for part in (
         "the loss became nan in epoch 1",
@@ -587,7 +596,7 @@ def test_what_does_not_go_together_is_refused_before_training(
     made: Path, tmp_path: Path, fields: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(MitsonarError, match=sentence):
-        train(recipe(**fields), made, tmp_path / "run")
+        train(TrainOptions(recipe(**fields), made, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 
@@ -602,20 +611,22 @@ def test_words_that_do_not_go_together_are_refused(made: Path, tmp_path: Path) -
         ({"threads": 0}, "--threads must be at least 1"),
     ):
         with pytest.raises(MitsonarError, match=sentence):
-            train(recipe(), made, tmp_path / "run", **words)
+            train(TrainOptions(recipe(), made, tmp_path / "run", **words))
     with pytest.raises(MitsonarError, match=r"--data DATA\.zarr, or --render"):
-        train(recipe(), None, tmp_path / "run")
+        train(TrainOptions(recipe(), None, tmp_path / "run"))
     with pytest.raises(MitsonarError, match="no data set at"):
-        train(recipe(), tmp_path / "none.zarr", tmp_path / "run")
+        train(TrainOptions(recipe(), tmp_path / "none.zarr", tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 
 def test_vectors_without_images_are_told_from_images(tmp_path: Path) -> None:
     make_dataset(tiny_recipe(store="vectors", scenes=[{"sequences": 20}]), str(tmp_path / "sums.zarr"))
     with pytest.raises(MitsonarError, match="holds vectors only"):
-        train(recipe(), tmp_path / "sums.zarr", tmp_path / "run")
+        train(TrainOptions(recipe(), tmp_path / "sums.zarr", tmp_path / "run"))
     heights = recipe(input={"kind": "vector", "frames": 1}, steps=2)
-    assert train(heights, tmp_path / "sums.zarr", tmp_path / "run", threads=1).labels["names"] == ["height (m)"]
+    assert train(TrainOptions(heights, tmp_path / "sums.zarr", tmp_path / "run", threads=1)).labels["names"] == [
+        "height (m)"
+    ]
     header = (tmp_path / "run" / "log.csv").read_text().splitlines()[0]
     assert "none height (mm)" in header
 
@@ -697,9 +708,9 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
     from mitsonar.cli.train import asked_to_stop
 
     with asked_to_stop() as stop, pytest.raises(KeyboardInterrupt):
-        train(told, made, out, progress=interrupt, stop=stop, threads=1)
+        train(TrainOptions(told, made, out, threads=1), progress=interrupt, stop=stop)
     assert torch.load(out / "last.ckpt", weights_only=True)["global_step"] in (9, 10)
-    train(told, made, out, resume=True, threads=1)
+    train(TrainOptions(told, made, out, resume=True, threads=1))
     assert_same(weights(out), weights(whole))
 
 
@@ -732,9 +743,10 @@ def test_two_devices_share_a_training(made: Path, tmp_path: Path) -> None:
     script.write_text(
         textwrap.dedent("""
         import sys
+        from mitsonar.config.training import TrainOptions
         from mitsonar.training.run import train
         if __name__ == "__main__":
-            train(*sys.argv[1:], accelerator="cpu", devices=2, strategy="ddp", threads=1)
+            train(TrainOptions(*sys.argv[1:], accelerator="cpu", devices=2, strategy="ddp", threads=1))
         """)
     )
     call = [sys.executable, str(script), str(told), str(made), str(tmp_path / "run")]
@@ -748,10 +760,14 @@ def test_a_training_begins_with_the_weights_that_it_is_told(made: Path, whole: P
     """One step at no rate to speak of leaves them; those of another network are refused."""
     kept = Checkpoint.load(whole).build().state_dict()
     told = {"start": str(whole), "seed": 5, "steps": 1, "optimiser": {"rate": 1e-12}}
-    again = train(recipe(**told), made, tmp_path / "again", threads=1, workers=0).build().state_dict()
-    other = train(recipe(**{**told, "start": None}), made, tmp_path / "other", threads=1, workers=0).build().state_dict()
+    again = train(TrainOptions(recipe(**told), made, tmp_path / "again", threads=1, workers=0)).build().state_dict()
+    other = (
+        train(TrainOptions(recipe(**{**told, "start": None}), made, tmp_path / "other", threads=1, workers=0))
+        .build()
+        .state_dict()
+    )
     learnt = [name for name in kept if "running" not in name and "num_batches" not in name]
     assert all(torch.allclose(again[name], kept[name], atol=1e-9) for name in learnt)
     assert not all(torch.allclose(other[name], kept[name], atol=1e-3) for name in learnt)
     with pytest.raises(MitsonarError, match="start holds the weights of posenet"):
-        train(recipe(**told, network={"name": "sfmnet", "width": 1 / 16}), made, tmp_path / "no")
+        train(TrainOptions(recipe(**told, network={"name": "sfmnet", "width": 1 / 16}), made, tmp_path / "no"))

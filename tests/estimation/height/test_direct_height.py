@@ -241,7 +241,7 @@ class TestNetworks:
 
     @staticmethod
     def trained(data: Path, run: Path, **words: Any) -> Any:
-        from mitsonar.config.training import training_recipe_from
+        from mitsonar.config.training import TrainOptions, training_recipe_from
         from mitsonar.training.run import train
 
         small = {
@@ -250,7 +250,7 @@ class TestNetworks:
             "validate": {"noise": ["none"], "every_steps": 3, "pairs": 4},
             "batch": 4,
         }
-        return train(training_recipe_from({**small, **words}), data, run)
+        return train(TrainOptions(training_recipe_from({**small, **words}), data, run))
 
     @pytest.mark.thorough
     def test_a_network_tells_the_height(self, heights: Path, tmp_path: Path, mitsonar: Command) -> None:

@@ -27,7 +27,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
 ]
 
-from mitsonar.config.training import Optimiser, load_training_recipe, training_recipe_from  # noqa: E402
+from mitsonar.config.training import Optimiser, TrainOptions, load_training_recipe, training_recipe_from  # noqa: E402
 from mitsonar.datasets.samples import Samples, SonarPairs  # noqa: E402
 from mitsonar.estimation.learned import (  # noqa: E402
     ImageNetwork,
@@ -257,7 +257,7 @@ SMALL: dict[str, Any] = {
 
 def test_a_network_of_vectors_learns_and_is_evaluated(portions: Path, tmp_path: Path, mitsonar: Command) -> None:
     recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "range_levels": 20}})
-    kept = train(recipe, portions, tmp_path / "run")
+    kept = train(TrainOptions(recipe, portions, tmp_path / "run"))
     assert kept.options["size"] == [20, 8]
     done = mitsonar("evaluate", tmp_path / "run", portions, "--part", "all", "--noise", "none")
     assert done.returncode == 0, done.stderr
@@ -269,7 +269,7 @@ def test_a_network_of_vectors_learns_and_is_evaluated(portions: Path, tmp_path: 
 def test_a_network_of_halves_estimates_from_any_frames(ahead: Path, tmp_path: Path) -> None:
     """As the training arranged them: frames in, the same answer as from the data set."""
     recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "halves": True}})
-    kept = train(recipe, ahead, tmp_path / "run")
+    kept = train(TrainOptions(recipe, ahead, tmp_path / "run"))
     assert kept.options["size"][1] == 4
     frames = SonarPairs(ahead, part="all", layout="channels").sonar_frames(7)
     samples = SonarPairs(ahead, part="all", **kept.arrangement, labels=kept.labels["kind"])
@@ -280,7 +280,7 @@ def test_a_network_of_halves_estimates_from_any_frames(ahead: Path, tmp_path: Pa
 
 def test_heights_of_vectors(portions: Path, tmp_path: Path) -> None:
     recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "frames": 1, "views": ["c1"]}})
-    kept = train(recipe, portions, tmp_path / "run")
+    kept = train(TrainOptions(recipe, portions, tmp_path / "run"))
     assert (kept.options["size"][1], kept.options["outputs"]) == (1, 1)
 
 
@@ -352,7 +352,7 @@ def learnt(portions: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run of a small network of four segments."""
     run = tmp_path_factory.mktemp("learnt") / "run"
     recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "views": ["c2", "c1", "c3", "c4"]}})
-    train(recipe, portions, run)
+    train(TrainOptions(recipe, portions, run))
     return run
 
 
