@@ -21,6 +21,7 @@ __all__ = [
     "ConvolutionNetwork",
     "Network",
     "Quadrants",
+    "RegressionNetwork",
     "SameAverage",
     "SameConv2d",
     "Size",
@@ -214,23 +215,21 @@ def fully_connected(sizes: Sequence[int]) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-class ConvolutionNetwork(Network):
-    """Network of convolutions, a mean over 4 x 4 cells, and a fully connected layer; a subclass sets the convolutions.
-
-    Dropout is applied before the fully connected layer (ours; the text gives no position).
+class RegressionNetwork(Network):
+    """Base of networks that end in a fully connected layer; a subclass builds the layers before it.
 
     Args:
         outputs: number of estimates.
-        width: factor on the channels.
+        width: factor on the channels and on the sizes of fully connected layers.
         dropout: rate in training.
-        size: rows and columns of the input.
+        size: rows and columns of the input; default: ``typical_size``.
         channels: of the input; with Almanza-Medina's 1 the frames are side by side.
 
     Raises:
         MitsonarError: a value is out of range.
     """
 
-    table: ClassVar[Table]
+    typical_size: ClassVar[Size] = (512, 192)
 
     def __init__(
         self,
@@ -238,24 +237,47 @@ class ConvolutionNetwork(Network):
         outputs: int = 3,
         width: float = 1.0,
         dropout: float = 0.5,
-        size: Size = (512, 192),
-        channels: int = 1,
+        size: Size | None = None,
+        channels: int | None = 1,
     ) -> None:
+        size = self.typical_size if size is None else size
         super().__init__(outputs=outputs, width=width, dropout=dropout, channels=channels, size=size)
-        layers = convolutions(self.table, channels, width)
-        self.layers = nn.Sequential(layers | {"average": SameAverage()})
-        self.dropout = nn.Dropout(dropout)
-        self.regression = nn.Linear(values_after(self.table, size, width), outputs)
+        values = self.build(size, width, nn.Dropout(dropout), channels or 1)
+        self.regression = nn.Linear(values, outputs)
         glorot(self)
 
+    def build(self, size: Size, width: float, dropout: nn.Dropout, channels: int) -> int:
+        """Add all layers but the last one, and return the number of values that it reads."""
+        raise NotImplementedError
+
+    def encode(self, image: Tensor) -> Tensor:
+        """Compute the input ``(batch, values)`` of the last layer."""
+        return self.dropout(self.layers(image).flatten(1))  # type: ignore[no-any-return]
+
     def forward(self, image: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` from frames ``(batch, channels, rows, columns)`` with grey values in 0..1.
+        """Estimate labels ``(batch, outputs)`` from an input ``(batch, channels, rows, columns)`` with grey values in 0..1.
 
         Raises:
-            MitsonarError: the frames have another size.
+            MitsonarError: the input has another size.
         """
         self.expect(image)
-        return self.regression(self.dropout(self.layers(image).flatten(1)))  # type: ignore[no-any-return]
+        return self.regression(self.encode(image))  # type: ignore[no-any-return]
+
+
+class ConvolutionNetwork(RegressionNetwork):
+    """Network of convolutions, a mean over 4 x 4 cells, and a fully connected layer; a subclass sets the convolutions.
+
+    Dropout is applied before the fully connected layer (ours; the text gives no position). See :class:`RegressionNetwork`
+    for options and errors.
+    """
+
+    table: ClassVar[Table]
+
+    def build(self, size: Size, width: float, dropout: nn.Dropout, channels: int) -> int:
+        """Add the convolutions and the mean."""
+        self.layers = nn.Sequential(convolutions(self.table, channels, width) | {"average": SameAverage()})
+        self.dropout = dropout
+        return values_after(self.table, size, width)
 
 
 class Quadrants(nn.Module):

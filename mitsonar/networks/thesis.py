@@ -16,6 +16,7 @@ from mitsonar.networks.blocks import (
     ConvolutionNetwork,
     Network,
     Quadrants,
+    RegressionNetwork,
     SameAverage,
     SameConv2d,
     Size,
@@ -31,10 +32,7 @@ from mitsonar.networks.blocks import (
 
 __all__ = [
     "IMPULSE_CHANNELS",
-    "IMPULSE_KERNELS",
     "IMPULSE_LAYERS",
-    "POSENETVEC_CHANNELS",
-    "POSENETVEC_KERNELS",
     "POSENET_LAYERS",
     "SFMNET_LAYERS",
     "SIZES",
@@ -47,11 +45,14 @@ __all__ = [
     "PoseNetDual",
     "PoseNetVec",
     "QuadPoseNet",
+    "QuadrantNetwork",
     "SfMNet",
 ]
 
 
 POSENET_KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3)
+"""Rows of the kernels of all PoseNets (Tables 4.1, 4.2 and 5.1)."""
+
 POSENET_CHANNELS = (32, 64, 128, 256, 512, 512, 512, 1024, 1024)
 POSENET_LAYERS: Table = tuple(
     (kernel, channels, 2) for kernel, channels in zip(POSENET_KERNELS, POSENET_CHANNELS, strict=True)
@@ -65,7 +66,7 @@ class PoseNet(ConvolutionNetwork):
     It is Almanza-Medina's best network on images (3.3.2 and Table 4.1), after GeoNet (Yin and Shi, 2018). It accepts any
     size: two frames side by side (512 x 192), three (512 x 288), two sensors (512 x 384), wide frames side by side (512 x
     1024) or stacked (1024 x 512). The text has 3 (Q - 1) outputs. Here three frames also have 3, because their motion is
-    constant. See :class:`~mitsonar.networks.blocks.ConvolutionNetwork` for options and errors.
+    constant. See :class:`~mitsonar.networks.blocks.RegressionNetwork` for options and errors.
     """
 
     table: ClassVar[Table] = POSENET_LAYERS
@@ -137,57 +138,30 @@ class PoseNetDual(Network):
 # ---------------- PoseNet for vectors
 
 
-POSENETVEC_KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3)
-"""Rows of the kernels, along range."""
-
-POSENETVEC_CHANNELS = (32, 64, 128, 256, 512, 512, 512, 1024, 1024)
-
 POSENETVEC_COLUMNS = 2
 """Columns of each kernel."""
 
 
-class PoseNetVec(Network):
+class PoseNetVec(RegressionNetwork):
     """PoseNet for vectors, which preserves the number of columns (Almanza-Medina, 4.3.1 and Table 4.2).
 
     Nine convolutions of stride 2 along range and 1 across columns are followed by a mean over 4 x 4 cells and a fully
     connected layer. The input is vectors side by side, two of each portion of the field of view: 512 x 2 for the whole,
     512 x 8 for four quadrants. From one vector the network estimates the height (Table 4.4). Dropout is applied before the
-    fully connected layer (ours, as in PoseNet; the text gives no position).
-
-    Args:
-        outputs: number of estimates.
-        width: factor on the channels.
-        dropout: rate in training.
-        size: range levels and columns of the input.
-        channels: of the input.
-
-    Raises:
-        MitsonarError: a value is out of range.
+    fully connected layer (ours, as in PoseNet; the text gives no position). See
+    :class:`~mitsonar.networks.blocks.RegressionNetwork` for options and errors.
     """
 
     needs: ClassVar[Fields] = {"kind": "vector"}
+    typical_size: ClassVar[Size] = (512, 8)
 
-    def __init__(
-        self, *, outputs: int = 3, width: float = 1.0, dropout: float = 0.5, size: Size = (512, 8), channels: int = 1
-    ) -> None:
-        super().__init__(outputs=outputs, width=width, dropout=dropout, channels=channels, size=size)
-        layers = column_convolutions(POSENETVEC_KERNELS, POSENETVEC_CHANNELS, POSENETVEC_COLUMNS, width, channels)
+    def build(self, size: Size, width: float, dropout: nn.Dropout, channels: int) -> int:
+        """Add the convolutions and the mean."""
+        layers = column_convolutions(POSENET_KERNELS, POSENET_CHANNELS, POSENETVEC_COLUMNS, width, channels)
         self.layers = nn.Sequential(*layers, SameAverage())
-        self.dropout = nn.Dropout(dropout)
-        rows, columns = size
-        for _ in POSENETVEC_KERNELS:
-            rows = -(-rows // 2)
-        self.regression = nn.Linear(scaled(POSENETVEC_CHANNELS[-1], width) * rows * columns, outputs)
-        glorot(self)
-
-    def forward(self, vectors: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` from vectors ``(batch, channels, levels, columns)``.
-
-        Raises:
-            MitsonarError: the vectors have another size.
-        """
-        self.expect(vectors)
-        return self.regression(self.dropout(self.layers(vectors).flatten(1)))  # type: ignore[no-any-return]
+        self.dropout = dropout
+        rows, _ = cells_after(size, [2] * len(POSENET_KERNELS))
+        return scaled(POSENET_CHANNELS[-1], width) * rows * size[1]
 
 
 # ---------------- SfMNet
@@ -208,7 +182,7 @@ class SfMNet(ConvolutionNetwork):
 
     It is the part of SfM-Net that estimates the motion of the camera (Almanza-Medina, 3.3.1; Vijayanarasimhan et al., 2017).
     The text gives neither the padding nor the extent of the average, which are those of PoseNet (ours). See
-    :class:`~mitsonar.networks.blocks.ConvolutionNetwork` for options and errors.
+    :class:`~mitsonar.networks.blocks.RegressionNetwork` for options and errors.
     """
 
     table: ClassVar[Table] = SFMNET_LAYERS
@@ -261,98 +235,83 @@ class CoarseFeatures(nn.Module):
         return torch.cat((fine.flatten(1), self.pool2(self.conv2(fine)).flatten(1)), dim=1)
 
 
-class Cnn1b(Network):
+class Cnn1b(RegressionNetwork):
     """CNN-1b: means over 8 x 8 cells, two convolutions, and four fully connected layers.
 
     The network is from Almanza-Medina (3.3.3), after Costante et al. (2016). Dropout is applied before the fully connected
-    layers (ours; the text gives a rate, but no position).
-
-    Args:
-        outputs: number of estimates.
-        width: factor on the channels and on the sizes of the fully connected layers.
-        dropout: rate in training.
-        size: rows and columns of the input, at least 64 each.
-        channels: of the input; with Almanza-Medina's 1 the frames are side by side.
-
-    Raises:
-        MitsonarError: a value is out of range.
+    layers (ours; the text gives a rate, but no position). Images have at least 64 rows and columns. See
+    :class:`~mitsonar.networks.blocks.RegressionNetwork` for options and errors.
     """
 
-    def __init__(
-        self,
-        *,
-        outputs: int = 3,
-        width: float = 1.0,
-        dropout: float = 0.5,
-        size: Size = (512, 192),
-        channels: int = 1,
-    ) -> None:
-        super().__init__(outputs=outputs, width=width, dropout=dropout, channels=channels, size=size)
+    def build(self, size: Size, width: float, dropout: nn.Dropout, channels: int) -> int:
+        """Add the convolutions and the fully connected layers."""
         self.features = CoarseFeatures(cells=8, size=size, width=width, channels=channels)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = dropout
         self.layers = fully_connected([self.features.values, *(scaled(full, width) for full in SIZES)])
-        self.regression = nn.Linear(scaled(SIZES[-1], width), outputs)
-        glorot(self)
+        return scaled(SIZES[-1], width)
 
-    def forward(self, image: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` from frames ``(batch, channels, rows, columns)`` with grey values in 0..1.
-
-        Raises:
-            MitsonarError: the frames have another size.
-        """
-        self.expect(image)
-        return self.regression(self.layers(self.dropout(self.features(image))))  # type: ignore[no-any-return]
+    def encode(self, image: Tensor) -> Tensor:
+        """Compute the input ``(batch, values)`` of the last layer."""
+        return self.layers(self.dropout(self.features(image)))  # type: ignore[no-any-return]
 
 
 # ---------------- CNN-4b
 
 
-class Cnn4b(Network):
-    """CNN-4b: the convolutions of CNN-1b on each pair of quadrants of two images, and four fully connected layers.
-
-    The network is from Almanza-Medina (3.3.3), after Costante et al. (2016). The convolutions read means over 4 x 4 cells.
-    The four quadrants share no weights, and dropout is applied before the fully connected layers; both are ours.
+class QuadrantNetwork(RegressionNetwork):
+    """Base of networks that read each pair of quadrants of two images side by side by layers that share no weights (ours).
 
     Args:
         outputs: number of estimates.
         width: factor on the channels and on the sizes of the fully connected layers.
         dropout: rate in training.
-        size: rows and columns of the input, two images side by side; at least 64 each, rows even, columns divisible by 4.
+        size: rows and columns of the input, two images side by side; rows even, columns divisible by 4.
 
     Raises:
         MitsonarError: a value is out of range, or the images cannot be cut into quadrants.
     """
 
-    def __init__(
-        self,
-        *,
-        outputs: int = 3,
-        width: float = 1.0,
-        dropout: float = 0.5,
-        size: Size = (512, 192),
-    ) -> None:
-        super().__init__(outputs=outputs, width=width, dropout=dropout, size=size)
-        quadrant = Quadrants.size(size)
-        quarters = [CoarseFeatures(cells=4, size=quadrant, width=width) for _ in range(4)]
-        values = sum(quarter.values for quarter in quarters)
+    def __init__(self, *, outputs: int = 3, width: float = 1.0, dropout: float = 0.5, size: Size | None = None) -> None:
+        super().__init__(outputs=outputs, width=width, dropout=dropout, size=size, channels=None)
+
+    def quadrant(self, size: Size, width: float) -> CoarseFeatures | QuadPoseNet:
+        """Build the layers of one pair of quadrants of that size."""
+        raise NotImplementedError
+
+    def build(self, size: Size, width: float, dropout: nn.Dropout, channels: int) -> int:
+        """Add the layers of all quadrants."""
+        quarters = [self.quadrant(Quadrants.size(size), width) for _ in range(4)]
         self.split = Quadrants()
         self.quarters = nn.ModuleList(quarters)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = dropout
+        return sum(quarter.values for quarter in quarters)
+
+    def encode(self, image: Tensor) -> Tensor:
+        """Compute the features ``(batch, values)`` of all quadrants."""
+        features = [quarter(part) for quarter, part in zip(self.quarters, self.split(image), strict=True)]
+        return self.dropout(torch.cat(features, dim=1))  # type: ignore[no-any-return]
+
+
+class Cnn4b(QuadrantNetwork):
+    """CNN-4b: the convolutions of CNN-1b on each pair of quadrants of two images, and four fully connected layers.
+
+    The network is from Almanza-Medina (3.3.3), after Costante et al. (2016). The convolutions read means over 4 x 4 cells.
+    Images have at least 64 rows and columns. Dropout is applied before the fully connected layers (ours).
+    """
+
+    def quadrant(self, size: Size, width: float) -> CoarseFeatures:
+        """Build the convolutions of one pair of quadrants."""
+        return CoarseFeatures(cells=4, size=size, width=width)
+
+    def build(self, size: Size, width: float, dropout: nn.Dropout, channels: int) -> int:
+        """Add the convolutions of all quadrants and the fully connected layers."""
+        values = super().build(size, width, dropout, channels)
         self.layers = fully_connected([values, *(scaled(full, width) for full in SIZES)])
-        self.regression = nn.Linear(scaled(SIZES[-1], width), outputs)
-        glorot(self)
+        return scaled(SIZES[-1], width)
 
-    def forward(self, pair: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` from two images side by side ``(batch, 1, rows, columns)``.
-
-        The grey values are in 0..1.
-
-        Raises:
-            MitsonarError: the images have another size.
-        """
-        self.expect(pair)
-        features = [quarter(image) for quarter, image in zip(self.quarters, self.split(pair), strict=True)]
-        return self.regression(self.layers(self.dropout(torch.cat(features, dim=1))))  # type: ignore[no-any-return]
+    def encode(self, image: Tensor) -> Tensor:
+        """Compute the input ``(batch, values)`` of the last layer."""
+        return self.layers(super().encode(image))  # type: ignore[no-any-return]
 
 
 # ---------------- CNN-4PoseNet
@@ -399,56 +358,19 @@ class QuadPoseNet(nn.Module):
         return torch.cat((last, self.from_first(self.early(first).flatten(1))), dim=1)
 
 
-class Cnn4PoseNet(Network):
+class Cnn4PoseNet(QuadrantNetwork):
     """CNN-4PoseNet: a QuadPoseNet on each pair of quadrants of two images, and a fully connected layer on all of them.
 
     The network is from Almanza-Medina (3.3.4). Dropout is applied before the last layer (ours).
-
-    Args:
-        outputs: number of estimates.
-        width: factor on the channels and on the sizes of the fully connected layers.
-        dropout: rate in training.
-        size: rows and columns of the input, two images side by side; rows even, columns divisible by 4.
-
-    Raises:
-        MitsonarError: a value is out of range, or the images cannot be cut into quadrants.
     """
 
-    def __init__(
-        self,
-        *,
-        outputs: int = 3,
-        width: float = 1.0,
-        dropout: float = 0.5,
-        size: Size = (512, 192),
-    ) -> None:
-        super().__init__(outputs=outputs, width=width, dropout=dropout, size=size)
-        quadrant = Quadrants.size(size)
-        quarters = [QuadPoseNet(size=quadrant, width=width) for _ in range(4)]
-        self.split = Quadrants()
-        self.quarters = nn.ModuleList(quarters)
-        self.dropout = nn.Dropout(dropout)
-        self.regression = nn.Linear(sum(quarter.values for quarter in quarters), outputs)
-        glorot(self)
-
-    def forward(self, pair: Tensor) -> Tensor:
-        """Estimate labels ``(batch, outputs)`` from two images side by side ``(batch, 1, rows, columns)``.
-
-        The grey values are in 0..1.
-
-        Raises:
-            MitsonarError: the images have another size.
-        """
-        self.expect(pair)
-        features = [quarter(image) for quarter, image in zip(self.quarters, self.split(pair), strict=True)]
-        return self.regression(self.dropout(torch.cat(features, dim=1)))  # type: ignore[no-any-return]
+    def quadrant(self, size: Size, width: float) -> QuadPoseNet:
+        """Build the layers of one pair of quadrants."""
+        return QuadPoseNet(size=size, width=width)
 
 
 # ---------------- PoseNet for impulse responses
 
-
-IMPULSE_KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3)
-"""Rows of the kernels, along delay (Table 5.1)."""
 
 IMPULSE_CHANNELS = (32, 64, 128, 256, 512, 512, 512, 512, 512)
 
@@ -503,9 +425,7 @@ class ImpulsePoseNet(Network):
             )
         self.options |= {"layers": layers, "receivers": receivers}
         self.nets = nn.ModuleList(_pose_net(layers, width, dropout) for _ in range(receivers))
-        rows = size[0]
-        for _ in range(layers):
-            rows = -(-rows // 2)
+        rows, _ = cells_after(size, [2] * layers)
         values = receivers * scaled(IMPULSE_CHANNELS[layers - 1], width) * rows * (size[1] // receivers)
         self.regression = nn.Linear(values, outputs)
         glorot(self)
@@ -524,6 +444,6 @@ class ImpulsePoseNet(Network):
 
 def _pose_net(layers: int, width: float, dropout: float) -> nn.Sequential:
     """Build the convolutions of Table 5.1 and the mean, with dropout after the first ReLU and after the mean."""
-    parts = column_convolutions(IMPULSE_KERNELS[:layers], IMPULSE_CHANNELS[:layers], IMPULSE_COLUMNS, width)
+    parts = column_convolutions(POSENET_KERNELS[:layers], IMPULSE_CHANNELS[:layers], IMPULSE_COLUMNS, width)
     parts.insert(3, nn.Dropout(dropout))
     return nn.Sequential(*parts, SameAverage(), nn.Dropout(dropout))
