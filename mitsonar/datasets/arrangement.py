@@ -23,7 +23,8 @@ ArrayOfAnyLibrary: TypeAlias = Any
 InputOfAnyLibrary: TypeAlias = ArrayOfAnyLibrary | tuple[ArrayOfAnyLibrary, ...]
 """Input of a network: one array, or a polar and a Cartesian array."""
 
-LABELS = ("raw", "quantised", "normx10")
+LabelKind = Literal["raw", "quantised", "normx10"]
+LABELS: tuple[str, ...] = get_args(LabelKind)
 """Kinds of labels; see :class:`Labels`."""
 
 LEVELS = 32

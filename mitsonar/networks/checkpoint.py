@@ -11,24 +11,25 @@ import math
 import os
 import warnings
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeGuard, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias, TypeGuard
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from torch import Tensor, nn
 
 from mitsonar.config.data import Recipe, Split
-from mitsonar.datasets.arrangement import LABELS, Coordinates, Labels, Layout
+from mitsonar.datasets.arrangement import Coordinates, LabelKind, Labels, Layout
 from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.sample_index import Part, split_for
 from mitsonar.datasets.samples import Batches, ground_at
-from mitsonar.errors import MitsonarError, meant, nearest_names, shortened
+from mitsonar.errors import MitsonarError, complaint, meant, shortened
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import sonar_from
@@ -42,19 +43,7 @@ if TYPE_CHECKING:
     from mitsonar.datasets.responses import ImpulseSamples
     from mitsonar.datasets.samples import SonarPairs
 
-__all__ = [
-    "FILE",
-    "FORMAT",
-    "LARGEST",
-    "WORDS",
-    "Checkpoint",
-    "are_numbers",
-    "faults_of",
-    "first_line",
-    "onnx_of",
-    "unpacked",
-]
-
+__all__ = ["FILE", "Checkpoint", "onnx_of"]
 
 FORMAT = 1
 """Version of the file format. A reader accepts only this version."""
@@ -80,7 +69,7 @@ class Checkpoint:
         network: its name, for :func:`~mitsonar.networks.create.create_network`.
         options: of the network.
         weights: its state, on the CPU.
-        arrangement: of its input: the options in :data:`WORDS`.
+        arrangement: of its input: the options of :class:`~mitsonar.datasets.samples.SonarPairs`.
         labels: of its output: kind, low, high, names; see :attr:`coder`.
         sonar: fields of the sonar of each view, keyed by view; empty if the network works with any sonar.
         trained_at: geometry of the sonar in training: ``height_m`` [low, high] above z = 0, ``pitch_deg``, ``roll_deg``.
@@ -172,7 +161,7 @@ class Checkpoint:
                 raise MitsonarError(f"{error} ({written})") from None
             except Exception as error:  # invalid options may raise anything
                 raise MitsonarError(
-                    f"no {self.network} has these options, {shortened(self.options)}: {first_line(error)}"
+                    f"no {self.network} has these options, {shortened(self.options)}: {_first_line(error)}"
                 ) from None
         try:
             network.load_state_dict(self.weights)
@@ -250,7 +239,7 @@ class Checkpoint:
         """
         known = {level: found.get("rmse") for level, found in self.metrics.items() if isinstance(found, dict)}
         chosen = [known[self.noise]] if self.noise in known else list(known.values())
-        if not chosen or not all(are_numbers(rmse, len(self.labels["names"])) for rmse in chosen):
+        if not chosen or not all(_are_numbers(rmse, len(self.labels["names"])) for rmse in chosen):
             return None
         return np.asarray(np.sqrt((np.array(chosen, dtype=float) ** 2).mean(axis=0)))
 
@@ -339,7 +328,7 @@ class Checkpoint:
         ]
         for level, found in self.metrics.items():
             rmse = found.get("rmse") if isinstance(found, dict) else None
-            if isinstance(rmse, list) and len(rmse) <= len(AXES) and are_numbers(rmse, len(rmse)):
+            if isinstance(rmse, list) and len(rmse) <= len(AXES) and _are_numbers(rmse, len(rmse)):
                 units = [axis.unit for axis in AXES[: len(rmse)]]
                 values = " / ".join(f"{value:.3g} {unit}" for value, unit in zip(rmse, units, strict=True))
                 rows.append((f"RMSE, noise {level}", f"{values} in validation"))
@@ -390,7 +379,7 @@ class Checkpoint:
         Raises:
             MitsonarError: the bytes are not a checkpoint, are damaged, or have another format.
         """
-        table = unpacked(content, source)
+        table = _unpacked(content, source)
         if table.get("kind") != KIND:
             lightning = any(str(key).startswith("pytorch-lightning") for key in table)
             held = "Lightning's state, from which `mitsonar train --resume` continues" if lightning else "something else"
@@ -401,11 +390,16 @@ class Checkpoint:
                 f"{str(table.get('version'))[:40]}; this is mitsonar {version('mitsonar')}, which reads format {FORMAT}: "
                 "use the version that wrote it, or train again"
             )
-        names = [one.name for one in fields(cls)]
-        faults = faults_of({key: value for key, value in table.items() if key != "kind"}, names)
-        if faults:
-            raise MitsonarError(f"{source} is damaged: {faults[0]}; train again, or take a copy that is whole")
-        return cls(**{name: table[name] for name in names})
+        try:
+            check_plain({name: value for name, value in table.items() if name != "weights"}, "it")
+            _Contents.model_validate(table)
+        except MitsonarError as error:
+            reason = str(error)
+        except ValidationError as error:
+            reason = complaint(error, _Contents, "checkpoint")
+        else:
+            return cls(**{one.name: table[one.name] for one in fields(cls)})
+        raise MitsonarError(f"{source} is damaged: {reason}; train again, or take a copy that is whole")
 
 
 def _numbers_in(options: Fields) -> list[tuple[str, float]]:
@@ -451,32 +445,11 @@ def _number(value: object) -> str:
 FILE = "network.ckpt"
 """Name of a checkpoint in the folder of a training run."""
 
-Table: TypeAlias = dict[Any, Any]
-"""Content of a file before its keys have been checked."""
-
-WORDS = {
-    "frames": int,
-    "views": list,
-    "kind": str,
-    "layout": str,
-    "coordinates": str,
-    "cartesian_rows": int,
-    "ground": bool,
-}
-"""Options of :class:`~mitsonar.datasets.samples.SonarPairs` that define the input of a network, with their types."""
-
-LATER: dict[str, type | tuple[type, ...]] = {"range_levels": (int, type(None)), "halves": bool}
-"""Options that may be missing in files of earlier versions; their defaults are those of SonarPairs."""
-
 LARGEST = 8 * 2**30
 """Largest accepted size of a checkpoint when unpacked [bytes]."""
 
 
-LONGEST_NAME = 80
-"""Largest number of letters of a name in a message; names in an untrusted file may have any length."""
-
-
-def unpacked(content: bytes, source: str) -> Table:
+def _unpacked(content: bytes, source: str) -> dict[Any, Any]:
     """Unpack the dictionary in a torch file, after checks of sizes and checksums that torch does not make.
 
     Args:
@@ -505,140 +478,109 @@ def unpacked(content: bytes, source: str) -> Table:
         raise
     except Exception as error:  # a damaged zip or pickle may raise anything
         raise MitsonarError(
-            f"{source} is damaged, or not a checkpoint of mitsonar ({first_line(error)}): give a {FILE} of `mitsonar train`"
+            f"{source} is damaged, or not a checkpoint of mitsonar ({_first_line(error)}): give a {FILE} of `mitsonar train`"
         ) from None
     return table if isinstance(table, dict) else {}
 
 
-def faults_of(table: Table, names: Collection[str]) -> list[str]:
-    """Check the fields of a file, and return one sentence per fault.
+class _Part(BaseModel):
+    """A table of a file: types are not converted."""
 
-    Args:
-        table: content of the file.
-        names: of the fields of a checkpoint.
-    """
-    # 1. The fields must be those of a checkpoint.
-    found = [f"it lacks {name}" for name in sorted(set(names) - set(table))]
-    found += [f"{shortened(key)} is unknown" for key in table if key not in names]
-    if found:
-        return found
-    # 2. All values but the weights must be plain, and have the right type.
-    try:
-        check_plain({name: value for name, value in table.items() if name != "weights"}, "it")
-    except MitsonarError as error:
-        return [str(error)]
-    texts, tables = (
-        ("network", "model", "noise", "data", "version"),
-        ("options", "arrangement", "labels", "sonar", "trained_at"),
-    )
-    found += [f"{name} is not a text" for name in texts if not isinstance(table[name], str)]
-    for name in (*tables, "weights", "data_recipe", "recipe", "metrics", "trained"):
-        if not (isinstance(table[name], dict) and all(isinstance(key, str) for key in table[name])):
-            found.append(f"{name} is not a table")
-    if found:
-        return found
-    # 3. The values must be possible.
-    for name, values in table["weights"].items():
-        found += _faults_of_weights(name, values)
-    words = table["arrangement"]
-    found += _faults_of_arrangement(words) if not found else _faults_of_types(words)
-    receives = words["kind"] == "response" if not found else False
-    return found + _faults_of_labels(table["labels"]) + _faults_of_sonar(table["sonar"], table["trained_at"], receives)
+    model_config = ConfigDict(strict=True, arbitrary_types_allowed=True)
 
 
-def _faults_of_weights(name: str, values: object) -> list[str]:
-    """Check one array of weights."""
-    if not isinstance(values, Tensor):
-        return [f"weights {name[:LONGEST_NAME]} are not numbers"]
-    if not _stored_whole(values):
-        return [f"weights {name[:LONGEST_NAME]} promise more numbers than the file holds"]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Arrangement(_Part, extra="forbid"):
+    """Options of :class:`~mitsonar.datasets.samples.SonarPairs` that define the input; earlier files lack the last two."""
+
+    frames: int = Field(ge=1, le=16)
+    views: list[str] = Field(min_length=1)
+    kind: Literal["image", "vector", "response"]
+    layout: Layout | Literal["columns"]
+    coordinates: Coordinates | Literal["delay"]
+    cartesian_rows: int = Field(ge=0, le=2**24)
+    ground: bool
+    range_levels: int | None = Field(None, ge=1, le=2**24)
+    halves: bool = False
+
+
+class _Labels(_Part):
+    """Kind, limits and names of the labels."""
+
+    kind: LabelKind
+    names: list[str] = Field(min_length=1)
+    low: list[Finite]
+    high: list[Finite]
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if not len(self.low) == len(self.high) == len(self.names):
+            raise ValueError("low and high must have one number a name")
+        return self
+
+
+class _TrainedAt(_Part):
+    """Geometry of the sonar in training."""
+
+    height_m: list[Finite] = Field(min_length=2, max_length=2)
+    pitch_deg: Finite
+    roll_deg: Finite
+
+
+def _stored_whole(values: Tensor) -> Tensor:
+    """Check that the file holds every number of a tensor, all finite; an expanded tensor would need more memory."""
+    plain = values.layout == torch.strided and values.device.type == "cpu" and not values.is_quantized
+    if not plain or values.numel() * values.element_size() > values.untyped_storage().nbytes():
+        raise ValueError("more numbers are promised than the file holds")
     if not torch.isfinite(values).all():
-        return [f"weights {name[:LONGEST_NAME]} hold nan or inf"]
-    return []
+        raise ValueError("numbers must be finite: got nan or inf")
+    return values
 
 
-def _faults_of_types(words: Fields) -> list[str]:
-    """Check the names and types of an arrangement's options."""
-    found = [
-        f"arrangement {word} is missing or of another type"
-        for word, kind in WORDS.items()
-        if not isinstance(words.get(word), kind)
-    ]
-    known = {**WORDS, **LATER}
-    found += [
-        f"arrangement {word[:LONGEST_NAME]} is unknown ({nearest_names(word, known)})" for word in words if word not in known
-    ]
-    later = [word for word in LATER if word in words]
-    return found + [
-        f"arrangement {word} is missing or of another type" for word in later if not isinstance(words[word], LATER[word])
-    ]
+class _Contents(_Part, extra="forbid"):
+    """Fields of a file: those of :class:`Checkpoint`, and ``kind``."""
+
+    kind: str
+    network: str
+    options: Fields
+    weights: dict[str, Annotated[Tensor, AfterValidator(_stored_whole)]]
+    arrangement: _Arrangement
+    labels: _Labels
+    sonar: dict[str, Fields]
+    trained_at: _TrainedAt
+    model: str
+    noise: str
+    data: str
+    data_recipe: Fields
+    recipe: Fields
+    metrics: Fields
+    trained: Fields
+    version: str
+    format: int
+
+    @model_validator(mode="after")
+    def _has_sonars(self) -> Self:
+        receives = self.arrangement.kind == "response"
+        if receives and list(self.sonar) != ["channel"]:
+            raise ValueError("sonar has no channel")
+        for view, own in self.sonar.items():
+            try:
+                (ChannelSonar if receives else Sonar).create(**own)
+            except (MitsonarError, TypeError) as error:
+                raise ValueError(f"sonar {view[:80]}: {error}") from None
+        return self
 
 
-def _faults_of_arrangement(words: Fields) -> list[str]:
-    """Check the options of an arrangement: their types first, then their values."""
-    found = _faults_of_types(words)
-    if found:
-        return found
-    if not (words["views"] and all(isinstance(view, str) for view in words["views"])):
-        return ["arrangement views are not names"]
-    known = {
-        "kind": ("image", "vector", "response"),
-        "layout": (*get_args(Layout), "columns"),
-        "coordinates": (*get_args(Coordinates), "delay"),
-    }
-    found = [f"arrangement {word} is {words[word][:40]!r}" for word, names in known.items() if words[word] not in names]
-    if not 1 <= words["frames"] <= 16 or not 0 <= words["cartesian_rows"] <= 2**24:
-        found.append("arrangement frames or cartesian_rows cannot be")
-    levels = words.get("range_levels")
-    if levels is not None and not 1 <= levels <= 2**24:
-        found.append("arrangement range_levels cannot be")
-    return found
-
-
-def _stored_whole(values: Tensor) -> bool:
-    """Return whether the file holds every number of a tensor; an expanded tensor would need more memory than the file."""
-    if values.layout != torch.strided or values.device.type != "cpu" or values.is_quantized:
-        return False
-    return values.numel() * values.element_size() <= values.untyped_storage().nbytes()
-
-
-def _faults_of_labels(labels: Fields) -> list[str]:
-    """Check the kind, names and limits of the labels."""
-    ends, names = [labels.get("low"), labels.get("high")], labels.get("names")
-    if labels.get("kind") not in LABELS:
-        return [f"labels are {shortened(labels.get('kind'))}, not one of {', '.join(LABELS)}"]
-    if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
-        return ["labels have no names"]
-    if not all(are_numbers(end, len(names)) for end in ends):
-        return ["the limits of the labels are not numbers, one a name"]
-    return []
-
-
-def _faults_of_sonar(sonar: Fields, trained_at: Fields, receives: bool) -> list[str]:
-    """Check the instrument of each view and the geometry in training."""
-    if receives and list(sonar) != ["channel"]:
-        return ["sonar has no channel"]
-    for view, own in sonar.items():
-        if not isinstance(own, dict):
-            return [f"sonar {view[:LONGEST_NAME]} is not a table"]
-        try:
-            (ChannelSonar if receives else Sonar).create(**own)
-        except (MitsonarError, TypeError) as error:
-            return [f"sonar {view[:LONGEST_NAME]}: {error}"]
-    angles = [trained_at.get("pitch_deg"), trained_at.get("roll_deg")]
-    if not (are_numbers(trained_at.get("height_m"), 2) and are_numbers(angles, 2)):
-        return ["trained_at must hold height_m (low, high), pitch_deg and roll_deg"]
-    return []
-
-
-def are_numbers(values: object, count: int) -> TypeGuard[list[float]]:
+def _are_numbers(values: object, count: int) -> TypeGuard[list[float]]:
     """Return whether ``values`` is a list of ``count`` finite numbers."""
     if not isinstance(values, list) or len(values) != count:
         return False
     return all(type(value) in (int, float) and math.isfinite(value) for value in values)
 
 
-def first_line(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     """Return the first line of an error's message, shortened if it is long, or the name of its class."""
     return (str(error).splitlines() or [type(error).__name__])[0][:300]
 

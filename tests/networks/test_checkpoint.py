@@ -190,19 +190,28 @@ def test_a_later_format_is_named(checkpoint: Checkpoint) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"trained_at": None}, "trained_at is not a table"),
-        ({"trained_at": {"height_m": [1.0], "pitch_deg": 0, "roll_deg": 0}}, "trained_at must hold height_m"),
-        ({"network": 3}, "network is not a text"),
-        ({"more": 1}, "'more' is unknown"),
-        ({"weights": {"a": [1, 2]}}, "weights a are not numbers"),
+        ({"trained_at": None}, "trained_at: input should be a valid dictionary"),
+        (
+            {"trained_at": {"height_m": [1.0], "pitch_deg": 0, "roll_deg": 0}},
+            "trained_at.height_m: list should have",
+        ),
+        ({"network": 3}, "network: input should be a valid string, got 3"),
+        ({"more": 1}, "unknown checkpoint key more"),
+        ({"weights": {"a": [1, 2]}}, "weights.a: input should be an instance of Tensor"),
         ({"weights": {"a": torch.tensor([1.0, float("nan")])}}, "nan or inf"),
-        ({"options": {1: 2}}, "options is not a table"),
-        ({"arrangement": {"frames": 2}}, "arrangement views is missing or of another type"),
-        ({"labels": {"kind": "octal"}}, "'octal', not one of raw, quantised, normx10"),
-        ({"labels": {"kind": "raw", "low": [0], "high": [1], "names": []}}, "no names"),
-        ({"labels": {"kind": "raw", "low": [0], "high": [float("inf")], "names": ["a"]}}, "limits of the labels"),
+        ({"options": {1: 2}}, "options.1.[key]: input should be a valid string"),
+        ({"arrangement": {"frames": 2}}, "lacks arrangement.views"),
+        ({"labels": {"kind": "octal"}}, "labels.kind: input should be 'raw', 'quantised' or 'normx10', got 'octal'"),
+        (
+            {"labels": {"kind": "raw", "low": [0], "high": [1], "names": []}},
+            "labels.names: list should have",
+        ),
+        (
+            {"labels": {"kind": "raw", "low": [0], "high": [float("inf")], "names": ["a"]}},
+            "labels.high.0: input should",
+        ),
         ({"sonar": {"image": {"beams": -4}}}, "sonar image: sonar beams"),
-        ({"sonar": {"image": 4}}, "sonar image is not a table"),
+        ({"sonar": {"image": 4}}, "sonar.image: input should be a valid dictionary, got 4"),
     ],
 )
 def test_fields_are_checked(checkpoint: Checkpoint, change: dict[str, Any], words: str) -> None:
@@ -236,7 +245,7 @@ def test_long_words_are_cut(checkpoint: Checkpoint, change: str) -> None:
 def test_fields_that_lack(checkpoint: Checkpoint) -> None:
     table = unpacked(checkpoint)
     for name in ("weights", "labels", "data_recipe"):
-        assert f"it lacks {name}" in refusal(packed({key: value for key, value in table.items() if key != name}))
+        assert f"checkpoint lacks {name}" in refusal(packed({key: value for key, value in table.items() if key != name}))
 
 
 def test_weights_and_options_must_fit_the_network(checkpoint: Checkpoint) -> None:
@@ -256,5 +265,5 @@ def test_files_of_before_vectors_had_words_are_read(checkpoint: Checkpoint) -> N
     older = Checkpoint.from_bytes(dataclasses.replace(checkpoint, arrangement=words).to_bytes())
     assert older.arrangement == words
     wrong = dataclasses.replace(checkpoint, arrangement={**words, "halves": 3})
-    with pytest.raises(MitsonarError, match="arrangement halves is missing or of another type"):
+    with pytest.raises(MitsonarError, match=r"arrangement\.halves: input should be a valid boolean, got 3"):
         Checkpoint.from_bytes(wrong.to_bytes())
