@@ -131,13 +131,13 @@ def measured(case: Case, repeats: int) -> dict[str, Any]:
     hard = case.sonar.replace(model="physical", pattern="box")
     sonars = {"physical": hard, "beams": hard.replace(pattern="two_way"), "coherent": case.sonar}
     simulators = {name: Simulator(case.scene, sonar) for name, sonar in sonars.items()}
-    coherent = simulators["coherent"].coherent
-    assert coherent is not None
+    imager = simulators["coherent"].model.imager
+    assert imager is not None
     work: dict[str, Callable[[int], object]] = {"trace": bare(case)}
     for name, simulator in simulators.items():
         work[name] = partial(rendered, simulator, case)
-    counts = coherent.image(case.pose(0)[0], 0)[1]
-    found = {"case": case.name, "rays": coherent.tracer.fan.rays, "points": counts.points}
+    counts = imager.image(case.pose(0)[0], 0)[1]
+    found = {"case": case.name, "rays": imager.tracer.fan.rays, "points": counts.points}
     return found | {name: dict(zip(("cpu", "wall"), ms, strict=True)) for name, ms in turns(work, repeats).items()}
 
 

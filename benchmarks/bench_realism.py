@@ -103,8 +103,8 @@ def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFra
         quiet = sonar.replace(noise_level_db=None, near_glow_db=0.0)
         silent = Simulator(scene, quiet, mirrors=stage.mirrors)
         bright = np.percentile(next(iter(silent.pings(poses[:1]))).levels[:, statistics.GLOW_BINS :], 99.9)
-        assert silent.coherent is not None
-        middle_db = 10 * math.log10(silent.coherent.gain[sonar.range_bins // 2])
+        assert silent.model.imager is not None
+        middle_db = 10 * math.log10(silent.model.imager.gain[sonar.range_bins // 2])
         full_db = 10 * math.log10(bright) - fit.bright_db
         for few in (2, frames):  # pictures dim glints of single cells: full scale moves by what is missing
             if fit.noise_db is not None:

@@ -189,7 +189,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         """Render samples of one world, starting at sequence ``begin``, with as many sequences per launch as fit."""
         assert self.gain is not None
         recipe, pings = renderer.recipe, renderer.recipe.flight.pings
-        together = max(1, renderer.simulator.pings_per_launch // pings)
+        together = max(1, renderer.simulator.model.pings_per_launch // pings)
         sequences = itertools.islice(sequences_of(recipe, renderer.scene), begin, None)
         before = renderer.scene.number * self.sequences_a_world * pings
         for start in range(begin, self.sequences_a_world, together):

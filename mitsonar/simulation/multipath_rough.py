@@ -1,7 +1,7 @@
-"""Multipath via rough surfaces: how the energies of paths with several reflections are traced and summed.
+"""Multipath via rough surfaces: how the energies of paths with several reflections are traced.
 
-The model ``physical`` sums the levels of these paths exactly, in the beams that receive them. The model ``coherent`` adds
-them as speckle.
+The model ``physical`` sums the levels of these paths exactly, in the beams that receive them
+(:class:`~mitsonar.simulation.models.physical.BounceSums`). The model ``coherent`` adds them as speckle.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,201 +19,27 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from mitsonar.acoustics.noise import uniform
-from mitsonar.errors import MitsonarError
-from mitsonar.instruments.sonar import Sonar
-from mitsonar.instruments.views import Whole
 from mitsonar.motion.pose import to_world_matrices
-from mitsonar.plugins.imaging_sonar_sensor import Fan
-from mitsonar.plugins.material_laws import material_of
 from mitsonar.plugins.surfaces import Hit, Surfaces
-from mitsonar.records.echoes import Echoes
-from mitsonar.simulation.beams import RANGES_A_PULSE, SINES_A_LOBE, angles_of, beam_at, elevation_gain_of_ends
-from mitsonar.simulation.binning import ViewEchoes, WholeTracer, accumulate, fraction_bits, half_path_rate
+from mitsonar.simulation.beams import RANGES_A_PULSE, SINES_A_LOBE, elevation_gain_of_ends
 from mitsonar.simulation.coherent_tracing import ADD, CoherentTracer, FanRays
-from mitsonar.simulation.device import DeviceArray, Frozen, LaunchTables, replayed
-from mitsonar.simulation.mirrors import Mirroring, SecondMirrors, mirror_of, parts_at, smooth_share, without_mirror_part
+from mitsonar.simulation.device import DeviceArray, Frozen, replayed
+from mitsonar.simulation.mirrors import SecondMirrors, parts_at, smooth_share, without_mirror_part
 from mitsonar.simulation.moving import scene_at
-from mitsonar.simulation.tracing import MovingSurfaces, going_on, hidden, lambert_direction, overlap, reflected
+from mitsonar.simulation.tracing import (
+    going_on,
+    half_path_rate,
+    hidden,
+    lambert_direction,
+    overlap,
+    reflected,
+)
 
-if TYPE_CHECKING:
-    from mitsonar.simulation.tracing import Rays
-
-__all__ = ["Arrival", "BounceSums", "DiffuseField", "Vertex", "Walk", "at_most_one"]
+__all__ = ["Arrival", "DiffuseField", "Vertex", "Walk", "at_most_one"]
 
 
 MOST_OF_A_RAY = 64
 """Bound of the levels of a ray's arrivals in one bin, relative to one reflection at the same ranges with C = 1."""
-
-
-class BounceSums:
-    """Sums of the levels of paths with several reflections.
-
-    Args:
-        scene: scene to trace.
-        sonar: sonar that gives the beam patterns.
-        traced: the sonar with hard boxes as beams; the sonar itself if it has no pattern.
-        mirroring: mirror parts of shapes.
-
-    Attributes:
-        tracer: tracer of the whole view; its fraction bits are those of these sums, separate from those of one reflection.
-
-    Raises:
-        MitsonarError: mirrors are rough, but the sonar has no carrier.
-    """
-
-    def __init__(self, scene: mi.Scene, sonar: Sonar, traced: Sonar, mirroring: Mirroring) -> None:
-        self.sonar, self.traced, self.tracer = sonar, traced, WholeTracer(Whole(traced))
-        found = mirror_of(scene, mirroring)
-        if found is not None and sonar.frequency_hz is None and (found.roughness_m * (found.reflection != 0)).any():
-            raise MitsonarError(
-                "what a rough mirror loses depends on the carrier: got a rms height and no frequency_hz; give frequency_hz"
-            )
-        self.wavenumber = 2 * math.pi * (sonar.frequency_hz or 0.0) / sonar.sound_speed
-        self.nearest = max(traced.range_min, traced.bin_m)
-        # the last surface may be near and the path long: R^g / nearest^2 against the R^(g - 2) of one reflection
-        spread = max(1.0, traced.range_max / self.nearest) ** min(traced.gain_exponent, 2)
-        self.tracer.bits = fraction_bits(traced, traced.rays, MOST_OF_A_RAY * spread)
-        self.second = SecondMirrors.of(scene, found, self.wavenumber) if sonar.bounces > 2 else None
-        self.tables_of_mirrors: LaunchTables | None = None
-        if found is not None:
-            lawless = [float(shape.bsdf() is None or material_of(shape) is None) for shape in scene.shapes()]
-            self.tables_of_mirrors = {"parts": found.table(), "lawless": mi.Float([*lawless, 0.0])}
-            dr.eval(self.tables_of_mirrors)
-
-    def scattered(self, echoes: Echoes, mirrors: LaunchTables | None) -> tuple[Echoes, DeviceArray]:
-        """Return echoes without the mirror part, and the amplitude factor of mirrors; 0 if there is no mirror."""
-        if mirrors is None:
-            return echoes, mi.Float(0)
-        known = (echoes.hit > 0) & (echoes.shape_id >= 0)
-        place = mi.UInt32(dr.select(known, echoes.shape_id, 0))
-        pair = dr.gather(mi.Vector2f, mirrors["parts"], place, known)
-        share = smooth_share(pair.y, echoes.cosine, self.wavenumber)
-        taken = (pair.x != 0) & (dr.gather(mi.Float, mirrors["lawless"], place, known) > 0)
-        kept = dr.select(taken, echoes.reflectivity * (1 - dr.square(share)), echoes.reflectivity)
-        return replace(echoes, reflectivity=kept), pair.x * share
-
-    def sums(
-        self,
-        scene: mi.Scene,
-        surfaces: Surfaces,
-        rays: Rays,
-        lines: list[mi.Vector4f],
-        seen: tuple[Fan, Echoes, DeviceArray],
-        keys: DeviceArray,
-        mirrors: LaunchTables | None,
-        pings: int,
-    ) -> mi.UInt64:
-        """Return the sums of a launch ``(pings, beams, stride)``, flat, as :func:`mitsonar.simulation.binning.accumulate`.
-
-        Args:
-            scene: scene to trace.
-            surfaces: surface tables of the scene.
-            rays: rays of the launch.
-            lines: three rows of ``to_world`` for each ray.
-            seen: fan in world axes, echoes of one reflection and amplitudes of :meth:`scattered`, without a pattern.
-            keys: keys of the random numbers, one for each ray.
-            mirrors: tables of :attr:`tables_of_mirrors`.
-            pings: number of pings in the launch.
-        """
-        # 1. the first surface of each ray, as traced for one reflection
-        fan, echoes, reflection = seen
-        mirror = reflection != 0
-        begin = Vertex(
-            valid=echoes.hit > 0,
-            place=mi.Point3f(echoes.x, echoes.y, echoes.z),
-            n=mi.Normal3f(echoes.nx, echoes.ny, echoes.nz),
-            d=fan.d,
-            lift=fan.lift,
-            side=fan.side,
-            reflectivity=at_most_one(echoes.reflectivity),
-            reflection=reflection,
-            length=echoes.range_m,
-            gain=mi.Float(1),
-            pure=mi.Bool(True),
-            first=mirror,
-        )
-        # 2. follow the paths, and add each arrival in the beams that receive it
-        origin = mi.Point3f(*(line.w for line in lines))
-        table, width = None if mirrors is None else mirrors["parts"], (echoes.far_m - echoes.near_m) * 0.25
-        moment: DeviceArray = mi.Float(rays.moment) if isinstance(surfaces, MovingSurfaces) else None
-        cell = fan.below, fan.above, fan.aside, width
-        walk = Walk(scene, surfaces, table, self.sonar.bounces, self.wavenumber, origin, *cell, moment, self.second)
-        sums: mi.UInt64 | None = None
-        for arrival in walk.arrivals(begin, rays.ray, keys):
-            for heard in self._heard(arrival, echoes, fan, lines, rays):
-                sums = accumulate(heard, rays.ping, pings, self.tracer, sums, counted=False)
-        assert sums is not None
-        return sums
-
-    def _heard(self, arrival: Arrival, echoes: Echoes, fan: Fan, lines: list[mi.Vector4f], rays: Rays) -> list[ViewEchoes]:
-        """Return the arrivals in the beams that receive them: a path, and its reverse if that is to be added too."""
-        sonar, traced = self.sonar, self.traced
-        level = self._levels(arrival, echoes)
-        # 1. a path that leaves along its ray as well has one direction only
-        if arrival.same:
-            gain = dr.square(self._vertical(fan.elevation, fan.elevation))
-            return [ViewEchoes(_scaled(level, gain), rays.beam, arrival.active, fan.elevation)]
-        # 2. angles of both ends; the other end must lie in the view, too
-        bearing, elevation = self._angles(fan.d, lines)
-        other, lift = self._angles(arrival.toward, lines)
-        at, inside = beam_at(traced, other)
-        high: DeviceArray = dr.abs(lift)
-        active = arrival.active & inside & (high <= math.radians(traced.elevation_fov_deg) / 2)
-        there, back = dr.square(self._vertical(elevation, lift)), dr.square(self._vertical(lift, elevation))
-        # 3. two-way pattern: the beams between both ends receive the path and its reverse in phase
-        if sonar.beam_pattern == "two_way":
-            part = dr.square(overlap(sonar, dr.sin(bearing) - dr.sin(other))) * dr.select(arrival.reverse, 4.0, 2.0)
-            middle, known = beam_at(traced, (bearing + other) * 0.5)
-            return [ViewEchoes(_scaled(level, there * part), middle, active & known, fan.elevation)]
-        # 4. otherwise each end receives one of them; they add coherently as far as the beams overlap
-        if sonar.beam_pattern == "box":
-            together = dr.select(at == rays.beam, 2.0, 1.0)
-        else:
-            together = 1 + overlap(sonar, dr.sin(bearing) - dr.sin(other))
-        found = [ViewEchoes(_scaled(level, there * together), rays.beam, active, fan.elevation)]
-        found += [ViewEchoes(_scaled(level, back * together), at, active & arrival.reverse, fan.elevation)]
-        return found
-
-    def _levels(self, arrival: Arrival, echoes: Echoes) -> Echoes:
-        """Return arrivals as echoes from which :func:`mitsonar.acoustics.levels.level` computes their level."""
-        radius, distance = (dr.select(v > self.nearest, v, self.nearest) for v in (arrival.range_m, arrival.distance))
-        return replace(
-            echoes,
-            hit=dr.select(arrival.active, mi.Float(1), 0),
-            range_m=arrival.range_m,
-            near_m=arrival.low_m,
-            far_m=arrival.high_m,
-            reflectivity=arrival.reflectivity,
-            cosine=arrival.cosine,
-            solid_angle_sr=echoes.solid_angle_sr * dr.square(radius / distance),
-        )
-
-    def _vertical(self, arrival: DeviceArray, departure: DeviceArray) -> DeviceArray:
-        """Return the amplitude of the pattern over elevation; 1 if the beams have no pattern."""
-        if self.sonar.beam_pattern == "box":
-            return mi.Float(1)
-        return elevation_gain_of_ends(self.sonar, dr.tan(arrival), dr.tan(departure))
-
-    def _angles(self, u: DeviceArray, lines: list[mi.Vector4f]) -> tuple[DeviceArray, DeviceArray]:
-        """Return bearing and elevation of directions given in the world [rad]."""
-        port, up, forward = (sum(line[axis] * u[row] for row, line in enumerate(lines)) for axis in range(3))
-        return angles_of(self.traced, -port, forward, up)
-
-
-def _scaled(echoes: Echoes, gain: DeviceArray) -> Echoes:
-    """Return echoes with their reflectivity scaled."""
-    return replace(echoes, reflectivity=echoes.reflectivity * gain)
-
-
-def bounce_sums(scene: mi.Scene, sonar: Sonar, traced: Sonar, mirroring: Mirroring) -> BounceSums | None:
-    """Return the sums of paths with several reflections in the model ``physical``; None if there is one reflection."""
-    if sonar.bounces == 1 or sonar.model != "physical":
-        return None
-    return BounceSums(scene, sonar, traced, mirroring)
-
-
-# ---------------- Paths of two and three reflections
-
 
 DRAWS = 0x6D756C74
 """Key that separates the random directions from the random jitter."""

@@ -6,30 +6,26 @@ import math
 from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.levels import coded
-from mitsonar.acoustics.materials import check_image_mirrors
 from mitsonar.errors import MitsonarError, counted
-from mitsonar.instruments.sonar import Sonar, group_of_beams, one_beam, scans, turned_heads
-from mitsonar.instruments.views import View, Whole
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import finite_number, whole_number
 from mitsonar.motion.pose import refuse_beyond_reach, vehicle_rotation
-from mitsonar.simulation.binning import Counts
 
 __all__ = [
     "NEARLY_EMPTY",
     "NEGLIGIBLE",
+    "Counts",
     "CutRays",
     "FirstPing",
-    "GroupedPings",
     "RenderedPings",
     "Tally",
     "angle_hint",
-    "check_timed",
     "constant_gain",
     "empty_frames",
     "labels_above",
@@ -37,7 +33,6 @@ __all__ = [
     "moments_of",
     "percent",
     "shadow",
-    "sonar_of_one_ping",
     "to_image",
     "view_of",
 ]
@@ -45,15 +40,6 @@ __all__ = [
 
 FirstPing: TypeAlias = int | Sequence[int]
 """Number of the first of several consecutive pings, or the number of each ping."""
-
-
-class OnePing(Protocol):
-    """Protocol of a renderer of pings, each at one moment."""
-
-    def pings(
-        self, poses: ArrayLike, *, first: FirstPing = 0, labels: bool = False, time_s: ArrayLike | None = None
-    ) -> Iterator[RenderedPings]:
-        """Yield batches of consecutive pings."""
 
 
 def moments_of(
@@ -94,87 +80,24 @@ def moments_of(
     return table, time if time.ndim == 2 else np.repeat(time[:, None], groups, axis=1), numbers
 
 
-def sonar_of_one_ping(sonar: Sonar) -> Sonar | None:
-    """Return the sonar whose separate pings make up a frame; None if one launch can trace all groups of beams.
-
-    One launch can trace each group from its pose if beams are independent boxes. If a beam also receives rays of other
-    beams, through its pattern or several reflections, all beams of the fan are formed at the pose of each group, and only
-    those of the group are used. A scanning head has a single beam.
-    """
-    if sonar.ping_groups == 1 or (sonar.beam_pattern == "box" and sonar.bounces == 1):
-        return None
-    return one_beam(sonar) if scans(sonar) else sonar.replace(ping_groups=1)
-
-
-def check_timed(sonar: Sonar, moving: object, views: Sequence[View] | None, mirrors: object) -> None:
-    """Reject views and mirrors that do not support the model, moving bodies or groups of beams.
-
-    Raises:
-        MitsonarError: bodies move, or beams ping in groups, with receivers elsewhere or portions of the field of view; the
-            model has no mirrors.
-    """
-    what = "bodies that move" if moving else "ping groups" if sonar.ping_groups > 1 else ""
-    check_image_mirrors(sonar, views, bool(mirrors))
-    if what and any(not isinstance(view, Whole) for view in views or ()):
-        raise MitsonarError(f"receivers elsewhere and portions have no {what}: render the whole view")
-
-
-class GroupedPings:
-    """Renderer of frames in which every group of beams is a separate ping.
-
-    Args:
-        inner: renderer for the sonar that :func:`sonar_of_one_ping` returns.
-        sonar: the sonar with groups of beams.
-    """
-
-    def __init__(self, inner: OnePing, sonar: Sonar) -> None:
-        self.inner, self.sonar = inner, sonar
-
-    def pings(
-        self, poses: NDArray[np.float64], time_s: NDArray[np.float64], numbers: list[int], labels: bool
-    ) -> Iterator[RenderedPings]:
-        """Yield frames one at a time; the arguments are those that :func:`moments_of` returns."""
-        groups = self.sonar.ping_groups
-        heads = turned_heads(self.sonar, poses) if scans(self.sonar) else poses
-        for place, number in enumerate(numbers):
-            made = self.inner.pings(heads[place], first=number * groups, labels=labels, time_s=time_s[place])
-            yield self._joined(list(made), number)
-
-    def _joined(self, parts: list[RenderedPings], number: int) -> RenderedPings:
-        """Join the pings of a frame's groups into one frame, taking each beam from the ping of its group."""
-        group = group_of_beams(self.sonar)
-        beam = np.zeros_like(group) if scans(self.sonar) else np.arange(self.sonar.beams)
-
-        def chosen(images: list[Any]) -> NDArray[Any]:
-            return np.ascontiguousarray(np.concatenate(images)[group, :, beam].T[None])
-
-        counts = (
-            np.concatenate([getattr(part.counts, name) for part in parts])
-            for name in ("inside", "nearer", "farther", "missed")
-        )
-        height_m = np.concatenate([part.height_m for part in parts])
-        return RenderedPings(
-            number,
-            chosen([part.levels for part in parts]),
-            Counts(*(self._of_beams(count, group, beam) for count in counts)),
-            height_m[len(height_m) // 2 :][:1],
-            {name: chosen([part.labels[name] for part in parts]) for name in parts[0].labels},
-            None if parts[0].expected is None else chosen([part.expected for part in parts]),
-            CutRays(sum(part.cut.rays for part in parts), max(part.cut.enough_m for part in parts)),
-        )
-
-    def _of_beams(self, count: NDArray[np.int64], group: NDArray[np.int64], beam: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the ray counts of the frame's beams, or their total if the pings do not count rays for each beam."""
-        if count.shape[1] == (1 if scans(self.sonar) else self.sonar.beams):
-            return np.asarray(count[group, beam][None])
-        return np.asarray([[count.sum()]])
-
-
 # ---------------- Rendered pings and their gain
 
 
 CALIBRATION_FRAMES = 20
 """Number of frames whose brightest pixels set the gain of a run."""
+
+
+@dataclass
+class Counts:
+    """Numbers of rays of each beam ``(frames, beams)``: inside the window, nearer, farther, missed.
+
+    ``inside`` is -1 where the number of rays of a beam differs from ping to ping (``View.rays_a_beam`` is None).
+    """
+
+    inside: NDArray[np.int64]
+    nearer: NDArray[np.int64]
+    farther: NDArray[np.int64]
+    missed: NDArray[np.int64]
 
 
 class CutRays(NamedTuple):

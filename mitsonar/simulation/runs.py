@@ -340,7 +340,7 @@ class StoredEchoes:
         import mitsuba as mi
 
         from mitsonar.instruments.views import Whole
-        from mitsonar.simulation.binning import ViewEchoes, WholeTracer, accumulate, develop, fetch
+        from mitsonar.simulation.models.thesis import ViewEchoes, WholeTracer, accumulate, develop, fetch
 
         if labels:
             raise MitsonarError("labels need the scene: render with --labels")

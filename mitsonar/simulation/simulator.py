@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -11,36 +11,30 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
-from mitsonar.acoustics.water import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar, TimedPath, overlap_notes, timed_path
 from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.device import ensure_variant, replayed
+from mitsonar.simulation.device import ensure_variant
+from mitsonar.simulation.pings import (
+    FirstPing,
+    RenderedPings,
+    Tally,
+    constant_gain,
+    labels_above,
+    moments_of,
+    to_image,
+)
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsonar.instruments.views import View
     from mitsonar.motion.bodies import Moving, MovingBodies
-    from mitsonar.simulation.expected import ExpectedFormer
     from mitsonar.simulation.mirrors import Mirroring
     from mitsonar.simulation.tracing import Tracer
-from mitsonar.simulation.pings import (
-    FirstPing,
-    GroupedPings,
-    RenderedPings,
-    Tally,
-    check_timed,
-    constant_gain,
-    labels_above,
-    labels_of,
-    moments_of,
-    sonar_of_one_ping,
-    to_image,
-)
 
 __all__ = ["Simulator"]
 
@@ -64,6 +58,9 @@ class Simulator:
     Attributes:
         gain: gain of the closed loop that :meth:`step` renders; None until it is set.
         mirrors: the mirrors as given.
+        model: renderer of the pings, by the sonar's model.
+        motion: motion of the scene's bodies; None if nothing moves.
+        notes: warnings about scene and sonar.
 
     Raises:
         MitsonarError: there is no sonar, neither given nor in the scene; a mirror moves.
@@ -103,50 +100,31 @@ class Simulator:
         return f"Simulator({self.sonar} in a scene of {shapes} shapes{also}; {self.variant})"
 
     def _build(self) -> None:
-        """Build everything derived from the current scene: surface tables, mirrors, moving bodies and launches."""
+        """Build everything derived from the current scene: moving bodies, and the model with its tables and launches."""
+        from mitsonar.simulation.models.create import create_model
+        from mitsonar.simulation.moving import motion_in
+        from mitsonar.simulation.scene import scale_notes
+
         scene, views, moving, rays_per_launch = self._given
         sonar, mirrors = self.sonar, self.mirrors
-        from mitsonar.instruments.views import Whole
-        from mitsonar.simulation.binning import view_tracers
-        from mitsonar.simulation.coherent import coherent_imager
-        from mitsonar.simulation.expected import expected_former
-        from mitsonar.simulation.image_launch import ImageLaunch
-        from mitsonar.simulation.mirrors import bright_notes, refuse_moving_mirrors, second_notes
-        from mitsonar.simulation.moving import motion_in
-        from mitsonar.simulation.multipath_rough import bounce_sums
-        from mitsonar.simulation.scene import scale_notes
-        from mitsonar.simulation.tracing import tracer_of
-
         self.motion = motion_in(scene, moving)
-        check_timed(sonar, self.motion, views, mirrors)
-        if self.motion is not None:
-            refuse_moving_mirrors(scene, mirrors, self.motion.bodies.shapes)
-        one, self.grouped = sonar_of_one_ping(sonar) or sonar, None
-        if one is not sonar:
-            bodies: Moving | MovingBodies = self.motion.bodies if self.motion else {}
-            self.grouped = GroupedPings(
-                Simulator(scene, one, mirrors=mirrors, moving=bodies, rays_per_launch=rays_per_launch), sonar
-            )
-        self.coherent = coherent_imager(scene, one, views, mirrors, self.motion)
-        self.former = expected_former(one, views)
-        traced = one if self.former is None else self.former.traced
-        self.tracer = tracer_of(scene, traced, self.motion)
-        self.notes = [*self.tracer.notes, *loss_notes(sonar)] if self.coherent is None else self.coherent.notes
-        self.notes = [
-            *self.notes,
-            *scale_notes(scene, one),
-            *(bright_notes(scene, self.tracer.surfaces) if sonar.bounces > 1 else ()),
-        ]
-        self.notes += second_notes(scene, mirrors) if sonar.bounces > 2 else []
-        self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
-        self.view_tracers = view_tracers(self.views)
-        cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
-        # a launch holds one state of each deforming body, hence one ping
-        self.pings_per_launch = 1 if self.tracer.deforms else max(1, rays_per_launch // max(traced.rays, cells))
-        self.bounces = bounce_sums(scene, one, traced, mirrors)
-        formed = None if self.former is None else one
-        self._maker = ImageLaunch(self.tracer, self.views, self.view_tracers, formed, self.bounces)
-        self._launches: dict[tuple[int, bool], tuple[Callable[..., Any], Any]] = {}
+        self.model = create_model(scene, sonar, views, mirrors, self.motion, rays_per_launch)
+        self.notes = [*self.model.notes, *scale_notes(scene, sonar)]
+        if sonar.bounces > 1:
+            from mitsonar.simulation.mirrors import bright_notes, second_notes
+
+            self.notes += bright_notes(scene, self.tracer.surfaces)
+            self.notes += second_notes(scene, mirrors) if sonar.bounces > 2 else []
+
+    @property
+    def tracer(self) -> Tracer:
+        """Return the tracer of the model's rays, which may extend beyond the field of view and the window."""
+        return self.model.tracer
+
+    @property
+    def views(self) -> Sequence[View]:
+        """Return the images of each ping."""
+        return self.model.views
 
     def _follow_scene(self) -> None:
         """Rebuild whatever depends on scene parameters that have changed since the last ping.
@@ -160,22 +138,18 @@ class Simulator:
             return
         import mitsuba as mi
 
-        from mitsonar.simulation.tracing import surfaces_of
-
-        scene = self._given[0]
-        tracers = [self.tracer, *(self.coherent.tracers.values() if self.coherent else ())]
         plain = not (self.motion or self.mirrors or self.sonar.bounces > 1 or self.tracer.surfaces.foreign)
         plain &= not self.tracer.surfaces.textured or all(isinstance(owner, mi.Mesh) for owner in changed.values())
-        if not (plain and all(one.surfaces.adopt(surfaces_of(scene, one.sonar, None)) for one in tracers)):
+        if not (plain and self.model.adopt(self._given[0])):
             self._build()
-        self.__dict__.pop("_own_tracer", None)
+        self.__dict__.pop("_exact_tracer", None)
 
     def pings(
         self, poses: ArrayLike, *, first: FirstPing = 0, labels: bool = False, time_s: ArrayLike | None = None
     ) -> Iterator[RenderedPings]:
         """Yield batches of consecutive pings in the first view; see :meth:`render_views`."""
-        for looks in self.render_views(poses, first=first, labels=labels, time_s=time_s):
-            yield looks[0]
+        for views in self.render_views(poses, first=first, labels=labels, time_s=time_s):
+            yield views[0]
 
     def render_views(
         self, poses: ArrayLike, *, first: FirstPing = 0, labels: bool = False, time_s: ArrayLike | None = None
@@ -198,76 +172,21 @@ class Simulator:
             MitsonarError: labels of portions in the model ``coherent``.
         """
         self._follow_scene()
-        table, time, numbers = moments_of(self.sonar, poses, time_s, first)
-        if self.grouped is not None:
-            for pings in self.grouped.pings(table, time, numbers, labels):
-                yield [pings]
-            return
-        if self.coherent is not None:
-            if labels and self.coherent.sides != (0,):
-                raise MitsonarError("portions have no labels in the model coherent: leave labels out, or use physical")
-            for pose, own, number in zip(table, time, numbers, strict=True):
-                yield self.coherent.in_views(self._coherent_ping(pose, own, number, labels))
-            return
-        for start in range(0, len(table), self.pings_per_launch):
-            part = slice(start, start + self.pings_per_launch)
-            yield self._launch(table[part], time[part], numbers[part], labels)
-
-    def _coherent_ping(self, pose: NDArray[np.float64], time_s: float, number: int, labels: bool) -> RenderedPings:
-        """Render one coherent ping; its labels come from the expected levels of the same surfaces."""
-        assert self.coherent is not None
-        levels, counts, cut = self.coherent.levels(pose, number, time_s)
-        if labels:
-            pings = self._launch(pose[None], np.array([time_s]), [number], True)[0]
-            pings.levels, pings.expected, pings.cut = levels[None], pings.echoes, cut
-            return pings
-        height_m = self.tracer.height_m(self.tracer.scene_at(time_s), self.tracer.inputs(pose[None], [number])[0])
-        return RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float), cut=cut)
-
-    def _launch(
-        self, poses: NDArray[np.float64], time_s: NDArray[np.float64], numbers: list[int], labels: bool
-    ) -> list[RenderedPings]:
-        """Render one batch of pings in a single launch and return it in each view."""
-        from mitsonar.simulation import binning
-
-        key = (len(poses), labels)
-        if key not in self._launches:
-            self._launches[key] = self._maker.compiled(*key)
-        scene = self.tracer.scene_at(time_s)  # first: it deforms bodies, and the inputs include their normals
-        inputs = self.tracer.inputs(poses, numbers)
-        tables = [tracer.tables(poses) for tracer in self.view_tracers]
-        mirrors = None if self.bounces is None else self.bounces.tables_of_mirrors
-        launch, rays = self._launches[key]
-        height, made = replayed(launch, rays, scene, *inputs, tables, mirrors)
-        height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, self.sonar.ping_groups // 2]
-        looks = []
-        for view, (image, counters, truth, single) in zip(self.views, made, strict=True):
-            pings = RenderedPings(numbers[0], *binning.fetch(image, counters, len(poses), view), height_m)
-            if labels:
-                pings.expected = None if single is None else binning.fetch(single, counters, len(poses), view)[0]
-                pings.labels = labels_of(pings, truth, self.tracer.sonar.rays)
-            looks.append(pings if self.former is None else self._formed(pings, self.former))
-        return looks
-
-    def _formed(self, pings: RenderedPings, former: ExpectedFormer) -> RenderedPings:
-        """Spread the levels of traced boxes over beams and pulse; the labels remain those of the boxes."""
-        labels = {name: former.crop(values) for name, values in pings.labels.items()}
-        expected = former.crop(pings.echoes) if labels else None
-        return RenderedPings(pings.first, former.levels(pings.levels), pings.counts, pings.height_m, labels, expected)
+        yield from self.model.render(*moments_of(self.sonar, poses, time_s, first), labels)
 
     def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
         """Return the echoes of one ping as NumPy arrays, in film order; all beams ping at ``time_s`` [s]."""
         self._follow_scene()
         time_s = ping / self.sonar.frame_rate_hz if time_s is None else time_s
-        return self._own_tracer.film_echoes(pose, ping, time_s)
+        return self._exact_tracer.film_echoes(pose, ping, time_s)
 
     @cached_property
-    def _own_tracer(self) -> Tracer:
-        """Return a tracer of exactly the sonar's rays; those of a launch may extend beyond the field of view."""
+    def _exact_tracer(self) -> Tracer:
+        """Return a tracer of exactly the sonar's rays."""
         from mitsonar.simulation.tracing import tracer_of
 
-        known = self.former is None and self.grouped is None
-        return self.tracer if known else tracer_of(self.tracer.scene, self.sonar, self.motion)
+        same = self.tracer.sonar is self.sonar
+        return self.tracer if same else tracer_of(self.tracer.scene, self.sonar, self.motion)
 
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Return the nearest and farthest return outside the window of one ping [m]; None if all lie inside."""

@@ -89,7 +89,7 @@ class SounderSimulator:
         rate = self.sounder.fan.frame_rate_hz
         time = (first + np.arange(len(table))) / rate if time_s is None else np.asarray(time_s, dtype=float)
         fans = len(self.sounder.channels)
-        together = FEW if self.simulator.coherent is not None else max(1, self.simulator.pings_per_launch // fans)
+        together = FEW if self.sounder.fan.model == "coherent" else max(1, self.simulator.model.pings_per_launch // fans)
         for start in range(0, len(table), together):
             own = self.sounder.fan_poses(table[start : start + together])
             now = np.repeat(time[start : start + together], fans)
@@ -125,9 +125,9 @@ class SounderSimulator:
 
     def _noise(self) -> NDArray[np.float64]:
         """Return the mean level of noise and volume after the gain ``(bins,)``; 0 if there is none."""
-        fan, coherent = self.sounder.fan, self.simulator.coherent
-        if coherent is not None:
-            return np.asarray(sum(coherent.receiver.noise_powers()) * coherent.gain, dtype=np.float64)
+        fan, imager = self.sounder.fan, self.simulator.model.imager
+        if imager is not None:
+            return np.asarray(sum(imager.receiver.noise_powers()) * imager.gain, dtype=np.float64)
         if fan.noise_level_db is None:
             return np.zeros(fan.range_bins)
         return np.asarray(10 ** ((fan.noise_level_db - fan.source_level_db) / 10) * gain_of(fan), dtype=np.float64)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins import echo_integrator, imaging_sonar_sensor, surfaces
+from mitsonar.plugins.echo_integrator import steep
 from mitsonar.plugins.hashed_texture import ROUNDS
 from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.plugins.native_plugins import load_dict
@@ -37,6 +38,7 @@ __all__ = [
     "buried_in",
     "free_way",
     "going_on",
+    "half_path_rate",
     "height_below",
     "hidden",
     "lambert_direction",
@@ -386,6 +388,22 @@ def overlap(sonar: Sonar, apart: DeviceArray) -> DeviceArray:
     """
     ways = 1 if sonar.beam_pattern == "two_way" else 2
     return dr.exp(dr.square(apart * (1 / sonar.beam_width_rad)) * (-HALF_LOG_2 * ways))
+
+
+def half_path_rate(
+    range_m: DeviceArray, d: DeviceArray, turn: DeviceArray, u: DeviceArray, normal: DeviceArray
+) -> DeviceArray:
+    """Return the derivative of half a path by an angle of its ray, on the tangent plane [m/rad].
+
+    Args:
+        range_m: range along the ray [m].
+        d: direction of the ray.
+        turn: derivative of the direction by the angle.
+        u: unit direction from the other end of the path to the point hit.
+        normal: unit normal of the surface at that point.
+    """
+    along = -range_m * dr.dot(normal, turn) / steep(dr.dot(normal, d))
+    return (along + dr.dot(u, d * along + turn * range_m)) * 0.5
 
 
 # ---------------- Clearance of vehicles and buried poses

@@ -13,7 +13,7 @@ from mitsonar.instruments.sonar import Sonar
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
 HEIGHT, PITCH = 2.5, math.radians(35)
 SONAR = Sonar.create(model="coherent", frequency_hz=1.8e6, beams=48, azimuth_fov_deg=14.5, beam_width_deg=0.3, range_min=4.0,
@@ -28,7 +28,7 @@ POSE = np.array([0, 0, HEIGHT, PITCH, 0, 0])
 
 
 def imager(loaded: mi.Scene, sonar: Sonar = SONAR) -> CoherentImager:
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
     return CoherentImager(loaded, sonar)
 

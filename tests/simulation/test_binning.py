@@ -54,7 +54,7 @@ def world(variant: str) -> mi.Scene:
     )
 
 
-# ---------------------------------------------------------------- a second binning, from the docstring of binning.py
+# ---------------------------------------------------------------- a second binning, from the docstring of models/thesis.py
 
 
 def fixed_point_bits(sonar: Sonar) -> int:

@@ -28,7 +28,7 @@ from mitsonar.worlds.families import RockyField
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
 

@@ -48,7 +48,7 @@ def levels(source: Simulator, poses: Array) -> list[NDArray[np.float32]]:
 
 def test_both_sides_add_up_to_the_whole() -> None:
     """Every point is on one side, so the fields add up, up to the rounding of single precision."""
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
     loaded = scene(floor=floor(), box=box([0.3, 0.2, 0.1], [0.1, 0.2, 0.1]))
     whole, rays = CoherentImager(loaded, SONAR).image(pose_at(), 0)
@@ -110,7 +110,7 @@ def test_what_has_no_portions_is_refused() -> None:
         simulator(loaded, ["q1", "c1"])
     with pytest.raises(MitsonarError, match="portions have no labels"):
         list(simulator(loaded, ["q1"]).render_views(pose_at()[None], labels=True))
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
     with pytest.raises(MitsonarError, match="mirrors are of whole views: got q1"):
         CoherentImager(loaded, SONAR, {"floor": (0.5, 0.001)}, [Segment(SONAR, "q1")])

@@ -53,7 +53,7 @@ def strength(kind: Kind, side: float, range_m: float, *, twist: float = 0.0, asi
     """
     import mitsuba as mi
 
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
     sonar = Sonar.create(model="coherent", frequency_hz=FREQUENCY, beams=40, azimuth_fov_deg=12.0, elevation_fov_deg=10.0,
                          range_min=range_m - 0.6, range_max=range_m + 0.6, range_bins=256, bearing="cone",

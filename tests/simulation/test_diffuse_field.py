@@ -32,7 +32,7 @@ def basin(variant: str) -> mi.Scene:
 @pytest.mark.thorough
 def test_the_mean_is_that_of_the_model_physical(basin: mi.Scene, pattern: str, bounces: int) -> None:
     """Sums over all beams in six parts of the range: 12 % each, 4 % of all."""
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
     sonar = SONAR.replace(pattern=pattern, bounces=bounces)
     expected = sonar.replace(model="physical", coding="linear")

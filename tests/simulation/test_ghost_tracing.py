@@ -25,7 +25,7 @@ SURFACE = 0.8
 
 def fields(mirror: tuple[float, float], sonar: Sonar) -> tuple[complex, complex, complex, Array]:
     """The sums of the waves of one point: seen straight, by way of the surface, and by it both ways; the point's place."""
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
     _, fields, at = one_point()
     own = sonar.replace(**fields)

@@ -292,25 +292,33 @@ def test_warned_of_surfaces_without_reflectivity() -> None:
 # ---------------------------------------------------------------- the simulator
 
 
+def _launches(simulator: Simulator) -> dict[tuple[int, bool], Any]:
+    from mitsonar.simulation.models.thesis import ThesisModel
+
+    assert isinstance(simulator.model, ThesisModel)
+    return simulator.model.launches
+
+
 def test_a_launch_is_recorded_once_and_not_for_every_call(flat: mi.Scene) -> None:
     """Whatever poses and first ping."""
     gc.collect()  # it would also record again as scenes of other tests go
     simulator = Simulator(flat, SMALL)
+    launches = _launches(simulator)
     for k in range(12):
         list(simulator.pings([Pose(k, 0, 2.5 + 0.01 * k, PITCH, 0, 0.3 * k)] * 2, first=7 * k))
-    ((launch, _),) = simulator._launches.values()
+    ((launch, _),) = launches.values()
     recorded: Any = launch
     assert recorded._recorded.n_recordings == 1
     list(simulator.pings([POSE] * 3))
     list(simulator.pings([POSE] * 3, labels=True))
-    assert len(simulator._launches) == 3
+    assert len(launches) == 3
 
 
 def test_a_launch_that_cannot_be_replayed_is_recorded_anew(flat: mi.Scene) -> None:
     """Dr.Jit refuses where other scenes came or went; here a stand-in refuses once."""
     simulator = Simulator(flat, SMALL)
     (before,) = simulator.pings([POSE])
-    ((key, (launch, rays)),) = simulator._launches.items()
+    ((key, (launch, rays)),) = _launches(simulator).items()
     recorded: Any = launch
     left = ["registry entries"]
 
@@ -322,7 +330,7 @@ def test_a_launch_that_cannot_be_replayed_is_recorded_anew(flat: mi.Scene) -> No
                 raise RuntimeError(left.pop())
             return recorded(*inputs)
 
-    simulator._launches[key] = Refusing(), rays
+    _launches(simulator)[key] = Refusing(), rays
     (after,) = simulator.pings([POSE])
     np.testing.assert_array_equal(before.levels, after.levels)
 

@@ -141,10 +141,10 @@ def test_images_and_impulse_responses_have_one_field(scenery: str) -> None:
     if scenery == "corner":  # of what hides what, each point before the wall's plane and above the ground is in sight
         before = ((points.place - [1, 5.5, 0]) @ np.array([-0.2, -1, 0.1])) > -1e-4
         points = SurfacePoints(*(values[before & (points.place[:, 2] > -1e-4)] for values in points))
-    coherent = Simulator(made, SONAR.replace(**texture)).coherent
-    assert coherent is not None
-    got = coherent.tracer.field(np.array(POSE))[0].astype(complex)
-    wanted = spread_over_grid(points, coherent.tracer)
+    imager = Simulator(made, SONAR.replace(**texture)).model.imager
+    assert imager is not None
+    got = imager.tracer.field(np.array(POSE))[0].astype(complex)
+    wanted = spread_over_grid(points, imager.tracer)
     # at the seam of two surfaces a ray's cell holds points of one of them
     assert np.linalg.norm(got - wanted) < {"floor": 1e-3, "corner": 0.02, "patches": 1e-3}[scenery] * np.linalg.norm(wanted)
 

@@ -18,7 +18,7 @@ from mitsonar.simulation.simulator import Simulator
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
     from mitsonar.simulation.multipath_coherent import MirrorTracer
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
@@ -33,7 +33,7 @@ STILL = np.zeros(6)
 
 
 def imager(loaded: mi.Scene, sonar: Sonar = SONAR, **mirrors: tuple[float, float] | Material) -> CoherentImager:
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
     return CoherentImager(loaded, sonar, mirrors)
 

@@ -81,7 +81,7 @@ def test_a_moved_body_is_one_built_there(changes: dict[str, Any]) -> None:
 
 def test_a_moving_point_has_the_ghosts_of_image_sources() -> None:
     """Amplitudes and phases in closed form where the body has gone to: 1 % and 0.03 rad; the point goes with the body."""
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
     from mitsonar.simulation.moving import motion_in
     from mitsonar.simulation.multipath_coherent import GhostTracer
 

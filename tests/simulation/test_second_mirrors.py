@@ -65,8 +65,8 @@ def test_one_point_has_the_ghost_of_two_image_sources(pattern: str, second: tupl
 
     An array that sends too hears mirrors above and below; others a wall aside as well.
     """
-    from mitsonar.simulation.coherent import CoherentImager
     from mitsonar.simulation.mirrors import mirror_of
+    from mitsonar.simulation.models.coherent import CoherentImager
     from mitsonar.simulation.multipath_coherent import GhostTracer
 
     _, changes, at = one_point()

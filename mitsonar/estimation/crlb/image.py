@@ -31,7 +31,7 @@ from mitsonar.simulation.derivatives import FIRST_PING, PINGS, Derivative, diffe
 from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
 __all__ = [
     "ALL",
@@ -204,7 +204,7 @@ def bounds_at(
         pings: pings of each half of the derivatives; default: 8, then four times as many, twice, while images leave it
             undecided whether an axis can be observed.
     """
-    if simulator.coherent is not None:
+    if simulator.sonar.model == "coherent":
         refuse_noise(noise, simulator.sonar)
         for laws in SpeckleBounds(simulator, gain).at(poses, pings=pings):
             yield {(simulator.views[0].name, "image", law): found for law, found in laws.items()}
@@ -259,7 +259,7 @@ def cramer_rao_bound(
     Raises:
         MitsonarError: unknown names; several portions that overlap, and none named; noise of pixels with speckle.
     """
-    speckle = simulator.coherent is not None
+    speckle = simulator.sonar.model == "coherent"
     law = law or ("ground" if speckle else "pixel")
     _check(kind, law, ["image"] if speckle else list(KINDS), list(laws_of(simulator.sonar)))
     portion = view or (ALL if len(simulator.views) > 1 else simulator.views[0].name)
@@ -588,10 +588,10 @@ class SpeckleBounds:
     """
 
     def __init__(self, simulator: Simulator, gain: float) -> None:
-        if simulator.coherent is None:
+        if simulator.model.imager is None:
             raise MitsonarError(f"bounds of speckle are for the model coherent: got {simulator.sonar.model}")
         self.sonar, self.gain = simulator.sonar, gain
-        self.imager = simulator.coherent
+        self.imager = simulator.model.imager
         self.halves = self.imager, self.imager.of_quality(OTHER_RAYS[self.sonar.quality])
         mirrors = simulator.mirrors if self.sonar.bounces > 1 else None  # with one reflection a mirror has no expected level
         self.expected = Simulator(simulator.tracer.scene, expected_sonar(self.sonar), mirrors=mirrors)

@@ -168,7 +168,7 @@ def test_an_oracle_of_the_scatterers_reaches_the_grain_bound(noise_db: float) ->
 
 def ground_oracle(bounds: SpeckleBounds, draws: int) -> float:
     """e' F e / 3 of one step of scoring on frames whose scatterers are drawn anew; level and motion are known before."""
-    from mitsonar.simulation.coherent import CoherentImager
+    from mitsonar.simulation.models.coherent import CoherentImager
 
     pose = np.array(POSE)
     told = bounds.ground(pose, 12)

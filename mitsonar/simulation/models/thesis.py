@@ -1,4 +1,4 @@
-"""How echoes are summed in range bins and beams: exactly, in the kernel that traces them, and for each view of a ping.
+"""Model ``thesis``: many pings in one launch, whose echoes are summed exactly in range bins and beams, for each view.
 
 Every sum is 64-bit fixed point, so it does not depend on the order of rays, threads or batches. The scale follows from the
 largest possible sum, so nothing can overflow.
@@ -12,10 +12,10 @@ q frac a at the next bin, and the same at b with opposite sign. A running sum ov
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -23,21 +23,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.levels import largest_level, level
+from mitsonar.acoustics.water import loss_notes
 from mitsonar.instruments.sonar import RAYS, Sonar
 from mitsonar.instruments.views import Receiver, Segment, View, Whole
 from mitsonar.motion.pose import mounted, to_world_matrices
+from mitsonar.plugins.echo_integrator import edge_direction, flatter
+from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.records.echoes import Echoes
-from mitsonar.simulation.device import DeviceArray, LaunchTables
-
-if TYPE_CHECKING:
-    from mitsonar.plugins.imaging_sonar_sensor import Fan
-    from mitsonar.simulation.tracing import Rays
+from mitsonar.simulation.beams import beam_of
+from mitsonar.simulation.device import DeviceArray, Frozen, LaunchTables, replayed
+from mitsonar.simulation.pings import Counts, RenderedPings, labels_of
+from mitsonar.simulation.tracing import Rays, Tracer, half_path_rate, hidden, surfaces_of
 
 __all__ = [
     "NARROWEST",
-    "Counts",
+    "ImageLaunch",
     "ReceiverTracer",
     "SegmentTracer",
+    "ThesisModel",
     "ViewEchoes",
     "ViewTracer",
     "WholeTracer",
@@ -45,9 +48,7 @@ __all__ = [
     "develop",
     "fetch",
     "fraction_bits",
-    "half_path_rate",
     "strongest",
-    "view_tracers",
 ]
 
 
@@ -57,18 +58,162 @@ ADD = dr.ReduceMode.Local
 COUNTERS = 3
 """Number of counter cells after the bins of a beam: returns nearer than the window, returns farther, and misses."""
 
+NARROWEST = 2.0**-6
+"""Shortest footprint [bins]: at normal incidence the footprint has no length, and the density would be infinite."""
 
-@dataclass
-class Counts:
-    """Numbers of rays of each beam ``(frames, beams)``: inside the window, nearer, farther, missed.
 
-    ``inside`` is -1 where the number of rays of a beam differs from ping to ping (``View.rays_a_beam`` is None).
+class ThesisModel:
+    """Renderer of levels: the level of each ray is added to the bin and the beam of its echo.
+
+    Implements :class:`~mitsonar.simulation.models.create.PingModel`.
+
+    Args:
+        launch: launch that renders pings.
+        rays_per_launch: upper bound on the rays of a launch and on its image cells.
+
+    Attributes:
+        launches: compiled launches and their rays, keyed by number of pings and whether there are labels.
     """
 
-    inside: NDArray[np.int64]
-    nearer: NDArray[np.int64]
-    farther: NDArray[np.int64]
-    missed: NDArray[np.int64]
+    imager = None
+
+    def __init__(self, launch: ImageLaunch, rays_per_launch: int) -> None:
+        self.launch, self.tracer, self.views = launch, launch.tracer, launch.views
+        self.notes = [*self.tracer.notes, *loss_notes(self.tracer.sonar)]
+        cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
+        # a launch holds one state of each deforming body, hence one ping
+        self.pings_per_launch = 1 if self.tracer.deforms else max(1, rays_per_launch // max(self.tracer.sonar.rays, cells))
+        self.launches: dict[tuple[int, bool], tuple[Callable[..., Any], DeviceArray]] = {}
+
+    def adopt(self, scene: mi.Scene) -> bool:
+        """Take over the surface tables of a changed scene at rest; return False if the model must be rebuilt."""
+        return self.tracer.surfaces.adopt(surfaces_of(scene, self.tracer.sonar, None))
+
+    def render(
+        self, poses: NDArray[np.float64], time_s: NDArray[np.float64], numbers: list[int], labels: bool
+    ) -> Iterator[list[RenderedPings]]:
+        """Yield batches of pings, one entry for each view; see :class:`~mitsonar.simulation.models.create.PingModel`."""
+        for start in range(0, len(poses), self.pings_per_launch):
+            part = slice(start, start + self.pings_per_launch)
+            yield self._batch(poses[part], time_s[part], numbers[part], labels)
+
+    def _batch(
+        self, poses: NDArray[np.float64], time_s: NDArray[np.float64], numbers: list[int], labels: bool
+    ) -> list[RenderedPings]:
+        """Render pings in a single launch."""
+        # 1. Compile the launch, once for each number of pings.
+        key, tracer = (len(poses), labels), self.tracer
+        if key not in self.launches:
+            self.launches[key] = self.launch.compiled(*key)
+        launch, rays = self.launches[key]
+        # 2. Run it. The scene comes first: it deforms bodies, and the inputs include their normals.
+        scene = tracer.scene_at(time_s)
+        inputs = tracer.inputs(poses, numbers)
+        tables = [own.tables(poses) for own in self.launch.view_tracers]
+        height, made = replayed(launch, rays, scene, *inputs, tables, self.launch.mirrors)
+        height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, tracer.sonar.ping_groups // 2]
+        # 3. Copy levels, counts and labels of each view to NumPy.
+        found = []
+        for view, (image, counters, truth, single) in zip(self.views, made, strict=True):
+            pings = RenderedPings(numbers[0], *fetch(image, counters, len(poses), view), height_m)
+            if labels:
+                pings.expected = None if single is None else fetch(single, counters, len(poses), view)[0]
+                pings.labels = labels_of(pings, truth, tracer.sonar.rays)
+            found.append(pings)
+        return found
+
+
+@dataclass(frozen=True)
+class ImageLaunch:
+    """Compiler of launches that render a given number of pings.
+
+    It holds no compiled launch: a launch refers to its compiler, and a circle of references would outlive the simulator.
+
+    Attributes:
+        tracer: tracer of the rays.
+        views: views that are rendered.
+    """
+
+    tracer: Tracer
+    views: Sequence[View]
+
+    @cached_property
+    def view_tracers(self) -> list[ViewTracer]:
+        """Return the view tracer of each view."""
+        return [TRACERS[type(view)](view) for view in self.views]
+
+    @property
+    def mirrors(self) -> LaunchTables | None:
+        """Return the tables of mirrors, an input of the launch; None without mirrors."""
+        return None
+
+    def compiled(self, pings: int, labels: bool) -> tuple[Callable[..., Any], DeviceArray]:
+        """Compile the launch of a number of pings; also return its first input, the numbers of the rays.
+
+        The launch is recorded once and then replayed (``dr.freeze``), so a single ping costs its rays and hardly any Python.
+        Its inputs are the ray numbers, the scene, the rows of the poses, the jitter keys, and the tables of surfaces, views
+        and mirrors. It returns the heights and, for each view, the levels, the counters, the truth for labels, and the
+        levels of single reflections if labels are derived from these.
+        """
+        tracer = self.tracer
+
+        @Frozen
+        def launch(index: Any, scene: Any, rows: Any, keys: Any, surfaces: Any, tables: Any, mirrors: Any) -> Any:
+            # 1. Trace one echo for each ray.
+            rays = Rays(tracer.sonar, index)
+            ray, fan = tracer.rays_of(rays, rows, keys)
+            echoes = tracer.echoes(scene, ray, fan, surfaces)
+            # 2. Sum paths with several reflections; the mirror part of a surface does not scatter.
+            echoes, more = self.bounced(scene, rays, fan, echoes, (rows, keys, surfaces, mirrors), pings)
+            # 3. Sum the echoes of each view, and find the strongest ray of each cell for labels.
+            weighted = self.weighted(fan, echoes)
+            seen = [
+                own.view_echoes(scene, rays, fan, weighted, table)
+                for own, table in zip(self.view_tracers, tables, strict=True)
+            ]
+            sums = [accumulate(one, rays.ping, pings, own) for one, own in zip(seen, self.view_tracers, strict=True)]
+            truths = [
+                (strongest(one, rays.ping, rays.ray, pings, view), one.elevation, one.echoes.shape_id, one.echoes.object_id)
+                if labels
+                else None
+                for one, view in zip(seen, self.views, strict=True)
+            ]
+            # 4. Evaluate everything that reads the echoes in one kernel, before any sum is read: rays are traced only once.
+            dr.eval(sums, more, truths)
+            # 5. Turn the sums into levels and counters.
+            made = []
+            for total, own, truth in zip(sums, self.view_tracers, truths, strict=True):
+                single = develop(total, pings, own)
+                levels, counters = single if more is None else develop(total, pings, own, more)
+                made.append((levels, counters, truth, single[0] if labels and more is not None else None))
+            return tracer.height_m(scene, rows), made
+
+        return launch, Rays.numbered(tracer.sonar, pings)
+
+    def weighted(self, fan: Fan, echoes: Echoes) -> Echoes:
+        """Return the echoes as they are summed; a pattern over elevation would weigh them here."""
+        return echoes
+
+    def bounced(
+        self, scene: Any, rays: Rays, fan: Fan, echoes: Echoes, inputs: tuple[Any, ...], pings: int
+    ) -> tuple[Echoes, tuple[mi.UInt64, int] | None]:
+        """Return the echoes of one reflection, and the sums over paths of several; None if the model has none of these.
+
+        Args:
+            scene: scene to trace.
+            rays: rays of the launch.
+            fan: fan of the rays, in world axes.
+            echoes: echo of each ray.
+            inputs: inputs of the launch: rows of the poses, jitter keys, tables of surfaces and of mirrors.
+            pings: number of pings in the launch.
+
+        Returns:
+            The echoes; the sums ``(pings, beams, stride)``, flat, with their number of fraction bits.
+        """
+        return echoes, None
+
+
+# ---------------- Sums in range bins and beams
 
 
 def stride(sonar: Sonar) -> int:
@@ -228,10 +373,6 @@ def _whole(place: DeviceArray) -> mi.UInt32:
 # ---------------- Views: the whole field of view or a portion
 
 
-NARROWEST = 2.0**-6
-"""Shortest footprint [bins]: at normal incidence the footprint has no length, and the density would be infinite."""
-
-
 @dataclass(frozen=True)
 class ViewEchoes:
     """Echoes of a launch in one view, one value for each ray, not evaluated yet.
@@ -294,9 +435,6 @@ class SegmentTracer:
 
     @cached_property
     def _on_device(self) -> LaunchTables:
-        import drjit as dr
-        import mitsuba as mi
-
         table = mi.Bool(self.view.member)
         dr.make_opaque(table)
         return {"member": table}
@@ -307,9 +445,6 @@ class SegmentTracer:
 
     def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
         """Return the echoes of the portion; beams are numbered from its first."""
-        import drjit as dr
-        import mitsuba as mi
-
         active = dr.gather(mi.Bool, tables["member"], rays.film)
         return ViewEchoes(echoes, dr.select(active, rays.beam - self.view.first_beam, 0), active, fan.elevation)
 
@@ -347,19 +482,11 @@ class ReceiverTracer:
 
     def tables(self, poses: ArrayLike) -> LaunchTables:
         """Return the poses of the receiver: three rows of ``to_world`` for each ping."""
-        import mitsuba as mi
-
         rows = to_world_matrices(mounted(poses, self.view.offset))[:, :3].astype(np.float32)
         return {"rows": mi.Float(rows.ravel().tolist())}
 
     def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
         """Return the echoes that the receiver measures."""
-        import drjit as dr
-        import mitsuba as mi
-
-        from mitsonar.simulation.beams import beam_of
-        from mitsonar.simulation.tracing import hidden
-
         # 1. Direction and distance from the receiver to the point that each ray hits.
         lines = [dr.gather(mi.Vector4f, tables["rows"], rays.ping * 3 + axis) for axis in range(3)]
         u: DeviceArray
@@ -382,8 +509,6 @@ class ReceiverTracer:
 
         ``way`` is the vector from the receiver to the point hit, and ``distance`` its length [m].
         """
-        import drjit as dr
-
         # 1. The range is half of the path. The copy leaves the echoes of other views unchanged.
         half = (echoes.range_m + distance) * 0.5
         received = replace(echoes, **{field.name: getattr(echoes, field.name) for field in fields(Echoes)})
@@ -426,33 +551,9 @@ class ReceiverTracer:
 
         ``end`` is the distance of the edge from the transmitter [m], ``angle`` its elevation relative to the ray [rad].
         """
-        import drjit as dr
-
-        from mitsonar.plugins.echo_integrator import edge_direction, flatter
-
         toward = edge_direction(fan, angle)
         back = dr.norm(way + toward * end - fan.d * echoes.range_m)
         return dr.select(flatter(normal, fan.d, toward), (end + back) * 0.5, otherwise)
-
-
-def half_path_rate(
-    range_m: DeviceArray, d: DeviceArray, turn: DeviceArray, u: DeviceArray, normal: DeviceArray
-) -> DeviceArray:
-    """Return the derivative of half a path by an angle of its ray, on the tangent plane [m/rad].
-
-    Args:
-        range_m: range along the ray [m].
-        d: direction of the ray.
-        turn: derivative of the direction by the angle.
-        u: unit direction from the other end of the path to the point hit.
-        normal: unit normal of the surface at that point.
-    """
-    import drjit as dr
-
-    from mitsonar.plugins.echo_integrator import steep
-
-    along = -range_m * dr.dot(normal, turn) / steep(dr.dot(normal, d))
-    return (along + dr.dot(u, d * along + turn * range_m)) * 0.5
 
 
 def _window(sonar: Sonar) -> dict[str, float]:
@@ -463,8 +564,3 @@ def _window(sonar: Sonar) -> dict[str, float]:
 
 
 TRACERS = {Whole: WholeTracer, Segment: SegmentTracer, Receiver: ReceiverTracer}
-
-
-def view_tracers(views: Iterable[View]) -> list[ViewTracer]:
-    """Return the view tracer of each view, in the same order."""
-    return [TRACERS[type(view)](view) for view in views]

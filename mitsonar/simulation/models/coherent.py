@@ -1,9 +1,9 @@
-"""How a coherent ping is made: field, beams, losses, crosstalk, noise and gain, in the order of the instrument."""
+"""Model ``coherent``: field, beams, losses, crosstalk, noise and gain of a ping, in the order of the instrument."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -16,26 +16,97 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Quality, Sonar
 from mitsonar.instruments.views import CONES, Segment, View, Whole
 from mitsonar.simulation.beams import BeamFormer
-from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
 from mitsonar.simulation.mirrors import Mirroring, mirror_of
+from mitsonar.simulation.models.thesis import ImageLaunch, ThesisModel
 from mitsonar.simulation.moving import SceneMotion
 from mitsonar.simulation.multipath_coherent import CornerTracer, GhostTracer, MirrorTracer
 from mitsonar.simulation.multipath_rough import DiffuseField
-from mitsonar.simulation.pings import CutRays, RenderedPings
+from mitsonar.simulation.pings import Counts, CutRays, RenderedPings
 from mitsonar.simulation.points import MOST_CANDIDATES
 from mitsonar.simulation.receiver_noise import ReceiverNoise, with_crosstalk
+from mitsonar.simulation.tracing import surfaces_of, tracer_of
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-__all__ = ["CoherentImager", "coherent_imager"]
+__all__ = ["CoherentImager", "CoherentModel"]
 
 FEWEST_A_CELL = 4.0
 """Points per resolution cell below which the contrast of speckle exceeds theory by 3 % or more (measured)."""
 
 MOST_CUT = 1e-3
 """Fraction of rays that may miss points: rays that graze the sides of bodies do, and contribute little."""
+
+
+class CoherentModel:
+    """Renderer of levels with speckle and noise, one ping after another.
+
+    Implements :class:`~mitsonar.simulation.models.create.PingModel`.
+
+    Args:
+        scene: any Mitsuba scene.
+        sonar: a sonar of the model ``coherent``.
+        views: the whole field of view or portions of it; default: the whole.
+        mirrors: mirror parts of shapes, keyed by shape id, or ``"materials"``; default: none.
+        motion: motion of the scene's bodies; default: nothing moves.
+        rays_per_launch: upper bound on the rays of a launch that renders labels, and on its image cells.
+
+    Attributes:
+        imager: renderer of the complex images.
+
+    Raises:
+        MitsonarError: as in :class:`CoherentImager`.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sonar: Sonar,
+        views: Sequence[View] | None = None,
+        mirrors: Mirroring = None,
+        motion: SceneMotion | None = None,
+        rays_per_launch: int = 2**23,
+    ) -> None:
+        self.imager = CoherentImager(scene, sonar, mirrors, views, motion)
+        self.tracer, self._rays_per_launch = tracer_of(scene, sonar, motion), rays_per_launch
+        self.views, self.notes = self.imager.views, self.imager.notes
+
+    @cached_property
+    def _expected(self) -> ThesisModel:
+        """Return the renderer of the expected levels of the same surfaces, from which labels are derived."""
+        return ThesisModel(ImageLaunch(self.tracer, self.views), self._rays_per_launch)
+
+    @property
+    def pings_per_launch(self) -> int:
+        """Return the number of pings whose labels fit into a launch."""
+        return self._expected.pings_per_launch
+
+    def adopt(self, scene: mi.Scene) -> bool:
+        """Take over the surface tables of a changed scene at rest; return False if the model must be rebuilt."""
+        tracers = (self.tracer, *self.imager.tracers.values())
+        return all(one.surfaces.adopt(surfaces_of(scene, one.sonar, None)) for one in tracers)
+
+    def render(
+        self, poses: NDArray[np.float64], time_s: NDArray[np.float64], numbers: list[int], labels: bool
+    ) -> Iterator[list[RenderedPings]]:
+        """Yield pings one at a time, one entry for each view.
+
+        Raises:
+            MitsonarError: labels of portions.
+        """
+        if labels and self.imager.sides != (0,):
+            raise MitsonarError("portions have no labels in the model coherent: leave labels out, or use physical")
+        for place, number in enumerate(numbers):
+            pose, time = poses[place : place + 1], time_s[place : place + 1]
+            levels, counts, cut = self.imager.levels(pose[0], number, time[0])
+            if labels:
+                pings = next(self._expected.render(pose, time, [number], True))[0]
+                pings.levels, pings.expected, pings.cut = levels[None], pings.echoes, cut
+            else:
+                height_m = self.tracer.height_m(self.tracer.scene_at(time), self.tracer.inputs(pose, [number])[0])
+                pings = RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float), cut=cut)
+            yield self.imager.in_views(pings)
 
 
 class CoherentImager:
@@ -69,7 +140,7 @@ class CoherentImager:
         self.sonar, self.former = sonar, BeamFormer(sonar)
         self.receiver = ReceiverNoise(sonar, self.former)
         self._given = scene, mirrors, motion
-        parts = mirror_of(scene, mirrors)
+        parts = None if mirrors is None else mirror_of(scene, mirrors)
         self.tracers = {side: CoherentTracer(scene, sonar, self.former, parts, side, motion) for side in self.sides}
         self.tracer = self.tracers[self.sides[0]]
         self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts, motion=motion)
@@ -174,23 +245,6 @@ def point_notes(sonar: Sonar) -> list[str]:
         f"a resolution cell holds {held:.2g} points at {nearest:g} m, {FEWEST_A_CELL:g} from {enough:.3g} m on: below, "
         f"intensities vary more than speckle does; a scatterer_spacing_m of {needed:.2g} m would do everywhere"
     ]
-
-
-def coherent_imager(
-    scene: mi.Scene,
-    sonar: Sonar,
-    views: Sequence[View] | None,
-    mirrors: Mirroring = None,
-    motion: SceneMotion | None = None,
-) -> CoherentImager | None:
-    """Return the renderer of pings of the model ``coherent``; None for other models.
-
-    Raises:
-        MitsonarError: a view is a receiver elsewhere or a cone; there are mirrors in portions.
-    """
-    if sonar.model != "coherent":
-        return None
-    return CoherentImager(scene, sonar, mirrors, views, motion)
 
 
 def check_views(views: Sequence[View], mirrors: Mirroring) -> Sequence[View]:

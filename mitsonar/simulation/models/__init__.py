@@ -1,0 +1,1 @@
+"""Models of a ping behind one protocol: ``thesis``, ``physical`` and ``coherent``."""
