@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import importlib.util
 import os
@@ -35,10 +36,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     _skip_what_is_absent(items)
 
 
+def pytest_configure() -> None:
+    """Import the test files without collections of garbage, which take a quarter of it."""
+    gc.disable()
+
+
 def pytest_collection_finish() -> None:
     """Leave what all test files have imported out of garbage collections, of which each data set makes several."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 def _turn(item: pytest.Item) -> int:
@@ -102,10 +109,20 @@ def bare_curves() -> Iterator[Callable[..., Any]]:
         yield real
 
 
+@functools.cache
+def _command_line() -> Any:
+    """What ``main`` calls, made once: the commands and their options take longer to build than most commands to refuse."""
+    import typer
+
+    from mitsonar.cli import application
+    from mitsonar.cli.console import with_plain_brackets
+
+    return with_plain_brackets(typer.main.get_command(application()))
+
+
 @pytest.fixture
 def mitsonar(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
     """The command line in this process, which saves its start: ``mitsonar("render", scene, cwd=folder)``."""
-    from mitsonar.cli import main
 
     def run(*arguments: object, cwd: Path | None = None) -> Done:
         capfd.readouterr()
@@ -113,7 +130,7 @@ def mitsonar(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str])
             changed.setattr(sys, "argv", ["mitsonar", *map(str, arguments)])
             changed.chdir(cwd or Path.cwd())
             with pytest.raises(SystemExit) as end:
-                main()
+                _command_line()()
         return Done(int(end.value.code or 0), *capfd.readouterr())
 
     return run
@@ -126,3 +143,4 @@ def scenes_of_before_are_gone() -> None:
         from mitsonar.simulation.device import release_memory
 
         release_memory()
+        gc.freeze()

@@ -546,7 +546,9 @@ def test_what_a_detectors_data_set_cannot_be_made_of(mitsonar: Command, tmp_path
 
 
 def test_worlds_of_a_recipe_are_split_by_scene() -> None:
-    recipe, rules, _ = detector_recipe("rocky-field", DetectorViews(60, split=(0.5, 0.25, 0.25)), "oculus-m750d-1200khz")
+    recipe, rules, _ = detector_recipe(
+        "rocky-field", DetectorViews(60, split=(0.5, 0.25, 0.25)), "oculus-m750d-1200khz", {"world": ROCKS}
+    )
     assert (len(recipe.scenes), recipe.sequences, recipe.split.by, recipe.flight.pings) == (6, 60, "scene", 1)
     assert rules == [("seabed", "")]
 

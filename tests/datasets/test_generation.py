@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers import PROGRAM, TINY, Command, by_itself, files_of, refused, tiny_recipe
+from helpers import PROGRAM, TINY, Command, by_itself, essence, files_of, refused, tiny_recipe
 
 from mitsonar.config.data import array_names
 from mitsonar.datasets.make import FRAMES_A_SCENE, Queue, SceneRenderer, calibrate, check, forget, make_dataset, make_shard
@@ -155,7 +155,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", sorted(VARIANTS))
+@pytest.mark.parametrize("name", essence(sorted(VARIANTS), "labels", "segments", "two sensors", "vectors"))
 def test_every_kind_of_data_set_is_made_and_checks(name: str, tmp_path: Path) -> None:
     recipe = tiny_recipe(scenes=[{"count": 1, "sequences": 10}], **VARIANTS[name])
     make_dataset(recipe, str(tmp_path / "data.zarr"))

@@ -524,6 +524,7 @@ def test_a_larger_batch_has_a_larger_rate() -> None:
     assert isinstance(Effort().recipe("posenet-hull"), TrainingRecipe)
 
 
+@pytest.mark.thorough
 def test_a_folder_keeps_to_what_it_was_begun_with(whole: Path, tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match=r"was begun with scale 1\.0, not 0\.5: "):
         tiny(whole, scale=0.5)
@@ -557,7 +558,7 @@ def test_a_folder_keeps_to_what_it_was_begun_with(whole: Path, tmp_path: Path) -
     assert os.listdir(tmp_path) == ["thesis.docx"]
 
 
-def test_the_command_lists_its_tables_and_answers_to_mistakes(mitsonar: Command, whole: Path, tmp_path: Path) -> None:
+def test_the_command_lists_its_tables_and_answers_to_mistakes(mitsonar: Command, tmp_path: Path) -> None:
     listed = mitsonar("reproduce")
     assert listed.returncode == 0, listed.stderr
     for name in RECIPES:
@@ -572,6 +573,10 @@ def test_the_command_lists_its_tables_and_answers_to_mistakes(mitsonar: Command,
         mitsonar("reproduce", "3.1", "--rows", "posenet", "-o", out), "no row 'posenet'", "did you mean posenet-quantised"
     )
     assert not out.exists()
+
+
+@pytest.mark.thorough
+def test_the_command_prints_the_table_that_is_there(mitsonar: Command, whole: Path) -> None:
     words = [word for key, value in TINY.items() for word in ("--set", f"{key}={json.dumps(value)}")]
     again = mitsonar("reproduce", "3.6", "-o", whole, "--scale", 1, "--minutes", 0, *words)
     assert again.returncode == 0, again.stderr

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from drawn_frames import over_ground, sway
-from helpers import Command, refused, run_python, tiny_recipe
+from helpers import Command, essence, refused, run_python, tiny_recipe
 
 from mitsonar.datasets.make import make_dataset
 from mitsonar.errors import MitsonarError
@@ -458,8 +458,8 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
 
 
 @pytest.fixture(scope="module")
-def many(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Small data sets of other kinds: three frames at several heights with vectors, two sensors, another sonar."""
+def many(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Small data sets of other kinds, made when they are first needed: three frames at several heights with vectors, two sensors, another sonar."""
     folder = tmp_path_factory.mktemp("many")
     two = [{"name": name, "starboard_m": side, "sonar": {"beams": 12}} for name, side in (("left", -0.5), ("right", 0.5))]
     recipes: dict[str, dict[str, Any]] = {
@@ -467,33 +467,42 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "two": {"receivers": two, "flight": {"pings": 2}, "sonar__beams": 96, "sonar__jitter": True},
         "other": {"sonar__beams": 16, "sonar__range_max": 6.0, "flight": {"pings": 2}, "mount": {"pitch_deg": 30.0}},
     }
-    for name, words in recipes.items():
-        make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 6}], **words), str(folder / f"{name}.zarr"))
-    return {name: folder / f"{name}.zarr" for name in recipes}
+
+    def make(name: str) -> Path:
+        url = folder / f"{name}.zarr"
+        if not url.exists():
+            make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 6}], **recipes[name]), str(url))
+        return url
+
+    return make
 
 
 @pytest.mark.parametrize(
     ("data", "words"),
-    [
+    essence(
+        [
+            ("high", {"frames": 3}),
+            ("high", {"frames": 2, "kind": "vector"}),
+            ("high", {"frames": 2, "coordinates": "cartesian", "cartesian_rows": 24, "layout": "channels"}),
+            ("two", {"frames": 2}),
+            ("two", {"views": ["right"], "layout": "stack"}),
+        ],
         ("high", {"frames": 3}),
         ("high", {"frames": 2, "kind": "vector"}),
-        ("high", {"frames": 2, "coordinates": "cartesian", "cartesian_rows": 24, "layout": "channels"}),
-        ("two", {"frames": 2}),
-        ("two", {"views": ["right"], "layout": "stack"}),
-    ],
+    ),
 )
-def test_all_arrangements_are_evaluated(many: dict[str, Path], data: str, words: dict[str, Any]) -> None:
-    own = SonarPairs(many[data], part="all", labels="normx10", one_a_sequence=True, **words)
-    report = evaluate(constant(own), many[data], noise=["low"], part="all")
+def test_all_arrangements_are_evaluated(many: Callable[[str], Path], data: str, words: dict[str, Any]) -> None:
+    own = SonarPairs(many(data), part="all", labels="normx10", one_a_sequence=True, **words)
+    report = evaluate(constant(own), many(data), noise=["low"], part="all")
     error = in_units(SAYS - np.array([own.target(k) for k in range(len(own))]))
     assert np.allclose(report["tables"][0]["rows"][0]["rmse"], np.sqrt((error**2).mean(axis=0)), rtol=1e-5)
 
 
-def test_heights_are_evaluated_in_mm(many: dict[str, Path], mitsonar: Command, tmp_path: Path) -> None:
-    own = SonarPairs(many["high"], part="all", labels="normx10", frames=1, one_a_sequence=True)
+def test_heights_are_evaluated_in_mm(many: Callable[[str], Path], mitsonar: Command, tmp_path: Path) -> None:
+    own = SonarPairs(many("high"), part="all", labels="normx10", frames=1, one_a_sequence=True)
     trained = constant(own, [2.5])
     trained.save(tmp_path / "network.ckpt")
-    done = mitsonar("evaluate", tmp_path, many["high"], "--part", "all", "--noise", "none", "-o", tmp_path / "out")
+    done = mitsonar("evaluate", tmp_path, many("high"), "--part", "all", "--noise", "none", "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "height mm" in done.stdout
     row, zero = json.loads((tmp_path / "out" / "table.json").read_text())["tables"][0]["rows"]
@@ -506,26 +515,26 @@ def test_heights_are_evaluated_in_mm(many: dict[str, Path], mitsonar: Command, t
 
 @pytest.mark.thorough
 def test_data_that_do_not_fit_are_refused(
-    mitsonar: Command, many: dict[str, Path], run: Path, checkpoint: Checkpoint, made: Path, tmp_path: Path
+    mitsonar: Command, many: Callable[[str], Path], run: Path, checkpoint: Checkpoint, made: Path, tmp_path: Path
 ) -> None:
-    done = mitsonar("evaluate", run, many["other"])
+    done = mitsonar("evaluate", run, many("other"))
     refused(done, "beams 16, not 48", "window 3.2..6 m, not 3.2..5.6 m", "--force", "didson300")
     # what any sonar may serve: the same network, made for sizes that fit
-    own = SonarPairs(many["other"], part="all", one_a_sequence=True)
+    own = SonarPairs(many("other"), part="all", one_a_sequence=True)
     other = replace(constant(own), sonar=checkpoint.sonar)
     with pytest.raises(MitsonarError, match="beams 16, not 48"):
-        evaluate(other, many["other"], part="all")
-    report = evaluate(other, many["other"], noise=["none"], part="all", force=True)
+        evaluate(other, many("other"), part="all")
+    report = evaluate(other, many("other"), noise=["none"], part="all", force=True)
     assert "beams 16, not 48" in report["notes"][0]
     elsewhere = evaluate(
         replace(other, sonar={}, trained_at={**other.trained_at, "pitch_deg": 35.0}),
-        many["other"],
+        many("other"),
         noise=["none"],
         part="all",
     )
     assert "pitch 30 deg" in elsewhere["notes"][1]
-    refused(mitsonar("evaluate", run, many["other"], "--force"), "(1, 1, 40, 32)", "(batch, 1, 256, 96)")
-    refused(mitsonar("evaluate", run, many["two"]), "unknown view image")
+    refused(mitsonar("evaluate", run, many("other"), "--force"), "(1, 1, 40, 32)", "(batch, 1, 256, 96)")
+    refused(mitsonar("evaluate", run, many("two")), "unknown view image")
     refused(mitsonar("evaluate", run, tmp_path / "none.zarr"), "none.zarr")
     refused(mitsonar("evaluate", run, made, "--noise", "loud"), "noise must be")
     refused(mitsonar("evaluate", run, made, "--part", "test"), "no test part")

@@ -97,8 +97,10 @@ def changed(frames: SonarFrames, **fields: object) -> SonarFrames:
 # ---------------------------------------------------------------- signs and sizes
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("size", essence([-5.0, -1.0, -0.3, 0.3, 1.0, 5.0], -1.0, 5.0))
+@pytest.mark.parametrize(
+    ("axis", "size"),
+    essence([(axis, size) for axis in range(3) for size in (-5.0, -1.0, -0.3, 0.3, 1.0, 5.0)], (0, -1.0), (1, 5.0), (2, -1.0)),
+)
 @pytest.mark.parametrize("method", METHODS)
 def test_sign_and_size_of_each_axis(pair: Pair, method: str, axis: int, size: float) -> None:
     """Motions along one axis of 6, 20 and 100 mm, or 0.12, 0.4 and 2 deg."""
