@@ -55,11 +55,12 @@ from mitsonar.records.frames import SonarFrames
 from mitsonar.records.responses import ImpulseResponses
 from mitsonar.worlds.meshes import mesh_world
 
-SLOW = {"frames.zarr", "frames.zarr, resumed", "responses.zarr", "data set", "data set, checked", "checkpoint"}
-"""Readers that take 20 ms and more a mutant."""
+OWN = {"data set, checked", "frames.zarr, resumed", "checkpoint", "run.json", "odometry"}
+OWN |= {"recipe", "sonar, noise, training", "material"}
+"""What this package writes itself, or pydantic checks."""
 
-USUAL, FEWER = 200, 30
-"""Mutants in the tests that are run always, of the others and of those."""
+FOREIGN, FEW = 100, 12
+"""Mutants in the tests that are run always: of files of others, and of its own or of Zarr, which takes 20 ms a mutant."""
 
 learn = pytest.mark.learn
 
@@ -126,7 +127,7 @@ def test_a_lone_carriage_return_in_a_path_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", cases())
 def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
-    count = FEWER if name in SLOW else USUAL
+    count = FEW if name in OWN or "zarr" in name or name == "data set" else FOREIGN
     found = attack(name, tmp_path, count)
     assert found["read"] + found["refused"] == count
     assert found["refused"] > 0
@@ -135,7 +136,7 @@ def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", cases())
 def test_ten_thousand_mutants(name: str, tmp_path: Path) -> None:
-    found = attack(name, tmp_path, 10_000, first=USUAL)
+    found = attack(name, tmp_path, 10_000, first=FOREIGN)
     print(f"\n{name}: {found['read']:,} read, {found['refused']:,} refused")
     assert min(found.values()) > 0
 
@@ -167,7 +168,7 @@ quick = settings(
 )
 
 
-@quick
+@settings(quick, max_examples=10)
 @given(key=some.sampled_from([*TINY["sonar"], "jitter", "seed", "sound_speed", "range_min", "range_max"]), value=values)
 def test_any_value_of_a_sonar(key: str, value: Any) -> None:
     from mitsonar.instruments.sounder import sonar_from
@@ -620,22 +621,13 @@ def spoilt(data_set: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(data_set, tmp_path / "data.zarr"))
 
 
-BAD_SCENES: list[Any] = [[], None, 5, [{}], [{"number": 0, "group": 9, "seed": 0, "sequences": 10}]]
-
-
 @pytest.mark.parametrize(
     "fields",
     [
-        *({"frames": value} for value in (10**12, 10**18, 1e300, -1, 0, "50", None, [50], True, 49)),
-        *({"sequences": value} for value in (10**12, 1e300, 0, "10")),
-        *({"shard_frames": value} for value in (0, -5, 1e300, "5")),
-        *({"chunk_frames": value} for value in (0, 3.5, None)),
-        *({"scenes": value} for value in BAD_SCENES),
-        *({"level_scale": value} for value in ("nan", "1", -1, [1])),
-        {"recipe": [1]},
-        {"recipe": {"name": []}},
-        {"versions": 5},
-        {"finished": "yes"},
+        *({"frames": value} for value in (10**12, 10**18, 1e300, "50", 49)),
+        *({"sequences": 10**12}, {"shard_frames": 0}, {"chunk_frames": None}, {"level_scale": -1}),
+        *({"scenes": value} for value in ([], None, [{"number": 0, "group": 9, "seed": 0, "sequences": 10}])),
+        *({"recipe": {"name": []}}, {"versions": 5}, {"finished": "yes"}),
     ],
     ids=str,
 )
@@ -652,8 +644,9 @@ def test_check_of_a_promise_of_10_to_the_12_frames(spoilt: Path, mitsonar: Comma
     refused(mitsonar("dataset", "check", spoilt), "damaged")
 
 
-@pytest.mark.parametrize("length", [10**12, 10**18, 0, -1, 1e300])
-@pytest.mark.parametrize("name", ["image", "sequence", "seal", "range_m"])
+@pytest.mark.parametrize(
+    ("name", "length"), [("image", 10**12), ("sequence", 10**18), ("seal", 0), ("range_m", -1), ("range_m", 1e300)]
+)
 def test_arrays_of_a_data_set_of_another_shape(name: str, length: Any, spoilt: Path) -> None:
     from mitsonar.datasets.store import DataStore
 
@@ -694,7 +687,7 @@ def test_frames_of_a_run_of_10_to_the_12_rows(rows: int, tmp_path: Path, capfd: 
     assert "Traceback" not in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("done", [10**12, -1, 1e300, "3", None])
+@pytest.mark.parametrize("done", [10**12, -1, "3"])
 def test_frames_done_of_a_run_that_cannot_be(done: Any, tmp_path: Path) -> None:
     make_frames_zarr(tmp_path)
     set_attributes(tmp_path / "frames.zarr", frames_done=done)
@@ -763,8 +756,13 @@ HOSTILE_YAML = {
 }
 
 
-@pytest.mark.parametrize("name", HOSTILE_YAML)
-@pytest.mark.parametrize("kind", ["recipe", "sonar", "noise", "training"])
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        *(("recipe", name) for name in HOSTILE_YAML),
+        *((kind, name) for kind in ("sonar", "noise", "training") for name in ("laughs", "itself as a key", "python", "large")),
+    ],
+)
 def test_yaml_made_to_harm(kind: str, name: str, tmp_path: Path) -> None:
     from mitsonar.acoustics.noise import load_noise
     from mitsonar.config.data import load_recipe
@@ -783,9 +781,12 @@ def test_yaml_made_to_harm(kind: str, name: str, tmp_path: Path) -> None:
     assert time.monotonic() - begun < 10
 
 
-@pytest.mark.parametrize("value", [10**400, [1], {"a": 1}, "x", float("nan"), None])
 @pytest.mark.parametrize(
-    "key", ["seed", "frames", "flight.pings", "flight.height_m", "sonar.beams", "world.size_m", "split.seed"]
+    ("key", "value"),
+    [
+        *(("seed", 10**400), ("frames", [1]), ("flight.pings", {"a": 1}), ("flight.height_m", "x")),
+        *(("sonar.beams", float("nan")), ("world.size_m", None), ("split.seed", 10**400)),
+    ],
 )
 def test_values_of_a_recipe_that_cannot_be(key: str, value: Any) -> None:
     import copy
@@ -893,23 +894,15 @@ def test_a_writer_that_nobody_could_be_is_replaced(content: str, monkeypatch: py
 # ---------------------------------------------------------------- run.json
 
 
-BAD_TALLIES: list[Any] = [None, [], {}, {**TALLY, "worst": 3}, {**TALLY, "rays": {"a": 1}}]
-
 BAD_STATES: dict[str, dict[str, Any]] = {
-    **{f"frames_done {value}": {"frames_done": value} for value in ("3", -1, 31, 1e300, None, [1], True, 10**12, 9)},
-    **{f"gain {value}": {"gain": value} for value in ("2", 0, -1.0, float("nan"), None)},
-    **{f"tally {value}": {"tally": value} for value in BAD_TALLIES},
+    **{f"frames_done {value}": {"frames_done": value} for value in ("3", 31, 9)},
+    **{f"gain {value}": {"gain": value} for value in (0, float("nan"))},
+    "no tally": {"tally": None},
     "tally of texts": {"tally": {**TALLY, "pixels": "9"}},
     "worst frame": {"tally": {**TALLY, "worst": [1, 99]}},
     "an empty frame that is not told": {"tally": {**TALLY, "first_empty": []}},
-    "an empty frame beyond": {"tally": {**TALLY, "first_empty": [10, 0, 0, 0, 2]}},
-    "cut rays without a pitch": {"tally": {**TALLY, "cut": 3}},
-    "a pitch that is no number": {"tally": {**TALLY, "enough_m": "0.1"}},
     "more saturated pixels than pixels": {"tally": {**TALLY, "pixels": 0, "filled": 0, "saturated": 1}},
-    "warnings": {"warnings": "none"},
-    "finished": {"finished": "no"},
     "asked": {"asked": [1]},
-    "versions": {"versions": "none"},
     "another key": {"more": 1},
 }
 
@@ -991,7 +984,7 @@ def test_answers_that_promise_more_than_is_there(tmp_path: Path) -> None:
     assert "remove the folder" in refusal(lambda: kept_answers(tmp_path / "out", {"a": 1}))
 
 
-@pytest.mark.parametrize("height", ["3", 0, -1.0, 1e9, float("nan"), [3.0], True])
+@pytest.mark.parametrize("height", ["3", -1.0, float("nan")])
 def test_a_height_of_an_odometry_that_cannot_be(height: Any, tmp_path: Path) -> None:
     from mitsonar.mapping.odometry_run import OdometryFolder
 

@@ -243,6 +243,7 @@ def test_of_several_noise_levels_each_sample_draws_one(made: Path) -> None:
         SonarPairs(made, noise=[])
 
 
+@pytest.mark.thorough
 def test_batches_are_the_same_wherever_they_are_finished(made: Path) -> None:
     """Where they are read, as for a CPU, or on the device of the network: epoch and noise go with them."""
     told = recipe()
@@ -517,7 +518,7 @@ def test_a_stop_leaves_a_network_and_a_row_of_the_log(made: Path, tmp_path: Path
     assert train(TrainOptions(told, made, tmp_path / "run", resume=True, minutes=5)).trained["steps"] == 3
 
 
-def test_runs_that_are_there_are_kept(made: Path, tmp_path: Path) -> None:
+def test_runs_that_are_there_are_kept(made: Path, other: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     told = recipe(steps=2)
     first = train(TrainOptions(told, made, out, threads=1))
@@ -525,8 +526,6 @@ def test_runs_that_are_there_are_kept(made: Path, tmp_path: Path) -> None:
         train(TrainOptions(told, made, out))
     with pytest.raises(MitsonarError, match=r"begun with recipe\.optimiser\.rate 0\.001, not 0\.002"):
         train(TrainOptions(recipe(steps=2, optimiser={"rate": 2e-3}), made, out, resume=True))
-    other = tmp_path / "other.zarr"
-    make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 10}], seed=3), str(other))
     with pytest.raises(MitsonarError, match="begun with digest"):
         train(TrainOptions(told, other, out, resume=True))
     before = weights(out)
@@ -667,6 +666,7 @@ def test_the_command_line_trains_stops_in_time_and_goes_on(made: Path, tmp_path:
     assert "--resume" in refused.stderr
 
 
+@pytest.mark.thorough
 def test_rows_of_the_log_between_validations_tell_the_errors_in_training(
     made: Path, tmp_path: Path, bare_curves: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -696,6 +696,7 @@ def test_rows_of_the_log_between_validations_tell_the_errors_in_training(
     )
 
 
+@pytest.mark.thorough
 def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_path: Path) -> None:
     """And the run goes on to the same bits."""
     told, out = tmp_path / "mine.yaml", tmp_path / "run"
