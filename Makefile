@@ -19,10 +19,11 @@ demo: $(VENV)/.installed
 PYTEST = OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.tested
-	$(PYTEST) -m "not slow and not thorough and not docs" tests $(PYTEST_FLAGS)
+	$(PYTEST) -p no:nbmake -m "not slow and not thorough and not docs" tests $(PYTEST_FLAGS)
 
+ALL = not slow and not docs
 test-all: $(VENV)/.tested
-	$(PYTEST) -m "not slow and not docs" --nbmake tests benchmarks/notebooks $(PYTEST_FLAGS)
+	$(PYTEST) -m "$(ALL)" --nbmake tests benchmarks/notebooks $(PYTEST_FLAGS)
 
 # how much of mitsonar the essence enters: a table of what it leaves out
 coverage: $(VENV)/.tested

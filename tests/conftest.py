@@ -16,6 +16,7 @@ import pytest
 from helpers import Command, Done, tiny_recipe
 
 LONGEST = (
+    "test_docs.py",
     "test_readme.py",
     "04_networks.ipynb",
     "03_odometry.ipynb",

@@ -252,6 +252,7 @@ def test_faults_of_the_command_are_one_sentence(mitsonar: Command, live: Live) -
     refused(mitsonar(*SERVE, "--ros", "--pings", 1), "--ros needs", "ROS 2")
 
 
+@pytest.mark.thorough
 @pytest.mark.e2e
 def test_a_missing_package_names_the_extra(tmp_path: Path) -> None:
     from helpers import run_python

@@ -197,6 +197,7 @@ def test_an_out_that_exists_is_kept(mitsonar: Command, scene: Path, tmp_path: Pa
     assert (out / "frames.npz").read_bytes() != before
 
 
+@pytest.mark.thorough
 def test_without_llvm_the_error_names_the_command(scene: Path, tmp_path: Path) -> None:
     done = by_itself("render", scene, "-o", tmp_path / "o", DRJIT_LIBLLVM_PATH="/nonexistent", CUDA_VISIBLE_DEVICES="")
     refused(done, "libLLVM", "apt-get install")

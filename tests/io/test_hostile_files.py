@@ -293,6 +293,7 @@ def test_render_of_a_bad_mesh_is_one_sentence(index: int, mitsonar: Command, tmp
     refused(mitsonar("render", "scene.xml", "-o", "out", cwd=tmp_path), "bad.ply", "names vertex")
 
 
+@pytest.mark.thorough
 def test_render_of_a_bad_mesh_in_a_process_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "bad.ply").write_bytes(ply(10**8))
     (tmp_path / "scene.xml").write_text(SCENE.format(NAMED["plain"]))

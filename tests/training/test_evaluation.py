@@ -318,6 +318,7 @@ def test_estimators_are_named_by_checkpoint_or_folder(
     assert np.allclose(create_estimator(run, force=True).estimate(frames).motion, SAYS, atol=1e-7)
 
 
+@pytest.mark.thorough
 def test_without_torch_the_extra_is_named(run: Path) -> None:
     said = run_python(
         f"""

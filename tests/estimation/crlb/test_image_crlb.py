@@ -431,6 +431,7 @@ def most_likely(
     return np.asarray(whitened @ optimize.minimize(unlikely, start, method="Nelder-Mead", options=words).x)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_an_oracle_reaches_the_bound_of_gaussian_noise() -> None:
     value = gaussian_oracle(oracle(24, 96, 6), 40)
