@@ -109,6 +109,7 @@ def test_frames_that_take_time_are_read_and_followed(mitsonar: Command, tmp_path
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.thorough
 def test_poses_are_named_and_an_instrument_that_looks_down_is_warned_of_on_a_pitched_path(
     mitsonar: Command, tmp_path: Path
 ) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import impulse_recipe, tiny_recipe
+from helpers import essence, impulse_recipe, tiny_recipe
 
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.config.data import Recipe
@@ -102,7 +102,7 @@ def test_frames_that_are_rendered_in_training_have_mirrors() -> None:
     assert sums(SURFACE) > 1.02 * sums(None)
 
 
-@pytest.mark.parametrize("direct", [False, True])
+@pytest.mark.parametrize("direct", essence([False, True], True))
 def test_responses_are_those_of_the_simulator_with_mirrors(direct: bool, tmp_path: Path) -> None:
     recipe = impulse_recipe(
         world={"surface_m": 6.0},

@@ -40,7 +40,9 @@ def made(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
 def straight(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
     """The same without turns, in pairs."""
     url = tmp_path_factory.mktemp("made") / "straight.zarr"
-    make_dataset(impulse_recipe(scenes=[{"count": 2, "sequences": 10}], flight={"yaw_deg": 0.0, "pings": 2}, frames=2), str(url))
+    make_dataset(
+        impulse_recipe(scenes=[{"count": 2, "sequences": 10}], flight={"yaw_deg": 0.0, "pings": 2}, frames=2), str(url)
+    )
     return url
 
 

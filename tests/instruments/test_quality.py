@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from helpers import diffuse, floor, floor_levels, scene, slope
+from helpers import diffuse, essence, floor, floor_levels, scene, slope
 
 from mitsonar.config.data import load_recipe
 from mitsonar.errors import MitsonarError
@@ -58,7 +58,7 @@ def plain_error(loaded: Any, sonar: Sonar) -> float:
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
-@pytest.mark.parametrize("name", ["didson300", "oculus-m1200d-2100khz"])
+@pytest.mark.parametrize("name", essence(["didson300", "oculus-m1200d-2100khz"], "didson300"))
 def test_a_plain_floor_errs_by_what_is_printed(variant: str, name: str, quality: str) -> None:
     """The table was measured against many rays; this is against the integral. Not above it, and not far below."""
     whole = preset(name).replace(model="physical", quality=quality)
@@ -111,6 +111,7 @@ def test_pings_of_a_resting_sonar_differ_as_much_as_is_printed(variant: str, qua
         assert found == pytest.approx(wanted, abs=0.05)
 
 
+@pytest.mark.thorough
 def test_errors_fall_as_the_law_says(variant: str) -> None:
     """Plain: faster than 1 / rays over elevation. Textured: as 1 / sqrt(rays across) while each reads a cell of its own."""
     plain = scene(floor=floor(diffuse(0.5), 500.0))

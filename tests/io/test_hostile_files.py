@@ -761,7 +761,11 @@ HOSTILE_YAML = {
     ("kind", "name"),
     [
         *(("recipe", name) for name in HOSTILE_YAML),
-        *((kind, name) for kind in ("sonar", "noise", "training") for name in ("laughs", "itself as a key", "python", "large")),
+        *(
+            (kind, name)
+            for kind in ("sonar", "noise", "training")
+            for name in ("laughs", "itself as a key", "python", "large")
+        ),
     ],
 )
 def test_yaml_made_to_harm(kind: str, name: str, tmp_path: Path) -> None:

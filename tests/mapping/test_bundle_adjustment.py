@@ -72,6 +72,7 @@ def test_the_ground_gives_the_scale_that_bearings_and_ranges_leave_open() -> Non
     assert found.poses[-1, 1] / true[-1, 1] == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.thorough
 def test_covariance_of_the_last_pose_is_that_of_repeated_noise() -> None:
     true, points = path(8), ground(80)
     errors, promised = [], []

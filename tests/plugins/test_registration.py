@@ -123,7 +123,7 @@ KEPT = """
 """
 
 
-@pytest.mark.parametrize("order", essence(ORDERS, "mitsonar, mitsuba, variant", "mitsuba, variant, mitsonar"))
+@pytest.mark.parametrize("order", essence(ORDERS, "mitsuba, variant, mitsonar"))
 def test_order_of_imports_and_variants(order: str) -> None:
     run_python(textwrap.dedent(SCENE) + textwrap.dedent(ORDERS[order]))
 

@@ -99,7 +99,9 @@ def changed(frames: SonarFrames, **fields: object) -> SonarFrames:
 
 @pytest.mark.parametrize(
     ("axis", "size"),
-    essence([(axis, size) for axis in range(3) for size in (-5.0, -1.0, -0.3, 0.3, 1.0, 5.0)], (0, -1.0), (1, 5.0), (2, -1.0)),
+    essence(
+        [(axis, size) for axis in range(3) for size in (-5.0, -1.0, -0.3, 0.3, 1.0, 5.0)], (0, -1.0), (1, 5.0), (2, -1.0)
+    ),
 )
 @pytest.mark.parametrize("method", METHODS)
 def test_sign_and_size_of_each_axis(pair: Pair, method: str, axis: int, size: float) -> None:

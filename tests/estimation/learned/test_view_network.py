@@ -88,6 +88,7 @@ def test_range_levels_are_those_of_a_sonar_with_fewer_bins(portions: Path) -> No
     assert np.median(np.abs(found - wanted)[wanted > 0] / wanted[wanted > 0]) < 1e-3
 
 
+@pytest.mark.thorough
 def test_halves_are_sums_over_port_and_starboard_beams(ahead: Path) -> None:
     """Port first, both pings of each (fig. 4.18); noise is drawn for each pixel before they are added up."""
     images = SonarPairs(ahead, part="all", layout="channels", noise="high", seed=4)
