@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from helpers import essence
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, rejected
@@ -44,7 +45,7 @@ def told() -> list[MotionPrior]:
     return [MotionPrior(Motion(1e-3 * k, 0.0, 0.0), np.eye(3) * (1 + k)) for k in range(FRAMES - 1)]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", essence([1, 2], 1))
 def test_each_pair_gets_its_own_prior(workers: int) -> None:
     """Also where pairs of an earlier run are left out, so that batches do not begin where the table does."""
     known = {0: rejected("known"), 5: rejected("known")}

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from bags import Maker, Sent, write_bag
 from drawn_frames import over_ground, sway
+from helpers import essence
 from hostile_readers import Reader, attack, read_recording
 from mutations import Rng, changed_bytes, changed_text, outcome
 from recording_files import aris_file, didson_file, oculus_log, oculus_ping, some_pings
@@ -24,8 +25,8 @@ from mitsonar import MitsonarError, open_recording
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.recordings.write_mcap import write_mcap
 
-USUAL, FEWER, MANY = 100, 10, 10_000
-"""Mutants of each format in the test that is always run, of bags, which take 0.1 s each, and in the slow one."""
+FIRST, USUAL, FEWER, MANY = 40, 100, 10, 10_000
+"""Mutants of each format in the essence, in CI, of bags, which take 0.1 s each, and in the slow test."""
 
 MEMORY_FLOOR, MEMORY_FACTOR = 4 * 2**20, 40
 """What a reader may hold at a time: so many bytes, and so many times the size of the recording."""
@@ -144,10 +145,11 @@ def read(folder: Path) -> None:
 READERS = {name: Reader(lambda folder, write=write: write(folder), spoil, read) for name, write in RECORDINGS.items()}  # type: ignore[misc]
 
 
+@pytest.mark.parametrize("first", essence([0, FIRST], 0))
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
-    count = FEWER if "bag" in name or "mcap" in name else USUAL
-    found = attack(name, tmp_path, count, readers=READERS)
+def test_mutants_are_read_or_refused(name: str, first: int, tmp_path: Path) -> None:
+    count = FEWER if "bag" in name or "mcap" in name else USUAL - FIRST if first else FIRST
+    found = attack(name, tmp_path, count, first, READERS)
     assert found["read"] + found["refused"] == count
     assert found["refused"] > 0
     assert found["read"] > 0 or name == "mcap of a run"  # whose every byte has a checksum

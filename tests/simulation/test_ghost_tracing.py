@@ -47,7 +47,7 @@ def fields(mirror: tuple[float, float], sonar: Sonar) -> tuple[complex, complex,
     return direct, found[0], found[1] - found[0], at
 
 
-@pytest.mark.parametrize("pattern", ["two_way", "receive"])
+@pytest.mark.parametrize("pattern", essence(["two_way", "receive"], "receive"))
 @pytest.mark.parametrize(("reflection", "height"), essence([(-1.0, 0.0), (0.7, 1e-4)], (0.7, 1e-4)))
 def test_one_point_has_the_ghosts_of_image_sources(pattern: str, reflection: float, height: float) -> None:
     """By way of the surface 2 V sqrt(cos cos') / R R', both ways by it V^2 cos' / R'^2: 1 % and 0.03 of a turn's radian."""
@@ -81,6 +81,7 @@ def test_ghosts_lie_in_the_bins_of_image_sources() -> None:
         assert sonar.range_m[around[levels[around].argmax()]] == pytest.approx(range_m, abs=sonar.bin_m)
 
 
+@pytest.mark.thorough
 def test_mirrors_out_of_sight_change_nothing() -> None:
     """A mirror behind the sonar: no ghosts; what is rough sends nothing from one plate to itself. Bits are the same."""
     loaded = separate(target=plate((0, 4.4, 0), (0, -1, 0), half=0.3), behind=plate((0, -5, 0), (0, 1, 0), half=0.3))

@@ -460,7 +460,7 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
 
 @pytest.fixture(scope="module")
 def many(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """Small data sets of other kinds, made when they are first needed: three frames at several heights with vectors, two sensors, another sonar."""
+    """Small data sets of other kinds, made when they are first needed: vectors, two sensors, another sonar."""
     folder = tmp_path_factory.mktemp("many")
     two = [{"name": name, "starboard_m": side, "sonar": {"beams": 12}} for name, side in (("left", -0.5), ("right", 0.5))]
     recipes: dict[str, dict[str, Any]] = {
