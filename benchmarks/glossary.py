@@ -1,4 +1,4 @@
-"""Count the words that names, messages, comments and documents of mitsonar avoid, and list those outside their allowed places.
+"""Count the words that names, messages, comments and documents avoid, and list those outside their allowed places.
 
     python benchmarks/glossary.py [--house FOLDER] [--list WORD] [--quick]
 
@@ -19,8 +19,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-CODE, DOCUMENTS = ("mitsonar", "plugins", "scenes", "benchmarks", "docs", "tests"), ("*.md", "docs/**/*.md", "benchmarks/*.md")
-COUNTED = ("mitsonar", "plugins", "scenes", "benchmarks", "docs", "tests")
+DOCUMENTS = ("*.md", "docs/**/*.md", "benchmarks/*.md")
+CODE = ("mitsonar", "plugins", "scenes", "benchmarks", "docs", "tests")
 
 WORDS = {
     **dict.fromkeys(("told", "tells", "said"), "given, reported, stated"),
@@ -71,7 +71,7 @@ def main() -> None:
         print("\n".join(f"{use.path}:{use.line}: {use.text}" for use in uses if use.word == arguments.list))
         return
     outside = [use for use in uses if not allowed(use)]
-    rooms = [(name, Counter(use.word for use in uses if use.path.split("/")[0] == name)) for name in COUNTED]
+    rooms = [(name, Counter(use.word for use in uses if use.path.split("/")[0] == name)) for name in CODE]
     print(f"| word | {' | '.join(name for name, _ in rooms)} | other pages | not allowed |")
     print("|---" * (len(rooms) + 3) + "|")
     for word in dict.fromkeys([*WORDS, *ALONE]):
