@@ -75,7 +75,7 @@ def level(echoes: LevelParts, sonar: Sonar, where: Callable[..., AnyArray]) -> A
     lambert = echoes.reflectivity * echoes.cosine
     if sonar.model == "thesis":
         return lambert
-    nearest, farthest = _ends(sonar)
+    nearest, farthest = _range_limits(sonar)
     radius = where(echoes.range_m > nearest, where(echoes.range_m < farthest, echoes.range_m, farthest), nearest)
     return lambert * echoes.solid_angle_sr * _spreading(radius, sonar.gain_exponent)
 
@@ -84,11 +84,11 @@ def largest_level(sonar: Sonar, solid_angle: float) -> float:
     """Return the largest possible level of one ray, given the largest ``solid_angle`` of a cell [sr]."""
     if sonar.model == "thesis":
         return 1.0
-    largest: float = max(_spreading(end, sonar.gain_exponent) for end in _ends(sonar))
+    largest: float = max(_spreading(end, sonar.gain_exponent) for end in _range_limits(sonar))
     return largest * solid_angle
 
 
-def _ends(sonar: Sonar) -> tuple[float, float]:
+def _range_limits(sonar: Sonar) -> tuple[float, float]:
     """Return the limits to which ranges are clamped in spreading and gain [m]."""
     nearest = max(sonar.range_min, sonar.bin_m)
     return nearest, max(4 * sonar.range_max, nearest)
@@ -198,12 +198,14 @@ def first_echoes(levels: Array, range_m: Array, noise: Array, *, below_db: float
     # Find the first bin above the threshold, and the bin before it.
     first = above.argmax(axis=-1)[..., None]
     before = np.maximum(first - 1, 0)
-    here, low, wanted = (np.take_along_axis(one, at, -1) for one, at in ((levels, first), (levels, before), (limit, first)))
+    level_at, level_before, threshold = (
+        np.take_along_axis(values, index, -1) for values, index in ((levels, first), (levels, before), (limit, first))
+    )
     # Interpolate the threshold crossing linearly between the two; an echo in the first bin starts there.
-    rise = np.where(here > low, here - low, 1.0)
-    back = np.where(first > 0, np.clip((here - wanted) / rise, 0, 1), 0)
-    place = (range_m[first] - back * (range_m[1] - range_m[0] if len(range_m) > 1 else 0))[..., 0]
-    return _told(levels, noise, above, _joined(above, first), place)
+    rise = np.where(level_at > level_before, level_at - level_before, 1.0)
+    back = np.where(first > 0, np.clip((level_at - threshold) / rise, 0, 1), 0)
+    onset_m = (range_m[first] - back * (range_m[1] - range_m[0] if len(range_m) > 1 else 0))[..., 0]
+    return _detected(levels, noise, above, _run_around(above, first), onset_m)
 
 
 def strongest_echoes(levels: Array, range_m: Array, noise: Array, *, below_db: float, above_noise_db: float) -> Detected:
@@ -225,12 +227,12 @@ def strongest_echoes(levels: Array, range_m: Array, noise: Array, *, below_db: f
     wide = above.copy()
     wide[..., 1:] |= above[..., :-1]
     wide[..., :-1] |= above[..., 1:]
-    echo = _joined(wide, strongest)
+    echo = _run_around(wide, strongest)
     # Average the ranges of the echo, weighted by the energy above the noise.
     energy = np.where(echo, np.maximum(levels - noise, 0), 0)
     total = energy.sum(axis=-1)
-    middle = (energy * range_m).sum(axis=-1) / np.where(total > 0, total, 1)
-    return _told(levels, noise, above, echo, middle)
+    centroid_m = (energy * range_m).sum(axis=-1) / np.where(total > 0, total, 1)
+    return _detected(levels, noise, above, echo, centroid_m)
 
 
 def _thresholds(
@@ -243,21 +245,21 @@ def _thresholds(
     return levels, limit, (levels >= limit) & (levels > 0)
 
 
-def _joined(above: NDArray[np.bool_], at: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _run_around(above: NDArray[np.bool_], index: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Return the contiguous run of bins above the threshold that contains ``at`` ``(..., 1)``."""
     gaps = np.cumsum(~above, axis=-1)
-    return np.asarray(above & (gaps == np.take_along_axis(gaps, at, -1)))
+    return np.asarray(above & (gaps == np.take_along_axis(gaps, index, -1)))
 
 
-def _told(levels: Array, noise: Array, above: NDArray[np.bool_], echo: NDArray[np.bool_], place: Array) -> Detected:
+def _detected(levels: Array, noise: Array, above: NDArray[np.bool_], echo: NDArray[np.bool_], range_m: Array) -> Detected:
     """Return the detections, with nan where no bin exceeds the threshold."""
-    there = above.any(axis=-1)
+    has_echo = above.any(axis=-1)
     energy = np.maximum(levels - noise, 0)
     total, inside = energy.sum(axis=-1), np.where(echo, energy, 0).sum(axis=-1)
     peak = np.where(echo, levels, 0).max(axis=-1)
-    quality = np.where(there, inside / np.where(total > 0, total, 1), 0.0)
-    level = 10 * np.log10(np.where(there, peak, 1.0))
-    return Detected(np.where(there, place, np.nan), np.where(there, level, np.nan), quality)
+    quality = np.where(has_echo, inside / np.where(total > 0, total, 1), 0.0)
+    level = 10 * np.log10(np.where(has_echo, peak, 1.0))
+    return Detected(np.where(has_echo, range_m, np.nan), np.where(has_echo, level, np.nan), quality)
 
 
 # ---------------- Local contrast of sonar images
@@ -302,13 +304,13 @@ class LocalContrast:
 
     def apply(self, level_db: Images) -> Images:
         """Return the contrast of images ``(frames, bins, beams)`` [dB] in 0..1; 0.5 is the mean of the neighbourhood."""
-        return np.stack([self._of(one) for one in level_db]) if len(level_db) else level_db.astype(np.float32)
+        return np.stack([self._contrast(image) for image in level_db]) if len(level_db) else level_db.astype(np.float32)
 
-    def _of(self, level_db: Images) -> Images:
+    def _contrast(self, level_db: Images) -> Images:
         smooth = ndimage.gaussian_filter(level_db, (self.bins, self.beams), mode="nearest", output=np.float32)
-        around = [part * size for part, size in zip(NEIGHBOURHOOD, smooth.shape, strict=True)]
-        rest = smooth - ndimage.gaussian_filter(smooth, around, mode="nearest")
-        contrast = rest / np.float32(max(float(rest.std()), LEAST_SPREAD_DB))
+        neighbourhood = [part * size for part, size in zip(NEIGHBOURHOOD, smooth.shape, strict=True)]
+        deviation = smooth - ndimage.gaussian_filter(smooth, neighbourhood, mode="nearest")
+        contrast = deviation / np.float32(max(float(deviation.std()), LEAST_SPREAD_DB))
         return np.asarray(np.clip(np.float32(0.5) + contrast / np.float32(SPREAD), 0, 1), dtype=np.float32)
 
 
@@ -330,12 +332,12 @@ def fitted_contrast(runs: Sequence[Images]) -> LocalContrast:
     Args:
         runs: sequences of consecutive images, each ``(frames, bins, beams)`` [dB].
     """
-    found, best = LocalContrast(*SMOOTHINGS[0]), -1.0
+    best, best_correlation = LocalContrast(*SMOOTHINGS[0]), -1.0
     for bins, beams in SMOOTHINGS:
-        tried = LocalContrast(bins, beams)
-        correlation = float(np.mean([alike(tried.apply(run)) for run in runs]))
-        if correlation > best:
-            found, best = tried, correlation
+        candidate = LocalContrast(bins, beams)
+        correlation = float(np.mean([alike(candidate.apply(run)) for run in runs]))
+        if correlation > best_correlation:
+            best, best_correlation = candidate, correlation
         if correlation >= ENOUGH:
             break
-    return found
+    return best

@@ -396,21 +396,21 @@ def structure_integral(q: Angles, alpha: float) -> Angles:
     """
     # Rotation of the path that keeps both the exponential and the Hankel function decaying.
     turn = min(math.pi / 4, math.pi / (8 * alpha))
-    found = np.zeros_like(q)
-    for k, one in enumerate(q):
-        if one > 0:
+    integral = np.zeros_like(q)
+    for k, q_k in enumerate(q):
+        if q_k > 0:
             begin, end = -19.0, math.log(40 / math.sin(turn))  # limits of log u, beyond which the integrand is negligible
             # A large q moves the scale of the exponential to smaller u, and with it both limits.
-            if one >= 1:
-                begin -= math.log(one) / (2 * alpha)
-                end = min(end, math.log(40 / (one * math.cos(2 * alpha * turn))) / (2 * alpha))
+            if q_k >= 1:
+                begin -= math.log(q_k) / (2 * alpha)
+                end = min(end, math.log(40 / (q_k * math.cos(2 * alpha * turn))) / (2 * alpha))
             # Sum over even steps of log u along the rotated ray.
             t = np.exp(np.arange(begin, end, 0.04))
             u = t * np.exp(1j * turn)
-            exponent = -one * t ** (2 * alpha) * np.exp(2j * alpha * turn)
-            decay = np.exp(exponent) if one >= 1 else np.expm1(exponent)
-            found[k] = 0.04 * np.sum(decay * hankel1(0, u) * u * u).real
-    return found
+            exponent = -q_k * t ** (2 * alpha) * np.exp(2j * alpha * turn)
+            decay = np.exp(exponent) if q_k >= 1 else np.expm1(exponent)
+            integral[k] = 0.04 * np.sum(decay * hankel1(0, u) * u * u).real
+    return integral
 
 
 def volume_sigma(sediment: Sediment, grazing_rad: Angles) -> Angles:
@@ -501,15 +501,15 @@ class Material(CheckedModel):
     def _consistent(self) -> Self:
         mirror = MIRROR if self.law in LARGEST_MU else ()
         given = [key for keys in (*LAWS.values(), MIRROR) for key in keys if getattr(self, key) is not None]
-        lacking = [key for key in LAWS[self.law] if key not in given]
-        strange = [key for key in given if key not in LAWS[self.law] + mirror]
-        if lacking:
+        missing = [key for key in LAWS[self.law] if key not in given]
+        unexpected = [key for key in given if key not in LAWS[self.law] + mirror]
+        if missing:
             raise ValueError(
-                f"a material of law {self.law} needs {', '.join(LAWS[self.law])}: it lacks {', '.join(lacking)}"
+                f"a material of law {self.law} needs {', '.join(LAWS[self.law])}: it lacks {', '.join(missing)}"
             )
-        if strange:
+        if unexpected:
             known = ", ".join(LAWS[self.law] + mirror)
-            raise ValueError(f"a material of law {self.law} has no key {strange[0]}: its keys are {known}")
+            raise ValueError(f"a material of law {self.law} has no key {unexpected[0]}: its keys are {known}")
         if (self.reflection is None) != (self.roughness_m is None):
             raise ValueError("a mirror part needs both reflection and roughness_m: got one; give both or none")
         low, high = self.band_hz
@@ -523,8 +523,8 @@ class Material(CheckedModel):
         """Reject a mu that would scatter more than the incident power, or more than a mirror part returns."""
         most = LARGEST_MU[self.law] * (1.0 if self.reflection is None else self.reflection**2)
         if mu > most * (1 + 1e-9):
-            than = "than arrives" if self.reflection is None else "than its reflection returns"
-            raise ValueError(f"mu of law {self.law} is at most {most:.4g}, or more is scattered {than}: got {mu:g}")
+            limit_text = "than arrives" if self.reflection is None else "than its reflection returns"
+            raise ValueError(f"mu of law {self.law} is at most {most:.4g}, or more is scattered {limit_text}: got {mu:g}")
 
     @property
     def band_hz(self) -> tuple[float, float]:
@@ -679,23 +679,23 @@ def material(name_or_file: str | Path) -> Material:
     text = str(name_or_file)
     if not text.lower().endswith((".yaml", ".yml")):
         if text in named_materials() or not os.path.exists(text):
-            return Material.create(**_named(text))
+            return Material.create(**_named_fields(text))
         raise MitsonarError(f"a material's file ends in .yaml: got {text}; rename it, or name a material")
     fields = read_yaml(text, "material file", " or a material's name")
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
         raise MitsonarError(f"{text} must hold `key: value` lines of a material")
-    fields = _by_grain_size(fields, text)
+    fields = _fill_from_grain_size(fields, text)
     base = fields.pop("material", None)
     if not isinstance(base, str | None):
         raise MitsonarError(f"material in {text} must name a material: got {shortened(base)}")
-    kept = {} if base is None else _named(base)
-    if fields.get("law", kept.get("law")) != kept.get("law"):
-        numbers = {key for keys in (*LAWS.values(), MIRROR) for key in keys}
-        kept = {key: value for key, value in kept.items() if key not in numbers}
-    return Material.create(**{**kept, "name": Path(text).stem, **fields})
+    base_fields = {} if base is None else _named_fields(base)
+    if fields.get("law", base_fields.get("law")) != base_fields.get("law"):
+        numeric_keys = {key for keys in (*LAWS.values(), MIRROR) for key in keys}
+        base_fields = {key: value for key, value in base_fields.items() if key not in numeric_keys}
+    return Material.create(**{**base_fields, "name": Path(text).stem, **fields})
 
 
-def _by_grain_size(fields: dict[str, PlainValue], text: str) -> dict[str, PlainValue]:
+def _fill_from_grain_size(fields: dict[str, PlainValue], text: str) -> dict[str, PlainValue]:
     """Return the fields of a file, completed from its grain size if it gives one; explicit fields take precedence."""
     if "grain_size_phi" not in fields:
         return fields
@@ -709,14 +709,14 @@ def _by_grain_size(fields: dict[str, PlainValue], text: str) -> dict[str, PlainV
     return {"law": "rough-fluid", "source": source, **band, **sediment_of(float(phi))._asdict(), **fields}
 
 
-def _named(name: str) -> dict[str, PlainValue]:
+def _named_fields(name: str) -> dict[str, PlainValue]:
     """Return the fields of a named material, with its sources joined into one text."""
     known = named_materials()
     if name not in known:
         raise MitsonarError(f"unknown material {shortened(name)}: {nearest_names(name, known)}")
-    one = known[name]
-    source = "; ".join(f"{key}: {text}" for key, text in one.sources.items())
-    return {"name": name, "about": one.about, "source": source, **one.values}
+    entry = known[name]
+    source = "; ".join(f"{key}: {text}" for key, text in entry.sources.items())
+    return {"name": name, "about": entry.about, "source": source, **entry.values}
 
 
 # ---------------- Checks for mirrors and multiple reflections

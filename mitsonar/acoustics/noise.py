@@ -72,8 +72,10 @@ class NoiseModel(CheckedModel):
         if self.is_none:
             return xp.clip(image, 0.0, 1.0)
         if image.shape[0] > 1 and str(device(image)) == "cpu":  # one frame at a time fits the cache
-            one = [self.apply(image[k : k + 1, ...], seed=seed, frames=frames[k : k + 1]) for k in range(image.shape[0])]
-            return xp.concat(one, axis=0)
+            by_frame = [
+                self.apply(image[k : k + 1, ...], seed=seed, frames=frames[k : k + 1]) for k in range(image.shape[0])
+            ]
+            return xp.concat(by_frame, axis=0)
         first, second = uniform(image.shape, seed=seed, frames=frames, like=image)
         # Box-Muller: the radius is also a Rayleigh variable, used for the echoes.
         radius = xp.sqrt(-2.0 * xp.log(first))
@@ -381,12 +383,12 @@ def snr_of(text: str) -> float | None:
     Raises:
         MitsonarError: any other text.
     """
-    found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d+)?)\s*dB\s*", text)
-    if text != "none" and not found:
+    match = re.fullmatch(r"\s*([+-]?\d+(?:\.\d+)?)\s*dB\s*", text)
+    if text != "none" and not match:
         raise MitsonarError(
             f"noise of impulse responses is a signal to noise ratio such as '20 dB', or none: got {shortened(text)}"
         )
-    return float(found[1]) if found else None
+    return float(match[1]) if match else None
 
 
 def snr_said(snr_db: float | None) -> str:

@@ -77,7 +77,7 @@ NODES = 80
 DECADES = (-5.0, 5.0)
 """Limits of the tables, as decimal logarithms of q. Beyond them the asymptotic limits hold within 1e-5."""
 
-A_DECADE = 16
+ENTRIES_PER_DECADE = 16
 """Number of table entries per decade of q."""
 
 
@@ -106,8 +106,8 @@ def rician_information(power: ArrayLike, noise: ArrayLike) -> NDArray[np.float64
     q = np.asarray(power, dtype=float) / noise
     least, most = (10.0**end for end in DECADES)
     table = _tables()
-    found = np.exp(np.interp(np.log(np.clip(q, least, most)), table.log_q, table.log_information))
-    return np.asarray(found * np.minimum(1, most / np.maximum(q, most)) / noise**2, dtype=np.float64)
+    information = np.exp(np.interp(np.log(np.clip(q, least, most)), table.log_q, table.log_information))
+    return np.asarray(information * np.minimum(1, most / np.maximum(q, most)) / noise**2, dtype=np.float64)
 
 
 def score_shares(power: ArrayLike, noise: ArrayLike) -> ScoreShares:
@@ -129,7 +129,7 @@ class _Tables(NamedTuple):
 @lru_cache(maxsize=1)
 def _tables() -> _Tables:
     """Integrate the score and the polynomials over the noise."""
-    q = np.logspace(*DECADES, round((DECADES[1] - DECADES[0]) * A_DECADE) + 1)
+    q = np.logspace(*DECADES, round((DECADES[1] - DECADES[0]) * ENTRIES_PER_DECADE) + 1)
     # Quadrature over the complex Gaussian noise n = x + i y of unit power.
     node, weight = np.polynomial.hermite.hermgauss(NODES)
     x, y = np.meshgrid(node, node, indexing="ij")

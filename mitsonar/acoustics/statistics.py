@@ -131,8 +131,8 @@ def intensity_contrast(intensity: ArrayLike, window: tuple[int, int] = WINDOW) -
     """
     parts = window_values(intensity, window)
     mean = parts.mean(axis=1)
-    kept = mean > 0
-    return np.asarray(parts[kept].std(axis=1, ddof=1) / mean[kept], dtype=np.float64)
+    nonzero = mean > 0
+    return np.asarray(parts[nonzero].std(axis=1, ddof=1) / mean[nonzero], dtype=np.float64)
 
 
 # ---------------- Correlation between frames and cells
@@ -163,13 +163,13 @@ def correlation_by_level(level_db: ArrayLike, parts: int = 10, window: tuple[int
     level = np.asarray(level_db, dtype=float)
     mean = local_mean(level, window)
     grain = level - mean
-    found = []
+    by_frame = []
     for k in range(len(level) - 1):
-        around = ((mean[k] + mean[k + 1]) / 2).ravel()
+        mean_level = ((mean[k] + mean[k + 1]) / 2).ravel()
         one, other = grain[k].ravel(), grain[k + 1].ravel()
-        cells = np.array_split(np.argsort(around, kind="stable"), parts)
-        found.append([(float(around[at].mean()), _correlation(one[at], other[at])) for at in cells])
-    table = np.mean(found, axis=0) if found else np.full((parts, 2), np.nan)
+        cells = np.array_split(np.argsort(mean_level, kind="stable"), parts)
+        by_frame.append([(float(mean_level[part].mean()), _correlation(one[part], other[part])) for part in cells])
+    table = np.mean(by_frame, axis=0) if by_frame else np.full((parts, 2), np.nan)
     return np.asarray(table[:, 0]), np.asarray(table[:, 1])
 
 
@@ -283,16 +283,16 @@ def _leaking_rows(intensity: Array) -> _Rows | None:
         median, level = np.nanmedian(ratio, axis=2), np.nanmean(np.where(quiet, around, np.nan), axis=2)
     # Only rows whose brightest cell is far above their quiet beams can show a leak.
     top = row.max(axis=2)
-    can = np.isfinite(median) & (level > 0) & (excess > 0) & (top > LEAK_CONTRAST * level)
-    if not can.any():
+    usable = np.isfinite(median) & (level > 0) & (excess > 0) & (top > LEAK_CONTRAST * level)
+    if not usable.any():
         return None
     lift = median * np.log(2) / np.nanmedian(median)  # normalised, since the mean of few neighbours raises all ratios
     spread = 1.4826 * np.nanmedian(np.abs(lift - np.log(2)))
     # Select the rows of each frame whose excess is largest relative to their quiet beams.
-    score = np.where(can, excess / np.where(level > 0, level, 1), -np.inf)
+    score = np.where(usable, excess / np.where(level > 0, level, 1), -np.inf)
     best = np.argsort(score, axis=1)[:, -LEAK_ROWS:]
-    kept = np.take_along_axis(can, best, axis=1)
-    excess, lift, level, top = (np.take_along_axis(table, best, axis=1)[kept] for table in (excess, lift, level, top))
+    best_usable = np.take_along_axis(usable, best, axis=1)
+    excess, lift, level, top = (np.take_along_axis(table, best, axis=1)[best_usable] for table in (excess, lift, level, top))
     return _Rows(excess, lift, level, top, float(1.25 * spread / np.sqrt(LEAK_ROWS)))
 
 
@@ -316,12 +316,12 @@ def leak_power(intensity: ArrayLike, limit: float = np.inf) -> float:
     """
     intensity = np.asarray(intensity, dtype=float)
     rows = _leaking_rows(intensity)
-    if rows is None or not (open_ := rows.top < limit).any():
+    if rows is None or not (below_limit := rows.top < limit).any():
         return 0.0
-    if np.median(rows.lift[open_]) < np.log(2) + LEAK_SURE * rows.chance:
+    if np.median(rows.lift[below_limit]) < np.log(2) + LEAK_SURE * rows.chance:
         return 0.0
-    leaked = np.array([_steady_power(one) for one in rows.lift[open_]]) * rows.level[open_]
-    return float(np.median(leaked / rows.excess[open_]))
+    leaked = np.array([_steady_power(one) for one in rows.lift[below_limit]]) * rows.level[below_limit]
+    return float(np.median(leaked / rows.excess[below_limit]))
 
 
 def smear_db(level_db: ArrayLike) -> float:
@@ -331,8 +331,8 @@ def smear_db(level_db: ArrayLike) -> float:
         return 0.0
     row, chooser, around = _rows_and_neighbours(level)
     brightest = row.max(axis=2).argmax(axis=1)
-    found = []
-    for k, at in enumerate(brightest):
-        quiet = chooser[k, at] <= np.percentile(chooser[k, at], 60)
-        found.append(float(np.median((row[k, at] - around[k, at])[quiet])))
-    return float(np.median(found)) - MEDIAN_ABOVE_MEAN_DB
+    excess_db = []
+    for k, brightest_row in enumerate(brightest):
+        quiet = chooser[k, brightest_row] <= np.percentile(chooser[k, brightest_row], 60)
+        excess_db.append(float(np.median((row[k, brightest_row] - around[k, brightest_row])[quiet])))
+    return float(np.median(excess_db)) - MEDIAN_ABOVE_MEAN_DB

@@ -56,16 +56,16 @@ class CartesianMap:
     index: NDArray[np.int64]
     weight: NDArray[np.float32]
     extent: tuple[float, float, float, float]
-    _kept: dict[str, list[AnyArray]] = field(default_factory=dict, repr=False, compare=False)
+    _by_device: dict[str, list[AnyArray]] = field(default_factory=dict, repr=False, compare=False)
 
     def apply(self, image: AnyArray) -> AnyArray:
         """Convert images ``(..., bins, beams)``, NumPy or torch, to fans ``(..., rows, columns)``; 0 outside the fan."""
         xp = array_namespace(image)
         flat = xp.reshape(image, (-1, image.shape[-2] * image.shape[-1]))
-        where = f"{xp.__name__} {device(image)}"
-        if where not in self._kept:  # once per device
-            self._kept[where] = [xp.asarray(table, device=device(image)) for table in (self.index, self.weight)]
-        index, weight = self._kept[where]
+        key = f"{xp.__name__} {device(image)}"
+        if key not in self._by_device:  # once per device
+            self._by_device[key] = [xp.asarray(table, device=device(image)) for table in (self.index, self.weight)]
+        index, weight = self._by_device[key]
         fan = None
         for corner in range(4):
             part = xp.take(flat, xp.reshape(index[corner], (-1,)), axis=1) * xp.reshape(weight[corner], (-1,))
@@ -138,9 +138,9 @@ def to_cartesian(image: ArrayLike, range_m: ArrayLike, bearing_rad: ArrayLike, r
         MitsonarError: inconsistent shapes, or ranges or bearings that do not increase.
     """
     image = np.asarray(image, dtype=float)
-    wanted = np.size(range_m), np.size(bearing_rad)
-    if image.shape != wanted:
-        raise MitsonarError(f"image must be (bins, beams) = {wanted}: got {image.shape}")
+    expected_shape = np.size(range_m), np.size(bearing_rad)
+    if image.shape != expected_shape:
+        raise MitsonarError(f"image must be (bins, beams) = {expected_shape}: got {image.shape}")
     conversion = cartesian_map(range_m, bearing_rad, rows)
     fan = np.where(conversion.weight.any(axis=0), conversion.apply(image), np.nan).astype(np.float32)
     return CartesianImage(fan, conversion.extent)
@@ -148,9 +148,9 @@ def to_cartesian(image: ArrayLike, range_m: ArrayLike, bearing_rad: ArrayLike, r
 
 def _cell(index: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Split a fractional index into a cell and the remainder, clamped to the centres of the outermost cells."""
-    held = np.clip(index, 0, count - 1)
-    whole = np.minimum(held.astype(np.int64), max(count - 2, 0))
-    return whole, held - whole
+    clamped = np.clip(index, 0, count - 1)
+    cell = np.minimum(clamped.astype(np.int64), max(count - 2, 0))
+    return cell, clamped - cell
 
 
 def _edges(centres: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -198,11 +198,11 @@ class Views(NamedTuple):
         rotations = vehicle_rotation(table).as_matrix()
         turns = np.empty((len(table), 3, 3, 3))
         for k in range(3):
-            beside = table.copy()
-            beside[:, 3 + k] += STEP
-            ahead = vehicle_rotation(beside).as_matrix()
-            beside[:, 3 + k] -= 2 * STEP
-            turns[:, k] = (ahead - vehicle_rotation(beside).as_matrix()) / (2 * STEP)
+            shifted = table.copy()
+            shifted[:, 3 + k] += STEP
+            ahead = vehicle_rotation(shifted).as_matrix()
+            shifted[:, 3 + k] -= 2 * STEP
+            turns[:, k] = (ahead - vehicle_rotation(shifted).as_matrix()) / (2 * STEP)
         return cls(table, rotations, turns)
 
     def take(self, index: NDArray[np.intp]) -> Views:

@@ -64,7 +64,7 @@ class GroundGeometry:
     @cached_property
     def turn(self) -> NDArray[np.float64]:
         """Return the sonar's starboard, forward and up axes in level axes, as columns ``(3, 3)``."""
-        return _turn(self.pitch_rad, self.roll_rad)
+        return _sonar_axes(self.pitch_rad, self.roll_rad)
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
@@ -104,8 +104,8 @@ class GroundGeometry:
         else:
             turning = (aside - (s / radius)[..., None] * along) / np.sqrt(radius * radius - s * s)[..., None]
         # Chain rule with the derivative of the ground point by the motion.
-        one, none = np.ones_like(x), np.zeros_like(x)
-        point = np.stack([np.stack([-one, none, -y], axis=-1), np.stack([none, -one, x], axis=-1)], axis=-2)
+        ones, zeros = np.ones_like(x), np.zeros_like(x)
+        point = np.stack([np.stack([-ones, zeros, -y], axis=-1), np.stack([zeros, -ones, x], axis=-1)], axis=-2)
         return np.asarray(np.stack([along, turning], axis=-2) @ point)
 
     @cached_property
@@ -141,20 +141,20 @@ class GroundGeometry:
         # Sample a coarse grid of cells, of which only those on lit ground count.
         bin_m, beam_rad = (float(np.median(np.abs(np.diff(axis)))) for axis in (self.range_m, self.bearing_rad))
         ranges, bearings = (np.linspace(axis[0], axis[-1], along) for axis in (self.range_m, self.bearing_rad))
-        few = replace(self, range_m=ranges, bearing_rad=bearings)
-        lit = np.isfinite(few.points).all(axis=-1) & (np.abs(few.elevation(few.points)) <= half_rad)
+        coarse = replace(self, range_m=ranges, bearing_rad=bearings)
+        lit = np.isfinite(coarse.points).all(axis=-1) & (np.abs(coarse.elevation(coarse.points)) <= half_rad)
         if lit.sum() < 3:
             return np.zeros((3, 3))
         # Express derivatives by the motion in bins and beams, so that both have equal weight.
-        scale, points = np.array([bin_m, beam_rad]), few.points[lit]
-        by_motion = few.derivative[lit] / scale[:, None]
+        scale, points = np.array([bin_m, beam_rad]), coarse.points[lit]
+        by_motion = coarse.derivative[lit] / scale[:, None]
         # Differentiate numerically by height, pitch and roll, and fit the motion.
         changes = []
         for name in ("height_m", "pitch_rad", "roll_rad"):
-            ends = [replace(few, **{name: getattr(few, name) + sign * SMALL}).to_polar(points) for sign in (-1, 1)]
+            ends = [replace(coarse, **{name: getattr(coarse, name) + sign * SMALL}).to_polar(points) for sign in (-1, 1)]
             changes.append((np.stack(ends[1], axis=-1) - np.stack(ends[0], axis=-1)) / (2 * SMALL) / scale)
-        found = np.linalg.lstsq(by_motion.reshape(-1, 3), np.stack(changes, axis=-1).reshape(-1, 3), rcond=None)[0]
-        return np.asarray(found)
+        motions = np.linalg.lstsq(by_motion.reshape(-1, 3), np.stack(changes, axis=-1).reshape(-1, 3), rcond=None)[0]
+        return np.asarray(motions)
 
     def _in_sonar(self, points: NDArray[np.floating]) -> tuple[NDArray[np.floating], ...]:
         """Return the starboard, forward and up coordinates of ground points in the sonar's axes."""
@@ -165,7 +165,7 @@ class GroundGeometry:
 
 
 @lru_cache(maxsize=16)
-def _turn(pitch: float, roll: float) -> NDArray[np.float64]:
+def _sonar_axes(pitch: float, roll: float) -> NDArray[np.float64]:
     """Return the axes of a sonar, cached since many geometries differ only in height."""
     axes = np.asarray(vehicle_rotation(Pose(0, 0, 0, pitch, roll, 0)).as_matrix()[0], dtype=np.float64)
     axes.setflags(write=False)
@@ -195,8 +195,8 @@ def arc_elevation(
     lean = np.arctan2(above, ahead)
     with np.errstate(invalid="ignore", divide="ignore"):
         swing = np.arccos((rise - fixed) / np.hypot(ahead, above))
-    one, other = (_within_pi(lean + sign * swing) for sign in (-1, 1))
-    return np.where(np.abs(one) <= np.abs(other), one, other)
+    first, second = (_wrap_to_pi(lean + sign * swing) for sign in (-1, 1))
+    return np.where(np.abs(first) <= np.abs(second), first, second)
 
 
 def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -212,10 +212,10 @@ def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[n
         Row and column, each ``(ranges, bearings)``.
     """
     rows, columns = known.shape
-    having = np.flatnonzero(known.any(axis=0))
-    if not having.size:
+    known_columns = np.flatnonzero(known.any(axis=0))
+    if not known_columns.size:
         return np.zeros_like(known, dtype=np.intp), np.zeros_like(known, dtype=np.intp)
-    column = having[np.abs(np.arange(columns)[:, None] - having).argmin(axis=1)]
+    column = known_columns[np.abs(np.arange(columns)[:, None] - known_columns).argmin(axis=1)]
     row = np.maximum(np.arange(rows)[:, None], known.argmax(axis=0)[column])
     return row, np.broadcast_to(column, row.shape)
 
@@ -236,7 +236,7 @@ def moved(points: AnyArray, motion: AnyArray) -> AnyArray:
     return xp.stack([x * cos - y * sin - sideways, x * sin + y * cos - forward], axis=-1)
 
 
-def _within_pi(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+def _wrap_to_pi(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
@@ -377,17 +377,19 @@ def echo_heights(frames: SonarFrames, pitch_rad: float, roll_rad: float) -> Echo
 
     if frames.level == "contrast":
         return EchoHeights(None)  # dark contrast does not mean water without echoes
-    edged = frames.sonar.vertical_pattern == "box"
+    hard_edged = frames.sonar.vertical_pattern == "box"
     image = frames.linear_values().mean(axis=0, dtype=np.float32)
-    across = (3, 0.5) if edged else (13, 2.0)  # speckle crosses a threshold early, so average more of it
+    across = (3, 0.5) if hard_edged else (13, 2.0)  # speckle crosses a threshold early, so average more of it
     smooth = cv2.GaussianBlur(image, (across[0], 13), sigmaX=across[1], sigmaY=BLUR, borderType=cv2.BORDER_REPLICATE)
     steepest = _down(frames, pitch_rad, roll_rad, far=False)
-    near = _ends(smooth, frames.range_m, steepest, SHARE if edged else SHARE_OF_SKIRT)
-    if not edged and near.shown:
+    near = _ends(smooth, frames.range_m, steepest, SHARE if hard_edged else SHARE_OF_SKIRT)
+    if not hard_edged and near.shown:
         near = near.scaled(_skirt(frames, pitch_rad, near))
     first = _first_echoes(near.received) if near.shown else None
     down = _down(frames, pitch_rad, roll_rad, far=True)
-    if np.median(down) < STEEP or not edged:  # the light of a beam with a skirt fades, so its last echo is not informative
+    if (
+        np.median(down) < STEEP or not hard_edged
+    ):  # the light of a beam with a skirt fades, so its last echo is not informative
         return EchoHeights(first)
     far = _ends(smooth[::-1], frames.range_m[::-1], down)
     if not far.shown:
@@ -508,7 +510,7 @@ def _first_echoes(drop: Doubles) -> FirstEchoes | None:
 DOUBTFUL = 3.0
 """Combined standard deviations beyond which first echoes contradict a given height and are ignored."""
 
-SAME = 1e-9
+MIN_CHANGE = 1e-9
 """Differences in height [m] and angle [rad] between frames that count as zero."""
 
 STD_MEASURED, STD_GIVEN = 0.02, 0.05
@@ -618,8 +620,8 @@ class Attitude:
         std = np.array(self.unsure)
         if not std.any():
             return covariance
-        seen = self.ground(frames).motions_of_lean(COARSE, np.radians(frames.sonar.elevation_fov_deg) / 2) * std
-        return np.asarray(covariance + seen @ seen.T)
+        apparent = self.ground(frames).motions_of_lean(COARSE, np.radians(frames.sonar.elevation_fov_deg) / 2) * std
+        return np.asarray(covariance + apparent @ apparent.T)
 
     def ground(self, frames: SonarFrames, number: int | None = None) -> GroundGeometry:
         """Return the level ground that the cells show, for the mean attitude or that of one frame."""
@@ -645,9 +647,9 @@ def attitude_of(
     Raises:
         MitsonarError: no pitch; a height that is neither given nor measured, or that is not above 0 or the relief.
     """
-    leans = _leans(frames)
-    lean = None if leans is None else leans.mean(axis=0)
-    pitch = pitch_rad if pitch_rad is not None else (None if lean is None else float(lean[0]))
+    pitch_roll = _pitch_roll(frames)
+    mean_pitch_roll = None if pitch_roll is None else pitch_roll.mean(axis=0)
+    pitch = pitch_rad if pitch_rad is not None else (None if mean_pitch_roll is None else float(mean_pitch_roll[0]))
     given = height_m if height_m is not None else _mean(frames.height_m)
     if pitch is None or (given is None and relief_m is not None):
         raise MitsonarError(
@@ -656,7 +658,7 @@ def attitude_of(
         )
     if given is not None and not 0 < given < np.inf:
         raise MitsonarError(f"{name} needs a height above 0 m: got {given:g}; give {argument('height_m')}")
-    roll = 0.0 if lean is None else float(lean[1])
+    roll = 0.0 if mean_pitch_roll is None else float(mean_pitch_roll[1])
     half = np.radians(frames.sonar.elevation_fov_deg) / 2
     if given is not None and pitch + half > np.pi / 2:
         reason = "the sonar looks past straight down: a cell shows two points of the ground"
@@ -664,43 +666,47 @@ def attitude_of(
     if given is not None and relief_m is not None:
         if not given - relief_m > 0:
             raise MitsonarError(f"the height over the visible surface must be above 0: got {given:g} m less {relief_m:g} m")
-        return Attitude(given - relief_m, STD_MEASURED * given, pitch, roll, apart=_apart(frames), unsure=_unsure(frames))
-    found = echo_heights(frames, pitch, roll)
-    if given is None and found.first is None:
+        return Attitude(
+            given - relief_m, STD_MEASURED * given, pitch, roll, apart=_deviations(frames), unsure=_change_std(frames)
+        )
+    heights = echo_heights(frames, pitch, roll)
+    if given is None and heights.first is None:
         raise MitsonarError(
             f"{name} needs height and pitch: the frames hold no height, and their window shows no first echoes; give "
             f"{argument('height_m')}"
         )
     attitude = (
-        _over_rising(found, given, pitch, roll) if _rises(found, given) else _over_level(found.first, given, pitch, roll)
+        _over_rising(heights, given, pitch, roll)
+        if _rises(heights, given)
+        else _over_level(heights.first, given, pitch, roll)
     )
-    return replace(attitude, apart=_apart(frames), unsure=_unsure(frames))
+    return replace(attitude, apart=_deviations(frames), unsure=_change_std(frames))
 
 
-def _rises(found: EchoHeights, given_m: float | None) -> bool:
+def _rises(heights: EchoHeights, given_m: float | None) -> bool:
     """Return whether the far end of the light lies so much higher than the near end that the ground must rise."""
-    if found.last_clear_m is None:
+    if heights.last_clear_m is None:
         return False
-    first_m = found.first.height_m + found.first.tops_m if found.first is not None else given_m
+    first_m = heights.first.height_m + heights.first.tops_m if heights.first is not None else given_m
     assert first_m is not None
-    even = found.first is not None and found.first.even
-    return first_m - found.last_clear_m > (RISING_EVEN if even else RISING) * first_m
+    even = heights.first is not None and heights.first.even
+    return first_m - heights.last_clear_m > (RISING_EVEN if even else RISING) * first_m
 
 
-def _over_rising(found: EchoHeights, given_m: float | None, pitch: float, roll: float) -> Attitude:
+def _over_rising(heights: EchoHeights, given_m: float | None, pitch: float, roll: float) -> Attitude:
     """Return the attitude over rising ground, using the mean height of both ends of the light."""
-    assert found.ends_m is not None
-    assert found.last_m is not None
-    first = found.first
+    assert heights.ends_m is not None
+    assert heights.last_m is not None
+    first = heights.first
     first_m = first.height_m + first.tops_m if first is not None else given_m
     assert first_m is not None
-    std = float(np.hypot(STD_MEASURED * found.ends_m, STD_RISING * (first_m - found.last_m)))
+    std = float(np.hypot(STD_MEASURED * heights.ends_m, STD_RISING * (first_m - heights.last_m)))
     doubt = ""
-    if given_m is not None and not found.last_m / STEEPEST < given_m < STEEPEST * first_m:
-        ends = f"{first_m:.2f} and {found.last_m:.2f} m"
+    if given_m is not None and not heights.last_m / STEEPEST < given_m < STEEPEST * first_m:
+        ends = f"{first_m:.2f} and {heights.last_m:.2f} m"
         doubt = f"the ground rises, and its ends give heights of {ends}, not {given_m:.2f} m"
     even = first is not None and first.even
-    return Attitude(found.ends_m, std, pitch, roll, doubt=doubt, even=even, given_m=given_m, first=first)
+    return Attitude(heights.ends_m, std, pitch, roll, doubt=doubt, even=even, given_m=given_m, first=first)
 
 
 def _over_level(first: FirstEchoes | None, given_m: float | None, pitch: float, roll: float) -> Attitude:
@@ -722,32 +728,36 @@ def _over_level(first: FirstEchoes | None, given_m: float | None, pitch: float, 
     return replace(measured, height_m=height, height_std_m=given_std * math.sqrt(1 - weight))
 
 
-def _apart(frames: SonarFrames) -> tuple[Apart, ...]:
+def _deviations(frames: SonarFrames) -> tuple[Apart, ...]:
     """Return the deviation of each frame's height, pitch and roll from their mean; empty if unknown or all equal."""
-    leans = _leans(frames)
-    if leans is None:
+    pitch_roll = _pitch_roll(frames)
+    if pitch_roll is None:
         return ()
-    heights = np.zeros(len(leans)) if frames.poses is None else np.nan_to_num(frames.poses[:, 2])
-    known = np.column_stack([heights, leans])
-    apart = known - known.mean(axis=0)
-    return () if (np.abs(apart) < SAME).all() else tuple(Apart(*(float(value) for value in row)) for row in apart)
+    heights = np.zeros(len(pitch_roll)) if frames.poses is None else np.nan_to_num(frames.poses[:, 2])
+    known = np.column_stack([heights, pitch_roll])
+    deviations = known - known.mean(axis=0)
+    return (
+        ()
+        if (np.abs(deviations) < MIN_CHANGE).all()
+        else tuple(Apart(*(float(value) for value in row)) for row in deviations)
+    )
 
 
-def _unsure(frames: SonarFrames) -> Apart:
+def _change_std(frames: SonarFrames) -> Apart:
     """Return the standard deviation of the unmeasured changes of height, pitch and roll between the frames.
 
     A pitch and roll that are the same in all frames do not count as a measurement of their change, unless heights are known.
     """
     time_s = frames.time_s if frames.time_s.ndim == 1 else frames.time_s.mean(axis=1)
     step_s = abs(float(time_s[-1] - time_s[0]))
-    leans = _leans(frames)
-    heave = frames.poses is not None and bool(np.isfinite(frames.poses[:, 2]).all())
-    lean = leans is not None and (heave or bool((np.abs(leans - leans[0]) > SAME).any()))
-    rates = zip(UNKNOWN_PER_S, UNKNOWN_MOST, (heave, lean, lean), strict=True)
+    pitch_roll = _pitch_roll(frames)
+    heave_known = frames.poses is not None and bool(np.isfinite(frames.poses[:, 2]).all())
+    lean_known = pitch_roll is not None and (heave_known or bool((np.abs(pitch_roll - pitch_roll[0]) > MIN_CHANGE).any()))
+    rates = zip(UNKNOWN_PER_S, UNKNOWN_MOST, (heave_known, lean_known, lean_known), strict=True)
     return Apart(*(0.0 if known else min(rate * step_s, most) for rate, most, known in rates))
 
 
-def _leans(frames: SonarFrames) -> NDArray[np.float64] | None:
+def _pitch_roll(frames: SonarFrames) -> NDArray[np.float64] | None:
     """Return the pitch and roll of each frame ``(frames, 2)`` from poses or the sonar's sensors; None if unknown."""
     table, columns = (frames.attitude_rad, slice(0, 2)) if frames.poses is None else (frames.poses, slice(3, 5))
     if table is None or not np.isfinite(table[:, columns]).all():

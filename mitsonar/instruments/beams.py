@@ -49,12 +49,12 @@ def _taylor(lobes: int, side_db: float) -> tuple[float, ...]:
     """Compute Taylor's coefficients for ``lobes`` - 1 side lobes at ``-side_db``."""
     a = math.acosh(10 ** (side_db / 20)) / math.pi
     stretch = lobes**2 / (a * a + (lobes - 0.5) ** 2)
-    found = []
+    coefficients = []
     for m in range(1, lobes):
         top = math.prod(1 - m * m / (stretch * (a * a + (n - 0.5) ** 2)) for n in range(1, lobes))
         bottom = 2 * math.prod(1 - m * m / (n * n) for n in range(1, lobes) if n != m)
-        found.append(-((-1) ** m) * top / bottom)
-    return tuple(found)
+        coefficients.append(-((-1) ** m) * top / bottom)
+    return tuple(coefficients)
 
 
 def shaded_sinc(x: ArrayLike, coefficients: tuple[float, ...]) -> NDArray[np.float64]:

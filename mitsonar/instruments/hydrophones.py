@@ -141,21 +141,21 @@ def four_receivers(distance_m: float = 0.1, **field: FieldValue) -> tuple[Hydrop
         distance_m: distance from the transmitter [m].
         field: fields of :class:`FieldOfView`, common to all receivers.
     """
-    made = []
+    receivers = []
     for name, heading in LOOKS.items():
         turn = math.radians(heading)
         position = (round(distance_m * math.sin(turn), 12), round(distance_m * math.cos(turn), 12), 0.0)
-        made.append(Hydrophone(name=name, position=position, field=FieldOfView(heading_deg=heading, **field)))
-    return tuple(made)
+        receivers.append(Hydrophone(name=name, position=position, field=FieldOfView(heading_deg=heading, **field)))
+    return tuple(receivers)
 
 
-def _few_digits(sampling_hz: float, taps: int) -> int:
+def _taps_with_short_step(sampling_hz: float, taps: int) -> int:
     """Return ``taps`` or slightly more, such that the frequency step has few digits."""
     for digits in (1, 2, 3):
-        for more in range(taps, taps + taps // 3 + 1):
-            step = sampling_hz / more
+        for candidate in range(taps, taps + taps // 3 + 1):
+            step = sampling_hz / candidate
             if float(f"{step:.{digits}g}") == step:
-                return more
+                return candidate
     return taps
 
 
@@ -202,7 +202,7 @@ class ChannelSonar(Instrument):
     receivers: tuple[Hydrophone, ...] = Field(default_factory=four_receivers, min_length=1, description="the receivers")
 
     def __repr__(self) -> str:
-        names = [one.name for one in self.receivers]
+        names = [receiver.name for receiver in self.receivers]
         shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
         return (
             f"ChannelSonar({self.name}: {self.carrier_hz / 1e3:g} kHz, band {self.bandwidth_hz / 1e3:g} kHz, {len(names)} "
@@ -224,7 +224,7 @@ class ChannelSonar(Instrument):
             )
         longest = 2 * self.range_max / self.sound_speed
         if not self.frequency_step_hz < 1 / (2 * longest):
-            enough = _few_digits(self.sampling_hz, math.floor(2 * longest * self.sampling_hz) + 1)
+            enough = _taps_with_short_step(self.sampling_hz, math.floor(2 * longest * self.sampling_hz) + 1)
             raise ValueError(
                 f"frequency_step_hz must be below 1 / (2 tau_max) = {1 / (2 * longest):.6g} Hz, tau_max being the delay "
                 f"from range_max {self.range_max:g} m: got {self.frequency_step_hz:g} Hz; give "
@@ -277,7 +277,7 @@ class ChannelSonar(Instrument):
     def field_of_view(self) -> dict[str, FieldOfView]:
         """Return the field of view of each receiver by name; without taper in the model ``rays``, as in Almanza-Medina."""
         hard = {"taper": 0.0} if self.model == "rays" else {}
-        return {one.name: one.field.model_copy(update=hard) for one in self.receivers}
+        return {receiver.name: receiver.field.model_copy(update=hard) for receiver in self.receivers}
 
     @property
     def offsets(self) -> NDArray[np.float64]:

@@ -95,13 +95,13 @@ QUALITIES: dict[str, RayCounts] = {
 """Ray sampling requirements by quality, coarsest first."""
 
 
-def _known(name: object) -> object:
+def _check_quality(name: object) -> object:
     if not isinstance(name, str) or name not in QUALITIES:
         raise ValueError(f"unknown quality {shortened(name)}: {nearest_names(str(name)[:40], QUALITIES)}")
     return name
 
 
-Quality = Annotated[Literal["draft", "standard", "fine"], BeforeValidator(_known)]
+Quality = Annotated[Literal["draft", "standard", "fine"], BeforeValidator(_check_quality)]
 
 
 def rays_over_elevation(quality: str, elevation_fov_rad: float) -> int:
@@ -121,9 +121,9 @@ def rays_across(quality: str, beam_width_rad: float, azimuth_fov_rad: float, ran
     ground varies across a beam by the fraction ``tan(bearing)`` times the beam width. Each ray may cover twice ``reach`` of
     that variation.
     """
-    wanted = QUALITIES[quality]
-    texture = min(wanted.across, math.ceil(beam_width_rad * range_max / wanted.apart_m))
-    oblique = math.ceil(beam_width_rad * math.tan(min(azimuth_fov_rad / 2, STEEPEST_RAD)) / (2 * wanted.reach))
+    requirements = QUALITIES[quality]
+    texture = min(requirements.across, math.ceil(beam_width_rad * range_max / requirements.apart_m))
+    oblique = math.ceil(beam_width_rad * math.tan(min(azimuth_fov_rad / 2, STEEPEST_RAD)) / (2 * requirements.reach))
     return min(MOST_ACROSS, max(1, texture, oblique))
 
 
@@ -151,11 +151,11 @@ class Measured(NamedTuple):
 def measured_errors() -> tuple[str, dict[str, dict[str, Measured]]]:
     """Return the machine and date of the measurement, and the measured errors by preset and quality."""
     table = yaml.safe_load(files("mitsonar.instruments").joinpath("quality.yaml").read_text(encoding="utf-8"))
-    found = {
+    errors = {
         preset: {quality: Measured(**numbers) for quality, numbers in rows.items()}
         for preset, rows in table["presets"].items()
     }
-    return f"{table['machine']}, {table['date']}", found
+    return f"{table['machine']}, {table['date']}", errors
 
 
 # ---------------- Timing: ping groups and scanning heads
@@ -290,11 +290,11 @@ def timed_path(sonar: Sonar, path: Trajectory) -> TimedPath:
     due = path.time_s
     if scans(sonar) and len(path) > 1:
         sweep = ping_interval_s(sonar) * sonar.ping_groups
-        lasts = path.time_s[-1] - path.time_s[0]
-        if lasts < sweep * (1 - 1e-9):
-            raise MitsonarError(f"a sweep lasts {sweep:.4g} s and the path {lasts:.4g} s: give a longer path")
+        duration_s = path.time_s[-1] - path.time_s[0]
+        if duration_s < sweep * (1 - 1e-9):
+            raise MitsonarError(f"a sweep lasts {sweep:.4g} s and the path {duration_s:.4g} s: give a longer path")
         # A scanning sonar sweeps without pauses, as often as the path allows.
-        due = path.time_s[0] + (np.arange(int(lasts / sweep + 1e-9)) + 0.5) * sweep
+        due = path.time_s[0] + (np.arange(int(duration_s / sweep + 1e-9)) + 0.5) * sweep
     # Extend the path, since the outer pings of the first and last frame lie beyond its ends.
     longer = path.lengthened(-offsets[0])
     time = due[:, None] + offsets
@@ -309,10 +309,10 @@ def first_sweeps(sonar: Sonar, path: Trajectory, count: int) -> Trajectory:
     Raises:
         MitsonarError: the path is too short; a single pose counts as one sweep.
     """
-    sweep, lasts = frame_period_s(sonar), float(path.time_s[-1] - path.time_s[0])
-    if lasts < count * sweep * (1 - 1e-9) and (len(path) > 1 or count > 1):
+    sweep, duration_s = frame_period_s(sonar), float(path.time_s[-1] - path.time_s[0])
+    if duration_s < count * sweep * (1 - 1e-9) and (len(path) > 1 or count > 1):
         raise MitsonarError(
-            f"a sweep lasts {sweep:.4g} s and the path {lasts:.4g} s, room for {int(lasts / sweep + 1e-9)}: got {count}; "
+            f"a sweep lasts {sweep:.4g} s and the path {duration_s:.4g} s, room for {int(duration_s / sweep + 1e-9)}: got {count}; "
             "--frames counts the sweeps of a head that turns: give fewer, or a longer path"
         )
     if len(path) == 1:
@@ -329,18 +329,18 @@ def overlap_notes(sonar: Sonar, time_s: NDArray[np.float64]) -> list[str]:
         sonar: the instrument that makes the frames.
         time_s: times of the frames ``(frames,)`` [s].
     """
-    lasts = sonar.ping_groups * ping_interval_s(sonar)
-    apart = np.diff(time_s).min(initial=np.inf)
-    if sonar.ping_groups == 1 or scans(sonar) or lasts <= apart * (1 + 1e-6):
+    duration_s = sonar.ping_groups * ping_interval_s(sonar)
+    interval_s = np.diff(time_s).min(initial=np.inf)
+    if sonar.ping_groups == 1 or scans(sonar) or duration_s <= interval_s * (1 + 1e-6):
         return []
     return [
-        f"the {sonar.ping_groups} pings of a frame last {lasts:.3g} s and the next frame is due {apart:.3g} s later: they "
-        f"overlap, which no instrument does; a frame_rate_hz of {_down(1 / lasts)} would do (of poses in a file, that many "
+        f"the {sonar.ping_groups} pings of a frame last {duration_s:.3g} s and the next frame is due {interval_s:.3g} s later: they "
+        f"overlap, which no instrument does; a frame_rate_hz of {_format_rounded_down(1 / duration_s)} would do (of poses in a file, that many "
         "a second), or a shorter range_max"
     ]
 
 
-def _down(value: float) -> str:
+def _format_rounded_down(value: float) -> str:
     """Format a number with three significant digits, rounded down."""
     step = 10.0 ** (math.floor(math.log10(value)) - 2)
     return f"{math.floor(value / step) * step:.3g}"
@@ -348,11 +348,11 @@ def _down(value: float) -> str:
 
 def turned_heads(sonar: Sonar, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the head poses of a scanning sonar from the vehicle poses, both ``(frames, beams, 6)``."""
-    found = np.empty_like(poses)
+    head_poses = np.empty_like(poses)
     group = group_of_beams(sonar)
     for beam, bearing in enumerate(sonar.bearing_rad):
-        found[:, group[beam]] = mounted(poses[:, group[beam]], Pose(0, 0, 0, heading=float(bearing)))
-    return found
+        head_poses[:, group[beam]] = mounted(poses[:, group[beam]], Pose(0, 0, 0, heading=float(bearing)))
+    return head_poses
 
 
 # ---------------- Imaging sonar
@@ -378,20 +378,20 @@ THESIS_ACROSS = 4
 """Value of ``rays_across`` in the ``thesis`` model, which nevertheless traces one ray."""
 
 
-def _rays_over_elevation(given: dict[str, FieldValue]) -> int:
+def _rays_over_elevation(fields: dict[str, FieldValue]) -> int:
     """Derive the number of rays over elevation from the other fields."""
-    if given["model"] == "thesis":
-        return int(given["thesis_rays"])
-    return rays_over_elevation(given["quality"], math.radians(given["elevation_fov_deg"]))
+    if fields["model"] == "thesis":
+        return int(fields["thesis_rays"])
+    return rays_over_elevation(fields["quality"], math.radians(fields["elevation_fov_deg"]))
 
 
-def _rays_across(given: dict[str, FieldValue]) -> int:
+def _rays_across(fields: dict[str, FieldValue]) -> int:
     """Derive the number of rays across a beam from the other fields."""
-    if given["model"] == "thesis":
+    if fields["model"] == "thesis":
         return THESIS_ACROSS
-    fov = math.radians(given["azimuth_fov_deg"])
-    width = fov / given["beams"] if given["beam_width_deg"] is None else math.radians(given["beam_width_deg"])
-    return rays_across(given["quality"], width, fov, given["range_max"])
+    fov = math.radians(fields["azimuth_fov_deg"])
+    width = fov / fields["beams"] if fields["beam_width_deg"] is None else math.radians(fields["beam_width_deg"])
+    return rays_across(fields["quality"], width, fov, fields["range_max"])
 
 
 UNNAMED = "custom"
@@ -648,12 +648,12 @@ class Sonar(Instrument):
         Ray counts that are derived from other fields are recomputed. Except in the ``thesis`` model, a new ``quality`` also
         replaces ray counts that were set explicitly. Ray counts passed together with it take precedence.
         """
-        kept = self.model_dump()
-        renewed = "quality" in fields and fields.get("model", self.model) != "thesis"
+        values = self.model_dump()
+        derive_rays = "quality" in fields and fields.get("model", self.model) != "thesis"
         for name in RAYS:
-            if renewed or name not in self.model_fields_set:
-                del kept[name]
-        return self.create(**{**kept, **fields})
+            if derive_rays or name not in self.model_fields_set:
+                del values[name]
+        return self.create(**{**values, **fields})
 
     def _outermost_deg(self) -> float:
         return math.degrees(self.bearing_rad[-1] + self.beam_width_rad / 2)

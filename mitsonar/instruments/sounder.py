@@ -80,14 +80,14 @@ class Sounder(CheckedModel):
         Raises:
             MitsonarError: an unknown key, or a value outside its limits.
         """
-        own = set(cls.model_fields) - {"fan"}
-        wrong = sorted(set(fields) - own - set(Sonar.model_fields))
-        if wrong:
+        instrument_keys = set(cls.model_fields) - {"fan"}
+        unknown = sorted(set(fields) - instrument_keys - set(Sonar.model_fields))
+        if unknown:
             raise MitsonarError(
-                f"unknown instrument key {wrong[0]}: {nearest_names(wrong[0], own | set(Sonar.model_fields))}"
+                f"unknown instrument key {unknown[0]}: {nearest_names(unknown[0], instrument_keys | set(Sonar.model_fields))}"
             )
-        fan = Sonar.create(**{key: value for key, value in fields.items() if key not in own or key == "name"})
-        return cls(fan=fan, **{key: value for key, value in fields.items() if key in own})
+        fan = Sonar.create(**{key: value for key, value in fields.items() if key not in instrument_keys or key == "name"})
+        return cls(fan=fan, **{key: value for key, value in fields.items() if key in instrument_keys})
 
     def replace(self, **fields: Any) -> Self:
         """Return a copy with some fields of the instrument or of its fan changed; all fields are validated.
@@ -95,11 +95,13 @@ class Sounder(CheckedModel):
         Raises:
             MitsonarError: as for :meth:`create`.
         """
-        own = set(type(self).model_fields) - {"fan"}
+        instrument_keys = set(type(self).model_fields) - {"fan"}
         fan = self.fan.replace(**{key: value for key, value in fields.items() if key in Sonar.model_fields})
-        kept = self.model_dump(exclude={"fan"}) | {key: fields[key] for key in own & set(fields)}
-        wrong = {key: value for key, value in fields.items() if key not in own and key not in Sonar.model_fields}
-        return self.create(**{**fan.model_dump(include=fan.model_fields_set), **kept, **wrong})
+        instrument_fields = self.model_dump(exclude={"fan"}) | {key: fields[key] for key in instrument_keys & set(fields)}
+        unknown = {
+            key: value for key, value in fields.items() if key not in instrument_keys and key not in Sonar.model_fields
+        }
+        return self.create(**{**fan.model_dump(include=fan.model_fields_set), **instrument_fields, **unknown})
 
     def __repr__(self) -> str:
         return f"Sounder({self.name}, {self.kind}: {len(self.channels)} fans ({', '.join(self.channels[:4])}) of {self.fan})"
@@ -139,7 +141,7 @@ class Sounder(CheckedModel):
             return bases
         step = math.radians(self.fan.elevation_fov_deg)
         pitch = (np.arange(self.rows) + 0.5 - self.rows / 2) * step  # the first row points up
-        rows = [mounted(bases, Pose.from_row((0, 0, 0, float(one), 0, 0))) for one in pitch]
+        rows = [mounted(bases, Pose.from_row((0, 0, 0, float(angle), 0, 0))) for angle in pitch]
         return np.stack(rows, axis=1).reshape(-1, 6)
 
     @property
@@ -200,11 +202,11 @@ def load_sounder(name_or_file: str | Path) -> Sounder:
 def _preset(name: str) -> Sounder:
     """Return the instrument of a preset, given by its name or its kind."""
     known = named_sounders()
-    found = OF_KIND.get(name, name)
-    if found not in known:
+    preset_name = OF_KIND.get(name, name)
+    if preset_name not in known:
         raise MitsonarError(f"unknown instrument {shortened(name)}: {nearest_names(name, [*KINDS, *known])}")
-    fields: dict[str, Any] = known[found].values
-    return Sounder.create(name=found, **fields)
+    fields: dict[str, Any] = known[preset_name].values
+    return Sounder.create(name=preset_name, **fields)
 
 
 # ---------------- Sonar presets
@@ -245,10 +247,10 @@ def load_sonar(name_or_file: str | Path) -> Sonar:
     """
     text = str(name_or_file)
     if "," in text and not os.path.exists(text):
-        first, *over = (part.strip() for part in text.split(","))
+        first, *override_files = (part.strip() for part in text.split(","))
         sonar = load_sonar(first)
-        for one in over:
-            sonar = sonar.replace(**{key: value for key, value in fields_in(one).items() if key != "name"})
+        for file in override_files:
+            sonar = sonar.replace(**{key: value for key, value in fields_in(file).items() if key != "name"})
         return sonar
     if not text.lower().endswith((".yaml", ".yml")):
         if text in named_sonars() or not os.path.exists(text):

@@ -105,8 +105,8 @@ class Segment:
         """Return the number of the segment's rays in each beam ``(beams,)``."""
         sonar = self.sonar
         counts = self.member.reshape(sonar.rays_per_beam, sonar.beams, sonar.across).sum(axis=(0, 2))
-        own: NDArray[np.int64] = counts[self.beams].astype(np.int64)
-        return own
+        beam_counts: NDArray[np.int64] = counts[self.beams].astype(np.int64)
+        return beam_counts
 
     @cached_property
     def member(self) -> NDArray[np.bool_]:

@@ -52,11 +52,13 @@ class Deforming:
     vertices: VertexLaw
 
     def __repr__(self) -> str:
-        law = self.vertices
-        shown = (
-            f"{len(law.vertices)} meshes" if isinstance(law, MeshSequence) else getattr(law, "__name__", type(law).__name__)
+        deformation = self.vertices
+        description = (
+            f"{len(deformation.vertices)} meshes"
+            if isinstance(deformation, MeshSequence)
+            else getattr(deformation, "__name__", type(deformation).__name__)
         )
-        return f"Deforming({shown} along {self.path})"
+        return f"Deforming({description} along {self.path})"
 
 
 @dataclass(frozen=True)
@@ -82,12 +84,12 @@ class MeshSequence:
     def __call__(self, time_s: float) -> NDArray[np.float32]:
         """Return the vertices ``(vertices, 3)`` at a time [s]; before time 0, the first mesh or the loop applies."""
         count = len(self.vertices)
-        place = time_s * self.rate_hz
-        place = place % count if self.loop else min(max(place, 0.0), count - 1.0)
-        first = int(place)
-        part = np.float32(place - first)
+        position = time_s * self.rate_hz
+        position = position % count if self.loop else min(max(position, 0.0), count - 1.0)
+        first = int(position)
+        weight = np.float32(position - first)
         after = self.vertices[(first + 1) % count if self.loop else min(first + 1, count - 1)]
-        return np.asarray(self.vertices[first % count] * (1 - part) + after * part, dtype=np.float32)
+        return np.asarray(self.vertices[first % count] * (1 - weight) + after * weight, dtype=np.float32)
 
 
 # ---------------- Moving bodies
@@ -104,7 +106,7 @@ VEHICLE = "vehicle"
 VELOCITY_STEP_S = 1e-3
 """Time step of the finite differences for velocities [s]."""
 
-MOST_BODIES = 100_000
+MAX_BODIES = 100_000
 
 
 class BodyStates(NamedTuple):
@@ -157,28 +159,28 @@ class MovingBodies:
         shapes: list[str] = []
         paths: list[Trajectory] = []
         deforming: dict[str, VertexLaw] = {}
-        for name, given in moving.items():
-            if isinstance(given, str) and given == VEHICLE:
+        for name, motion in moving.items():
+            if isinstance(motion, str) and motion == VEHICLE:
                 if vehicle is None:
                     raise MitsonarError(f"moving: {name} follows the vehicle, whose path is unknown here: give a trajectory")
-                given = vehicle
-            if isinstance(given, Deforming):
-                deforming[name] = given.vertices
-                given = given.path
-            if isinstance(given, str | Path):
-                given = Trajectory.load(given, frame, looks_ahead=False)
-            many = [given] if isinstance(given, Trajectory) else list(given)
-            if not many or not all(isinstance(one, Trajectory) for one in many):
+                motion = vehicle
+            if isinstance(motion, Deforming):
+                deforming[name] = motion.vertices
+                motion = motion.path
+            if isinstance(motion, str | Path):
+                motion = Trajectory.load(motion, frame, looks_ahead=False)
+            trajectories = [motion] if isinstance(motion, Trajectory) else list(motion)
+            if not trajectories or not all(isinstance(item, Trajectory) for item in trajectories):
                 raise MitsonarError(
                     f"moving: {name} follows a Trajectory, a TUM or CSV file, or a list of trajectories: got "
-                    f"{type(given).__name__ if many else 'none'}"
+                    f"{type(motion).__name__ if trajectories else 'none'}"
                 )
-            for path in many:
+            for path in trajectories:
                 path.at(path.time_s[0])  # rejects times that do not increase
-            shapes += [name] * len(many)
-            paths += many
-        if len(paths) > MOST_BODIES:
-            raise MitsonarError(f"moving: at most {MOST_BODIES:,} bodies: got {len(paths):,}")
+            shapes += [name] * len(trajectories)
+            paths += trajectories
+        if len(paths) > MAX_BODIES:
+            raise MitsonarError(f"moving: at most {MAX_BODIES:,} bodies: got {len(paths):,}")
         return cls(tuple(shapes), tuple(paths), deforming)
 
     def __len__(self) -> int:
@@ -187,12 +189,12 @@ class MovingBodies:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Return the name of each body: that of its shape, numbered if a shape has several bodies: ``fish 2``."""
-        seen: dict[str, int] = {}
-        found = []
+        counts: dict[str, int] = {}
+        names = []
         for shape in self.shapes:
-            seen[shape] = seen.get(shape, 0) + 1
-            found.append(shape if self.shapes.count(shape) == 1 else f"{shape} {seen[shape]}")
-        return tuple(found)
+            counts[shape] = counts.get(shape, 0) + 1
+            names.append(shape if self.shapes.count(shape) == 1 else f"{shape} {counts[shape]}")
+        return tuple(names)
 
     def poses(self, time_s: ArrayLike) -> NDArray[np.float64]:
         """Return the pose of each body at each time ``(times, bodies, 6)`` [m, rad]."""
@@ -207,17 +209,17 @@ class MovingBodies:
         one-sided difference is used.
         """
         time = np.atleast_1d(np.asarray(time_s, dtype=float))
-        found = np.zeros((len(time), len(self), 6))
+        velocity = np.zeros((len(time), len(self), 6))
         for number, path in enumerate(self.paths):
             first, last = path.time_s[0], path.time_s[-1]
-            before, after = (np.clip(time + half, first, last) for half in (-VELOCITY_STEP_S / 2, VELOCITY_STEP_S / 2))
-            moves = (time >= first) & (time <= last) & (after > before)
-            if moves.any():
-                begin, end, lasts = path.at(before[moves]), path.at(after[moves]), (after - before)[moves, None]
-                found[moves, number, :3] = (end - begin)[:, :3] / lasts
-                turn = vehicle_rotation(end) * vehicle_rotation(begin).inv()
-                found[moves, number, 3:] = turn.as_rotvec() / lasts
-        return found
+            before, after = (np.clip(time + offset, first, last) for offset in (-VELOCITY_STEP_S / 2, VELOCITY_STEP_S / 2))
+            moving = (time >= first) & (time <= last) & (after > before)
+            if moving.any():
+                begin, end, duration = path.at(before[moving]), path.at(after[moving]), (after - before)[moving, None]
+                velocity[moving, number, :3] = (end - begin)[:, :3] / duration
+                rotation = vehicle_rotation(end) * vehicle_rotation(begin).inv()
+                velocity[moving, number, 3:] = rotation.as_rotvec() / duration
+        return velocity
 
     def states(self, time_s: ArrayLike) -> BodyStates:
         """Return the names, poses and velocities at given times."""
@@ -261,12 +263,12 @@ class BodyMotion(BaseModel):
         if not (isinstance(fields, dict) and all(isinstance(key, str) for key in fields)):
             raise MitsonarError(f"moving: {name} takes a path, or keys such as path and meshes: got {type(given).__name__}")
         try:
-            made = cls(**fields)
+            motion = cls(**fields)
         except ValidationError as error:
             raise MitsonarError(f"moving: {name}: {complaint(error, cls, 'motion', SEE)}") from None
-        if made.path is None and made.meshes is None:
+        if motion.path is None and motion.meshes is None:
             raise MitsonarError(f"moving: {name} needs a path or meshes{SEE}")
-        return made
+        return motion
 
 
 def read_motions(file: str | Path) -> dict[str, BodyMotion]:
@@ -286,7 +288,7 @@ def motions_from(table: Any, source: str) -> dict[str, BodyMotion]:
     """
     if not (isinstance(table, dict) and table and all(isinstance(name, str) for name in table)):
         raise MitsonarError(f"{source} must hold `shape id: path` lines{SEE}")
-    return {name: BodyMotion.create(name, given) for name, given in table.items()}
+    return {name: BodyMotion.create(name, keys) for name, keys in table.items()}
 
 
 def files_of(name: str, folder: Path) -> list[Path]:
@@ -295,8 +297,8 @@ def files_of(name: str, folder: Path) -> list[Path]:
     Raises:
         MitsonarError: no file matches.
     """
-    whole = folder / name
-    found = sorted(whole.parent.glob(whole.name)) if "*" in whole.name else [whole]
-    if not found:
-        raise MitsonarError(f"no file matches {whole}: give TUM, CSV or PLY files")
-    return found
+    pattern = folder / name
+    matches = sorted(pattern.parent.glob(pattern.name)) if "*" in pattern.name else [pattern]
+    if not matches:
+        raise MitsonarError(f"no file matches {pattern}: give TUM, CSV or PLY files")
+    return matches

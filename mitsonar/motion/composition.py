@@ -78,9 +78,9 @@ def steady(
     time = np.arange(frames) / rate_hz
     angle = turn * time
     # integrals over time of the cosine and sine of the turned angle a: t sin(a)/a and t (1 - cos a)/a
-    along, beside = time * np.sinc(angle / np.pi), time * np.sin(angle / 2) * np.sinc(angle / (2 * np.pi))
+    cos_integral, sin_integral = time * np.sinc(angle / np.pi), time * np.sin(angle / 2) * np.sinc(angle / (2 * np.pi))
     sin, cos = np.sin(start.heading), np.cos(start.heading)
-    right, ahead = sideways * along + forward * beside, forward * along - sideways * beside
+    right, ahead = sideways * cos_integral + forward * sin_integral, forward * cos_integral - sideways * sin_integral
     poses = np.tile(np.array(start, dtype=float), (frames, 1))
     poses[:, 0] += right * cos + ahead * sin
     poses[:, 1] += ahead * cos - right * sin
@@ -105,8 +105,8 @@ def steered(poses: ArrayLike, velocity: ArrayLike, step_s: float) -> NDArray[np.
     poses, velocity = np.asarray(poses, dtype=float), np.asarray(velocity, dtype=float)
     starboard, forward, up, turn = (velocity * step_s).T
     middle = poses[:, 5] + turn / 2
-    shorter = np.sinc(turn / (2 * np.pi))
-    sin, cos = np.sin(middle) * shorter, np.cos(middle) * shorter
+    chord_ratio = np.sinc(turn / (2 * np.pi))
+    sin, cos = np.sin(middle) * chord_ratio, np.cos(middle) * chord_ratio
     after = poses.copy()
     after[:, 0] += starboard * cos + forward * sin
     after[:, 1] += forward * cos - starboard * sin

@@ -48,7 +48,7 @@ LEGS: dict[str, tuple[Leg, ...]] = {
 
 def _legs(name: str) -> NDArray[np.float64]:
     """Return positions ``(n, 2)`` along straight legs, starboard and forward [m]."""
-    steps = [np.tile(np.array(way) * speed * STEP_S, (count, 1)) for count, way, speed in LEGS[name]]
+    steps = [np.tile(np.array(direction) * speed * STEP_S, (count, 1)) for count, direction, speed in LEGS[name]]
     return np.concatenate([np.zeros((1, 2)), np.cumsum(np.concatenate(steps), axis=0)])
 
 

@@ -125,16 +125,16 @@ def motion_errors(
             "errors need as many estimates as true motions, one at least: got "
             f"{estimated.shape}, {true.shape}, {valid.shape}"
         )
-    answer = in_units(np.where(valid[:, None], estimated, 0.0))
+    estimate = in_units(np.where(valid[:, None], estimated, 0.0))
     truth = in_units(true)
-    error = answer - truth
+    error = estimate - truth
     rmse, zero = _rms(error), _rms(truth)
     low, high = (rmse, rmse) if resamples is None else _rms_interval(error, resamples)
     size = np.abs(truth)
     large = np.where(size > LARGE * size.max(axis=0), error, np.nan)
     power = (truth**2).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        slope, skill = (answer * truth).sum(axis=0) / power, 1 - rmse / zero
+        slope, skill = (estimate * truth).sum(axis=0) / power, 1 - rmse / zero
     return MotionErrors(
         pairs=len(true),
         failures=int((~valid).sum()),
@@ -180,10 +180,10 @@ def cluster_resamples(scene: ArrayLike, *, count: int = 1000, seed: int = 0) -> 
     for row in table:
         # Draw scenes, each repeated by its size, and fill up or cut to n.
         drawn = rng.integers(len(names), size=len(names))
-        of = np.repeat(drawn, size[drawn])
-        of = np.concatenate([of, rng.choice(of, size=max(0, total - len(of)))])[:total]
+        drawn_scene = np.repeat(drawn, size[drawn])
+        drawn_scene = np.concatenate([drawn_scene, rng.choice(drawn_scene, size=max(0, total - len(drawn_scene)))])[:total]
         # Draw a sequence from each of these scenes.
-        row[:] = order[start[of] + (rng.random(total) * size[of]).astype(np.int64)]
+        row[:] = order[start[drawn_scene] + (rng.random(total) * size[drawn_scene]).astype(np.int64)]
     return table
 
 
@@ -281,22 +281,22 @@ class PathErrors:
 
     def rows(self) -> list[tuple[str, float, str]]:
         """Return the name, value and unit of every error, as shown in console, log and README."""
-        laid = {"none": "as they lie", "first": "first pose aligned", "plane": "aligned in the plane", "space": "aligned"}
+        texts = {"none": "as they lie", "first": "first pose aligned", "plane": "aligned in the plane", "space": "aligned"}
         unit = {"frames": "frame", "metres": "m"}[self.unit] + ("s" if self.unit == "frames" and self.delta != 1 else "")
-        each = f"over {self.delta:g} {unit}"
+        span = f"over {self.delta:g} {unit}"
         return [
             ("poses compared", self.frames, ""),
             ("path length", self.path_m, "m"),
             ("estimated path length", self.estimated_path_m, "m"),
-            (f"absolute error RMSE, {laid[self.alignment]}", 1e3 * self.absolute_rmse_m, "mm"),
-            (f"absolute error maximum, {laid[self.alignment]}", 1e3 * self.absolute_max_m, "mm"),
+            (f"absolute error RMSE, {texts[self.alignment]}", 1e3 * self.absolute_rmse_m, "mm"),
+            (f"absolute error maximum, {texts[self.alignment]}", 1e3 * self.absolute_max_m, "mm"),
             (
-                f"absolute attitude error RMSE, {laid[self.alignment]}",
+                f"absolute attitude error RMSE, {texts[self.alignment]}",
                 float(np.degrees(self.absolute_angle_rmse_rad)),
                 "deg",
             ),
-            (f"relative error RMSE {each}", 1e3 * self.relative_rmse_m, "mm"),
-            (f"relative attitude error RMSE {each}", float(np.degrees(self.relative_angle_rmse_rad)), "deg"),
+            (f"relative error RMSE {span}", 1e3 * self.relative_rmse_m, "mm"),
+            (f"relative attitude error RMSE {span}", float(np.degrees(self.relative_angle_rmse_rad)), "deg"),
             ("end-point error", 1e3 * self.end_error_m, "mm"),
             ("end-point drift", 100 * self.end_drift, "% of path"),
             ("heading error at the end", float(np.degrees(self.end_heading_rad)), "deg"),
@@ -327,20 +327,22 @@ def assess(
         MitsonarError: fewer than two poses at equal times, a path too short for ``delta``, or one that cannot be aligned.
     """
     # 1. Match the poses by time.
-    mine, theirs = associated(estimated.time_s, true.time_s, tolerance_s)
-    if mine.size < 2:
-        raise MitsonarError(f"a path's errors need two poses or more at equal times: got {mine.size}; give longer paths")
-    whole = Trajectory(true.poses[theirs[0] : theirs[-1] + 1], true.time_s[theirs[0] : theirs[-1] + 1])
-    estimated, true = _picked(estimated, mine), _picked(true, theirs)
+    estimated_index, true_index = associated(estimated.time_s, true.time_s, tolerance_s)
+    if estimated_index.size < 2:
+        raise MitsonarError(
+            f"a path's errors need two poses or more at equal times: got {estimated_index.size}; give longer paths"
+        )
+    true_path = Trajectory(true.poses[true_index[0] : true_index[-1] + 1], true.time_s[true_index[0] : true_index[-1] + 1])
+    estimated, true = _select(estimated, estimated_index), _select(true, true_index)
     # 2. Compute the absolute, relative and end errors.
     absolute, angle = absolute_errors(estimated, true, align)
     relative, turn = relative_errors(estimated, true, delta, unit)
-    ends, _ = absolute_errors(estimated, true, "first")
-    astray = np.unwrap(estimated.poses[:, 5] - true.poses[:, 5])
+    end_errors, _ = absolute_errors(estimated, true, "first")
+    heading_error = np.unwrap(estimated.poses[:, 5] - true.poses[:, 5])
     return PathErrors(
         frames=len(true),
         alignment=align,
-        path_m=path_length(whole),
+        path_m=path_length(true_path),
         estimated_path_m=path_length(estimated),
         absolute_rmse_m=float(_rms(absolute)),
         absolute_max_m=float(absolute.max()),
@@ -350,8 +352,8 @@ def assess(
         pairs=relative.size,
         relative_rmse_m=float(_rms(relative)),
         relative_angle_rmse_rad=float(_rms(turn)),
-        end_error_m=float(ends[-1]),
-        end_heading_rad=float(astray[-1] - astray[0]),
+        end_error_m=float(end_errors[-1]),
+        end_heading_rad=float(heading_error[-1] - heading_error[0]),
     )
 
 
@@ -367,18 +369,18 @@ def associated(estimated_s: Array, true_s: Array, tolerance_s: float = 0.01) -> 
     for name, time in (("estimated", estimated_s), ("true", true_s)):
         if not (np.diff(time) > 0).all():
             raise MitsonarError(f"the times of the {name} path must increase: sort its poses")
-    theirs = _nearest(true_s, estimated_s)
-    mine = np.arange(len(estimated_s))
-    apart = np.abs(true_s[theirs] - estimated_s)
+    true_index = _nearest(true_s, estimated_s)
+    estimated_index = np.arange(len(estimated_s))
+    gap_s = np.abs(true_s[true_index] - estimated_s)
     # times read from files may differ in the last digit
-    keep = (_nearest(estimated_s, true_s)[theirs] == mine) & (apart <= tolerance_s + 1e-9)
-    if not keep.any():
+    matched = (_nearest(estimated_s, true_s)[true_index] == estimated_index) & (gap_s <= tolerance_s + 1e-9)
+    if not matched.any():
         raise MitsonarError(
             f"no pose of the estimated path ({estimated_s[0]:g}..{estimated_s[-1]:g} s) is within {tolerance_s:g} s of one "
-            f"of the true path ({true_s[0]:g}..{true_s[-1]:g} s): the nearest is {apart.min():.3g} s away; give paths of "
+            f"of the true path ({true_s[0]:g}..{true_s[-1]:g} s): the nearest is {gap_s.min():.3g} s away; give paths of "
             "the same run, or a larger tolerance_s"
         )
-    return mine[keep], theirs[keep]
+    return estimated_index[matched], true_index[matched]
 
 
 def path_length(path: Trajectory) -> float:
@@ -401,21 +403,24 @@ def aligned(estimated: Trajectory, true: Trajectory, align: Alignment) -> Trajec
         raise MitsonarError(
             f"as many estimated as true poses are needed: got {len(estimated)} and {len(true)}; associate them"
         )
-    here, there = estimated.poses[:, :3], true.poses[:, :3]
+    estimated_position, true_position = estimated.poses[:, :3], true.poses[:, :3]
     if align == "none":
         return estimated
     if align == "first":
-        turn = vehicle_rotation(true.poses[0]) * vehicle_rotation(estimated.poses[0]).inv()
-        shift = there[0] - turn.apply(here[0])[0]
+        rotation = vehicle_rotation(true.poses[0]) * vehicle_rotation(estimated.poses[0]).inv()
+        shift = true_position[0] - rotation.apply(estimated_position[0])[0]
     elif align == "plane":
-        turn = _turn_in_the_plane(here, there)
-        shift = (there - turn.apply(here)).mean(axis=0) * [1, 1, 0]
+        rotation = _rotation_in_plane(estimated_position, true_position)
+        shift = (true_position - rotation.apply(estimated_position)).mean(axis=0) * [1, 1, 0]
     elif align == "space":
-        turn = _turn_in_space(here, there)
-        shift = (there - turn.apply(here)).mean(axis=0)
+        rotation = _rotation_in_space(estimated_position, true_position)
+        shift = (true_position - rotation.apply(estimated_position)).mean(axis=0)
     else:
         raise MitsonarError(f"align must be one of {', '.join(get_args(Alignment))}: got {align!r}")
-    return Trajectory(poses_from(turn.apply(here) + shift, turn * vehicle_rotation(estimated.poses)), estimated.time_s)
+    return Trajectory(
+        poses_from(rotation.apply(estimated_position) + shift, rotation * vehicle_rotation(estimated.poses)),
+        estimated.time_s,
+    )
 
 
 def absolute_errors(estimated: Trajectory, true: Trajectory, align: Alignment = "first") -> tuple[Array, Array]:
@@ -448,9 +453,9 @@ def relative_errors(
             f"as many estimated as true poses are needed: got {len(estimated)} and {len(true)}; associate them"
         )
     first, second = _pairs(true, delta, unit, overlapping)
-    position, turn = _between(true, first, second)
-    got, turned = _between(estimated, first, second)
-    return np.linalg.norm(got - position, axis=1), np.asarray((turn.inv() * turned).magnitude())
+    true_step, true_turn = _relative_poses(true, first, second)
+    estimated_step, estimated_turn = _relative_poses(estimated, first, second)
+    return np.linalg.norm(estimated_step - true_step, axis=1), np.asarray((true_turn.inv() * estimated_turn).magnitude())
 
 
 def _pairs(true: Trajectory, delta: float, unit: DeltaUnit, overlapping: bool) -> tuple[Index, Index]:
@@ -474,23 +479,23 @@ def _pairs(true: Trajectory, delta: float, unit: DeltaUnit, overlapping: bool) -
     return starts, ends[starts]
 
 
-def _between(path: Trajectory, first: Index, second: Index) -> tuple[Array, Rotation]:
+def _relative_poses(path: Trajectory, first: Index, second: Index) -> tuple[Array, Rotation]:
     """Return positions ``(pairs, 3)`` and attitudes of the second poses, in the axes of the first."""
-    turn = vehicle_rotation(path.poses)
-    back = turn[first].inv()
-    return back.apply(path.poses[second, :3] - path.poses[first, :3]), back * turn[second]
+    rotation = vehicle_rotation(path.poses)
+    to_first = rotation[first].inv()
+    return to_first.apply(path.poses[second, :3] - path.poses[first, :3]), to_first * rotation[second]
 
 
-def _turn_in_the_plane(here: Array, there: Array) -> Rotation:
-    a, b = (points[:, :2] - points[:, :2].mean(axis=0) for points in (here, there))
+def _rotation_in_plane(estimated: Array, true: Array) -> Rotation:
+    a, b = (points[:, :2] - points[:, :2].mean(axis=0) for points in (estimated, true))
     along, across = float((a * b).sum()), float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
     if np.hypot(along, across) <= 1e-12 * np.linalg.norm(a) * np.linalg.norm(b) or not (a.any() and b.any()):
         raise MitsonarError("a path without motion cannot be aligned by its positions: align by the first pose")
     return Rotation.from_euler("z", np.arctan2(across, along))
 
 
-def _turn_in_space(here: Array, there: Array) -> Rotation:
-    a, b = (points - points.mean(axis=0) for points in (here, there))
+def _rotation_in_space(estimated: Array, true: Array) -> Rotation:
+    a, b = (points - points.mean(axis=0) for points in (estimated, true))
     spread = np.linalg.svd(b.T @ a, compute_uv=False)
     if spread[1] <= 1e-9 * spread[0]:
         raise MitsonarError(
@@ -499,16 +504,16 @@ def _turn_in_space(here: Array, there: Array) -> Rotation:
     return Rotation.align_vectors(b, a)[0]
 
 
-def _picked(path: Trajectory, index: Index) -> Trajectory:
+def _select(path: Trajectory, index: Index) -> Trajectory:
     return Trajectory(path.poses[index], path.time_s[index])
 
 
-def _nearest(among: Array, wanted: Array) -> Index:
+def _nearest(values: Array, queries: Array) -> Index:
     """Return the index of the nearest of increasing values for each wanted one."""
-    after = np.clip(np.searchsorted(among, wanted), 1, max(len(among) - 1, 1))
-    after = np.minimum(after, len(among) - 1)
+    after = np.clip(np.searchsorted(values, queries), 1, max(len(values) - 1, 1))
+    after = np.minimum(after, len(values) - 1)
     before = np.maximum(after - 1, 0)
-    return np.where(wanted - among[before] <= among[after] - wanted, before, after)
+    return np.where(queries - values[before] <= values[after] - queries, before, after)
 
 
 # ---------------- Drift over segments (KITTI)

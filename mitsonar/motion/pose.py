@@ -40,7 +40,7 @@ def plain_number(value: object) -> object:
     return value.item() if isinstance(value, np.generic) else value
 
 
-class _Six(NamedTuple):
+class _PoseFields(NamedTuple):
     """The six numbers of a pose, unchecked."""
 
     x: float
@@ -51,7 +51,7 @@ class _Six(NamedTuple):
     heading: float = 0.0
 
 
-class Pose(_Six):
+class Pose(_PoseFields):
     """Position and attitude of a sonar or vehicle: x, y, z [m], pitch, roll, heading [rad].
 
     Raises:
@@ -95,9 +95,9 @@ class Pose(_Six):
             raise MitsonarError(f"a pose is six numbers x,y,z,pitch,roll,heading (m, deg): got {values.size}")
         if not np.isfinite(values).all():
             raise MitsonarError(f"a pose must be finite: got {','.join(f'{v:g}' for v in values)}; give m and deg")
-        made = cls.from_row([*values[:3], *np.radians(values[3:])])
-        refuse_beyond_reach([made])
-        return made
+        pose = cls.from_row([*values[:3], *np.radians(values[3:])])
+        refuse_beyond_reach([pose])
+        return pose
 
 
 def refuse_beyond_reach(poses: ArrayLike) -> None:
@@ -107,12 +107,12 @@ def refuse_beyond_reach(poses: ArrayLike) -> None:
         MitsonarError: a coordinate or an angle exceeds its bound.
     """
     table = np.abs(np.asarray(poses, dtype=float).reshape(-1, 6))
-    for what, unit, values, bound in (
+    for quantity, unit, values, bound in (
         ("position", "m", table[:, :3], FARTHEST),
         ("angle", "rad", table[:, 3:], MOST_TURNED),
     ):
         if values.size and values.max() > bound:
-            raise MitsonarError(f"a pose's {what} must be at most {bound:g} {unit}: got {values.max():g} {unit}")
+            raise MitsonarError(f"a pose's {quantity} must be at most {bound:g} {unit}: got {values.max():g} {unit}")
 
 
 def mounted(poses: ArrayLike, mount: Pose) -> NDArray[np.float64]:
@@ -134,9 +134,9 @@ def mounted(poses: ArrayLike, mount: Pose) -> NDArray[np.float64]:
 
 def mount_between(vehicle: Pose, sensor: Pose) -> Pose:
     """Return the mount of a sensor on a vehicle, for which ``mounted(vehicle, mount)`` is the pose of the sensor."""
-    turn = vehicle_rotation(vehicle).inv()
-    place = turn.apply(np.subtract(sensor[:3], vehicle[:3]))
-    return Pose(*(float(value) for value in poses_from(place, turn * vehicle_rotation(sensor))[0]))
+    to_vehicle = vehicle_rotation(vehicle).inv()
+    position = to_vehicle.apply(np.subtract(sensor[:3], vehicle[:3]))
+    return Pose(*(float(value) for value in poses_from(position, to_vehicle * vehicle_rotation(sensor))[0]))
 
 
 def vehicle_rotation(poses: ArrayLike) -> Rotation:

@@ -42,7 +42,7 @@ Index = NDArray[np.intp]
 UNKNOWN_STD = np.array([10.0, 10.0, np.pi])
 """Standard deviations of motion components that a sensor does not measure [m, m, rad]."""
 
-LEAST_STD = 1e-12
+MIN_STD = 1e-12
 """Smallest standard deviation of a reading, whose inverse square must be finite."""
 
 LONGEST_GAP_S = 1.0
@@ -94,7 +94,7 @@ class Readings:
             raise MitsonarError(
                 f"times of readings must increase: got {self.time_s[where + 1]:g} s after {self.time_s[where]:g}"
             )
-        if not (self.std >= LEAST_STD).all():
+        if not (self.std >= MIN_STD).all():
             raise MitsonarError(f"standard deviations of readings must be above 0: got {self.std.min():g}")
 
     @property
@@ -108,7 +108,7 @@ class Readings:
 
     def means(self, time_s: Array) -> Array:
         """Return the mean between consecutive times ``(times - 1,)``, which is valid where readings cover them."""
-        return np.asarray(_between(self.edges_s, self.values, time_s) / np.diff(time_s))
+        return np.asarray(_integrate_between(self.edges_s, self.values, time_s) / np.diff(time_s))
 
     def variances(self, time_s: Array, *, density: bool) -> Array:
         """Return the variance of the integral between consecutive times ``(times - 1,)``.
@@ -120,16 +120,16 @@ class Readings:
         """
         edges = self.edges_s
         power = np.asarray(self.std**2 if density else self.std**2 * np.diff(edges))
-        return _between(edges, power, time_s)
+        return _integrate_between(edges, power, time_s)
 
     def covers(self, time_s: Array) -> NDArray[np.bool_]:
         """Return whether readings cover each interval between consecutive times without a gap ``(times - 1,)``."""
         edges, step = self.edges_s, np.diff(self.time_s)
         widest = max(LONGEST_GAP_S, SLOWER * float(np.median(step))) if step.size else LONGEST_GAP_S
-        within = (time_s[:-1] >= edges[0] - 1e-6) & (time_s[1:] <= edges[-1] + 1e-6)
+        covered = (time_s[:-1] >= edges[0] - 1e-6) & (time_s[1:] <= edges[-1] + 1e-6)
         for gap in np.flatnonzero(step > widest):
-            within &= (time_s[1:] <= self.time_s[gap]) | (time_s[:-1] >= self.time_s[gap + 1])
-        return np.asarray(within)
+            covered &= (time_s[1:] <= self.time_s[gap]) | (time_s[:-1] >= self.time_s[gap + 1])
+        return np.asarray(covered)
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
         """Return interpolated values and standard deviations at times ``(times,)`` each; nan where no reading is near.
@@ -152,10 +152,10 @@ class Readings:
         return np.where(near, value, np.nan), np.where(near, self.std[nearest], np.nan)
 
 
-def _between(edges: Array, rate: Array, time_s: Array) -> Array:
+def _integrate_between(edges: Array, rate: Array, time_s: Array) -> Array:
     """Integrate a step function with values ``rate`` (n,) and limits ``edges`` (n + 1,) between consecutive times."""
-    whole = np.concatenate([[0.0], np.cumsum(rate * np.diff(edges))])
-    return np.asarray(np.diff(np.interp(time_s, edges, whole)))
+    cumulative = np.concatenate([[0.0], np.cumsum(rate * np.diff(edges))])
+    return np.asarray(np.diff(np.interp(time_s, edges, cumulative)))
 
 
 @dataclass(frozen=True)
@@ -247,34 +247,38 @@ class VehicleSensors:
             )
 
     def __repr__(self) -> str:
-        each = [one for one in (self.yaw_rate, self.sideways, self.forward, self.depth, self.heading) if one is not None]
-        times = [one.time_s for one in each] + ([self.dead_reckoning.path.time_s] if self.dead_reckoning else [])
+        readings = [
+            item for item in (self.yaw_rate, self.sideways, self.forward, self.depth, self.heading) if item is not None
+        ]
+        times = [item.time_s for item in readings] + ([self.dead_reckoning.path.time_s] if self.dead_reckoning else [])
         span = max(float(time[-1]) for time in times) - min(float(time[0]) for time in times)
         return f"VehicleSensors({', '.join(self.names)}; {sum(map(len, times)):,} readings over {span:.4g} s)"
 
     @property
     def names(self) -> list[str]:
         """Return the names of the sensors that are present."""
-        there = {
+        sensors = {
             "gyroscope": self.yaw_rate,
             "DVL": self.sideways or self.forward,
             "depth": self.depth,
             "compass": self.heading,
             "dead reckoning": self.dead_reckoning,
         }
-        return [name for name, sensor in there.items() if sensor is not None]
+        return [name for name, sensor in sensors.items() if sensor is not None]
 
     def digest(self) -> str:
         """Return the SHA-256 of all readings."""
         digest = hashlib.sha256(repr(self.bias_std).encode())
-        for one in (self.yaw_rate, self.sideways, self.forward, self.depth, self.heading):
-            for values in () if one is None else (one.time_s, one.values, one.std):
+        for readings in (self.yaw_rate, self.sideways, self.forward, self.depth, self.heading):
+            for values in () if readings is None else (readings.time_s, readings.values, readings.std):
                 digest.update(values.astype(float).tobytes())
             digest.update(b";")
         if self.dead_reckoning is not None:
-            dead = self.dead_reckoning
+            reckoning = self.dead_reckoning
             digest.update(
-                dead.path.poses.tobytes() + dead.path.time_s.tobytes() + repr((dead.walk_m, dead.walk_rad)).encode()
+                reckoning.path.poses.tobytes()
+                + reckoning.path.time_s.tobytes()
+                + repr((reckoning.walk_m, reckoning.walk_rad)).encode()
             )
         return digest.hexdigest()
 
@@ -284,21 +288,21 @@ class VehicleSensors:
         Raises:
             MitsonarError: no sensor covers the time of any frame.
         """
-        found = [one for one in self._motions(time_s) if one.pair.size]
-        if not found and self.headings(time_s).pose.size == 0 and self.rises(time_s) is None:
+        measured = [sensor_motions for sensor_motions in self._motions_by_sensor(time_s) if sensor_motions.pair.size]
+        if not measured and self.headings(time_s).pose.size == 0 and self.rises(time_s) is None:
             first, last = time_s[0], time_s[-1]
             raise MitsonarError(f"{self.name} hold no reading between {first:g} and {last:g} s, the times of the frames")
-        return found
+        return measured
 
-    def _motions(self, time_s: Array) -> Iterator[SensorMotions]:
+    def _motions_by_sensor(self, time_s: Array) -> Iterator[SensorMotions]:
         if self.yaw_rate is not None:
-            yield self._turned(self.yaw_rate, time_s)
+            yield self._gyro_motions(self.yaw_rate, time_s)
         if self.sideways is not None or self.forward is not None:
-            yield self._moved(time_s)
+            yield self._dvl_motions(time_s)
         if self.dead_reckoning is not None:
-            yield _reckoned(self.dead_reckoning, time_s)
+            yield _reckoning_motions(self.dead_reckoning, time_s)
 
-    def _turned(self, gyro: Readings, time_s: Array) -> SensorMotions:
+    def _gyro_motions(self, gyro: Readings, time_s: Array) -> SensorMotions:
         """Return the yaw measured by the gyroscope."""
         pair, step = np.flatnonzero(gyro.covers(time_s)), np.diff(time_s)
         table = np.zeros((len(step), 3))
@@ -309,7 +313,7 @@ class VehicleSensors:
         bias[:, 2] = self.bias_std * step
         return SensorMotions(pair, table[pair], covariances[pair], bias[pair])
 
-    def _moved(self, time_s: Array) -> SensorMotions:
+    def _dvl_motions(self, time_s: Array) -> SensorMotions:
         """Return the displacement measured by velocities, in the axes of the second heading.
 
         Velocities are in rotating axes, so the displacement lies half the rotation behind the final axes. The rotation is
@@ -318,23 +322,23 @@ class VehicleSensors:
         """
         # 1. Integrate each velocity over the intervals that it covers; the other components remain unknown.
         step = np.diff(time_s)
-        moved, variance = np.zeros((2, len(step))), np.tile(UNKNOWN_STD[:2, None] ** 2, (1, len(step)))
+        displacement, variance = np.zeros((2, len(step))), np.tile(UNKNOWN_STD[:2, None] ** 2, (1, len(step)))
         covered = np.zeros(len(step), dtype=bool)
         for axis, sensor in enumerate((self.sideways, self.forward)):
             if sensor is not None:
-                there = sensor.covers(time_s)
-                moved[axis] = np.where(there, sensor.means(time_s) * step, 0.0)
-                variance[axis] = np.where(there, sensor.variances(time_s, density=False), variance[axis])
-                covered |= there
+                sensor_covers = sensor.covers(time_s)
+                displacement[axis] = np.where(sensor_covers, sensor.means(time_s) * step, 0.0)
+                variance[axis] = np.where(sensor_covers, sensor.variances(time_s, density=False), variance[axis])
+                covered |= sensor_covers
         # 2. Rotate the displacement by half the yaw into the axes of the second heading.
         yaw = self._yaws(time_s)
         sin, cos = np.sin(yaw / 2), np.cos(yaw / 2)
-        sideways, forward = moved[0] * cos - moved[1] * sin, moved[0] * sin + moved[1] * cos
+        sideways, forward = displacement[0] * cos - displacement[1] * sin, displacement[0] * sin + displacement[1] * cos
         # 3. Propagate the variances, including that of the yaw, through this rotation.
-        none, one = np.zeros_like(sin), np.ones_like(sin)
-        turn = np.array([[cos, -sin, -forward / 2], [sin, cos, sideways / 2], [none, none, one]]).transpose(2, 0, 1)
-        own = np.stack([*variance, UNKNOWN_STD[2] ** 2 * one], axis=1)
-        covariances = (turn * own[:, None]) @ turn.swapaxes(1, 2)
+        zeros, ones = np.zeros_like(sin), np.ones_like(sin)
+        jacobian = np.array([[cos, -sin, -forward / 2], [sin, cos, sideways / 2], [zeros, zeros, ones]]).transpose(2, 0, 1)
+        component_variances = np.stack([*variance, UNKNOWN_STD[2] ** 2 * ones], axis=1)
+        covariances = (jacobian * component_variances[:, None]) @ jacobian.swapaxes(1, 2)
         pair = np.flatnonzero(covered)
         table = np.column_stack([sideways, forward, yaw])
         return SensorMotions(pair, table[pair], covariances[pair], np.zeros((len(pair), 3)))
@@ -354,16 +358,16 @@ class VehicleSensors:
         Raises:
             MitsonarError: as for :meth:`motions`.
         """
-        told = self.motions(time_s)
-        if not told:
+        measurements = self.motions(time_s)
+        if not measurements:
             return None
         # Weight each sensor by its information, starting from a weak prior, so that the result is always defined.
         information = np.tile(np.diag(1 / UNKNOWN_STD**2), (len(time_s) - 1, 1, 1))
         weighted = np.zeros((len(time_s) - 1, 3, 1))
-        for one in told:
-            inverse = _inverse(one.covariances + one.bias[:, :, None] * one.bias[:, None])
-            information[one.pair] += inverse
-            weighted[one.pair] += inverse @ one.motions[..., None]
+        for measurement in measurements:
+            inverse = _inverse(measurement.covariances + measurement.bias[:, :, None] * measurement.bias[:, None])
+            information[measurement.pair] += inverse
+            weighted[measurement.pair] += inverse @ measurement.motions[..., None]
         covariances = _inverse(information)
         means = (covariances @ weighted)[..., 0]
         return [
@@ -375,8 +379,8 @@ class VehicleSensors:
         """Return the compass headings of frames; frames without a nearby reading are omitted."""
         if self.heading is None:
             return Headings.none()
-        smooth = Readings(self.heading.time_s, np.unwrap(self.heading.values), self.heading.std)
-        heading, std = smooth.at(time_s)
+        unwrapped = Readings(self.heading.time_s, np.unwrap(self.heading.values), self.heading.std)
+        heading, std = unwrapped.at(time_s)
         known = np.flatnonzero(np.isfinite(heading))
         return Headings(known, wrapped(heading[known]), std[known])
 
@@ -400,13 +404,13 @@ def _inverse(matrices: Array) -> Array:
     return np.asarray(both * np.linalg.inv(matrices * both))
 
 
-def _reckoned(dead: DeadReckoning, time_s: Array) -> SensorMotions:
+def _reckoning_motions(reckoning: DeadReckoning, time_s: Array) -> SensorMotions:
     """Return the motions measured by dead reckoning."""
-    step, known = np.diff(time_s), dead.path.time_s
-    table = motions(dead.poses_at(time_s))
+    step, known = np.diff(time_s), reckoning.path.time_s
+    table = motions(reckoning.poses_at(time_s))
     covered = (time_s[:-1] >= known[0] - 1e-6) & (time_s[1:] <= known[-1] + 1e-6)
     pair = np.flatnonzero(covered)
-    walk = np.diag([dead.walk_m**2, dead.walk_m**2, dead.walk_rad**2])
+    walk = np.diag([reckoning.walk_m**2, reckoning.walk_m**2, reckoning.walk_rad**2])
     return SensorMotions(pair, table[pair], step[pair, None, None] * walk, np.zeros((len(pair), 3)))
 
 
@@ -437,7 +441,7 @@ RECKONED = ("reckoned_x_m", "reckoned_y_m", "reckoned_heading_deg")
 WALKS = ("reckoned_walk_m_rts", "reckoned_walk_deg_rts")
 """Columns of the random walk of dead reckoning per root second; ``RECKONED`` are those of its poses."""
 
-OF_POSES = {name for axis in "xy" for name in ALIASES[axis]}
+POSITION_COLUMNS = {name for axis in "xy" for name in ALIASES[axis]}
 """Columns of positions. In a file that has them, ``heading_deg`` is the heading of a pose, which may be the true one."""
 
 BIAS = "yaw_rate_bias_deg_h"
@@ -470,25 +474,25 @@ def load_sensors(path: str | Path) -> VehicleSensors:
             that do not increase.
     """
     table = CsvTable(Path(path))
-    time = _column(table, _time_name(table), whole=True)
-    known = _sensor_columns(table)
-    if not known:
-        wanted = ", ".join((*COLUMNS, *RECKONED))
-        raise MitsonarError(f"{path} has no column of a sensor ({', '.join(table.names)[:80]}): known are {wanted}")
-    doubled = sorted({name for name in table.names if table.names.count(name) > 1})
-    if doubled:
-        raise MitsonarError(f"{path} has the column {doubled[0]} more than once: leave one out")
-    if {"heading_deg", "compass_deg"} <= set(known):
+    time = _column(table, _time_name(table), complete=True)
+    sensor_columns = _sensor_columns(table)
+    if not sensor_columns:
+        known_columns = ", ".join((*COLUMNS, *RECKONED))
+        raise MitsonarError(f"{path} has no column of a sensor ({', '.join(table.names)[:80]}): known are {known_columns}")
+    repeated = sorted({name for name in table.names if table.names.count(name) > 1})
+    if repeated:
+        raise MitsonarError(f"{path} has the column {repeated[0]} more than once: leave one out")
+    if {"heading_deg", "compass_deg"} <= set(sensor_columns):
         raise MitsonarError(f"{path} has headings of a compass twice, heading_deg and compass_deg: leave one out")
-    readings = {name: _readings(table, time, name) for name in known if name in COLUMNS}
-    bias = _first(table, BIAS) * DEG / 3600 if BIAS in table.names else 0.0
+    readings = {name: _parse_readings(table, time, name) for name in sensor_columns if name in COLUMNS}
+    bias = _first_number(table, BIAS) * DEG / 3600 if BIAS in table.names else 0.0
     return VehicleSensors(
         readings.get("yaw_rate_deg_s"),
         readings.get("sideways_m_s"),
         readings.get("forward_m_s"),
         readings.get("depth_m"),
         readings.get("compass_deg", readings.get("heading_deg")),
-        _reckoned_in(table, time) if set(known) & set(RECKONED) else None,
+        _parse_dead_reckoning(table, time) if set(sensor_columns) & set(RECKONED) else None,
         bias,
         f"the sensors of {Path(path).name}",
     )
@@ -497,16 +501,16 @@ def load_sensors(path: str | Path) -> VehicleSensors:
 def save_sensors(path: str | Path, sensors: VehicleSensors) -> None:
     """Write sensors atomically to a CSV file for :func:`load_sensors`, with a row for each time of any sensor."""
     columns: dict[str, tuple[Array, Array]] = {}
-    for name, one in _named(sensors).items():
+    for name, readings in _readings_by_column(sensors).items():
         noise, unit, noise_unit = COLUMNS[name]
-        columns[name] = one.time_s, one.values / unit
-        columns[noise] = one.time_s, one.std / noise_unit
+        columns[name] = readings.time_s, readings.values / unit
+        columns[noise] = readings.time_s, readings.std / noise_unit
     if sensors.dead_reckoning is not None:
-        dead = sensors.dead_reckoning
-        unit_poses = dead.path.poses[:, [0, 1, 5]] / [1, 1, DEG]
-        walks = np.tile([dead.walk_m, dead.walk_rad / DEG], (len(dead.path), 1))
+        reckoning = sensors.dead_reckoning
+        unit_poses = reckoning.path.poses[:, [0, 1, 5]] / [1, 1, DEG]
+        walks = np.tile([reckoning.walk_m, reckoning.walk_rad / DEG], (len(reckoning.path), 1))
         for name, values in zip((*RECKONED, *WALKS), np.column_stack([unit_poses, walks]).T, strict=True):
-            columns[name] = dead.path.time_s, values
+            columns[name] = reckoning.path.time_s, values
     if sensors.bias_std and sensors.yaw_rate is not None:
         columns[BIAS] = sensors.yaw_rate.time_s[:1], np.array([sensors.bias_std * 3600 / DEG])
     times = np.unique(np.concatenate([time for time, _ in columns.values()]))
@@ -518,49 +522,49 @@ def save_sensors(path: str | Path, sensors: VehicleSensors) -> None:
     write_whole(Path(path), ("\n".join(lines) + "\n").encode())
 
 
-def _named(sensors: VehicleSensors) -> Mapping[str, Readings]:
+def _readings_by_column(sensors: VehicleSensors) -> Mapping[str, Readings]:
     """Return the readings by column name."""
-    every = {
+    by_column = {
         "yaw_rate_deg_s": sensors.yaw_rate,
         "sideways_m_s": sensors.sideways,
         "forward_m_s": sensors.forward,
         "depth_m": sensors.depth,
         "heading_deg": sensors.heading,
     }
-    return {name: one for name, one in every.items() if one is not None}
+    return {name: readings for name, readings in by_column.items() if readings is not None}
 
 
 def _sensor_columns(table: CsvTable) -> list[str]:
     """Return the sensor columns of a table; in a table with poses, ``heading_deg`` is not one of them."""
-    found = [name for name in (*COLUMNS, *RECKONED) if name in table.names]
-    if not OF_POSES & set(table.names) or "heading_deg" not in found:
-        return found
+    columns = [name for name in (*COLUMNS, *RECKONED) if name in table.names]
+    if not POSITION_COLUMNS & set(table.names) or "heading_deg" not in columns:
+        return columns
     if COLUMNS["heading_deg"][0] in table.names:
         message = f"{table.path}: heading_deg is that of the poses beside it, and is not read"
         warnings.warn(f"{message}: name the column of a compass compass_deg, and its noise", MitsonarWarning, stacklevel=3)
-    found.remove("heading_deg")
-    return found
+    columns.remove("heading_deg")
+    return columns
 
 
 def _time_name(table: CsvTable) -> str:
-    there = [name for name in TIMES if name in table.names]
-    if len(there) != 1:
+    time_columns = [name for name in TIMES if name in table.names]
+    if len(time_columns) != 1:
         raise MitsonarError(f"{table.path} needs one column of times, {', '.join(TIMES)}: got {', '.join(table.names)[:80]}")
-    return there[0]
+    return time_columns[0]
 
 
-def _column(table: CsvTable, name: str, *, whole: bool = False) -> Array:
+def _column(table: CsvTable, name: str, *, complete: bool = False) -> Array:
     """Return a column; empty cells are nan, or rejected if the column must be complete."""
     column = table.names.index(name)
     numbers = table.at(column)
-    for row, (words, number) in enumerate(zip(table.rows, numbers, strict=True), start=2):
-        word = words[column].strip()
-        if (word or whole) and not (abs(number) <= LARGEST and "_" not in word):
-            raise MitsonarError(f"{table.path}, row {row:,}: {name} must be a number: got {word[:40]!r}")
+    for row, (cells, number) in enumerate(zip(table.rows, numbers, strict=True), start=2):
+        cell = cells[column].strip()
+        if (cell or complete) and not (abs(number) <= LARGEST and "_" not in cell):
+            raise MitsonarError(f"{table.path}, row {row:,}: {name} must be a number: got {cell[:40]!r}")
     return numbers
 
 
-def _first(table: CsvTable, name: str) -> float:
+def _first_number(table: CsvTable, name: str) -> float:
     """Return the first number of a column."""
     numbers = _column(table, name)
     known = numbers[np.isfinite(numbers)]
@@ -569,7 +573,7 @@ def _first(table: CsvTable, name: str) -> float:
     return float(known[0])
 
 
-def _readings(table: CsvTable, time: Array, name: str) -> Readings | None:
+def _parse_readings(table: CsvTable, time: Array, name: str) -> Readings | None:
     """Return the readings of a column; None if it is empty."""
     noise, unit, noise_unit = COLUMNS[name]
     values = _column(table, name)
@@ -578,7 +582,7 @@ def _readings(table: CsvTable, time: Array, name: str) -> Readings | None:
         return None
     if noise not in table.names:
         raise MitsonarError(f"{table.path} has {name}, but not its noise: add the column {noise} ({_hint(table, noise)})")
-    first, std = _first(table, noise), _column(table, noise)
+    first, std = _first_number(table, noise), _column(table, noise)
     std = np.where(np.isfinite(std), std, first)
     try:
         return Readings(time[known], values[known] * unit, std[known] * noise_unit)
@@ -590,7 +594,7 @@ def _hint(table: CsvTable, noise: str) -> str:
     return nearest_names(noise, [name for name in table.names if name]) if table.names else ""
 
 
-def _reckoned_in(table: CsvTable, time: Array) -> DeadReckoning:
+def _parse_dead_reckoning(table: CsvTable, time: Array) -> DeadReckoning:
     """Return the dead reckoning of a table."""
     missing = [name for name in (*RECKONED, *WALKS) if name not in table.names]
     if missing:
@@ -600,6 +604,8 @@ def _reckoned_in(table: CsvTable, time: Array) -> DeadReckoning:
     poses = np.zeros((int(known.sum()), 6))
     poses[:, [0, 1, 5]] = numbers[known] * [1, 1, DEG]
     try:
-        return DeadReckoning(Trajectory(poses, time[known]), _first(table, WALKS[0]), _first(table, WALKS[1]) * DEG)
+        return DeadReckoning(
+            Trajectory(poses, time[known]), _first_number(table, WALKS[0]), _first_number(table, WALKS[1]) * DEG
+        )
     except MitsonarError as error:
         raise MitsonarError(f"{table.path}, dead reckoning: {error}") from None

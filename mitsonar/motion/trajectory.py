@@ -56,8 +56,8 @@ def velocities(flown: Trajectory) -> NDArray[np.float64]:
     turn = np.diff(flown.poses[:, 5])
     turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
     # 2. chord to arc: turn back by half the turn, and divide by the sinc
-    shorter = np.sinc(turn / (2 * np.pi))
-    sin, cos = np.sin(turn / 2) / shorter, np.cos(turn / 2) / shorter
+    chord_ratio = np.sinc(turn / (2 * np.pi))
+    sin, cos = np.sin(turn / 2) / chord_ratio, np.cos(turn / 2) / chord_ratio
     starboard, forward, up = chord.T
     table = np.column_stack([starboard * cos - forward * sin, forward * cos + starboard * sin, up, turn]) / step
     return np.concatenate([table, table[-1:]])
@@ -136,13 +136,13 @@ class Trajectory:
         if len(self) == 1 or seconds <= 0:
             return self
         ends, times = [], []
-        for at, inner, way in ((0, 1, -1.0), (-1, -2, 1.0)):
-            part = seconds / abs(self.time_s[at] - self.time_s[inner])
-            last, before = vehicle_rotation(self.poses[at]), vehicle_rotation(self.poses[inner])
-            onward = Rotation.from_rotvec((last * before.inv()).as_rotvec() * part)
-            place = self.poses[at, :3] + (self.poses[at, :3] - self.poses[inner, :3]) * part
-            ends.append(poses_from(place, onward * last))
-            times.append(self.time_s[at] + way * seconds)
+        for end, inner, sign in ((0, 1, -1.0), (-1, -2, 1.0)):
+            ratio = seconds / abs(self.time_s[end] - self.time_s[inner])
+            end_rotation, inner_rotation = vehicle_rotation(self.poses[end]), vehicle_rotation(self.poses[inner])
+            extrapolated = Rotation.from_rotvec((end_rotation * inner_rotation.inv()).as_rotvec() * ratio)
+            position = self.poses[end, :3] + (self.poses[end, :3] - self.poses[inner, :3]) * ratio
+            ends.append(poses_from(position, extrapolated * end_rotation))
+            times.append(self.time_s[end] + sign * seconds)
         poses = np.concatenate([ends[0], self.poses, ends[1]])
         return Trajectory(poses, np.concatenate([times[:1], self.time_s, times[1:]]))
 
@@ -170,14 +170,14 @@ class Trajectory:
         convention = convention_named(frame)
         if Path(path).suffix.lower() != ".csv":
             table = read_tum(path, convention)
-            read = {name: _posed(table, one) for name, one in CONVENTIONS.items()}
+            poses_by_frame = {name: _poses_from_quaternions(table, candidate) for name, candidate in CONVENTIONS.items()}
         else:
-            placed, attitude, angles = read_csv(path, convention)
-            table = np.column_stack([placed, attitude])
-            to_poses = _posed if angles is None else _posed_by_angles
-            read = {name: to_poses(table, one) for name, one in CONVENTIONS.items()}
-        _warn_of_attitude(path, read, frame, looks_ahead)
-        return cls(read[frame], table[:, 0])
+            time_position, attitude, angles = read_csv(path, convention)
+            table = np.column_stack([time_position, attitude])
+            to_poses = _poses_from_quaternions if angles is None else _poses_from_angles
+            poses_by_frame = {name: to_poses(table, candidate) for name, candidate in CONVENTIONS.items()}
+        _warn_of_attitude(path, poses_by_frame, frame, looks_ahead)
+        return cls(poses_by_frame[frame], table[:, 0])
 
     def save(self, path: str | Path, frame: str = "mitsonar") -> None:
         """Write a TUM file, or a CSV file if the name ends with ``.csv``. :meth:`load` reads it back to 1e-9 m and deg.
@@ -208,7 +208,7 @@ class Trajectory:
             MitsonarError: the file cannot be read, or a line is broken; the message names the line.
         """
         table = read_tum(path, CONVENTIONS["mitsonar"])
-        return cls(_posed(table, CONVENTIONS["mitsonar"]), table[:, 0])
+        return cls(_poses_from_quaternions(table, CONVENTIONS["mitsonar"]), table[:, 0])
 
     def save_tum(self, path: str | Path) -> None:
         """Write a TUM file in the convention of mitsonar. :meth:`load_tum` reads it back to 1e-9."""
@@ -216,30 +216,32 @@ class Trajectory:
         write_tum(path, np.column_stack([self.time_s, self.poses[:, :3], quaternions]), CONVENTIONS["mitsonar"])
 
 
-def _posed(table: NDArray[np.float64], convention: Convention) -> NDArray[np.float64]:
+def _poses_from_quaternions(table: NDArray[np.float64], convention: Convention) -> NDArray[np.float64]:
     """Make poses ``(n, 6)`` from times, positions and quaternions ``(n, 8)`` in a convention."""
     if convention.name == "mitsonar":
         return poses_from(table[:, 1:4], Rotation.from_quat(table[:, 4:]))
     return poses_from(*convention.to_ours(table[:, 1:4], Rotation.from_quat(table[:, 4:])))
 
 
-def _posed_by_angles(table: NDArray[np.float64], convention: Convention) -> NDArray[np.float64]:
+def _poses_from_angles(table: NDArray[np.float64], convention: Convention) -> NDArray[np.float64]:
     """Make poses ``(n, 6)`` from times, positions, pitch, roll and turn about the vertical ``(n, 7)`` in a convention."""
     position, _ = convention.to_ours(table[:, 1:4], Rotation.identity(len(table)))
     return np.column_stack([position, convention.angles_to_ours(table[:, 4:])])
 
 
-def _warn_of_attitude(path: str | Path, read: dict[str, NDArray[np.float64]], frame: str, looks_ahead: bool) -> None:
+def _warn_of_attitude(
+    path: str | Path, poses_by_frame: dict[str, NDArray[np.float64]], frame: str, looks_ahead: bool
+) -> None:
     """Warn if the sonar points sideways or at the sky in most frames; ``read`` holds the poses in every convention."""
-    share = {name: sideways_or_up(poses, looks_ahead=looks_ahead).mean() for name, poses in read.items()}
-    if share[frame] <= 0.5:
+    fraction = {name: sideways_or_up(poses, looks_ahead=looks_ahead).mean() for name, poses in poses_by_frame.items()}
+    if fraction[frame] <= 0.5:
         return
-    others = [name for name in read if name != frame and share[name] <= 0.5]
+    others = [name for name in poses_by_frame if name != frame and fraction[name] <= 0.5]
     better = f"read as {' or '.join(others)} it would not" if others else "nor would it look down in another convention"
-    pitch, roll, heading = np.degrees(read[frame][0, 3:])
-    count = round(share[frame] * len(read[frame]))
+    pitch, roll, heading = np.degrees(poses_by_frame[frame][0, 3:])
+    count = round(fraction[frame] * len(poses_by_frame[frame]))
     warnings.warn(
-        f"the sonar looks sideways or at the sky in {count} of {counted(len(read[frame]), 'frame')} of {path}, read as "
+        f"the sonar looks sideways or at the sky in {count} of {counted(len(poses_by_frame[frame]), 'frame')} of {path}, read as "
         f"{frame} (first pose: pitch {pitch:.3g}, roll {roll:.3g}, heading {heading:.3g} deg); {better}: name the file's "
         f"convention by --frame (frame= in Python), one of {', '.join(CONVENTIONS)}; nothing is wrong where that is meant",
         MitsonarWarning,
@@ -252,7 +254,7 @@ def _warn_of_attitude(path: str | Path, read: dict[str, NDArray[np.float64]], fr
 
 Table = NDArray[np.float64]
 
-OURS = "(starboard, forward, up to world)"
+MITSONAR_AXES = "(starboard, forward, up to world)"
 """End of the first line of a TUM file in the convention of mitsonar."""
 
 ALIASES = {
@@ -277,9 +279,9 @@ def read_tum(path: str | Path, convention: Convention) -> Table:
         MitsonarError: the file cannot be read or names another convention, or a line is broken; the message names the line.
     """
     rows: list[list[float]] = []
-    for number, line in enumerate(_text(path).splitlines(), start=1):
+    for number, line in enumerate(_read_text(path).splitlines(), start=1):
         if line.lstrip().startswith("#"):
-            _refuse_another(path, line, convention)
+            _refuse_other_convention(path, line, convention)
         elif line.strip():
             rows.append(_tum_row(path, number, line))
             _refuse_disorder(path, number, rows)
@@ -296,7 +298,7 @@ def write_tum(path: str | Path, table: Table, convention: Convention) -> None:
         table: time, position, quaternion ``(poses, 8)``, in the convention.
         convention: convention of the table, which the first line names.
     """
-    axes = OURS if convention.name == "mitsonar" else f"(frame {convention.name}: {convention.axes})"
+    axes = MITSONAR_AXES if convention.name == "mitsonar" else f"(frame {convention.name}: {convention.axes})"
     np.savetxt(path, table, fmt="%.9f", header=f"time_s x y z qx qy qz qw {axes}")
 
 
@@ -321,7 +323,7 @@ def read_csv(path: str | Path, convention: Convention) -> tuple[Table, Table, Ta
             line.
     """
     try:
-        lines = list(csv.reader(io.StringIO(_text(path))))
+        lines = list(csv.reader(io.StringIO(_read_text(path))))
     except csv.Error as error:
         raise MitsonarError(f"cannot read trajectory {path}: it is no table of CSV ({error}); write it again") from None
     if not lines or not any(word.strip() for word in lines[0]):
@@ -360,7 +362,7 @@ def write_csv(path: str | Path, table: Table, convention: Convention) -> None:
     write_whole(Path(path), text.getvalue().encode())
 
 
-def _text(path: str | Path) -> str:
+def _read_text(path: str | Path) -> str:
     try:
         content = at_most(path, LARGEST)
         text = content.decode("utf-8-sig")
@@ -372,10 +374,10 @@ def _text(path: str | Path) -> str:
     return text
 
 
-def _refuse_another(path: str | Path, line: str, convention: Convention) -> None:
+def _refuse_other_convention(path: str | Path, line: str, convention: Convention) -> None:
     """Raise a MitsonarError if a comment line written by mitsonar names another convention."""
-    named = re.search(r"\(frame ([\w-]+):", line)
-    name = named.group(1) if named else "mitsonar" if OURS in line else convention.name
+    match = re.search(r"\(frame ([\w-]+):", line)
+    name = match.group(1) if match else "mitsonar" if MITSONAR_AXES in line else convention.name
     if name != convention.name:
         raise MitsonarError(f"trajectory {path} says that it is {name}, and --frame {convention.name} is asked: give {name}")
 
@@ -404,14 +406,14 @@ def _tum_row(path: str | Path, number: int, line: str) -> list[float]:
 
 def _column(path: str | Path, names: list[str], key: str) -> int:
     """Return the index of the column of a key of :data:`ALIASES`."""
-    found = [number for number, name in enumerate(names) if name in ALIASES[key]]
-    if len(found) > 1:
-        raise MitsonarError(f"trajectory {path} has {key} in {len(found)} columns: leave all but one out")
-    if not found:
+    matches = [number for number, name in enumerate(names) if name in ALIASES[key]]
+    if len(matches) > 1:
+        raise MitsonarError(f"trajectory {path} has {key} in {len(matches)} columns: leave all but one out")
+    if not matches:
         raise MitsonarError(
             f"trajectory {path} has no column {key} ({', '.join(names)[:80]}): its columns must be {COLUMNS}"
         )
-    return found[0]
+    return matches[0]
 
 
 def _attitude(path: str | Path, names: list[str], convention: Convention) -> tuple[list[int], Table | None]:
@@ -422,37 +424,37 @@ def _attitude(path: str | Path, names: list[str], convention: Convention) -> tup
         raise MitsonarError(f"trajectory {path} has the attitude twice, {quaternion[0]} and {angles[0]}: leave one out")
     if quaternion:
         return [_column(path, names, f"q{axis}") for axis in "xyzw"], None
-    found = [_angle(path, names, wanted, convention) for wanted in (("pitch",), ("roll",), convention.turn)]
-    return [column for column, _ in found], np.array([unit for _, unit in found])
+    columns = [_angle(path, names, aliases, convention) for aliases in (("pitch",), ("roll",), convention.turn)]
+    return [column for column, _ in columns], np.array([unit for _, unit in columns])
 
 
-def _angle(path: str | Path, names: list[str], wanted: Sequence[str], convention: Convention) -> tuple[int, float]:
+def _angle(path: str | Path, names: list[str], aliases: Sequence[str], convention: Convention) -> tuple[int, float]:
     """Return the column of an angle, and its factor to radians."""
     units = {"_deg": math.radians(1), "_rad": 1.0}
-    known = {f"{name}{ending}": unit for name in wanted for ending, unit in units.items()}
-    found = [number for number, name in enumerate(names) if name in known]
-    if len(found) > 1:
-        raise MitsonarError(f"trajectory {path} has {wanted[0]} in {len(found)} columns: leave all but one out")
-    if found:
-        return found[0], known[names[found[0]]]
-    if set(wanted) & set(names):
-        bare = next(name for name in wanted if name in names)
+    unit_by_column = {f"{name}{ending}": unit for name in aliases for ending, unit in units.items()}
+    matches = [number for number, name in enumerate(names) if name in unit_by_column]
+    if len(matches) > 1:
+        raise MitsonarError(f"trajectory {path} has {aliases[0]} in {len(matches)} columns: leave all but one out")
+    if matches:
+        return matches[0], unit_by_column[names[matches[0]]]
+    if set(aliases) & set(names):
+        bare = next(name for name in aliases if name in names)
         raise MitsonarError(f"trajectory {path}: the column {bare} has no unit; name it {bare}_deg or {bare}_rad")
-    if "yaw" in wanted and any(name.startswith("heading") for name in names):
+    if "yaw" in aliases and any(name.startswith("heading") for name in names):
         raise MitsonarError(
             f"trajectory {path} has a heading, which turns clockwise from north; {convention.name} has a yaw, which turns "
             "anticlockwise from east: name the column yaw_deg if it is that, or give the file's --frame"
         )
-    near = nearest_names(f"{wanted[0]}_deg", known)
+    suggestion = nearest_names(f"{aliases[0]}_deg", unit_by_column)
     raise MitsonarError(
-        f"trajectory {path} has no column {wanted[0]} ({', '.join(names)[:80]}): {near}; columns are {COLUMNS}"
+        f"trajectory {path} has no column {aliases[0]} ({', '.join(names)[:80]}): {suggestion}; columns are {COLUMNS}"
     )
 
 
-def _readings_only(words: list[str], columns: list[int]) -> bool:
+def _readings_only(cells: list[str], columns: list[int]) -> bool:
     """Return whether a line has a time and values but no pose: readings of sensors between poses."""
-    held = {number for number, word in enumerate(words) if word.strip()}
-    return not held & set(columns[1:]) and columns[0] in held and len(held) > 1
+    filled = {number for number, cell in enumerate(cells) if cell.strip()}
+    return not filled & set(columns[1:]) and columns[0] in filled and len(filled) > 1
 
 
 def _csv_row(path: str | Path, number: int, words: list[str], columns: list[int]) -> list[float]:
@@ -611,8 +613,8 @@ def sideways_or_up(poses: Table, *, looks_ahead: bool = True) -> NDArray[np.bool
         return np.asarray(up < ON_ITS_SIDE)
     level = np.abs(rises) < LEVEL
     # direction of motion relative to the horizontal acoustic axis; frames without motion do not count
-    way = np.gradient(poses[:, :2], axis=0) if len(poses) > 1 else np.zeros((1, 2))
-    length = np.linalg.norm(way, axis=1)
-    ahead = np.abs(way[:, 0] * np.sin(heading) + way[:, 1] * np.cos(heading))
+    displacement = np.gradient(poses[:, :2], axis=0) if len(poses) > 1 else np.zeros((1, 2))
+    length = np.linalg.norm(displacement, axis=1)
+    ahead = np.abs(displacement[:, 0] * np.sin(heading) + displacement[:, 1] * np.cos(heading))
     across = (length > 1e-6) & (ahead < ALONG * length)
     return np.asarray((rises > LEVEL) | (leans > ON_ITS_SIDE) | (level & ((leans > LEVEL) | across)))

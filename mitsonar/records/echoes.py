@@ -56,15 +56,15 @@ class Echoes:
         if not isinstance(self.hit, np.ndarray):
             return "Echoes(not evaluated yet)"
         hit = self.hit > 0
-        reach = f", {self.range_m[hit].min():.4g}..{self.range_m[hit].max():.4g} m" if hit.any() else ""
-        return f"Echoes({hit.size:,} rays, {int(hit.sum()):,} hit{reach})"
+        extent = f", {self.range_m[hit].min():.4g}..{self.range_m[hit].max():.4g} m" if hit.any() else ""
+        return f"Echoes({hit.size:,} rays, {int(hit.sum()):,} hit{extent})"
 
     def outside(self, sonar: Sonar) -> tuple[float, float] | None:
         """Return the nearest and farthest echo outside the window [m], or None; requires NumPy arrays."""
         near, far = (self.range_m, self.range_m) if sonar.model == "thesis" else (self.near_m, self.far_m)
-        missed = (far < sonar.range_min) | (near >= sonar.range_max)
-        found = self.range_m[(self.hit > 0) & missed]
-        return (float(found.min()), float(found.max())) if found.size else None
+        outside_window = (far < sonar.range_min) | (near >= sonar.range_max)
+        outside_range_m = self.range_m[(self.hit > 0) & outside_window]
+        return (float(outside_range_m.min()), float(outside_range_m.max())) if outside_range_m.size else None
 
 
 CHANNELS = tuple(field.name for field in fields(Echoes))
@@ -136,8 +136,8 @@ def _check_header(header: dict[str, PlainValue], names: list[str], shape: tuple[
         MitsonarError: a size that differs from the sonar's, or more pixels than the file can contain.
     """
     low, high = (np.asarray(corner).tolist() for corner in header["dataWindow"])
-    found = (high[1] - low[1] + 1, high[0] - low[0] + 1)
-    if found != shape:
-        raise MitsonarError(f"must be {shape[1]} x {shape[0]} rays as its sonar: got {found}")
+    film_shape = (high[1] - low[1] + 1, high[0] - low[0] + 1)
+    if film_shape != shape:
+        raise MitsonarError(f"must be {shape[1]} x {shape[0]} rays as its sonar: got {film_shape}")
     if len(names) > 100 or len(names) * 2 * shape[0] * shape[1] > INFLATION * size:
         raise MitsonarError(f"promises {len(names)} channels of {shape[1]} x {shape[0]} rays in {size:,} bytes")

@@ -87,9 +87,9 @@ class ViewFrames:
     def __post_init__(self) -> None:
         for view, values in self.values.items():
             shape = (len(self.time_s), self.sonars[view].range_bins)
-            wanted = shape if self.kind == "vector" else (*shape, len(self.bearing_rad[view]))
-            if values.shape != wanted:
-                raise MitsonarError(f"{self.kind}s of view {view} must have the shape {wanted}: got {values.shape}")
+            expected_shape = shape if self.kind == "vector" else (*shape, len(self.bearing_rad[view]))
+            if values.shape != expected_shape:
+                raise MitsonarError(f"{self.kind}s of view {view} must have the shape {expected_shape}: got {values.shape}")
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -107,8 +107,8 @@ class ViewFrames:
     def profiles(self) -> NDArray[np.float32]:
         """Sum the images over the beams; return ``(views, n, bins)`` float32, in units of the largest pixel value."""
         scale = {np.dtype(np.uint8): np.float32(1 / 255)}
-        whole = [values * scale.get(values.dtype, np.float32(1)) for values in self.values.values()]
-        return np.stack([one if self.kind == "vector" else one.sum(axis=-1) for one in whole]).astype(np.float32)
+        scaled = [values * scale.get(values.dtype, np.float32(1)) for values in self.values.values()]
+        return np.stack([array if self.kind == "vector" else array.sum(axis=-1) for array in scaled]).astype(np.float32)
 
 
 # ---------------- Validation of stored arrays
@@ -117,11 +117,11 @@ class ViewFrames:
 StoredArray: TypeAlias = Any
 """An array of NumPy or Zarr, with ``dtype``, ``shape`` and ``ndim``."""
 
-MOST_DIMENSIONS = 4
-PIECES_A_ROW = 64
+MAX_DIMENSIONS = 4
+MAX_CHUNKS_PER_ROW = 64
 """Largest number of chunks per row of an array."""
 
-ROWS_A_BYTE = 200
+MAX_ROWS_PER_BYTE = 200
 """Largest number of rows per byte of a compressed array, since times and poses differ from row to row."""
 
 FEW_ROWS = 100_000
@@ -162,8 +162,8 @@ def check_column(values: StoredArray, name: str, column: Column, sizes: Mapping[
     Raises:
         MitsonarError: the array does not meet the requirements.
     """
-    wanted = tuple(sizes.get(dim, length) for dim, length in zip(column.dims, values.shape, strict=False))
-    if values.dtype.kind not in column.kinds or values.ndim != len(column.dims) or values.shape != wanted:
+    expected_shape = tuple(sizes.get(dim, length) for dim, length in zip(column.dims, values.shape, strict=False))
+    if values.dtype.kind not in column.kinds or values.ndim != len(column.dims) or values.shape != expected_shape:
         shape = ", ".join(f"{dim} {sizes[dim]:,}" if dim in sizes else dim for dim in column.dims)
         kinds = " or ".join({"f": "float", "i": "int", "u": "uint", "c": "complex"}[kind] for kind in column.kinds)
         raise MitsonarError(
@@ -186,8 +186,8 @@ def _check_column_values(values: FileArray, name: str, column: Column, source: s
     if column.order != "any" and len(values) > 1:
         steps = np.diff(values, axis=0)
         if (steps < 0).any() or (column.order == "strict" and not (steps > 0).all()):
-            wanted = "grow" if column.order == "strict" else "not fall"
-            raise MitsonarError(f"{source}: {name} must {wanted} from row to row")
+            requirement = "grow" if column.order == "strict" else "not fall"
+            raise MitsonarError(f"{source}: {name} must {requirement} from row to row")
 
 
 def text_of(table: Mapping[str, StoredArray], name: str, default: str | None = None) -> str:
@@ -255,11 +255,13 @@ def open_group(
     if rows not in arrays or arrays[rows].ndim not in (1, 2) or arrays[rows].dtype.kind != "f":
         raise ValueError(f"it lacks {rows}, a number for each row")
     count = int(arrays[rows].shape[0])
-    stored = sum(one.stat().st_size for one in (path / rows).rglob("*") if one.is_file() and one.name != "zarr.json")
-    if count > rows_that_fit(stored):
-        raise ValueError(f"{count:,} rows are more than the {stored:,} bytes of {rows} can hold")
+    stored_bytes = sum(
+        file.stat().st_size for file in (path / rows).rglob("*") if file.is_file() and file.name != "zarr.json"
+    )
+    if count > rows_that_fit(stored_bytes):
+        raise ValueError(f"{count:,} rows are more than the {stored_bytes:,} bytes of {rows} can hold")
     for name, array in arrays.items():
-        _check_pieces(name, array)
+        _check_chunks(name, array)
         if name in columns and name != rows:
             check_column(array, name, columns[name], {columns[rows].dims[0]: count}, "it")
     attributes = dict(group.attrs)
@@ -280,7 +282,7 @@ def arrays_in(path: Path, mode: Literal["r", "r+"]) -> tuple[zarr.Group, dict[st
 
     from mitsonar.io.storage import refuse_codecs
 
-    names = sorted(one.parent.name for one in path.glob("*/zarr.json"))
+    names = sorted(file.parent.name for file in path.glob("*/zarr.json"))
     for name in ("", *names):
         metadata = read_json(path / name / "zarr.json")
         for length in metadata["shape"] if name else ():
@@ -296,18 +298,18 @@ def arrays_in(path: Path, mode: Literal["r", "r+"]) -> tuple[zarr.Group, dict[st
 
 def rows_that_fit(stored: int) -> int:
     """Return the largest plausible number of rows in ``stored`` compressed bytes."""
-    return max(FEW_ROWS, ROWS_A_BYTE * stored)
+    return max(FEW_ROWS, MAX_ROWS_PER_BYTE * stored)
 
 
-def _check_pieces(name: str, array: StoredArray) -> None:
+def _check_chunks(name: str, array: StoredArray) -> None:
     """Check that an array can be read in finite time and memory."""
-    if array.ndim > MOST_DIMENSIONS or array.dtype.kind not in "biufc":
-        raise ValueError(f"{name} holds no numbers, or has more than {MOST_DIMENSIONS} dimensions")
-    if any(piece < 1 for piece in array.chunks):
+    if array.ndim > MAX_DIMENSIONS or array.dtype.kind not in "biufc":
+        raise ValueError(f"{name} holds no numbers, or has more than {MAX_DIMENSIONS} dimensions")
+    if any(chunk < 1 for chunk in array.chunks):
         raise ValueError(f"{name} is cut into pieces of nothing")
-    pieces = math.prod(-(-length // piece) for length, piece in zip(array.shape, array.chunks, strict=True))
-    if pieces > PIECES_A_ROW * max(1, array.shape[0] if array.ndim else 1):
-        raise ValueError(f"{name} is cut into {pieces:,} pieces")
+    chunks = math.prod(-(-length // chunk) for length, chunk in zip(array.shape, array.chunks, strict=True))
+    if chunks > MAX_CHUNKS_PER_ROW * max(1, array.shape[0] if array.ndim else 1):
+        raise ValueError(f"{name} is cut into {chunks:,} pieces")
     refuse_beyond_memory(math.prod(array.chunks) * array.dtype.itemsize, name)
 
 
@@ -487,9 +489,9 @@ class SonarFrames:
 
     def select(self, index: slice | NDArray[Any]) -> SonarFrames:
         """Return a subset of the frames."""
-        picked = {name: getattr(self, name)[index] for name in PER_FRAME if getattr(self, name) is not None}
-        rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in picked}
-        return SonarFrames(**picked, **rest)
+        selected = {name: getattr(self, name)[index] for name in PER_FRAME if getattr(self, name) is not None}
+        unchanged = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in selected}
+        return SonarFrames(**selected, **unchanged)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of ``frames.npz`` by name; ``sonar``, ``about`` and ``names`` are JSON strings."""
@@ -561,10 +563,10 @@ class SonarFrames:
         """
         path = Path(path)
         if os.path.isdir(path) and path.suffix != ".zarr":
-            found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
-            if not found:
+            existing = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
+            if not existing:
                 raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: give the folder of a finished run")
-            path = found[0]
+            path = existing[0]
         if not os.path.exists(path):
             raise MitsonarError(f"there are no frames at {path}: give frames.npz or a run's folder")
         try:
@@ -572,7 +574,7 @@ class SonarFrames:
                 table, done = open_group(path, COLUMNS, "time_s", "frames_done")
                 refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in table.values()), str(path))
                 arrays = {name: values for name, values in table.items() if not isinstance(values, np.ndarray)}
-                table |= {name: one[:done] if name in PER_FRAME else one[...] for name, one in arrays.items()}
+                table |= {name: array[:done] if name in PER_FRAME else array[...] for name, array in arrays.items()}
             else:
                 table = read_npz(path)
         except Exception as error:  # a damaged zip or Zarr may raise any error
@@ -587,10 +589,10 @@ def _texts(names: dict[str, Any], key: str, source: str) -> tuple[str, ...]:
     Raises:
         MitsonarError: the entry is not a list of strings.
     """
-    found = names.get(key, [])
-    if not (isinstance(found, list) and all(isinstance(one, str) for one in found)):
+    texts = names.get(key, [])
+    if not (isinstance(texts, list) and all(isinstance(text, str) for text in texts)):
         raise MitsonarError(f"{source}: {key} of the field names must be a list of texts; the file is damaged")
-    return tuple(found)
+    return tuple(texts)
 
 
 def _check_values(values: dict[str, NDArray[Any]], source: str) -> None:
@@ -655,11 +657,11 @@ class FrameStore:
             if name in table:
                 group.attrs[name] = table.pop(name).item()
         for name, values in table.items():
-            each = name in PER_FRAME or name == "pitch_rad"
-            shape = (frames, *values.shape[1:]) if each else values.shape
+            per_frame = name in PER_FRAME or name == "pitch_rad"
+            shape = (frames, *values.shape[1:]) if per_frame else values.shape
             chunks = (1, *shape[1:]) if len(shape) == 3 else shape
             array = group.create_array(name, shape=shape, chunks=chunks, dtype=values.dtype, fill_value=0)
-            if not each:
+            if not per_frame:
                 array[...] = values
         group.attrs["frames_done"] = 0
         return cls(group, path)
@@ -674,8 +676,8 @@ class FrameStore:
         try:
             store = cls(arrays_in(path, "r+")[0], path)
             store.frames, store.done  # noqa: B018
-            for left in path.rglob("*.partial"):  # Zarr writes to a temporary name, then renames the file
-                left.unlink()
+            for partial in path.rglob("*.partial"):  # Zarr writes to a temporary name, then renames the file
+                partial.unlink()
         except Exception as error:  # a damaged Zarr raises many types of errors
             raise MitsonarError(f"cannot go on with {path}: {error}; render again with --overwrite") from None
         return store
@@ -701,12 +703,12 @@ class FrameStore:
             for name, array in arrays.items():
                 if name in COLUMNS and not (name == "time_s" and array.shape == (frames, cells[1])):
                     check_column(array, name, COLUMNS[name], sizes, "it")
-                wanted = (1, *array.shape[1:]) if array.ndim == 3 else array.shape
-                if array.chunks != wanted:
-                    raise ValueError(f"{name} is cut into pieces of {array.chunks}, not {wanted}")
-            lacking = {"image", "range_m", "bearing_rad", "time_s"} - set(arrays)
-            if lacking:
-                raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+                expected_chunks = (1, *array.shape[1:]) if array.ndim == 3 else array.shape
+                if array.chunks != expected_chunks:
+                    raise ValueError(f"{name} is cut into pieces of {array.chunks}, not {expected_chunks}")
+            missing = {"image", "range_m", "bearing_rad", "time_s"} - set(arrays)
+            if missing:
+                raise ValueError(f"it lacks {', '.join(sorted(missing))}")
         except Exception as error:
             raise MitsonarError(f"cannot go on with {self.path}: {error}; render again with --overwrite") from None
 
@@ -749,11 +751,11 @@ def _write_npy(entry: IO[bytes], array: StoredArray) -> None:
     """Write an array in the .npy format, one frame at a time."""
     header = {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape}
     np.lib.format.write_array_header_2_0(entry, header)
-    for piece in _pieces(array):
-        entry.write(np.ascontiguousarray(piece).tobytes())
+    for frame in _frames_of(array):
+        entry.write(np.ascontiguousarray(frame).tobytes())
 
 
-def _pieces(array: StoredArray) -> Iterator[FileArray]:
+def _frames_of(array: StoredArray) -> Iterator[FileArray]:
     """Yield an array frame by frame, or as a whole if it has no frames."""
     if array.ndim < 3:
         yield np.asarray(array[...])

@@ -60,21 +60,21 @@ class ImpulseResponses:
     about: dict[str, PlainValue] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        wanted = (len(self.time_s), len(self.sonar.receivers), self.sonar.taps)
-        if self.response.shape != wanted:
+        expected_shape = (len(self.time_s), len(self.sonar.receivers), self.sonar.taps)
+        if self.response.shape != expected_shape:
             raise MitsonarError(
-                f"response must be (pings, receivers, taps) = {wanted} after time_s and sonar: got {self.response.shape}"
+                f"response must be (pings, receivers, taps) = {expected_shape} after time_s and sonar: got {self.response.shape}"
             )
         for name in PER_PING:
             values = getattr(self, name)
-            if values is not None and len(values) != wanted[0]:
-                raise MitsonarError(f"{name} must hold {wanted[0]} pings: got {len(values)}")
+            if values is not None and len(values) != expected_shape[0]:
+                raise MitsonarError(f"{name} must hold {expected_shape[0]} pings: got {len(values)}")
 
     def __len__(self) -> int:
         return len(self.response)
 
     def __repr__(self) -> str:
-        names = ", ".join(one.name for one in self.sonar.receivers)
+        names = ", ".join(receiver.name for receiver in self.sonar.receivers)
         known = ", ".join(name for name in PER_PING[2:] if getattr(self, name) is not None)
         return (
             f"ImpulseResponses({len(self)} pings, {self.response.shape[1]} receivers ({names}), {self.sonar.taps} taps at "
@@ -88,9 +88,9 @@ class ImpulseResponses:
 
     def select(self, index: slice | NDArray[np.integer] | NDArray[np.bool_]) -> ImpulseResponses:
         """Return a subset of the pings."""
-        picked = {name: getattr(self, name)[index] for name in PER_PING if getattr(self, name) is not None}
-        rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in picked}
-        return ImpulseResponses(**picked, **rest)
+        selected = {name: getattr(self, name)[index] for name in PER_PING if getattr(self, name) is not None}
+        unchanged = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in selected}
+        return ImpulseResponses(**selected, **unchanged)
 
     def arrays(self) -> dict[str, FileArray]:
         """Return the arrays of ``responses.npz`` by name; ``sonar`` and ``about`` are JSON strings."""
@@ -135,7 +135,7 @@ class ImpulseResponses:
             if os.path.isdir(path):
                 table, _ = open_group(path, COLUMNS, "time_s")
                 refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in table.values()), str(path))
-                table |= {name: one[...] for name, one in table.items() if not isinstance(one, np.ndarray)}
+                table |= {name: array[...] for name, array in table.items() if not isinstance(array, np.ndarray)}
             else:
                 table = read_npz(path)
         except Exception as error:  # a damaged zip or Zarr raises many types of errors

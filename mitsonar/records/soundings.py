@@ -62,10 +62,10 @@ class Soundings:
     quality: Array
 
     def __post_init__(self) -> None:
-        wanted = (len(self.time_s), len(self.sounder.channels), self.sounder.fan.beams)
+        expected_shape = (len(self.time_s), len(self.sounder.channels), self.sounder.fan.beams)
         for name in MEASURED:
-            if getattr(self, name).shape != wanted:
-                raise MitsonarError(f"{name} must have the shape {wanted}: got {getattr(self, name).shape}")
+            if getattr(self, name).shape != expected_shape:
+                raise MitsonarError(f"{name} must have the shape {expected_shape}: got {getattr(self, name).shape}")
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -85,9 +85,9 @@ class Soundings:
     def points(self) -> Array:
         """Return the positions of all soundings in the world ``(pings, channels, beams, 3)`` [m], on the beam axes."""
         fans = self.sounder.fan_poses(self.poses)
-        turn = vehicle_rotation(fans.reshape(-1, 6)).as_matrix().reshape(*fans.shape[:2], 3, 3)
-        way = np.einsum("pcij,bj->pcbi", turn, self.sounder.directions())
-        return np.asarray(fans[:, :, None, :3] + self.range_m[..., None] * way)
+        rotation = vehicle_rotation(fans.reshape(-1, 6)).as_matrix().reshape(*fans.shape[:2], 3, 3)
+        direction = np.einsum("pcij,bj->pcbi", rotation, self.sounder.directions())
+        return np.asarray(fans[:, :, None, :3] + self.range_m[..., None] * direction)
 
     def save(self, path: str | Path) -> None:
         """Write a file atomically, in the format of its suffix.
@@ -99,8 +99,8 @@ class Soundings:
         """
         path = Path(path)
         if path.suffix == ".npz":
-            named = {name: getattr(self, name) for name in ("time_s", "poses", *MEASURED)}
-            return save_pings(path, self.sounder, named)
+            arrays = {name: getattr(self, name) for name in ("time_s", "poses", *MEASURED)}
+            return save_pings(path, self.sounder, arrays)
         writers = {".csv": self._csv, ".xyz": self._xyz, ".ply": self._ply}
         if path.suffix not in writers:
             raise MitsonarError(f"soundings are written as .npz, {', '.join(writers)}: got {path.name}")
@@ -174,9 +174,9 @@ class Echogram:
     height_m: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        wanted = (len(self.time_s), len(self.sounder.channels), self.sounder.fan.range_bins)
-        if self.levels.shape != wanted:
-            raise MitsonarError(f"levels must have the shape {wanted}: got {self.levels.shape}")
+        expected_shape = (len(self.time_s), len(self.sounder.channels), self.sounder.fan.range_bins)
+        if self.levels.shape != expected_shape:
+            raise MitsonarError(f"levels must have the shape {expected_shape}: got {self.levels.shape}")
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -207,9 +207,9 @@ class Echogram:
 
         Full scale is the 99.9th percentile of all levels.
         """
-        full = float(np.percentile(self.levels, 99.9)) or float(self.levels.max()) or 1.0
-        least = 10 ** (-span_db / 10)
-        return np.asarray(10 * np.log10(np.clip(self.levels / np.float32(full), least, 1)), dtype=np.float32)
+        full_scale = float(np.percentile(self.levels, 99.9)) or float(self.levels.max()) or 1.0
+        lowest = 10 ** (-span_db / 10)
+        return np.asarray(10 * np.log10(np.clip(self.levels / np.float32(full_scale), lowest, 1)), dtype=np.float32)
 
     def save(self, path: str | Path) -> None:
         """Write an npz file atomically."""
@@ -249,24 +249,26 @@ def range_rates(frames: SonarFrames, velocity: Array | None = None) -> NDArray[n
     if velocity is None and len(frames) < 2:
         raise MitsonarError("one frame tells no velocity of the sonar: give velocity (1, 3) in m/s")
     # 1. Velocity of the sonar.
-    own = np.gradient(frames.poses[:, :3], time, axis=0) if velocity is None else np.asarray(velocity, dtype=float)
-    if own.shape != (len(frames), 3):
-        raise MitsonarError(f"the sonar's velocity must be ({len(frames)}, 3) in m/s: got {own.shape}")
-    found = np.full(frames.image.shape, np.nan, np.float32)
+    sonar_velocity = (
+        np.gradient(frames.poses[:, :3], time, axis=0) if velocity is None else np.asarray(velocity, dtype=float)
+    )
+    if sonar_velocity.shape != (len(frames), 3):
+        raise MitsonarError(f"the sonar's velocity must be ({len(frames)}, 3) in m/s: got {sonar_velocity.shape}")
+    range_rate = np.full(frames.image.shape, np.nan, np.float32)
     bodies = body_of_pixels(frames)
     for number in range(len(frames)):
         # 2. Direction and position of the echo of each pixel in the world, from its bearing and elevation.
         bins, beams = np.nonzero(np.isfinite(frames.elevation_rad[number]))
         elevation = frames.elevation_rad[number, bins, beams]
         poses = frames.poses[None, number] if frames.beam_poses is None else frames.beam_poses[number]
-        one = np.zeros_like(beams) if frames.beam_poses is None else beams
-        own_axes = directions(frames.sonar.bearing, frames.bearing_rad[beams], elevation)
-        way = np.einsum("nij,nj->ni", vehicle_rotation(poses).as_matrix()[one], own_axes)
-        place = poses[one, :3] + way * frames.range_m[bins, None]
+        pose_index = np.zeros_like(beams) if frames.beam_poses is None else beams
+        local_direction = directions(frames.sonar.bearing, frames.bearing_rad[beams], elevation)
+        direction = np.einsum("nij,nj->ni", vehicle_rotation(poses).as_matrix()[pose_index], local_direction)
+        position = poses[pose_index, :3] + direction * frames.range_m[bins, None]
         # 3. Relative velocity, projected on the direction.
-        moves = _velocity_at(frames, number, bodies[number, bins, beams], place) - own[number]
-        found[number, bins, beams] = (moves * way).sum(axis=1)
-    return found
+        relative_velocity = _velocity_at(frames, number, bodies[number, bins, beams], position) - sonar_velocity[number]
+        range_rate[number, bins, beams] = (relative_velocity * direction).sum(axis=1)
+    return range_rate
 
 
 def body_of_pixels(frames: SonarFrames) -> NDArray[np.int32]:
@@ -277,24 +279,24 @@ def body_of_pixels(frames: SonarFrames) -> NDArray[np.int32]:
     """
     if frames.object_id is None or frames.shape_id is None:
         raise MitsonarError("bodies of pixels need labels: render with --labels")
-    found = np.full(frames.image.shape, -1, np.int32)
+    body_index = np.full(frames.image.shape, -1, np.int32)
     for number, name in enumerate(frames.body_names):
         if name in frames.object_names:
-            found[frames.object_id == frames.object_names.index(name)] = number
+            body_index[frames.object_id == frames.object_names.index(name)] = number
         if name in frames.shape_names:  # a mesh that numbers its objects
-            found[frames.shape_id == frames.shape_names.index(name)] = number
-    return found
+            body_index[frames.shape_id == frames.shape_names.index(name)] = number
+    return body_index
 
 
-def _velocity_at(frames: SonarFrames, number: int, body: NDArray[np.int32], place: Array) -> Array:
+def _velocity_at(frames: SonarFrames, number: int, body: NDArray[np.int32], position: Array) -> Array:
     """Return the velocity at positions ``(n, 3)`` in one frame: v + w x r of the body there, or 0 for stationary parts."""
-    found = np.zeros_like(place)
+    velocity = np.zeros_like(position)
     if frames.body_poses is None or frames.body_velocities is None:
-        return found
-    on = body >= 0
-    moves, middle = frames.body_velocities[number, body[on]], frames.body_poses[number, body[on], :3]
-    found[on] = moves[:, :3] + np.cross(moves[:, 3:], place[on] - middle)
-    return found
+        return velocity
+    on_body = body >= 0
+    body_velocity, origin = frames.body_velocities[number, body[on_body]], frames.body_poses[number, body[on_body], :3]
+    velocity[on_body] = body_velocity[:, :3] + np.cross(body_velocity[:, 3:], position[on_body] - origin)
+    return velocity
 
 
 # ---------------- DVL readings
@@ -323,8 +325,8 @@ class DvlReadings:
     def of(cls, soundings: Soundings, range_rate: Array) -> Self:
         """Compute velocities from range rates ``(pings, beams)``, ignoring beams without an echo."""
         sounder = soundings.sounder
-        heard = np.where(soundings.found[..., 0], range_rate, np.nan)
-        return cls(soundings, heard, *velocity_of(heard, sounder.axes, sounder.beam_std_m_s))
+        valid_rates = np.where(soundings.found[..., 0], range_rate, np.nan)
+        return cls(soundings, valid_rates, *velocity_of(valid_rates, sounder.axes, sounder.beam_std_m_s))
 
     @property
     def locked(self) -> NDArray[np.bool_]:
@@ -335,8 +337,8 @@ class DvlReadings:
     def altitude_m(self) -> Array:
         """Return the height of the vehicle over the mean of the points where the beams hit ``(pings,)`` [m]."""
         depth = self.soundings.poses[:, None, 2] - self.soundings.points()[:, :, 0, 2]
-        there = np.isfinite(depth)
-        return np.where(there.any(axis=1), np.nansum(depth, axis=1) / np.maximum(there.sum(axis=1), 1), np.nan)
+        valid = np.isfinite(depth)
+        return np.where(valid.any(axis=1), np.nansum(depth, axis=1) / np.maximum(valid.sum(axis=1), 1), np.nan)
 
     def level(self) -> tuple[Array, Array]:
         """Return velocities ``(pings, 3)`` and covariances ``(pings, 3, 3)`` in level axes: sideways, forward, up.
@@ -345,8 +347,8 @@ class DvlReadings:
         """
         upright = self.soundings.poses.copy()
         upright[:, 3:5] = 0
-        turn = (vehicle_rotation(upright).inv() * vehicle_rotation(self.soundings.poses)).as_matrix()
-        return np.einsum("pij,pj->pi", turn, self.velocity), turn @ self.covariance @ turn.swapaxes(1, 2)
+        rotation = (vehicle_rotation(upright).inv() * vehicle_rotation(self.soundings.poses)).as_matrix()
+        return np.einsum("pij,pj->pi", rotation, self.velocity), rotation @ self.covariance @ rotation.swapaxes(1, 2)
 
     def save(self, path: str | Path) -> None:
         """Write a CSV file atomically; unknown values are empty cells."""
@@ -374,13 +376,13 @@ def velocity_of(range_rate: Array, axes: Array, std_m_s: float) -> tuple[Array, 
     Returns:
         Velocities ``(pings, 3)`` and covariances ``(pings, 3, 3)``, nan with fewer than three beams or coplanar beams.
     """
-    heard = np.isfinite(range_rate)
-    weight = heard.astype(float)
+    valid = np.isfinite(range_rate)
+    weight = valid.astype(float)
     information = np.einsum("pb,bi,bj->pij", weight, axes, axes)
-    right = -np.einsum("pb,bi->pi", np.where(heard, range_rate, 0), axes)
-    known = (heard.sum(axis=1) >= FEWEST_BEAMS) & (np.linalg.cond(information) < 1e6)
+    right = -np.einsum("pb,bi->pi", np.where(valid, range_rate, 0), axes)
+    determined = (valid.sum(axis=1) >= FEWEST_BEAMS) & (np.linalg.cond(information) < 1e6)
     inverse = np.full(information.shape, np.nan)
-    inverse[known] = np.linalg.inv(information[known])
+    inverse[determined] = np.linalg.inv(information[determined])
     return np.einsum("pij,pj->pi", inverse, right), inverse * std_m_s**2
 
 
@@ -390,8 +392,8 @@ def velocity_of(range_rate: Array, axes: Array, std_m_s: float) -> tuple[Array, 
 def save_pings(path: str | Path, sounder: Sounder, arrays: dict[str, NDArray[Any]]) -> None:
     """Write arrays and the instrument, as JSON, to an npz file, atomically."""
     buffer = io.BytesIO()
-    told = sounder.model_dump(mode="json", exclude={"fan"}) | {"fan": sounder.fan.model_dump(mode="json")}
-    table: dict[str, Any] = {"sounder": np.array(json.dumps(told)), **arrays}
+    fields = sounder.model_dump(mode="json", exclude={"fan"}) | {"fan": sounder.fan.model_dump(mode="json")}
+    table: dict[str, Any] = {"sounder": np.array(json.dumps(fields)), **arrays}
     np.savez_compressed(buffer, **table)
     write_whole(Path(path), buffer.getvalue())
 
@@ -405,19 +407,19 @@ def load_pings(path: str | Path, names: tuple[str, ...]) -> tuple[Sounder, dict[
         MitsonarError: a file that cannot be read or has another format.
     """
     try:
-        found = read_npz(path)
+        table = read_npz(path)
     except MitsonarError:
         raise
     except Exception as error:  # damaged bytes raise many types of errors
         raise MitsonarError(f"cannot read {path}: {error}; give a file that `mitsonar sound` wrote") from None
-    lacking = [name for name in (*names, "sounder", "time_s", "poses") if name not in found]
-    if lacking:
-        raise MitsonarError(f"{path} lacks {lacking[0]}: give a file that `mitsonar sound` wrote")
-    told: Any = parse_json(str(found.pop("sounder")), str(path))
-    if not isinstance(told, dict) or not isinstance(told.get("fan"), dict):
+    missing = [name for name in (*names, "sounder", "time_s", "poses") if name not in table]
+    if missing:
+        raise MitsonarError(f"{path} lacks {missing[0]}: give a file that `mitsonar sound` wrote")
+    fields: Any = parse_json(str(table.pop("sounder")), str(path))
+    if not isinstance(fields, dict) or not isinstance(fields.get("fan"), dict):
         raise MitsonarError(f"{path} tells of no instrument: give a file that `mitsonar sound` wrote")
-    sounder = Sounder.create(**{**told.pop("fan"), **told})
-    arrays = {name: found[name] for name in (*names, "time_s", "poses")}
+    sounder = Sounder.create(**{**fields.pop("fan"), **fields})
+    arrays = {name: table[name] for name in (*names, "time_s", "poses")}
     pings = len(arrays["time_s"]) if arrays["time_s"].ndim == 1 else -1
     for name, values in arrays.items():
         if values.dtype.kind != "f" or not values.ndim or len(values) != pings or np.isinf(values).any():
