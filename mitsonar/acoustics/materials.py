@@ -256,7 +256,7 @@ def sediment_of(phi: float) -> Sediment:
     if not COARSEST_PHI <= phi <= FINEST_PHI:
         raise MitsonarError(
             f"{argument('grain_size_phi')} must lie in {COARSEST_PHI:g}..{FINEST_PHI:g}, sandy gravel to clay: got "
-            f"{shortened(phi)}; give rock the named material, or numbers of your own"
+            f"{shortened(phi)}; use the named material rock, or give the parameters"
         )
     speed = _speed_ratio(phi)
     return Sediment(
@@ -474,8 +474,8 @@ class Material(CheckedModel):
 
     called: ClassVar[str] = "material"
 
-    name: str = Field("custom", max_length=200, description="what the material is called")
-    about: str = Field("", max_length=2000, description="what it stands for")
+    name: str = Field("custom", max_length=200, description="name of the material")
+    about: str = Field("", max_length=2000, description="description of the material")
     source: str = Field("", max_length=20_000, description="where its numbers come from")
     law: Law = Field("lambert", description="lambert, lommel-seeliger, rough-fluid or table")
     mu: float | None = Field(None, gt=0, le=1 / math.pi, description="cross-section at normal incidence [1/sr]")
@@ -703,7 +703,7 @@ def _fill_from_grain_size(fields: dict[str, PlainValue], text: str) -> dict[str,
     if isinstance(phi, bool) or not isinstance(phi, int | float):
         raise MitsonarError(f"grain_size_phi in {text} must be a number: got {shortened(phi)}")
     if "material" in fields:
-        raise MitsonarError(f"grain_size_phi and material say the same: {text} gives both; leave one of them out")
+        raise MitsonarError(f"grain_size_phi and material both set the parameters: {text} gives both; omit one of them")
     band = {"frequency_min_hz": 10e3, "frequency_max_hz": 100e3}
     source = f"grain size of {phi:g} phi: regressions of APL-UW TR 9407 (1994), section IV (not seen)"
     return {"law": "rough-fluid", "source": source, **band, **sediment_of(float(phi))._asdict(), **fields}
@@ -739,9 +739,7 @@ def check_image_mirrors(sonar: Sonar, views: Sequence[View] | None, mirrors: boo
             + (", or bounces 2" if sonar.model == "physical" else "")
         )
     if sonar.bounces > 1 and any(not isinstance(view, Whole) for view in views or ()):
-        raise MitsonarError(
-            "receivers elsewhere and portions hear one reflection: leave bounces out, or render the whole view"
-        )
+        raise MitsonarError("separate receivers and segments support one reflection: omit bounces, or render the whole view")
 
 
 def check_channel_mirrors(sonar: ChannelSonar, mirrors: bool, lacking: str) -> None:
@@ -758,4 +756,4 @@ def check_channel_mirrors(sonar: ChannelSonar, mirrors: bool, lacking: str) -> N
     if sonar.bounces > 1 and not mirrors:
         raise MitsonarError(f"bounces {sonar.bounces} need mirrors, and the scene has none: {lacking}")
     if mirrors and sonar.model == "rays":
-        raise MitsonarError("mirrors are of the model scatterers: got the model rays; leave them out, or choose scatterers")
+        raise MitsonarError("mirrors need the model scatterers: got the model rays; omit them, or choose scatterers")

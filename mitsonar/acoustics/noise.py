@@ -228,7 +228,7 @@ def refuse_noise(noise: NoiseModel | None, sonar: Sonar) -> None:
     """
     if noise is not None and not noise.is_none and sonar.model == "coherent":
         raise MitsonarError(
-            "the model coherent has noise of its own: got a noise of pixels; leave noise out and give the sonar "
+            "the model coherent adds its own noise: got pixel noise; omit noise and give the sonar "
             "noise_level_db, such as --set noise_level_db=60"
         )
 

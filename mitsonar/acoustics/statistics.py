@@ -325,7 +325,7 @@ def leak_power(intensity: ArrayLike, limit: float = np.inf) -> float:
 
 
 def smear_db(level_db: ArrayLike) -> float:
-    """Return the median excess of the quiet beams beside the brightest target of each frame over the rows around it [dB]."""
+    """Return the median excess of the quiet beams near the brightest target of each frame over the rows around it [dB]."""
     level = np.asarray(level_db, dtype=float)
     if level.shape[1] < 4 * (LEAK_GUARD + LEAK_BINS):
         return 0.0

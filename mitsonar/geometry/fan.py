@@ -102,7 +102,7 @@ def cartesian_map(range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -
     """
     range_m, bearing_rad = (np.asarray(a, dtype=float) for a in (range_m, bearing_rad))
     if (np.diff(range_m) <= 0).any() or (np.diff(bearing_rad) <= 0).any():
-        raise MitsonarError("range_m and bearing_rad must rise: sort the image's rows and columns")
+        raise MitsonarError("range_m and bearing_rad must increase: sort the image's rows and columns")
     range_edges, bearing_edges = _edges(range_m), _edges(bearing_rad)
     # Bounding box of the fan: its extremes lie at the edges, or where the fan crosses an axis.
     near, far = range_edges[[0, -1]]

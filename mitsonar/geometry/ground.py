@@ -653,7 +653,7 @@ def attitude_of(
     given = height_m if height_m is not None else _mean(frames.height_m)
     if pitch is None or (given is None and relief_m is not None):
         raise MitsonarError(
-            f"{name} needs height and pitch, and the frames do not hold both: give {argument('height_m')} and "
+            f"{name} needs height and pitch, and the frames do not contain both: give {argument('height_m')} and "
             f"{argument('pitch_rad')}"
         )
     if given is not None and not 0 < given < np.inf:

@@ -187,7 +187,7 @@ class ChannelSonar(Instrument):
     direct: bool = Field(False, description="sound also arrives directly from transmitter to receiver")
     spreading: bool | None = Field(None, description="amplitudes fall with distance; default: scatterers yes, rays no")
     points_per_m2: float = Field(
-        1700.0, gt=0, le=1e7, description="scatterers of surfaces without cells of their own [1/m2]"
+        1700.0, gt=0, le=1e7, description="density of the scatterers of surfaces without cells [1/m2]"
     )
     scatterer_spacing_m: float | None = Field(
         None, gt=0, le=10, description="pitch of the points on all surfaces [m], as of an imaging sonar; default: cells"
@@ -238,12 +238,12 @@ class ChannelSonar(Instrument):
             )
         if self.model == "rays" and (self.bounces > 1 or self.direct):
             raise ValueError(
-                f"bounces and direct are of the model scatterers, rays has one bounce: got bounces {self.bounces}, direct "
-                f"{str(self.direct).lower()}; leave them out, or choose the model scatterers"
+                f"bounces and direct need the model scatterers, since rays has one bounce: got bounces {self.bounces}, "
+                f"direct {str(self.direct).lower()}; omit them, or choose the model scatterers"
             )
         names = [receiver.name for receiver in self.receivers]
         if len(set(names)) < len(names):
-            raise ValueError(f"receivers must have names of their own: got {', '.join(names)}")
+            raise ValueError(f"receivers must have different names: got {', '.join(names)}")
         if round(taps) * len(names) > 2**24:
             raise ValueError(f"a measurement has at most {2**24:,} taps: got {round(taps) * len(names):,}")
         return self

@@ -222,7 +222,7 @@ def scanned(sonar: Sonar, *, sector_deg: float = 360.0, step_deg: float = 0.9, o
         MitsonarError: the sonar has more than one beam, or the sector is not a whole number of steps.
     """
     if sonar.beams != 1:
-        raise MitsonarError(f"a head that turns has one beam: got {sonar.beams}; give a sonar with beams 1")
+        raise MitsonarError(f"a rotating head has one beam: got {sonar.beams}; give a sonar with beams 1")
     steps = round(sector_deg / step_deg) if step_deg > 0 and 0 < sector_deg <= 360 else 0
     if steps < 2 or not math.isclose(steps * step_deg, sector_deg, rel_tol=1e-6):
         raise MitsonarError(
@@ -312,8 +312,8 @@ def first_sweeps(sonar: Sonar, path: Trajectory, count: int) -> Trajectory:
     sweep, duration_s = frame_period_s(sonar), float(path.time_s[-1] - path.time_s[0])
     if duration_s < count * sweep * (1 - 1e-9) and (len(path) > 1 or count > 1):
         raise MitsonarError(
-            f"a sweep lasts {sweep:.4g} s and the path {duration_s:.4g} s, room for {int(duration_s / sweep + 1e-9)}: got {count}; "
-            "--frames counts the sweeps of a head that turns: give fewer, or a longer path"
+            f"a sweep lasts {sweep:.4g} s and the path {duration_s:.4g} s, room for {int(duration_s / sweep + 1e-9)}: got "
+            f"{count}; --frames counts the sweeps of a rotating head: give fewer, or a longer path"
         )
     if len(path) == 1:
         return path
@@ -333,10 +333,11 @@ def overlap_notes(sonar: Sonar, time_s: NDArray[np.float64]) -> list[str]:
     interval_s = np.diff(time_s).min(initial=np.inf)
     if sonar.ping_groups == 1 or scans(sonar) or duration_s <= interval_s * (1 + 1e-6):
         return []
+    rate = _format_rounded_down(1 / duration_s)
     return [
-        f"the {sonar.ping_groups} pings of a frame last {duration_s:.3g} s and the next frame is due {interval_s:.3g} s later: they "
-        f"overlap, which no instrument does; a frame_rate_hz of {_format_rounded_down(1 / duration_s)} would do (of poses in a file, that many "
-        "a second), or a shorter range_max"
+        f"the {sonar.ping_groups} pings of a frame last {duration_s:.3g} s and the next frame is due {interval_s:.3g} s "
+        f"later: they overlap, which no instrument can do; lower frame_rate_hz to {rate} (or the rate of the poses in the "
+        "file), or range_max"
     ]
 
 
@@ -401,7 +402,7 @@ UNNAMED = "custom"
 class Instrument(CheckedModel):
     """Base class of all instruments."""
 
-    name: str = Field(UNNAMED, description="what the instrument is called")
+    name: str = Field(UNNAMED, description="name of the instrument")
 
     if TYPE_CHECKING:  # subclasses define these at different positions among their fields
         model: str
@@ -484,7 +485,7 @@ class Sonar(Instrument):
         0.0, ge=0, le=1e3, description="what a ping takes beyond its echo [s], where group_interval_s is not given"
     )
     quality: Quality = Field(
-        "standard", description="rays of `physical`: draft, standard or fine; `mitsonar presets` prints what each errs by"
+        "standard", description="rays of `physical`: draft, standard or fine; `mitsonar presets` prints the errors of each"
     )
     thesis_rays: int = Field(700, ge=1, le=1_000_000, description="rays over a beam's elevation of the model thesis")
     rays_per_beam: int = Field(
@@ -560,7 +561,7 @@ class Sonar(Instrument):
     stripes_db: float = Field(0.0, ge=0, le=20, description="spread of the beams' gains, by the seed [dB] (coherent)")
     coding: Coding | None = Field(
         None,
-        description="how values stand for levels (with a pattern): linear, dB or gamma; default: coherent dB, else linear",
+        description="how image values encode levels (with a pattern): linear, dB, gamma; default: coherent dB, else linear",
     )
     coding_db: float = Field(80.0, gt=0, le=300, description="span of the coding dB, from value 0 to 1 [dB]")
     coding_gamma: float = Field(0.5, gt=0, le=4, description="of the coding gamma: value = amplitude^gamma")
@@ -596,11 +597,11 @@ class Sonar(Instrument):
                 f"an image has at most {2**28:,} cells: got {self.beams * self.range_bins:,}; lower beams or range_bins"
             )
         if self.pulse_m is not None and self.bandwidth_hz is not None:
-            raise ValueError("pulse_m and bandwidth_hz say the same: give one of them")
+            raise ValueError("pulse_m and bandwidth_hz both set the range resolution: give one of them")
         check_groups(self)
         if self.bounces > 1 and self.model == "thesis":
             raise ValueError(
-                f"the model thesis knows one reflection: got bounces {self.bounces}; leave bounces out, or use physical or "
+                f"the model thesis supports one reflection: got bounces {self.bounces}; omit bounces, or use physical or "
                 "coherent"
             )
         if self.model == "coherent":
@@ -614,7 +615,7 @@ class Sonar(Instrument):
 
     def _check_coherent(self) -> None:
         if self.near_glow_db > 0 and self.noise_level_db is None:
-            raise ValueError("near_glow_db stands above the noise: give noise_level_db too")
+            raise ValueError("near_glow_db is relative to noise_level_db: give noise_level_db too")
         if self.frequency_hz is None:
             raise ValueError("the model coherent needs the carrier: give frequency_hz, 1.8e6 for example")
         across = math.degrees(self.beam_width_rad) if scans(self) else self.azimuth_fov_deg

@@ -59,8 +59,8 @@ class Sounder(CheckedModel):
     called: ClassVar[str] = "instrument"
     see: ClassVar[str] = SEE
 
-    name: str = Field("custom", description="what the instrument is called")
-    kind: Kind = Field(description="what is made of its echoes")
+    name: str = Field("custom", description="name of the instrument")
+    kind: Kind = Field(description="type of instrument")
     fan: Sonar = Field(description="the sonar at each mount")
     mounts: dict[str, Mount] = Field(
         min_length=1,
@@ -83,9 +83,8 @@ class Sounder(CheckedModel):
         instrument_keys = set(cls.model_fields) - {"fan"}
         unknown = sorted(set(fields) - instrument_keys - set(Sonar.model_fields))
         if unknown:
-            raise MitsonarError(
-                f"unknown instrument key {unknown[0]}: {nearest_names(unknown[0], instrument_keys | set(Sonar.model_fields))}"
-            )
+            known = instrument_keys | set(Sonar.model_fields)
+            raise MitsonarError(f"unknown instrument key {unknown[0]}: {nearest_names(unknown[0], known)}")
         fan = Sonar.create(**{key: value for key, value in fields.items() if key not in instrument_keys or key == "name"})
         return cls(fan=fan, **{key: value for key, value in fields.items() if key in instrument_keys})
 

@@ -79,7 +79,7 @@ class MeshSequence:
         if self.vertices.ndim != 3 or self.vertices.shape[2] != 3 or not len(self.vertices):
             raise MitsonarError(f"meshes are vertices (meshes, vertices, 3): got {self.vertices.shape}")
         if not 0 < self.rate_hz < np.inf:
-            raise MitsonarError(f"the rate of meshes must be positive: got {self.rate_hz:g}; give meshes a second")
+            raise MitsonarError(f"rate_hz must be positive: got {self.rate_hz:g}; give the number of meshes per second")
 
     def __call__(self, time_s: float) -> NDArray[np.float32]:
         """Return the vertices ``(vertices, 3)`` at a time [s]; before time 0, the first mesh or the loop applies."""

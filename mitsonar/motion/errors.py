@@ -122,7 +122,7 @@ def motion_errors(
     """
     if not len(true) or estimated.shape != true.shape or valid.shape != (len(true),):
         raise MitsonarError(
-            "errors need as many estimates as true motions, one at least: got "
+            "errors need equal numbers of estimated and true motions, at least one: got "
             f"{estimated.shape}, {true.shape}, {valid.shape}"
         )
     estimate = in_units(np.where(valid[:, None], estimated, 0.0))
@@ -401,7 +401,7 @@ def aligned(estimated: Trajectory, true: Trajectory, align: Alignment) -> Trajec
     """
     if len(estimated) != len(true):
         raise MitsonarError(
-            f"as many estimated as true poses are needed: got {len(estimated)} and {len(true)}; associate them"
+            f"the paths must have equal numbers of poses: got {len(estimated)} and {len(true)}; associate them"
         )
     estimated_position, true_position = estimated.poses[:, :3], true.poses[:, :3]
     if align == "none":
@@ -450,7 +450,7 @@ def relative_errors(
     """
     if len(estimated) != len(true):
         raise MitsonarError(
-            f"as many estimated as true poses are needed: got {len(estimated)} and {len(true)}; associate them"
+            f"the paths must have equal numbers of poses: got {len(estimated)} and {len(true)}; associate them"
         )
     first, second = _pairs(true, delta, unit, overlapping)
     true_step, true_turn = _relative_poses(true, first, second)
@@ -509,7 +509,7 @@ def _select(path: Trajectory, index: Index) -> Trajectory:
 
 
 def _nearest(values: Array, queries: Array) -> Index:
-    """Return the index of the nearest of increasing values for each wanted one."""
+    """Return the index of the nearest of increasing ``values`` for each query."""
     after = np.clip(np.searchsorted(values, queries), 1, max(len(values) - 1, 1))
     after = np.minimum(after, len(values) - 1)
     before = np.maximum(after - 1, 0)

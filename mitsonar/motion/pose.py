@@ -66,8 +66,8 @@ class Pose(_PoseFields):
         for name, angle in (("pitch", pitch), ("roll", roll), ("heading", heading)):
             if abs(angle) > FULL_TURN:
                 raise MitsonarError(
-                    f"{name} of a pose is in radians, at most a full turn of {FULL_TURN:.4g} rad: got {angle:g}; of degrees "
-                    "make it by Pose.from_degrees or np.radians, of a heading that went on turning by Pose.from_row"
+                    f"{name} of a pose is in radians, at most a full turn of {FULL_TURN:.4g} rad: got {angle:g}; use "
+                    "Pose.from_degrees for degrees, or Pose.from_row for a heading that has turned several times"
                 )
         return super().__new__(cls, x, y, z, pitch, roll, heading)
 
@@ -177,6 +177,6 @@ def pose_from_to_world(matrix: ArrayLike) -> Pose:
     if not np.isfinite(matrix).all():
         raise MitsonarError("the sonar's to_world must be finite: got inf or nan; give a lookat, translate or rotate")
     if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-4) or np.linalg.det(turn) < 0:
-        raise MitsonarError("the sonar's to_world may only turn and move: got a scale, shear or mirror; remove it")
+        raise MitsonarError("the sonar's to_world may only rotate and translate: got a scale, shear or mirror; remove it")
     poses = poses_from(matrix[:3, 3], Rotation.from_matrix(turn @ SENSOR_IN_VEHICLE.T))
     return Pose(*(float(value) for value in poses[0]))

@@ -181,7 +181,7 @@ class DeadReckoning:
                 f"dead reckoning needs a random walk above 0 m and rad: got {self.walk_m:g} and {self.walk_rad:g}"
             )
         if len(self.path) < 2 or not (np.diff(self.path.time_s) > 0).all():
-            raise MitsonarError("dead reckoning needs two poses or more, at times that increase: sort them")
+            raise MitsonarError("dead reckoning needs at least two poses, at increasing times: sort them")
 
     def poses_at(self, time_s: Array) -> Array:
         """Return interpolated poses at times ``(times, 6)``, constant before the first and after the last."""
@@ -540,7 +540,7 @@ def _sensor_columns(table: CsvTable) -> list[str]:
     if not POSITION_COLUMNS & set(table.names) or "heading_deg" not in columns:
         return columns
     if COLUMNS["heading_deg"][0] in table.names:
-        message = f"{table.path}: heading_deg is that of the poses beside it, and is not read"
+        message = f"{table.path}: heading_deg belongs to the poses in this file, and is not read as a compass"
         warnings.warn(f"{message}: name the column of a compass compass_deg, and its noise", MitsonarWarning, stacklevel=3)
     columns.remove("heading_deg")
     return columns

@@ -124,7 +124,7 @@ class Trajectory:
         if len(self) == 1:
             return np.repeat(self.poses, len(time), axis=0)
         if not (np.diff(self.time_s) > 0).all():
-            raise MitsonarError("poses between those of a trajectory need times that grow: got one that does not")
+            raise MitsonarError("interpolation of a trajectory needs increasing times: got one that does not increase")
         position = np.column_stack([np.interp(time, self.time_s, axis) for axis in self.poses[:, :3].T])
         return poses_from(position, Slerp(self.time_s, vehicle_rotation(self.poses))(time))
 
@@ -239,11 +239,12 @@ def _warn_of_attitude(
     others = [name for name in poses_by_frame if name != frame and fraction[name] <= 0.5]
     better = f"read as {' or '.join(others)} it would not" if others else "nor would it look down in another convention"
     pitch, roll, heading = np.degrees(poses_by_frame[frame][0, 3:])
-    count = round(fraction[frame] * len(poses_by_frame[frame]))
+    frames = len(poses_by_frame[frame])
+    count = round(fraction[frame] * frames)
     warnings.warn(
-        f"the sonar looks sideways or at the sky in {count} of {counted(len(poses_by_frame[frame]), 'frame')} of {path}, read as "
+        f"the sonar looks sideways or at the sky in {count} of {counted(frames, 'frame')} of {path}, read as "
         f"{frame} (first pose: pitch {pitch:.3g}, roll {roll:.3g}, heading {heading:.3g} deg); {better}: name the file's "
-        f"convention by --frame (frame= in Python), one of {', '.join(CONVENTIONS)}; nothing is wrong where that is meant",
+        f"convention by --frame (frame= in Python), one of {', '.join(CONVENTIONS)}; ignore this if it is intended",
         MitsonarWarning,
         stacklevel=3,
     )
@@ -325,7 +326,7 @@ def read_csv(path: str | Path, convention: Convention) -> tuple[Table, Table, Ta
     try:
         lines = list(csv.reader(io.StringIO(_read_text(path))))
     except csv.Error as error:
-        raise MitsonarError(f"cannot read trajectory {path}: it is no table of CSV ({error}); write it again") from None
+        raise MitsonarError(f"cannot read trajectory {path}: it is not a CSV table ({error}); write it again") from None
     if not lines or not any(word.strip() for word in lines[0]):
         raise MitsonarError(f"trajectory {path} holds no pose: its first line must name the columns, {COLUMNS}")
     names = [word.strip().lower() for word in lines[0]]
@@ -370,7 +371,7 @@ def _read_text(path: str | Path) -> str:
         reason = error.strerror if isinstance(error, OSError) else "not text"
         raise MitsonarError(f"cannot read trajectory {path}: {reason}; give a TUM or CSV file") from None
     if len(content) > LARGEST:
-        raise MitsonarError(f"trajectory {path} is larger than {LARGEST:,} bytes: it is no TUM or CSV file, or cut it")
+        raise MitsonarError(f"trajectory {path} is larger than {LARGEST:,} bytes: give a TUM or CSV file, or a shorter one")
     return text
 
 
@@ -379,7 +380,9 @@ def _refuse_other_convention(path: str | Path, line: str, convention: Convention
     match = re.search(r"\(frame ([\w-]+):", line)
     name = match.group(1) if match else "mitsonar" if MITSONAR_AXES in line else convention.name
     if name != convention.name:
-        raise MitsonarError(f"trajectory {path} says that it is {name}, and --frame {convention.name} is asked: give {name}")
+        raise MitsonarError(
+            f"trajectory {path} is in the convention {name}, but --frame is {convention.name}: give --frame {name}"
+        )
 
 
 def _refuse_disorder(path: str | Path, number: int, rows: list[list[float]]) -> None:

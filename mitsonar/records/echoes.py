@@ -117,7 +117,7 @@ def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
         if name not in channels:
             raise MitsonarError(f"{path} lacks the channel {name}: has {', '.join(sorted(channels))}")
         if channels[name].shape != shape:
-            raise MitsonarError(f"{path} must be {shape[1]} x {shape[0]} rays as its sonar: got {channels[name].shape}")
+            raise MitsonarError(f"{path} must have {shape[1]} x {shape[0]} rays, like its sonar: got {channels[name].shape}")
         values[name] = np.ascontiguousarray(channels[name], dtype=np.float32).ravel()
         if not np.isfinite(values[name]).all():
             raise MitsonarError(f"{path}: channel {name} holds inf or nan; render the echoes again with --exr")
@@ -138,6 +138,6 @@ def _check_header(header: dict[str, PlainValue], names: list[str], shape: tuple[
     low, high = (np.asarray(corner).tolist() for corner in header["dataWindow"])
     film_shape = (high[1] - low[1] + 1, high[0] - low[0] + 1)
     if film_shape != shape:
-        raise MitsonarError(f"must be {shape[1]} x {shape[0]} rays as its sonar: got {film_shape}")
+        raise MitsonarError(f"must have {shape[1]} x {shape[0]} rays, like its sonar: got {film_shape}")
     if len(names) > 100 or len(names) * 2 * shape[0] * shape[1] > INFLATION * size:
-        raise MitsonarError(f"promises {len(names)} channels of {shape[1]} x {shape[0]} rays in {size:,} bytes")
+        raise MitsonarError(f"declares {len(names)} channels of {shape[1]} x {shape[0]} rays in {size:,} bytes")

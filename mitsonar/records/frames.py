@@ -186,7 +186,7 @@ def _check_column_values(values: FileArray, name: str, column: Column, source: s
     if column.order != "any" and len(values) > 1:
         steps = np.diff(values, axis=0)
         if (steps < 0).any() or (column.order == "strict" and not (steps > 0).all()):
-            requirement = "grow" if column.order == "strict" else "not fall"
+            requirement = "increase" if column.order == "strict" else "not decrease"
             raise MitsonarError(f"{source}: {name} must {requirement} from row to row")
 
 
@@ -198,7 +198,7 @@ def text_of(table: Mapping[str, StoredArray], name: str, default: str | None = N
     """
     value = np.asarray(table[name]) if name in table else np.asarray(default)
     if value.ndim or value.dtype.kind != "U":
-        raise MitsonarError(f"{name} must be one text: got {str(value.dtype)[:20]} {str(value.shape)[:40]}")
+        raise MitsonarError(f"{name} must be a single string: got {str(value.dtype)[:20]} {str(value.shape)[:40]}")
     return str(value)
 
 
@@ -224,7 +224,7 @@ def table_in(table: Mapping[str, StoredArray], name: str, source: str, default: 
     except MitsonarError as error:
         raise MitsonarError(f"{source}: the field {name} is not JSON ({error}); the file is damaged") from None
     if not isinstance(value, dict):
-        raise MitsonarError(f"{source}: the field {name} is not JSON of a table; the file is damaged")
+        raise MitsonarError(f"{source}: the field {name} is not a JSON object; the file is damaged")
     return value
 
 
@@ -253,7 +253,7 @@ def open_group(
     """
     group, arrays = arrays_in(path, "r")
     if rows not in arrays or arrays[rows].ndim not in (1, 2) or arrays[rows].dtype.kind != "f":
-        raise ValueError(f"it lacks {rows}, a number for each row")
+        raise ValueError(f"it lacks {rows}, with a number per row")
     count = int(arrays[rows].shape[0])
     stored_bytes = sum(
         file.stat().st_size for file in (path / rows).rglob("*") if file.is_file() and file.name != "zarr.json"
@@ -306,10 +306,10 @@ def _check_chunks(name: str, array: StoredArray) -> None:
     if array.ndim > MAX_DIMENSIONS or array.dtype.kind not in "biufc":
         raise ValueError(f"{name} holds no numbers, or has more than {MAX_DIMENSIONS} dimensions")
     if any(chunk < 1 for chunk in array.chunks):
-        raise ValueError(f"{name} is cut into pieces of nothing")
+        raise ValueError(f"{name} has empty chunks")
     chunks = math.prod(-(-length // chunk) for length, chunk in zip(array.shape, array.chunks, strict=True))
     if chunks > MAX_CHUNKS_PER_ROW * max(1, array.shape[0] if array.ndim else 1):
-        raise ValueError(f"{name} is cut into {chunks:,} pieces")
+        raise ValueError(f"{name} has {chunks:,} chunks, too many")
     refuse_beyond_memory(math.prod(array.chunks) * array.dtype.itemsize, name)
 
 
@@ -462,7 +462,7 @@ class SonarFrames:
             MitsonarError: contrast images, whose levels cannot be recovered.
         """
         if self.level == "contrast":
-            raise MitsonarError("images of contrast hold no levels: take the frames before their contrast")
+            raise MitsonarError("contrast images hold no levels: use the frames from before the conversion to contrast")
         values = to_float32(self.image)
         if self.level == "linear":
             return values
@@ -591,7 +591,7 @@ def _texts(names: dict[str, Any], key: str, source: str) -> tuple[str, ...]:
     """
     texts = names.get(key, [])
     if not (isinstance(texts, list) and all(isinstance(text, str) for text in texts)):
-        raise MitsonarError(f"{source}: {key} of the field names must be a list of texts; the file is damaged")
+        raise MitsonarError(f"{source}: {key} of the field names must be a list of strings; the file is damaged")
     return tuple(texts)
 
 
@@ -679,7 +679,7 @@ class FrameStore:
             for partial in path.rglob("*.partial"):  # Zarr writes to a temporary name, then renames the file
                 partial.unlink()
         except Exception as error:  # a damaged Zarr raises many types of errors
-            raise MitsonarError(f"cannot go on with {path}: {error}; render again with --overwrite") from None
+            raise MitsonarError(f"cannot continue {path}: {error}; render again with --overwrite") from None
         return store
 
     def check(self, frames: int, sonar: Sonar, done: int) -> None:
@@ -698,19 +698,19 @@ class FrameStore:
         try:
             whole_number(self.group.attrs["frames_done"], "frames_done")
             if not done <= self.done <= frames:
-                raise ValueError(f"it holds {self.done:,} frames, run.json says {done:,} of {frames:,}")
+                raise ValueError(f"it holds {self.done:,} frames, run.json states {done:,} of {frames:,}")
             _, arrays = arrays_in(self.path, "r+")
             for name, array in arrays.items():
                 if name in COLUMNS and not (name == "time_s" and array.shape == (frames, cells[1])):
                     check_column(array, name, COLUMNS[name], sizes, "it")
                 expected_chunks = (1, *array.shape[1:]) if array.ndim == 3 else array.shape
                 if array.chunks != expected_chunks:
-                    raise ValueError(f"{name} is cut into pieces of {array.chunks}, not {expected_chunks}")
+                    raise ValueError(f"{name} has chunks of {array.chunks}, not {expected_chunks}")
             missing = {"image", "range_m", "bearing_rad", "time_s"} - set(arrays)
             if missing:
                 raise ValueError(f"it lacks {', '.join(sorted(missing))}")
         except Exception as error:
-            raise MitsonarError(f"cannot go on with {self.path}: {error}; render again with --overwrite") from None
+            raise MitsonarError(f"cannot continue {self.path}: {error}; render again with --overwrite") from None
 
     @property
     def frames(self) -> int:

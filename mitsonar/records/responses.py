@@ -63,7 +63,8 @@ class ImpulseResponses:
         expected_shape = (len(self.time_s), len(self.sonar.receivers), self.sonar.taps)
         if self.response.shape != expected_shape:
             raise MitsonarError(
-                f"response must be (pings, receivers, taps) = {expected_shape} after time_s and sonar: got {self.response.shape}"
+                f"response must be (pings, receivers, taps) = {expected_shape} after time_s and sonar: got "
+                f"{self.response.shape}"
             )
         for name in PER_PING:
             values = getattr(self, name)
@@ -143,7 +144,7 @@ class ImpulseResponses:
             raise MitsonarError(f"cannot read responses {path}: {reason}; give what `mitsonar impulse` wrote") from None
         missing = [name for name in ("response", "time_s", "sonar") if name not in table]
         if missing:
-            raise MitsonarError(f"{path} lacks {', '.join(missing)}: it holds no impulse responses of mitsonar")
+            raise MitsonarError(f"{path} lacks {', '.join(missing)}: it is not a file of impulse responses of mitsonar")
         sonar = ChannelSonar.create(**table_in(table, "sonar", str(path)))
         about = table_in(table, "about", str(path), "{}")
         values = {name: table[name] for name in PER_PING if name in table}

@@ -105,7 +105,9 @@ class Soundings:
         if path.suffix not in writers:
             raise MitsonarError(f"soundings are written as .npz, {', '.join(writers)}: got {path.name}")
         if not self.found.any():
-            raise MitsonarError(f"no beam has an echo, and {path.name} would be empty: move the window, or come nearer")
+            raise MitsonarError(
+                f"no beam has an echo, and {path.name} would be empty: move the window, or the instrument closer"
+            )
         write_whole(path, writers[path.suffix]())
         return None
 
@@ -247,7 +249,7 @@ def range_rates(frames: SonarFrames, velocity: Array | None = None) -> NDArray[n
         raise MitsonarError("range rates need labels and poses: render with --labels")
     time = frames.time_s if frames.time_s.ndim == 1 else frames.time_s.mean(axis=1)
     if velocity is None and len(frames) < 2:
-        raise MitsonarError("one frame tells no velocity of the sonar: give velocity (1, 3) in m/s")
+        raise MitsonarError("a single frame does not determine the velocity of the sonar: give velocity (1, 3) in m/s")
     # 1. Velocity of the sonar.
     sonar_velocity = (
         np.gradient(frames.poses[:, :3], time, axis=0) if velocity is None else np.asarray(velocity, dtype=float)
@@ -417,7 +419,7 @@ def load_pings(path: str | Path, names: tuple[str, ...]) -> tuple[Sounder, dict[
         raise MitsonarError(f"{path} lacks {missing[0]}: give a file that `mitsonar sound` wrote")
     fields: Any = parse_json(str(table.pop("sounder")), str(path))
     if not isinstance(fields, dict) or not isinstance(fields.get("fan"), dict):
-        raise MitsonarError(f"{path} tells of no instrument: give a file that `mitsonar sound` wrote")
+        raise MitsonarError(f"{path} describes no instrument: give a file that `mitsonar sound` wrote")
     sounder = Sounder.create(**{**fields.pop("fan"), **fields})
     arrays = {name: table[name] for name in (*names, "time_s", "poses")}
     pings = len(arrays["time_s"]) if arrays["time_s"].ndim == 1 else -1

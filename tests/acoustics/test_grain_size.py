@@ -71,7 +71,7 @@ def test_a_file_names_the_grain_size(tmp_path: Path) -> None:
         ("grain_size_phi: .nan\n", r"must lie in -1\.\.9"),
         ("grain_size_phi: fine\n", "grain_size_phi in .* must be a number: got 'fine'"),
         ("grain_size_phi: true\n", "must be a number: got True"),
-        ("grain_size_phi: 2\nmaterial: sand\n", "grain_size_phi and material say the same"),
+        ("grain_size_phi: 2\nmaterial: sand\n", "grain_size_phi and material both set the parameters"),
         ("grain_size_phi: 2\nlaw: lambert\nmu: 0.1\n", "law lambert has no key"),
     ],
 )

@@ -341,7 +341,7 @@ def test_odometry_and_mosaic_speak_the_convention_that_is_named(mitsonar: Comman
             np.testing.assert_allclose(bands(tmp_path / f"{frame}{ending}")[0], wanted, atol=1e-3)
     refused(
         mitsonar("mosaic", drawn, tmp_path / "ned" / "true.tum", "-o", tmp_path / "x.tif"),
-        "says that it is ned, and --frame mitsonar is asked",
+        "is in the convention ned, but --frame is mitsonar",
     )
     refused(mitsonar("odometry", drawn, "-o", tmp_path / "y", "--frame", "nde"), "unknown frame 'nde'", "did you mean ned?")
 

@@ -448,7 +448,7 @@ def test_speed_and_sweeps_are_as_asked_and_haste_is_told(mitsonar: Command, tmp_
 def test_pings_that_overlap_are_told(mitsonar: Command, tmp_path: Path) -> None:
     asked = ("--sonar", "didson300", "--from", "0,0,2,30,0,0", "--frames", 2, "--model", "physical", "--quality", "draft")
     done = mitsonar("render", "flat_floor", *asked, "--set", "ping_groups=8", "-o", tmp_path / "o")
-    assert "they overlap, which no instrument does; a frame_rate_hz of 16.7 would do" in done.stderr
+    assert "they overlap, which no instrument can do; lower frame_rate_hz to 16.7" in done.stderr
     kept = mitsonar("render", "flat_floor", *asked, "--set", "ping_groups=8", "-o", tmp_path / "o", "--resume")
     assert "they overlap" in kept.stderr
     slower = ("--set", "ping_groups=8", "--set", "frame_rate_hz=16")

@@ -214,5 +214,5 @@ def test_mirrors_of_responses_fit_the_instrument() -> None:
 
     with pytest.raises(MitsonarError, match=r"bounces 2 need mirrors, .* give the recipe the key mirrors"):
         impulse_recipe(channel={"bounces": 2})
-    with pytest.raises(MitsonarError, match="mirrors are of the model scatterers"):
+    with pytest.raises(MitsonarError, match="mirrors need the model scatterers"):
         impulse_recipe(channel={"model": "rays"}, mirrors={"surface": [-1, 0]})

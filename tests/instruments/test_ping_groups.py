@@ -99,7 +99,7 @@ def test_pings_that_overlap_are_told_with_the_rate_that_would_do() -> None:
     didson = preset("didson300").replace(ping_groups=8)
     (note,) = overlap_notes(didson, np.arange(3) / 21)
     assert "the 8 pings of a frame last 0.0597 s and the next frame is due 0.0476 s later" in note
-    rate = float(note.partition("frame_rate_hz of ")[2].split()[0])
+    rate = float(note.partition("frame_rate_hz to ")[2].split()[0])
     assert not overlap_notes(didson, np.arange(3) / rate)
     assert overlap_notes(didson, np.arange(3) / (rate * 1.01))
     for fine in (preset("didson300"), preset("ping360")):

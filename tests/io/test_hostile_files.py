@@ -119,7 +119,7 @@ def test_a_link_to_itself_is_refused(tmp_path: Path, variant: str) -> None:
 
 def test_a_lone_carriage_return_in_a_path_is_refused(tmp_path: Path) -> None:
     (tmp_path / "path.csv").write_bytes(b"time_s,x,y,z,qx,qy,qz,qw\n0,1\r2,0,0,0,0,0,1\n")
-    assert "path.csv: it is no table of CSV" in refusal(lambda: mitsonar.Trajectory.load(tmp_path / "path.csv"))
+    assert "path.csv: it is not a CSV table" in refusal(lambda: mitsonar.Trajectory.load(tmp_path / "path.csv"))
 
 
 # ---------------------------------------------------------------- mutants
@@ -506,16 +506,16 @@ def test_text_that_is_not_unicode_is_refused(name: str, tmp_path: Path) -> None:
 BAD_FRAMES: dict[str, tuple[dict[str, Any], str]] = {
     "a scalar for an array": ({"range_m": np.array(3.0)}, "range_m must be float"),
     "text for an array": ({"image": np.array("x")}, "image must be"),
-    "an array for text": ({"level": np.zeros(3)}, "level must be one text"),
+    "an array for text": ({"level": np.zeros(3)}, "level must be a single string"),
     "a scale of nan": ({"level_scale": np.array(np.nan)}, "level_scale must be a finite number"),
     "complex pixels": ({"image": np.zeros((3, 6, 4), complex)}, "image must be"),
     "pixels of nan": ({"image": np.full((3, 6, 4), np.nan, np.float32)}, "nan or inf"),
     "negative pixels": ({"image": np.full((3, 6, 4), -1, np.float32)}, "must lie in 0"),
     "pixels above 1": ({"image": np.full((3, 6, 4), 2, np.float32)}, "0..1"),
-    "ranges that fall": ({"range_m": np.arange(6.0)[::-1].copy()}, "must grow"),
+    "ranges that fall": ({"range_m": np.arange(6.0)[::-1].copy()}, "must increase"),
     "ranges of inf": ({"range_m": np.array([1, 2, 3, 4, 5, np.inf])}, "nan or inf"),
     "bearings that fall": ({"bearing_rad": -np.arange(4.0)}, "must"),
-    "times that go back": ({"time_s": np.array([0.0, 2.0, 1.0])}, "must not fall"),
+    "times that go back": ({"time_s": np.array([0.0, 2.0, 1.0])}, "must not decrease"),
     "times of nan": ({"time_s": np.array([0.0, np.nan, 1.0])}, "nan or inf"),
     "poses of five": ({"poses": np.zeros((3, 5))}, "poses must be float"),
     "poses of inf": ({"poses": np.full((3, 6), np.inf)}, "nan or inf"),
@@ -545,7 +545,7 @@ BAD_RESPONSES: dict[str, tuple[dict[str, Any], str]] = {
     "nan": ({"velocity": np.full((2, 4), np.nan)}, "nan or inf"),
     "negative counts": ({"echoes": np.full((2, 4), -1)}, "must lie in 0"),
     "counts of floats": ({"echoes": np.ones((2, 4))}, "echoes must be int"),
-    "times that go back": ({"time_s": np.array([1.0, 0.0])}, "must not fall"),
+    "times that go back": ({"time_s": np.array([1.0, 0.0])}, "must not decrease"),
     "deep JSON": ({"sonar": np.array("[" * 100_000)}, "sonar is not JSON"),
 }
 

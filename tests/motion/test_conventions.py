@@ -255,7 +255,9 @@ def test_a_file_that_says_its_convention_is_not_read_in_another(tmp_path: Path, 
     if written == read:
         Trajectory.load(tmp_path / "path.tum", read)
         return
-    with pytest.raises(MitsonarError, match=f"says that it is {written}, and --frame {read} is asked: give {written}"):
+    with pytest.raises(
+        MitsonarError, match=f"is in the convention {written}, but --frame is {read}: give --frame {written}"
+    ):
         Trajectory.load(tmp_path / "path.tum", read)
 
 

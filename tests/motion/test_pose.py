@@ -100,7 +100,7 @@ def test_looking_straight_down_or_up(pitch: float, kind: type) -> None:
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
-        (np.diag([2.0, 2.0, 2.0, 1.0]), "only turn and move: got a scale"),
+        (np.diag([2.0, 2.0, 2.0, 1.0]), "only rotate and translate: got a scale"),
         (np.diag([-1.0, 1.0, 1.0, 1.0]), "mirror"),
         (np.array([[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "shear"),
         (np.diag([np.nan, 1.0, 1.0, 1.0]), "must be finite"),
@@ -277,9 +277,7 @@ def test_a_pitched_mount_keeps_the_rest_to_the_bit() -> None:
 @pytest.mark.parametrize("angles", [{"pitch": 35.0}, {"roll": -10.0}, {"heading": 90.0}])
 def test_degrees_where_radians_are_meant_are_refused(angles: dict[str, float]) -> None:
     (name,) = angles
-    with pytest.raises(
-        MitsonarError, match=rf"{name} of a pose is in radians.*got .*of degrees make it by Pose\.from_degrees"
-    ):
+    with pytest.raises(MitsonarError, match=rf"{name} of a pose is in radians.*got .*use Pose\.from_degrees for degrees"):
         Pose(0, 0, 2.5, **angles)
 
 

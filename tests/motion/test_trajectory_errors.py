@@ -158,7 +158,7 @@ def test_what_cannot_be_aligned() -> None:
         aligned(straight(11, yaw=0.01), true, "space")
     with pytest.raises(MitsonarError, match="path without motion"):
         aligned(straight(11, step=0.0), true, "plane")
-    with pytest.raises(MitsonarError, match="as many estimated as true poses are needed: got 10 and 11"):
+    with pytest.raises(MitsonarError, match="the paths must have equal numbers of poses: got 10 and 11"):
         absolute_errors(straight(10), true)
     with pytest.raises(MitsonarError, match="align must be one of none, first, plane, space: got 'umeyama'"):
         aligned(true, true, "umeyama")  # type: ignore[arg-type]
@@ -197,7 +197,7 @@ def test_relative_errors_do_not_see_where_the_path_lies() -> None:
 def test_deltas_that_cannot_be(delta: float, unit: str, message: str) -> None:
     with pytest.raises(MitsonarError, match=message):
         relative_errors(straight(11), straight(11), delta, unit)  # type: ignore[arg-type]
-    with pytest.raises(MitsonarError, match="as many estimated as true poses"):
+    with pytest.raises(MitsonarError, match="the paths must have equal numbers of poses"):
         relative_errors(straight(10), straight(11))
 
 

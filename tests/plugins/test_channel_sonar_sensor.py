@@ -76,7 +76,7 @@ BAD: list[tuple[MitsubaDict, str]] = [
     ({"frequency_step_hz": 20}, "frequency_step_hz must be below .* = 15 Hz"),
     ({"frequency_step_hz": 7}, "sampling_hz must be a whole number of frequency_step_hz"),
     ({"receivers": ()}, "receivers"),
-    ({"receivers": four_receivers()[:1] * 2}, "names of their own"),
+    ({"receivers": four_receivers()[:1] * 2}, "different names"),
     ({"receivers": [{"name": "a b"}]}, "letters, digits"),
     ({"receivers": [{"name": "a", "position": (0, 0, np.inf)}]}, "position must be finite"),
     ({"receivers": [{"name": "a", "field": {"across_deg": 0}}]}, "across_deg"),

@@ -138,7 +138,7 @@ CROP: MitsubaDict = {"crop_width": 8, "crop_height": 12, "crop_offset_x": 0, "cr
         ({"beams": 0}, r"sonar beams: .* got 0"),
         ({"range_max": 1.0}, r"range_max must exceed range_min: got 1 m <= 3\.2 m"),
         ({"ping": -1}, r"ping must be 0 or more: got -1"),
-        ({"to_world": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]}, r"only turn and move"),
+        ({"to_world": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]}, r"only rotate and translate"),
     ],
 )
 def test_contradictions_are_errors_that_say_so(fields: MitsubaDict, message: str) -> None:

@@ -97,7 +97,7 @@ def test_a_law_may_exceed_1_at_flat_angles(tmp_path: Path) -> None:
 
 def test_another_size_and_no_exr(tmp_path: Path) -> None:
     write(tmp_path / "e.exr", table())
-    with pytest.raises(MitsonarError, match=r"must be 20 x 9 rays as its sonar: got \(9, 10\)"):
+    with pytest.raises(MitsonarError, match=r"must have 20 x 9 rays, like its sonar: got \(9, 10\)"):
         load_exr(tmp_path / "e.exr", SONAR.replace(rays_across=4))
     with pytest.raises(MitsonarError, match="no such echo file"):
         load_exr(tmp_path / "absent.exr", SONAR)

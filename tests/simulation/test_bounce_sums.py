@@ -168,13 +168,13 @@ def test_groups_of_beams_at_rest_are_one_ping(pattern: str) -> None:
 def test_what_has_one_reflection_refuses_more() -> None:
     loaded, _ = under_surface(1.0, np.array([0.3, 5.0, -1.3]))
     several = SONAR.replace(bounces=2)
-    with pytest.raises(MitsonarError, match="portions hear one reflection"):
+    with pytest.raises(MitsonarError, match="segments support one reflection"):
         Simulator(loaded, several, views=[Segment(several, "port")])
     with pytest.raises(MitsonarError, match="has no mirrors: give the sonar model coherent, or bounces 2"):
         Simulator(loaded, SONAR, mirrors={"top": (1.0, 0.0)})
     with pytest.raises(MitsonarError, match="give frequency_hz"):
         Simulator(loaded, several.replace(frequency_hz=None), mirrors={"top": (1.0, 1e-4)})
-    with pytest.raises(MitsonarError, match="the model thesis knows one reflection"):
+    with pytest.raises(MitsonarError, match="the model thesis supports one reflection"):
         SONAR.replace(model="thesis", bounces=2)
     for wrong in (0, 4, 1.5):
         with pytest.raises(MitsonarError, match="bounces"):

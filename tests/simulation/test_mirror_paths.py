@@ -263,9 +263,9 @@ def test_mirrors_that_do_not_fit_are_refused() -> None:
         ChannelSimulator(guide(), instrument(points_per_m2=1e-3))
     with pytest.raises(MitsonarError, match="the scene has no shape surfase"):
         ChannelSimulator(guide(), instrument(), mirrors={"surfase": (-1.0, 0.0)})
-    with pytest.raises(MitsonarError, match="bounces and direct are of the model scatterers"):
+    with pytest.raises(MitsonarError, match="bounces and direct need the model scatterers"):
         instrument(bounces=1).replace(model="rays")
-    with pytest.raises(MitsonarError, match="mirrors are of the model scatterers: got the model rays"):
+    with pytest.raises(MitsonarError, match="mirrors need the model scatterers: got the model rays"):
         ChannelSimulator(guide(), ChannelSonar(model="rays"), mirrors=GUIDE)
     with pytest.raises(MitsonarError, match="bounces"):
         ChannelSonar().replace(bounces=4)

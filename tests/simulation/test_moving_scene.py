@@ -127,7 +127,7 @@ def test_steps_are_the_frames_of_a_run() -> None:
     [
         ({"wal": along(5)}, "the scene has no shape wal"),
         ({"wall": []}, "follows a Trajectory"),
-        ({"wall": Trajectory(np.zeros((2, 6)), np.zeros(2))}, "times that grow"),
+        ({"wall": Trajectory(np.zeros((2, 6)), np.zeros(2))}, "increasing times"),
     ],
 )
 def test_mistakes_are_told(moving: Any, said: str) -> None:

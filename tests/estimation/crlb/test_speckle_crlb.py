@@ -203,7 +203,7 @@ def test_grain_tells_far_more_than_ground_and_noise_hides_both() -> None:
     simulator = source(-90.0)
     found = cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["none"], 1.0)
     np.testing.assert_allclose(found[0], quiet["ground"].std(2))
-    with pytest.raises(MitsonarError, match="noise of its own"):
+    with pytest.raises(MitsonarError, match="adds its own noise"):
         cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["low"], 1e-3)
     with pytest.raises(MitsonarError, match="unknown law 'rays'"):
         cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["none"], 1e-3, law="rays")
