@@ -1,4 +1,4 @@
-"""Compute sound absorption and sound speed in sea water and fresh water, with the validity of the formulas.
+"""How sound travels through water: its speed and absorption with the validity of the formulas, and the delay of its paths.
 
 Absorption is in dB per metre of path, one way. Above 1 MHz both formulas extrapolate; the dominant term there is the
 viscosity of pure water, which grows with the square of the frequency.
@@ -7,8 +7,8 @@ viscosity of pure water, which grows with the square of the frequency.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import ClassVar, Literal
+from collections.abc import Iterable, Sequence
+from typing import ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,12 @@ __all__ = [
     "absorption_db_per_m",
     "absorption_line",
     "absorption_warning",
+    "delay_exact",
+    "delay_iterated",
+    "delay_static",
+    "dot",
     "gain_of",
+    "length",
     "loss_notes",
     "loss_of",
     "noise_of",
@@ -332,3 +337,60 @@ def noise_of(sonar: Sonar) -> NDArray[np.float64]:
     glow = np.maximum(0.0, sonar.near_glow_db * (1 - sonar.range_m / sonar.near_glow_m))
     power = 10 ** ((sonar.noise_level_db - sonar.source_level_db + glow) / 10)
     return np.asarray(power * gain_of(sonar), dtype=np.float64)
+
+
+# ---------------- Delays from the transmitter via a point to a moving receiver
+# The equations are those of Almanza-Medina, sections 5.2.2 and 5.2.3. The functions accept NumPy arrays and Dr.Jit arrays.
+
+
+Vector: TypeAlias = Sequence[AnyArray] | NDArray[np.floating]
+"""Three coordinates: a sequence of NumPy or Dr.Jit arrays, or an array whose first axis holds them."""
+
+
+def dot(a: Vector, b: Vector) -> AnyArray:
+    """Return the inner product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def length(a: Vector) -> AnyArray:
+    """Return the Euclidean length."""
+    return dot(a, a) ** 0.5
+
+
+def delay_static(to_point: Vector, from_receiver: Vector, sound_speed: float) -> AnyArray:
+    """Return the delay for a vehicle at rest (Almanza-Medina, eq. 5.1-5.4) [s].
+
+    Args:
+        to_point: vector from the transmitter to the point, P - A [m].
+        from_receiver: vector from the receiver to the point, P - B, when the sound is sent [m].
+        sound_speed: [m/s].
+    """
+    return (length(to_point) + length(from_receiver)) / sound_speed
+
+
+def delay_iterated(
+    to_point: Vector, from_receiver: Vector, velocity: Vector, sound_speed: float, times: int = 2
+) -> AnyArray:
+    """Return the delay to a receiver that moves while sound travels, by iteration (Almanza-Medina, eq. 5.5-5.14) [s].
+
+    Each round moves the receiver along its velocity for the previous delay. Almanza-Medina takes two rounds.
+    """
+    out = length(to_point) / sound_speed
+    delay = out + length(from_receiver) / sound_speed
+    for _ in range(times):
+        moved = [q - v * delay for q, v in zip(from_receiver, velocity, strict=True)]
+        delay = out + length(moved) / sound_speed
+    return delay
+
+
+def delay_exact(to_point: Vector, from_receiver: Vector, velocity: Vector, sound_speed: float) -> AnyArray:
+    """Return the exact delay to a receiver that moves while sound travels [s]: the limit of :func:`delay_iterated`.
+
+    |P - B - v tau| = c (tau - tau_0) is a quadratic equation, whose larger root is the one after tau_0. Let s = tau - tau_0,
+    and let q be the vector from the receiver to P when the sound is at P. Then (c^2 - v^2) s^2 + 2 q.v s - q^2 = 0. This
+    form suffers no cancellation.
+    """
+    out = length(to_point) / sound_speed
+    left = [q - v * out for q, v in zip(from_receiver, velocity, strict=True)]
+    closing, speed2 = dot(left, velocity), sound_speed**2 - dot(velocity, velocity)
+    return out + ((closing * closing + speed2 * dot(left, left)) ** 0.5 - closing) / speed2

@@ -34,7 +34,7 @@ __all__ = ["ChannelSimulator", "Channels", "Paths", "frequency_response", "impul
 
 FOR_PATHS = ("counts", "beyond", "delay", "amplitude", "phase", "doppler")
 FOR_RESPONSES = ("counts", "beyond", "turn", "real", "imag")
-"""Fields of :class:`~mitsonar.simulation.link_geometry.EchoBatch` that a launch returns."""
+"""Fields of :class:`~mitsonar.simulation.scatterers.EchoBatch` that a launch returns."""
 
 LACKING = (
     'give reflection and rms height by the ids of shapes, mirrors={"surface": (-1.0, 0.0)}, or "materials" (--mirrors) with '

@@ -11,13 +11,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.acoustics.water import delay_exact
 from mitsonar.instruments.hydrophones import PADDING, ChannelSonar
 from mitsonar.simulation.beams import phasors
 from mitsonar.simulation.device import DeviceArray, Frozen, padded, replayed
-from mitsonar.simulation.link_geometry import ScatteringPoints, link_table
-from mitsonar.simulation.links import delay_exact
-from mitsonar.simulation.mirrors import ROW, MirrorFacets, MirrorWay, PlaneRow, mirror_ways, unfolded
-from mitsonar.simulation.scatterers import ChannelTracer, EchoValues
+from mitsonar.simulation.mirrors import ROW, MirrorFacets, MirrorWay, PlaneRow, ScatteringPoints, mirror_ways, unfolded
+from mitsonar.simulation.scatterers import ChannelTracer, EchoValues, link_table
 from mitsonar.simulation.tracing import hidden
 
 __all__ = ["APART_M", "FacetEchoes", "MirrorPaths", "facet_echoes", "half_fresnel_m", "phase_mean"]
@@ -198,7 +197,7 @@ def echo_values(
     doppler: NDArray[np.float64],
     valid: NDArray[np.bool_],
 ) -> EchoValues:
-    """Return echoes as NumPy arrays with the fields of :class:`~mitsonar.simulation.link_geometry.EchoBatch`.
+    """Return echoes as NumPy arrays with the fields of :class:`~mitsonar.simulation.scatterers.EchoBatch`.
 
     Args:
         sonar: the instrument.

@@ -18,13 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.materials import Material
+from mitsonar.acoustics.water import dot, length
 from mitsonar.errors import MitsonarError, nearest_names, shortened
-from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.plugins.material_laws import material_of
 from mitsonar.plugins.surfaces import Hit, Surfaces, registry_index
 from mitsonar.simulation.device import DeviceArray
-from mitsonar.simulation.link_geometry import LINK, Leg, LinkGeometry, ScatteringPoints
-from mitsonar.simulation.links import dot, length
 from mitsonar.simulation.tracing import OFF_SURFACE, hidden
 
 __all__ = [
@@ -36,10 +34,10 @@ __all__ = [
     "MirrorPart",
     "MirrorPlane",
     "MirrorWay",
-    "MirroredLink",
     "Mirroring",
     "Mirrors",
     "PlaneRow",
+    "ScatteringPoints",
     "SecondMirror",
     "SecondMirrors",
     "WayBack",
@@ -47,7 +45,6 @@ __all__ = [
     "flat_mirrors",
     "mirror_of",
     "mirror_ways",
-    "mirrored_table",
     "second_notes",
     "unfolded",
 ]
@@ -458,27 +455,21 @@ def mirror_ways(planes: Sequence[MirrorPlane], length: int) -> list[MirrorWay]:
     return [MirrorWay(way) for way in ways]
 
 
-def mirrored_table(
-    table: NDArray[np.float64], out: MirrorWay, back: MirrorWay, registry: dict[int, int]
-) -> NDArray[np.float64]:
-    """Return the geometry of a link via mirrors: :func:`~mitsonar.simulation.link_geometry.link_table` of the images.
-
-    Positions, velocities and fields of view are those of the images; the rows of both sequences of mirrors follow.
-
-    Args:
-        table: table of the link without mirrors ``(30,)``.
-        out: mirrors from the transmitter to the points.
-        back: mirrors from the receiver to the points, backwards in time.
-        registry: see :meth:`MirrorWay.rows`.
-    """
-    places = out.images(table[0:3])[-1], back.images(table[3:6])[-1]
-    velocities = out.turn @ table[6:9], back.turn @ table[9:12]
-    axes = table[12:21].reshape(3, 3) @ back.turn.T, table[21:30].reshape(3, 3) @ out.turn.T
-    rows = out.rows(table[0:3], registry), back.rows(table[3:6], registry)
-    return np.concatenate([*places, *velocities, *(part.ravel() for part in (*axes, *rows))])
-
-
 # ---------------- Unfolded paths: visibility and loss
+
+
+class ScatteringPoints(NamedTuple):
+    """Points on surfaces.
+
+    Attributes:
+        at: position [m].
+        exact: position in double precision, three arrays [m].
+        normal: unit normal of the surface.
+    """
+
+    at: DeviceArray
+    exact: list[DeviceArray]
+    normal: DeviceArray
 
 
 class PlaneRow(NamedTuple):
@@ -587,38 +578,6 @@ def _meets(
     aside = dr.abs(dr.dot(mi.Vector3f(*row.normal), met) - mi.Float(row.offset))
     near = 4 * size * OFF_SURFACE + mi.Float(row.slab_m)
     return found.is_valid() & (index == mi.UInt32(row.registry)) & (aside < near)
-
-
-class MirroredLink(LinkGeometry):
-    """Geometry between the images of transmitter and receiver.
-
-    Args:
-        sonar: the instrument.
-        receiver: index of the receiver.
-        table: as returned by :func:`~mitsonar.simulation.mirrors.mirrored_table`.
-        out: number of mirrors between transmitter and points.
-        back: number of mirrors between points and receiver.
-    """
-
-    def __init__(self, sonar: ChannelSonar, receiver: int, table: mi.Float64, out: int, back: int) -> None:
-        self.out, self.back = out, back
-        super().__init__(sonar, receiver, table)
-        self.wavenumber = 2 * math.pi / sonar.wavelength_m
-
-    @property
-    def size(self) -> int:
-        """Return the length of the table."""
-        return LINK + (ROW + 1) * (self.out + self.back)
-
-    def reached(
-        self, scene: mi.Scene, point: ScatteringPoints, sent: Leg, received: Leg, active: DeviceArray
-    ) -> tuple[DeviceArray, DeviceArray]:
-        """Return which points sound reaches via the mirrors, out and back, and the product of the mirrors' factors."""
-        starts = [LINK + (ROW + 1) * k for k in range(self.out + self.back)]
-        rows = [PlaneRow.of(self.numbers[start : start + ROW + 1]) for start in starts]
-        active, there = unfolded(scene, point, self.vector(0), rows[: self.out], self.wavenumber, active)
-        active, back = unfolded(scene, point, self.vector(3), rows[self.out :], self.wavenumber, active)
-        return active, there * back
 
 
 # ---------------- Return paths via a second mirror

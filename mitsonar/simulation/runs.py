@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.acoustics.water import delay_exact, delay_iterated
 from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar, TimedPath, overlap_notes, timed_path
@@ -40,7 +41,6 @@ from mitsonar.records.responses import COLUMNS, ImpulseResponses
 from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.channel import ChannelSimulator, Paths
 from mitsonar.simulation.device import current_variant, ensure_variant, padded
-from mitsonar.simulation.links import delay_exact, delay_iterated
 from mitsonar.simulation.pings import RenderedPings, Tally, constant_gain, labels_above, to_image
 from mitsonar.simulation.simulator import Simulator
 from mitsonar.simulation.sounding import SoundedPings, SounderSimulator, dvl_readings, dvl_sensors

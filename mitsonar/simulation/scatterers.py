@@ -15,32 +15,34 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from mitsonar.acoustics.water import delay_exact, delay_iterated
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
+from mitsonar.instruments.hydrophones import PADDING, ChannelSonar, FieldOfView, Maths
+from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.plugins.bsdf_reflectance import is_black, reflectances_of, reflectivity_at
 from mitsonar.plugins.cell_noise import CellNoise
 from mitsonar.plugins.hashed_texture import ROUNDS
 from mitsonar.plugins.surfaces import Surfaces, registry_index
 from mitsonar.simulation.device import DeviceArray, Frozen, LaunchTables, padded, replayed
-from mitsonar.simulation.link_geometry import EchoBatch, Leg, LinkGeometry, ScatteringPoints, link_table
-from mitsonar.simulation.links import delay_exact, delay_iterated
 from mitsonar.simulation.mirrors import (
+    ROW,
     FlatMirrors,
-    MirroredLink,
     Mirrors,
     MirrorWay,
+    PlaneRow,
+    ScatteringPoints,
     flat_mirrors,
     mirror_ways,
-    mirrored_table,
+    unfolded,
 )
 from mitsonar.simulation.points import Patches, SurfacePoints, lattice_points, lattice_size
-from mitsonar.simulation.tracing import height_below
+from mitsonar.simulation.tracing import height_below, hidden
 
-__all__ = ["DIRECT", "ChannelTracer", "EchoValues", "ScattererWay", "Scatterers"]
+__all__ = ["DIRECT", "ChannelTracer", "EchoBatch", "EchoValues", "LinkGeometry", "ScattererWay", "Scatterers", "link_table"]
 
 
 EchoValues: TypeAlias = dict[str, NDArray[Any]]
-"""Fields of :class:`~mitsonar.simulation.link_geometry.EchoBatch` keyed by name, as NumPy arrays ``(points,)``."""
+"""Fields of :class:`EchoBatch` keyed by name, as NumPy arrays ``(points,)``."""
 
 _Launch: TypeAlias = Callable[..., list[DeviceArray]]
 """A frozen launch, which maps indices, scene, link table and source tables to values."""
@@ -324,6 +326,212 @@ def _even(field: FieldOfView, rays: int) -> NDArray[np.float64]:
 
 MARGIN_DEG = 2.0
 """Angle by which the rays exceed a receiver's field of view: 0.1 m at 3 m."""
+
+
+# ---------------- Geometry of a link: where both ends are in one ping, and what echoes they exchange via points
+
+
+LINK = 30
+"""Length of :func:`link_table`."""
+
+DRJIT = Maths(dr.asin, dr.atan2, dr.cos, dr.clip, dr.select)
+
+
+class Leg(NamedTuple):
+    """Unit direction from transmitter or receiver (or its image) to points, and distance [m]."""
+
+    u: DeviceArray
+    length: DeviceArray
+
+
+@dataclass
+class EchoBatch:
+    """Echoes as unevaluated Dr.Jit arrays, one value for each point.
+
+    Attributes:
+        delay: delay of the echo [s].
+        amplitude: magnitude of the echo.
+        phase: phase of the scatterer, without that of the delay [rad]; a single 0 in the model ``rays``.
+        doppler: Doppler shift of the carrier [Hz].
+        counts: whether there is an echo within ``range_max``.
+        beyond: whether there is an echo from beyond ``range_max``.
+        turn: phase of the delay at the finest frequency step, -pi..pi, for the transform [rad].
+        real, imag: complex amplitude, with the phases of the scatterer and the carrier.
+    """
+
+    delay: DeviceArray
+    amplitude: DeviceArray
+    phase: DeviceArray
+    doppler: DeviceArray
+    counts: DeviceArray
+    beyond: DeviceArray
+    turn: DeviceArray
+    real: DeviceArray
+    imag: DeviceArray
+
+
+def link_table(
+    sonar: ChannelSonar, receiver: int, pose: NDArray[np.float64], velocity: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the geometry of one ping in the world ``(30,)``.
+
+    The table holds the positions of transmitter and receiver [m] and their velocities [m/s], three numbers each, then the
+    axes of the receiver's and of the transmitter's field of view, nine numbers each.
+    """
+    turn = vehicle_rotation(pose).as_matrix()[0]
+    one = sonar.receivers[receiver]
+    offset = np.array(one.position)
+    swing = velocity[:3] + np.cross([0.0, 0.0, -velocity[3]], offset)
+    axes = [field.axes @ turn.T for field in (one.field, sonar.transmitter)]
+    places, velocities = (pose[:3], pose[:3] + turn @ offset), (turn @ velocity[:3], turn @ swing)
+    return np.concatenate([*places, *velocities, *(each.ravel() for each in axes)])
+
+
+class LinkGeometry:
+    """Geometry between transmitter and receiver in one ping, on the device.
+
+    Quantities that affect the phase are float64.
+
+    Args:
+        sonar: the instrument.
+        receiver: index of the receiver.
+        table: as returned by :func:`link_table`.
+    """
+
+    def __init__(self, sonar: ChannelSonar, receiver: int, table: mi.Float64) -> None:
+        self.sonar = sonar
+        self.numbers = [dr.gather(mi.Float64, table, mi.UInt32(k)) for k in range(self.size)]
+        dr.eval(self.numbers)  # read once, not once per point
+        self.listens: FieldOfView = sonar.field_of_view[sonar.receivers[receiver].name]
+        self.sends: FieldOfView = sonar.transmitter
+
+    @property
+    def size(self) -> int:
+        """Return the length of the table."""
+        return LINK
+
+    def vector(self, start: int) -> list[DeviceArray]:
+        """Return three consecutive numbers of the table."""
+        return self.numbers[start : start + 3]
+
+    @property
+    def sent_from(self) -> list[DeviceArray]:
+        """Return the position of the transmitter [m]."""
+        return self.vector(0)
+
+    @property
+    def velocity(self) -> list[DeviceArray]:
+        """Return the velocity of the receiver [m/s]."""
+        return self.vector(9)
+
+    def axes(self, which: int) -> list[mi.Vector3f]:
+        """Return the axes of the receiver's field of view (0) or the transmitter's (1)."""
+        return [mi.Vector3f(*self.vector(12 + 9 * which + 3 * k)) for k in range(3)]
+
+    def to_point(self, point: list[DeviceArray]) -> tuple[list[DeviceArray], list[DeviceArray]]:
+        """Return the vectors from the transmitter and from the receiver to points in the world [m]."""
+        sent, received = ([p - a for p, a in zip(point, self.vector(start), strict=True)] for start in (0, 3))
+        return sent, received
+
+    def sensitivity(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
+        """Return the combined sensitivity of transmitter and receiver, given unit directions to the points."""
+        ahead, aside, above = (dr.dot(axis, received) for axis in self.axes(0))
+        both = self.listens.sensitivity(ahead, aside, above, DRJIT)
+        if self.sends.shape != "all":
+            ahead, aside, above = (dr.dot(axis, sent) for axis in self.axes(1))
+            both = both * self.sends.sensitivity(ahead, aside, above, DRJIT)
+        return both
+
+    def reached(
+        self, scene: mi.Scene, point: ScatteringPoints, sent: Leg, received: Leg, active: DeviceArray
+    ) -> tuple[DeviceArray, DeviceArray | None]:
+        """Return which points sound reaches, and the factor of mirrors on its amplitude; None without mirrors.
+
+        Only the path from the transmitter is tested, since receivers are near it.
+        """
+        return ~hidden(scene, point.at, point.normal, sent.u, sent.length, active), None
+
+    def doppler(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
+        """Return the Doppler shift of the carrier [Hz], given unit directions to the points.
+
+        The shift is positive where the vehicle approaches the point, because both legs of the path get shorter. In a turn,
+        transmitter and receiver have different velocities. Terms of second order in velocity over sound speed are neglected.
+        """
+        sender, receiver = (mi.Vector3f(*self.vector(start)) for start in (6, 9))
+        return (dr.dot(sent, sender) + dr.dot(received, receiver)) * (1 / self.sonar.wavelength_m)
+
+    def echo_batch(
+        self, delay: DeviceArray, amplitude: DeviceArray, phase: DeviceArray, doppler: DeviceArray, valid: DeviceArray
+    ) -> EchoBatch:
+        """Return the echoes, split into those within ``range_max`` and those from beyond."""
+        beyond = valid & (delay > 2 * self.sonar.range_max / self.sonar.sound_speed)
+        turn = delay * (self.sonar.frequency_step_hz / PADDING)
+        turns = delay * self.sonar.carrier_hz
+        # remove whole cycles in float64; the rest of the phase fits float32
+        sin, cos = dr.sincos(mi.Float((turns - dr.round(turns)) * (2 * math.pi)) - phase)
+        return EchoBatch(
+            delay=delay,
+            amplitude=amplitude,
+            phase=phase,
+            doppler=doppler,
+            counts=valid & ~beyond,
+            beyond=beyond,
+            turn=(turn - dr.round(turn)) * (2 * math.pi),
+            real=amplitude * cos,
+            imag=-amplitude * sin,
+        )
+
+
+class MirroredLink(LinkGeometry):
+    """Geometry between the images of transmitter and receiver.
+
+    Args:
+        sonar: the instrument.
+        receiver: index of the receiver.
+        table: as returned by :func:`mirrored_table`.
+        out: number of mirrors between transmitter and points.
+        back: number of mirrors between points and receiver.
+    """
+
+    def __init__(self, sonar: ChannelSonar, receiver: int, table: mi.Float64, out: int, back: int) -> None:
+        self.out, self.back = out, back
+        super().__init__(sonar, receiver, table)
+        self.wavenumber = 2 * math.pi / sonar.wavelength_m
+
+    @property
+    def size(self) -> int:
+        """Return the length of the table."""
+        return LINK + (ROW + 1) * (self.out + self.back)
+
+    def reached(
+        self, scene: mi.Scene, point: ScatteringPoints, sent: Leg, received: Leg, active: DeviceArray
+    ) -> tuple[DeviceArray, DeviceArray]:
+        """Return which points sound reaches via the mirrors, out and back, and the product of the mirrors' factors."""
+        starts = [LINK + (ROW + 1) * k for k in range(self.out + self.back)]
+        rows = [PlaneRow.of(self.numbers[start : start + ROW + 1]) for start in starts]
+        active, there = unfolded(scene, point, self.vector(0), rows[: self.out], self.wavenumber, active)
+        active, back = unfolded(scene, point, self.vector(3), rows[self.out :], self.wavenumber, active)
+        return active, there * back
+
+
+def mirrored_table(
+    table: NDArray[np.float64], out: MirrorWay, back: MirrorWay, registry: dict[int, int]
+) -> NDArray[np.float64]:
+    """Return the geometry of a link via mirrors: :func:`link_table` of the images.
+
+    Positions, velocities and fields of view are those of the images; the rows of both sequences of mirrors follow.
+
+    Args:
+        table: table of the link without mirrors ``(30,)``.
+        out: mirrors from the transmitter to the points.
+        back: mirrors from the receiver to the points, backwards in time.
+        registry: see :meth:`MirrorWay.rows`.
+    """
+    places = out.images(table[0:3])[-1], back.images(table[3:6])[-1]
+    velocities = out.turn @ table[6:9], back.turn @ table[9:12]
+    axes = table[12:21].reshape(3, 3) @ back.turn.T, table[21:30].reshape(3, 3) @ out.turn.T
+    rows = out.rows(table[0:3], registry), back.rows(table[3:6], registry)
+    return np.concatenate([*places, *velocities, *(part.ravel() for part in (*axes, *rows))])
 
 
 # ---------------- Scattering points, and their search

@@ -137,7 +137,7 @@ def test_single_echoes_of_waves_are_kirchhoffs_integral(tmp_path: Path) -> None:
 
 def test_crests_hide_facets_from_a_sonar_at_grazing(tmp_path: Path) -> None:
     """The facets that are seen are those whose line to the sonar stays below the waves: all but 2 % at edges of shadows."""
-    from mitsonar.simulation.link_geometry import link_table
+    from mitsonar.simulation.scatterers import link_table
 
     height, length = 0.3, 3.0
     scene = unmerged(surface=loaded(ridges(height, length), tmp_path))

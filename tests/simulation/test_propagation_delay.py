@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsonar.simulation.links import delay_exact, delay_iterated, delay_static
+from mitsonar.acoustics.water import delay_exact, delay_iterated, delay_static
 
 C = 1500.0
 

@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mitsonar.acoustics.water import delay_exact
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.hydrophones import ChannelSonar, Hydrophone
-from mitsonar.simulation.links import delay_exact
 
 __all__ = ["LinkResponse", "ResponseCovariance", "block_toeplitz", "link_response"]
 

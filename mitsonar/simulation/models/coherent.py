@@ -84,8 +84,8 @@ class CoherentModel:
 
     def adopt(self, scene: mi.Scene) -> bool:
         """Take over the surface tables of a changed scene at rest; return False if the model must be rebuilt."""
-        tracers = (self.tracer, *self.imager.tracers.values())
-        return all(one.surfaces.adopt(surfaces_of(scene, one.sonar, None)) for one in tracers)
+        tables = [self.tracer.surfaces, *(one.surfaces for one in self.imager.tracers.values())]
+        return all(one.adopt(surfaces_of(scene, self.imager.sonar, None)) for one in tables)
 
     def render(
         self, poses: NDArray[np.float64], time_s: NDArray[np.float64], numbers: list[int], labels: bool
