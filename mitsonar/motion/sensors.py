@@ -441,7 +441,7 @@ RECKONED = ("reckoned_x_m", "reckoned_y_m", "reckoned_heading_deg")
 WALKS = ("reckoned_walk_m_rts", "reckoned_walk_deg_rts")
 """Columns of the random walk of dead reckoning per root second; ``RECKONED`` are those of its poses."""
 
-POSITION_COLUMNS = {name for axis in "xy" for name in ALIASES[axis]}
+POSITION_COLUMNS = {*ALIASES["x"], *ALIASES["y"]}
 """Columns of positions. In a file that has them, ``heading_deg`` is the heading of a pose, which may be the true one."""
 
 BIAS = "yaw_rate_bias_deg_h"

@@ -26,14 +26,7 @@ from mitsonar.simulation.coherent_tracing import ADD, CoherentTracer, FanRays
 from mitsonar.simulation.device import DeviceArray, Frozen, replayed
 from mitsonar.simulation.mirrors import SecondMirrors, parts_at, smooth_share, without_mirror_part
 from mitsonar.simulation.moving import scene_at
-from mitsonar.simulation.tracing import (
-    going_on,
-    half_path_rate,
-    hidden,
-    lambert_direction,
-    overlap,
-    reflected,
-)
+from mitsonar.simulation.tracing import going_on, half_path_rate, hidden, lambert_direction, overlap, reflected
 
 __all__ = ["Arrival", "DiffuseField", "Vertex", "Walk", "at_most_one"]
 

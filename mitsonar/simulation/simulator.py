@@ -18,15 +18,7 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.device import ensure_variant
-from mitsonar.simulation.pings import (
-    FirstPing,
-    RenderedPings,
-    Tally,
-    constant_gain,
-    labels_above,
-    moments_of,
-    to_image,
-)
+from mitsonar.simulation.pings import FirstPing, RenderedPings, Tally, constant_gain, labels_above, moments_of, to_image
 
 if TYPE_CHECKING:
     import mitsuba as mi

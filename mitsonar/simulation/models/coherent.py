@@ -44,13 +44,7 @@ class CoherentModel:
 
     Implements :class:`~mitsonar.simulation.models.create.PingModel`.
 
-    Args:
-        scene: any Mitsuba scene.
-        sonar: a sonar of the model ``coherent``.
-        views: the whole field of view or portions of it; default: the whole.
-        mirrors: mirror parts of shapes, keyed by shape id, or ``"materials"``; default: none.
-        motion: motion of the scene's bodies; default: nothing moves.
-        rays_per_launch: upper bound on the rays of a launch that renders labels, and on its image cells.
+    The arguments are those of :func:`~mitsonar.simulation.models.create.create_model`.
 
     Attributes:
         imager: renderer of the complex images.
@@ -63,10 +57,10 @@ class CoherentModel:
         self,
         scene: mi.Scene,
         sonar: Sonar,
-        views: Sequence[View] | None = None,
-        mirrors: Mirroring = None,
-        motion: SceneMotion | None = None,
-        rays_per_launch: int = 2**23,
+        views: Sequence[View] | None,
+        mirrors: Mirroring,
+        motion: SceneMotion | None,
+        rays_per_launch: int,
     ) -> None:
         self.imager = CoherentImager(scene, sonar, mirrors, views, motion)
         self.tracer, self._rays_per_launch = tracer_of(scene, sonar, motion), rays_per_launch

@@ -56,13 +56,7 @@ class PhysicalModel(ThesisModel):
 
     Implements :class:`~mitsonar.simulation.models.create.PingModel`.
 
-    Args:
-        scene: any Mitsuba scene.
-        sonar: a sonar of the model ``physical``.
-        views: images of each ping; default: one of all echoes.
-        mirrors: mirror parts of shapes, for several reflections.
-        motion: motion of the scene's bodies; None if nothing moves.
-        rays_per_launch: upper bound on the rays of a launch and on its image cells.
+    The arguments are those of :func:`~mitsonar.simulation.models.create.create_model`.
 
     Attributes:
         former: operator that spreads the levels of boxes over beams and pulse; None without a pattern.
@@ -76,10 +70,10 @@ class PhysicalModel(ThesisModel):
         self,
         scene: mi.Scene,
         sonar: Sonar,
-        views: Sequence[View] | None = None,
-        mirrors: Mirroring = None,
-        motion: SceneMotion | None = None,
-        rays_per_launch: int = 2**23,
+        views: Sequence[View] | None,
+        mirrors: Mirroring,
+        motion: SceneMotion | None,
+        rays_per_launch: int,
     ) -> None:
         patterned = sonar.beam_pattern != "box"
         if not patterned and sonar_absorption(sonar):
