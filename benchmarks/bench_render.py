@@ -300,7 +300,7 @@ def render_for_memory(frames: int, rays: int) -> None:
     """Render frames over the seabed into a folder and print the peak memory of this process."""
     from mitsonar.acoustics.noise import NoiseModel
     from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.simulation.runs import Outputs, run
+    from mitsonar.simulation.runs import Destination, RenderOptions, run
 
     ensure_variant()
     sonar = instrument(96, rays, "physical").replace(range_bins=128)
@@ -308,7 +308,7 @@ def render_for_memory(frames: int, rays: int) -> None:
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         path = Trajectory(poses_over(frames), np.arange(frames) / 10)
-        run(simulator, path, Path(folder) / "run", Outputs(NoiseModel()), origin={})
+        run(simulator, path, RenderOptions(NoiseModel()), Destination(Path(folder) / "run"))
     # not ru_maxrss: a child inherits its parent's
     status = Path("/proc/self/status").read_text()
     peak = int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))) / 1024

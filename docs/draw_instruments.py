@@ -18,7 +18,8 @@ import numpy as np
 import mitsonar
 from mitsonar.motion.pose import Pose
 from mitsonar.plotting.fans import save_fan, write_fan_video
-from mitsonar.simulation.runs import run_sounder
+from mitsonar.simulation.instrument_runs import run_sounder
+from mitsonar.simulation.runs import Destination
 
 SOUNDED = {
     "sidescan": ("waterfall.png", Pose(-6, -3, 2.5, heading=math.pi / 2), Pose(6, -3, 2.5, heading=math.pi / 2), 240),
@@ -56,7 +57,7 @@ def draw(folder: Path, coarser: int) -> None:
         simulator = mitsonar.SounderSimulator(scene, mitsonar.load_sounder(kind).replace(**CHANGES[kind]))
         path = mitsonar.Trajectory.between(start, end, max(2, pings // coarser), 10.0)
         with tempfile.TemporaryDirectory() as out:
-            run_sounder(simulator, path, Path(out) / "run", origin={})
+            run_sounder(simulator, path, Destination(Path(out) / "run"))
             (folder / f"{kind}.png").write_bytes((Path(out) / "run" / picture).read_bytes())
     head = mitsonar.load_sonar("ping360").replace(
         range_max=10.0, model="physical", pattern="two_way", coding="dB", coding_db=50.0

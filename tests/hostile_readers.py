@@ -282,10 +282,10 @@ def read_run(folder: Path) -> None:
     run = RunDirectory.begin(folder, RENDERING, ASKED, resume=True)
     if run.finished:
         return
-    found = progress_of(run, SONAR, ASKED["frames"])
-    assert 0 <= found.frames <= 30
-    assert 0 < found.gain < np.inf
-    found.tally.warnings(Nearby(), np.zeros((30, 6)))
+    gain, tally = progress_of(run, SONAR, ASKED["frames"])
+    assert 0 <= tally.frames <= 30
+    assert 0 < gain < np.inf
+    tally.warnings(Nearby(), np.zeros((30, 6)))
 
 
 class Nearby:

@@ -44,7 +44,7 @@ from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.device import release_memory
-from mitsonar.simulation.runs import RENDERING, Outputs, run
+from mitsonar.simulation.runs import RENDERING, Destination, RenderOptions, run
 from mitsonar.simulation.scene import load_scene
 from mitsonar.worlds.families import RockyField, ShipHull
 from mitsonar.worlds.world import Family, sloped
@@ -447,8 +447,8 @@ class RenderedSet:
             path = self.simulated.path(self.frames, sonar.frame_rate_hz)
             origin = {"set": self.name, "seed": self.simulated.seed}
             with begin(f"rendering {self.folder.name}", self.frames) as progress:
-                nothing = Outputs(NOISE_MODELS["none"])
-                run(self._simulator(sonar), path, self.folder, nothing, origin=origin, resume=True, progress=progress)
+                destination = Destination(self.folder, origin, resume=True, progress=progress)
+                run(self._simulator(sonar), path, RenderOptions(NOISE_MODELS["none"]), destination)
             release_memory()
         source = replace(open_frames(self.folder), name=self.folder.name)
         return source.with_noise(self._noise, SEED) if self.texture == "still" else source

@@ -26,7 +26,7 @@ from mitsonar.cli.console import (
     with_plain_brackets,
 )
 from mitsonar.cli.estimate import Geometry
-from mitsonar.cli.paths import Frame
+from mitsonar.cli.options import Frame
 from mitsonar.cli.recording import (
     LEAST_SNR_DB,
     Classes,

@@ -13,8 +13,7 @@ import numpy as np
 import typer
 
 from mitsonar.cli.console import answered, command_line, numbers, progress_bar, say, say_json, warn
-from mitsonar.cli.paths import SIX, Frame, path_for
-from mitsonar.cli.render import NOISE, instrument_for, scene_parameters
+from mitsonar.cli.options import NOISE, SIX, Frame, Noise, instrument_for, path_for, scene_parameters, sonar_changes
 from mitsonar.errors import MitsonarError, counted, meant
 from mitsonar.io.files import write_whole
 from mitsonar.io.runs import kind_of_run, refuse_to_replace
@@ -224,7 +223,7 @@ def mosaic(
         str | None, typer.Option(help="View of a data set, or topic of a ROS bag (default: the first, or the only one).")
     ] = None,
     geometry: Geometry = None,
-    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
+    noise: Noise = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
@@ -374,7 +373,7 @@ def height(
     view: Annotated[
         str | None, typer.Option(help="View of a data set (default: the first; of portions: whole, or all).")
     ] = None,
-    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
+    noise: Noise = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
@@ -598,7 +597,7 @@ def _of_scene(
     from mitsonar.simulation.scene import load_scene
 
     loaded = load_scene(source, **parameters)
-    instrument, attitude = instrument_for(loaded, sonar, model, seed)
+    instrument, attitude = instrument_for(loaded, sonar, sonar_changes(None, None, model, seed))
     count = poses["count"] or (20 if poses["file"] else None)
     path = path_for(instrument, attitude, source, count, poses["start"], poses["end"], poses["file"], poses["frame"])
     return subject_of_scene(loaded, instrument, path.poses, segments=segments.split(",") if segments else [], gain=gain)

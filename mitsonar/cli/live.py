@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mitsonar.cli import options
 from mitsonar.cli.console import answered, command_line, progress_bar, say, warn
-from mitsonar.cli.paths import SIX, Frame, path_for
-from mitsonar.cli.render import NOISE, instrument_for, scene_parameters, sonar_changes
 from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
@@ -27,28 +26,24 @@ __all__ = ["serve", "view"]
 
 @answered
 def serve(
-    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")],
-    sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
+    scene: options.SceneName,
+    sonar: options.SonarName = None,
     model: Annotated[str | None, typer.Option(help="physical, thesis or coherent.")] = None,
     quality: Annotated[str | None, typer.Option(help="draft, standard or fine (`mitsonar presets`).")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a key of the sonar, KEY=VALUE: range_max=8.")
-    ] = None,
+    set_: options.SonarKeys = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the Foxglove WebSocket; 0: a free one.")] = 8765,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0: all of this machine.")] = "127.0.0.1",
-    rate: Annotated[float | None, typer.Option(help="Pings per second along the path [Hz] (default: the sonar's).")] = None,
-    start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
+    rate: Annotated[float | None, typer.Option(help="Pings a second of the path (default: the sonar's) [Hz].")] = None,
+    start: options.Start = None,
     trajectory: Annotated[
         Path | None, typer.Option(help="Path to play while no pose arrives: a TUM or CSV file, or `shipped`.")
     ] = None,
-    frame: Frame = "mitsonar",
-    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
+    frame: options.Frame = "mitsonar",
+    noise: options.Noise = "none",
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
-    parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
-    pings: Annotated[int | None, typer.Option(min=1, help="End after this many pings (default: never).")] = None,
-    ros: Annotated[
-        bool, typer.Option("--ros", help="Start a ROS 2 node instead of the Foxglove server; needs rclpy.")
-    ] = False,
+    parameter: options.Parameters = None,
+    pings: Annotated[int | None, typer.Option(min=1, help="End after so many pings (default: never).")] = None,
+    ros: Annotated[bool, typer.Option("--ros", help="A ROS 2 node in place of the Foxglove server; needs rclpy.")] = False,
 ) -> None:
     """Serve a live sonar: clients publish poses on /pose and get fan, polar image, transform and timing. Ctrl-C ends it."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
@@ -57,10 +52,10 @@ def serve(
     from mitsonar.simulation.simulator import Simulator
 
     drawn = load_noise(noise)
-    loaded = load_scene(scene, **scene_parameters(parameter or []))
-    instrument, attitude = instrument_for(loaded, sonar, model, seed, sonar_changes(set_ or [], quality))
+    loaded = load_scene(scene, **options.scene_parameters(parameter or []))
+    instrument, attitude = options.instrument_for(loaded, sonar, options.sonar_changes(set_, quality, model, seed))
     refuse_noise(drawn, instrument)
-    path = path_for(instrument, attitude, scene, None, start, None, trajectory, frame)
+    path = options.path_for(instrument, attitude, scene, None, start, None, trajectory, frame)
     hertz = instrument.frame_rate_hz if rate is None else rate
     if not hertz > 0:
         raise MitsonarError(f"--rate must be positive: got {hertz:g}; give pings a second")
@@ -134,13 +129,13 @@ def view(
     path: Annotated[
         Path | None, typer.Option("--path", help="Estimated path to add: the folder of an odometry, a TUM or CSV file.")
     ] = None,
-    frame: Frame = "mitsonar",
+    frame: options.Frame = "mitsonar",
     scene: Annotated[
         str | None, typer.Option(help="Scene to draw: XML file or name (default: the run's; `none`: no scene).")
     ] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
     view_: Annotated[str | None, typer.Option("--view", help="View of a data set (default: the first).")] = None,
-    parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
+    parameter: options.Parameters = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file or page.")] = False,
 ) -> None:
     """Show fan, polar image and levels of each frame, with scene, beams, true and estimated path."""
@@ -156,7 +151,7 @@ def view(
     if target is not None:
         option = "--save" if html is None else "--html"
         refuse_to_replace(target, *[html / name for name in VIEWER if html], overwrite=overwrite, option=option)
-    shown = _shown(what, scene, dict(scene_parameters(parameter or [])), _paths(path, frame), sequence, view_)
+    shown = _shown(what, scene, dict(options.scene_parameters(parameter or [])), _paths(path, frame), sequence, view_)
     if html is not None:
         html.mkdir(parents=True, exist_ok=True)
     frames = 0 if shown.source is None else len(shown.source)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from mitsonar.cli import options
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.cli.paths import FRAMES, SIX, SPEED, Frame, path_for, poses_line, under_vehicle, warn_of_speed
 from mitsonar.errors import MitsonarError, counted, meant
 
 if TYPE_CHECKING:
@@ -18,63 +19,40 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mitsonar.instruments.hydrophones import ChannelSonar
-    from mitsonar.instruments.sonar import Sonar
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.simulation.runs import Outputs
+    from mitsonar.simulation.runs import Destination, RenderOptions
     from mitsonar.simulation.scene import Said
     from mitsonar.simulation.simulator import Simulator
     from mitsonar.simulation.vehicle import VehicleFile
 
-__all__ = [
-    "NOISE",
-    "VehicleOptions",
-    "check_above_ground",
-    "first_pose",
-    "image",
-    "impulse",
-    "instrument_for",
-    "moving_said",
-    "render",
-    "render_vehicle",
-    "scene_parameters",
-    "sonar_changes",
-    "sound",
-    "vehicle_file",
-]
-
-
-NOISE = (
-    "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; not realistic, since it "
-    "reveals empty pixels"
-)
+__all__ = ["image", "impulse", "render", "sound"]
 
 
 @answered
 def render(
-    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")],
+    scene: options.SceneName,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/SCENE).")] = None,
-    frames: Annotated[int | None, typer.Option(help=FRAMES)] = None,
-    start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
-    end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
-    speed: Annotated[float | None, typer.Option(help=SPEED)] = None,
+    frames: Annotated[int | None, typer.Option(help=options.FRAMES)] = None,
+    start: options.Start = None,
+    end: options.End = None,
+    speed: options.Speed = None,
     trajectory: Annotated[
         Path | None,
         typer.Option(help="Poses of the sonar, or with --vehicle of the vehicle: a TUM or CSV file, or `shipped`."),
     ] = None,
-    frame: Frame = "mitsonar",
-    sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
-    model: Annotated[str | None, typer.Option(help="coherent (default of most presets), physical or thesis.")] = None,
+    frame: options.Frame = "mitsonar",
+    sonar: options.SonarName = None,
+    model: Annotated[str | None, typer.Option(help="coherent (as of most presets), physical or thesis.")] = None,
     quality: Annotated[
         str | None, typer.Option(help="draft, standard or fine: number of rays by accuracy (`mitsonar presets`).")
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a key of the sonar, KEY=VALUE: range_max=8.")
     ] = None,
-    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
-    labels: Annotated[
-        bool, typer.Option("--labels", help="Write elevation, shape id, object id and shadow of each pixel.")
-    ] = False,
+    set_: options.SonarKeys = None,
+    noise: options.Noise = "none",
+    labels: Annotated[bool, typer.Option("--labels", help="Per-pixel elevation, shape id and shadow too.")] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
     label_floor: Annotated[
         float, typer.Option(min=0, max=1, help="Label only pixels above this fraction of full scale, before noise.")
@@ -91,10 +69,7 @@ def render(
             help="Render glints (coherent) and mirrors (bounces) of smooth materials; see docs/guides/multipath.md.",
         ),
     ] = False,
-    moving: Annotated[
-        list[str] | None,
-        typer.Option("--moving", help="ID=FILE.tum: move the shape ID along a path; or FILE.yaml (docs/guides/moving.md)."),
-    ] = None,
+    moving: options.Moving = None,
     all_sensors: Annotated[
         bool,
         typer.Option(
@@ -104,81 +79,87 @@ def render(
     vehicle: Annotated[
         Path | None, typer.Option(help="YAML file with the sensors of a vehicle; see docs/guides/bridges.md.")
     ] = None,
-    rays_per_launch: Annotated[int, typer.Option(help="Rays traced at once, about 30 bytes each: limits memory.")] = 2**22,
-    parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
+    rays_per_launch: options.RaysPerLaunch = 2**22,
+    parameter: options.Parameters = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
 ) -> None:
     """Render sonar frames: frames.npz, images/, poses.tum and run.json in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.acoustics.water import absorption_line
     from mitsonar.instruments.sonar import Sonar
-    from mitsonar.io.runs import file_digest
     from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.trajectory import convention_named
-    from mitsonar.simulation.runs import Outputs, run
-    from mitsonar.simulation.scene import digests_of, find_scene, load_scene, read_said
+    from mitsonar.simulation.runs import Destination, RenderOptions, run
+    from mitsonar.simulation.scene import channel_sonar_in, digests_of, find_scene, read_said, sonar_in
     from mitsonar.simulation.simulator import Simulator
 
     if label_floor and not labels:
         raise MitsonarError(f"--label-floor {label_floor:g} needs --labels: without labels nothing is labelled")
     named = convention_named(frame).name
-    outputs = Outputs(
-        load_noise(noise), labels=labels, cartesian=cartesian, exr=exr, frame=named, fan=fan, label_floor=label_floor
-    )
-    parameters = scene_parameters(parameter or [])
-    loaded = load_scene(scene, **parameters)
-    changes, folder = sonar_changes(set_ or [], quality), out or Path("out") / find_scene(scene).stem
-    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
+    outputs = RenderOptions(load_noise(noise), labels, cartesian, exr, named, fan, label_floor)
+    loaded, origin = _load(scene, parameter)
+    changes = options.sonar_changes(set_, quality, model, seed)
+    folder = out or Path("out") / find_scene(scene).stem
     if all_sensors or vehicle is not None:
         if mirrors:
             raise MitsonarError("--mirrors is of one sonar: leave it out, or render the sonars one by one")
-        file = vehicle_file(vehicle, all_sensors, sonar)
-        changes |= {name: value for name, value in (("model", model), ("seed", seed)) if value is not None}
-        begin = first_pose(loaded) if file is None else None
-        flown = path_for(Sonar(), begin, scene, frames, start, end, trajectory, frame, speed)
-        warn_of_speed(flown, end, speed)
-        said = moving_said(loaded, moving or [], named, [] if file is None else file.said)
-        options = VehicleOptions(changes, overwrite, resume)
-        return render_vehicle(loaded, file, flown, folder, outputs, said, origin, options)
-    instrument, attitude = instrument_for(loaded, sonar, model, seed, changes)
+        file = _vehicle_file(vehicle, all_sensors, sonar)
+        found = (sonar_in(loaded) or channel_sonar_in(loaded)) if file is None else None
+        flown = options.path_for(Sonar(), found and found[1], scene, frames, start, end, trajectory, frame, speed)
+        options.warn_of_speed(flown, end, speed)
+        motions = _motions(loaded, moving, named, [] if file is None else file.said)
+        return _render_vehicle(
+            loaded, file, flown, changes, motions, outputs, Destination(folder, origin, overwrite, resume)
+        )
+    instrument, attitude = options.instrument_for(loaded, sonar, changes)
     refuse_noise(outputs.noise, instrument)
-    path = path_for(instrument, attitude, scene, frames, start, end, trajectory, frame, speed)
-    warn_of_speed(path, end, speed)
+    path = options.path_for(instrument, attitude, scene, frames, start, end, trajectory, frame, speed)
+    options.warn_of_speed(path, end, speed)
     if mirrors and instrument.model != "coherent" and instrument.bounces == 1:
         raise MitsonarError(
             f"--mirrors needs the model coherent, or --set bounces=2: got {instrument.model}; leave it out, or give one"
         )
-    said = moving_said(loaded, moving or [], named)
-    bodies = MovingBodies.of(read_said(said), named, path)
+    motions = _motions(loaded, moving, named)
+    bodies = MovingBodies.of(read_said(motions), named, path)
     simulator = Simulator(
         loaded, instrument, mirrors="materials" if mirrors else None, moving=bodies, rays_per_launch=rays_per_launch
     )
-    check_above_ground(loaded, path, simulator.motion is not None, simulator)
+    _check_above_ground(loaded, path, simulator.motion is not None, simulator)
     origin |= {"mirrors": True} if mirrors else {}
-    origin |= {"moving": digests_of(said)} if said else {}
+    origin |= {"moving": digests_of(motions)} if motions else {}
     origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
     origin["path"] |= {} if speed is None else {"speed": speed}
     with progress_bar("rendering", len(path), "pings") as progress:
-        report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)
+        report = run(simulator, path, outputs, Destination(folder, origin, overwrite, resume, progress))
     for sentence in report.warnings:
         warn(sentence)
     say(f"{counted(report.frames, 'frame')} ({instrument.model} model, {instrument.title}) in {folder}")
-    say(poses_line(path))
+    say(options.poses_line(path))
     if line := absorption_line(instrument):
         say(line)
     if report.pictures:
         say(f"pictures: {report.pictures[0]}" + (f" ... {report.pictures[-1].name}" if len(report.pictures) > 1 else ""))
 
 
-def check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: Simulator | None = None) -> None:
+def _load(scene: str, parameter: list[str] | None) -> tuple[Any, dict[str, Any]]:
+    """Load a scene; return it and what identifies it in ``run.json``: name, digest of the file, parameters."""
+    from mitsonar.io.runs import file_digest
+    from mitsonar.simulation.scene import find_scene, load_scene
+
+    parameters = options.scene_parameters(parameter or [])
+    loaded = load_scene(scene, **parameters)
+    return loaded, {"scene": scene, "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
+
+
+def _check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: Simulator | None = None) -> None:
     """Refuse a path below the ground or inside an object, from where the sonar sees nothing; warn where it sees something.
 
     Args:
         scene: the Mitsuba scene.
         path: of the sonar or vehicle.
         moving: whether bodies move, which is not judged.
-        simulator: of the sonar, tells whether it sees anything; None: only warn.
+        simulator: simulator of the sonar, to find whether it sees anything; None: only warn.
     """
     from mitsonar.simulation.tracing import buried_in
 
@@ -194,13 +175,13 @@ def check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: Si
         warn(f"{frames} {found.text}: its frames show the ground from below")
 
 
-def moving_said(scene: Any, options: list[str], frame: str, also: Sequence[Said] = ()) -> list[Said]:
-    """Return what the scene says of its bodies' motion, and in its place what --moving and a vehicle's file say."""
+def _motions(scene: Any, moving: list[str] | None, frame: str, also: Sequence[Said] = ()) -> list[Said]:
+    """Return the motions of bodies: those of --moving, of other bodies those of a vehicle's file, then of the scene."""
     from mitsonar.motion.bodies import BodyMotion
     from mitsonar.simulation.scene import Said, said_by, said_in
 
     given: list[Said] = []
-    for option in options:
+    for option in moving or []:
         name, _, file = option.partition("=")
         if option.lower().endswith((".yaml", ".yml")) and not file:
             given += said_in(option)
@@ -214,65 +195,11 @@ def moving_said(scene: Any, options: list[str], frame: str, also: Sequence[Said]
     return given
 
 
-def scene_parameters(pairs: list[str]) -> dict[str, str]:
-    """Return what -D says, by name."""
-    wrong = [pair for pair in pairs if "=" not in pair]
-    if wrong:
-        raise MitsonarError(f"-D takes NAME=VALUE: got {wrong[0]!r}")
-    return dict(pair.split("=", 1) for pair in pairs)
-
-
-def sonar_changes(pairs: list[str], quality: str | None) -> dict[str, Any]:
-    """Return what --set and --quality change of a sonar."""
-    wrong = [pair for pair in pairs if "=" not in pair]
-    if wrong:
-        raise MitsonarError(f"--set takes KEY=VALUE: got {wrong[0]!r}")
-    changes = dict(pair.split("=", 1) for pair in pairs)
-    if "preset" in changes:
-        raise MitsonarError(f"--set changes keys of the sonar: got preset={changes['preset']}; name it by --sonar")
-    if quality is not None and changes.get("quality", quality) != quality:
-        raise MitsonarError(f"--quality {quality} and --set quality={changes['quality']} contradict each other: give one")
-    return changes if quality is None else {**changes, "quality": quality}
-
-
-def instrument_for(
-    scene: Any, name: str | None, model: str | None, seed: int | None, changes: dict[str, Any] | None = None
-) -> tuple[Sonar, Pose | None]:
-    """Return the sonar to use and the pose that the scene gives it."""
-    from mitsonar.instruments.sounder import load_sonar
-    from mitsonar.simulation.scene import sonar_in
-
-    found = sonar_in(scene)
-    if name is None and found is None:
-        raise MitsonarError(
-            "the scene has no sensor of type imaging_sonar: add one, or name a sonar (--sonar didson300) and a pose (--from)"
-        )
-    sonar = load_sonar(name) if name is not None else found[0]  # type: ignore[index]
-    change: dict[str, Any] = dict(changes or {})
-    change |= {} if model is None else {"model": model}
-    change |= {} if seed is None else {"seed": seed}
-    sonar = sonar.replace(**change)
-    if "quality" in change and sonar.model == "thesis":
-        raise MitsonarError(
-            "quality is of the model physical, the thesis model has its own number of rays: got quality "
-            f"{change['quality']}; leave it out, or give --set rays_per_beam=N"
-        )
-    return sonar, found[1] if found else None
-
-
 # ---------------- What ``mitsonar render --all-sensors`` and ``--vehicle`` do: all sensors of a vehicle in one run
 
 
-class VehicleOptions(NamedTuple):
-    """Options of a run: what changes in the sonars, and how its folder is begun."""
-
-    changes: dict[str, Any]
-    overwrite: bool
-    resume: bool
-
-
-def vehicle_file(file: Path | None, all_sensors: bool, sonar: str | None) -> VehicleFile | None:
-    """Return what --vehicle says, None where the scene's own sensors are meant."""
+def _vehicle_file(file: Path | None, all_sensors: bool, sonar: str | None) -> VehicleFile | None:
+    """Return the content of the file of --vehicle; None for the sensors of the scene."""
     from mitsonar.simulation.vehicle import load_vehicle
 
     if file is not None and all_sensors:
@@ -282,29 +209,20 @@ def vehicle_file(file: Path | None, all_sensors: bool, sonar: str | None) -> Veh
     return None if file is None else load_vehicle(file)
 
 
-def first_pose(scene: Any) -> Pose | None:
-    """Return the pose of a scene's first sonar or hydrophones, where a path begins that no option tells."""
-    from mitsonar.simulation.scene import channel_sonar_in, sonar_in
-
-    found = sonar_in(scene) or channel_sonar_in(scene)
-    return None if found is None else found[1]
-
-
-def render_vehicle(
+def _render_vehicle(
     scene: Any,
     vehicle: VehicleFile | None,
     path: Trajectory,
-    folder: Path,
-    outputs: Outputs,
-    said: list[Said],
-    origin: dict[str, Any],
-    options: VehicleOptions,
+    changes: dict[str, Any],
+    motions: list[Said],
+    outputs: RenderOptions,
+    destination: Destination,
 ) -> None:
-    """Run all sensors of a vehicle along a path, and say where they lie."""
+    """Run all sensors of a vehicle along a path, and print where their folders are."""
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.instruments.sounder import Sounder
     from mitsonar.motion.pose import Pose
-    from mitsonar.simulation.runs import run_vehicle
+    from mitsonar.simulation.instrument_runs import run_vehicle
     from mitsonar.simulation.scene import digests_of, read_said
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, sensors_in
 
@@ -312,20 +230,19 @@ def render_vehicle(
     changed = {}
     for name, one in sensors.items():
         instrument: Any = one.instrument
-        if options.changes and isinstance(instrument, Sonar | Sounder):
-            instrument = instrument.replace(**options.changes)
+        if changes and isinstance(instrument, Sonar | Sounder):
+            instrument = instrument.replace(**changes)
         changed[name] = Mounted(instrument, one.mount)
-    origin = origin | ({"moving": digests_of(said)} if said else {})
-    simulator = VehicleSimulator(scene, changed, moving=read_said(said))
-    begun = {"overwrite": options.overwrite, "resume": options.resume}
+    origin = {**destination.origin, **({"moving": digests_of(motions)} if motions else {})}
+    simulator = VehicleSimulator(scene, changed, moving=read_said(motions))
     with progress_bar("rendering", len(path) * len(changed), "pings") as progress:
-        report = run_vehicle(simulator, path, folder, outputs, origin=origin, progress=progress, **begun)
+        report = run_vehicle(simulator, path, outputs, replace(destination, origin=origin, progress=progress))
     for sentence in report.warnings:
         warn(sentence)
-    say(poses_line(path, {name: one.mount for name, one in changed.items()}))
+    say(options.poses_line(path, {name: one.mount for name, one in changed.items()}))
     say(
         f"{counted(len(path), 'pose')}, "
-        f"{counted(len(report.sensors), 'sensor')} ({', '.join(report.sensors)}) in {folder}, a folder each"
+        f"{counted(len(report.sensors), 'sensor')} ({', '.join(report.sensors)}) in {destination.folder}, a folder each"
     )
 
 
@@ -334,7 +251,7 @@ def render_vehicle(
 
 @answered
 def impulse(
-    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")],
+    scene: options.SceneName,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/SCENE-impulse).")] = None,
     velocity: Annotated[
         str | None,
@@ -346,12 +263,12 @@ def impulse(
         int | None,
         typer.Option(help="Number of pings (default: 1); with --trajectory evenly spaced in time over all of it."),
     ] = None,
-    start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
+    start: options.Start = None,
     trajectory: Annotated[
         str | None,
         typer.Option(help="Poses of the vehicle: a TUM or CSV file, or a course (square, stairs, zigzag, circle ...)."),
     ] = None,
-    frame: Frame = "mitsonar",
+    frame: options.Frame = "mitsonar",
     model: Annotated[
         str | None,
         typer.Option(help="scatterers (fixed in the world) or rays (fixed to the vehicle, as in Almanza-Medina)."),
@@ -360,7 +277,7 @@ def impulse(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a key of the instrument, KEY=VALUE: carrier_hz=160e3.")
     ] = None,
-    parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
+    parameter: options.Parameters = None,
     mirrors: Annotated[
         bool,
         typer.Option("--mirrors", help="Add paths reflected by smooth materials; see docs/guides/impulse-responses.md."),
@@ -371,36 +288,32 @@ def impulse(
             "--mirror", help="Reflection coefficient of pressure and rms height [m] of a shape, NAME=V,H: surface=-1,0.002."
         ),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
+    overwrite: options.Overwrite = False,
+    resume: options.Resume = False,
 ) -> None:
     """Simulate channels, and write responses.npz, responses.zarr, response.png and waterfall.png into the folder OUT."""
-    from mitsonar.io.runs import file_digest
     from mitsonar.simulation.channel import ChannelSimulator
-    from mitsonar.simulation.runs import iteration_error, run_impulse
-    from mitsonar.simulation.scene import channel_sonar_in, find_scene, load_scene
+    from mitsonar.simulation.instrument_runs import iteration_error, run_impulse
+    from mitsonar.simulation.runs import Destination
+    from mitsonar.simulation.scene import channel_sonar_in, find_scene
 
-    parameters = scene_parameters(parameter or [])
-    loaded = load_scene(scene, **parameters)
-    sonar, attitude = _instrument(channel_sonar_in(loaded), model, seed, set_ or [])
-    flown, speeds = _path(sonar, attitude, velocity, frames, start, trajectory, frame)
+    loaded, origin = _load(scene, parameter)
+    sonar, attitude = _channel_sonar(channel_sonar_in(loaded), model, seed, set_ or [])
+    flown, speeds = _channel_path(sonar, attitude, velocity, frames, start, trajectory, frame)
     folder = out or Path("out") / f"{find_scene(scene).stem}-impulse"
-    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
     parts = _mirrors(mirrors, mirror or [])
     origin |= {"mirrors": True if parts == "materials" else parts} if parts else {}
     simulator = ChannelSimulator(loaded, sonar, mirrors=parts)
     with progress_bar("measuring", len(flown), "pings") as progress:
-        report = run_impulse(
-            simulator, flown, speeds, folder, origin=origin, overwrite=overwrite, resume=resume, progress=progress
-        )
+        report = run_impulse(simulator, flown, speeds, Destination(folder, origin, overwrite, resume, progress))
     for sentence in report.warnings:
         warn(sentence)
     names = ", ".join(receiver.name for receiver in sonar.receivers)
     say(
-        f"{counted(report.pings, 'ping')} ({sonar.model} model, {sonar.title}: {names}) of "
+        f"{counted(len(flown), 'ping')} ({sonar.model} model, {sonar.title}: {names}) of "
         f"{counted(sonar.taps, 'tap')} in {folder}"
     )
-    say(poses_line(flown, {}))
+    say(options.poses_line(flown, {}))
     spread = report.spread
     say(
         f"spread factor {spread.factor:.3g}: delays over {1e3 * spread.delay_s:.3g} ms, Doppler shifts over "
@@ -415,7 +328,7 @@ def impulse(
     say(f"figures: {folder / 'response.png'}, {folder / 'waterfall.png'}")
 
 
-def _instrument(
+def _channel_sonar(
     found: tuple[ChannelSonar, Pose] | None, model: str | None, seed: int | None, changes: list[str]
 ) -> tuple[ChannelSonar, Pose | None]:
     """Return the instrument with its changes, and its pose in the scene; by default the instrument of Almanza-Medina."""
@@ -436,7 +349,7 @@ def _instrument(
 
 
 def _mirrors(materials: bool, given: list[str]) -> dict[str, tuple[float, float]] | Literal["materials"] | None:
-    """Return the mirrors that --mirrors or --mirror say; None where they say nothing."""
+    """Return the mirrors of --mirrors or --mirror; None without either."""
     if not given:
         return "materials" if materials else None
     if materials:
@@ -464,7 +377,7 @@ def _receivers(sonar: ChannelSonar, names: str) -> list[dict[str, object]]:
     return [known[name].model_dump() for name in wanted]
 
 
-def _path(
+def _channel_path(
     sonar: ChannelSonar,
     attitude: Pose | None,
     velocity: str | None,
@@ -501,7 +414,8 @@ def _path(
         return flown, speeds
     if begin is None:
         raise MitsonarError(
-            f"the scene has no channel_sonar that gives a pose: add one, or give a pose with --from ({SIX}), or --trajectory"
+            f"the scene has no channel_sonar that gives a pose: add one, or give a pose with --from ({options.SIX}), or "
+            "--trajectory"
         )
     if velocity is not None and velocity.count(",") not in (1, 2):
         raise MitsonarError(f"--velocity takes vx,vy or vx,vy,turn (m/s, m/s, deg/s): got {velocity!r}")
@@ -517,71 +431,64 @@ def _path(
 
 @answered
 def sound(
-    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")],
+    scene: options.SceneName,
     instrument: Annotated[
         str,
         typer.Option(help="sidescan, altimeter, profiler, dvl, range-image, a preset (`mitsonar presets`) or a YAML file."),
     ],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/INSTRUMENT).")] = None,
-    frames: Annotated[int | None, typer.Option(help="Number of pings, with --trajectory evenly spaced in time.")] = None,
-    start: Annotated[str | None, typer.Option("--from", help=f"First pose of the vehicle: {SIX}.")] = None,
-    end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
-    speed: Annotated[float | None, typer.Option(help=SPEED)] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Number of pings; with --trajectory evenly spaced in time over all of it.")
+    ] = None,
+    start: Annotated[str | None, typer.Option("--from", help=f"First pose of the vehicle: {options.SIX}.")] = None,
+    end: options.End = None,
+    speed: options.Speed = None,
     trajectory: Annotated[
         Path | None,
         typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped` (levelled)."),
     ] = None,
-    frame: Frame = "mitsonar",
-    model: Annotated[str | None, typer.Option(help="coherent (speckle and noise) or physical.")] = None,
-    quality: Annotated[str | None, typer.Option(help="draft, standard or fine: number of rays by accuracy.")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a key of the instrument, KEY=VALUE: range_max=20.")
-    ] = None,
+    frame: options.Frame = "mitsonar",
+    model: Annotated[str | None, typer.Option(help="coherent, with speckle and noise, or physical.")] = None,
+    quality: Annotated[str | None, typer.Option(help="draft, standard or fine: rays by the error wanted.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the instrument: range_max=20.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter, speckle and noise.")] = None,
-    moving: Annotated[
-        list[str] | None,
-        typer.Option("--moving", help="ID=FILE.tum: move the shape ID along a path; or FILE.yaml (docs/guides/moving.md)."),
-    ] = None,
-    rays_per_launch: Annotated[int, typer.Option(help="Rays traced at once, about 30 bytes each: limits memory.")] = 2**22,
-    parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
+    moving: options.Moving = None,
+    rays_per_launch: options.RaysPerLaunch = 2**22,
+    parameter: options.Parameters = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
 ) -> None:
     """Simulate a side-scan, altimeter, profiler, DVL or 3-D sonar on a vehicle, and write its records into OUT."""
     from mitsonar.instruments.sounder import load_sounder
-    from mitsonar.io.runs import file_digest
     from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import convention_named
-    from mitsonar.simulation.runs import run_sounder
-    from mitsonar.simulation.scene import digests_of, find_scene, load_scene, read_said
+    from mitsonar.simulation.instrument_runs import run_sounder
+    from mitsonar.simulation.runs import Destination
+    from mitsonar.simulation.scene import digests_of, read_said
     from mitsonar.simulation.sounding import SounderSimulator
 
     named = convention_named(frame).name
-    changes: dict[str, Any] = sonar_changes(set_ or [], quality)
-    changes |= {} if model is None else {"model": model}
-    changes |= {} if seed is None else {"seed": seed}
+    changes = options.sonar_changes(set_, quality, model, seed)
     sounder = load_sounder(instrument)
     sounder = sounder.replace(**changes) if changes else sounder
-    parameters = scene_parameters(parameter or [])
-    loaded = load_scene(scene, **parameters)
-    flown = path_for(sounder.fan, None, scene, frames, start, end, trajectory, frame, speed)
-    flown = under_vehicle(flown, sounder, trajectory)
-    warn_of_speed(flown, end, speed)
-    said = moving_said(loaded, moving or [], named)
-    bodies = MovingBodies.of(read_said(said), named, flown)
+    loaded, origin = _load(scene, parameter)
+    flown = options.path_for(sounder.fan, None, scene, frames, start, end, trajectory, frame, speed)
+    flown = options.under_vehicle(flown, sounder, trajectory)
+    options.warn_of_speed(flown, end, speed)
+    motions = _motions(loaded, moving, named)
+    bodies = MovingBodies.of(read_said(motions), named, flown)
     simulator = SounderSimulator(loaded, sounder, moving=bodies, rays_per_launch=rays_per_launch)
-    check_above_ground(loaded, flown, bool(said))
-    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
-    origin |= {"moving": digests_of(said)} if said else {}
-    options: dict[str, Any] = {"frame": named, "overwrite": overwrite, "resume": resume}
+    _check_above_ground(loaded, flown, bool(motions))
+    origin |= {"moving": digests_of(motions)} if motions else {}
     folder = out or Path("out") / sounder.name
     with progress_bar("sounding", len(flown), "pings") as progress:
-        report = run_sounder(simulator, flown, folder, origin=origin, progress=progress, **options)
+        destination = Destination(folder, origin, overwrite, resume, progress)
+        report = run_sounder(simulator, flown, destination, frame=named)
     for sentence in report.warnings:
         warn(sentence)
     say(f"{counted(len(flown), 'ping')} ({sounder.kind}, {sounder.name}, {sounder.fan.model} model) in {folder}")
-    say(poses_line(flown, {name: Pose.from_degrees(mount) for name, mount in sounder.mounts.items()}))
+    say(options.poses_line(flown, {name: Pose.from_degrees(mount) for name, mount in sounder.mounts.items()}))
     say(f"echoes in {report.found:,} of {counted(report.beams, 'beam')}; files: {', '.join(report.files)}")
 
 
@@ -593,19 +500,19 @@ def image(
     run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run rendered with --exr.")],
     bins: Annotated[int | None, typer.Option(help="Number of range bins (default: as rendered).")] = None,
     window: Annotated[str | None, typer.Option("--range", help="Range window from,to [m] (default: as rendered).")] = None,
-    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
+    noise: options.Noise = "none",
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: OUT/rebinned).")] = None,
     cartesian: Annotated[bool, typer.Option("--cartesian", help="Draw each frame with axes in metres.")] = False,
-    frame: Frame = "mitsonar",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
+    frame: options.Frame = "mitsonar",
+    overwrite: options.Overwrite = False,
+    resume: options.Resume = False,
 ) -> None:
     """Bin the stored echoes of a run into new frames, with other bins, another window or other noise."""
     from mitsonar.acoustics.noise import load_noise
     from mitsonar.motion.trajectory import convention_named
-    from mitsonar.simulation.runs import Outputs, StoredEchoes, run
+    from mitsonar.simulation.runs import Destination, RenderOptions, StoredEchoes, run
 
-    outputs = Outputs(load_noise(noise), cartesian=cartesian, frame=convention_named(frame).name)
+    outputs = RenderOptions(load_noise(noise), cartesian=cartesian, frame=convention_named(frame).name)
     ends = numbers(window, 2, "--range")
     if ends and not 0 <= ends[0] < ends[1]:
         raise MitsonarError(f"--range takes from,to in m, the near end first: got {window}")
@@ -613,11 +520,9 @@ def image(
     folder = out or run_folder / "rebinned"
     if run_folder.resolve().is_relative_to(folder.resolve()):
         raise MitsonarError(f"-o {folder} would replace the echoes that are read: choose another folder")
-    origin = {"echoes_of": str(run_folder), "echoes_recipe": source.asked}
+    origin = {"echoes_of": str(run_folder), "echoes_recipe": source.settings}
     with progress_bar("binning", len(source.trajectory), "pings") as progress:
-        report = run(
-            source, source.trajectory, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress
-        )
+        report = run(source, source.trajectory, outputs, Destination(folder, origin, overwrite, resume, progress))
     for sentence in report.warnings:
         warn(sentence)
     say(f"{counted(report.frames, 'frame')} of {counted(source.sonar.range_bins, 'bin')} in {folder}")

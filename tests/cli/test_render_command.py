@@ -21,7 +21,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames, to_uint8
-from mitsonar.simulation.runs import Outputs, StoredEchoes, run
+from mitsonar.simulation.runs import Destination, RenderOptions, StoredEchoes, run
 from mitsonar.simulation.scene import load_scene, shipped_scenes, shipped_trajectory, sonar_in
 from mitsonar.simulation.simulator import Simulator
 
@@ -258,9 +258,9 @@ def test_a_long_run_stays_zarr(scene: Path, tmp_path: Path, monkeypatch: pytest.
 
     simulator = Simulator(load_scene(scene))
     path = Trajectory(np.tile([0, 0, 2.5, np.radians(35), 0, 0], (5, 1)), np.arange(5.0))
-    run(simulator, path, tmp_path / "npz", Outputs(NOISE_MODELS["none"]), origin={})
+    run(simulator, path, RenderOptions(NOISE_MODELS["none"]), Destination(tmp_path / "npz"))
     monkeypatch.setattr(runs, "LONGEST_NPZ", 4)
-    run(simulator, path, tmp_path / "zarr", Outputs(NOISE_MODELS["none"]), origin={})
+    run(simulator, path, RenderOptions(NOISE_MODELS["none"]), Destination(tmp_path / "zarr"))
     assert not (tmp_path / "zarr" / "frames.npz").exists()
     np.testing.assert_array_equal(SonarFrames.load(tmp_path / "zarr").image, SonarFrames.load(tmp_path / "npz").image)
 
@@ -362,13 +362,13 @@ def test_a_run_killed_after_its_last_frame_is_finished_by_resume(
         raise KeyboardInterrupt
 
     path = Trajectory(np.tile([0, 0, 2.5, np.radians(35), 0, 0], (3, 1)), np.arange(3.0))
-    outputs = Outputs(NOISE_MODELS["none"])
+    options = RenderOptions(NOISE_MODELS["none"])
     with monkeypatch.context() as patch:
         patch.setattr(FrameStore, "pack", killed)
         with pytest.raises(KeyboardInterrupt):
-            run(Simulator(load_scene(scene)), path, tmp_path / "run", outputs, origin={})
+            run(Simulator(load_scene(scene)), path, options, Destination(tmp_path / "run"))
     assert not json.loads((tmp_path / "run" / "run.json").read_text())["finished"]
-    run(Simulator(load_scene(scene)), path, tmp_path / "run", outputs, origin={}, resume=True)
+    run(Simulator(load_scene(scene)), path, options, Destination(tmp_path / "run", resume=True))
     assert json.loads((tmp_path / "run" / "run.json").read_text())["finished"]
     assert len(SonarFrames.load(tmp_path / "run")) == 3
 
@@ -384,7 +384,7 @@ def test_echoes_are_not_replaced_by_what_is_made_of_them(mitsonar: Command, scen
 def test_a_damaged_state_is_not_gone_on_with(scene: Path, tmp_path: Path) -> None:
     """Killed in the middle, then written by a stranger: one sentence each, and the true state still goes on."""
     path = Trajectory(np.tile([0, 0, 2.5, np.radians(35), 0, 0], (3, 1)), np.arange(3.0))
-    simulator, outputs = Simulator(load_scene(scene), rays_per_launch=4_000), Outputs(NOISE_MODELS["none"])
+    simulator, options = Simulator(load_scene(scene), rays_per_launch=4_000), RenderOptions(NOISE_MODELS["none"])
     calls: list[int] = []
 
     def killed(frames: int) -> None:
@@ -393,7 +393,7 @@ def test_a_damaged_state_is_not_gone_on_with(scene: Path, tmp_path: Path) -> Non
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(simulator, path, tmp_path / "run", outputs, origin={}, progress=killed)
+        run(simulator, path, options, Destination(tmp_path / "run", progress=killed))
     file = tmp_path / "run" / "run.json"
     kept = file.read_text()
     state = json.loads(kept)
@@ -408,10 +408,10 @@ def test_a_damaged_state_is_not_gone_on_with(scene: Path, tmp_path: Path) -> Non
     ):
         file.write_text(json.dumps(state | damage))
         with pytest.raises(MitsonarError, match=said):
-            run(simulator, path, tmp_path / "run", outputs, origin={}, resume=True)
+            run(simulator, path, options, Destination(tmp_path / "run", resume=True))
     file.write_text(kept)
-    run(simulator, path, tmp_path / "run", outputs, origin={}, resume=True)
-    run(simulator, path, tmp_path / "whole", outputs, origin={})
+    run(simulator, path, options, Destination(tmp_path / "run", resume=True))
+    run(simulator, path, options, Destination(tmp_path / "whole"))
     np.testing.assert_array_equal(SonarFrames.load(tmp_path / "run").image, SonarFrames.load(tmp_path / "whole").image)
 
 

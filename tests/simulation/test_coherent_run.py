@@ -12,7 +12,7 @@ from helpers import diffuse, floor, scene, sphere
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import FrameStore, SonarFrames
-from mitsonar.simulation.runs import Outputs, run
+from mitsonar.simulation.runs import Destination, RenderOptions, run
 from mitsonar.simulation.simulator import Simulator
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -28,8 +28,8 @@ def test_a_run_that_is_broken_off_and_resumed_has_the_same_bits(tmp_path: Path, 
     """25 frames, broken off after the 22nd: the gain is that of the first 20; noise goes by the number of the ping."""
     loaded = scene(floor=floor(diffuse(0.1)), ball=sphere((0, 3.4, 0.2), 0.15, diffuse(0.3)))
     poses = np.array([0, 0, HEIGHT, PITCH, 0, 0]) + np.arange(25)[:, None] * np.array([0.01, 0.004, 0, 0, 0, 0.002])
-    path, outputs = Trajectory(poses, np.arange(25) / 10), Outputs(NOISE_MODELS["none"], labels=True)
-    run(Simulator(loaded, NOISY), path, tmp_path / "whole", outputs, origin={})
+    path, options = Trajectory(poses, np.arange(25) / 10), RenderOptions(NOISE_MODELS["none"], labels=True)
+    run(Simulator(loaded, NOISY), path, options, Destination(tmp_path / "whole"))
     real = FrameStore.write
 
     def broken(store: FrameStore, first: int, frames: SonarFrames) -> None:
@@ -40,8 +40,8 @@ def test_a_run_that_is_broken_off_and_resumed_has_the_same_bits(tmp_path: Path, 
     with monkeypatch.context() as patch:
         patch.setattr(FrameStore, "write", broken)
         with pytest.raises(KeyboardInterrupt):
-            run(Simulator(loaded, NOISY), path, tmp_path / "parts", outputs, origin={})
-    run(Simulator(loaded, NOISY), path, tmp_path / "parts", outputs, origin={}, resume=True)
+            run(Simulator(loaded, NOISY), path, options, Destination(tmp_path / "parts"))
+    run(Simulator(loaded, NOISY), path, options, Destination(tmp_path / "parts", resume=True))
     whole, parts = (SonarFrames.load(tmp_path / name) for name in ("whole", "parts"))
     np.testing.assert_array_equal(whole.image, parts.image)
     assert whole.shape_id is not None

@@ -8,7 +8,7 @@ from channel_scenes import LEVEL, cells_floor, simulator
 
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.simulation.channel import Paths
-from mitsonar.simulation.runs import spread_of
+from mitsonar.simulation.instrument_runs import spread_of
 
 
 def paths(delay_s: float, doppler_hz: float, around_hz: float) -> Paths:

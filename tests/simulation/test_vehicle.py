@@ -15,7 +15,7 @@ from mitsonar.motion.pose import Pose, mount_between, mounted
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 from mitsonar.records.soundings import Soundings, range_rates
-from mitsonar.simulation.runs import run_vehicle
+from mitsonar.simulation.instrument_runs import run_vehicle
 from mitsonar.simulation.scene import load_motions, load_scene, motions_of
 from mitsonar.simulation.simulator import Simulator
 from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle, sensors_in
@@ -84,7 +84,7 @@ def test_hydrophones_and_bodies_that_move_are_refused(tank: Path) -> None:
 @pytest.mark.thorough
 def test_a_run_goes_on_with_the_same_bits(tank: Path, tmp_path: Path) -> None:
     from mitsonar.acoustics.noise import NOISE_MODELS
-    from mitsonar.simulation.runs import Outputs
+    from mitsonar.simulation.runs import Destination, RenderOptions
 
     class KilledError(Exception):
         pass
@@ -95,7 +95,7 @@ def test_a_run_goes_on_with_the_same_bits(tank: Path, tmp_path: Path) -> None:
         "  camera: {camera: {width: 32, height: 24, samples: 4}, mount: [0, 0, 0, 20, 0, 0]}\n"
         "moving: {fish: fish.tum}\n"
     )
-    file, outputs, calls = load_vehicle(tmp_path / "auv.yaml"), Outputs(NOISE_MODELS["none"]), [0]
+    file, options, calls = load_vehicle(tmp_path / "auv.yaml"), RenderOptions(NOISE_MODELS["none"]), [0]
     simulator = VehicleSimulator(load_scene(tank), file.sensors, moving={"fish": FISH})
 
     def killed(pings: int) -> None:
@@ -104,17 +104,17 @@ def test_a_run_goes_on_with_the_same_bits(tank: Path, tmp_path: Path) -> None:
             raise KilledError
 
     with pytest.raises(KilledError):
-        run_vehicle(simulator, PATH, tmp_path / "run", outputs, origin={}, progress=killed)
+        run_vehicle(simulator, PATH, options, Destination(tmp_path / "run", progress=killed))
     (tmp_path / "run" / "camera" / "images" / "000000.png").unlink()  # what was deleted is made again
-    report = run_vehicle(simulator, PATH, tmp_path / "run", outputs, origin={}, resume=True)
-    run_vehicle(simulator, PATH, tmp_path / "whole", outputs, origin={})
+    report = run_vehicle(simulator, PATH, options, Destination(tmp_path / "run", resume=True))
+    run_vehicle(simulator, PATH, options, Destination(tmp_path / "whole"))
     assert report.sensors == ("ahead", "down", "camera")
     for name in ("ahead/images/000002.png", "camera/images/000000.png", "camera/images/000002.png", "vehicle.tum"):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     down = Soundings.load(tmp_path / "run" / "down" / "soundings.npz")
     np.testing.assert_allclose(down.range_m.ravel(), 2.0, atol=0.08)
     with pytest.raises(MitsonarError, match="kept as it is"):
-        run_vehicle(simulator, PATH, tmp_path / "run", outputs, origin={})
+        run_vehicle(simulator, PATH, options, Destination(tmp_path / "run"))
 
 
 def test_motions_of_the_scene_and_of_a_file_are_the_same(tank: Path, tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ def test_range_rates_are_those_of_body_and_sonar(tank: Path) -> None:
 
 def test_a_sensor_that_cannot_follow_is_named_before_any_is_rendered(tank: Path, tmp_path: Path) -> None:
     from mitsonar.acoustics.noise import NOISE_MODELS
-    from mitsonar.simulation.runs import Outputs
+    from mitsonar.simulation.runs import Destination, RenderOptions
 
     (tmp_path / "auv.yaml").write_text(
         "sensors:\n  ahead: {sonar: {beams: 12, range_max: 9, quality: draft}}\n  head: {sonar: ping360}\n"
@@ -159,9 +159,9 @@ def test_a_sensor_that_cannot_follow_is_named_before_any_is_rendered(tank: Path,
     simulator = VehicleSimulator(load_scene(tank), load_vehicle(tmp_path / "auv.yaml").sensors)
     calls: list[int] = []
     for noise, said in (("none", r"sensor head: a sweep lasts 18\.67 s and the path 1 s"), ("low", "sensor head: ")):
-        outputs = Outputs(NOISE_MODELS[noise])
+        options = RenderOptions(NOISE_MODELS[noise])
         with pytest.raises(MitsonarError, match=said):
-            run_vehicle(simulator, PATH, tmp_path / "run", outputs, origin={}, progress=calls.append)
+            run_vehicle(simulator, PATH, options, Destination(tmp_path / "run", progress=calls.append))
     assert not calls
     assert not (tmp_path / "run").exists()
     with pytest.raises(MitsonarError, match="sensor head: a sweep"):

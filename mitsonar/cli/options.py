@@ -1,11 +1,14 @@
-"""The path that the options ``--from``, ``--to``, ``--frames``, ``--speed`` and ``--trajectory`` define."""
+"""Options that several commands share, and what they select: path, scene, instrument.
+
+The path is that of ``--from``, ``--to``, ``--frames``, ``--speed`` and ``--trajectory``.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -21,24 +24,43 @@ if TYPE_CHECKING:
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["FRAMES", "SIX", "SPEED", "Frame", "path_for", "poses_line", "under_vehicle", "warn_of_speed"]
-
 SIX = "x,y,z,pitch,roll,heading in m and deg"
 FRAMES = (
     "Number of frames, with --trajectory evenly spaced in time. For a rotating head (ping360) the number of sweeps from the "
     "start, with --vehicle the number of poses."
 )
-SPEED = "Speed from --from to --to [m/s] (default: a frame every 1 / frame_rate_hz)."
-FAST_M_S = 5.0
-"""Speed above which a warning reports the vehicle's [m/s]: few underwater vehicles reach it."""
+NOISE = (
+    "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; no realism, it shows which "
+    "pixels are empty"
+)
 
-TILTED_DEG = 10.0
-"""Pitch or roll of a vehicle above which an instrument that looks down causes a warning [deg]."""
-
+SceneName = Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")]
+Parameters = Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")]
+Moving = Annotated[
+    list[str] | None,
+    typer.Option("--moving", help="ID=FILE.tum: the shape ID follows that path; or FILE.yaml (docs/guides/moving.md)."),
+]
+Start = Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")]
+End = Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")]
+Speed = Annotated[
+    float | None, typer.Option(help="Speed from --from to --to [m/s] (default: a frame every 1 / frame_rate_hz).")
+]
 Frame = Annotated[
     str,
     typer.Option(help="Convention of pose files to read and write: mitsonar, ros-enu or ned; --from is always mitsonar."),
 ]
+SonarName = Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")]
+SonarKeys = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the sonar: range_max=8.")]
+Noise = Annotated[str, typer.Option(help=f"{NOISE}.")]
+RaysPerLaunch = Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")]
+
+FAST_M_S = 5.0
+"""Speed above which a vehicle's speed is reported [m/s]: few underwater vehicles reach it."""
+
+TILTED_DEG = 10.0
+"""Pitch or roll of a vehicle above which an instrument that looks down from it is warned of [deg]."""
 
 
 def path_for(
@@ -52,7 +74,7 @@ def path_for(
     frame: str,
     speed: float | None = None,
 ) -> Trajectory:
-    """Return the poses that the options define."""
+    """Return the trajectory that the options define."""
     from mitsonar.instruments.sonar import first_sweeps, frame_period_s, scans
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
@@ -82,7 +104,8 @@ def path_for(
     if begin is None:
         raise MitsonarError(f"the scene gives no pose: give one with --from ({SIX}), or --trajectory FILE.tum")
     if last is None:
-        return Trajectory.between(begin, begin, _ends(sonar, frames or 1), 1 / frame_period_s(sonar))
+        rest = frames or 1  # poses of a vehicle at rest; those of a head that turns lie at the ends of its sweeps
+        return Trajectory.between(begin, begin, rest + (rest > 1 and scans(sonar)), 1 / frame_period_s(sonar))
     if frames is None or (frames < 2 and not scans(sonar)):
         raise MitsonarError("--to needs --frames T, 2 or more: how many frames lie between --from and --to")
     ends, poses = (begin, Pose.from_degrees(last)), frames + 1 if scans(sonar) else frames
@@ -134,13 +157,6 @@ def poses_line(path: Trajectory, mounts: Mapping[str, ArrayLike] | None = None) 
     return f"poses: of the vehicle, at pitch {pitch:.3g} deg{on_it}"
 
 
-def _ends(sonar: Sonar, frames: int) -> int:
-    """Return the number of poses of a resting vehicle; a rotating head sweeps between poses, so it has one more."""
-    from mitsonar.instruments.sonar import scans
-
-    return frames + 1 if scans(sonar) and frames > 1 else frames
-
-
 def warn_of_speed(path: Trajectory, end: str | None, speed: float | None) -> None:
     """Warn about an implausible speed that follows from --from, --to, --frames and the frame rate."""
     lasts = float(path.time_s[-1] - path.time_s[0])
@@ -152,3 +168,45 @@ def warn_of_speed(path: Trajectory, end: str | None, speed: float | None) -> Non
             f"the vehicle flies {away:.3g} m in {lasts:.3g} s, {away / lasts:.3g} m/s, since frames follow each other at "
             "the sonar's rate; give --speed 1 (m/s), or more --frames"
         )
+
+
+def scene_parameters(pairs: list[str]) -> dict[str, str]:
+    """Return the parameters of -D, keyed by name."""
+    wrong = [pair for pair in pairs if "=" not in pair]
+    if wrong:
+        raise MitsonarError(f"-D takes NAME=VALUE: got {wrong[0]!r}")
+    return dict(pair.split("=", 1) for pair in pairs)
+
+
+def sonar_changes(pairs: list[str] | None, quality: str | None, model: str | None, seed: int | None) -> dict[str, Any]:
+    """Return the keys of a sonar that --set, --quality, --model and --seed change."""
+    wrong = [pair for pair in pairs or [] if "=" not in pair]
+    if wrong:
+        raise MitsonarError(f"--set takes KEY=VALUE: got {wrong[0]!r}")
+    changes: dict[str, Any] = dict(pair.split("=", 1) for pair in pairs or [])
+    if "preset" in changes:
+        raise MitsonarError(f"--set changes keys of the sonar: got preset={changes['preset']}; name it by --sonar")
+    if quality is not None and changes.get("quality", quality) != quality:
+        raise MitsonarError(f"--quality {quality} and --set quality={changes['quality']} contradict each other: give one")
+    given = {"quality": quality, "model": model, "seed": seed}
+    return changes | {key: value for key, value in given.items() if value is not None}
+
+
+def instrument_for(scene: Any, name: str | None, changes: dict[str, Any]) -> tuple[Sonar, Pose | None]:
+    """Return the sonar to use, with its changes, and the pose that the scene gives it."""
+    from mitsonar.instruments.sounder import load_sonar
+    from mitsonar.simulation.scene import sonar_in
+
+    found = sonar_in(scene)
+    if name is None and found is None:
+        raise MitsonarError(
+            "the scene has no sensor of type imaging_sonar: add one, or name a sonar (--sonar didson300) and a pose (--from)"
+        )
+    sonar = load_sonar(name) if name is not None else found[0]  # type: ignore[index]
+    sonar = sonar.replace(**changes)
+    if "quality" in changes and sonar.model == "thesis":
+        raise MitsonarError(
+            "quality is of the model physical, the thesis model has its own number of rays: got quality "
+            f"{changes['quality']}; leave it out, or give --set rays_per_beam=N"
+        )
+    return sonar, found[1] if found else None
