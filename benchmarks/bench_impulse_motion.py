@@ -58,7 +58,7 @@ from mitsonar.datasets.responses import with_noise
 from mitsonar.datasets.samples import ImpulsePairs
 from mitsonar.estimation.crlb.channel import channel_crlb
 from mitsonar.estimation.named import create_estimator
-from mitsonar.mapping.odometry import odometry
+from mitsonar.mapping.odometry import OdometryOptions, odometry
 from mitsonar.mapping.open_source import ResponseSource
 from mitsonar.mapping.series import path_of
 from mitsonar.motion.composition import motions
@@ -379,8 +379,8 @@ def driven(asked: argparse.Namespace, label: str, name: str, responses: ImpulseR
     are bridged. The last column is the validity."""
     path = asked.out / f"{label}-{file_name(name)}.json"
     if not path.exists():
-        found = odometry(ResponseSource(label, responses), create_estimator(name), workers=asked.processes)
-        rows = np.column_stack([found.series.motions, np.zeros((len(found.series), 3)), found.believed])
+        found = odometry(ResponseSource(label, responses), create_estimator(name), OdometryOptions(workers=asked.processes))
+        rows = np.column_stack([found.series.motions, np.zeros((len(found.series), 3)), found.valid])
         path.write_text(json.dumps(rows.tolist()))
     return np.array(json.loads(path.read_text()))
 
@@ -394,7 +394,7 @@ def figure(asked: argparse.Namespace) -> None:
     flown = course_of(asked, "sinusoid", Pose(0, 0, 2.5, pitch=np.radians(35)))
     sonar = load_sonar("didson300").replace(frame_rate_hz=20.0)
     frames = Simulator(scene, sonar).render(flown)
-    seen = odometry(frames, create_estimator("direct"), start=Pose.from_row(flown.poses[0]))
+    seen = odometry(frames, create_estimator("direct"), OdometryOptions(start=Pose.from_row(flown.poses[0])))
     path = asked.out / f"course-sinusoid-{asked.model}-{asked.pings}-correlation.json"
     received = np.array(json.loads(path.read_text()))[:, :3]
     driven_by = {
@@ -413,7 +413,7 @@ def figure(asked: argparse.Namespace) -> None:
             flush=True,
         )
         axes.plot(*poses[:, :2].T, lw=1.2, label=f"{name}: ends {100 * end:.1f} cm off")
-    print(f"images: {int((~seen.believed).sum())} of {len(true)} motions invalid and bridged", flush=True)
+    print(f"images: {int((~seen.valid).sum())} of {len(true)} motions invalid and bridged", flush=True)
     axes.set(xlabel="starboard (m)", ylabel="forward (m)", aspect="equal", title="Trajectory 5 (sinusoid), no noise")
     axes.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
     axes.grid(alpha=0.3)

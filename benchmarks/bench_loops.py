@@ -30,10 +30,9 @@ from trajectory_jobs import COARSE, FIELD_M, FIELD_SEED, HEIGHT_M, PITCH_DEG, RE
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.config.data import load_recipe
 from mitsonar.errors import MitsonarWarning
-from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named import create_estimator
-from mitsonar.mapping.graph_odometry import normalised_errors
-from mitsonar.mapping.odometry import Odometry, odometry
+from mitsonar.mapping.odometry import Odometry, OdometryOptions, normalised_errors, odometry
+from mitsonar.mapping.pairs import EstimateStore
 from mitsonar.mapping.sensors import simulated_sensors
 from mitsonar.mapping.series import path_of
 from mitsonar.mapping.sources import FrameSource
@@ -117,17 +116,20 @@ def rendered(path: Trajectory, *, coarse: bool) -> SonarFrames:
 
 def rows(source: FrameSource, noise: str, seeds: int) -> Iterator[str]:
     """Run odometry with and without a gyroscope and loops; the motions of frames are estimated once."""
-    estimator, known = create_estimator("direct"), dict[int, Estimate]()
+    estimator, store = create_estimator("direct"), EstimateStore()
     assert source.true is not None
     begun = time.perf_counter()
-    plain = odometry(source, estimator, known=known, keep=known.__setitem__)
+    plain = odometry(source, estimator, store=store)
     yield row([noise, "no", "no"], [plain], time.perf_counter() - begun)
-    print(f"{len(known)} motions estimated", file=sys.stderr, flush=True)
+    print(f"{len(store.pairs)} motions estimated", file=sys.stderr, flush=True)
     gyros = [simulated_sensors(source.true, GYRO, seed) for seed in range(seeds)]
     choices: list[tuple[Sequence[VehicleSensors | None], bool]] = [([None], True), (gyros, False), (gyros, True)]
     for sensors, loops in choices:
         begun = time.perf_counter()
-        runs = [odometry(source, estimator, known=known, sensors=one, loops=loops) for one in sensors]
+        runs = [
+            odometry(source, estimator, OdometryOptions(sensors=one, loops=loops), store=EstimateStore(store.pairs))
+            for one in sensors
+        ]
         name = "no" if sensors[0] is None else f"1 deg/h^0.5, {seeds} draws"
         yield row([noise, name, "yes" if loops else "no"], runs, (time.perf_counter() - begun) / len(runs))
 

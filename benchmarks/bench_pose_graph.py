@@ -21,7 +21,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from mitsonar.mapping.graph_odometry import graph_path
+from mitsonar.mapping.odometry import graph_path
 from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
 from mitsonar.mapping.series import MotionSeries, path_of
 from mitsonar.motion.pose import Pose
@@ -53,9 +53,7 @@ def row(frames: int) -> str:
     """Solve a chain; return the row of its time and memory."""
     measured, sensors = drawn(frames)
     held, begun = peak_mib(), time.process_time()
-    found = graph_path(
-        measured, lambda whole: whole, Pose(0, 0, 2), start_known=True, sensors=sensors, loops=None, source=None
-    )
+    found = graph_path(measured, Pose(0, 0, 2), start_known=True, sensors=sensors, loops=None, source=None)
     seconds = time.process_time() - begun
     return (
         f"| {frames:,} | {seconds:.1f} | {1e3 * seconds / frames:.2f} | {peak_mib() - held:.0f} | {found.end_told_m:.6f} |"

@@ -26,7 +26,7 @@ from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named import create_estimator
 from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.odometry import odometry
+from mitsonar.mapping.odometry import OdometryOptions, odometry
 from mitsonar.mapping.open_source import LOOP, with_assumed_plane
 from mitsonar.mapping.sources import FrameSource, open_frames
 from mitsonar.recordings.write_aris import write_aris
@@ -141,12 +141,12 @@ def chain(source: FrameSource, reference: Array | None, estimators: list[str]) -
     for moving in (False, True):
         seen = source.with_contrast(moving=moving)
         for word in estimators:
-            found = odometry(seen, create_estimator(word), closure=LOOP)
+            found = odometry(seen, create_estimator(word), OdometryOptions(closure=LOOP))
             total = found.series.motions.sum(axis=0) / unit
             loops = "" if found.closure is None else " / ".join(f"{value:.3f}" for value in found.closure.rms / unit)
             kind = "moving" if moving else "local"
             sums = " / ".join(f"{value:.2f}" for value in total)
-            print(f"| {kind} | {word} | {sums} | {loops} | {int(found.believed.sum())} of {len(found.estimates)} |")
+            print(f"| {kind} | {word} | {sums} | {loops} | {int(found.valid.sum())} of {len(found.estimates)} |")
     if reference is not None:
         print(f"reference: forward {reference[:, 2].sum():.1f} px, yaw {-reference[:, 0].sum():.2f} deg, without truth")
 

@@ -321,7 +321,7 @@ def paths(asked: argparse.Namespace) -> None:
             off = np.linalg.norm(found.path.poses[-1][:2] - source.poses[-1, :2])
             length = np.linalg.norm(np.diff(source.poses[:, :2], axis=0), axis=1).sum()
             print(
-                f"| {Path(run).name} | {name}, scene {number // 2} | {len(found.estimates)} | {int(found.believed.sum())} | "
+                f"| {Path(run).name} | {name}, scene {number // 2} | {len(found.estimates)} | {int(found.valid.sum())} | "
                 f"{rmse} | {1e3 * off:.0f} ({100 * off / length:.1f} %) |",
                 flush=True,
             )

@@ -356,8 +356,8 @@ def run_trajectory(job: Job, out: Path) -> Result:
 def smoothed(found: list[Estimate], time_s: Array) -> dict[str, MotionSeries]:
     """Return the estimates without smoothing (invalid ones as no motion), and smoothed."""
     series = MotionSeries.from_estimates(found, time_s)
-    motion = np.where(series.believed[:, None], series.motions, 0)
-    known = None if series.covariances is None else np.where(series.believed[:, None, None], series.covariances, 0)
+    motion = np.where(series.is_valid[:, None], series.motions, 0)
+    known = None if series.covariances is None else np.where(series.is_valid[:, None, None], series.covariances, 0)
     raw = MotionSeries(motion, time_s, known)
     return {"raw": raw, "Kalman": kalman_smoothed(series), "spline": spline_smoothed(series)}
 

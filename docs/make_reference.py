@@ -43,6 +43,7 @@ GROUPS = {
         "compare",
         "Comparison",
         "odometry",
+        "OdometryOptions",
         "VehicleSensors",
         "load_sensors",
         "save_sensors",

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.instruments.sounder import Sounder, load_sonar, load_sounder
     from mitsonar.mapping.mosaic import build_mosaic, illumination
-    from mitsonar.mapping.odometry import odometry
+    from mitsonar.mapping.odometry import OdometryOptions, odometry
     from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
     from mitsonar.mapping.series import path_of
     from mitsonar.mapping.sources import load_frames
@@ -74,6 +74,7 @@ __all__ = [
     "MitsonarWarning",
     "Motion",
     "Mounted",
+    "OdometryOptions",
     "Pose",
     "RenderedPairs",
     "SeaSurface",
@@ -141,6 +142,7 @@ _MODULES = {
     "MitsonarWarning": "errors",
     "Motion": "motion.composition",
     "Mounted": "simulation.vehicle",
+    "OdometryOptions": "mapping.odometry",
     "Pose": "motion.pose",
     "RenderedPairs": "datasets.rendered",
     "SeaSurface": "worlds.sea",

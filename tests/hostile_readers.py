@@ -321,9 +321,7 @@ def read_sensors(folder: Path) -> None:
 
 
 def read_odometry(folder: Path) -> None:
-    there = OdometryFolder(RunDirectory.begin(folder, ODOMETRY, {"a": 1}, resume=True))
-    there.kept()
-    there.kept_loops()
+    OdometryFolder(RunDirectory.begin(folder, ODOMETRY, {"a": 1}, resume=True)).read_journals()
 
 
 def spoil_odometry(rng: Rng, folder: Path) -> None:

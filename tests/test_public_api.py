@@ -63,6 +63,7 @@ MADE: dict[str, Callable[[Path], Any]] = {
     "ImpulseResponses": _responses,
     "Motion": lambda _: mitsonar.Motion(*np.array([0.1, 0.2, 0.3]) / 3),
     "Mounted": lambda _: mitsonar.Mounted(SONAR, mitsonar.Pose(*np.ones(6) / 3)),
+    "OdometryOptions": lambda _: mitsonar.OdometryOptions(),
     "Pose": lambda _: mitsonar.Pose(*np.ones(6) / 3),
     "RenderedPairs": lambda _: mitsonar.RenderedPairs(tiny_recipe(), seed=1),
     "SeaSurface": lambda _: mitsonar.SeaSurface(),

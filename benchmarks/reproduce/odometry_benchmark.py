@@ -25,7 +25,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.io.files import parse_json, read_json, whole_lines, write_json, write_whole
 from mitsonar.io.runs import RunDirectory, RunKind, digest, versions
-from mitsonar.mapping.odometry import Odometry
+from mitsonar.mapping.odometry import Odometry, OdometryOptions
 from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder, run_odometry
 from mitsonar.mapping.open_source import LOOP, Reading, open_source, record_at
 from mitsonar.mapping.sources import FrameSource, open_frames
@@ -154,15 +154,14 @@ def measured_row(
     row |= {"command": case.command, "inputs": estimator.inputs, "frames": len(source), "pairs": pairs, "note": ""}
     loop = LOOP if source.true is None and pairs > LOOP else 0
     try:
-        found = run_odometry(
-            source, case.method, estimator, folder, closure=loop, workers=workers, resume=True, progress=progress
-        )
+        options = OdometryOptions(closure=loop, workers=workers)
+        found = run_odometry(source, case.method, estimator, folder, options, resume=True, progress=progress)
     except MitsonarError as error:
         estimates = _kept(folder)
         if len(estimates) < pairs or any(one.valid for one in estimates):
             raise
         return row | {"failures": pairs, "note": str(error), "ms": _milliseconds(source, estimator)}
-    row |= {"failures": int((~found.believed).sum()), "ms": _milliseconds(source, estimator)}
+    row |= {"failures": int((~found.valid).sum()), "ms": _milliseconds(source, estimator)}
     row |= {"estimated_path_m": path_length(found.path)}
     return row | (_without_truth(found) if found.true is None else _against_truth(found, found.true, bound))
 
@@ -171,7 +170,7 @@ def _kept(folder: Path) -> list[Estimate]:
     """Return the estimates of a row that failed."""
     if not (folder / "run.json").exists():
         return []
-    return list(OdometryFolder(RunDirectory.open(folder, ODOMETRY)).kept().values())
+    return list(OdometryFolder(RunDirectory.open(folder, ODOMETRY)).read_journals().pairs.values())
 
 
 def _without_truth(found: Odometry) -> PlainTable:

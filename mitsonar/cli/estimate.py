@@ -131,7 +131,7 @@ def odometry(
     also loops.csv.
     """
     from mitsonar.estimation.named import create_estimator
-    from mitsonar.mapping.odometry import loop_starts
+    from mitsonar.mapping.odometry import OdometryOptions, loop_starts
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
     from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at, usual_loop
     from mitsonar.mapping.sensors import open_sensors
@@ -155,35 +155,29 @@ def odometry(
     if source.note:
         say(source.note)
     pairs = max(0, len(source) - 1) // max(1, every)
-    processes = workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER))
     steps = usual_loop(source) if closure is None else closure
     closing = len(loop_starts(pairs, steps)) if steps > 1 else 0
     frames_mapped = pairs + 1 if local_map else 0
+    options = OdometryOptions(
+        smooth=smooth,  # type: ignore[arg-type]  # other words are refused
+        scale=factors,
+        start=None if first is None else Pose.from_degrees(first),
+        every=every,
+        closure=steps,
+        sensors=vehicle,
+        loops=loops,
+        local_map=local_map,
+        workers=workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER)),
+    )
     with progress_bar("estimating", pairs + closing + frames_mapped, "pairs") as progress:
         found = run_odometry(
-            source,
-            estimator,
-            method,
-            out,
-            smooth=smooth,  # type: ignore[arg-type]  # other words are refused there
-            scale=factors,
-            start=None if first is None else Pose.from_degrees(first),
-            frame=frame,
-            every=every,
-            closure=steps,
-            sensors=vehicle,
-            loops=loops,
-            local_map=local_map,
-            workers=processes,
-            overwrite=overwrite,
-            resume=resume,
-            progress=progress,
+            source, estimator, method, out, options, frame=frame, overwrite=overwrite, resume=resume, progress=progress
         )
     for line in table_lines(found.rows()):
         say(line)
     for sentence in found.warnings():
         warn(sentence)
-    count, lost = len(found.estimates), int((~found.believed).sum())
+    count, lost = len(found.estimates), int((~found.valid).sum())
     if found.graph is not None and found.graph.sensors:
         say(f"sensors: {', '.join(found.graph.sensors)}")
     say(f"{counted(count, 'motion')} by {estimator} ({method.inputs}), {lost} invalid and bridged, in {out}")

@@ -7,7 +7,6 @@ Frames are drawn as coarse views of the ground from above (:class:`Canvas`), and
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Self
@@ -20,7 +19,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.image.phase import GroundView, fan_places
 from mitsonar.geometry.ground import attitude_of
-from mitsonar.mapping.pairs import estimate_motions
+from mitsonar.mapping.pairs import EstimateStore, estimate_motions
 from mitsonar.mapping.pose_graph import GraphSolution, PoseEdges, motion_derivatives, relative_motions
 from mitsonar.mapping.series import ErrorCorrelation
 from mitsonar.mapping.sources import FrameSource
@@ -31,8 +30,6 @@ from mitsonar.records.frames import SonarFrames
 __all__ = [
     "Canvas",
     "CoarseView",
-    "KeepLoop",
-    "KnownLoops",
     "Likeness",
     "LoopSearch",
     "canvas_of",
@@ -266,10 +263,6 @@ NEIGHBOURS = 6
 AGREEING_STD, AGREEING_WAY, AGREEING_M = 3.0, 0.03, 0.005
 """Largest difference of two neighbouring loops: standard deviations of both, fraction of the distance between them, [m]."""
 
-KnownLoops = Mapping[tuple[int, int, Motion], Estimate]
-KeepLoop = Callable[[int, int, Motion, Estimate], None]
-"""Registrations, identified by the numbers of both frames in the source and by the initial motion."""
-
 
 @dataclass(frozen=True)
 class LoopSearch:
@@ -362,9 +355,7 @@ def search_loops(
     solution: GraphSolution,
     errors: ErrorCorrelation,
     canvas: Canvas,
-    *,
-    known: KnownLoops | None = None,
-    keep: KeepLoop = lambda first, second, motion, estimate: None,
+    store: EstimateStore,
 ) -> LoopSearch:
     """Search a path for loops, by appearance and registration.
 
@@ -379,22 +370,21 @@ def search_loops(
         solution: solution of the pose graph without loops.
         errors: correlation of errors over the same ground, by which neighbouring loops count as fewer.
         canvas: canvas from :func:`canvas_of`.
-        known: registrations of an earlier run.
-        keep: called with each new registration.
+        store: registrations of an earlier run, to which new ones are added.
 
     Raises:
         MitsonarError: frames cannot be read, or lack height or pitch.
     """
     # 1. choose keyframes and draw their views
     searched = _searched(source, numbers, solution, canvas)
-    register = _Register(source, estimator, numbers, searched, known or {}, keep)
+    register = _Register(source, estimator, numbers, searched, store)
     # 2. for each keyframe: one unambiguous place by appearance, confirmed by registration
     rejected: Counter[str] = Counter()
     compared, found = 0, []
     for second in (int(one) for one in searched.keys if int(one) in searched.views):
-        alike, tried = _alike(searched, second)
+        matches, tried = _matches(searched, second)
         compared += tried
-        reason, candidate = _unambiguous(searched, second, alike)
+        reason, candidate = _unambiguous(searched, second, matches)
         if candidate is not None:
             estimate = register(candidate)
             reason = _astray(estimate, candidate.motion, searched)
@@ -427,7 +417,7 @@ def _searched(source: FrameSource, numbers: Index, solution: GraphSolution, canv
 # ---------------- Loop closure: appearance
 
 
-def _alike(searched: _Searched, second: int) -> tuple[list[tuple[int, Likeness]], int]:
+def _matches(searched: _Searched, second: int) -> tuple[list[tuple[int, Likeness]], int]:
     """Return the matches of a keyframe with earlier ones that may show the same ground, and how many were compared."""
     # 1. earlier keyframes far enough back along the path
     apart = searched.travelled[second] - searched.travelled[searched.keys] >= APART * searched.extent
@@ -475,15 +465,15 @@ def _relative(searched: _Searched, first: Index, second: int) -> tuple[Array, Ar
     return relative_motions(searched.poses, first, others), covariances
 
 
-def _unambiguous(searched: _Searched, second: int, alike: list[tuple[int, Likeness]]) -> tuple[str, _Candidate | None]:
+def _unambiguous(searched: _Searched, second: int, matches: list[tuple[int, Likeness]]) -> tuple[str, _Candidate | None]:
     """Return the one candidate of a keyframe; or why there is none, with an empty reason if no view matches."""
-    if not alike:
+    if not matches:
         return "", None
-    first, best = max(alike, key=lambda one: one[1].correlation)
+    first, best = max(matches, key=lambda one: one[1].correlation)
     if best.correlation < LEAST_LIKE:
         return "", None
     place = _middle_of(_composed(searched.poses[first], best.motion), searched.reach)
-    for other, one in alike:
+    for other, one in matches:
         there = _middle_of(_composed(searched.poses[other], one.motion), searched.reach)
         if one.correlation > RIVAL * best.correlation and np.hypot(*(there - place)) > SAME_PLACE * searched.reach:
             return "two places are alike", None
@@ -524,17 +514,16 @@ class _Register:
     estimator: AnyEstimator
     numbers: Index
     searched: _Searched
-    known: KnownLoops
-    keep: KeepLoop
+    store: EstimateStore
 
     def __call__(self, candidate: _Candidate) -> Estimate:
         pair = int(self.numbers[candidate.first]), int(self.numbers[candidate.second])
-        estimate = self.known.get((*pair, candidate.motion))
+        estimate = self.store.loops.get((*pair, candidate.motion))
         if estimate is None:
             cell = self.searched.cell
             prior = MotionPrior(candidate.motion, np.diag([cell**2, cell**2, TURN_STEP**2]))
             estimate = estimate_motions(self.source, self.estimator, pair, priors=[prior])[0]
-            self.keep(*pair, candidate.motion, estimate)
+            self.store.add_loop(*pair, candidate.motion, estimate)
         return estimate
 
 
@@ -618,10 +607,10 @@ def _edges(found: list[_Found], searched: _Searched, errors: ErrorCorrelation) -
     motions = np.array([one.motion for _, one in found], dtype=float)
     known = [_covariance_of(one, searched) for _, one in found]
     # errors in proportion to the motion, which registrations do not report
-    slopes = errors.of(np.vstack([motions, motions[:1]]), searched.reach).slope_std
+    slopes = errors.along(np.vstack([motions, motions[:1]]), searched.reach).slope_std
     scaled = (motions**2) @ (slopes**2).T
     # the mean of a first-order chain with correlation r has (1 + r) / (1 - r) times the variance of independent errors
-    alike = errors.share * np.exp(-SPACING / errors.length)
-    covariances = (1 + alike) / (1 - alike) * (np.array(known) + scaled[:, None] * np.eye(3))
+    correlation = errors.share * np.exp(-SPACING / errors.length)
+    covariances = (1 + correlation) / (1 - correlation) * (np.array(known) + scaled[:, None] * np.eye(3))
     first, second = (np.array([place[k] for place, _ in found], dtype=np.intp) for k in (0, 1))
     return PoseEdges(first, second, motions, covariances)

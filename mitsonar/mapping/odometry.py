@@ -2,8 +2,8 @@
 
 :func:`odometry` selects the frames, estimates the motion of each pair of consecutive frames, resolves ambiguous motions,
 scales, bridges or smooths the motions, and composes them into a path (Almanza-Medina, eq. 3.4). With vehicle sensors or loop
-closures, a pose graph replaces the composition. :func:`closure_of` measures quality without ground truth, and
-:func:`height_profile` collects the height of the sonar over the ground along the path.
+closures, a pose graph replaces the composition (:func:`graph_path`). :func:`closure_of` measures quality without ground
+truth, and :func:`height_profile` collects the height of the sonar over the ground along the path.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import csv
 import io
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -23,14 +23,17 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.errors import MitsonarError, argument, counted, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.named import EstimatorLike, create_estimator
-from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, errors_along, graph_path
 from mitsonar.mapping.local_map import USED, map_attitudes, mapped
-from mitsonar.mapping.loops import KeepLoop, KnownLoops, canvas_of
+from mitsonar.mapping.loops import Canvas, LoopSearch, canvas_of, search_loops
 from mitsonar.mapping.open_source import Source
-from mitsonar.mapping.pairs import continued, estimate_motions
-from mitsonar.mapping.pose_graph import CorrelatedErrors
+from mitsonar.mapping.pairs import EstimateStore, continued, estimate_motions
+from mitsonar.mapping.pose_graph import GraphSolution, PoseEdges, PoseGraph, relative_motions, solved
 from mitsonar.mapping.series import (
+    CorrelatedErrors,
+    ErrorCorrelation,
     MotionSeries,
+    bridged,
+    fit_noise,
     fit_scale,
     kalman_smoothed,
     path_of,
@@ -42,7 +45,7 @@ from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import AXES, assess, in_units, motion_errors, path_length
 from mitsonar.motion.pose import Pose
-from mitsonar.motion.sensors import VehicleSensors
+from mitsonar.motion.sensors import UNKNOWN_STD, Headings, VehicleSensors, wrapped
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 
@@ -50,24 +53,347 @@ __all__ = [
     "ALTIMETER",
     "FIRST_ECHOES",
     "Closure",
+    "GraphPath",
     "HeightProfile",
+    "LoopTask",
     "Odometry",
+    "OdometryOptions",
     "Row",
     "Smoothing",
-    "bridged",
     "closure_of",
+    "errors_along",
+    "graph_path",
     "height_profile",
     "loop_starts",
+    "normalised_errors",
     "odometry",
     "series_of",
 ]
 
 
-# ---------------- Closure: quality without ground truth
-
-
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+Smoothing = Literal["none", "spline", "kalman"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OdometryOptions:
+    """Choices of :func:`odometry`.
+
+    Attributes:
+        smooth: assumption about the velocity. ``none`` assumes nothing and preserves corners. ``spline`` assumes slow
+            changes, with a period chosen by cross validation. ``kalman`` assumes a random walk, with a size chosen by
+            maximum likelihood, and smooths the covariances too. Invalid motions are bridged in any case.
+        scale: factors for sideways, forward, yaw ``(3,)``; ``fit`` fits valid to true motions by least squares.
+        start: first pose; by default the true one, or the origin at the height of the first frame. Height, pitch and roll
+            follow those of the frames along the path, where known.
+        every: use only every ``every``-th frame.
+        closure: number of motions over which loops are closed; covariances are inflated to explain the loop residuals. 0
+            closes none.
+        sensors: sensors of the vehicle; they give the estimators a prior and enter the pose graph.
+        loops: search for places seen again, and close the path there in a pose graph.
+        local_map: also register frames to a map of the last metres; see :mod:`mitsonar.mapping.local_map`.
+        workers: number of worker processes; 1 computes in this process. The result is bit-identical.
+
+    Raises:
+        MitsonarError: an option is outside its limits, or smoothing is combined with a pose graph.
+    """
+
+    smooth: Smoothing = "none"
+    scale: ArrayLike | Literal["fit"] | None = None
+    start: Pose | None = None
+    every: int = 1
+    closure: int = 0
+    sensors: VehicleSensors | None = None
+    loops: bool = False
+    local_map: bool = False
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise MitsonarError(f"{argument('every')} must be at least 1: got {self.every}")
+        if self.closure < 0 or self.closure == 1:
+            raise MitsonarError(f"{argument('closure')} must be 0, or 2 motions or more: got {self.closure}")
+        if self.smooth not in get_args(Smoothing):
+            raise MitsonarError(f"unknown smoothing {self.smooth!r}: {nearest_names(self.smooth, get_args(Smoothing))}")
+        if isinstance(self.scale, str) and self.scale != "fit":
+            raise MitsonarError(f"scale is three factors or fit: got {self.scale!r}")
+        if self.smooth != "none" and (self.loops or self.sensors is not None):
+            raise MitsonarError(
+                f"{argument('smooth')} {self.smooth} and a pose graph of sensors or loops exclude each other: give one"
+            )
+
+
+def odometry(
+    frames: Source | SonarFrames,
+    estimator: EstimatorLike,
+    options: OdometryOptions = OdometryOptions(),
+    *,
+    store: EstimateStore | None = None,
+    progress: Callable[[int], None] = lambda pairs: None,
+) -> Odometry:
+    """Estimate the path of a sonar from its frames.
+
+    Args:
+        frames: frames of one run, in memory or as a source.
+        estimator: estimates the motion between two frames; anything that
+            :func:`~mitsonar.estimation.named.create_estimator` accepts: a name, a checkpoint, or an estimator object.
+        options: which frames are used, and what the path is made of.
+        store: estimates of an earlier run, to which new ones are added.
+        progress: called with the number of pairs processed since the last call.
+
+    Raises:
+        MitsonarError: fewer than two frames, times that do not increase, frames that lack what the estimator needs, no valid
+            motion, ``fit`` without true poses, or loops or a map in records that are not sonar frames.
+    """
+    # 1. select the frames, and reject impossible options before hours of estimating
+    source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
+    estimator, sensors = create_estimator(estimator), options.sensors
+    numbers, shown = _frames_used(source, options)
+    time_s, store = source.time_s[numbers], store or EstimateStore()
+    # 2. estimate the motion of each pair, and resolve ambiguous motions by their neighbours
+    priors = None if sensors is None else sensors.priors(time_s)
+    estimates = estimate_motions(
+        source, estimator, numbers, workers=options.workers, priors=priors, store=store, progress=progress
+    )
+    estimates = continued(estimates)
+    # 3. inflate covariances to explain the loop residuals, and refine the motions by the local map
+    steps = options.closure
+    closing = closure_of(source, estimator, numbers, estimates, steps, progress) if steps else None
+    estimates = estimates if closing is None else closing.inflate_covariances(estimates)
+    pairs = estimates  # the height profile needs their first echoes
+    estimates = mapped(shown, numbers, estimates, progress) if options.local_map and shown is not None else estimates
+    # 4. scale, bridge or smooth the motions, and compose them to a path
+    measured = series_of(estimates, time_s)
+    factors = _scale_factors(measured, source.true, numbers, options.scale)
+    measured, first = scaled(measured, factors), options.start or _start(source, int(numbers[0]))
+    series = {"none": bridged, "spline": spline_smoothed, "kalman": kalman_smoothed}[options.smooth](measured)
+    path = path_of(series.motions, first, series.time_s)
+    # 5. with sensors or loops, the pose graph replaces this path
+    graph = None
+    if sensors is not None or options.loops:
+        graph = graph_path(
+            measured,
+            first,
+            start_known=options.start is not None or source.poses is not None,
+            sensors=sensors,
+            loops=LoopTask(estimator, numbers, store) if options.loops else None,
+            source=shown,
+            by_map=np.array([one.about.get("map") == USED for one in estimates], dtype=bool),
+        )
+        series, path = graph.series, graph.path
+    # 6. complete the planar path: height, pitch and roll of the frames, height profile, correlation of the errors
+    path = _with_known(path, source, numbers, by_sensors=sensors is not None and sensors.rises(time_s) is not None)
+    heights = height_profile(source, numbers, pairs, sensors, path)
+    plain = shown is not None and options.smooth == "none" and graph is None
+    correlated = errors_along(series.motions, canvas_of(shown)) if plain and shown is not None else None
+    return Odometry(numbers, estimates, series, path, source.true, options, factors, heights, closing, graph, correlated)
+
+
+def _frames_used(source: Source, options: OdometryOptions) -> tuple[Index, FrameSource | None]:
+    """Return the numbers of the frames to use, and the source if it holds sonar frames; reject options that do not fit."""
+    numbers = np.arange(0, len(source), options.every)
+    if len(numbers) < 2:
+        used = f", {len(numbers)} of them used" if options.every > 1 else ""
+        raise MitsonarError(f"odometry needs two frames or more: got {len(source)} from {source.name}{used}")
+    source.check_times()
+    if isinstance(options.scale, str) and source.poses is None:
+        raise MitsonarError(f"{source.name} holds no true poses, which scale fit needs: give three factors")
+    shown = source if isinstance(source, FrameSource) else None
+    if options.loops and shown is None:
+        raise MitsonarError(f"loops are searched in sonar frames, and {source.name} holds other records: leave loops out")
+    if options.local_map:
+        if shown is None:
+            raise MitsonarError(f"a map is made of sonar frames, and {source.name} holds other records: leave the map out")
+        map_attitudes(shown, numbers)  # raises if the frames lack height or pitch
+    return numbers, shown
+
+
+def _scale_factors(
+    measured: MotionSeries, true: Trajectory | None, numbers: Index, scale: ArrayLike | Literal["fit"] | None
+) -> Array:
+    """Return the factors for sideways, forward, yaw ``(3,)``: ones, as given, or fitted to the true path."""
+    if isinstance(scale, str):
+        assert true is not None
+        valid = measured.is_valid
+        return fit_scale(measured.motions[valid], motions(true.poses[numbers])[valid])
+    return np.ones(3) if scale is None else np.asarray(scale, dtype=float)
+
+
+def _start(source: Source, first: int) -> Pose:
+    """Return the true first pose; without truth, the origin with the known height and pitch."""
+    if source.poses is not None:
+        return Pose.from_row(float(value) for value in source.poses[first])
+    height = 0.0 if source.height_m is None else float(np.nan_to_num(source.height_m[first]))
+    return Pose(0.0, 0.0, height, source.pitch_rad or 0.0)
+
+
+def _with_known(path: Trajectory, source: Source, numbers: Index, *, by_sensors: bool) -> Trajectory:
+    """Add the changes of height, pitch and roll of the frames to a path of planar motions, where they are known.
+
+    Args:
+        path: poses at the frames; changes count from its first pose.
+        source: source of the records.
+        numbers: numbers of the frames.
+        by_sensors: whether a depth sensor has already set the heights.
+    """
+    known = source.attitudes(numbers) if isinstance(source, FrameSource) else None
+    known = source.poses[numbers] if known is None and source.poses is not None else known
+    if known is None or not np.isfinite(known[:, 2:5]).all():
+        return path
+    poses = path.poses.copy()
+    poses[:, 3:5] += known[:, 3:5] - known[0, 3:5]
+    if source.poses is not None and not by_sensors:
+        poses[:, 2] += known[:, 2] - known[0, 2]
+    return Trajectory(poses, path.time_s)
+
+
+# ---------------- The result
+
+Row = tuple[str, float, str]
+"""Name, value and unit of a result."""
+
+MANY = 0.1
+"""Fraction of invalid motions above which the user is warned that much of the path is interpolated."""
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """An estimated path together with everything from which it was computed.
+
+    Attributes:
+        frames: numbers of the frames used, in their source ``(frames,)``.
+        estimates: estimate of each pair of consecutive frames.
+        series: motions of the path after scaling, bridging or smoothing, with covariances if known.
+        path: poses at the times of the frames.
+        true: true poses of the sonar at all frames of the source, if known.
+        options: choices with which the path was made.
+        factors: factors that multiplied the estimates, for sideways, forward, yaw ``(3,)``.
+        heights: heights over the ground along the path.
+        closure: residuals of short loops of motions, if requested.
+        graph: solution of the pose graph, if sensors or loops were requested.
+        correlated: how errors of motions over the same ground are correlated; None to use the correlation stored in
+            ``series``, if any.
+    """
+
+    frames: Index
+    estimates: list[Estimate]
+    series: MotionSeries
+    path: Trajectory
+    true: Trajectory | None
+    options: OdometryOptions
+    factors: Array
+    heights: HeightProfile
+    closure: Closure | None = None
+    graph: GraphPath | None = None
+    correlated: CorrelatedErrors | None = None
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Return whether each motion is valid ``(frames - 1,)``; invalid motions were bridged."""
+        return np.array([estimate.valid for estimate in self.estimates], dtype=bool)
+
+    @property
+    def true_at_frames(self) -> Trajectory | None:
+        """Return the true path at the frames used; None if it is not known."""
+        return None if self.true is None else Trajectory(self.true.poses[self.frames], self.true.time_s[self.frames])
+
+    @cached_property
+    def pose_covariances(self) -> Array | None:
+        """Return the covariances of x, y [m] and heading [rad] along the path ``(frames, 3, 3)``.
+
+        Errors of motions over the same ground are correlated as
+        :class:`~mitsonar.mapping.series.ErrorCorrelation` describes, except for motions from the local map. Errors of
+        smoothed motions, and of records that do not show the ground, are taken as independent. With sensors or loops the
+        covariances are the marginals of the pose graph. None if the covariances of the motions are not known.
+        """
+        if self.graph is not None:
+            return self.graph.covariances
+        if self.series.covariances is None:
+            return None
+        by_map = np.array([one.about.get("map") == USED for one in self.estimates], dtype=bool)
+        return pose_covariances(self.series, Pose.from_row(self.path.poses[0]), correlated=self.correlated, alone=by_map)
+
+    def rows(self) -> list[Row]:
+        """Return name, value and unit of every result, as shown on the console, in the files and in the README."""
+        count = len(self.estimates)
+        rows: list[Row] = [("motions", count, ""), ("motions rejected, bridged", count - int(self.valid.sum()), "")]
+        by_map = [one.about["map"] for one in self.estimates if "map" in one.about]
+        if by_map:
+            rows.append(("motions by the local map", by_map.count(USED), ""))
+        fitted = isinstance(self.options.scale, str)
+        how = "fitted to the true path" if fitted else "as given"
+        if fitted or (self.factors != 1).any():
+            rows += [(f"scale of {axis.name}, {how}", float(f), "") for axis, f in zip(AXES, self.factors, strict=True)]
+        if self.series.covariances is not None:
+            std = np.sqrt(np.diagonal(self.series.covariances, axis1=1, axis2=2).mean(axis=0))
+            rows += _by_axis("standard deviation of a motion as told", in_units(std))
+        if self.closure is not None:
+            rows += _by_axis(f"closure over {self.closure.steps} motions, rms", in_units(self.closure.rms))
+            rows += _by_axis(f"closure over {self.closure.steps} motions, mean", in_units(self.closure.mean))
+        true = self.true_at_frames
+        rows += [] if self.graph is None else self.graph.rows(true)
+        if self.true is None or true is None:
+            return [*rows, ("estimated path length", path_length(self.path), "m")]
+        errors = motion_errors(self.series.motions, motions(true.poses), np.ones(count, dtype=bool), self.series.covariances)
+        rows += _by_axis("motion error RMSE", errors.rmse)
+        rows += _by_axis("RMSE of always answering zero", errors.zero)
+        rows += [(f"slope over the true {axis.name}", float(s), "") for axis, s in zip(AXES, errors.slope, strict=True)]
+        if np.isfinite(errors.nees):
+            rows.append(("NEES (1 is honest)", errors.nees, ""))
+        return rows + [(name, float(value), unit) for name, value, unit in assess(self.path, self.true).rows()]
+
+    def warnings(self) -> list[str]:
+        """Return warnings for the user: many motions invalid or not from the map, doubtful heights, untrained regimes."""
+        lost = [estimate.reason for estimate in self.estimates if not estimate.valid]
+        without = [one.about["map"] for one in self.estimates if one.about.get("map", USED) != USED]
+        warnings = []
+        for reasons, what in ((lost, "were rejected and bridged"), (without, "are those of pairs of frames")):
+            if len(reasons) > MANY * len(self.estimates):
+                part = 100 * len(reasons) / len(self.estimates)
+                warnings.append(
+                    f"{len(reasons)} of {counted(len(self.estimates), 'motion')} ({part:.0f} %) {what}: {_frequent(reasons)}"
+                )
+        doubts = [str(one.about["doubt"]) for one in self.estimates if "doubt" in one.about]
+        if doubts:
+            warnings.append(
+                f"{len(doubts)} of {len(self.estimates)} pairs of frames contradict the height that they are given, which "
+                f"counts unless the ground rises: {_frequent(doubts)}; check height and pitch (faint ground near the sonar "
+                "looks so, too)"
+            )
+        untrained = dict.fromkeys(str(one.about["untrained"]) for one in self.estimates if "untrained" in one.about)
+        warnings.extend(f"{one}: its covariances have not been learnt there" for one in untrained)
+        return warnings
+
+
+def _by_axis(what: str, values: Array) -> list[Row]:
+    return [(f"{what}, {axis.name}", float(value), axis.unit) for axis, value in zip(AXES, values, strict=True)]
+
+
+def _frequent(reasons: list[str]) -> str:
+    """Return the three most frequent reasons as text; reasons that differ only in their numbers count as one."""
+    kinds = Counter(re.sub(r"-?\d+(\.\d+)?", "#", reason) for reason in reasons).most_common(3)
+    example = {re.sub(r"-?\d+(\.\d+)?", "#", reason): reason for reason in reversed(reasons)}
+    return "; ".join(f"{counted(count, 'time')} such as {example[kind]!r}" for kind, count in kinds)
+
+
+def series_of(estimates: list[Estimate], time_s: ArrayLike) -> MotionSeries:
+    """Return the motions of estimates between the times ``time_s`` ``(frames,)`` [s] as a series.
+
+    Raises:
+        MitsonarError: no estimate is valid; the message gives the most frequent reasons.
+    """
+    if estimates and not any(estimate.valid for estimate in estimates):
+        reasons = _frequent([estimate.reason for estimate in estimates])
+        raise MitsonarError(
+            f"none of {len(estimates)} motions is valid, so that there is no path ({reasons}): check what the estimator "
+            "is given (height, attitude, window or receivers), or try another one"
+        )
+    return MotionSeries.from_estimates(estimates, time_s)
+
+
+# ---------------- Closure: quality without ground truth
 
 FEWEST = 2
 """Smallest number of loops from which errors are estimated."""
@@ -98,7 +424,7 @@ class Closure:
         """Return the mean of the residuals ``(3,)`` [m, m, rad]: the bias of the composed single steps."""
         return np.asarray(self.residuals.mean(axis=0))
 
-    def honest(self, estimates: Sequence[Estimate]) -> list[Estimate]:
+    def inflate_covariances(self, estimates: Sequence[Estimate]) -> list[Estimate]:
         """Return the estimates with covariances that explain the residuals.
 
         Covariances are multiplied by ``factor``. An estimate without a covariance gets the mean square of the residuals
@@ -177,8 +503,250 @@ def _composed(motions: Array) -> Array:
     return np.array([sideways.sum(), forward.sum(), heading[-1]])
 
 
-# ---------------- Height over the ground along a path
+# ---------------- Sensors and loops: a pose graph in place of plain composition
 
+DEFAULT_REACH_M = 3.0
+"""Horizontal distance to the middle of the ground in view, if it is not known [m]."""
+
+NOTHING = 1e-9
+"""Correlation of errors that are independent of each other."""
+
+MEASURED = 0.5
+"""Fraction of the standard deviation of an unknown component below which a sensor counts as measuring the component."""
+
+
+@dataclass(frozen=True)
+class LoopTask:
+    """Request for a search for loops.
+
+    Attributes:
+        estimator: registers two frames.
+        numbers: numbers of the frames used ``(frames,)``.
+        store: registrations of an earlier run, to which new ones are added.
+    """
+
+    estimator: AnyEstimator
+    numbers: Index
+    store: EstimateStore
+
+
+@dataclass(frozen=True)
+class GraphPath:
+    """A path computed by a pose graph.
+
+    Attributes:
+        path: poses at the times of the frames.
+        covariances: covariances of x, y [m], heading [rad] ``(frames, 3, 3)``.
+        series: motions of the path, with their covariances.
+        sensors: names of the sensors that were used.
+        search: result of the search for loops; None if none was requested.
+        kept: whether each loop of the search agrees with all other measurements ``(loops,)``.
+        end_moved_m: distance by which loops moved the end of the path [m].
+        end_std_m: standard deviation of the position of the end without loops [m].
+    """
+
+    path: Trajectory
+    covariances: Array
+    series: MotionSeries
+    sensors: tuple[str, ...]
+    search: LoopSearch | None
+    kept: NDArray[np.bool_]
+    end_moved_m: float
+    end_std_m: float
+
+    @property
+    def end_told_m(self) -> float:
+        """Return the standard deviation of the position of the end [m]."""
+        return float(np.sqrt(np.trace(self.covariances[-1, :2, :2])))
+
+    def rows(self, true: Trajectory | None) -> list[tuple[str, float, str]]:
+        """Return name, value and unit of the results that the graph adds; ``true`` is the true path at the frames."""
+        rows: list[tuple[str, float, str]] = []
+        if self.search is not None:
+            out = len(self.kept) - int(self.kept.sum())
+            rows += [
+                ("loops", float(self.kept.sum()), ""),
+                ("loops rejected", float(out + sum(self.search.rejected.values())), ""),
+                ("pairs of views compared for loops", float(self.search.compared), ""),
+                ("standard deviation of the end as told, before loops", 1e3 * self.end_std_m, "mm"),
+                ("end moved by loops", 1e3 * self.end_moved_m, "mm"),
+            ]
+        rows.append(("standard deviation of the end as told", 1e3 * self.end_told_m, "mm"))
+        if true is not None:
+            each = normalised_errors(self.path, self.covariances, true)
+            rows.append(("squared pose error over its covariance, a third, mean along the path", float(each.mean()), ""))
+            rows.append(("squared pose error over its covariance, a third, at the end", float(each[-1]), ""))
+        return rows
+
+
+def normalised_errors(path: Trajectory, covariances: Array, true: Trajectory) -> Array:
+    """Return a third of the squared error of each pose but the first, normalised by its covariance ``(frames - 1,)``.
+
+    The expected value is 1 if the covariances are right.
+
+    Args:
+        path: estimated path.
+        covariances: covariances of x, y [m], heading [rad] ``(frames, 3, 3)``.
+        true: true path, at the same times.
+    """
+    off = (path.poses - true.poses)[1:, [0, 1, 5]]
+    off[:, 2] = wrapped(off[:, 2])
+    solution = np.linalg.solve(covariances[1:], off[..., None])[..., 0]
+    return np.asarray((off * solution).sum(axis=1) / 3)
+
+
+def errors_along(motions: Array, canvas: Canvas | None) -> CorrelatedErrors:
+    """Return the correlation of the errors of consecutive motions ``(n, 3)``.
+
+    Args:
+        motions: sideways, forward [m], yaw [rad].
+        canvas: ground that the frames show; None if its distance from the sonar is not known.
+    """
+    return _error_model(canvas).along(motions, DEFAULT_REACH_M if canvas is None else canvas.reach_m)
+
+
+def _error_model(canvas: Canvas | None) -> ErrorCorrelation:
+    """Return the error model over this ground; without relief, errors are noise, independent from pair to pair."""
+    return ErrorCorrelation(share=0.0) if canvas is not None and canvas.view.attitude.even else ErrorCorrelation()
+
+
+def graph_path(
+    measured: MotionSeries,
+    start: Pose,
+    *,
+    start_known: bool,
+    sensors: VehicleSensors | None,
+    loops: LoopTask | None,
+    source: FrameSource | None,
+    by_map: NDArray[np.bool_] | None = None,
+) -> GraphPath:
+    """Compute the path that agrees best with estimated motions, sensors and loops.
+
+    Args:
+        measured: estimated motions, scaled; some may be invalid.
+        start: first pose.
+        start_known: whether the heading of the first pose is known; otherwise a compass determines it, if there is one.
+        sensors: sensors of the vehicle, if any.
+        loops: request for a search for loops; None for none.
+        source: source of the frames if they show the ground, from which the distance of the ground is known.
+        by_map: whether each motion comes from a local map ``(motions,)``, whose errors are not correlated with those of
+            pairs of frames. None: no map.
+
+    Raises:
+        MitsonarError: the sensors cover no frame, or the motions have no covariance and are too few to estimate one.
+    """
+    # 1. the graph of motions and sensors, with errors correlated over the same ground
+    canvas = None if source is None else canvas_of(source)
+    errors = _error_model(canvas)
+    graph = _graph(measured, start, start_known, sensors)
+    correlated = errors_along(graph.chain.motions, canvas)
+    # 2. errors are independent next to motions that only sensors determine, and where the map begins or ends
+    wide = np.diagonal(graph.chain.covariances, axis1=1, axis2=2) >= UNKNOWN_STD**2
+    left = np.asarray(wide.all(axis=1), dtype=bool)
+    apart = left[1:] | left[:-1]
+    if by_map is not None:
+        apart |= by_map[1:] != by_map[:-1]
+    onward = np.where(apart, NOTHING, correlated.onward)
+    graph = replace(graph, correlated=correlated._replace(onward=onward))
+    # 3. solve without loops; its covariances guide the search for loops, with which the graph is solved again
+    before = after = solved(graph)
+    search = None
+    if loops is not None:
+        if source is None or canvas is None:
+            raise MitsonarError("a search for loops needs frames that show level ground: give the height and the pitch")
+        search = search_loops(source, loops.estimator, loops.numbers, before, errors, canvas, loops.store)
+        after = _closed(replace(graph, start=before.poses), search, before)
+    return _path_of(after, before, measured.time_s, start, sensors, search)
+
+
+def _closed(graph: PoseGraph, search: LoopSearch, before: GraphSolution) -> GraphSolution:
+    """Solve a graph with loops, leaving out all loops of a stretch where most disagree with the other measurements."""
+    if not len(search.loops.first):
+        return before
+    after = solved(replace(graph, loops=search.loops))
+    out = after.kept & search.outvoted(after.kept)
+    if not out.any():
+        return after
+    kept = after.kept & ~out
+    rest = solved(replace(graph, loops=search.loops.at(kept))) if kept.any() else before
+    kept[kept] = rest.kept if kept.any() else True
+    return replace(rest, kept=kept)
+
+
+def _path_of(
+    solution: GraphSolution,
+    before: GraphSolution,
+    time_s: Array,
+    start: Pose,
+    sensors: VehicleSensors | None,
+    search: LoopSearch | None,
+) -> GraphPath:
+    """Collect the path, its covariances and its motions."""
+    count = len(time_s)
+    own, following = solution.covariances()
+    poses = np.tile(np.asarray(start, dtype=float), (count, 1))
+    poses[:, [0, 1, 5]] = solution.poses
+    rises = None if sensors is None else sensors.rises(time_s)
+    poses[:, 2] += 0.0 if rises is None else rises
+    moved = relative_motions(solution.poses, np.arange(count - 1), np.arange(1, count))
+    covariances = solution.motion_covariances(own, following)
+    last = count - 1
+    end = before.columns([last])[last, :2, 0, :2]
+    return GraphPath(
+        path=Trajectory(poses, time_s),
+        covariances=own,
+        series=MotionSeries(moved, time_s, (covariances + covariances.swapaxes(1, 2)) / 2),
+        sensors=() if sensors is None else tuple(sensors.names),
+        search=search,
+        kept=solution.kept,
+        end_moved_m=float(np.hypot(*(solution.poses[-1] - before.poses[-1])[:2])),
+        end_std_m=float(np.sqrt(np.trace(end))),
+    )
+
+
+def _graph(
+    measured: MotionSeries,
+    start: Pose,
+    start_known: bool,
+    sensors: VehicleSensors | None,
+) -> PoseGraph:
+    """Assemble the pose graph of estimated motions and sensors."""
+    # 1. the chain of estimated motions, bridged, with covariances
+    if measured.covariances is None:
+        covariances = np.tile(np.diag(fit_noise(measured) ** 2), (len(measured), 1, 1))
+        measured = replace(measured, covariances=covariances)
+    whole = bridged(measured)
+    assert whole.covariances is not None
+    chain = PoseEdges.chain(whole.motions, whole.covariances.copy())
+    # 2. motions and headings of the sensors; where these suffice, a bridged motion must not count as a measurement
+    others, bias, headings = PoseEdges.none(), None, Headings.none()
+    if sensors is not None:
+        measurements = sensors.motions(measured.time_s)
+        chain.covariances[~measured.is_valid & _determined(sensors, measured.time_s)] = np.diag(UNKNOWN_STD**2)
+        if measurements:
+            pair, motions, covariances, bias = (np.concatenate(parts) for parts in zip(*measurements, strict=True))
+            others = PoseEdges(pair, pair + 1, motions, covariances)
+        headings = sensors.headings(measured.time_s)
+    bias = None if bias is None or not bias.any() else bias
+    # 3. initial guess; an unknown first heading begins near that of the compass, so that Gauss-Newton converges
+    at_start, first = np.zeros((3, 3)), start
+    poses = path_of(whole.motions, first, measured.time_s).poses[:, [0, 1, 5]]
+    if headings.pose.size and not start_known:
+        at_start[2, 2] = np.pi**2
+        turn = float(headings.heading[0] - poses[headings.pose[0], 2])
+        poses = path_of(whole.motions, first._replace(heading=first.heading + turn), measured.time_s).poses[:, [0, 1, 5]]
+    return PoseGraph(poses, chain, others, bias, headings=headings, at_start=at_start)
+
+
+def _determined(sensors: VehicleSensors, time_s: Array) -> NDArray[np.bool_]:
+    """Return whether the sensors alone determine each motion ``(frames - 1,)``."""
+    priors = sensors.priors(time_s)
+    if priors is None:
+        return np.zeros(len(time_s) - 1, dtype=bool)
+    return np.array([(one.std < MEASURED * UNKNOWN_STD).all() for one in priors], dtype=bool)
+
+
+# ---------------- Height over the ground along a path
 
 FIRST_ECHOES, ALTIMETER = "first echoes", "altimeter"
 """Possible sources of a measured height."""
@@ -240,7 +808,9 @@ def height_profile(
     """
     # 1. heights: estimates belong to pairs, so each frame takes the mean of its two pairs; the altimeter fills the rest
     poses = path.poses
-    height, std = (_at_frames(np.array([_told(one, name) for one in estimates])) for name in ("height_m", "height_std_m"))
+    height, std = (
+        _at_frames(np.array([_from_first_echoes(one, name) for one in estimates])) for name in ("height_m", "height_std_m")
+    )
     echoes = np.isfinite(height)
     altimeter = _altimeter(source, frames)
     height = np.where(echoes, height, altimeter)
@@ -264,7 +834,7 @@ def height_profile(
     )
 
 
-def _told(estimate: Estimate, name: str) -> float:
+def _from_first_echoes(estimate: Estimate, name: str) -> float:
     """Return a value measured from first echoes, by its name in ``about``; nan if there is none."""
     return float(estimate.about[name]) if "height_std_m" in estimate.about else np.nan
 
@@ -293,352 +863,3 @@ def _ahead(source: Source, frames: Index, height_m: Array) -> Array:
         return np.zeros(len(frames))
     steepest = attitudes[:, 3] + np.radians(source.like.sonar.elevation_fov_deg) / 2
     return np.asarray(height_m / np.tan(steepest) * float(np.cos(source.like.bearing_rad).mean()))
-
-
-# ---------------- Odometry
-
-Row = tuple[str, float, str]
-"""Name, value and unit of a result."""
-
-Smoothing = Literal["none", "spline", "kalman"]
-
-MANY = 0.1
-"""Fraction of invalid motions above which the user is warned that much of the path is interpolated."""
-
-
-@dataclass(frozen=True)
-class Odometry:
-    """An estimated path together with everything from which it was computed.
-
-    Attributes:
-        frames: numbers of the frames used, in their source ``(frames,)``.
-        estimates: estimate of each pair of consecutive frames.
-        series: motions of the path after scaling, bridging or smoothing, with covariances if known.
-        path: poses at the times of the frames.
-        true: true poses of the sonar at all frames of the source, if known.
-        smooth: how the motions were smoothed.
-        factors: factors that multiplied the estimates, for sideways, forward, yaw ``(3,)``.
-        fitted: whether these factors were fitted to the true path.
-        heights: heights over the ground along the path.
-        closure: residuals of short loops of motions, if requested.
-        graph: solution of the pose graph, if sensors or loops were requested.
-        correlated: how errors of motions over the same ground are correlated; None to use the correlation stored in
-            ``series``, if any.
-    """
-
-    frames: Index
-    estimates: list[Estimate]
-    series: MotionSeries
-    path: Trajectory
-    true: Trajectory | None
-    smooth: Smoothing
-    factors: Array
-    fitted: bool
-    heights: HeightProfile
-    closure: Closure | None = None
-    graph: GraphPath | None = None
-    correlated: CorrelatedErrors | None = None
-
-    @property
-    def believed(self) -> NDArray[np.bool_]:
-        """Return whether each motion is valid ``(frames - 1,)``; invalid motions were bridged."""
-        return np.array([estimate.valid for estimate in self.estimates], dtype=bool)
-
-    @property
-    def true_at_frames(self) -> Trajectory | None:
-        """Return the true path at the frames used; None if it is not known."""
-        return None if self.true is None else Trajectory(self.true.poses[self.frames], self.true.time_s[self.frames])
-
-    @cached_property
-    def pose_covariances(self) -> Array | None:
-        """Return the covariances of x, y [m] and heading [rad] along the path ``(frames, 3, 3)``.
-
-        Errors of motions over the same ground are correlated as
-        :class:`~mitsonar.mapping.series.ErrorCorrelation` describes, except for motions from the local map. Errors of
-        smoothed motions, and of records that do not show the ground, are taken as independent. With sensors or loops the
-        covariances are the marginals of the pose graph. None if the covariances of the motions are not known.
-        """
-        if self.graph is not None:
-            return self.graph.covariances
-        if self.series.covariances is None:
-            return None
-        by_map = np.array([one.about.get("map") == USED for one in self.estimates], dtype=bool)
-        return pose_covariances(self.series, Pose.from_row(self.path.poses[0]), correlated=self.correlated, alone=by_map)
-
-    def rows(self) -> list[Row]:
-        """Return name, value and unit of every result, as shown on the console, in the files and in the README."""
-        count = len(self.estimates)
-        rows: list[Row] = [("motions", count, ""), ("motions rejected, bridged", count - int(self.believed.sum()), "")]
-        by_map = [one.about["map"] for one in self.estimates if "map" in one.about]
-        if by_map:
-            rows.append(("motions by the local map", by_map.count(USED), ""))
-        how = "fitted to the true path" if self.fitted else "as given"
-        if self.fitted or (self.factors != 1).any():
-            rows += [(f"scale of {axis.name}, {how}", float(f), "") for axis, f in zip(AXES, self.factors, strict=True)]
-        if self.series.covariances is not None:
-            std = np.sqrt(np.diagonal(self.series.covariances, axis1=1, axis2=2).mean(axis=0))
-            rows += _by_axis("standard deviation of a motion as told", in_units(std))
-        if self.closure is not None:
-            rows += _by_axis(f"closure over {self.closure.steps} motions, rms", in_units(self.closure.rms))
-            rows += _by_axis(f"closure over {self.closure.steps} motions, mean", in_units(self.closure.mean))
-        true = self.true_at_frames
-        rows += [] if self.graph is None else self.graph.rows(true)
-        if self.true is None or true is None:
-            return [*rows, ("estimated path length", path_length(self.path), "m")]
-        errors = motion_errors(self.series.motions, motions(true.poses), np.ones(count, dtype=bool), self.series.covariances)
-        rows += _by_axis("motion error RMSE", errors.rmse)
-        rows += _by_axis("RMSE of always answering zero", errors.zero)
-        rows += [(f"slope over the true {axis.name}", float(s), "") for axis, s in zip(AXES, errors.slope, strict=True)]
-        if np.isfinite(errors.nees):
-            rows.append(("NEES (1 is honest)", errors.nees, ""))
-        return rows + [(name, float(value), unit) for name, value, unit in assess(self.path, self.true).rows()]
-
-    def warnings(self) -> list[str]:
-        """Return warnings for the user: many motions invalid or not from the map, doubtful heights, untrained regimes."""
-        lost = [estimate.reason for estimate in self.estimates if not estimate.valid]
-        without = [one.about["map"] for one in self.estimates if one.about.get("map", USED) != USED]
-        told = []
-        for reasons, what in ((lost, "were rejected and bridged"), (without, "are those of pairs of frames")):
-            if len(reasons) > MANY * len(self.estimates):
-                part = 100 * len(reasons) / len(self.estimates)
-                told.append(
-                    f"{len(reasons)} of {counted(len(self.estimates), 'motion')} ({part:.0f} %) {what}: {_usual(reasons)}"
-                )
-        doubts = [str(one.about["doubt"]) for one in self.estimates if "doubt" in one.about]
-        if doubts:
-            told.append(
-                f"{len(doubts)} of {len(self.estimates)} pairs of frames contradict the height that they are given, which "
-                f"counts unless the ground rises: {_usual(doubts)}; check height and pitch (faint ground near the sonar "
-                "looks so, too)"
-            )
-        untrained = dict.fromkeys(str(one.about["untrained"]) for one in self.estimates if "untrained" in one.about)
-        told.extend(f"{one}: its covariances have not been learnt there" for one in untrained)
-        return told
-
-
-def odometry(
-    frames: Source | SonarFrames,
-    estimator: EstimatorLike,
-    *,
-    smooth: Smoothing = "none",
-    scale: ArrayLike | Literal["fit"] | None = None,
-    start: Pose | None = None,
-    every: int = 1,
-    closure: int = 0,
-    sensors: VehicleSensors | None = None,
-    loops: bool = False,
-    local_map: bool = False,
-    workers: int = 1,
-    known: Mapping[int, Estimate] | None = None,
-    keep: Callable[[int, Estimate], None] = lambda number, estimate: None,
-    known_loops: KnownLoops | None = None,
-    keep_loop: KeepLoop = lambda first, second, motion, estimate: None,
-    progress: Callable[[int], None] = lambda pairs: None,
-) -> Odometry:
-    """Estimate the path of a sonar from its frames.
-
-    Invalid motions are bridged from their neighbours. ``smooth`` selects a further assumption about the velocity. ``none``
-    assumes nothing and preserves corners. ``spline`` assumes slow changes, with a period chosen by cross validation.
-    ``kalman`` assumes a random walk, with a size chosen by maximum likelihood, and smooths the covariances too.
-
-    Args:
-        frames: frames of one run, in memory or as a source.
-        estimator: estimates the motion between two frames; anything that
-            :func:`~mitsonar.estimation.named.create_estimator` accepts: a name, a checkpoint, or an estimator object.
-        smooth: smoothing of the motions, see above.
-        scale: factors for sideways, forward, yaw ``(3,)``; ``fit`` fits valid to true motions by least squares.
-        start: first pose; by default the true one, or the origin at the height of the first frame. Height, pitch and roll
-            follow those of the frames along the path, where known.
-        every: use only every ``every``-th frame.
-        closure: number of motions over which loops are closed; covariances are inflated to explain the loop residuals. 0
-            closes none.
-        sensors: sensors of the vehicle; they give the estimators a prior and enter the pose graph.
-        loops: search for places seen again, and close the path there in a pose graph.
-        local_map: also register frames to a map of the last metres; see :mod:`mitsonar.mapping.local_map`.
-        workers: number of worker processes; 1 computes in this process. The result is bit-identical.
-        known: estimates of an earlier run, by pair number.
-        keep: called with the number and the estimate of each new pair.
-        known_loops: loop registrations of an earlier run.
-        keep_loop: called with both frames, the initial guess and the estimate of each new loop registration.
-        progress: called with the number of pairs processed since the last call.
-
-    Raises:
-        MitsonarError: fewer than two frames, times that do not increase, frames that lack what the estimator needs, no valid
-            motion, ``fit`` without true poses, loops in records that are not sonar frames, or smoothing of a pose graph.
-    """
-    # 1. select the frames, and reject impossible options before hours of estimating
-    source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
-    estimator = create_estimator(estimator)
-    numbers = _frames_used(source, smooth, scale, every, closure)
-    time_s, shown = source.time_s[numbers], _ground_shown(source, sensors, smooth, loops, local_map)
-    if local_map and shown is not None:
-        map_attitudes(shown, numbers)  # raises if the frames lack height or pitch
-    # 2. estimate the motion of each pair, and resolve ambiguous motions by their neighbours
-    estimate = partial(estimate_motions, priors=None if sensors is None else sensors.priors(time_s))
-    estimates = estimate(source, estimator, numbers, workers=workers, known=known, keep=keep, progress=progress)
-    estimates = continued(estimates)
-    # 3. inflate covariances to explain the loop residuals, and refine the motions by the local map
-    closing = closure_of(source, estimator, numbers, estimates, closure, progress) if closure else None
-    estimates = estimates if closing is None else closing.honest(estimates)
-    pairs = estimates  # the height profile needs their first echoes
-    estimates = mapped(shown, numbers, estimates, progress) if local_map and shown is not None else estimates
-    # 4. scale, bridge or smooth the motions, and compose them to a path
-    measured = series_of(estimates, time_s)
-    factors = _scale_factors(measured, source.true, numbers, scale)
-    measured, first = scaled(measured, factors), start or _start(source, int(numbers[0]))
-    series = _SMOOTHED[smooth](measured)
-    path = path_of(series.motions, first, series.time_s)
-    fitted = isinstance(scale, str)
-    # 5. with sensors or loops, the pose graph replaces this path
-    graph = None
-    if sensors is not None or loops:
-        task = LoopTask(estimator, numbers, known_loops, keep_loop) if loops else None
-        known_start = start is not None or source.poses is not None
-        by_map = np.array([one.about.get("map") == USED for one in estimates], dtype=bool)
-        graph = graph_path(
-            measured, bridged, first, start_known=known_start, sensors=sensors, loops=task, source=shown, by_map=by_map
-        )
-        series, path = graph.series, graph.path
-    # 6. complete the planar path: height, pitch and roll of the frames, height profile, correlation of the errors
-    path = _with_known(path, source, numbers, by_sensors=sensors is not None and sensors.rises(time_s) is not None)
-    heights = height_profile(source, numbers, pairs, sensors, path)
-    alike = (
-        None if shown is None or smooth != "none" or graph is not None else errors_along(series.motions, canvas_of(shown))
-    )
-    return Odometry(numbers, estimates, series, path, source.true, smooth, factors, fitted, heights, closing, graph, alike)
-
-
-def _ground_shown(
-    source: Source, sensors: VehicleSensors | None, smooth: str, loops: bool, local_map: bool
-) -> FrameSource | None:
-    """Return the source if it holds sonar frames, else None. Reject options that exclude each other or need sonar frames."""
-    if smooth != "none" and (loops or sensors is not None):
-        raise MitsonarError(
-            f"{argument('smooth')} {smooth} and a pose graph of sensors or loops exclude each other: give one"
-        )
-    shown = source if isinstance(source, FrameSource) else None
-    if loops and shown is None:
-        raise MitsonarError(f"loops are searched in sonar frames, and {source.name} holds other records: leave loops out")
-    if local_map and shown is None:
-        raise MitsonarError(f"a map is made of sonar frames, and {source.name} holds other records: leave the map out")
-    return shown
-
-
-def _frames_used(source: Source, smooth: str, scale: ArrayLike | str | None, every: int, closure: int) -> Index:
-    """Return the numbers of the frames to use. Reject impossible arguments early, before hours of estimating."""
-    if every < 1:
-        raise MitsonarError(f"{argument('every')} must be at least 1: got {every}")
-    if closure < 0 or closure == 1:
-        raise MitsonarError(f"{argument('closure')} must be 0, or 2 motions or more: got {closure}")
-    numbers = np.arange(0, len(source), every)
-    if len(numbers) < 2:
-        used = f", {len(numbers)} of them used" if every > 1 else ""
-        raise MitsonarError(f"odometry needs two frames or more: got {len(source)} from {source.name}{used}")
-    source.check_times()
-    if smooth not in get_args(Smoothing):
-        raise MitsonarError(f"unknown smoothing {smooth!r}: {nearest_names(smooth, get_args(Smoothing))}")
-    if isinstance(scale, str) and (scale != "fit" or source.poses is None):
-        raise MitsonarError(
-            f"scale is three factors or fit: got {scale!r}"
-            if scale != "fit"
-            else f"{source.name} holds no true poses, which scale fit needs: give three factors"
-        )
-    return numbers
-
-
-def _scale_factors(
-    measured: MotionSeries, true: Trajectory | None, numbers: Index, scale: ArrayLike | Literal["fit"] | None
-) -> Array:
-    """Return the factors for sideways, forward, yaw ``(3,)``: ones, as given, or fitted to the true path."""
-    if isinstance(scale, str):
-        assert true is not None
-        valid = measured.believed
-        return fit_scale(measured.motions[valid], motions(true.poses[numbers])[valid])
-    return np.ones(3) if scale is None else np.asarray(scale, dtype=float)
-
-
-def _start(source: Source, first: int) -> Pose:
-    """Return the true first pose; without truth, the origin with the known height and pitch."""
-    if source.poses is not None:
-        return Pose.from_row(float(value) for value in source.poses[first])
-    height = 0.0 if source.height_m is None else float(np.nan_to_num(source.height_m[first]))
-    return Pose(0.0, 0.0, height, source.pitch_rad or 0.0)
-
-
-def _with_known(path: Trajectory, source: Source, numbers: Index, *, by_sensors: bool) -> Trajectory:
-    """Add the changes of height, pitch and roll of the frames to a path of planar motions, where they are known.
-
-    Args:
-        path: poses at the frames; changes count from its first pose.
-        source: source of the records.
-        numbers: numbers of the frames.
-        by_sensors: whether a depth sensor has already set the heights.
-    """
-    known = source.attitudes(numbers) if isinstance(source, FrameSource) else None
-    known = source.poses[numbers] if known is None and source.poses is not None else known
-    if known is None or not np.isfinite(known[:, 2:5]).all():
-        return path
-    poses = path.poses.copy()
-    poses[:, 3:5] += known[:, 3:5] - known[0, 3:5]
-    if source.poses is not None and not by_sensors:
-        poses[:, 2] += known[:, 2] - known[0, 2]
-    return Trajectory(poses, path.time_s)
-
-
-def _by_axis(what: str, values: Array) -> list[Row]:
-    return [(f"{what}, {axis.name}", float(value), axis.unit) for axis, value in zip(AXES, values, strict=True)]
-
-
-# ---------------- Series of motions
-
-
-def series_of(estimates: list[Estimate], time_s: ArrayLike) -> MotionSeries:
-    """Return the motions of estimates between the times ``time_s`` ``(frames,)`` [s] as a series.
-
-    Raises:
-        MitsonarError: no estimate is valid; the message gives the most frequent reasons.
-    """
-    if estimates and not any(estimate.valid for estimate in estimates):
-        reasons = _usual([estimate.reason for estimate in estimates])
-        raise MitsonarError(
-            f"none of {len(estimates)} motions is valid, so that there is no path ({reasons}): check what the estimator "
-            "is given (height, attitude, window or receivers), or try another one"
-        )
-    return MotionSeries.from_estimates(estimates, time_s)
-
-
-def bridged(measured: MotionSeries) -> MotionSeries:
-    """Fill in invalid motions from the valid ones, which stay as measured.
-
-    If covariances are known, the Kalman smoother fills the gaps and supplies their covariances. Otherwise the velocity is
-    interpolated linearly between its neighbours.
-    """
-    known = np.flatnonzero(measured.believed)
-    if known.size == len(measured):
-        return measured
-    if measured.covariances is not None and known.size > 1:
-        filled = kalman_smoothed(measured)
-        fill, fill_covariances = filled.motions, filled.covariances
-    else:
-        middle = measured.middle_s
-        velocity = np.column_stack([np.interp(middle, middle[known], v[known]) for v in measured.velocity.T])
-        fill, fill_covariances = velocity * measured.step_s[:, None], None
-    together = np.where(measured.believed[:, None], measured.motions, fill)
-    if fill_covariances is None or measured.covariances is None:
-        return MotionSeries(together, measured.time_s)
-    covariances = np.where(measured.believed[:, None, None], measured.covariances, fill_covariances)
-    return MotionSeries(together, measured.time_s, covariances)
-
-
-_SMOOTHED: dict[str, Callable[[MotionSeries], MotionSeries]] = {
-    "none": bridged,
-    "spline": spline_smoothed,
-    "kalman": kalman_smoothed,
-}
-
-
-def _usual(reasons: list[str]) -> str:
-    """Return the three most frequent reasons as text; reasons that differ only in their numbers count as one."""
-    kinds = Counter(re.sub(r"-?\d+(\.\d+)?", "#", reason) for reason in reasons).most_common(3)
-    example = {re.sub(r"-?\d+(\.\d+)?", "#", reason): reason for reason in reversed(reasons)}
-    return "; ".join(f"{counted(count, 'time')} such as {example[kind]!r}" for kind, count in kinds)

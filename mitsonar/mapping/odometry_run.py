@@ -13,24 +13,22 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, PlainTable
 from mitsonar.io.files import finite_number, parse_json, whole_lines, whole_number, write_json, write_whole
 from mitsonar.io.runs import RunDirectory, RunKind
-from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
+from mitsonar.mapping.odometry import Odometry, OdometryOptions, Row, odometry
 from mitsonar.mapping.open_source import Source
+from mitsonar.mapping.pairs import EstimateStore
 from mitsonar.mapping.pose_graph import PoseEdges
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.errors import AXES, in_units
-from mitsonar.motion.pose import Pose
-from mitsonar.motion.sensors import VehicleSensors
 from mitsonar.motion.trajectory import Trajectory, convention_named
 from mitsonar.plotting.figures import path_figure, save_figure
 
@@ -58,8 +56,8 @@ ODOMETRY = RunKind(
 search for loops adds ``loops.jsonl``, with one line per registration, and ``loops.csv``."""
 
 
-class OdometryFolder:
-    """A folder to which an odometry run is written, or from which it is read.
+class OdometryFolder(EstimateStore):
+    """A folder to which an odometry run is written, or from which it is read; its journals are a store of estimates.
 
     Attributes:
         run: options and state of the run.
@@ -67,6 +65,7 @@ class OdometryFolder:
     """
 
     def __init__(self, run: RunDirectory) -> None:
+        super().__init__()
         self.run, self.path = run, run.path
 
     @classmethod
@@ -112,16 +111,20 @@ class OdometryFolder:
 
     # ---------------- Journals
 
-    def kept(self) -> dict[int, Estimate]:
-        """Return the estimates of an earlier run, by pair number. Remove a last line that a killed run left incomplete.
+    def read_journals(self) -> Self:
+        """Read the estimates of an earlier run. Remove a last line that a killed run left incomplete.
 
         Raises:
-            MitsonarError: the journal is damaged.
+            MitsonarError: a journal is damaged.
         """
-        return {of["pair"]: estimate for of, estimate in read_journal(self.path / "estimates.jsonl", "pair")}
+        pairs = read_journal(self.path / "estimates.jsonl", "pair")
+        self.pairs = {of["pair"]: estimate for of, estimate in pairs}
+        loops = read_journal(self.path / "loops.jsonl", "first", "second")
+        self.loops = {(of["first"], of["second"], of["guess"]): estimate for of, estimate in loops}
+        return self
 
-    def keep(self, pair: int, estimate: Estimate) -> None:
-        """Append an estimate to the journal; the first one creates the folder.
+    def add_pair(self, pair: int, estimate: Estimate) -> None:
+        """Append an estimate to its journal; the first one creates the folder.
 
         Raises:
             MitsonarError: the folder cannot be created.
@@ -129,21 +132,8 @@ class OdometryFolder:
         self.run.start()
         add_to_journal(self.path / "estimates.jsonl", {"pair": pair}, estimate)
 
-    def kept_loops(self) -> dict[tuple[int, int, Motion], Estimate]:
-        """Return the loop registrations of an earlier run, by both frames and the initial guess; see :meth:`kept`.
-
-        Raises:
-            MitsonarError: the journal is damaged.
-        """
-        journal = read_journal(self.path / "loops.jsonl", "first", "second")
-        return {(of["first"], of["second"], of["guess"]): estimate for of, estimate in journal}
-
-    def keep_loop(self, first: int, second: int, guess: Motion, estimate: Estimate) -> None:
-        """Append a loop registration to its journal.
-
-        Raises:
-            MitsonarError: the folder cannot be created.
-        """
+    def add_loop(self, first: int, second: int, guess: Motion, estimate: Estimate) -> None:
+        """Append a loop registration to its journal; see :meth:`add_pair`."""
         self.run.start()
         add_to_journal(self.path / "loops.jsonl", {"first": first, "second": second, "guess": list(guess)}, estimate)
 
@@ -181,17 +171,9 @@ def run_odometry(
     name: str,
     estimator: AnyEstimator,
     out: str | Path,
+    options: OdometryOptions = OdometryOptions(),
     *,
-    smooth: Smoothing = "none",
-    scale: ArrayLike | Literal["fit"] | None = None,
-    start: Pose | None = None,
     frame: str = "mitsonar",
-    every: int = 1,
-    closure: int = 0,
-    sensors: VehicleSensors | None = None,
-    loops: bool = False,
-    local_map: bool = False,
-    workers: int = 1,
     overwrite: bool = False,
     resume: bool = False,
     progress: Callable[[int], None] = lambda pairs: None,
@@ -203,63 +185,45 @@ def run_odometry(
         name: name of the estimator, as the user gave it.
         estimator: estimates the motions.
         out: folder to write to; it is created.
-        smooth: see :func:`~mitsonar.mapping.odometry.odometry`.
-        scale: see ``odometry``.
-        start: see ``odometry``.
+        options: which frames are used, and what the path is made of.
         frame: convention of ``estimated.tum`` and ``true.tum``: ``mitsonar``, ``ros-enu`` or ``ned``.
-        every: see ``odometry``.
-        closure: see ``odometry``.
-        sensors: see ``odometry``.
-        loops: see ``odometry``.
-        local_map: see ``odometry``.
-        workers: see ``odometry``.
         overwrite: replace an odometry run in the folder.
-        resume: continue an interrupted run.
+        resume: continue an interrupted run; other options than ``every`` and ``sensors`` may change.
         progress: see ``odometry``.
 
     Raises:
         MitsonarError: as for ``odometry``; or the folder holds something else, or cannot be written.
     """
     convention_named(frame)
-    run = RunDirectory.begin(
-        out, ODOMETRY, _asked(source, name, estimator, every, sensors), resume=resume, overwrite=overwrite
-    )
-    folder = OdometryFolder(run)
-    kept, begun = folder.kept() if folder.run.resumed else {}, time.perf_counter()
-    asked = partial(odometry, smooth=smooth, scale=scale, start=start, every=every, closure=closure)
-    pipeline = partial(asked, sensors=sensors, loops=loops, local_map=local_map, workers=workers, progress=progress)
-    known_loops = folder.kept_loops() if folder.run.resumed else {}
-    journals = partial(pipeline, known=kept, keep=folder.keep, known_loops=known_loops, keep_loop=folder.keep_loop)
-    found = journals(source, estimator)
-    settings = {
-        **{"source": source.name, "inputs": estimator.inputs, "smooth": smooth, "scale": _named(scale), "frame": frame},
-        **{**_found(found), "seconds": time.perf_counter() - begun},
-        **{"pairs_in_these_seconds": len(found.estimates) - len(kept), "workers": workers},
-        **{"closure": closure, "loops": loops, "local_map": local_map},
+    # 1. open the folder, and read the estimates of an earlier run
+    settings = _settings(source, name, estimator, options)
+    run = RunDirectory.begin(out, ODOMETRY, settings, resume=resume, overwrite=overwrite)
+    folder = OdometryFolder(run).read_journals() if run.resumed else OdometryFolder(run)
+    # 2. compute the path; each new estimate goes to the journals at once
+    begun = time.perf_counter()
+    found = odometry(source, estimator, options, store=folder, progress=progress)
+    # 3. write the results, with notes for `run.json`
+    notes = {
+        **{"source": source.name, "inputs": estimator.inputs, "smooth": options.smooth},
+        "scale": options.scale if isinstance(options.scale, str) or options.scale is None else "given",
+        **{"frame": frame, "factors": found.factors, "from": found.path.poses[0], "not_believed": int((~found.valid).sum())},
+        **{"warnings": found.warnings(), "seconds": time.perf_counter() - begun},
+        **{"pairs_in_these_seconds": len(found.estimates) - len(folder.pairs), "workers": options.workers},
+        **{"closure": options.closure, "loops": options.loops, "local_map": options.local_map},
     }
-    folder.write(found, f"{Path(source.name).name}, {name}", settings)
+    folder.write(found, f"{Path(source.name).name}, {name}", notes)
     return found
 
 
-def _named(scale: ArrayLike | Literal["fit"] | None) -> str | None:
-    return scale if isinstance(scale, str) or scale is None else "given"
-
-
-def _found(found: Odometry) -> PlainTable:
-    """Return the notes about the path for ``run.json``."""
-    lost = int((~found.believed).sum())
-    return {"factors": found.factors, "from": found.path.poses[0], "not_believed": lost, "warnings": found.warnings()}
-
-
-def _asked(source: Source, name: str, estimator: AnyEstimator, every: int, sensors: VehicleSensors | None) -> PlainTable:
+def _settings(source: Source, name: str, estimator: AnyEstimator, options: OdometryOptions) -> PlainTable:
     """Return the options on which the estimates depend; a run can be resumed only with the same ones."""
-    options: PlainTable = dataclasses.asdict(estimator) if dataclasses.is_dataclass(estimator) else {}
+    of_estimator: PlainTable = dataclasses.asdict(estimator) if dataclasses.is_dataclass(estimator) else {}
     return {
-        **{"estimator": name, "options": options, "frames": len(source), "frames_sha256": source.digest(), "every": every},
-        "height_m": source.told_height_m,
+        **{"estimator": name, "options": of_estimator, "frames": len(source), "frames_sha256": source.digest()},
+        **{"every": options.every, "height_m": source.told_height_m},
         "pitch_deg": None if source.pitch_rad is None else float(np.degrees(source.pitch_rad)),
         "noise": None if source.noise is None else {**source.noise.model_dump(), "seed": source.seed},
-        **({} if sensors is None else {"sensors_sha256": sensors.digest()}),
+        **({} if options.sensors is None else {"sensors_sha256": options.sensors.digest()}),
     }
 
 
@@ -316,7 +280,7 @@ def _covariances(found: Odometry) -> bytes:
         time_s=found.series.time_s,
         frames=found.frames,
         motions=found.series.motions,
-        believed=found.believed,
+        believed=found.valid,
         motion_covariances=np.full((count, 3, 3), np.nan) if motions is None else motions,
         pose_covariances=np.full((count + 1, 3, 3), np.nan) if poses is None else poses,
     )

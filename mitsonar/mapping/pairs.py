@@ -28,7 +28,7 @@ from mitsonar.mapping.open_source import Source
 from mitsonar.mapping.sources import without_height
 from mitsonar.motion.composition import Motion, MotionPrior
 
-__all__ = ["continued", "estimate_motions"]
+__all__ = ["EstimateStore", "continued", "estimate_motions"]
 
 
 Index = NDArray[np.intp]
@@ -42,6 +42,27 @@ PAIRS_A_BATCH = 8
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
+class EstimateStore:
+    """Estimates of an earlier run, to which a run adds its own as they are made. This store is in memory.
+
+    Attributes:
+        pairs: estimates by pair number.
+        loops: registrations of loops by the numbers of both frames in the source and the initial motion.
+    """
+
+    def __init__(self, pairs: Mapping[int, Estimate] | None = None) -> None:
+        self.pairs: dict[int, Estimate] = dict(pairs or {})
+        self.loops: dict[tuple[int, int, Motion], Estimate] = {}
+
+    def add_pair(self, pair: int, estimate: Estimate) -> None:
+        """Add the estimate of a pair."""
+        self.pairs[pair] = estimate
+
+    def add_loop(self, first: int, second: int, guess: Motion, estimate: Estimate) -> None:
+        """Add a registration of two frames from an initial motion."""
+        self.loops[first, second, guess] = estimate
+
+
 def estimate_motions(
     source: Source,
     estimator: AnyEstimator,
@@ -49,8 +70,7 @@ def estimate_motions(
     *,
     workers: int = 1,
     priors: Sequence[MotionPrior] | None = None,
-    known: Mapping[int, Estimate] | None = None,
-    keep: Callable[[int, Estimate], None] = lambda number, estimate: None,
+    store: EstimateStore | None = None,
     progress: Callable[[int], None] = lambda pairs: None,
 ) -> list[Estimate]:
     """Estimate the motion of each pair of consecutive frames, with only a few frames in memory at a time.
@@ -61,8 +81,7 @@ def estimate_motions(
         frames: numbers of the frames ``(n,)``; pair ``k`` consists of frames ``k`` and ``k + 1`` of these.
         workers: number of worker processes, with one thread each; 1 computes in this process.
         priors: prior for the motion of each pair ``(n - 1,)``; default: none.
-        known: estimates of an earlier run, by pair number.
-        keep: called with the number and the estimate of each new pair, in order.
+        store: estimates of an earlier run, to which each new one is added, in order.
         progress: called with the number of pairs processed since the last call.
 
     Raises:
@@ -72,17 +91,18 @@ def estimate_motions(
     numbers = np.asarray(frames, dtype=np.intp)
     if priors is not None and len(priors) != len(numbers) - 1:
         raise MitsonarError(f"{len(numbers)} frames make {len(numbers) - 1} pairs, each with one prior: got {len(priors)}")
-    estimates = {pair: estimate for pair, estimate in (known or {}).items() if pair < len(numbers) - 1}
+    store = store or EstimateStore()
+    estimates = {pair: estimate for pair, estimate in store.pairs.items() if pair < len(numbers) - 1}
     if estimates:
         progress(len(estimates))
     batches = _batches([pair for pair in range(len(numbers) - 1) if pair not in estimates])
-    made = _made_here if workers <= 1 else _made_beside
-    told: Priors = [None] * (len(numbers) - 1) if priors is None else list(priors)
-    with closing(made(source, estimator, numbers, told, batches, workers)) as found:
-        for batch, answers in found:
-            for pair, answer in zip(batch, answers, strict=True):
-                estimates[pair] = answer
-                keep(pair, answer)
+    run = _run_serial if workers <= 1 else _run_parallel
+    of_pairs: Priors = [None] * (len(numbers) - 1) if priors is None else list(priors)
+    with closing(run(source, estimator, numbers, of_pairs, batches, workers)) as finished:
+        for batch, made in finished:
+            for pair, estimate in zip(batch, made, strict=True):
+                estimates[pair] = estimate
+                store.add_pair(pair, estimate)
             progress(len(batch))
     return [estimates[pair] for pair in range(len(numbers) - 1)]
 
@@ -98,7 +118,7 @@ def _batches(pairs: list[int]) -> list[range]:
     return batches
 
 
-def _made_here(
+def _run_serial(
     source: Source, estimator: AnyEstimator, numbers: Index, priors: Priors, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
     """Yield each batch with its estimates, computed in this process."""
@@ -107,7 +127,7 @@ def _made_here(
             yield batch, _estimates(estimator, _frames_of(source, numbers, batch), priors[batch.start : batch.stop])
 
 
-def _made_beside(
+def _run_parallel(
     source: Source, estimator: AnyEstimator, numbers: Index, priors: Priors, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
     """Yield each batch with its estimates, computed in worker processes; this process reads the frames."""

@@ -18,11 +18,11 @@ from scipy.sparse.linalg import SuperLU, splu
 from scipy.stats import chi2
 
 from mitsonar.errors import MitsonarError
+from mitsonar.mapping.series import CorrelatedErrors
 from mitsonar.motion.sensors import Headings, wrapped
 
 __all__ = [
     "OUTLIER",
-    "CorrelatedErrors",
     "GraphSolution",
     "NormalFactor",
     "PoseEdges",
@@ -80,30 +80,6 @@ class PoseEdges(NamedTuple):
             return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariances)))
         except np.linalg.LinAlgError:
             raise MitsonarError("a pose graph needs covariances of motions that are positive: got one that is not") from None
-
-
-class CorrelatedErrors(NamedTuple):
-    """Correlation between the errors of consecutive motions of the chain.
-
-    Attributes:
-        share: fraction of the variance of each error that consecutive motions have in common, in [0, 1).
-        onward: correlation of the common part from each motion to the next ``(motions - 1,)``, in [0, 1).
-        slope_std: standard deviation of the slope of each component of the error (rows) over each component of the motion
-            (columns) ``(3, 3)``. All motions share the same slopes.
-        sloped: motions that the slopes multiply, smoothed to reduce the errors of single ones ``(motions, 3)``.
-    """
-
-    share: float
-    onward: Array
-    slope_std: Array
-    sloped: Array
-
-    def by_slopes(self) -> Array:
-        """Return the derivatives of the errors by the nine slopes, in standard deviations ``(motions, 3, 9)``."""
-        table = np.zeros((len(self.sloped), 3, 3, 3))
-        for axis in range(3):
-            table[:, axis, axis] = self.sloped * self.slope_std[axis]
-        return table.reshape(-1, 3, 9)
 
 
 @dataclass(frozen=True)

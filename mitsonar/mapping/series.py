@@ -19,15 +19,16 @@ from scipy.stats import chi2
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.mapping.pose_graph import CorrelatedErrors
 from mitsonar.motion.errors import AXES
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = [
+    "CorrelatedErrors",
     "Ellipse",
     "ErrorCorrelation",
     "MotionSeries",
+    "bridged",
     "ellipse",
     "fit_noise",
     "fit_scale",
@@ -75,9 +76,9 @@ class MotionSeries:
             raise MitsonarError(f"motions must be ({count}, 3) for {count + 1} frame times: got {self.motions.shape}")
         if not (np.isfinite(self.time_s).all() and (np.diff(self.time_s) > 0).all()):
             raise MitsonarError("frame times must be finite and increase: sort the frames, or give their times")
-        if self.believed.shape != (count,):
-            raise MitsonarError(f"valid must be ({count},), one for each motion: got {self.believed.shape}")
-        if not self.believed.any():
+        if self.is_valid.shape != (count,):
+            raise MitsonarError(f"valid must be ({count},), one for each motion: got {self.is_valid.shape}")
+        if not self.is_valid.any():
             raise MitsonarError(f"none of {count} motions is valid, so that there is no path: try another estimator")
         self._refuse(~np.isfinite(self.motions).all(axis=1), "is not finite")
         if self.covariances is not None:
@@ -89,13 +90,13 @@ class MotionSeries:
         if covariances.shape != (len(self), 3, 3):
             raise MitsonarError(f"covariances must be ({len(self)}, 3, 3), one a motion: got {covariances.shape}")
         self._refuse(~np.isfinite(covariances).all(axis=(1, 2)), "has a covariance that is not finite")
-        known = np.where(self.believed[:, None, None], covariances, np.eye(3))
+        known = np.where(self.is_valid[:, None, None], covariances, np.eye(3))
         crooked = np.abs(known - known.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(known).max(axis=(1, 2))
         least = np.linalg.eigvalsh(known)
         self._refuse(crooked | (least[:, 0] < -1e-9 * least[:, 2]), "has a covariance with a negative variance, or lopsided")
 
     def _refuse(self, bad: ArrayLike, what: str) -> None:
-        where = np.flatnonzero(np.asarray(bad) & self.believed)
+        where = np.flatnonzero(np.asarray(bad) & self.is_valid)
         if where.size:
             raise MitsonarError(
                 f"the motion from frame {where[0]} to {where[0] + 1} {what} ({where.size} of {len(self)} are so): "
@@ -120,7 +121,7 @@ class MotionSeries:
         return cls(motions, np.asarray(time_s, dtype=float), np.array(covariances) if known else None, valid)
 
     @cached_property
-    def believed(self) -> NDArray[np.bool_]:
+    def is_valid(self) -> NDArray[np.bool_]:
         """Return whether each motion is valid ``(frames - 1,)``."""
         return np.ones(len(self), dtype=bool) if self.valid is None else self.valid
 
@@ -205,6 +206,29 @@ def fit_scale(estimated: ArrayLike, true: ArrayLike) -> Array:
     return np.where(power > 0, (e * t).sum(axis=0) / np.where(power > 0, power, 1), 1.0)
 
 
+def bridged(measured: MotionSeries) -> MotionSeries:
+    """Fill in invalid motions from the valid ones, which stay as measured.
+
+    If covariances are known, the Kalman smoother fills the gaps and supplies their covariances. Otherwise the velocity is
+    interpolated linearly between its neighbours.
+    """
+    known = np.flatnonzero(measured.is_valid)
+    if known.size == len(measured):
+        return measured
+    if measured.covariances is not None and known.size > 1:
+        filled = kalman_smoothed(measured)
+        fill, fill_covariances = filled.motions, filled.covariances
+    else:
+        middle = measured.middle_s
+        velocity = np.column_stack([np.interp(middle, middle[known], v[known]) for v in measured.velocity.T])
+        fill, fill_covariances = velocity * measured.step_s[:, None], None
+    together = np.where(measured.is_valid[:, None], measured.motions, fill)
+    if fill_covariances is None or measured.covariances is None:
+        return MotionSeries(together, measured.time_s)
+    covariances = np.where(measured.is_valid[:, None, None], measured.covariances, fill_covariances)
+    return MotionSeries(together, measured.time_s, covariances)
+
+
 # ---------------- Smoothing: weighted spline
 # Almanza-Medina composes estimates without smoothing (3.5.1, 4.4.4, 5.4.5), and leaves splines and Kalman filters to
 # future work (6.2).
@@ -277,7 +301,7 @@ def spline_period(measured: MotionSeries) -> Array:
 
 def _spline_data(measured: MotionSeries) -> tuple[NDArray[np.intp], Array, Array]:
     """Return the indices of the valid motions, their times (mean gap 1) and their weights on each axis (mean 1)."""
-    known = np.flatnonzero(measured.believed)
+    known = np.flatnonzero(measured.is_valid)
     weight = np.broadcast_to(measured.step_s[known, None] ** 2, (known.size, 3))
     if measured.covariances is not None:
         weight = weight / _variances(measured)[known]
@@ -397,7 +421,7 @@ def _filtered(measured: MotionSeries, wander: Array) -> tuple[Array, Array, Arra
     seen, noise = measured.velocity, np.asarray(measured.covariances) / (measured.step_s**2)[:, None, None]
     walked = _walked(measured, wander)
     # without a prior the first valid motion initialises the filter
-    first = int(np.argmax(measured.believed))
+    first = int(np.argmax(measured.is_valid))
     n, one = len(measured), np.eye(3)
     mean, covariance = np.tile(seen[first], (n, 1)), np.zeros((n, 3, 3))
     back = np.tile(one, (max(n - 1, 0), 1, 1))
@@ -408,7 +432,7 @@ def _filtered(measured: MotionSeries, wander: Array) -> tuple[Array, Array, Arra
         back[k - 1] = np.linalg.solve(ahead, covariance[k - 1]).T
         mean[k], covariance[k] = mean[k - 1], ahead
         # update by a valid measurement, in Joseph form: a sum of two squares, which rounding cannot make negative
-        if measured.believed[k]:
+        if measured.is_valid[k]:
             gain = np.linalg.solve(ahead + noise[k], ahead).T
             mean[k] += gain @ (seen[k] - mean[k - 1])
             covariance[k] = _symmetric((one - gain) @ ahead @ (one - gain).T + gain @ noise[k] @ gain.T)
@@ -439,7 +463,7 @@ def fit_wander(measured: MotionSeries) -> Array:
     """
     if measured.covariances is None:
         raise MitsonarError("fit_wander needs the motions' covariances: give them, or estimate the noise with fit_noise")
-    known = np.flatnonzero(measured.believed)
+    known = np.flatnonzero(measured.is_valid)
     if known.size == 1 < len(measured):
         raise MitsonarError(f"one valid motion of {len(measured)} shows no change of velocity: give wander")
     gap, seen = np.diff(measured.middle_s[known])[:, None], measured.velocity[known]
@@ -463,7 +487,7 @@ def fit_noise(measured: MotionSeries) -> Array:
     Raises:
         MitsonarError: fewer than five motions are valid, or an axis never changes.
     """
-    known = np.flatnonzero(measured.believed)
+    known = np.flatnonzero(measured.is_valid)
     seen, step = measured.velocity[known], measured.step_s[known, None]
     if known.size < 5:
         raise MitsonarError(f"the noise of motions needs five of them or more: got {known.size}; give covariances")
@@ -508,7 +532,7 @@ def _innovations(seen: Array, noise: Array, gap: Array, walk: Array) -> tuple[Ar
 def _variances(measured: MotionSeries) -> Array:
     """Return the variances of the motions ``(frames - 1, 3)``, checked to be positive where valid."""
     variance = np.diagonal(np.asarray(measured.covariances), axis1=1, axis2=2)
-    for axis, values in zip(AXES, variance[measured.believed].T, strict=True):
+    for axis, values in zip(AXES, variance[measured.is_valid].T, strict=True):
         if not (values > 0).all():
             raise MitsonarError(f"smoothing needs variances above zero: got {values.min():g} for {axis.name}")
     return variance
@@ -553,8 +577,8 @@ def pose_covariances(
     """
     if series.covariances is None:
         raise MitsonarError("the pose's covariance needs those of the motions: give them, or use kalman_smoothed")
-    if not series.believed.all():
-        gaps = int((~series.believed).sum())
+    if not series.is_valid.all():
+        gaps = int((~series.is_valid).sum())
         raise MitsonarError(f"{gaps} motions are not valid, so that their errors are not known: use kalman_smoothed first")
     poses = path_of(series.motions, start, series.time_s).poses
     found = np.zeros((len(poses), 3, 3))
@@ -653,6 +677,30 @@ def ellipse(covariance: ArrayLike, probability: float = 0.95) -> Ellipse:
 # ---------------- Correlation of errors over the same ground
 
 
+class CorrelatedErrors(NamedTuple):
+    """Correlation between the errors of consecutive motions of the chain.
+
+    Attributes:
+        share: fraction of the variance of each error that consecutive motions have in common, in [0, 1).
+        onward: correlation of the common part from each motion to the next ``(motions - 1,)``, in [0, 1).
+        slope_std: standard deviation of the slope of each component of the error (rows) over each component of the motion
+            (columns) ``(3, 3)``. All motions share the same slopes.
+        sloped: motions that the slopes multiply, smoothed to reduce the errors of single ones ``(motions, 3)``.
+    """
+
+    share: float
+    onward: Array
+    slope_std: Array
+    sloped: Array
+
+    def by_slopes(self) -> Array:
+        """Return the derivatives of the errors by the nine slopes, in standard deviations ``(motions, 3, 9)``."""
+        table = np.zeros((len(self.sloped), 3, 3, 3))
+        for axis in range(3):
+            table[:, axis, axis] = self.sloped * self.slope_std[axis]
+        return table.reshape(-1, 3, 9)
+
+
 @dataclass(frozen=True)
 class ErrorCorrelation:
     """Model of the correlation between errors of motions over the same ground.
@@ -682,7 +730,7 @@ class ErrorCorrelation:
                 f"{self.share:g}, {self.length:g} and {self.slope:g}"
             )
 
-    def of(self, motions: ArrayLike, reach_m: float) -> CorrelatedErrors:
+    def along(self, motions: ArrayLike, reach_m: float) -> CorrelatedErrors:
         """Return the correlation of the errors of consecutive motions ``(n, 3)``.
 
         Args:
@@ -706,11 +754,11 @@ def _spread(moved: Array, onward: Array) -> Array:
 
     A slope over the unsmoothed motions would mistake an error that two components share for a proportional error.
     """
-    total = _alike(np.ones((len(moved), 1)), onward)
-    return _alike(moved / total, onward)
+    total = _correlated_sum(np.ones((len(moved), 1)), onward)
+    return _correlated_sum(moved / total, onward)
 
 
-def _alike(values: Array, onward: Array) -> Array:
+def _correlated_sum(values: Array, onward: Array) -> Array:
     """Sum values ``(n, k)`` weighted by the correlations of their motions, with one recursion in each direction."""
     before, after = values.copy(), values.copy()
     for k, stays in enumerate(onward):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mitsonar import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.odometry import Closure, closure_of, odometry
+from mitsonar.mapping.odometry import Closure, OdometryOptions, closure_of, odometry
 from mitsonar.mapping.pairs import estimate_motions
 from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, MotionPrior, motions
@@ -77,8 +77,8 @@ def test_residuals_have_the_variance_of_nine_motions_and_true_covariances_stay()
     # 200 loops: the rms scatters by 5 %; turns of a degree mix the axes by less
     np.testing.assert_allclose(found.rms, 3 * STD, rtol=0.2)
     assert found.factor == pytest.approx(1, abs=0.25)
-    honest = found.honest(estimates)
-    np.testing.assert_allclose(np.asarray(honest[0].covariance), np.diag(STD**2) * found.factor)
+    inflated = found.inflate_covariances(estimates)
+    np.testing.assert_allclose(np.asarray(inflated[0].covariance), np.diag(STD**2) * found.factor)
 
 
 @pytest.mark.parametrize("told", [STD / 5, None])
@@ -86,7 +86,7 @@ def test_covariances_that_are_too_small_or_missing_are_made_honest(told: NDArray
     frames = numbered(1601)
     assert frames.poses is not None
     found, estimates = closed(Known(frames.poses, STD, told), frames)
-    covariance = np.asarray(found.honest(estimates)[3].covariance)
+    covariance = np.asarray(found.inflate_covariances(estimates)[3].covariance)
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), STD, rtol=0.2)
 
 
@@ -115,7 +115,7 @@ def test_odometry_tells_the_closure_and_raises_its_covariances() -> None:
     frames = numbered(FRAMES)
     assert frames.poses is not None
     estimator = Known(frames.poses, STD, STD / 5)
-    plain, closing = odometry(frames, estimator), odometry(frames, estimator, closure=STEPS)
+    plain, closing = odometry(frames, estimator), odometry(frames, estimator, OdometryOptions(closure=STEPS))
     assert plain.closure is None
     assert closing.closure is not None
     np.testing.assert_array_equal(plain.series.motions, closing.series.motions)
@@ -125,4 +125,4 @@ def test_odometry_tells_the_closure_and_raises_its_covariances() -> None:
     names = [name for name, _, _ in closing.rows()]
     assert "closure over 8 motions, rms, forward" in names
     with pytest.raises(MitsonarError, match="must be 0, or 2 motions or more: got 1"):
-        odometry(frames, estimator, closure=1)
+        OdometryOptions(closure=1)

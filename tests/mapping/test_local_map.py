@@ -17,7 +17,8 @@ from mitsonar.geometry.fan import Views, polar_of
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping import local_map
 from mitsonar.mapping.local_map import ImageAxes, mapped
-from mitsonar.mapping.odometry import odometry, series_of
+from mitsonar.mapping.odometry import OdometryOptions, odometry, series_of
+from mitsonar.mapping.pairs import EstimateStore
 from mitsonar.mapping.series import MotionSeries, path_of, pose_covariances
 from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, motions
@@ -150,15 +151,15 @@ def test_frames_without_a_height_are_refused() -> None:
 
 def test_odometry_tells_what_the_map_did() -> None:
     frames = run().select(slice(0, 16))
-    known = dict(enumerate(wrong_estimates()[:15]))
-    found = odometry(frames, Zero(), local_map=True, known=known)
+    known, options = EstimateStore(dict(enumerate(wrong_estimates()[:15]))), OdometryOptions(local_map=True)
+    found = odometry(frames, Zero(), options, store=known)
     assert ("motions by the local map", 15, "") in found.rows()
     assert found.warnings() == []
-    plain = odometry(frames, Zero(), known=known)
+    plain = odometry(frames, Zero(), store=known)
     assert frames.poses is not None
     errors = [np.linalg.norm((one.path.poses - frames.poses)[-1, :2]) for one in (found, plain)]
     assert errors[0] < 0.5 * errors[1]
     dark = frames.image.copy()
     dark[4:] = 0
-    blind = odometry(replace(frames, image=dark), Zero(), local_map=True, known=known)
+    blind = odometry(replace(frames, image=dark), Zero(), options, store=known)
     assert "are those of pairs of frames" in blind.warnings()[0]

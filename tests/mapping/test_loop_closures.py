@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.mapping.loops import Canvas, likenesses
-from mitsonar.mapping.odometry import Odometry, odometry
+from mitsonar.mapping.odometry import Odometry, OdometryOptions, odometry
 from mitsonar.mapping.odometry_run import run_odometry
 from mitsonar.mapping.pose_graph import PoseEdges
 from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
@@ -32,6 +32,7 @@ COARSE = SONAR.replace(beams=48, range_bins=64)
 STD = np.array([1e-3, 1e-3, 2e-3])
 DRIFT = 0.006
 START = Pose.from_degrees([1.0, -2.0, 2.5, 35, 0, 40])
+LOOPS = OdometryOptions(loops=True)
 
 
 def circle(frames: int = 127, round_frames: int = 120) -> Trajectory:
@@ -118,7 +119,7 @@ def test_blank_frames_have_no_view() -> None:
 def test_a_circle_is_closed_where_it_began(round_trip: tuple[SonarFrames, Drifting]) -> None:
     frames, estimator = round_trip
     path = estimator.path
-    plain, closed = odometry(frames, estimator), odometry(frames, estimator, loops=True)
+    plain, closed = odometry(frames, estimator), odometry(frames, estimator, LOOPS)
     assert plain.graph is None
     assert closed.graph is not None
     loops = kept_loops(closed)
@@ -156,7 +157,7 @@ def test_places_beyond_the_path_s_covariance_are_not_taken_for_one_another() -> 
     assert first is not None
     assert second is not None
     assert likenesses(first, second, np.zeros(1), np.zeros(2), np.full(2, 0.3))[0].correlation > 0.95
-    found = odometry(frames, Drifting(path, period=14.0), loops=True)
+    found = odometry(frames, Drifting(path, period=14.0), LOOPS)
     assert found.graph is not None
     assert len(kept_loops(found).first) == 0
 
@@ -173,7 +174,7 @@ def test_a_floor_that_repeats_within_the_covariance_is_ambiguous(round_trip: tup
         def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
             return replace(super().estimate(frames), covariance=np.diag(loose**2))
 
-    found = odometry(frames, Loose(path), loops=True)
+    found = odometry(frames, Loose(path), LOOPS)
     assert found.graph is not None
     assert found.graph.search is not None
     assert found.graph.search.rejected["two places are alike"] > 0
@@ -197,8 +198,8 @@ def test_wrong_registrations_are_no_loops(round_trip: tuple[SonarFrames, Driftin
             off = self.size * np.array([*rng.uniform(0.1, 0.2, 2) * rng.choice([-1, 1], 2), 0.0])
             return replace(right, motion=Motion(*(np.asarray(right.motion) + off).tolist()))
 
-    far = odometry(frames, Lost(estimator.path, size=4.0), loops=True)
-    near = odometry(frames, Lost(estimator.path, size=1.0), loops=True)
+    far = odometry(frames, Lost(estimator.path, size=4.0), LOOPS)
+    near = odometry(frames, Lost(estimator.path, size=1.0), LOOPS)
     assert far.graph is not None
     assert near.graph is not None
     assert far.graph.search is not None
@@ -214,7 +215,7 @@ def test_a_gyroscope_lowers_the_error_of_the_end(round_trip: tuple[SonarFrames, 
     frames, estimator = round_trip
     plain = odometry(frames, estimator)
     gyro = simulated_sensors(estimator.path, SensorNoise(gyro_deg_rth=0.1, depth_m=1e-4), 4)
-    found = odometry(frames, estimator, sensors=gyro)
+    found = odometry(frames, estimator, OdometryOptions(sensors=gyro))
     assert found.graph is not None
     assert found.graph.sensors == ("gyroscope", "depth")
     errors = [np.abs(one.path.poses[-1, 5] - estimator.path.poses[-1, 5]) for one in (plain, found)]
@@ -233,17 +234,17 @@ def test_motions_without_an_estimate_are_those_of_the_sensors(round_trip: tuple[
             return right if frames.time_s[0] % 40 < 20 else replace(right, valid=False, reason="blind")
 
     sensors = simulated_sensors(estimator.path, SensorNoise(gyro_deg_rth=0.1, velocity_m_s=1e-3), 4)
-    found = odometry(frames, Blind(estimator.path), sensors=sensors)
-    assert (~found.believed).sum() >= 60
+    found = odometry(frames, Blind(estimator.path), OdometryOptions(sensors=sensors))
+    assert (~found.valid).sum() >= 60
     off = found.series.motions - motions(estimator.path.poses)
-    assert np.abs(off[~found.believed]).max() < 3e-3
+    assert np.abs(off[~found.valid]).max() < 3e-3
 
 
 def test_a_compass_tells_the_first_heading_where_nothing_else_does(round_trip: tuple[SonarFrames, Drifting]) -> None:
     frames, estimator = round_trip
     blind = FrameSource.of(replace(frames, poses=None)).with_geometry(pitch_rad=float(np.radians(35)))
     sensors = simulated_sensors(estimator.path, SensorNoise(compass_deg=2.0, rate_hz=1.0), 5)
-    found = odometry(blind, estimator, sensors=sensors)
+    found = odometry(blind, estimator, OdometryOptions(sensors=sensors))
     assert found.graph is not None
     assert np.degrees(found.path.poses[0, 5]) == pytest.approx(40, abs=2)
     assert np.degrees(np.sqrt(found.graph.covariances[0, 2, 2])) < 1
@@ -256,7 +257,8 @@ def test_a_run_s_folder_keeps_registrations_and_resumes_to_the_same_bits(
     frames, estimator = round_trip
     source = FrameSource.of(frames, "circle")
     save_sensors(tmp_path / "gyro.csv", sensors := simulated_sensors(estimator.path, SensorNoise(gyro_deg_rth=5.0), 4))
-    once = run_odometry(source, "drifting", estimator, tmp_path / "out", sensors=sensors, loops=True, every=2)
+    options = OdometryOptions(sensors=sensors, loops=True, every=2)
+    once = run_odometry(source, "drifting", estimator, tmp_path / "out", options)
     assert once.graph is not None
     files = ("estimated.tum", "motions.csv", "loops.csv", "loops.jsonl", "table.md")
     bits = {name: (tmp_path / "out" / name).read_bytes() for name in files}
@@ -275,26 +277,24 @@ def test_a_run_s_folder_keeps_registrations_and_resumes_to_the_same_bits(
             return super().estimate(frames)
 
     asked: list[float] = []
-    run_odometry(
-        source, "drifting", Counting(estimator.path), tmp_path / "out", sensors=sensors, loops=True, every=2, resume=True
-    )
+    run_odometry(source, "drifting", Counting(estimator.path), tmp_path / "out", options, resume=True)
     assert len(asked) == len(lines) - 1
     assert min(asked) > 2
     assert {name: (tmp_path / "out" / name).read_bytes() for name in files} == bits
     (tmp_path / "out" / "loops.jsonl").write_bytes(b'{"first": 1, "motion": [0, 0, 0]}\n')
     with pytest.raises(MitsonarError, match=r"loops.jsonl, line 1 is damaged"):
-        run_odometry(source, "drifting", estimator, tmp_path / "out", sensors=sensors, loops=True, every=2, resume=True)
+        run_odometry(source, "drifting", estimator, tmp_path / "out", options, resume=True)
     with pytest.raises(MitsonarError, match="sensors_sha256"):
-        run_odometry(source, "drifting", estimator, tmp_path / "out", loops=True, every=2, resume=True)
+        run_odometry(source, "drifting", estimator, tmp_path / "out", replace(options, sensors=None), resume=True)
 
 
 def test_what_a_pose_graph_cannot_do_is_refused(round_trip: tuple[SonarFrames, Drifting]) -> None:
     frames, estimator = round_trip
     with pytest.raises(MitsonarError, match="exclude each other"):
-        odometry(frames, estimator, loops=True, smooth="kalman")
+        OdometryOptions(loops=True, smooth="kalman")
     blind = FrameSource.of(replace(frames, poses=None))
     with pytest.raises(MitsonarError, match="give the height and the pitch"):
-        odometry(blind, estimator, loops=True)
+        odometry(blind, estimator, LOOPS)
     late = simulated_sensors(Trajectory(estimator.path.poses, estimator.path.time_s + 1000), SensorNoise(gyro_deg_rth=1.0))
     with pytest.raises(MitsonarError, match="no reading between 0 and 126 s"):
-        odometry(frames, estimator, sensors=late)
+        odometry(frames, estimator, OdometryOptions(sensors=late))

@@ -24,14 +24,13 @@ from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping import odometry_run
-from mitsonar.mapping.graph_odometry import errors_along
 from mitsonar.mapping.loops import Canvas
-from mitsonar.mapping.odometry import bridged, odometry
+from mitsonar.mapping.odometry import OdometryOptions, errors_along, odometry
 from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
 from mitsonar.mapping.open_source import usual_loop
-from mitsonar.mapping.pairs import PAIRS_A_BATCH, estimate_motions
+from mitsonar.mapping.pairs import PAIRS_A_BATCH, EstimateStore, estimate_motions
 from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
-from mitsonar.mapping.series import MotionSeries, path_of
+from mitsonar.mapping.series import MotionSeries, bridged, path_of
 from mitsonar.mapping.sources import FrameSource, load_frames, open_frames
 from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.motion.pose import Pose
@@ -95,8 +94,8 @@ def test_the_path_is_the_motions_composed_from_the_first_pose() -> None:
     found = odometry(*told(path))
     np.testing.assert_allclose(found.path.poses, path.poses, atol=1e-12)
     np.testing.assert_array_equal(found.path.time_s, path.time_s)
-    assert found.believed.all()
-    elsewhere = odometry(*told(path), start=Pose(5, 6, 7, 0.1, 0.2, 1.0))
+    assert found.valid.all()
+    elsewhere = odometry(*told(path), OdometryOptions(start=Pose(5, 6, 7, 0.1, 0.2, 1.0)))
     assert elsewhere.path.poses[0].tolist() == [5, 6, 7, 0.1, 0.2, 1.0]
     np.testing.assert_allclose(motions(elsewhere.path.poses), motions(path.poses), atol=1e-12)
 
@@ -117,7 +116,7 @@ def test_without_poses_the_path_begins_at_the_origin_with_what_is_known() -> Non
 
 def test_every_third_frame() -> None:
     path = sway(30)
-    found = odometry(*told(path), every=3)
+    found = odometry(*told(path), OdometryOptions(every=3))
     assert found.frames.tolist() == list(range(0, 30, 3))
     np.testing.assert_allclose(found.path.poses, path.poses[::3], atol=1e-12)
     rows = {name: value for name, value, _ in found.rows()}
@@ -139,7 +138,7 @@ def test_direct_finds_the_path_over_a_drawn_floor() -> None:
     path = sway(16)
     found = odometry(over_ground(path), Direct())
     errors = motions(found.path.poses) - motions(path.poses)
-    assert found.believed.all()
+    assert found.valid.all()
     rmse = np.sqrt((errors**2).mean(axis=0))
     assert (rmse < [6e-4, 3e-4, 3e-4]).all(), rmse
     assert found.pose_covariances is not None
@@ -161,7 +160,7 @@ def test_errors_over_relief_are_alike_and_those_over_even_ground_are_not() -> No
     assert staying is not None
     assert told is not None
     assert np.trace(staying[-1]) > 2 * np.trace(told[-1])
-    assert odometry(over_ground(sway(16)), Direct(), smooth="kalman").correlated is None
+    assert odometry(over_ground(sway(16)), Direct(), OdometryOptions(smooth="kalman")).correlated is None
 
 
 def test_a_gyroscope_over_even_ground_mends_the_heading_and_leaves_the_rest() -> None:
@@ -182,7 +181,7 @@ def test_a_gyroscope_over_even_ground_mends_the_heading_and_leaves_the_rest() ->
     moved = motions(poses) + rng.standard_normal((count - 1, 3)) @ mixed.T
     known = {k: Estimate(Motion(*one.tolist()), mixed @ mixed.T, True, "", {}) for k, one in enumerate(moved)}
     gyroscope = simulated_sensors(path, SensorNoise(gyro_deg_rth=1.0), seed=0)
-    found = odometry(seen, Direct(), known=known, sensors=gyroscope)
+    found = odometry(seen, Direct(), OdometryOptions(sensors=gyroscope), store=EstimateStore(known))
     off = found.path.poses[-1, :2] - poses[-1, :2]
     assert found.pose_covariances is not None
     told = np.sqrt(np.trace(found.pose_covariances[-1, :2, :2]))
@@ -195,7 +194,7 @@ def test_a_gyroscope_over_even_ground_mends_the_heading_and_leaves_the_rest() ->
 @pytest.mark.thorough
 def test_workers_change_no_bit() -> None:
     frames = over_ground(sway(3 * PAIRS_A_BATCH), noise=0.05)
-    one, two = (odometry(frames, Direct(), workers=workers) for workers in (1, 2))
+    one, two = (odometry(frames, Direct(), OdometryOptions(workers=workers)) for workers in (1, 2))
     np.testing.assert_array_equal(one.path.poses, two.path.poses)
     assert one.series.covariances is not None
     np.testing.assert_array_equal(one.series.covariances, two.series.covariances)
@@ -206,7 +205,7 @@ def test_workers_change_no_bit() -> None:
 def test_a_worker_that_is_lost_is_said_to_be() -> None:
     had = os.environ.get("OMP_NUM_THREADS")
     with pytest.raises(MitsonarError, match="worker was lost"):
-        odometry(*told(sway(40), deadly=20), workers=2)
+        odometry(*told(sway(40), deadly=20), OdometryOptions(workers=2))
     assert os.environ.get("OMP_NUM_THREADS") == had
 
 
@@ -221,9 +220,9 @@ def test_what_is_not_believed_is_bridged_and_the_rest_left_as_it_is(covariance: 
     even = path_of(speed * np.diff(path.time_s)[:, None], START, path.time_s)
     lost = (0, 7, 8, 9, 28)
     found = odometry(*told(even, lost=lost, covariance=covariance))
-    assert np.flatnonzero(~found.believed).tolist() == list(lost)
+    assert np.flatnonzero(~found.valid).tolist() == list(lost)
     np.testing.assert_allclose(found.path.poses, even.poses, atol=1e-6)
-    kept = found.believed
+    kept = found.valid
     np.testing.assert_array_equal(found.series.motions[kept], np.array([e.motion for e in found.estimates])[kept])
     if covariance is None:
         assert found.series.covariances is None
@@ -274,15 +273,15 @@ def test_scale_fits_what_was_shrunk() -> None:
     path = sway(30)
     shrunk = motions(path.poses) * (np.array([1 / 2, 1 / 3, 2]) - 1)
     words = {"off": np.vstack([shrunk, np.zeros(3)]), "covariance": np.diag(STD**2)}
-    found = odometry(*told(path, lost=(4,), **words), scale="fit")
+    found = odometry(*told(path, lost=(4,), **words), OdometryOptions(scale="fit"))
     np.testing.assert_allclose(found.factors, [2, 3, 0.5], rtol=1e-9)
-    kept = found.believed
+    kept = found.valid
     np.testing.assert_allclose(found.series.motions[kept], motions(path.poses)[kept], atol=1e-12)
     assert found.series.covariances is not None
     np.testing.assert_allclose(np.sqrt(np.diag(found.series.covariances[0])), STD * [2, 3, 0.5])
     rows = {name: value for name, value, _ in found.rows()}
     assert rows["scale of forward, fitted to the true path"] == pytest.approx(3)
-    given = odometry(*told(path, **words), scale=[2, 3, 0.5])
+    given = odometry(*told(path, **words), OdometryOptions(scale=[2, 3, 0.5]))
     np.testing.assert_allclose(given.path.poses, path.poses, atol=1e-9)
     assert "scale of yaw, as given" in [name for name, _, _ in given.rows()]
 
@@ -295,7 +294,8 @@ def test_smoothing_takes_noise_from_motions_and_hardly_changes_the_end() -> None
     for seed in range(10):
         off = STD * np.random.default_rng(seed).normal(size=(200, 3))
         for smooth in end:
-            found = odometry(*told(path, off=off, covariance=np.diag(STD**2)), smooth=smooth)  # type: ignore[arg-type]
+            options = OdometryOptions(smooth=smooth)  # type: ignore[arg-type]
+            found = odometry(*told(path, off=off, covariance=np.diag(STD**2)), options)
             rows = {name: value for name, value, _ in found.rows()}
             end[smooth].append(rows["end-point error"])
             each[smooth].append(rows["motion error RMSE, sideways"])
@@ -361,7 +361,7 @@ def test_what_cannot_be_driven_is_said(change: str, options: dict[str, Any], mes
         case "no poses":
             frames.poses = None
     with pytest.raises(MitsonarError, match=message):
-        odometry(frames, estimator, **options)
+        odometry(frames, estimator, OdometryOptions(**options))
 
 
 # ---------------------------------------------------------------- sources
@@ -558,10 +558,16 @@ def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(odometry_run, "path_figure", lambda *_, **__: Figure(figsize=(1, 1)))
 
 
-def run(out: Path, path: Trajectory, estimator: AnyEstimator | None = None, **options: Any) -> dict[str, bytes]:
+def run(
+    out: Path,
+    path: Trajectory,
+    estimator: AnyEstimator | None = None,
+    options: OdometryOptions = OdometryOptions(),
+    **how: Any,
+) -> dict[str, bytes]:
     """An odometry's files, but for run.json, which tells the time, and the picture."""
     source = FrameSource.of(numbered(path))
-    run_odometry(source, "told", estimator or Told(path.poses, covariance=np.diag(STD**2)), out, **options)
+    run_odometry(source, "told", estimator or Told(path.poses, covariance=np.diag(STD**2)), out, options, **how)
     files = files_of(out)
     assert set(files) == RESULTS
     return {name: content for name, content in files.items() if name not in ("run.json", "path.png")}
@@ -615,7 +621,7 @@ def test_a_killed_odometry_goes_on_to_the_same_files(tmp_path: Path, workers: in
     whole = run(tmp_path / "whole", path)
     out = tmp_path / "killed"
     with pytest.raises(KeyboardInterrupt):
-        run(out, path, workers=workers, progress=killed_at(17))
+        run(out, path, options=OdometryOptions(workers=workers), progress=killed_at(17))
     with pytest.raises(MitsonarError, match="not finished: run the same"):
         OdometryFolder.open(out)
     journal = out / "estimates.jsonl"
@@ -634,8 +640,9 @@ def test_path_options_may_change_when_it_goes_on(tmp_path: Path) -> None:
     first = Told(path.poses, off=off, covariance=np.diag(STD**2))
     out = tmp_path / "out"
     before = run(out, path, first)
-    wanted = run(tmp_path / "new", path, first, smooth="kalman", scale="fit")
-    again = run(out, path, first, smooth="kalman", scale="fit", resume=True)
+    options = OdometryOptions(smooth="kalman", scale="fit")
+    wanted = run(tmp_path / "new", path, first, options)
+    again = run(out, path, first, options, resume=True)
     assert again == wanted
     assert again["estimates.jsonl"] == before["estimates.jsonl"]
     assert again["motions.csv"] != before["motions.csv"]
@@ -652,7 +659,7 @@ def test_another_odometry_is_not_gone_on_with(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match=r"was begun with options\.covariance .*, not None"):
         run(out, path, Told(path.poses), resume=True)
     with pytest.raises(MitsonarError, match="was begun with every 1, not 2"):
-        run(out, path, every=2, resume=True)
+        run(out, path, options=OdometryOptions(every=2), resume=True)
     with pytest.raises(MitsonarError, match="was begun with frames_sha256"):
         run(out, replace(path, poses=path.poses + 1), Told(path.poses, covariance=np.diag(STD**2)), resume=True)
     with pytest.raises(MitsonarError, match="contradict"):

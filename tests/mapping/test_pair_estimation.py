@@ -12,7 +12,7 @@ from helpers import essence
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.pairs import PAIRS_A_BATCH, estimate_motions
+from mitsonar.mapping.pairs import PAIRS_A_BATCH, EstimateStore, estimate_motions
 from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
@@ -49,7 +49,9 @@ def told() -> list[MotionPrior]:
 def test_each_pair_gets_its_own_prior(workers: int) -> None:
     """Also where pairs of an earlier run are left out, so that batches do not begin where the table does."""
     known = {0: rejected("known"), 5: rejected("known")}
-    found = estimate_motions(numbered(), Believer(), np.arange(FRAMES), workers=workers, priors=told(), known=known)
+    found = estimate_motions(
+        numbered(), Believer(), np.arange(FRAMES), workers=workers, priors=told(), store=EstimateStore(known)
+    )
     assert {k for k, one in enumerate(found) if one.reason == "known"} == {0, 5}
     for k, one in enumerate(found):
         if k not in known:
@@ -71,13 +73,14 @@ class Slow(Believer):
 def test_a_stop_does_not_wait_for_what_workers_have_begun() -> None:
     stopped = list[float]()
 
-    def stop(number: int, estimate: Estimate) -> None:
-        time.sleep(1)  # the next batch has begun
-        stopped.append(time.monotonic())
-        raise KeyboardInterrupt
+    class Stopping(EstimateStore):
+        def add_pair(self, pair: int, estimate: Estimate) -> None:
+            time.sleep(1)  # the next batch has begun
+            stopped.append(time.monotonic())
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_motions(numbered(), Slow(), np.arange(FRAMES), workers=2, keep=stop)
+        estimate_motions(numbered(), Slow(), np.arange(FRAMES), workers=2, store=Stopping())
     assert time.monotonic() - stopped[0] < 20
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping import pose_graph
-from mitsonar.mapping.graph_odometry import graph_path
+from mitsonar.mapping.odometry import graph_path
 from mitsonar.mapping.pose_graph import GraphSolution, PoseEdges, PoseGraph, relative_motions, solved
 from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
 from mitsonar.mapping.series import ErrorCorrelation, MotionSeries, path_of, pose_covariances
@@ -67,7 +67,7 @@ def test_motions_alone_give_their_composition_and_its_covariance() -> None:
 def test_errors_that_are_alike_give_the_covariances_of_the_path_that_the_graph_has() -> None:
     """Two routes to one number, with errors that wander and slopes; a path whose errors are alike drifts by far more."""
     moved = square()
-    correlated = ErrorCorrelation().of(moved, 3.0)
+    correlated = ErrorCorrelation().along(moved, 3.0)
     own, _ = solved(replace(graph_of(moved), correlated=correlated)).covariances()
     series = MotionSeries(moved, np.arange(45.0), graph_of(moved).chain.covariances)
     told = pose_covariances(series, Pose(0, 0, 0), correlated=correlated)
@@ -149,7 +149,7 @@ def tangled(rng: np.random.Generator, share: float = 0.8, slope: float = 0.01) -
     moved = square()
     true = composed(moved)
     model = ErrorCorrelation(share, length=0.2, slope=slope)
-    correlated = model.of(moved, REACH_M)
+    correlated = model.along(moved, REACH_M)
     wander = rng.normal(size=(44, 3))
     for k in range(1, 44):
         wander[k] = correlated.onward[k - 1] * wander[k - 1] + np.sqrt(1 - correlated.onward[k - 1] ** 2) * wander[k]
@@ -187,7 +187,7 @@ def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
 def test_marginals_of_a_long_path_are_those_of_columns(monkeypatch: pytest.MonkeyPatch, stretch: int, looped: bool) -> None:
     """A chain with correlated errors and a biased gyroscope: nodes and stretches between them are exact."""
     moved = np.tile([0.0, 0.02, 0.03], (120, 1))
-    graph = replace(graph_of(moved), correlated=ErrorCorrelation().of(moved, REACH_M))
+    graph = replace(graph_of(moved), correlated=ErrorCorrelation().along(moved, REACH_M))
     gyro = PoseEdges.chain(moved, np.tile(np.diag([10.0, 10.0, 1e-4]) ** 2, (120, 1, 1)))
     graph = replace(graph, others=gyro, bias=np.tile([0, 0, 1e-4], (120, 1)), at_start=np.diag([0, 0, 1e-2]))
     if looped:
@@ -227,7 +227,7 @@ def test_correlated_errors_make_a_long_path_s_covariance_larger_than_independent
     graph = graph_of(moved)
     alone = solved(graph).covariances()[0][-1]
     model = ErrorCorrelation(share=0.9, length=0.2, slope=1e-6)
-    alike = solved(replace(graph, correlated=model.of(moved, REACH_M))).covariances()[0][-1]
+    alike = solved(replace(graph, correlated=model.along(moved, REACH_M))).covariances()[0][-1]
     # a chain of correlation r sums to (1 + r)/(1 - r) times the variance of independent ones, up to its ends
     r = np.exp(-0.01 / 0.7)
     n = 200
@@ -324,8 +324,8 @@ def test_errors_of_the_map_say_nothing_of_those_of_two_frames() -> None:
     gyroscope = simulated_sensors(true, SensorNoise(gyro_deg_rth=0.01), seed=0)
     graph = partial(graph_path, start_known=True, sensors=gyroscope, loops=None, source=None)
     start = Pose(*true.poses[0])
-    apart = graph(measured, lambda series: series, start, by_map=by_map)
-    alike = graph(measured, lambda series: series, start)
+    apart = graph(measured, start, by_map=by_map)
+    alike = graph(measured, start)
     off, before = (abs(one.path.poses[-1, 0] - true.poses[-1, 0]) for one in (apart, alike))
     assert off < before / 2
 
@@ -335,7 +335,7 @@ def test_errors_of_the_map_say_nothing_of_those_of_two_frames() -> None:
 
 def by_least_squares(model: ErrorCorrelation, covariance: Array, moved: Array, yaw_errors: Array, gyro_std: float) -> Array:
     """What yaw errors, known but for a gyroscope's noise, tell of the errors of motions along a straight line ``(n, 3)``."""
-    count, slope = len(moved), model.of(moved, REACH_M).slope_std
+    count, slope = len(moved), model.along(moved, REACH_M).slope_std
     way = np.cumsum(np.hypot(moved[:, 0], moved[:, 1]))
     alike = model.share * np.exp(-np.abs(way[:, None] - way) / (model.length * REACH_M)) + (1 - model.share) * np.eye(count)
     joint = np.einsum("kl,ab->kalb", alike, covariance)
@@ -356,7 +356,7 @@ def test_a_gyroscope_mends_what_errors_share_with_the_yaw_as_least_squares_do(di
     gyro.motions[:, 2] = gyro_std * rng.normal(size=count)
     measured = moved + errors
     chain = PoseEdges.chain(measured, np.tile(covariance, (count, 1, 1)))
-    graph = PoseGraph(composed(measured), chain, gyro, correlated=model.of(measured, REACH_M))
+    graph = PoseGraph(composed(measured), chain, gyro, correlated=model.along(measured, REACH_M))
     expected = composed(measured - by_least_squares(model, covariance, moved, measured[:, 2] - gyro.motions[:, 2], gyro_std))
     found = solved(graph)
     np.testing.assert_allclose(found.poses[-1, :2], expected[-1, :2], atol=1e-3)
@@ -369,7 +369,7 @@ def test_what_slopes_are_over_adds_up_to_the_path() -> None:
     steady = np.concatenate([np.zeros((300, 3)), np.tile([0.0, 0.01, 0.0], (300, 1))])
     moved = np.concatenate([steady, [[0.0, 0.0, np.pi / 2]], np.tile([0.01, 0.0, 0.0], (300, 1))])
     noisy = moved + 1e-3 * rng.normal(size=moved.shape)
-    sloped = ErrorCorrelation().of(noisy, REACH_M).sloped
+    sloped = ErrorCorrelation().along(noisy, REACH_M).sloped
     np.testing.assert_allclose(sloped.sum(axis=0), noisy.sum(axis=0), atol=1e-12)
     assert np.abs(sloped[440:460] - moved[440:460])[:, :2].max() < 4e-4
     assert sloped[600, 2] == pytest.approx(np.pi / 2, rel=0.15)

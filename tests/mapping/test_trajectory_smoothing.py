@@ -127,7 +127,7 @@ def test_a_series_of_estimates() -> None:
     good = Estimate(Motion(1, 2, 3), np.eye(3))
     none = Estimate(Motion(0, 0, 0), valid=False)
     series = MotionSeries.from_estimates([good, none, good], np.arange(4.0))
-    assert series.believed.tolist() == [True, False, True]
+    assert series.is_valid.tolist() == [True, False, True]
     assert series.covariances is not None
     np.testing.assert_array_equal(series.covariances[2], np.eye(3))
     assert MotionSeries.from_estimates([good, Estimate(Motion(0, 0, 0))], np.arange(3.0)).covariances is None
@@ -201,7 +201,7 @@ def test_the_period_minimises_generalised_cross_validation() -> None:
     """Against the definition: the hat matrix of SciPy's spline, column by column."""
     _, measured = swaying(40)
     measured = replace(measured, valid=np.random.default_rng(0).random(39) > 0.2)
-    at = measured.believed
+    at = measured.is_valid
     assert measured.covariances is not None
     middle, variance = measured.middle_s[at], np.diagonal(measured.covariances, axis1=1, axis2=2)[at]
     n, gap = at.sum(), (middle[-1] - middle[0]) / (at.sum() - 1)
@@ -291,7 +291,7 @@ def least_squares(measured: MotionSeries, wander: Array) -> tuple[Array, Array]:
     n = len(measured)
     rows, right = [], []
     assert measured.covariances is not None
-    for k in np.flatnonzero(measured.believed).tolist():
+    for k in np.flatnonzero(measured.is_valid).tolist():
         root = np.linalg.inv(np.linalg.cholesky(measured.covariances[k]))
         row = np.zeros((3, n, 3))
         row[:, k] = root * measured.step_s[k]

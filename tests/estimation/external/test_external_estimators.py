@@ -20,7 +20,7 @@ from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.external import CfarGicp, ground_pair
 from mitsonar.estimation.named import EXTERNAL, create_estimator
 from mitsonar.geometry.ground import GroundGeometry, moved
-from mitsonar.mapping.odometry import odometry
+from mitsonar.mapping.odometry import OdometryOptions, odometry
 from mitsonar.motion.composition import Motion, MotionPrior, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
@@ -241,7 +241,7 @@ def test_what_cannot_be_sent_to_workers_is_one_sentence(ground: NDArray[np.float
     frames = pair(ground, Motion(0.0, 0.0, 0.0))
     assert odometry(frames, Local()).estimates[0].motion.sideways == 0.01
     with pytest.raises(MitsonarError, match=r"Local cannot be sent to another process .*: use one worker, or name it as"):
-        odometry(frames, Local, workers=2)
+        odometry(frames, Local, OdometryOptions(workers=2))
 
 
 @pytest.mark.learn
