@@ -10,7 +10,7 @@ import numpy as np
 from trajectory_jobs import NOISE_OF, RECIPES, Job, trajectory_job
 
 from mitsonar.io.files import write_whole
-from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Blend, Mosaic, build_mosaic, illumination
+from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Blend, Mosaic, MosaicOptions, build_mosaic, illumination
 from mitsonar.motion.errors import AXES, in_units
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fans import GAMMA
@@ -53,7 +53,7 @@ def paths_of(out: Path, job: Job, name: str) -> tuple[SonarFrames, dict[str, Tra
 def mosaic_along(frames: SonarFrames, path: Trajectory, blend: Blend = "weighted") -> Mosaic:
     """Build the mosaic of all frames along a path, with the illumination compensated."""
     some = frames.select(np.unique(np.linspace(0, len(frames) - 1, ILLUMINATION_FRAMES).astype(int)))
-    return build_mosaic(frames, path.poses, frames.height_m, cell_m=0.015, blend=blend, illumination=illumination(some))
+    return build_mosaic(frames, path.poses, frames.height_m, MosaicOptions(0.015, blend), illumination=illumination(some))
 
 
 def draw_network(out: Path, pictures: Path, frames: int, method: str) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mitsonar.datasets.samples import ImpulsePairs, SonarPairs
     from mitsonar.datasets.store import DataStore
     from mitsonar.errors import MitsonarError, MitsonarWarning
-    from mitsonar.estimation.compare import Comparison, compare
+    from mitsonar.estimation.compare import Comparison, ComparisonOptions, compare
     from mitsonar.estimation.crlb.image import cramer_rao_bound
     from mitsonar.estimation.estimator import Estimate
     from mitsonar.estimation.named import create_estimator, load_checkpoint
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mitsonar.instruments.hydrophones import ChannelSonar
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.instruments.sounder import Sounder, load_sonar, load_sounder
-    from mitsonar.mapping.mosaic import build_mosaic, illumination
+    from mitsonar.mapping.mosaic import MosaicOptions, build_mosaic, illumination
     from mitsonar.mapping.odometry import OdometryOptions, odometry
     from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
     from mitsonar.mapping.series import path_of
@@ -63,6 +63,7 @@ __all__ = [
     "ChannelSimulator",
     "ChannelSonar",
     "Comparison",
+    "ComparisonOptions",
     "DataStore",
     "Deforming",
     "Echogram",
@@ -72,6 +73,7 @@ __all__ = [
     "ImpulseResponses",
     "MitsonarError",
     "MitsonarWarning",
+    "MosaicOptions",
     "Motion",
     "Mounted",
     "OdometryOptions",
@@ -131,6 +133,7 @@ _MODULES = {
     "ChannelSimulator": "simulation.channel",
     "ChannelSonar": "instruments.hydrophones",
     "Comparison": "estimation.compare",
+    "ComparisonOptions": "estimation.compare",
     "DataStore": "datasets.store",
     "Deforming": "motion.bodies",
     "Echogram": "records.soundings",
@@ -140,6 +143,7 @@ _MODULES = {
     "ImpulseResponses": "records.responses",
     "MitsonarError": "errors",
     "MitsonarWarning": "errors",
+    "MosaicOptions": "mapping.mosaic",
     "Motion": "motion.composition",
     "Mounted": "simulation.vehicle",
     "OdometryOptions": "mapping.odometry",

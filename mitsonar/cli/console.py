@@ -135,7 +135,7 @@ INSTRUMENT = {"model": "--model", "seed": "--seed"}
 
 OPTIONS: dict[str, dict[str, str]] = {
     "render": INSTRUMENT,
-    "crlb": INSTRUMENT,
+    "crlb": {**INSTRUMENT, "height_m": "--height"},
     "sound": INSTRUMENT,
     "serve": {**INSTRUMENT, "rate_hz": "--rate"},
     "impulse": {**INSTRUMENT, "velocity": "--velocity"},

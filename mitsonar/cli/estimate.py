@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypedDict
 
@@ -21,7 +20,7 @@ from mitsonar.io.runs import kind_of_run, refuse_to_replace
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mitsonar.estimation.crlb.report import Subject, Table, Value
+    from mitsonar.estimation.crlb.report import Subject, Value
     from mitsonar.estimation.height import HeightEstimate
     from mitsonar.mapping.mosaic import Mosaic
     from mitsonar.mapping.open_source import ViewSource
@@ -222,7 +221,7 @@ def mosaic(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
     """Lay frames on the ground plane along a path: mean level, standard deviation and count of each cell."""
-    from mitsonar.mapping.mosaic import Mosaic, build_mosaic, illumination, save_geotiff
+    from mitsonar.mapping.mosaic import MosaicOptions, build_mosaic, illumination, save_geotiff
     from mitsonar.mapping.odometry_run import ODOMETRY
     from mitsonar.mapping.open_source import Reading, frames_for, with_assumed_plane
     from mitsonar.mapping.sources import is_recording
@@ -233,7 +232,7 @@ def mosaic(
             f"{command_line('mosaic', trajectory, frames, '-o', out)}"
         )
     quality = _checked_out(out, true, overwrite)
-    Mosaic(cell_mm / 1e3, blend, centre_beams=centre_beams)  # type: ignore[arg-type]  # refused before frames are read
+    options = MosaicOptions(cell_mm / 1e3, blend, centre_beams)  # type: ignore[arg-type]  # other words are refused
     paths, path_height = _paths(trajectory, true, frame)
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
     source = frames_for(frames, Reading(sequence, view, noise, seed, height, pitch, geometry=geometry))
@@ -259,15 +258,7 @@ def mosaic(
         some = _spread(len(index))
         light = illumination(source.read(index[some]), poses[some], heights[some])
     with progress_bar("laying", len(index), "frames") as progress:
-        found = build_mosaic(
-            _counted(source.chunks(index), progress),
-            poses,
-            heights,
-            cell_m=cell_mm / 1e3,
-            blend=blend,  # type: ignore[arg-type]
-            centre_beams=centre_beams,
-            illumination=light,
-        )
+        found = build_mosaic(_counted(source.chunks(index), progress), poses, heights, options, illumination=light)
     if len(index) < len(source):
         warn(f"left out without a pose at their time: {len(source) - len(index):,} of {counted(len(source), 'frame')}")
     if found.frames_without_ground:
@@ -444,8 +435,8 @@ def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | Non
 # data set
 
 
-class _PosesAsked(TypedDict):
-    """Options that define poses in a scene."""
+class _RequestedPoses(TypedDict):
+    """Options that define the poses in a scene."""
 
     start: str | None
     end: str | None
@@ -503,35 +494,23 @@ def crlb(
     With --vary the gain is computed for each value. If height, pitch or a field of view varies, both ends of the range
     window follow the nearest and farthest range of the floor. The number of bins stays.
     """
-    from mitsonar.acoustics.noise import load_noise, refuse_noise
-    from mitsonar.estimation.crlb.report import bounds_of_subject, report_lines, report_of, subject_of_data
+    from mitsonar.estimation.crlb.report import BoundOptions, bounds_report, report_lines, subject_of_data
     from mitsonar.motion.trajectory import convention_named
 
-    given, (name, values) = None if noise is None else load_noise(noise), _variable(vary)
-    if height is not None and not height > 0:
-        raise MitsonarError(f"--height must be above 0: got {height:g} m")
-    asked_poses: _PosesAsked = {"start": start, "end": end, "count": poses, "file": trajectory, "frame": frame}
+    name, values = _variable(vary)
+    options = BoundOptions(noise=noise, height_m=height, vary=name, values=values, gain=gain, pings=pings)
+    requested: _RequestedPoses = {"start": start, "end": end, "count": poses, "file": trajectory, "frame": frame}
     convention_named(frame)
     if Path(source).suffix == ".zarr" or "://" in source:
         scene_only = (start, end, poses, trajectory, sonar, model, segments, parameter)
         if any(value is not None for value in scene_only):
             raise MitsonarError(f"{source} is a data set, which has its own sonar, poses and segments: give none of them")
-        subject = subject_of_data(source, pairs, part=part, gain=gain, seed=seed)
+        subject = subject_of_data(source, pairs, part=part, seed=seed)
     else:
-        subject = _of_scene(source, sonar, model, seed, segments, gain, scene_parameters(parameter or []), asked_poses)
-    refuse_noise(given, subject.sonar)
-    speckle = subject.sonar.model == "coherent"
-    noise = noise or ("none" if speckle else "high")
-    added = given or load_noise(noise)
-    if name is not None and gain is None:
-        subject = replace(subject, gain=None)
-    rows: list[tuple[Value | None, Table]] = []
+        subject = _of_scene(source, sonar, model, seed, segments, scene_parameters(parameter or []), requested)
+    noiseless = options.noise_for(subject.sonar).scale == 0 and subject.sonar.model != "coherent"
     with progress_bar("differentiating", subject.poses * max(1, len(values)), "poses") as progress:
-        asked: list[Value | None] = [*values] or [None]
-        for value in asked:
-            changes = [(key, v) for key, v in (("height_m", height), (name, value)) if v is not None and key is not None]
-            rows.append((value, bounds_of_subject(subject, added, changes, pings, progress)))
-    report = report_of(source, subject.sonar, "of the receiver" if speckle else noise, name, rows)
+        report = bounds_report(source, subject, options, progress)
     if plot is not None:
         from mitsonar.io.files import write_whole
         from mitsonar.plotting.figures import crlb_png
@@ -542,7 +521,7 @@ def crlb(
         return
     for line in report_lines(report):
         say(line)
-    if added.scale == 0 and not speckle:
+    if noiseless:
         warn(
             "without noise the echoes determine the motion without limit (`pixel`: -); `gaussian` counts rounding as "
             "variance 1 / (12 255^2), `rays` adds the noise of the rays of a ping"
@@ -582,9 +561,8 @@ def _of_scene(
     model: str | None,
     seed: int | None,
     segments: str | None,
-    gain: float | None,
     parameters: dict[str, str],
-    poses: _PosesAsked,
+    poses: _RequestedPoses,
 ) -> Subject:
     """Load a scene and the poses that the options define."""
     from mitsonar.estimation.crlb.report import subject_of_scene
@@ -594,7 +572,7 @@ def _of_scene(
     instrument, attitude = instrument_for(loaded, sonar, sonar_changes(None, None, model, seed))
     count = poses["count"] or (20 if poses["file"] else None)
     path = path_for(instrument, attitude, source, count, poses["start"], poses["end"], poses["file"], poses["frame"])
-    return subject_of_scene(loaded, instrument, path.poses, segments=segments.split(",") if segments else [], gain=gain)
+    return subject_of_scene(loaded, instrument, path.poses, segments=segments.split(",") if segments else [])
 
 
 # ---------------- ``mitsonar compare``: estimators on the same pairs of a data set
@@ -642,11 +620,10 @@ def compare(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Compare estimators on the same pairs. Failures count as zero motion. Bootstrap by scene, then sequence."""
+    from mitsonar.estimation.compare import ComparisonOptions
     from mitsonar.estimation.compare import compare as compared
 
-    found = compared(
-        data,
-        estimators,
+    options = ComparisonOptions(
         noise=noise,
         part=part,
         split=split,
@@ -657,9 +634,8 @@ def compare(
         limit=limit,
         reference=reference,
         seed=seed,
-        out=out,
-        begin=lambda what, count: progress_bar(what, count, "pairs"),
     )
+    found = compared(data, estimators, options, out=out, begin=lambda what, count: progress_bar(what, count, "pairs"))
     for sentence in found.notes:
         warn(sentence)
     if as_json:

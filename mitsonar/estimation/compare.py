@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias, overload
+from typing import TYPE_CHECKING, TypeAlias, overload
 
 import cv2
 import numpy as np
@@ -54,6 +54,7 @@ __all__ = [
     "BenchmarkRow",
     "Cells",
     "Comparison",
+    "ComparisonOptions",
     "Estimators",
     "Samples",
     "answers_of",
@@ -539,19 +540,34 @@ Estimators: TypeAlias = str | Sequence[EstimatorLike] | Mapping[str, EstimatorLi
 """Estimators of a comparison: a comma-separated string, a list, or a mapping from row names."""
 
 
-class _Asked(NamedTuple):
-    """Settings of a comparison, besides data and estimators; see :func:`compare`."""
+@dataclass(frozen=True, kw_only=True)
+class ComparisonOptions:
+    """Choices of a comparison.
 
-    noise: str
-    part: str | None
-    split: str | None
-    pairs: int | None
-    perturb: bool
-    jitter: bool
-    prior: bool
-    limit: int
-    reference: str | None
-    seed: int
+    Attributes:
+        noise: levels of noise, separated by commas, or by ``;``.
+        part: part of the data set; default: the one that training does not use.
+        split: ``sequence``, ``scene`` or ``sample``; default: the split with which networks among the estimators were
+            trained on this data set, else that of the data set.
+        pairs: largest number of pairs; default: all.
+        perturb: add rows in which estimators get wrong inputs.
+        jitter: add a row with jittered rays.
+        prior: add rows that use the prior of the size of motions.
+        limit: number of pairs over which the Cramer-Rao lower bound is computed; 0: no bound.
+        reference: the method with which others are compared; default: the last.
+        seed: seed of noise, choice of pairs and bootstrap.
+    """
+
+    noise: str = "none"
+    part: str | None = None
+    split: str | None = None
+    pairs: int | None = None
+    perturb: bool = False
+    jitter: bool = False
+    prior: bool = False
+    limit: int = 10
+    reference: str | None = None
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -585,17 +601,8 @@ class Bench:
 def compare(
     data: str | Path,
     estimators: Estimators = None,
+    options: ComparisonOptions = ComparisonOptions(),
     *,
-    noise: str = "none",
-    part: str | None = None,
-    split: str | None = None,
-    pairs: int | None = None,
-    perturb: bool = False,
-    jitter: bool = False,
-    prior: bool = False,
-    limit: int = 10,
-    reference: str | None = None,
-    seed: int = 0,
     out: str | Path | None = None,
     begin: Begin = lambda what, pairs: nullcontext(lambda done: None),
 ) -> Comparison:
@@ -605,17 +612,7 @@ def compare(
         data: path or URL of a data set.
         estimators: what :func:`~mitsonar.estimation.named.create_estimator` accepts: one comma-separated string, a list,
             or a dictionary from row names; default: all that need no training.
-        noise: levels of noise, separated by commas, or by ``;``.
-        part: part of the data set; default: the one that training does not use.
-        split: ``sequence``, ``scene`` or ``sample``; default: the split with which networks among the estimators were
-            trained on this data set, else that of the data set.
-        pairs: largest number of pairs; default: all.
-        perturb: add rows in which estimators get wrong inputs.
-        jitter: add a row with jittered rays.
-        prior: add rows that use the prior of the size of motions.
-        limit: number of pairs over which the Cramer-Rao lower bound is computed; 0: no bound.
-        reference: the method with which others are compared; default: the last.
-        seed: seed of noise, choice of pairs and bootstrap.
+        options: which pairs, and which rows.
         out: folder for estimates, ``table.md`` and ``table.json``; an interrupted comparison in it resumes.
         begin: called with each stage, for progress.
 
@@ -625,12 +622,11 @@ def compare(
     Raises:
         MitsonarError: unknown names, too few pairs, or another comparison in the folder.
     """
-    asked = _Asked(noise, part, split, pairs, perturb, jitter, prior, limit, reference, seed)
     data = str(data)
-    bench = _bench(data, estimators, asked)
-    settings = _settings(bench, asked)
+    bench = _bench(data, estimators, options)
+    settings = _settings(bench, options)
     kept = kept_answers(out, settings)
-    variations = _variations(asked)
+    variations = _variations(options)
     with begin("comparing", len(bench.levels) * len(variations) * len(bench.numbers)) as progress:
         answers = {
             (level, variation): answers_of(
@@ -647,8 +643,8 @@ def compare(
         }
     tables = []
     for level in bench.levels:
-        bounds = _bounds(bench, level, asked.limit, kept, begin)
-        tables += [_table(bench, asked, level, variation, answers[level, variation], bounds) for variation in variations]
+        bounds = _bounds(bench, level, options.limit, kept, begin)
+        tables += [_table(bench, options, level, variation, answers[level, variation], bounds) for variation in variations]
     scenes = len(np.unique(bench.scenes))
     notes = [f"{counted(scenes, 'scene')} only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
     notes = notes if scenes < FEWEST_SCENES else []
@@ -667,7 +663,7 @@ def compare(
 # ---------------- Samples, methods and settings
 
 
-def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
+def _bench(data: str, estimators: Estimators, options: ComparisonOptions) -> Bench:
     """Open the samples and create the estimators.
 
     Raises:
@@ -676,30 +672,30 @@ def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
     recipe = DataStore.open(data).recipe
     modality = modality_of(recipe)
     methods = _methods(modality.estimators if estimators is None else estimators)
-    if not methods or (asked.reference is not None and asked.reference not in methods):
+    if not methods or (options.reference is not None and options.reference not in methods):
         raise MitsonarError(
-            f"{argument('reference')} must be one of {', '.join(methods) or 'the estimators'}: got {asked.reference!r}"
-            f"{meant(asked.reference, methods)}"
+            f"{argument('reference')} must be one of {', '.join(methods) or 'the estimators'}: got {options.reference!r}"
+            f"{meant(options.reference, methods)}"
         )
     perturb, jitter, prior = (argument(name) for name in ("perturb", "jitter", "prior"))
-    if not modality.variations and (asked.perturb or asked.jitter or asked.prior):
+    if not modality.variations and (options.perturb or options.jitter or options.prior):
         raise MitsonarError(f"{perturb}, {jitter} and {prior} are for data sets of images: leave them out")
-    if recipe.recorded is not None and (asked.perturb or asked.jitter):
+    if recipe.recorded is not None and (options.perturb or options.jitter):
         raise MitsonarError(f"{perturb} and {jitter} render anew, and recorded frames have no world: leave them out")
-    words = list(dict.fromkeys(asked.noise.split(";" if ";" in asked.noise else ",")))
+    words = list(dict.fromkeys(options.noise.split(";" if ";" in options.noise else ",")))
     levels = {word: modality.noise_model(word) for word in words}
-    split = _split(asked.split, methods, recipe)
-    options = {
-        **{"part": asked.part or split.unseen, "split": split},
-        **{"one_a_sequence": recipe.recorded is None, "seed": asked.seed},
+    split = _split(options.split, methods, recipe)
+    chosen_samples = {
+        **{"part": options.part or split.unseen, "split": split},
+        **{"one_a_sequence": recipe.recorded is None, "seed": options.seed},
     }
-    samples = {level: samples_of(modality, data, noise=level, **options) for level in levels}
+    samples = {level: samples_of(modality, data, noise=level, **chosen_samples) for level in levels}
     first = next(iter(samples.values()))
     if len(first) < 2:
         raise MitsonarError(f"a comparison needs two pairs or more: give {argument('part')} all, or a larger data set")
-    if asked.jitter and first.recipe.instrument.jittered:
+    if options.jitter and first.recipe.instrument.jittered:
         raise MitsonarError(f"the rays of this data set move already: {jitter} is for Almanza-Medina's model")
-    numbers = chosen(len(first), asked.pairs, asked.seed)
+    numbers = chosen(len(first), options.pairs, options.seed)
     # motion of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
     pose = first.chosen.pose
     truth = np.array([motions(pose[first.frame_numbers(number)][[0, -1]])[0] for number in numbers])
@@ -710,14 +706,14 @@ def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
     return Bench(methods, levels, samples, numbers, truth, first.scene[first.first[numbers]], learnt)
 
 
-def _split(asked: str | None, methods: Mapping[str, AnyEstimator], recipe: Recipe) -> Split:
+def _split(requested: str | None, methods: Mapping[str, AnyEstimator], recipe: Recipe) -> Split:
     """Return the requested split, else that of the networks trained on this data set, else that of the data set.
 
     Raises:
         MitsonarError: an unknown split, or networks trained on different ones.
     """
-    if asked is not None:
-        return split_for(asked, recipe)
+    if requested is not None:
+        return split_for(requested, recipe)
     known = [(name, one.split_of_training(recipe)) for name, of in _checkpoints(methods).items() for one in of]
     theirs = [(name, split) for name, split in known if split is not None]
     if len({split.model_dump_json() for _, split in theirs}) > 1:
@@ -758,7 +754,7 @@ def _name_of(estimator: EstimatorLike) -> str:
     return (estimator if isinstance(estimator, type) else type(estimator)).__name__
 
 
-def _settings(bench: Bench, asked: _Asked) -> PlainTable:
+def _settings(bench: Bench, options: ComparisonOptions) -> PlainTable:
     """Return the settings that determine the estimates; levels of noise may be added later."""
     chosen_of, recipe = bench.first.chosen, bench.first.recipe
     recipe_text = json.dumps(recipe.model_dump(), default=str)
@@ -766,17 +762,17 @@ def _settings(bench: Bench, asked: _Asked) -> PlainTable:
     return {
         "digest": digest(chosen_of.motion.tobytes(), chosen_of.pose.tobytes(), recipe_text),
         "methods": list(bench.methods),
-        "part": asked.part,
+        "part": options.part,
         "split": bench.first.split.model_dump(),
         "pairs": len(bench.numbers),
-        "seed": asked.seed,
+        "seed": options.seed,
         **({"networks": networks} if networks else {}),
     }
 
 
-def _variations(asked: _Asked) -> list[str]:
-    changed = [name for name in VARIATIONS if name not in ("as told", "jitter")] if asked.perturb else []
-    return ["as told", *changed, *(["jitter"] if asked.jitter else [])]
+def _variations(options: ComparisonOptions) -> list[str]:
+    changed = [name for name in VARIATIONS if name not in ("as told", "jitter")] if options.perturb else []
+    return ["as told", *changed, *(["jitter"] if options.jitter else [])]
 
 
 def _key(level: str, model: NoiseModel | None) -> str:
@@ -802,19 +798,24 @@ def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Beg
 
 
 def _table(
-    bench: Bench, asked: _Asked, level: str, variation: str, answers: dict[str, Answers], bounds: dict[str, Array]
+    bench: Bench,
+    options: ComparisonOptions,
+    level: str,
+    variation: str,
+    answers: dict[str, Answers],
+    bounds: dict[str, Array],
 ) -> PlainTable:
     """Return the errors of all methods as a JSON object."""
     found = dict(answers)
-    if asked.prior:
+    if options.prior:
         flight = bench.first.recipe.flight
         largest = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
         known = {name: one for name, one in found.items() if np.isfinite(one.covariance).any()}
         found |= {f"{name}{PRIOR}": with_prior(one, largest) for name, one in known.items()}
     inputs = {name: bench.methods[name.removesuffix(PRIOR)].inputs for name in found}
     inputs = {name: f"{text}, prior" if name.endswith(PRIOR) else text for name, text in inputs.items()}
-    reference = asked.reference or list(bench.methods)[-1]
-    resamples = cluster_resamples(bench.scenes, seed=asked.seed)
+    reference = options.reference or list(bench.methods)[-1]
+    resamples = cluster_resamples(bench.scenes, seed=options.seed)
     law = list(bounds)[-1] if bounds else "rays"
     rows = rows_of(found, inputs, bench.truth, resamples, limit=bounds.get(law), reference=reference)
     return {

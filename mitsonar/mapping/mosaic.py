@@ -33,6 +33,7 @@ __all__ = [
     "CellSums",
     "FrameFan",
     "Mosaic",
+    "MosaicOptions",
     "accumulate",
     "band_limited",
     "box_around",
@@ -73,6 +74,40 @@ ONE_ALONE = 1e-3
 """Fraction of the weight W of a cell that W - sum w^2 / W must exceed for a standard deviation, given float32 precision."""
 
 
+@dataclass(frozen=True)
+class MosaicOptions:
+    """Choices of a mosaic.
+
+    Attributes:
+        cell_m: edge of a cell [m].
+        blend: ``weighted`` uses all beams, with cos^2 weights that fall to 0 at the edges of the fan in bearing and in
+            range; ``centre`` is the plain mean of the ``centre_beams`` in the middle (Almanza-Medina, 3.5.1).
+        centre_beams: number of beams for ``centre``.
+        most_cells: largest number of cells.
+
+    Raises:
+        MitsonarError: an option is outside its limits.
+    """
+
+    cell_m: float = 0.01
+    blend: Blend = "weighted"
+    centre_beams: int = CENTRE_BEAMS
+    most_cells: int = MOST_CELLS
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.cell_m) and self.cell_m > 0):
+            raise MitsonarError(
+                f"{argument('cell_m')} must be above 0: got {self.cell_m:g} m; 0.01 m suits range bins of 5 mm"
+            )
+        if self.blend not in get_args(Blend):
+            raise MitsonarError(f"unknown blend {self.blend!r}: {nearest_names(self.blend, get_args(Blend))}")
+        if self.centre_beams < 2 or self.most_cells < 1:
+            raise MitsonarError(
+                f"{argument('centre_beams')} must be at least 2 and {argument('most_cells')} at least 1: got "
+                f"{self.centre_beams} and {self.most_cells:,}"
+            )
+
+
 class Mosaic:
     """A map of the level plane below the sonar, to which frames are added and which grows as they require.
 
@@ -84,41 +119,19 @@ class Mosaic:
     from the ground are mapped too near.
 
     Args:
-        cell_m: edge of a cell [m].
-        blend: ``weighted`` uses all beams, with cos^2 weights that fall to 0 at the edges of the fan in bearing and in
-            range; ``centre`` is the plain mean of the ``centre_beams`` in the middle (Almanza-Medina, 3.5.1).
-        centre_beams: number of beams for ``centre``.
-        most_cells: largest number of cells.
+        options: cells and blend.
         illumination: result of :func:`mitsonar.mapping.mosaic.illumination` ``(bins, beams)``. Images are divided by it, so
             that the fall-off of the level with range neither shades the map nor adds to the standard deviation. Levels may
             then exceed 1.
 
     Raises:
-        MitsonarError: an argument is outside its limits.
+        MitsonarError: the illumination is not finite and above 0.
     """
 
-    def __init__(
-        self,
-        cell_m: float = 0.01,
-        blend: Blend = "weighted",
-        *,
-        centre_beams: int = CENTRE_BEAMS,
-        most_cells: int = MOST_CELLS,
-        illumination: Floats | None = None,
-    ) -> None:
-        if not (math.isfinite(cell_m) and cell_m > 0):
-            raise MitsonarError(f"{argument('cell_m')} must be above 0: got {cell_m:g} m; 0.01 m suits range bins of 5 mm")
-        if blend not in get_args(Blend):
-            raise MitsonarError(f"unknown blend {blend!r}: {nearest_names(blend, get_args(Blend))}")
-        if centre_beams < 2 or most_cells < 1:
-            raise MitsonarError(
-                f"{argument('centre_beams')} must be at least 2 and {argument('most_cells')} at least 1: got {centre_beams} "
-                f"and {most_cells:,}"
-            )
+    def __init__(self, options: MosaicOptions = MosaicOptions(), *, illumination: Floats | None = None) -> None:
         if illumination is not None and not (np.isfinite(illumination).all() and np.all(illumination > 0)):
             raise MitsonarError("an illumination must be finite and above 0 everywhere: take it from `illumination`")
-        self.cell_m, self.blend, self.centre_beams, self.most_cells = float(cell_m), blend, centre_beams, most_cells
-        self.illumination = illumination
+        self.options, self.cell_m, self.illumination = options, float(options.cell_m), illumination
         self.frames = 0
         """Number of frames added."""
         self.frames_without_ground = 0
@@ -173,8 +186,8 @@ class Mosaic:
         for image, pose, height, all_beams in zip(images, table, heights, entire, strict=True):
             fan = fan_of(frames, pose, height)
             self.frames += 1
-            if self.blend == "centre" and not all_beams:
-                fan, image = middle_beams(fan, image, self.centre_beams)
+            if self.options.blend == "centre" and not all_beams:
+                fan, image = middle_beams(fan, image, self.options.centre_beams)
             if not self._lay(image, fan, pose):
                 self.frames_without_ground += 1
 
@@ -220,7 +233,7 @@ class Mosaic:
         elevation = from_middle(fan.ground.elevation(points), -fan.half_elevation, fan.half_elevation)
         along = np.maximum(elevation, from_middle(radius, *fan.window))
         inside = (across < 1) & (along < 1)
-        if self.blend == "centre":
+        if self.options.blend == "centre":
             return inside.astype(np.float32)
         quarter = np.float32(np.pi / 2)
         taper = np.square(np.cos(quarter * across) * np.cos(quarter * along))
@@ -251,10 +264,10 @@ class Mosaic:
         if new == self._box:
             return
         cells = math.prod(new.shape)
-        if cells > self.most_cells or max(box.shape) > LONGEST_SIDE:
+        if cells > self.options.most_cells or max(box.shape) > LONGEST_SIDE:
             raise MitsonarError(self._too_large(new, cells))
         room = with_slack(self._box, new, slack)
-        new = room if math.prod(room.shape) <= self.most_cells else new
+        new = room if math.prod(room.shape) <= self.options.most_cells else new
         sums = np.zeros((len(self._sums), *new.shape), np.float32)
         south, west = self._box.south - new.south, self._box.west - new.west
         rows, columns = self._box.shape
@@ -264,12 +277,12 @@ class Mosaic:
 
     def _too_large(self, box: Box, cells: int) -> str:
         rows, columns = box.shape
-        fits = max(self.cell_m * math.sqrt(cells / self.most_cells), self.cell_m * max(rows, columns) / LONGEST_SIDE)
+        fits = max(self.cell_m * math.sqrt(cells / self.options.most_cells), self.cell_m * max(rows, columns) / LONGEST_SIDE)
         fits = math.ceil(fits * 1.02 * 1e4) / 1e4
         return (
             f"the map would have {rows:,} x {columns:,} cells of {1e3 * self.cell_m:g} mm, for {rows * self.cell_m:.4g} x "
-            f"{columns * self.cell_m:.4g} m; at most {self.most_cells:,} are allowed: use cells of {1e3 * fits:g} mm, raise "
-            "most_cells (20 bytes each), or look for a pose that is wrong"
+            f"{columns * self.cell_m:.4g} m; at most {self.options.most_cells:,} are allowed: use cells of "
+            f"{1e3 * fits:g} mm, raise most_cells (20 bytes each), or look for a pose that is wrong"
         )
 
     @property
@@ -344,11 +357,8 @@ def build_mosaic(
     frames: SonarFrames | Iterable[SonarFrames],
     poses: ArrayLike | None = None,
     height_m: ArrayLike | None = None,
+    options: MosaicOptions = MosaicOptions(),
     *,
-    cell_m: float = 0.01,
-    blend: Blend = "weighted",
-    centre_beams: int = CENTRE_BEAMS,
-    most_cells: int = MOST_CELLS,
     illumination: Floats | None = None,
 ) -> Mosaic:
     """Build the mosaic of a run, whose frames are read once, a chunk at a time.
@@ -360,11 +370,7 @@ def build_mosaic(
         poses: poses of the sonar in the whole run ``(n, 6)`` [m, rad], such as an estimated path; default: those of the
             frames.
         height_m: height over the ground ``(n,)``, or one for all [m]; default: those of the frames.
-        cell_m: edge of a cell [m].
-        blend: ``weighted`` uses all beams, with weights that fall to 0 at the edges of the fan; ``centre`` is the plain mean
-            of the ``centre_beams`` in the middle.
-        centre_beams: number of beams for ``centre``.
-        most_cells: largest number of cells.
+        options: cells and blend.
         illumination: result of :func:`mitsonar.mapping.mosaic.illumination` ``(bins, beams)``, by which images are divided.
 
     Returns:
@@ -374,7 +380,7 @@ def build_mosaic(
         MitsonarError: frames lack poses or height or do not fit, the numbers of frames and poses differ, or no frame shows
             ground.
     """
-    mosaic = Mosaic(cell_m, blend, centre_beams=centre_beams, most_cells=most_cells, illumination=illumination)
+    mosaic = Mosaic(options, illumination=illumination)
     table = None if poses is None else checked_poses(poses)
     heights = None if height_m is None else np.asarray(height_m, dtype=float)
     done, chunks = 0, [frames] if isinstance(frames, SonarFrames) else frames

@@ -19,7 +19,7 @@ from mitsonar.config.data import load_recipe, recipe_from
 from mitsonar.datasets.make import check, make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.compare import compare
+from mitsonar.estimation.compare import ComparisonOptions, compare
 from mitsonar.estimation.named import create_estimator
 from mitsonar.mapping.sources import load_frames, open_frames, poses_at, stretches
 from mitsonar.motion.composition import motions
@@ -186,7 +186,7 @@ def test_compare_gives_the_errors_of_the_estimator_on_the_run(
     places: dict[str, Path], frames: SonarFrames, tmp_path: Path
 ) -> None:
     written(tmp_path / "data.zarr", places["npz"])
-    report = compare(tmp_path / "data.zarr", "zero,direct", part="all").report
+    report = compare(tmp_path / "data.zarr", "zero,direct", ComparisonOptions(part="all")).report
     rows = {row["method"]: row for row in report["tables"][0]["rows"]}
     truth = motions(true_poses(frames))
     direct = create_estimator("direct")
@@ -196,7 +196,7 @@ def test_compare_gives_the_errors_of_the_estimator_on_the_run(
     assert np.allclose(rows["direct"]["rmse"], wanted, rtol=1e-6)
     assert (np.array(rows["direct"]["rmse"]) < 0.2 * np.array(rows["zero"]["rmse"])).all()
     with pytest.raises(MitsonarError, match="have no world"):
-        compare(tmp_path / "data.zarr", "zero", part="all", perturb=True)
+        compare(tmp_path / "data.zarr", "zero", ComparisonOptions(part="all", perturb=True))
 
 
 @pytest.mark.thorough
@@ -205,7 +205,7 @@ def test_an_aris_file_and_its_path_are_compared(mitsonar: Command, places: dict[
     done = mitsonar("dataset", "from-frames", places["aris"], "--poses", places["path"], "--cut", 6, "-o", out)
     assert done.returncode == 0, done
     assert "24 frames in 4 sequences" in done.stdout
-    report = compare(out, "zero,direct", part="all").report
+    report = compare(out, "zero,direct", ComparisonOptions(part="all")).report
     zero, direct = (np.array(row["rmse"]) for row in report["tables"][0]["rows"])
     assert (direct < 0.3 * zero).all(), (direct, zero)
     assert mitsonar("compare", out, "--estimators", "zero,direct").returncode == 0
@@ -351,7 +351,7 @@ def test_rendered_runs_are_compared_and_fine_tuned_on(mitsonar: Command, variant
     store = DataStore.open(out)
     assert check(store) == []
     assert np.array_equal(store.read("image", slice(8, 16)), SonarFrames.load(tmp_path / "two").image)
-    report = compare(out, "zero,direct", part="all").report
+    report = compare(out, "zero,direct", ComparisonOptions(part="all")).report
     zero, direct = (np.array(row["rmse"]) for row in report["tables"][0]["rows"])
     assert (direct < 0.2 * zero).all(), (direct, zero)
     (tmp_path / "tune.yaml").write_text(FINE_TUNING, encoding="utf-8")

@@ -18,7 +18,7 @@ from mitsonar.datasets.samples import SonarPairs
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.image import bounds_at
-from mitsonar.estimation.crlb.report import bounds_of_subject, subject_of_data
+from mitsonar.estimation.crlb.report import BoundOptions, bounds_of_subject, subject_of_data
 from mitsonar.records.frames import to_uint8
 from mitsonar.simulation.channel import ChannelSimulator
 from mitsonar.simulation.pings import to_image
@@ -81,7 +81,8 @@ def test_re_rendering_and_bounds_use_the_mirrors_of_the_data_set(tmp_path: Path)
         np.testing.assert_array_equal(frames.image, pairs.sonar_frames(number).image)
     subject = subject_of_data(url, 1, part="all")
     noise = load_noise("low")
-    (found,) = bounds_of_subject(subject, noise, [], 2, lambda poses: None)["image", "image", "pixel"]
+    options = BoundOptions(noise="low", pings=2)
+    (found,) = bounds_of_subject(subject, options, None, lambda poses: None)["image", "image", "pixel"]
     place = next(subject.places())
     for mirrors, same in ((subject.mirrors, True), (None, False)):
         simulator = Simulator(place.scene, subject.sonar, mirrors=mirrors)

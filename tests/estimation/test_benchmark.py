@@ -30,6 +30,7 @@ from mitsonar.datasets.samples import SonarPairs  # noqa: E402
 from mitsonar.estimation.compare import (  # noqa: E402  # noqa: E402
     VARIATIONS,
     Answers,
+    ComparisonOptions,
     _heaved,
     _methods,
     answers_of,
@@ -128,7 +129,9 @@ def test_compare_in_python_is_the_table_of_the_command(
 ) -> None:
     """Estimators of one's own, by an object and by name; rows, CSV and columns hold what the table holds."""
     oracle = Oracle(pairs)
-    found = compare(made, {"oracle": oracle, "zero": "zero", "again": Zero}, part="all", noise="none,low", limit=0)
+    found = compare(
+        made, {"oracle": oracle, "zero": "zero", "again": Zero}, ComparisonOptions(part="all", noise="none,low", limit=0)
+    )
     rows = found.rows
     assert [(row["noise"], row["method"]) for row in rows] == [
         (noise, name) for noise in ("none", "low") for name in ("oracle", "zero", "again")
@@ -140,15 +143,15 @@ def test_compare_in_python_is_the_table_of_the_command(
     assert (tmp_path / "table.csv").read_text() == text
     assert [row["method"] for row in csv.DictReader(text.splitlines())] == found.columns()["method"]
     assert text.count("\n") == 7
-    plain = compare(made, ["zero"], part="all", limit=0, pairs=4)
+    plain = compare(made, ["zero"], ComparisonOptions(part="all", limit=0, pairs=4))
     done = mitsonar("compare", made, "--estimators", "zero", "--part", "all", "--limit", "0", "--pairs", "4")
     assert done.returncode == 0, done.stderr
     of_command, of_python = (re.sub(r"\S+ +\| nothing", "MS", text).strip() for text in (done.stdout, str(plain)))
     assert of_command == of_python
     with pytest.raises(MitsonarError, match="two estimators are named Zero: give a dictionary"):
-        compare(made, [Zero, Zero()], part="all")
+        compare(made, [Zero, Zero()], ComparisonOptions(part="all"))
     with pytest.raises(MitsonarError, match=r"^reference must be one of zero: got 'zeor'; did you mean zero\?"):
-        compare(made, "zero", part="all", reference="zeor")
+        compare(made, "zero", ComparisonOptions(part="all", reference="zeor"))
 
 
 def test_a_network_gets_the_input_of_its_training(pairs: SonarPairs) -> None:

@@ -20,7 +20,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.geometry.ground import GroundGeometry
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import directions
-from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic, illumination, save_geotiff
+from mitsonar.mapping.mosaic import Blend, Mosaic, MosaicOptions, build_mosaic, illumination, save_geotiff
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.figures import mosaic_figure, path_figure, quality_figure, save_figure
@@ -116,7 +116,7 @@ def test_the_ground_comes_back(bearing: str, blend: Blend, pose: Pose) -> None:
     The ground's slope is up to 2.5 a metre, so 0.01 of level stand for 4 mm: bilinear interpolation over beams of 20 mm errs
     by 0.003.
     """
-    mosaic = Mosaic(0.01, blend)
+    mosaic = Mosaic(MosaicOptions(0.01, blend))
     mosaic.add(frames_of(waves, [pose], SONAR.replace(bearing=bearing)))
     x, y = centres(mosaic)
     error = mosaic.mean - waves(x, y)
@@ -136,7 +136,7 @@ def test_starboard_and_heading_have_the_right_sign(bearing: str, heading_deg: fl
     pose = looking(heading_deg, x=10, y=20)
     frames = blank([pose], 0.0, sonar)
     frames.image[0, 120:124, 80] = 1.0
-    mosaic = build_mosaic(frames, cell_m=0.01)
+    mosaic = build_mosaic(frames, options=MosaicOptions(cell_m=0.01))
     level = np.nan_to_num(mosaic.mean)
     x, y = (float((axis * level).sum() / level.sum()) for axis in centres(mosaic))
     theta = np.radians(heading_deg)
@@ -153,12 +153,14 @@ def test_starboard_and_heading_have_the_right_sign(bearing: str, heading_deg: fl
 
 def test_only_lit_ground_is_touched() -> None:
     """The axis beam meets the floor at elevations of 28 to 42 deg below level: nothing nearer or farther."""
-    mosaic = build_mosaic(blank([looking(0)]), cell_m=0.01, blend="centre")
+    mosaic = build_mosaic(blank([looking(0)]), options=MosaicOptions(cell_m=0.01, blend="centre"))
     x, y = centres(mosaic)
     ahead = y[(np.abs(x) < 0.006) & np.isfinite(mosaic.mean)]
     assert ahead.min() == pytest.approx(HEIGHT / np.tan(np.radians(42)), abs=0.011)
     assert ahead.max() == pytest.approx(HEIGHT / np.tan(np.radians(28)), abs=0.011)
-    narrow = build_mosaic(blank([looking(0)], sonar=SONAR.replace(range_min=4.0, range_max=4.5)), cell_m=0.01)
+    narrow = build_mosaic(
+        blank([looking(0)], sonar=SONAR.replace(range_min=4.0, range_max=4.5)), options=MosaicOptions(cell_m=0.01)
+    )
     x, y = centres(narrow)
     radius = np.sqrt(x**2 + y**2 + HEIGHT**2)[np.isfinite(narrow.mean)]
     assert radius.min() >= 4.0
@@ -171,7 +173,7 @@ def test_all_lit_ground_and_no_other_is_seen(bearing: str) -> None:
     """Every cell by hand, in a fan that rolls: window, beams and elevations by the directions of the beams."""
     sonar = SONAR.replace(bearing=bearing, azimuth_fov_deg=50, range_min=4.0, range_max=5.0)
     pose = looking(0, 35, 6)
-    mosaic = build_mosaic(blank([pose], sonar=sonar), cell_m=0.02, blend="centre")
+    mosaic = build_mosaic(blank([pose], sonar=sonar), options=MosaicOptions(cell_m=0.02, blend="centre"))
     x, y = centres(mosaic)
     below = np.stack([x, y, np.full_like(x, -HEIGHT)], axis=-1)
     s, f, u = np.moveaxis(vehicle_rotation(pose).inv().apply(below.reshape(-1, 3)).reshape(below.shape), -1, 0)
@@ -195,7 +197,7 @@ def test_all_lit_ground_and_no_other_is_seen(bearing: str) -> None:
 
 def test_uneven_beams_are_where_they_say() -> None:
     sonar = SONAR.replace(beam_layout="sine", azimuth_fov_deg=80, beams=128)
-    mosaic = build_mosaic(frames_of(waves, [looking(20)], sonar), cell_m=0.02)
+    mosaic = build_mosaic(frames_of(waves, [looking(20)], sonar), options=MosaicOptions(cell_m=0.02))
     error = mosaic.mean - waves(*centres(mosaic))
     assert np.abs(error[mosaic.weight > 0.05]).max() < 0.04
     assert np.sqrt(np.square(error[mosaic.weight > 0.05]).mean()) < 0.01
@@ -209,7 +211,7 @@ def test_finer_bins_than_cells_are_averaged() -> None:
     frames.image[...] = rng.uniform(0, 1, frames.image.shape)
     spread = {}
     for cell in (0.05, 0.1):
-        mosaic = build_mosaic(frames, cell_m=cell)
+        mosaic = build_mosaic(frames, options=MosaicOptions(cell_m=cell))
         spread[cell] = float(mosaic.mean[mosaic.weight > 0.3].std())
     # a cell of 50 mm spans some 18 bins and 1.5 to 3 beams; picking between four pixels would leave about 0.19
     assert spread[0.05] < 0.29 / np.sqrt(18) * 1.3
@@ -222,13 +224,13 @@ def test_finer_bins_than_cells_are_averaged() -> None:
 @pytest.mark.parametrize("blend", ["weighted", "centre"])
 def test_identical_frames_do_not_differ(blend: Blend) -> None:
     one = frames_of(waves, [POSES[1]])
-    mosaic = Mosaic(0.02, blend)
+    mosaic = Mosaic(MosaicOptions(0.02, blend))
     for _ in range(7):
         mosaic.add(one)
     seen = mosaic.count > 0
     assert (mosaic.count[seen] == 7).all()
     assert np.nanmax(mosaic.std) < 1e-6
-    single = Mosaic(0.02, blend)
+    single = Mosaic(MosaicOptions(0.02, blend))
     single.add(one)
     np.testing.assert_allclose(mosaic.mean, single.mean, atol=1e-6)
     assert np.isnan(single.std).all()
@@ -242,7 +244,7 @@ def test_deviation_is_the_noise_s(blend: Blend) -> None:
     """
     rng = np.random.default_rng(3)
     noise = rng.normal(0, 0.05, 120)
-    mosaic = Mosaic(0.05, blend)
+    mosaic = Mosaic(MosaicOptions(0.05, blend))
     for value in noise:
         mosaic.add(blank([looking(0)], 0.5 + value))
     np.testing.assert_allclose(mosaic.std[mosaic.count == 120], noise.std(ddof=1), rtol=1e-3)
@@ -254,7 +256,7 @@ def test_deviation_of_unequal_weights_has_no_bias() -> None:
     rng = np.random.default_rng(4)
     variances = []
     for _ in range(40):
-        mosaic = Mosaic(0.1, "weighted")
+        mosaic = Mosaic(MosaicOptions(0.1, "weighted"))
         for step in range(4):
             mosaic.add(blank([looking(0, x=0.4 * step)], 0.5 + rng.normal(0, 0.1)))
         known = mosaic.std[mosaic.count == 4]
@@ -270,12 +272,12 @@ def test_means_are_weighted_means() -> None:
     poses = [looking(10 * k, x=0.3 * k) for k in range(5)]
     frames = blank(poses)
     frames.image[...] = rng.uniform(0, 1, frames.image.shape)
-    whole = Mosaic(0.02)
+    whole = Mosaic(MosaicOptions(0.02))
     whole.add(frames)
     sums = np.zeros((3, *whole.mean.shape))
     west, _, _, north = whole.extent
     for k in range(5):
-        one = Mosaic(0.02)
+        one = Mosaic(MosaicOptions(0.02))
         one.add(frames.select(np.array([k])))
         column, row = round((one.extent[0] - west) / 0.02), round((north - one.extent[3]) / 0.02)
         rows, columns = one.mean.shape
@@ -298,7 +300,7 @@ def test_order_does_not_matter() -> None:
     frames.image += rng.normal(0, 0.05, frames.image.shape).astype(np.float32)
     maps = []
     for order in (np.arange(6), np.arange(6)[::-1], rng.permutation(6)):
-        mosaic = Mosaic(0.02)
+        mosaic = Mosaic(MosaicOptions(0.02))
         mosaic.add(frames.select(order))
         maps.append(mosaic)
     for other in maps[1:]:
@@ -324,7 +326,7 @@ def test_illumination_is_taken_out() -> None:
     assert found[lit].mean() == pytest.approx(1, abs=0.02)
     results = {}
     for name, use in (("with", found), ("without", None)):
-        mosaic = build_mosaic(shaded, cell_m=0.02, illumination=use)
+        mosaic = build_mosaic(shaded, options=MosaicOptions(cell_m=0.02), illumination=use)
         many = mosaic.count >= 5
         level = waves(*centres(mosaic))
         results[name] = np.corrcoef(mosaic.mean[many], level[many])[0, 1], np.nanmean(mosaic.std[many] / mosaic.mean[many])
@@ -341,18 +343,18 @@ def test_chunks_and_whole_runs_make_one_map() -> None:
     poses = np.array([looking(3 * k, x=0.2 * k) for k in range(9)])
     frames = frames_of(waves, poses)
     frames.poses = None
-    at_once = build_mosaic(frames, poses, HEIGHT, cell_m=0.02, blend="centre")
+    at_once = build_mosaic(frames, poses, HEIGHT, MosaicOptions(cell_m=0.02, blend="centre"))
     chunks = (frames.select(slice(a, a + 4)) for a in (0, 4, 8))
-    in_parts = build_mosaic(chunks, poses, cell_m=0.02, blend="centre")
+    in_parts = build_mosaic(chunks, poses, options=MosaicOptions(cell_m=0.02, blend="centre"))
     assert in_parts.extent == at_once.extent
     np.testing.assert_array_equal(in_parts.mean, at_once.mean)
-    plain = Mosaic(0.02, "centre")
+    plain = Mosaic(MosaicOptions(0.02, "centre"))
     plain.add(frames, poses)
     assert (at_once.count > 0).sum() > 1.3 * (plain.count > 0).sum()
 
 
 def test_24_beams_are_the_middle_quarter() -> None:
-    mosaic = Mosaic(0.005, "centre")
+    mosaic = Mosaic(MosaicOptions(0.005, "centre"))
     mosaic.add(blank([looking(0)]))
     x, y = centres(mosaic)
     seen = mosaic.count > 0
@@ -362,7 +364,7 @@ def test_24_beams_are_the_middle_quarter() -> None:
 
 def test_memory_is_the_map_s() -> None:
     """Many frames over one place: the state does not grow."""
-    mosaic = Mosaic(0.05)
+    mosaic = Mosaic(MosaicOptions(0.05))
     one = blank([looking(0)])
     mosaic.add(one)
     held = mosaic.state_bytes
@@ -378,13 +380,13 @@ def test_memory_is_the_map_s() -> None:
 
 def test_a_map_grows_in_every_direction() -> None:
     poses = [looking(0), looking(0, x=-3), looking(0, x=4), looking(0, y=5), looking(0, y=-4)]
-    reserved = Mosaic(0.05)
+    reserved = Mosaic(MosaicOptions(0.05))
     frames = frames_of(waves, poses)
     reserved.reserve(frames, poses, HEIGHT)
     held = reserved.state_bytes
     reserved.add(frames)
     assert reserved.state_bytes == held, "room was made before"
-    grown = Mosaic(0.05)
+    grown = Mosaic(MosaicOptions(0.05))
     for k in range(5):
         grown.add(frames.select(np.array([k])))
     assert grown.extent == reserved.extent
@@ -394,16 +396,16 @@ def test_a_map_grows_in_every_direction() -> None:
 def test_too_large_a_map_names_a_cell_that_fits() -> None:
     poses = np.array([looking(0), looking(0, x=200, y=100)])
     with pytest.raises(MitsonarError, match=r"at most 1,000,000 are allowed: use cells of ([\d.]+) mm") as found:
-        build_mosaic(blank(poses), poses, HEIGHT, most_cells=1_000_000)
+        build_mosaic(blank(poses), poses, HEIGHT, MosaicOptions(most_cells=1_000_000))
     cell = float(str(found.value).split("use cells of ")[1].split(" mm")[0]) / 1e3
     assert 0.14 < cell < 0.17
-    fits = build_mosaic(blank(poses), poses, HEIGHT, cell_m=cell, most_cells=1_000_000)
+    fits = build_mosaic(blank(poses), poses, HEIGHT, MosaicOptions(cell_m=cell, most_cells=1_000_000))
     assert fits.frames_without_ground == 0
 
 
 def test_cells_far_too_small_are_refused_before_they_fill_the_memory() -> None:
     with pytest.raises(MitsonarError, match="use cells of"):
-        Mosaic(1e-6).add(blank([looking(0)]))
+        Mosaic(MosaicOptions(1e-6)).add(blank([looking(0)]))
 
 
 def test_frames_without_ground_are_counted() -> None:
@@ -411,7 +413,7 @@ def test_frames_without_ground_are_counted() -> None:
     frames = blank([looking(0), high, looking(0)])
     assert frames.height_m is not None
     frames.height_m[:] = HEIGHT, 9.0, np.nan
-    mosaic = build_mosaic(frames, cell_m=0.05)
+    mosaic = build_mosaic(frames, options=MosaicOptions(cell_m=0.05))
     assert (mosaic.frames, mosaic.frames_without_ground, mosaic.count.max()) == (3, 2, 1)
     frames.height_m[0] = 9.0
     with pytest.raises(MitsonarError, match="3 frames added, without ground in 3"):
@@ -457,8 +459,10 @@ def wrong(change: str) -> SonarFrames:
     ],
 )
 def test_what_is_wrong_is_said(change: str, options: dict[str, Any], message: str) -> None:
+    chosen = {name: options[name] for name in ("cell_m", "blend", "centre_beams") if name in options}
+    rest = {name: value for name, value in options.items() if name not in chosen}
     with pytest.raises(MitsonarError, match=message):
-        build_mosaic(wrong(change), **options)
+        build_mosaic(wrong(change), options=MosaicOptions(**chosen), **rest)
 
 
 def test_an_empty_mosaic_says_so() -> None:
@@ -479,7 +483,9 @@ def test_an_empty_mosaic_says_so() -> None:
 
 
 def small_mosaic() -> Mosaic:
-    return build_mosaic(frames_of(waves, [looking(0, x=5, y=-7), looking(20, x=5, y=-7)]), cell_m=0.02)
+    return build_mosaic(
+        frames_of(waves, [looking(0, x=5, y=-7), looking(20, x=5, y=-7)]), options=MosaicOptions(cell_m=0.02)
+    )
 
 
 def test_geotiff_says_where_its_cells_are(tmp_path: Path) -> None:

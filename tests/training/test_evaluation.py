@@ -31,7 +31,7 @@ pytestmark = [
 ]
 
 from mitsonar.datasets.samples import Samples, SonarPairs  # noqa: E402
-from mitsonar.estimation.compare import compare  # noqa: E402
+from mitsonar.estimation.compare import ComparisonOptions, compare  # noqa: E402
 from mitsonar.estimation.learned import (  # noqa: E402
     HeightEnsemble,
     ImageNetwork,
@@ -391,7 +391,7 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: 
     told = constant(SonarPairs(made, part="train", split=by_scene, labels="normx10"), **about)
     told.save(tmp_path / "network.ckpt")
     taught = set(SonarPairs(made, part="train", split=by_scene).first)
-    found = compare(made, {"zero": "zero", "net": ImageNetwork(told)}, limit=0)
+    found = compare(made, {"zero": "zero", "net": ImageNetwork(told)}, ComparisonOptions(limit=0))
     assert (found.report["pairs"], found.report["split"]["by"]) == (6, "scene")
     assert [row["learnt"] for row in found.rows] == [0, 0]
     assert not any("was trained on" in sentence for sentence in found.notes)
@@ -408,8 +408,10 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: 
     with pytest.raises(
         MitsonarError, match="trained on other parts of this data set: a by scene, b by sequence; choose split"
     ):
-        compare(made, {"a": ImageNetwork(told), "b": ImageNetwork(other)}, limit=0)
-    both = compare(made, {"both": HeightEnsemble([ImageNetwork(told), ImageNetwork(told)])}, part="train", limit=0)
+        compare(made, {"a": ImageNetwork(told), "b": ImageNetwork(other)}, ComparisonOptions(limit=0))
+    both = compare(
+        made, {"both": HeightEnsemble([ImageNetwork(told), ImageNetwork(told)])}, ComparisonOptions(part="train", limit=0)
+    )
     assert [row["learnt"] for row in both.rows] == [both.report["pairs"]]
     rendered = replace(told, trained={"rendered": True})
     assert not rendered.learnt(by_sequence).any()

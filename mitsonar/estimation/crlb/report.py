@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.acoustics.noise import NoiseModel, load_noise, refuse_noise
 from mitsonar.config.data import MirrorKeys
 from mitsonar.datasets.make import SceneRenderer
 from mitsonar.datasets.store import DataStore, deal, world_of
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, argument
 from mitsonar.estimation.crlb.image import Bound, bounds_at, laws_of, overall, varied
 from mitsonar.estimation.estimator import PlainTable
 from mitsonar.instruments.sonar import Sonar
@@ -26,13 +26,14 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 __all__ = [
+    "BoundOptions",
     "Place",
     "Subject",
     "Table",
     "Value",
     "bounds_of_subject",
+    "bounds_report",
     "report_lines",
-    "report_of",
     "subject_of_data",
     "subject_of_scene",
 ]
@@ -47,37 +48,100 @@ Table = dict[tuple[str, str, str], list[Bound | None]]
 UNITS = np.array([1e3, 1e3, np.degrees(1)])
 
 
-def bounds_of_subject(
-    subject: Subject,
-    noise: NoiseModel,
-    changes: list[tuple[str, Value]],
-    pings: int | None,
-    progress: Callable[[int], None],
-) -> Table:
-    """Compute the bounds at all poses, with changed sonar and poses.
+@dataclass(frozen=True, kw_only=True)
+class BoundOptions:
+    """Choices of bounds.
+
+    Attributes:
+        noise: noise of the pixels; None: high, or none in the model ``coherent``, which has noise of its own.
+        height_m: height of the sonar over the ground [m]; None: that of the poses.
+        vary: name of one of :data:`~mitsonar.estimation.crlb.image.VARIABLES`, if any.
+        values: values of this variable.
+        gain: constant gain; None: that of a data set if nothing varies, else determined from the frames.
+        pings: pings of each half of the derivatives; None: as needed.
+
+    Raises:
+        MitsonarError: an unknown noise, or a height that is not above 0.
+    """
+
+    noise: str | None = None
+    height_m: float | None = None
+    vary: str | None = None
+    values: Sequence[Value] = ()
+    gain: float | None = None
+    pings: int | None = None
+
+    def __post_init__(self) -> None:
+        load_noise(self.noise or "none")
+        if self.height_m is not None and not self.height_m > 0:
+            raise MitsonarError(f"{argument('height_m')} must be above 0: got {self.height_m:g} m")
+
+    def noise_for(self, sonar: Sonar) -> NoiseModel:
+        """Return the noise of the pixels of a sonar.
+
+        Raises:
+            MitsonarError: noise of pixels for the model ``coherent``.
+        """
+        noise = load_noise(self.noise or ("none" if sonar.model == "coherent" else "high"))
+        refuse_noise(noise, sonar)
+        return noise
+
+
+def bounds_report(source: str, subject: Subject, options: BoundOptions, progress: Callable[[int], None]) -> PlainTable:
+    """Compute the bounds of a subject for each value of the variable, and report them as a JSON object.
+
+    Numbers are in mm and deg; they are null where there is no bound or the motion is not observable.
 
     Args:
+        source: name of the scene or data set.
         subject: scenes, poses and sonar of the bounds.
-        noise: noise of the image.
-        changes: names of :data:`~mitsonar.estimation.crlb.image.VARIABLES` with values, applied one after another.
-        pings: pings of each half of the derivatives; None: as needed.
+        options: noise, variable and derivatives.
         progress: called with the number of finished poses.
 
     Raises:
-        MitsonarError: values that do not fit, or no echo at all.
+        MitsonarError: noise or values that do not fit, or no echo at all.
     """
+    name, rows = options.vary, []
+    for value in options.values or [None]:
+        for (portion, kind, law), bounds in bounds_of_subject(subject, options, value, progress).items():
+            row: PlainTable = {} if name is None else {name: value}
+            row |= {"portion": portion, "data": kind, "law": law, "poses": len(bounds)}
+            known = [one for one in bounds if one is not None]
+            for frames, words in ((1, "one_frame"), (2, "two_frames")):
+                each = np.array([one.std(frames) * UNITS for one in known])
+                row[words] = _numbers(overall(each)) if len(known) == len(bounds) else None
+                row[f"{words}_each"] = [_numbers(std) for std in each]
+            row["not_observable"] = sum(not np.isfinite(one.std()).all() for one in known)
+            row["relative_error"] = _numbers(np.mean([one.relative_error for one in known], axis=0)) if known else None
+            rows.append(row)
+    return {
+        "source": source,
+        "noise": "of the receiver" if subject.sonar.model == "coherent" else options.noise or "high",
+        "vary": name,
+        "units": ["sideways mm", "forward mm", "yaw deg"],
+        "laws": laws_of(subject.sonar),
+        "rows": rows,
+    }
+
+
+def bounds_of_subject(
+    subject: Subject, options: BoundOptions, value: Value | None, progress: Callable[[int], None]
+) -> Table:
+    """Compute the bounds at all poses for one value of the variable; see :func:`bounds_report`."""
+    noise = options.noise_for(subject.sonar)
+    changes = [(name, v) for name, v in (("height_m", options.height_m), (options.vary, value)) if name and v is not None]
+    gain = subject.gain if options.gain is None and options.vary is None else options.gain
     table: Table = {}
-    gain = subject.gain
     for place in subject.places():
         sonar, poses, heights = subject.sonar, place.poses, place.heights
         if sonar.model == "coherent" and place.seed is not None:
             sonar = sonar.replace(seed=place.seed)
-        for name, value in changes:
-            sonar, poses = varied(sonar, poses, heights, name, value)
-            heights = np.full_like(heights, value) if name == "height_m" else heights
+        for name, changed in changes:
+            sonar, poses = varied(sonar, poses, heights, name, changed)
+            heights = np.full_like(heights, changed) if name == "height_m" else heights
         simulator = Simulator(place.scene, sonar, views=subject.views(sonar), mirrors=subject.mirrors)
         gain = gain if gain is not None else _gain(simulator, poses)
-        for bounds in bounds_at(simulator, poses, noise, gain, pings=pings):
+        for bounds in bounds_at(simulator, poses, noise, gain, pings=options.pings):
             for key, found in bounds.items():
                 table.setdefault(key, []).append(found)
             progress(1)
@@ -93,41 +157,6 @@ def _gain(simulator: Simulator, poses: NDArray[np.float64]) -> float:
     if not any(pings.levels.any() for pings in batches):
         raise MitsonarError("no ray met anything within the window: check the pose (pitch > 0 looks down) and the window")
     return constant_gain(batches)[0]
-
-
-def report_of(source: str, sonar: Sonar, noise: str, name: str | None, rows: list[tuple[Value | None, Table]]) -> PlainTable:
-    """Return the bounds as a JSON object.
-
-    Numbers are in mm and deg; they are null where there is no bound or the motion is not observable.
-
-    Args:
-        source: of scene or data.
-        sonar: determines the laws.
-        noise: name of the noise of the pixels.
-        name: name of the variable, if any.
-        rows: values of the variable, each with the bounds.
-    """
-    found = []
-    for value, table in rows:
-        for (portion, kind, law), bounds in table.items():
-            row: PlainTable = {} if name is None else {name: value}
-            row |= {"portion": portion, "data": kind, "law": law, "poses": len(bounds)}
-            known = [one for one in bounds if one is not None]
-            for frames, words in ((1, "one_frame"), (2, "two_frames")):
-                each = np.array([one.std(frames) * UNITS for one in known])
-                row[words] = _numbers(overall(each)) if len(known) == len(bounds) else None
-                row[f"{words}_each"] = [_numbers(std) for std in each]
-            row["not_observable"] = sum(not np.isfinite(one.std()).all() for one in known)
-            row["relative_error"] = _numbers(np.mean([one.relative_error for one in known], axis=0)) if known else None
-            found.append(row)
-    return {
-        "source": source,
-        "noise": noise,
-        "vary": name,
-        "units": ["sideways mm", "forward mm", "yaw deg"],
-        "laws": laws_of(sonar),
-        "rows": found,
-    }
 
 
 def _numbers(values: NDArray[np.float64]) -> list[float | None]:
@@ -194,7 +223,7 @@ class Subject:
         views: function that returns the views of a sonar; it may refuse any other than the instrument.
         places: function that yields the places one after another, so that only one scene is in memory.
         poses: number of poses in all places.
-        gain: constant gain; None: determined from the frames.
+        gain: gain of a data set, if it is one.
         mirrors: mirrors of all scenes.
     """
 
@@ -202,13 +231,11 @@ class Subject:
     views: Callable[[Sonar], list[View]]
     places: Callable[[], Iterator[Place]]
     poses: int
-    gain: float | None
+    gain: float | None = None
     mirrors: MirrorKeys = None
 
 
-def subject_of_scene(
-    scene: mi.Scene, sonar: Sonar, poses: NDArray[np.float64], *, segments: list[str], gain: float | None = None
-) -> Subject:
+def subject_of_scene(scene: mi.Scene, sonar: Sonar, poses: NDArray[np.float64], *, segments: list[str]) -> Subject:
     """Return the subject of poses in one scene.
 
     Args:
@@ -216,7 +243,6 @@ def subject_of_scene(
         sonar: the instrument.
         poses: poses of the sonar ``(n, 6)``.
         segments: names of portions of a looking-down sonar's view; none: all of it.
-        gain: constant gain; None: determined from the frames.
 
     Raises:
         MitsonarError: a pose over nothing.
@@ -225,19 +251,16 @@ def subject_of_scene(
     if not np.isfinite(heights).all():
         raise MitsonarError("nothing is below the sonar at some pose: give a pose over the scene with --from")
     place = Place(scene, poses, heights)
-    return Subject(sonar, lambda other: _views(other, segments), lambda: iter([place]), len(heights), gain)
+    return Subject(sonar, lambda other: _views(other, segments), lambda: iter([place]), len(heights))
 
 
-def subject_of_data(
-    source: str, pairs: int, *, part: str | None = None, gain: float | None = None, seed: int | None = None
-) -> Subject:
+def subject_of_data(source: str, pairs: int, *, part: str | None = None, seed: int | None = None) -> Subject:
     """Return the subject of the first poses of pairs of a data set, scene by scene.
 
     Args:
         source: path or URL.
         pairs: number of pairs, each from a different sequence.
         part: part of the data set; None: the one that training does not see.
-        gain: constant gain; None: that of the data set.
         seed: seed of the rays; None: that of the data set.
 
     Raises:
@@ -269,8 +292,7 @@ def subject_of_data(
         return recipe.views if recipe.receivers else _views(other, recipe.segments)
 
     own = recipe.instrument if seed is None else recipe.instrument.replace(seed=seed)
-    gain = float(store.about["gain"]) if gain is None else gain
-    return Subject(own, views, places, len(chosen), gain, recipe.mirrors)
+    return Subject(own, views, places, len(chosen), float(store.about["gain"]), recipe.mirrors)
 
 
 def _views(sonar: Sonar, segments: list[str]) -> list[View]:
