@@ -1,4 +1,4 @@
-"""Commands ``mitsonar serve`` and ``mitsonar view``: serve a live sonar, and show frames in Rerun."""
+"""``mitsonar serve``: poses in, sonar out, ping by ping."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def serve(
     rate: Annotated[float | None, typer.Option(help="Pings a second of the path (default: the sonar's) [Hz].")] = None,
     start: options.Start = None,
     trajectory: Annotated[
-        Path | None, typer.Option(help="Path to play while no pose arrives: a TUM or CSV file, or `shipped`.")
+        Path | None, typer.Option(help="Path that is played while no pose comes: a TUM or CSV file, or `shipped`.")
     ] = None,
     frame: options.Frame = "mitsonar",
     noise: options.Noise = "none",
@@ -120,25 +120,23 @@ def view(
             metavar="RUN|FILE|DATA.zarr|SCENE", help="A run, frames, a recording, a data set, or a scene (XML or name)."
         ),
     ],
-    save: Annotated[
-        Path | None, typer.Option("--save", help="Write a recording (.rrd) instead of opening the viewer.")
-    ] = None,
+    save: Annotated[Path | None, typer.Option("--save", help="Write a recording (.rrd) and open no viewer.")] = None,
     html: Annotated[
-        Path | None, typer.Option("--html", help="Make a folder with a page and the viewer, for any web server.")
+        Path | None, typer.Option("--html", help="Make a folder: a page with the viewer, for any web server.")
     ] = None,
     path: Annotated[
-        Path | None, typer.Option("--path", help="Estimated path to add: the folder of an odometry, a TUM or CSV file.")
+        Path | None, typer.Option("--path", help="Estimated path too: the folder of an odometry, a TUM or CSV file.")
     ] = None,
     frame: options.Frame = "mitsonar",
     scene: Annotated[
-        str | None, typer.Option(help="Scene to draw: XML file or name (default: the run's; `none`: no scene).")
+        str | None, typer.Option(help="Scene to draw: XML or name (default: that of the run; `none`: no scene).")
     ] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
     view_: Annotated[str | None, typer.Option("--view", help="View of a data set (default: the first).")] = None,
     parameter: options.Parameters = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file or page.")] = False,
 ) -> None:
-    """Show fan, polar image and levels of each frame, with scene, beams, true and estimated path."""
+    """Show fan, polar image and levels of each frame; scene, wedge of the beams, true and estimated path."""
     from mitsonar.bridges.rerun import write_recording
     from mitsonar.bridges.viewer_page import RECORDING, VIEWER, write_page
     from mitsonar.io.runs import refuse_to_replace
@@ -177,7 +175,7 @@ def _shown(
     sequence: int | None,
     view_: str | None,
 ) -> Shown:
-    """Return the content to show: frames with their scene, or a scene with its sonar and its shipped path."""
+    """Return what to show: frames with the scene they were made of, or a scene with its sonar and its shipped path."""
     from mitsonar.bridges.rerun import Shown
     from mitsonar.mapping.sources import is_data_set, is_recording, open_frames
 
@@ -195,7 +193,7 @@ def _shown(
 
 
 def _loaded(scene: str, parameters: dict[str, str]) -> tuple[Any, Any, Any]:
-    """Load a scene: its triangles, its sonar, and the path beside its file or the pose of the sonar."""
+    """Load a scene: its triangles, its sonar, and the path that lies beside it or the pose of the sonar."""
     import numpy as np
 
     from mitsonar.motion.trajectory import Trajectory
@@ -211,7 +209,7 @@ def _loaded(scene: str, parameters: dict[str, str]) -> tuple[Any, Any, Any]:
 
 
 def _scene_of(run: Path) -> tuple[str | None, dict[str, str]]:
-    """Return the scene of a run and its parameters, if run.json names the scene and the file exists."""
+    """Return the scene that a run was made of, where it says it and it is there, and its parameters."""
     from mitsonar.io.files import read_json
     from mitsonar.simulation.scene import find_scene
 
@@ -232,7 +230,7 @@ def _scene_of(run: Path) -> tuple[str | None, dict[str, str]]:
 
 
 def _paths(path: Path | None, frame: str) -> dict[str, Trajectory]:
-    """Load an estimated path; from the folder of an odometry also the true one."""
+    """Load an estimated path; of an odometry's folder the true one as well."""
     from mitsonar.mapping.odometry_run import OdometryFolder
     from mitsonar.motion.trajectory import Trajectory
 

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 SIX = "x,y,z,pitch,roll,heading in m and deg"
 FRAMES = (
-    "Number of frames, with --trajectory evenly spaced in time. For a rotating head (ping360) the number of sweeps from the "
-    "start, with --vehicle the number of poses."
+    "Number of frames: with --trajectory evenly spaced in time over all of it; of a head that turns (ping360) of sweeps, "
+    "the first ones; of --vehicle of poses."
 )
 NOISE = (
     "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; no realism, it shows which "
@@ -47,7 +47,7 @@ Speed = Annotated[
 ]
 Frame = Annotated[
     str,
-    typer.Option(help="Convention of pose files to read and write: mitsonar, ros-enu or ned; --from is always mitsonar."),
+    typer.Option(help="Convention of pose files, read and written: mitsonar, ros-enu or ned (not of --from)."),
 ]
 SonarName = Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")]
 SonarKeys = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the sonar: range_max=8.")]
@@ -119,8 +119,8 @@ def path_for(
 def under_vehicle(path: Trajectory, sounder: Sounder, file: Path | None) -> Trajectory:
     """Return the path of the vehicle that carries an instrument, for a path that may be that of a forward-looking sonar.
 
-    The trajectories of shipped scenes belong to a sonar that looks ahead and down: an instrument that looks down or aside
-    rides on the level vehicle below it. For other paths a warning reports a tilted instrument.
+    The trajectories of shipped scenes are those of a sonar that looks ahead and down: an instrument that looks down or aside
+    rides on the level vehicle below it. Of other paths a warning tells where such an instrument is tilted.
     """
     if sounder.looks_ahead:
         return path
@@ -139,12 +139,12 @@ def under_vehicle(path: Trajectory, sounder: Sounder, file: Path | None) -> Traj
 
 
 def poses_line(path: Trajectory, mounts: Mapping[str, ArrayLike] | None = None) -> str:
-    """Describe whose poses a path holds, with the median pitch and the mounts of instruments.
+    """Say whose poses a path holds, with the usual attitude, and how instruments are mounted.
 
     Args:
         path: of the sonar or of the vehicle.
-        mounts: poses in the vehicle by name [m, rad], empty for instruments that define their own; None: the path
-            belongs to the sonar itself.
+        mounts: poses in the vehicle by name [m, rad]; none of instruments that say themselves where they are. None: the
+            path is that of the sonar itself.
     """
     pitch = math.degrees(float(np.median(path.poses[:, 3])))
     if mounts is None:
@@ -158,7 +158,7 @@ def poses_line(path: Trajectory, mounts: Mapping[str, ArrayLike] | None = None) 
 
 
 def warn_of_speed(path: Trajectory, end: str | None, speed: float | None) -> None:
-    """Warn about an implausible speed that follows from --from, --to, --frames and the frame rate."""
+    """Tell how fast the vehicle is where --from, --to and --frames leave it to the frame rate, and it is faster than any."""
     lasts = float(path.time_s[-1] - path.time_s[0])
     if end is None or speed is not None or lasts <= 0:
         return

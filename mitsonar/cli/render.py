@@ -1,4 +1,4 @@
-"""Commands ``mitsonar render``, ``impulse``, ``sound`` and ``image``: simulate sonars in a scene."""
+"""``mitsonar render``: a scene becomes sonar frames on disk."""
 
 from __future__ import annotations
 
@@ -45,46 +45,38 @@ def render(
     sonar: options.SonarName = None,
     model: Annotated[str | None, typer.Option(help="coherent (as of most presets), physical or thesis.")] = None,
     quality: Annotated[
-        str | None, typer.Option(help="draft, standard or fine: number of rays by accuracy (`mitsonar presets`).")
-    ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a key of the sonar, KEY=VALUE: range_max=8.")
+        str | None, typer.Option(help="draft, standard or fine: rays by the error wanted (`mitsonar presets`).")
     ] = None,
     set_: options.SonarKeys = None,
     noise: options.Noise = "none",
     labels: Annotated[bool, typer.Option("--labels", help="Per-pixel elevation, shape id and shadow too.")] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
     label_floor: Annotated[
-        float, typer.Option(min=0, max=1, help="Label only pixels above this fraction of full scale, before noise.")
+        float, typer.Option(min=0, max=1, help="Label only pixels above this part of full scale, before noise.")
     ] = 0.0,
     fan: Annotated[
-        bool, typer.Option("--fan", help="Write a plain fan picture of each frame to fan/; with --labels also of labels.")
+        bool, typer.Option("--fan", help="A plain fan picture of each frame, in fan/; with --labels of these as well.")
     ] = False,
-    cartesian: Annotated[bool, typer.Option("--cartesian", help="Draw each frame as a fan with axes in metres.")] = False,
-    exr: Annotated[bool, typer.Option("--exr", help="Write the echo of every ray, one EXR file per frame.")] = False,
+    cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
+    exr: Annotated[bool, typer.Option("--exr", help="Every ray's echo, one EXR a frame.")] = False,
     mirrors: Annotated[
         bool,
-        typer.Option(
-            "--mirrors",
-            help="Render glints (coherent) and mirrors (bounces) of smooth materials; see docs/guides/multipath.md.",
-        ),
+        typer.Option("--mirrors", help="Smooth materials glint (coherent) and mirror (bounces); docs/guides/multipath.md."),
     ] = False,
     moving: options.Moving = None,
     all_sensors: Annotated[
         bool,
-        typer.Option(
-            "--all-sensors", help="Use all sonars and cameras of the scene, on one vehicle (docs/guides/bridges.md)."
-        ),
+        typer.Option("--all-sensors", help="All sonars and cameras of the scene, on one vehicle (docs/guides/bridges.md)."),
     ] = False,
     vehicle: Annotated[
-        Path | None, typer.Option(help="YAML file with the sensors of a vehicle; see docs/guides/bridges.md.")
+        Path | None, typer.Option(help="All sensors of a vehicle, a YAML file; see docs/guides/bridges.md.")
     ] = None,
     rays_per_launch: options.RaysPerLaunch = 2**22,
     parameter: options.Parameters = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
 ) -> None:
-    """Render sonar frames: frames.npz, images/, poses.tum and run.json in the folder OUT."""
+    """Render what the sonar receives: frames.npz, images/, poses.tum and run.json in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.acoustics.water import absorption_line
     from mitsonar.instruments.sonar import Sonar
@@ -280,13 +272,11 @@ def impulse(
     parameter: options.Parameters = None,
     mirrors: Annotated[
         bool,
-        typer.Option("--mirrors", help="Add paths reflected by smooth materials; see docs/guides/impulse-responses.md."),
+        typer.Option("--mirrors", help="Paths by way of smooth materials; see docs/guides/impulse-responses.md."),
     ] = False,
     mirror: Annotated[
         list[str] | None,
-        typer.Option(
-            "--mirror", help="Reflection coefficient of pressure and rms height [m] of a shape, NAME=V,H: surface=-1,0.002."
-        ),
+        typer.Option("--mirror", help="NAME=V,H: reflection of pressures and rms height [m] of a shape: surface=-1,0.002."),
     ] = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
@@ -445,7 +435,7 @@ def sound(
     speed: options.Speed = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped` (levelled)."),
+        typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped`, level below the sonar of the scene."),
     ] = None,
     frame: options.Frame = "mitsonar",
     model: Annotated[str | None, typer.Option(help="coherent, with speckle and noise, or physical.")] = None,
@@ -458,7 +448,7 @@ def sound(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
 ) -> None:
-    """Simulate a side-scan, altimeter, profiler, DVL or 3-D sonar on a vehicle, and write its records into OUT."""
+    """Simulate an instrument of beams on a vehicle: waterfall, ranges, points or velocities in the folder OUT."""
     from mitsonar.instruments.sounder import load_sounder
     from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.pose import Pose
@@ -497,7 +487,7 @@ def sound(
 
 @answered
 def image(
-    run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run rendered with --exr.")],
+    run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run that was rendered with --exr.")],
     bins: Annotated[int | None, typer.Option(help="Number of range bins (default: as rendered).")] = None,
     window: Annotated[str | None, typer.Option("--range", help="Range window from,to [m] (default: as rendered).")] = None,
     noise: options.Noise = "none",

@@ -16,6 +16,7 @@ import zarr
 from numpy.typing import NDArray
 from PIL import Image
 
+from mitsonar.acoustics.water import delay_exact, delay_iterated
 from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
@@ -33,7 +34,6 @@ from mitsonar.records.responses import COLUMNS, ImpulseResponses
 from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.channel import ChannelSimulator, Paths
 from mitsonar.simulation.device import current_variant
-from mitsonar.simulation.links import delay_exact, delay_iterated
 from mitsonar.simulation.runs import SIMULATORS, Destination, RenderOptions, Steps, path_digest, run, write_run
 from mitsonar.simulation.simulator import Simulator
 from mitsonar.simulation.sounding import SoundedPings, SounderSimulator, dvl_readings, dvl_sensors
