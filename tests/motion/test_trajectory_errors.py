@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import essence
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
@@ -280,8 +281,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trajectory
 
 @pytest.mark.parametrize(
     ("align", "options"),
-    [("none", []), ("first", ["--align_origin"]), ("space", ["--align"])],
-    ids=["none", "first", "space"],
+    essence([("none", []), ("first", ["--align_origin"]), ("space", ["--align"])], ("space", ["--align"])),
 )
 def test_absolute_errors_are_those_of_evo(
     recorded: tuple[Path, Trajectory, Trajectory], align: Alignment, options: list[str]
