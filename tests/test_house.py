@@ -66,6 +66,8 @@ def modules() -> dict[str, Path]:
 
 MODULES = modules()
 
+parsed = cache(lambda path: ast.parse(path.read_text()))
+
 
 def imports(tree: ast.AST, types: bool = True) -> Iterator[str]:
     """What a module imports, also within functions, and with ``types`` for type checking: ``mitsonar.errors.EXTRAS``."""
@@ -86,7 +88,7 @@ def imports(tree: ast.AST, types: bool = True) -> Iterator[str]:
 def imported(path: Path, types: bool = True) -> frozenset[str]:
     """Modules of mitsonar that a file imports; a name in a module counts as the module."""
     found = set()
-    for full in imports(ast.parse(path.read_text()), types):
+    for full in imports(parsed(path), types):
         if full.split(".")[0] == "mitsonar":
             name = full.removeprefix("mitsonar").removeprefix(".")
             while name not in MODULES:
@@ -129,7 +131,7 @@ def test_objects_of_mitsuba_are_created_where_no_foreign_library_is_loaded() -> 
     creating = {"load_dict", "load_file", "load_string", "instantiate", "create_object", "plugin_type"}
     found = set()
     for name, path in HOUSE.items():
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.Attribute) and node.attr in creating:
                 found.add((name, node.attr))
     assert found == {("plugins.native_plugins", "load_dict"), ("simulation.scene", "instantiate")}
@@ -153,7 +155,7 @@ def test_only_plugins_and_the_simulation_speak_mitsuba() -> None:
     """What evaluates images must work where there is no renderer."""
     speak = set()
     for name, path in MODULES.items():
-        tops = {full.split(".")[0] for full in imports(ast.parse(path.read_text()), types=False)}
+        tops = {full.split(".")[0] for full in imports(parsed(path), types=False)}
         if tops & {"mitsuba", "drjit"}:
             speak.add(name.split(".")[0])
     assert speak <= {
@@ -167,7 +169,7 @@ def test_only_plugins_and_the_simulation_speak_mitsuba() -> None:
 
 def test_every_module_says_what_it_is() -> None:
     for name, path in MODULES.items():
-        assert ast.get_docstring(ast.parse(path.read_text())), f"{name or 'mitsonar'} has no docstring"
+        assert ast.get_docstring(parsed(path)), f"{name or 'mitsonar'} has no docstring"
 
 
 # ---------------------------------------------------------------- what imports load

@@ -130,6 +130,7 @@ def test_spheres_have_a_quarter_of_their_square(radius: float, range_m: float) -
         assert np.angle(ratio) == pytest.approx(0, abs=0.1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("words", essence([{}, {"pulse_m": 0.012, "beam_width_deg": 0.9, "pattern": "receive"}], {}))
 def test_target_strength_is_read_from_an_image(words: dict[str, float | str]) -> None:
     """The sum of the levels over bins and beams, times spacing over width, times R^4: a^2 / 4 within 0.5 dB."""

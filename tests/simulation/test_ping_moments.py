@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Array, diffuse, plate, scene
+from helpers import Array, diffuse, essence, plate, scene
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar, group_of_beams, scanned
@@ -39,7 +39,9 @@ def wall() -> Any:
     return scene(wall=plate((0, WALL_M, 0), (0, -1, 0), bsdf=diffuse(0.8)))
 
 
-@pytest.mark.parametrize(("sonar", "tolerance"), [(BOXES, 0.003), (PATTERN, 0.012), (COHERENT, 0.02)])
+@pytest.mark.parametrize(
+    ("sonar", "tolerance"), essence([(BOXES, 0.003), (PATTERN, 0.012), (COHERENT, 0.02)], (BOXES, 0.003), (COHERENT, 0.02))
+)
 def test_a_vehicle_that_drives_skews_a_wall(sonar: Sonar, tolerance: float) -> None:
     """Range of beam b: (5 m - v t) / cos b, with the time t of its group."""
     path = Trajectory.between(Pose(0, 0, 0), Pose(0, SPEED, 0), 2, 1.0)
@@ -85,7 +87,10 @@ def tank(radius: float) -> Any:
 
 @pytest.mark.parametrize(
     ("changes", "tolerance"),
-    [({}, 0.006), ({"model": "coherent", "frequency_hz": 7.5e5, "bearing": "cone", "absorption_db_per_m": 0.0}, 0.03)],
+    essence(
+        [({}, 0.006), ({"model": "coherent", "frequency_hz": 7.5e5, "bearing": "cone", "absorption_db_per_m": 0.0}, 0.03)],
+        ({}, 0.006),
+    ),
 )
 def test_a_tank_that_is_scanned_under_way(changes: dict[str, Any], tolerance: float) -> None:
     """The head at (0, v t) meets the circle of radius 5 m along its bearing b at -y cos b + sqrt(25 - y^2 sin^2 b)."""

@@ -91,7 +91,9 @@ def upright_array(elevation: Array, half_deg: float, ways: int) -> Array:
     return sum_over(low, elevation)
 
 
-@pytest.mark.parametrize(("pattern", "ways", "least_db"), [("receive", 1, -35.0), ("two_way", 2, -29.5)])
+@pytest.mark.parametrize(
+    ("pattern", "ways", "least_db"), essence([("receive", 1, -35.0), ("two_way", 2, -29.5)], ("two_way", 2, -29.5))
+)
 def test_spread_over_elevation(pattern: Pattern, ways: int, least_db: float) -> None:
     """A point that the sonar nods past keeps its bearing: its level follows the array's sum, to where the fan ends."""
     loaded, fields, place = one_point(half=0.05)

@@ -34,7 +34,7 @@ def test_every_cell_has_one_point_inside_it_whoever_looks() -> None:
     assert not np.array_equal(points(different), place)
 
 
-@pytest.mark.parametrize("shape", essence(["rectangle", "mesh", "sphere"], "rectangle", "mesh"))
+@pytest.mark.parametrize("shape", essence(["rectangle", "mesh", "sphere"], "mesh"))
 def test_strengths_add_up_to_reflectivity_times_area(shape: str) -> None:
     kinds = {
         "rectangle": (floor(diffuse(0.3), 2.0), 16.0),
