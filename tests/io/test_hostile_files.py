@@ -522,7 +522,7 @@ BAD_FRAMES: dict[str, tuple[dict[str, Any], str]] = {
     "a negative height": ({"height_m": np.array([1.0, -2.0, 1.0])}, "must lie in 0"),
     "labels of floats": ({"shape_id": np.zeros((3, 6, 4))}, "shape_id must be int"),
     "shadow of 7": ({"shadow": np.full((3, 6, 4), 7, np.uint8)}, "0..2"),
-    "a list as sonar": ({"sonar": np.array("[1]")}, "sonar is not JSON"),
+    "a list as sonar": ({"sonar": np.array("[1]")}, "sonar is not a JSON object"),
     "deep JSON": ({"sonar": np.array("[" * 100_000)}, "sonar is not JSON"),
     "a huge integer": ({"sonar": np.array('{"beams": ' + "9" * 5000 + "}")}, "sonar"),
     "about a list": ({"about": np.array("[1]")}, "about"),
