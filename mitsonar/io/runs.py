@@ -2,7 +2,7 @@
 
 The folder of a run holds ``run.json``: the type of run, its settings, the versions of the packages that determine its
 results bit for bit, and notes on its progress. The file is complete at any time, so that an interrupted run can be resumed.
-It is treated as untrusted input: every value is checked for its type, and an invalid one is reported in one sentence.
+It is untrusted input: the type of every value is checked, and an invalid value is reported in one sentence.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import UnionType
-from typing import Any, get_args
+from typing import Annotated, Any
 
-from mitsonar.errors import MitsonarError, shortened
-from mitsonar.io.files import PlainValue, check_plain, finite_number, read_json, whole_number, write_json
+from mitsonar.errors import MitsonarError, complaint
+from mitsonar.io.files import LARGEST_COUNT, PlainValue, check_plain, finite_number, read_json, whole_number, write_json
 
 __all__ = [
     "RUN_FILE",
@@ -216,7 +216,7 @@ class RunDirectory:
         new = cls(Path(path), kind, plain_json(asked), versions(kind.packages))
         if not _holds_a_run(new.path):
             return new
-        had = _read(new.path, kind, damaged_will_do=overwrite)
+        had = _read(new.path, kind, only_kind=overwrite)
         if overwrite or (resume and had._replaces):  # killed while it removed the run that it replaces
             new._replaces = True
             return new
@@ -295,10 +295,10 @@ class RunDirectory:
         except MitsonarError as error:
             raise self.damage(error) from None
 
-    def damage(self, said: object) -> MitsonarError:
+    def damage(self, reason: object) -> MitsonarError:
         """Return the error for a damaged run file, with its remedies."""
         do = "begin anew with --overwrite" if self.kind.replaced else "remove the folder"
-        return MitsonarError(f"{self.path / RUN_FILE} is damaged ({said}): {do}, or choose another -o")
+        return MitsonarError(f"{self.path / RUN_FILE} is damaged ({reason}): {do}, or choose another -o")
 
     def _write(self) -> None:
         unknown = set(self.notes) - set(self.kind.notes)
@@ -344,65 +344,47 @@ def _holds_a_run(path: Path) -> bool:
     return bool(there)
 
 
-def _read(path: Path, kind: RunKind, *, damaged_will_do: bool = False) -> RunDirectory:
-    """Read the run in a folder and check the types of its values; a damaged run to be replaced needs only its type."""
-    told = read_json(path / RUN_FILE, check=False)
-    if told.get("kind") != kind.name:
+def _read(path: Path, kind: RunKind, *, only_kind: bool = False) -> RunDirectory:
+    """Read the run in a folder and check its values; of a run to be replaced, only its type is checked."""
+    content = read_json(path / RUN_FILE, check=False)
+    if content.get("kind") != kind.name:
         raise MitsonarError(f"{path} holds no {kind.name} of mitsonar and is kept as it is: choose another -o")
     run = RunDirectory(path, kind, {}, {})
-    if damaged_will_do:
+    if only_kind:
         return run
     try:
-        _check(told, kind)
+        _check(content, kind)
     except MitsonarError as error:
         raise run.damage(error) from None
-    run.asked, run.versions, run.finished = told["asked"], told["versions"], told["finished"]
-    run.notes = {key: told[key] for key in kind.notes if key in told}
-    run._replaces, run._started = told["replaces"], True
+    run.asked, run.versions, run.finished = content["asked"], content["versions"], content["finished"]
+    run.notes = {key: content[key] for key in kind.notes if key in content}
+    run._replaces, run._started = content["replaces"], True
     return run
 
 
-OWN: dict[str, type] = {"kind": str, "finished": bool, "replaces": bool, "asked": dict, "versions": dict}
+COMMON: dict[str, Any] = {"kind": str, "finished": bool, "replaces": bool, "asked": dict, "versions": dict}
 """Keys of every run file."""
 
-NAMES: dict[type, str] = {bool: "true or false", str: "a text", dict: "an object"}
 
-
-def _check(told: dict[str, Any], kind: RunKind) -> None:
+def _check(content: dict[str, Any], kind: RunKind) -> None:
     """Check that the keys of a file are those of a type of run, and that its values have the right types.
 
     Raises:
         MitsonarError: an invalid key or value.
     """
-    check_plain(told, "it")
-    expected = {**OWN, **kind.notes}
-    for key, value in told.items():
-        if key not in expected:
-            raise MitsonarError(f"unknown key {shown(key)}")
-        _check_value(value, key, expected[key])
-    lacking = set(OWN) - set(told)
-    if lacking:
-        raise MitsonarError(f"it lacks {min(lacking)}")
+    from pydantic import ConfigDict, Field, ValidationError, create_model
 
-
-def _check_value(value: Any, name: str, expected: type | UnionType) -> None:
-    """Check that a value of the file has the expected type."""
-    if isinstance(expected, UnionType):
-        known, _ = get_args(expected)
-        if value is not None:
-            _check_value(value, name, known)
-    elif expected is int:
-        whole_number(value, name)
-    elif expected is float:
-        finite_number(value, name)
-    elif expected is list:
-        if not isinstance(value, list) or not all(isinstance(one, str | int | float) for one in value):
-            raise MitsonarError(f"{name} must be a list of texts and numbers: got {shortened(value)}")
-        for place, one in enumerate(value):
-            if not isinstance(one, str):
-                finite_number(one, f"{name}[{place}]")
-    elif type(value) is not expected:
-        raise MitsonarError(f"{name} must be {NAMES[expected]}: got {shortened(value)}")
+    check_plain(content, "it")
+    narrower: dict[Any, Any] = {int: Annotated[int, Field(ge=0, le=LARGEST_COUNT)], list: list[str | int | float]}
+    fields: dict[str, Any] = {name: (expected, ...) for name, expected in COMMON.items()}
+    fields |= {name: (narrower.get(expected, expected), None) for name, expected in kind.notes.items()}
+    model = create_model(
+        "RunFile", __config__=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, protected_namespaces=()), **fields
+    )
+    try:
+        model.model_validate(content)
+    except ValidationError as error:
+        raise MitsonarError(complaint(error, model, "run")) from None
 
 
 def _remove(path: Path, outputs: Iterable[str]) -> None:

@@ -400,11 +400,11 @@ def test_a_damaged_state_is_not_gone_on_with(scene: Path, tmp_path: Path) -> Non
     assert 0 < state["frames_done"] < 3
     for damage, said in (
         ({"frames_done": 4}, r"frames_done must be a whole number in 0\.\.3: got 4"),
-        ({"frames_done": "1"}, "frames_done must be a whole number"),
+        ({"frames_done": "1"}, "run frames_done: input should be a valid integer, got '1'"),
         ({"gain": 0.0}, "gain must be a finite number above 0"),
         ({"tally": {**state["tally"], "frames": "1"}}, r"damaged \(frames of the tally must be a whole number"),
         ({"tally": {**state["tally"], "worst": 3}}, r"damaged \(worst of the tally must be two counts"),
-        ({"tally": None}, r"damaged \(tally must be an object: got None"),
+        ({"tally": None}, r"damaged \(run tally: input should be a valid dictionary, got None"),
     ):
         file.write_text(json.dumps(state | damage))
         with pytest.raises(MitsonarError, match=said):
