@@ -60,7 +60,7 @@ FAST_M_S = 5.0
 """Speed above which a vehicle's speed is reported [m/s]: few underwater vehicles reach it."""
 
 TILTED_DEG = 10.0
-"""Pitch or roll of a vehicle above which an instrument that looks down from it is warned of [deg]."""
+"""Pitch or roll of a vehicle above which a warning is given for instruments that look down from it [deg]."""
 
 
 def path_for(
@@ -117,10 +117,10 @@ def path_for(
 
 
 def under_vehicle(path: Trajectory, sounder: Sounder, file: Path | None) -> Trajectory:
-    """Return the path of the vehicle that carries an instrument, for a path that may be that of a forward-looking sonar.
+    """Return the path of the vehicle that carries an instrument, given a path that may be that of a forward-looking sonar.
 
-    The trajectories of shipped scenes are those of a sonar that looks ahead and down: an instrument that looks down or aside
-    rides on the level vehicle below it. Of other paths a warning tells where such an instrument is tilted.
+    The trajectories of shipped scenes are those of a sonar that looks ahead and down; an instrument that looks down or aside
+    is mounted on the level vehicle below it. On other paths, warn if such an instrument is tilted.
     """
     if sounder.looks_ahead:
         return path
@@ -139,12 +139,12 @@ def under_vehicle(path: Trajectory, sounder: Sounder, file: Path | None) -> Traj
 
 
 def poses_line(path: Trajectory, mounts: Mapping[str, ArrayLike] | None = None) -> str:
-    """Say whose poses a path holds, with the usual attitude, and how instruments are mounted.
+    """Return a sentence on whose poses a path holds, the median pitch, and how instruments are mounted.
 
     Args:
-        path: of the sonar or of the vehicle.
-        mounts: poses in the vehicle by name [m, rad]; none of instruments that say themselves where they are. None: the
-            path is that of the sonar itself.
+        path: trajectory of the sonar or of the vehicle.
+        mounts: mounts on the vehicle keyed by name [m, rad]; empty for hydrophones, whose receivers have positions. None:
+            the path is that of the sonar itself.
     """
     pitch = math.degrees(float(np.median(path.poses[:, 3])))
     if mounts is None:
@@ -158,7 +158,7 @@ def poses_line(path: Trajectory, mounts: Mapping[str, ArrayLike] | None = None) 
 
 
 def warn_of_speed(path: Trajectory, end: str | None, speed: float | None) -> None:
-    """Tell how fast the vehicle is where --from, --to and --frames leave it to the frame rate, and it is faster than any."""
+    """Warn if the frame rate makes the vehicle faster than real ones, since --to is given without --speed."""
     lasts = float(path.time_s[-1] - path.time_s[0])
     if end is None or speed is not None or lasts <= 0:
         return

@@ -145,12 +145,12 @@ def _load(scene: str, parameter: list[str] | None) -> tuple[Any, dict[str, Any]]
 
 
 def _check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: Simulator | None = None) -> None:
-    """Refuse a path below the ground or inside an object, from where the sonar sees nothing; warn where it sees something.
+    """Refuse a path below the ground or inside an object if the sonar sees nothing from there; warn if it sees something.
 
     Args:
         scene: the Mitsuba scene.
-        path: of the sonar or vehicle.
-        moving: whether bodies move, which is not judged.
+        path: trajectory of the sonar or vehicle.
+        moving: whether bodies move; such scenes are not checked.
         simulator: simulator of the sonar, to find whether it sees anything; None: only warn.
     """
     from mitsonar.simulation.tracing import buried_in
