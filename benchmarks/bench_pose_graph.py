@@ -55,9 +55,7 @@ def row(frames: int) -> str:
     held, begun = peak_mib(), time.process_time()
     found = graph_path(measured, Pose(0, 0, 2), start_known=True, sensors=sensors, loops=None, source=None)
     seconds = time.process_time() - begun
-    return (
-        f"| {frames:,} | {seconds:.1f} | {1e3 * seconds / frames:.2f} | {peak_mib() - held:.0f} | {found.end_told_m:.6f} |"
-    )
+    return f"| {frames:,} | {seconds:.1f} | {1e3 * seconds / frames:.2f} | {peak_mib() - held:.0f} | {found.end_std_m:.6f} |"
 
 
 def drawn(frames: int) -> tuple[MotionSeries, VehicleSensors]:

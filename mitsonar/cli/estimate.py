@@ -133,7 +133,6 @@ def odometry(
     from mitsonar.mapping.odometry import OdometryOptions, loop_starts
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
     from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at, usual_loop
-    from mitsonar.mapping.sensors import open_sensors
     from mitsonar.motion.pose import Pose
     from mitsonar.records.frames import SonarFrames
 
@@ -149,7 +148,11 @@ def odometry(
         if images:
             frames_for(frames, reading)  # faults of the frames are reported first
         raise
-    vehicle = None if sensors is None else open_sensors(sensors)
+    vehicle = None
+    if sensors is not None:
+        from mitsonar.mapping.sensors import open_sensors
+
+        vehicle = open_sensors(sensors)
     source = open_source(frames, method, reading)
     if source.note:
         say(source.note)

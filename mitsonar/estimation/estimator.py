@@ -5,7 +5,9 @@ An estimator takes consecutive records and returns the motion, its covariance an
 
 from __future__ import annotations
 
+import inspect
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -13,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, meant
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.motion.errors import in_units
 from mitsonar.records.frames import SonarFrames, ViewFrames
@@ -33,6 +35,7 @@ __all__ = [
     "Record",
     "ambiguity",
     "blank",
+    "checked_options",
     "correlation_excess",
     "correlation_of",
     "correlation_rejection",
@@ -303,7 +306,7 @@ def without_slow(image: Real, block: int) -> Real:
 
 
 def matching_rejection(
-    first: Real, second: Real, inside: NDArray[np.bool_], *, alike: float, block: int = 32, aside: int = 0
+    first: Real, second: Real, inside: NDArray[np.bool_], *, correlated: float, block: int = 32, aside: int = 0
 ) -> str:
     """Return why two registered images ``(rows, columns)`` do not match; empty if they do.
 
@@ -311,17 +314,17 @@ def matching_rejection(
         first: image ``(rows, columns)``.
         second: the other image, registered to the first.
         inside: which pixels count.
-        alike: number of neighbouring pixels that count as one, since the images are smooth.
+        correlated: number of neighbouring pixels that count as one, since the images are smooth.
         block: edge of the blocks over which the matched energy must be spread [pixels].
         aside: displacement against which a low correlation is compared, see :func:`correlation_excess`; 0: no comparison.
     """
     count = int(inside.sum())
-    if count < alike:
+    if count < correlated:
         return "nothing in the frames to match"
     first, second = without_slow(first, block), without_slow(second, block)
     correlation = correlation_of(first[inside], second[inside])
     excess = correlation_excess(first, second, inside, aside) if aside and correlation < LEAST_AT_BEST else UNMEASURED
-    reason = correlation_rejection(correlation, count / alike, excess)
+    reason = correlation_rejection(correlation, count / correlated, excess)
     if reason:
         return reason
     product = np.where(inside, (first - first[inside].mean()) * (second - second[inside].mean()), 0).astype(np.float64)
@@ -362,3 +365,31 @@ def prior_rejection(motion: Motion, covariance: NDArray[np.float64] | None, prio
     sideways, forward, yaw = in_units(apart)
     off = np.sqrt(square)
     return f"the motion is {sideways:.0f}, {forward:.0f} mm, {yaw:.2f} deg from the prior: {off:.1f} standard deviations"
+
+
+# ---------------- Options of estimators
+
+
+def checked_options(name: str, options: Options, made: Callable[..., object], but: int = 0) -> Options:
+    """Check the names of options, and return the options.
+
+    Args:
+        name: name of the estimator, for the message.
+        options: options by name.
+        made: the function or class that takes them.
+        but: number of its first arguments that are not options.
+
+    Raises:
+        MitsonarError: an option that it does not take.
+    """
+    try:
+        parameters = list(inspect.signature(made).parameters.values())[but:]
+    except (TypeError, ValueError):  # implemented in C, without a signature
+        return options
+    if any(one.kind is one.VAR_KEYWORD for one in parameters):
+        return options
+    known = [one.name for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
+    for key in options:
+        if key not in known:
+            raise MitsonarError(f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}{meant(key, known)}")
+    return options

@@ -19,10 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, explain_missing, meant
-from mitsonar.estimation.estimator import INPUTS, Estimate, Options, rejected, two_frames
-from mitsonar.estimation.image.phase import GroundView
-from mitsonar.geometry.ground import Attitude, attitude_of
+from mitsonar.errors import MitsonarError, explain_missing
+from mitsonar.estimation.estimator import INPUTS, Estimate, Options, checked_options, rejected, two_frames
+from mitsonar.geometry.ground import Attitude, GroundView, attitude_of
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
 
@@ -33,7 +32,6 @@ __all__ = [
     "HasEstimate",
     "OwnEstimator",
     "StackReg",
-    "checked_options",
     "created",
     "ground_pair",
     "own_class",
@@ -422,31 +420,6 @@ def own_class(text: str, options: Options) -> OwnEstimator | None:
             raise MitsonarError(f"a class is my_module:MyEstimator or my_module:MyEstimator:key=value: got {text!r}")
         values[key] = _value(value)
     return _FromText(found[1], os.getcwd(), values)()
-
-
-def checked_options(name: str, options: Options, made: Callable[..., object], but: int = 0) -> Options:
-    """Check the names of options, and return the options.
-
-    Args:
-        name: name of the estimator, for the message.
-        options: options by name.
-        made: the function or class that takes them.
-        but: number of its first arguments that are not options.
-
-    Raises:
-        MitsonarError: an option that it does not take.
-    """
-    try:
-        parameters = list(inspect.signature(made).parameters.values())[but:]
-    except (TypeError, ValueError):  # implemented in C, without a signature
-        return options
-    if any(one.kind is one.VAR_KEYWORD for one in parameters):
-        return options
-    known = [one.name for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
-    for key in options:
-        if key not in known:
-            raise MitsonarError(f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}{meant(key, known)}")
-    return options
 
 
 @dataclass(frozen=True)

@@ -455,7 +455,7 @@ class Comparison(NamedTuple):
     smoothing: tuple[float, float]
 
     @property
-    def alike(self) -> float:
+    def correlated(self) -> float:
         """Return the number of neighbouring cells that count as one."""
         return 4 * math.pi * math.hypot(self.smoothing[0] / self.cell, 12**-0.5) * self.smoothing[1]
 
@@ -664,7 +664,7 @@ class ImageNetwork(Trained):
         fine = COMPARISONS[-1]
         one, other, inside = _brought_together(images, ground, motion, fine)
         excess = correlation_excess(one, other, inside, BLOCK // 2).mean
-        unsure = ambiguity(excess, inside.sum() / fine.alike)
+        unsure = ambiguity(excess, inside.sum() / fine.correlated)
         reason = found.reason or self._rejection_of_size(motion)
         covariance = unsure * found.covariance + np.outer(went, went) + np.outer(apart, apart) / 2
         return Estimate(motion, covariance, not reason, reason, found.about)
@@ -717,7 +717,7 @@ class ImageNetwork(Trained):
         row, column = np.unravel_index(int(found.argmax()), found.shape)
         there = first[row : row + middle.shape[0], column : column + middle.shape[1]]
         inside = np.ones(middle.shape, dtype=bool)
-        return matching_rejection(there, middle, inside, alike=4 * math.pi * SMOOTH[0] * SMOOTH[1])
+        return matching_rejection(there, middle, inside, correlated=4 * math.pi * SMOOTH[0] * SMOOTH[1])
 
     def _reach(self, frames: SonarFrames) -> tuple[int, int]:
         """Return how far an echo can move between frames in bins and in beams, by the motions of training."""
@@ -754,7 +754,7 @@ def _rejection_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
 def _mismatch(images: Pair, ground: Ground, motion: Motion, comparison: Comparison) -> str:
     """Return why the frames registered by an answer do not match in one comparison; empty if they do."""
     first, second, inside = _brought_together(images, ground, motion, comparison)
-    return matching_rejection(first, second, inside, alike=comparison.alike, block=BLOCK, aside=BLOCK // 2)
+    return matching_rejection(first, second, inside, correlated=comparison.correlated, block=BLOCK, aside=BLOCK // 2)
 
 
 def _correlation_of_answer(images: Pair, ground: Ground, motion: Motion) -> float:

@@ -15,13 +15,12 @@ import numpy as np
 from mitsonar.errors import MitsonarError, explain_missing, meant, nearest_names
 from mitsonar.estimation.channel.correlation import Correlation, pings_of
 from mitsonar.estimation.channel.likelihood import Likelihood
-from mitsonar.estimation.estimator import AnyEstimator, Estimate, Options, Record, two_frames
+from mitsonar.estimation.estimator import AnyEstimator, Estimate, Options, Record, checked_options, two_frames
 from mitsonar.estimation.external import (
     CfarGicp,
     FourierMellin,
     HasEstimate,
     StackReg,
-    checked_options,
     created,
     own_class,
     own_estimator,

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
-from mitsonar.estimation.image.phase import GroundView, fan_places
-from mitsonar.geometry.ground import attitude_of
+from mitsonar.geometry.ground import GroundView, attitude_of, fan_places
 from mitsonar.mapping.pairs import EstimateStore, estimate_motions
 from mitsonar.mapping.pose_graph import GraphSolution, PoseEdges, motion_derivatives, relative_motions
 from mitsonar.mapping.series import ErrorCorrelation
@@ -280,9 +279,9 @@ class LoopSearch:
     compared: int
     rejected: Counter[str]
 
-    def outvoted(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return whether each loop is in a stretch where fewer than two loops, or no majority, were kept ``(loops,)``."""
-        votes, voters = np.bincount(self.group, kept), np.bincount(self.group)
+    def outvoted(self, accepted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return whether each loop is in a stretch where fewer than two, or no majority, were accepted ``(loops,)``."""
+        votes, voters = np.bincount(self.group, accepted), np.bincount(self.group)
         return np.asarray(((votes < 2) | (2 * votes <= voters))[self.group])
 
 

@@ -540,9 +540,9 @@ class GraphPath:
         series: motions of the path, with their covariances.
         sensors: names of the sensors that were used.
         search: result of the search for loops; None if none was requested.
-        kept: whether each loop of the search agrees with all other measurements ``(loops,)``.
+        accepted: whether each loop of the search agrees with all other measurements ``(loops,)``.
         end_moved_m: distance by which loops moved the end of the path [m].
-        end_std_m: standard deviation of the position of the end without loops [m].
+        end_std_before_m: standard deviation of the position of the end without loops [m].
     """
 
     path: Trajectory
@@ -550,12 +550,12 @@ class GraphPath:
     series: MotionSeries
     sensors: tuple[str, ...]
     search: LoopSearch | None
-    kept: NDArray[np.bool_]
+    accepted: NDArray[np.bool_]
     end_moved_m: float
-    end_std_m: float
+    end_std_before_m: float
 
     @property
-    def end_told_m(self) -> float:
+    def end_std_m(self) -> float:
         """Return the standard deviation of the position of the end [m]."""
         return float(np.sqrt(np.trace(self.covariances[-1, :2, :2])))
 
@@ -563,15 +563,15 @@ class GraphPath:
         """Return name, value and unit of the results that the graph adds; ``true`` is the true path at the frames."""
         rows: list[tuple[str, float, str]] = []
         if self.search is not None:
-            out = len(self.kept) - int(self.kept.sum())
+            out = len(self.accepted) - int(self.accepted.sum())
             rows += [
-                ("loops", float(self.kept.sum()), ""),
+                ("loops", float(self.accepted.sum()), ""),
                 ("loops rejected", float(out + sum(self.search.rejected.values())), ""),
                 ("pairs of views compared for loops", float(self.search.compared), ""),
-                ("standard deviation of the end as told, before loops", 1e3 * self.end_std_m, "mm"),
+                ("standard deviation of the end as told, before loops", 1e3 * self.end_std_before_m, "mm"),
                 ("end moved by loops", 1e3 * self.end_moved_m, "mm"),
             ]
-        rows.append(("standard deviation of the end as told", 1e3 * self.end_told_m, "mm"))
+        rows.append(("standard deviation of the end as told", 1e3 * self.end_std_m, "mm"))
         if true is not None:
             each = normalised_errors(self.path, self.covariances, true)
             rows.append(("squared pose error over its covariance, a third, mean along the path", float(each.mean()), ""))
@@ -664,13 +664,13 @@ def _closed(graph: PoseGraph, search: LoopSearch, before: GraphSolution) -> Grap
     if not len(search.loops.first):
         return before
     after = solved(replace(graph, loops=search.loops))
-    out = after.kept & search.outvoted(after.kept)
+    out = after.accepted & search.outvoted(after.accepted)
     if not out.any():
         return after
-    kept = after.kept & ~out
-    rest = solved(replace(graph, loops=search.loops.at(kept))) if kept.any() else before
-    kept[kept] = rest.kept if kept.any() else True
-    return replace(rest, kept=kept)
+    accepted = after.accepted & ~out
+    rest = solved(replace(graph, loops=search.loops.at(accepted))) if accepted.any() else before
+    accepted[accepted] = rest.accepted if accepted.any() else True
+    return replace(rest, accepted=accepted)
 
 
 def _path_of(
@@ -698,9 +698,9 @@ def _path_of(
         series=MotionSeries(moved, time_s, (covariances + covariances.swapaxes(1, 2)) / 2),
         sensors=() if sensors is None else tuple(sensors.names),
         search=search,
-        kept=solution.kept,
+        accepted=solution.accepted,
         end_moved_m=float(np.hypot(*(solution.poses[-1] - before.poses[-1])[:2])),
-        end_std_m=float(np.sqrt(np.trace(end))),
+        end_std_before_m=float(np.sqrt(np.trace(end))),
     )
 
 
@@ -852,7 +852,7 @@ def _altimeter(source: Source, frames: Index) -> Array:
     if source.height_m is None or (isinstance(source, FrameSource) and source.assumed_height):
         return np.full(len(frames), np.nan)
     heights = np.asarray(source.height_m[frames], dtype=float)
-    given = np.nan if source.told_height_m is None else source.told_height_m
+    given = np.nan if source.given_height_m is None else source.given_height_m
     return np.where(heights == given, np.nan, heights)
 
 

@@ -155,7 +155,7 @@ class OdometryFolder(EstimateStore):
         else:
             (self.path / "height_profile.csv").unlink(missing_ok=True)  # left from an earlier run with heights
         if found.graph is not None and found.graph.search is not None:
-            write_whole(self.path / "loops.csv", _loops_csv(found, found.graph.search.loops, found.graph.kept).encode())
+            write_whole(self.path / "loops.csv", _loops_csv(found, found.graph.search.loops, found.graph.accepted).encode())
         else:
             (self.path / "loops.csv").unlink(missing_ok=True)  # left from an earlier search
         rows = found.rows()
@@ -220,7 +220,7 @@ def _settings(source: Source, name: str, estimator: AnyEstimator, options: Odome
     of_estimator: PlainTable = dataclasses.asdict(estimator) if dataclasses.is_dataclass(estimator) else {}
     return {
         **{"estimator": name, "options": of_estimator, "frames": len(source), "frames_sha256": source.digest()},
-        **{"every": options.every, "height_m": source.told_height_m},
+        **{"every": options.every, "height_m": source.given_height_m},
         "pitch_deg": None if source.pitch_rad is None else float(np.degrees(source.pitch_rad)),
         "noise": None if source.noise is None else {**source.noise.model_dump(), "seed": source.seed},
         **({} if options.sensors is None else {"sensors_sha256": options.sensors.digest()}),
@@ -253,7 +253,7 @@ def _motions_csv(found: Odometry) -> str:
     return text.getvalue()
 
 
-def _loops_csv(found: Odometry, loops: PoseEdges, kept: NDArray[np.bool_]) -> str:
+def _loops_csv(found: Odometry, loops: PoseEdges, accepted: NDArray[np.bool_]) -> str:
     """Return a CSV table with one line per loop, in mm and deg."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -262,7 +262,7 @@ def _loops_csv(found: Odometry, loops: PoseEdges, kept: NDArray[np.bool_]) -> st
     moved, std = in_units(loops.motions), in_units(np.sqrt(np.diagonal(loops.covariances, axis1=1, axis2=2)))
     for k, (first, second) in enumerate(zip(loops.first, loops.second, strict=True)):
         numbers = [f"{value:.6f}" for value in moved[k]] + [f"{value:.6g}" for value in std[k]]
-        table.writerow([int(found.frames[first]), int(found.frames[second]), *numbers, int(kept[k])])
+        table.writerow([int(found.frames[first]), int(found.frames[second]), *numbers, int(accepted[k])])
     return text.getvalue()
 
 

@@ -85,7 +85,7 @@ class ViewSource:
     noise: NoiseModel | None = None
     seed: int = 0
     note: str = ""
-    told_height_m: float | None = None
+    given_height_m: float | None = None
     pitch_rad: float | None = None
     altimeter: HeightEstimator | None = None
     contrast: ClassVar[None] = None
@@ -223,7 +223,7 @@ class ResponseSource:
     Attributes:
         name: name of the source, for messages.
         responses: impulse responses of all pings.
-        told_height_m: height that the user gave for responses without one [m].
+        given_height_m: height that the user gave for responses without one [m].
         noise: noise added to the pings when they are read.
         seed: seed of the noise.
         note: always empty; data sets are read by their samples.
@@ -232,7 +232,7 @@ class ResponseSource:
 
     name: str
     responses: ImpulseResponses
-    told_height_m: float | None = None
+    given_height_m: float | None = None
     noise: ResponseNoise | None = None
     seed: int = 0
     note: str = ""
@@ -286,7 +286,7 @@ class ResponseSource:
         if known is not None and np.isfinite(known).all():
             raise MitsonarError(f"{self.name} holds heights, so that {height_m:g} m would not be used: leave it out")
         responses = replace(self.responses, height_m=np.full(len(self), height_m))
-        return replace(self, responses=responses, told_height_m=height_m)
+        return replace(self, responses=responses, given_height_m=height_m)
 
     def check_times(self) -> None:
         """Check that the times of the pings increase.
@@ -424,7 +424,7 @@ def open_source(where: str, estimator: AnyEstimator, reading: Reading) -> Source
     source = frames_for(where, reading)
     _check_consumed(where, there, wanted)
     source = _with_heights(source, reading)
-    bare = is_recording(where) and not _tells_height(source)
+    bare = not _tells_height(source) and is_recording(where)
     return _with_contrast(with_assumed_plane(source) if bare else source, reading, bare=bare)
 
 

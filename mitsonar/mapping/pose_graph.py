@@ -352,7 +352,7 @@ class GraphSolution:
 
     Attributes:
         poses: x, y [m], heading [rad], not wrapped ``(poses, 3)``.
-        kept: whether each loop agrees with all other measurements ``(loops,)``; the others were left out.
+        accepted: whether each loop agrees with all other measurements ``(loops,)``; the others were left out.
         squared: squared residual of each loop normalised by its covariance ``(loops,)``, at the solution.
         factor: factor of the normal equations.
         states: index of each unknown among those of the factor; -1 where it is known.
@@ -361,7 +361,7 @@ class GraphSolution:
     """
 
     poses: Array
-    kept: NDArray[np.bool_]
+    accepted: NDArray[np.bool_]
     squared: Array
     factor: NormalFactor
     states: Index
@@ -421,22 +421,22 @@ def solved(graph: PoseGraph) -> GraphSolution:
     Raises:
         MitsonarError: a covariance is not positive definite, or some poses are not connected by any measurement.
     """
-    kept = np.ones(len(graph.loops.first), dtype=bool)
+    accepted = np.ones(len(graph.loops.first), dtype=bool)
     poses = graph.start
     while True:
-        asked = replace(graph, loops=graph.loops.at(kept))
+        closed = replace(graph, loops=graph.loops.at(accepted))
         # robust solution: drop the outliers among the loops, and repeat without them
-        if kept.any():
-            poses = _gauss_newton(asked, poses, robust=True)[0]
+        if accepted.any():
+            poses = _gauss_newton(closed, poses, robust=True)[0]
             squared = _squared(graph.loops, poses)
-            out = kept & (squared > OUTLIER)
+            out = accepted & (squared > OUTLIER)
             if out.any():
-                kept &= ~out
+                accepted &= ~out
                 continue
         # final solution with full weights, whose normal equations give the covariances
-        poses, normal, factor, states = _gauss_newton(asked, poses, robust=False)
-        pose_of = asked.pose_of[states >= 0]
-        return GraphSolution(poses, kept, _squared(graph.loops, poses), factor, states, normal, pose_of)
+        poses, normal, factor, states = _gauss_newton(closed, poses, robust=False)
+        pose_of = closed.pose_of[states >= 0]
+        return GraphSolution(poses, accepted, _squared(graph.loops, poses), factor, states, normal, pose_of)
 
 
 def _squared(edges: PoseEdges, poses: Array) -> Array:

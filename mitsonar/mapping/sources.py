@@ -23,11 +23,9 @@ from scipy.spatial.transform import Slerp
 from mitsonar.acoustics.levels import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
-from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.errors import associated
 from mitsonar.motion.pose import poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.recordings.open import format_of, known_formats, open_recording
 from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels, Recording
 from mitsonar.records.frames import COLUMNS, LABELS, PER_FRAME, SonarFrames, check_column, open_group, to_float32
 
@@ -82,7 +80,7 @@ class FrameSource:
             not.
         height_m: height over the ground ``(frames,)`` [m], if known; nan where nothing is below.
         pitch_rad: pitch of the sonar [rad], if its poses are not known.
-        told_height_m: height that the user gave for frames without one [m].
+        given_height_m: height that the user gave for frames without one [m].
         assumed_height: whether ``height_m`` is an assumption, because neither the frames nor the user give a height.
         noise: noise added to the frames when they are read.
         seed: seed of the noise.
@@ -101,7 +99,7 @@ class FrameSource:
     attitude_rad: Array | None = None
     height_m: Array | None = None
     pitch_rad: float | None = None
-    told_height_m: float | None = None
+    given_height_m: float | None = None
     assumed_height: bool = False
     noise: NoiseModel | None = None
     seed: int = 0
@@ -147,7 +145,8 @@ class FrameSource:
         """Make a source of times, poses, attitudes and heights in memory, with images that are read on demand."""
         time = np.asarray(time_s, dtype=float)
         time = time.mean(axis=1) if time.ndim == 2 else time
-        like = replace(like, beam_poses=None, **BodyStates().fields())  # truth, dropped as labels are
+        # truth is dropped, as labels are
+        like = replace(like, beam_poses=None, body_names=(), body_poses=None, body_velocities=None)
         return cls(name, like, time, images, poses, attitude_rad, height_m, first_number=first_number, note=note)
 
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
@@ -218,7 +217,10 @@ class FrameSource:
             known = np.full(len(self), np.nan) if heights is None else heights
             heights = np.where(np.isfinite(known), known, height_m)
         return replace(
-            self, height_m=heights, told_height_m=height_m, pitch_rad=pitch_rad if self.pitch_rad is None else self.pitch_rad
+            self,
+            height_m=heights,
+            given_height_m=height_m,
+            pitch_rad=pitch_rad if self.pitch_rad is None else self.pitch_rad,
         )
 
     @property
@@ -354,6 +356,9 @@ class FrameSource:
 StoredArray = Any
 """A Zarr array of either metadata format, read by indexing."""
 
+RUN_FRAMES = ("frames.npz", "frames.zarr")
+"""Files that hold the frames of a run."""
+
 FINDING = "give frames.npz, frames.zarr, the folder of a run, a data set or a recording"
 
 
@@ -383,7 +388,7 @@ def open_frames(
     if sequence is not None or view is not None:
         raise MitsonarError(f"{where} is no data set or recording: sequence and view choose among theirs; leave them out")
     if os.path.isdir(path) and not os.path.isfile(path / "zarr.json"):
-        found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
+        found = [path / name for name in RUN_FRAMES if os.path.exists(path / name)]
         if not found:
             raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {FINDING}")
         path = found[0]
@@ -430,12 +435,19 @@ def is_data_set(where: str | Path) -> bool:
 
 
 def is_recording(where: str | Path) -> bool:
-    """Return whether a path is a recording of a real sonar."""
-    return "://" not in str(where) and format_of(where) is not None
+    """Return whether a path is a recording of a real sonar; the readers are not loaded for a run of mitsonar."""
+    run = os.path.isfile(Path(where) / "run.json") and any(os.path.exists(Path(where) / name) for name in RUN_FRAMES)
+    if run or "://" in str(where):
+        return False
+    from mitsonar.recordings.open import format_of
+
+    return format_of(where) is not None
 
 
 def _of_recording(path: Path, number: int | None, view: str | None, geometry: str | Path | None) -> FrameSource:
     """Open a part of a recording, by default the longest."""
+    from mitsonar.recordings.open import open_recording
+
     recording = open_recording(path, geometry, view)
     for note in recording.notes:
         warnings.warn(f"{path}: {note}", MitsonarWarning, stacklevel=3)
@@ -456,6 +468,8 @@ def _of_npz(path: Path, name: str) -> FrameSource:
     if not os.path.exists(path):
         raise MitsonarError(f"there are no frames at {path}: {FINDING}")
     if os.path.isfile(path) and os.access(path, os.R_OK) and not is_zipfile(path):
+        from mitsonar.recordings.open import known_formats
+
         empty = path.stat().st_size == 0
         reason = "it is empty" if empty else "it is neither a whole frames.npz nor a recording that mitsonar reads"
         raise MitsonarError(f"cannot read frames {path}: {reason}; {FINDING}: {known_formats()}")
@@ -641,6 +655,8 @@ def recording_at(
     """
     data_set = is_data_set(where)
     if not data_set and is_recording(where):
+        from mitsonar.recordings.open import open_recording
+
         return open_recording(where, geometry, view)
     source = open_frames(where, sequence=sequence if data_set else None, view=view, geometry=geometry)
     labels = None if data_set else _labels_at(Path(where))

@@ -103,7 +103,7 @@ def kept_loops(found: Odometry) -> PoseEdges:
     """The loops that were kept."""
     assert found.graph is not None
     assert found.graph.search is not None
-    return found.graph.search.loops.at(found.graph.kept)
+    return found.graph.search.loops.at(found.graph.accepted)
 
 
 def test_blank_frames_have_no_view() -> None:
@@ -124,7 +124,7 @@ def test_a_circle_is_closed_where_it_began(round_trip: tuple[SonarFrames, Drifti
     assert closed.graph is not None
     loops = kept_loops(closed)
     assert len(loops.first) >= 2
-    assert closed.graph.kept.all()
+    assert closed.graph.accepted.all()
     # every loop is between frames a whole round apart
     assert (np.abs(loops.second - loops.first - 120) <= 4).all(), loops
     rows = {name: value for name, value, _ in closed.rows()}
@@ -263,7 +263,7 @@ def test_a_run_s_folder_keeps_registrations_and_resumes_to_the_same_bits(
     files = ("estimated.tum", "motions.csv", "loops.csv", "loops.jsonl", "table.md")
     bits = {name: (tmp_path / "out" / name).read_bytes() for name in files}
     rows = list(csv.DictReader((tmp_path / "out" / "loops.csv").open()))
-    assert len(rows) == len(once.graph.kept)
+    assert len(rows) == len(once.graph.accepted)
     assert {row["kept"] for row in rows} == {"1"}
     # a kill in the middle of the registrations
     lines = bits["loops.jsonl"].splitlines(keepends=True)

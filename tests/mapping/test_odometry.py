@@ -471,7 +471,7 @@ def test_geometry_is_given_where_it_lacks_and_only_there() -> None:
     with pytest.raises(MitsonarError, match="above 0"):
         FrameSource.of(frames).with_geometry(-1.0)
     far = float(frames.range_m[-1])
-    assert FrameSource.of(frames).with_geometry(far).told_height_m == far
+    assert FrameSource.of(frames).with_geometry(far).given_height_m == far
     with pytest.raises(MitsonarError, match="no ground is seen from a height of 3500 m: give heights in metres"):
         FrameSource.of(frames).with_geometry(3500.0)
     with pytest.raises(MitsonarError, match=r"-90..90"):

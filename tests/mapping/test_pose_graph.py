@@ -135,7 +135,7 @@ def test_a_wrong_loop_is_left_out_and_right_ones_are_kept() -> None:
     right = [edge(i, j, relative_motions(true, [i], [j])[0] + STD * rng.normal(size=3)) for i, j in pairs]
     wrong = [edge(5, 26, np.zeros(3)), edge(0, 20, np.array([0.5, 0, 0]))]
     found = solved(replace(graph_of(moved), loops=joined(*right, *wrong)))
-    assert found.kept.tolist() == [True] * 4 + [False] * 2
+    assert found.accepted.tolist() == [True] * 4 + [False] * 2
     assert (found.squared[4:] > 100).all()
     only = solved(replace(graph_of(moved), loops=joined(*right)))
     np.testing.assert_allclose(found.poses, only.poses, atol=1e-9)
@@ -286,7 +286,7 @@ def test_gtsam_finds_the_same_poses_and_marginals() -> None:
     graph, _ = tangled(np.random.default_rng(4), share=0.0, slope=1e-9)
     plain = replace(graph, correlated=None, headings=Headings.none())
     found = solved(plain)
-    assert found.kept.all()
+    assert found.accepted.all()
     own, _ = found.covariances()
     poses, covariances = by_gtsam(plain)
     off = found.poses - poses

@@ -42,11 +42,11 @@ from mitsonar.estimation.image.registration import (
     Fit,
     GroundNodes,
     Held,
-    alike_cells,
     blurred,
     by_block,
     cauchy,
     cell_blocks,
+    correlated_cells,
     is_resolved,
     noise_of,
     on_cells,
@@ -368,7 +368,7 @@ RELIEF_STD = 0.048
 ILLUMINATION = (12.0, 4.0)
 """Bins and beams beyond which brightness variations come from the sonar, which moves, and not from the ground."""
 
-ALIKE = 20.0
+CORRELATED = 20.0
 """Residuals that count as one: those of a block err together where its ground deviates from the model."""
 
 SETTLED = np.array([3e-4, 3e-4, 6e-5])
@@ -495,7 +495,7 @@ class _ReliefLevel:
         correlation = correlation_of(one.before[one.inside], one.after[one.inside])
         normal, pulls = by_motion[:, :3].sum(axis=-1), by_motion[:, 3]
         return _Equations(
-            normal, both, height[0], pulls, height[1], ALIKE * one.scale**2, correlation, int(one.inside.sum())
+            normal, both, height[0], pulls, height[1], CORRELATED * one.scale**2, correlation, int(one.inside.sum())
         )
 
     def pulls_by_lean(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -651,6 +651,6 @@ def _assessed(
         by_height=undone @ (found.both @ (held / (found.height + held))),
         by_lean=by_lean,
         correlation=found.correlation,
-        independent=found.cells / alike_cells(level),
+        independent=found.cells / correlated_cells(level),
         blocks=spread_of(found.height),
     )

@@ -50,15 +50,13 @@ LONGEST = np.array([2.0, 0.7])
 STILL = np.array([0.004, 0.002])
 """Gauss-Newton iterations, the longest step of one, and the step below which a patch is finished [bins, beams]."""
 
-ALIKE = 3.0
+CORRELATED = 3.0
 """Number of neighbouring pixels with correlated errors."""
 
 FLOOR = np.array([0.05, 0.04])
 """Lower limit of an alignment's standard deviations at any contrast [bins, beams]: interpolation between cells."""
 
-ROWS, COLUMNS = (
-    axis.ravel().astype(float) for axis in np.meshgrid(*(np.arange(-reach, reach + 1) for reach in REACH), indexing="ij")
-)
+ROWS, COLUMNS = np.mgrid[-REACH[0] : REACH[0] + 1, -REACH[1] : REACH[1] + 1].reshape(2, -1).astype(float)
 """Offsets of a patch's pixels from its centre ``(pixels,)`` [bins, beams]."""
 
 _TAPER = np.exp(-0.5 * ((ROWS / (0.7 * REACH[0])) ** 2 + (COLUMNS / (0.7 * REACH[1])) ** 2)).astype(np.float32)
@@ -197,7 +195,7 @@ def align(image: PatchImage, patches: Patches, row: Array, column: Array) -> Ali
         if not len(moving):
             break
     # covariance from the residuals, for as many independent pixels as the weights leave
-    independent = 1 / ((patches.weights**2).sum(axis=1) * ALIKE)
+    independent = 1 / ((patches.weights**2).sum(axis=1) * CORRELATED)
     covariance = np.linalg.inv(normal + 1e-9 * np.eye(2)) * (residual / independent)[:, None, None]
     return Alignment(shift, covariance + np.diag(FLOOR**2), correlation)
 

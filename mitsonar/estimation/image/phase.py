@@ -8,8 +8,7 @@ rotation is removed, phase correlation finds the translation. ``ecc`` is OpenCV'
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,12 +16,11 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_rejection, rejected, two_frames
-from mitsonar.geometry.ground import Attitude, GroundGeometry, attitude_of, moved
-from mitsonar.instruments.sonar import Sonar
+from mitsonar.geometry.ground import GroundView, attitude_of
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
 
-__all__ = ["Ecc", "GroundView", "Phase", "fan_places"]
+__all__ = ["Ecc", "Phase"]
 
 
 Floats = NDArray[np.float32]
@@ -98,7 +96,7 @@ class Phase:
         # accept the motion only if the aligned frames match, away from the fan's outline
         matched = _back(second, view, motion)
         smooth = [cv2.GaussianBlur(image, (5, 5), 0) for image in (first, matched)]
-        reason = matching_rejection(smooth[0], smooth[1], window > 0.3, alike=4 * np.pi * 1.1**2)
+        reason = matching_rejection(smooth[0], smooth[1], window > 0.3, correlated=4 * np.pi * 1.1**2)
         return Estimate(motion, None, not reason, reason, attitude.about)
 
 
@@ -264,122 +262,4 @@ class Ecc:
             inside.astype(np.float32), warp, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         )
         edge = cv2.erode((inside & (seen > 0.99)).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
-        return matching_rejection(smooth[0], back, edge, alike=4 * np.pi * (0.3 * ((size - 1) / 2 - 1) + 0.8) ** 2)
-
-
-# ---------------- Frames projected to level ground
-
-
-MOST_VIEW_CELLS = 2**20
-"""Largest number of cells of a view: a window of many metres has larger cells."""
-
-
-@dataclass(frozen=True)
-class GroundView:
-    """The part of the ground that a fan shows, as an image: row 0 farthest forward, column 0 most to port.
-
-    Args:
-        frames: frames whose cells are projected.
-        attitude: height over the visible surface, pitch, roll.
-        cell_m: edge of a pixel; larger where the view would have more than a million.
-        most_along: largest number of pixels along the longer side; pixels grow to keep within it.
-    """
-
-    frames: SonarFrames
-    attitude: Attitude
-    cell_m: float
-    most_along: int = MOST_VIEW_CELLS
-
-    @cached_property
-    def _geometry(self) -> GroundGeometry:
-        return self.attitude.ground(self.frames)
-
-    @cached_property
-    def edge(self) -> float:
-        """Edge of a pixel [m]."""
-        left, right, near, far = self.reach
-        whole = float(np.sqrt((right - left) * (far - near) / MOST_VIEW_CELLS))
-        return max(self.cell_m, whole, max(right - left, far - near) / self.most_along)
-
-    @cached_property
-    def reach(self) -> tuple[float, float, float, float]:
-        """Extent of the visible ground: starboard from, to, forward from, to [m]; all 0 if the fan meets no ground."""
-        f = self.frames
-        few = (f.range_m[::8], f.bearing_rad[::4]), (f.range_m[[0, -1]], f.bearing_rad)
-        geometries = [replace(self._geometry, range_m=ranges, bearing_rad=bearings) for ranges, bearings in few]
-        points = np.concatenate([geometry.points.reshape(-1, 2) for geometry in geometries])
-        points = points[np.isfinite(points).all(axis=1)]
-        if not len(points):
-            return 0.0, 0.0, 0.0, 0.0
-        (left, near), (right, far) = points.min(axis=0), points.max(axis=0)
-        return float(left), float(right), float(near), float(far)
-
-    @cached_property
-    def points(self) -> NDArray[np.float64]:
-        """Ground point of each pixel: starboard, forward [m] ``(rows, columns, 2)``."""
-        left, right, near, far = self.reach
-        x = np.arange(left, right, self.edge) + self.edge / 2
-        y = np.arange(far, near, -self.edge) - self.edge / 2
-        return np.stack(np.meshgrid(x, y), axis=-1)
-
-    @cached_property
-    def _pixel_positions(self) -> list[tuple[Floats, Floats, NDArray[np.bool_]]]:
-        """Row and column in each frame of each pixel, and whether it is inside and lit ``(rows, columns)``."""
-        numbers = range(len(self.attitude.apart)) if self.attitude.apart else (None,)
-        return [fan_places(self.attitude.ground(self.frames, k), self.frames.sonar, self.points) for k in numbers]
-
-    @property
-    def inside(self) -> NDArray[np.bool_]:
-        """Pixels within the fans that the sonar would light on level ground ``(rows, columns)``.
-
-        The surroundings are dark in every frame and form an outline that moves with the sonar.
-        """
-        return np.asarray(np.all([lit for _, _, lit in self._pixel_positions], axis=0))
-
-    def draw(self, image: Floats, number: int = 0) -> Floats:
-        """Project the image ``(bins, beams)`` of a frame to the view from above ``(rows, columns)``; 0 outside the fan."""
-        row, column, _ = self._pixel_positions[number if self.attitude.apart else 0]
-        if not row.size:
-            return np.zeros((0, 0), dtype=np.float32)
-        finer = self.edge / float(np.median(np.diff(self.frames.range_m)))
-        if finer > 1:  # smooth bins that are finer than pixels
-            border = cv2.BORDER_REPLICATE
-            image = np.asarray(
-                cv2.GaussianBlur(image, (1, 0), sigmaX=1e-3, sigmaY=0.4 * finer, borderType=border), np.float32
-            )
-        return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), np.float32)
-
-    def warp(self, motion: Motion) -> NDArray[np.float32]:
-        """Return the matrix ``(2, 3)`` that maps a pixel (column, row) of the first frame according to a motion."""
-        corner = np.array([self.reach[0], self.reach[3]]) + self.edge / 2 * np.array([1, -1])
-        pixels = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        there = moved(corner + pixels * [self.edge, -self.edge], motion)
-        there = (there - corner) / [self.edge, -self.edge]
-        return np.column_stack([there[1] - there[0], there[2] - there[0], there[0]]).astype(np.float32)
-
-    def motion(self, warp: NDArray[np.floating]) -> Motion:
-        """Return the motion of a warp, the inverse of :meth:`warp`."""
-        yaw = float(np.arctan2(warp[0, 1], warp[0, 0]))
-        still = self.warp(Motion(0.0, 0.0, yaw)).astype(float)
-        step = (warp[:, 2] - still[:, 2]) * self.edge
-        return Motion(float(-step[0]), float(step[1]), yaw)
-
-
-def fan_places(
-    ground: GroundGeometry, sonar: Sonar, points: NDArray[np.float64]
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Find the cells of a frame that show points of the ground.
-
-    Args:
-        ground: ground geometry of the frame, with its ranges and bearings.
-        sonar: the receiving sonar, which lights what is within the opening of its beams.
-        points: starboard, forward [m] ``(..., 2)``.
-
-    Returns:
-        Row and column in the frame, -1 beyond its cells; and whether a point is within them and lit; each ``(...)``.
-    """
-    radius, bearing = ground.to_polar(points)
-    row = np.interp(radius, ground.range_m, np.arange(len(ground.range_m)), left=-1, right=-1)
-    column = np.interp(bearing, ground.bearing_rad, np.arange(len(ground.bearing_rad)), left=-1, right=-1)
-    lit = np.abs(ground.elevation(points)) <= np.radians(sonar.elevation_fov_deg) / 2
-    return row.astype(np.float32), column.astype(np.float32), (row >= 0) & (column >= 0) & lit
+        return matching_rejection(smooth[0], back, edge, correlated=4 * np.pi * (0.3 * ((size - 1) / 2 - 1) + 0.8) ** 2)

@@ -26,12 +26,12 @@ __all__ = [
     "Fit",
     "GroundNodes",
     "Held",
-    "alike_cells",
     "blurred",
     "by_block",
     "cauchy",
     "cell_blocks",
     "central_differences",
+    "correlated_cells",
     "is_resolved",
     "node_axes",
     "noise_of",
@@ -121,7 +121,7 @@ class Held(NamedTuple):
 
     def weight(self, scale: float, level: DirectLevel) -> Doubles:
         """Return the prior weight of each unknown in units of the residuals' noise."""
-        return np.asarray(alike_cells(level) * scale**2 / self.std**2)
+        return np.asarray(correlated_cells(level) * scale**2 / self.std**2)
 
 
 def register(
@@ -284,7 +284,7 @@ def cauchy(residual: Floats, scale: float) -> Floats:
     return np.asarray(np.reciprocal(ratio, out=ratio))
 
 
-def alike_cells(level: DirectLevel) -> float:
+def correlated_cells(level: DirectLevel) -> float:
     """Return the number of cells that count as one, since a smoothing kernel correlates the noise of neighbours."""
     return float(4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28))
 
@@ -318,7 +318,7 @@ def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held:
     # the jackknife over blocks gives the covariance of what the frames contribute
     each = _without_each(sound + np.diag(held), informed, at, cells)
     # the error of the prior adds to it: where the frames hold no information, it is all there is
-    known = undone * (alike_cells(level) * at.scale**2 * held) @ undone.T
+    known = undone * (correlated_cells(level) * at.scale**2 * held) @ undone.T
     # share of each block in the information, and sensitivity to the height and to differences of height, pitch and roll
     side = at.sides[0]
     both = [_information(cells.derivative, one.slopes) for one in at.sides]
@@ -329,7 +329,7 @@ def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held:
     )
     # a match that hardly stands out from displaced ones has a larger covariance
     before, after = side.before[side.inner], side.after[side.inner]
-    independent, excess = before.size / alike_cells(level), _excess(side, cells)
+    independent, excess = before.size / correlated_cells(level), _excess(side, cells)
     return Fit(
         converged=converged,
         covariance=ambiguity(excess.mean, independent) * (each @ each.T + (known + known.T) / 2),

@@ -9,7 +9,6 @@ import pytest
 
 from mitsonar.estimation.estimator import two_frames
 from mitsonar.estimation.image.direct import LEVELS, _resolved, registered_over_relief
-from mitsonar.estimation.image.phase import GroundView
 from mitsonar.estimation.image.registration import (
     Cells,
     DirectLevel,
@@ -23,7 +22,7 @@ from mitsonar.estimation.image.registration import (
     smoothed,
 )
 from mitsonar.estimation.named import create_estimator
-from mitsonar.geometry.ground import Attitude
+from mitsonar.geometry.ground import Attitude, GroundView
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.records.frames import SonarFrames

@@ -12,9 +12,9 @@ from helpers import box, essence, scene
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.direct import Direct
-from mitsonar.estimation.image.phase import Ecc, GroundView
+from mitsonar.estimation.image.phase import Ecc
 from mitsonar.estimation.named import Zero, create_estimator, estimators_for
-from mitsonar.geometry.ground import STD_MEASURED, Attitude, attitude_of, moved
+from mitsonar.geometry.ground import STD_MEASURED, Attitude, GroundView, attitude_of, moved
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.motion.composition import Motion, compose
