@@ -230,6 +230,8 @@ class RegressionNetwork(Network):
     """
 
     typical_size: ClassVar[Size] = (512, 192)
+    layers: nn.Sequential
+    dropout: nn.Dropout
 
     def __init__(
         self,
