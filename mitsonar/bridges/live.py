@@ -136,7 +136,8 @@ def live_pings(
         if delivered is not None:
             heard = time.monotonic()
         elif playing and time.monotonic() >= due:
-            delivered, source = _played(path, next_in_path), "path"
+            pose = Pose.from_row(float(value) for value in path.poses[next_in_path % len(path)])  # the path plays in a loop
+            delivered, source = Delivered(AskedPose(pose), time.time_ns(), 0), "path"
             next_in_path += 1
             due = max(due, time.monotonic() - 1 / rate_hz) + 1 / rate_hz  # at most one late ping is caught up
         else:
@@ -148,20 +149,10 @@ def live_pings(
         except MitsonarError as error:
             publisher.complain(f"this pose cannot be rendered: {error}")
             continue
-        ping = _ping(frames, next(numbers), delivered, source, time.perf_counter() - begun)
+        render_s, mark = time.perf_counter() - begun, delivered.asked.mark
+        ping = LivePing(frames, next(numbers), delivered.came_ns, source, mark, delivered.dropped, render_s)
         publisher.publish(ping)
         yield ping
-
-
-def _ping(frames: SonarFrames, number: int, delivered: Delivered, source: str, render_s: float) -> LivePing:
-    """Combine a frame, its delivered pose and the rendering time into a ping."""
-    return LivePing(frames, number, delivered.came_ns, source, delivered.asked.mark, delivered.dropped, render_s)
-
-
-def _played(path: Trajectory, number: int) -> Delivered:
-    """Return the next pose of a path that is played in a loop, delivered at the current time."""
-    pose = path.poses[number % len(path)]
-    return Delivered(AskedPose(Pose.from_row(float(value) for value in pose)), time.time_ns(), 0)
 
 
 # ---------------- Messages with poses

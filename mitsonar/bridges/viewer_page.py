@@ -74,16 +74,12 @@ def write_page(folder: Path) -> None:
     page, head, script = files["index.html"].decode(), "<head>\n", '<script src="re_viewer.js"></script>'
     if page.count(head) != 1 or page.count(script) != 1 or not files["re_viewer_bg.wasm"].startswith(b"\0asm"):
         raise MitsonarError("the web viewer of this rerun-sdk has another form than known: use --save, and `rerun FILE.rrd`")
-    lines = [line for line in page.splitlines(keepends=True) if "fonts.g" not in line]
-    page = _without_fonts("".join(lines)).replace(head, head + ONLY_HERE)
+    # A page without network must not wait for a font on another host: remove the link, and what is left of its element.
+    page = "".join(line for line in page.splitlines(keepends=True) if "fonts.g" not in line)
+    page = page.replace('    <link\n      rel="stylesheet"\n    />\n', "").replace(head, head + ONLY_HERE)
     files["index.html"] = page.replace(script, f"{OPEN.strip()}\n    {script}").encode()
     for name, content in files.items():
         write_whole(folder / name, content)
-
-
-def _without_fonts(page: str) -> str:
-    """Remove what is left of the link to a font on another host: a page without network must not wait for it."""
-    return page.replace('    <link\n      rel="stylesheet"\n    />\n', "")
 
 
 def _fetched(port: int, name: str, process: subprocess.Popen[bytes]) -> bytes:

@@ -74,7 +74,8 @@ class Input(_Part):
     def _of_one_kind(self) -> Self:
         plain = Input.model_construct(kind=self.kind, frames=self.frames)
         images = ("views", "layout", "coordinates", "cartesian_rows", "range_levels", "halves", "ground")
-        other = [name for name in (images if self.kind == "response" else ("leak",)) if _differ(self, plain, name)]
+        names = images if self.kind == "response" else ("leak",)
+        other = [name for name in names if getattr(self, name) != getattr(plain, name)]
         if other:
             raise ValueError(f"input.{other[0]} is not for kind {self.kind}: leave it out")
         return self
@@ -88,10 +89,6 @@ class Input(_Part):
         if not words["ground"]:
             del words["ground"]
         return words
-
-
-def _differ(one: BaseModel, other: BaseModel, name: str) -> bool:
-    return bool(getattr(one, name) != getattr(other, name))
 
 
 class Loss(_Part):

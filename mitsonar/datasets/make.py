@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.water import noise_of
 from mitsonar.config.data import Recipe
-from mitsonar.datasets.modality import Fields, Renderer, Values, empty_sentence, renderer_of
+from mitsonar.datasets.modality import Fields, Renderer, Scene, Values, empty_sentence, renderer_of
 from mitsonar.datasets.plan import (
     ImageModality,
     Plan,
-    Scene,
     footprints_at,
     modality_of,
     scenes_of,

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +107,7 @@ class Plan:
             MitsonarError: fewer than one sequence, more than the recipe has, or a footprint that does not fit its scene.
         """
         scenes = scenes_of(recipe, recipe.sequences if sequences is None else sequences)
-        flown = [(scene, one) for scene in scenes for one in _first(sequences_of(recipe, scene), scene.sequences)]
+        flown = [(scene, one) for scene in scenes for one in islice(sequences_of(recipe, scene), scene.sequences)]
         lengths = [len(one.vehicle) for _, one in flown]
         vehicle = np.concatenate([one.vehicle for _, one in flown])
         # the last frame of a sequence has no motion: the next one belongs to another sequence
@@ -159,11 +160,6 @@ def world_seed(seed: int, scene: int) -> int:
     return int(np.random.SeedSequence([seed, WORLD, scene]).generate_state(1)[0])
 
 
-def _first(sequences: Iterator[Sequence], count: int) -> list[Sequence]:
-    """Return the first ``count`` sequences of a scene."""
-    return [next(sequences) for _ in range(count)]
-
-
 def sequences_of(recipe: Recipe, scene: Scene) -> Iterator[Sequence]:
     """Yield the sequences of a scene in order; with random flights the iterator never ends.
 
@@ -208,7 +204,8 @@ def _sequence(
         pitch = math.radians(float(draw(rng, flight.pitch_deg)))
     # 2. Drive the sequence from the origin, so that each candidate only needs a rotation and a shift of its footprints.
     driven = _drive(Pose(0, 0, height), motion, flight.pings)
-    corners = _corners(recipe, height, pitch, driven)
+    reach = modality_of(recipe).reach(height, pitch)
+    corners = np.concatenate([footprints_at(driven, reach).reshape(-1, 2), driven[:, :2]])
     for _ in range(TRIES):
         # 3. Draw candidate positions and headings, and rotate all corners into the axes of the world.
         position = _positions(flight, half, rng, last)
@@ -249,12 +246,6 @@ def _kept_out(flight: Flight, x: NDArray[np.float64], y: NDArray[np.float64], he
         if low <= height <= high:
             inside |= ((left <= x) & (x <= right) & (near <= y) & (y <= far)).any(axis=1)
     return inside
-
-
-def _corners(recipe: Recipe, height: float, pitch: float, driven: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute footprint corners and positions of all pings ``(n, 2)`` [m] in the frame of the first ping."""
-    reach = modality_of(recipe).reach(height, pitch)
-    return np.concatenate([footprints_at(driven, reach).reshape(-1, 2), driven[:, :2]])
 
 
 def footprints_at(vehicle: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -199,7 +199,7 @@ def arc_elevation(
     lean = np.arctan2(above, ahead)
     with np.errstate(invalid="ignore", divide="ignore"):
         swing = np.arccos((rise - fixed) / np.hypot(ahead, above))
-    first, second = (_wrap_to_pi(lean + sign * swing) for sign in (-1, 1))
+    first, second = ((lean + sign * swing + np.pi) % (2 * np.pi) - np.pi for sign in (-1, 1))
     return np.where(np.abs(first) <= np.abs(second), first, second)
 
 
@@ -238,10 +238,6 @@ def moved(points: AnyArray, motion: AnyArray) -> AnyArray:
     cos, sin = xp.cos(yaw), xp.sin(yaw)
     x, y = points[..., 0], points[..., 1]
     return xp.stack([x * cos - y * sin - sideways, x * sin + y * cos - forward], axis=-1)
-
-
-def _wrap_to_pi(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 # ---------------- Outline of the lit ground

@@ -587,9 +587,10 @@ class Sonar(Instrument):
             )
         if self.beam_layout == "sine" and self.azimuth_fov_deg > 180:
             raise ValueError(f"beam_layout sine covers at most 180 deg: got azimuth_fov_deg {self.azimuth_fov_deg:g}")
-        if self.bearing == "cone" and self.bearing_rad[-1] + self.beam_width_rad / 2 > math.radians(90) + 1e-9:
+        outermost = self.bearing_rad[-1] + self.beam_width_rad / 2
+        if self.bearing == "cone" and outermost > math.radians(90) + 1e-9:
             raise ValueError(
-                f"a cone's beams end at 90 deg: the outermost reaches {self._outermost_deg():.4g} deg; lower "
+                f"a cone's beams end at 90 deg: the outermost reaches {math.degrees(outermost):.4g} deg; lower "
                 "azimuth_fov_deg or beam_width_deg"
             )
         if self.beams * self.range_bins > 2**28:
@@ -655,9 +656,6 @@ class Sonar(Instrument):
             if derive_rays or name not in self.model_fields_set:
                 del values[name]
         return self.create(**{**values, **fields})
-
-    def _outermost_deg(self) -> float:
-        return math.degrees(self.bearing_rad[-1] + self.beam_width_rad / 2)
 
     @property
     def beam_pattern(self) -> Pattern:

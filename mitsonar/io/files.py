@@ -325,7 +325,8 @@ def parse_yaml(text: str, source: str) -> PlainValue:
     Raises:
         MitsonarError: not YAML, a circular reference, or a depth, size or integer beyond the limits of this module.
     """
-    if _brackets(text) > MOST_BRACKETS:  # PyYAML would need seconds to reject it
+    steps = ((one in "[{") - (one in "]}") for one in text if one in "[]{}")  # those in strings and comments as well
+    if max(itertools.accumulate(steps), default=0) > MOST_BRACKETS:  # PyYAML would need seconds to reject it
         raise MitsonarError(f"{source} is not YAML: it nests more than {DEEPEST} deep")
     loader: yaml.SafeLoader | None = None
     try:
@@ -401,11 +402,6 @@ def finite_number(value: Any, name: str, above: float = -math.inf, below: float 
         under = "" if below == math.inf else f" below {below:g}"
         raise MitsonarError(f"{name} must be a finite number{over}{under}: got {shortened(value)}")
     return float(value)
-
-
-def _brackets(text: str) -> int:
-    """Return the largest number of open brackets, including those in strings and comments."""
-    return max(itertools.accumulate((one in "[{") - (one in "]}") for one in text if one in "[]{}"), default=0)
 
 
 def _check_nodes(node: yaml.Node, source: str) -> None:

@@ -129,7 +129,9 @@ def motion_errors(
     truth = in_units(true)
     error = estimate - truth
     rmse, zero = _rms(error), _rms(truth)
-    low, high = (rmse, rmse) if resamples is None else _rms_interval(error, resamples)
+    low = high = rmse
+    if resamples is not None:  # 95 % interval of the root mean square
+        low, high = np.percentile(np.sqrt((error**2)[resamples].mean(axis=1)), [2.5, 97.5], axis=0)
     size = np.abs(truth)
     large = np.where(size > LARGE * size.max(axis=0), error, np.nan)
     power = (truth**2).sum(axis=0)
@@ -185,12 +187,6 @@ def cluster_resamples(scene: ArrayLike, *, count: int = 1000, seed: int = 0) -> 
         # Draw a sequence from each of these scenes.
         row[:] = order[start[drawn_scene] + (rng.random(total) * size[drawn_scene]).astype(np.int64)]
     return table
-
-
-def _rms_interval(error: Array, resamples: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return the 95 % interval of the root mean square."""
-    low, high = np.percentile(np.sqrt((error**2)[resamples].mean(axis=1)), [2.5, 97.5], axis=0)
-    return low, high
 
 
 def _rms(error: Array) -> Array:

@@ -581,17 +581,14 @@ def _parse_readings(table: CsvTable, time: Array, name: str) -> Readings | None:
     if not known.any():
         return None
     if noise not in table.names:
-        raise MitsonarError(f"{table.path} has {name}, but not its noise: add the column {noise} ({_hint(table, noise)})")
+        hint = nearest_names(noise, [one for one in table.names if one]) if table.names else ""
+        raise MitsonarError(f"{table.path} has {name}, but not its noise: add the column {noise} ({hint})")
     first, std = _first_number(table, noise), _column(table, noise)
     std = np.where(np.isfinite(std), std, first)
     try:
         return Readings(time[known], values[known] * unit, std[known] * noise_unit)
     except MitsonarError as error:
         raise MitsonarError(f"{table.path}, column {name}: {error}") from None
-
-
-def _hint(table: CsvTable, noise: str) -> str:
-    return nearest_names(noise, [name for name in table.names if name]) if table.names else ""
 
 
 def _parse_dead_reckoning(table: CsvTable, time: Array) -> DeadReckoning:

@@ -181,7 +181,7 @@ def _pings_of(messages: Messages) -> tuple[_Pings, list[str]]:
     tables: list[Array] = []
     fan = np.full(len(messages), -1, dtype=np.intp)
     for one in np.flatnonzero(whole):
-        start, beams = _header_size(int(head["version"][one])), int(head["beams"][one])
+        start, beams = (LATER if head["version"][one] >= 2 else OLDER).itemsize, int(head["beams"][one])
         content = messages.head(int(one), start + 2 * beams)[start:]
         if content not in fans:
             table = np.frombuffer(content, "<i2") / 100.0 if len(content) == 2 * beams else np.zeros(0)
@@ -201,10 +201,6 @@ def _pings_of(messages: Messages) -> tuple[_Pings, list[str]]:
     if not len(place):
         raise MitsonarError(f"{messages.name} holds no ping of an Oculus that can be read: {'; '.join(notes)}")
     return _Pings(place, head[place], fan[place], tables), notes
-
-
-def _header_size(version: int) -> int:
-    return LATER.itemsize if version >= 2 else OLDER.itemsize
 
 
 def _fields(blocks: NDArray[np.void]) -> Header:

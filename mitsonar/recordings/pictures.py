@@ -733,9 +733,8 @@ def recording_of(pictures: Pictures, geometry: PictureGeometry, told_by: Path) -
         some = np.unique(np.linspace(0, len(kept) - 1, OUTLINE_PICTURES).astype(np.intp)) if len(kept) else kept
         if len(some):
             notes += doubts(geometry, np.max([_bytes(pictures.read(int(place))) for place in kept[some]], axis=0))
-    part = Part(
-        like, times[kept], images, attitude_rad=_attitude(geometry, len(kept)), height_m=_height(geometry, len(kept))
-    )
+    height_m = None if geometry.height_m is None else np.full(len(kept), geometry.height_m)
+    part = Part(like, times[kept], images, attitude_rad=_attitude(geometry, len(kept)), height_m=height_m)
     facts: Facts = {"pictures": len(pictures.names), "rows": pictures.shape[0], "columns": pictures.shape[1]}
     facts |= {"layout": geometry.layout, "geometry": str(told_by)} | pictures.facts
     return Recording(str(pictures.source), pictures.format, (part,), facts, tuple(notes))
@@ -887,11 +886,6 @@ def _attitude(geometry: PictureGeometry, frames: int) -> Array | None:
     if geometry.pitch_deg is None:
         return None
     return np.tile([math.radians(geometry.pitch_deg), math.radians(geometry.roll_deg), np.nan], (frames, 1))
-
-
-def _height(geometry: PictureGeometry, frames: int) -> Array | None:
-    """Return heights ``(frames,)`` [m] if the geometry gives one."""
-    return None if geometry.height_m is None else np.full(frames, geometry.height_m)
 
 
 # ---------------- Conversion to mitsonar frames

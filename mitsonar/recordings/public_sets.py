@@ -352,7 +352,8 @@ def read_uxo(path: Path) -> Recording:
     kept, sorting = in_time_order(np.where(usable, headers["time_us"] * 1e-6, np.nan), headers["index"])
     sorting = [note for note in sorting if "no valid time" not in note]
     poses, told = _uxo_poses(path / ROTATOR, headers["index"][kept])
-    keys = [(int(headers["ping_mode"][k]), int(headers["samples"][k]), *key) for k, key in _keys(headers, kept)]
+    modes, samples = headers["ping_mode"][kept].tolist(), headers["samples"][kept].tolist()
+    keys = [(*one, *window) for *one, window in zip(modes, samples, windows_of(headers[kept]), strict=True)]
     parts = tuple(_uxo_part(headers[kept[run]], files, None if poses is None else poses[run]) for _, run in runs_of(keys))
     facts: Facts = facts_of(headers[kept], BEAMS[int(headers["ping_mode"][kept[0]])]) if len(kept) else {}
     return Recording(
@@ -384,11 +385,6 @@ def _whole(headers: Header) -> NDArray[np.bool_]:
     for name, (low, high) in LIMITS.items():
         whole &= (headers[name] >= low) & (headers[name] <= high)
     return whole
-
-
-def _keys(headers: Header, kept: Index) -> list[tuple[int, tuple[float, ...]]]:
-    """Return the indices of the remaining frames, each with the values that determine its geometry."""
-    return list(zip(map(int, kept), windows_of(headers[kept]), strict=True))
 
 
 def _uxo_part(mine: Header, files: dict[int, Path], poses: Array | None) -> Part:

@@ -17,7 +17,6 @@ from mitsonar.records.frames import SonarFrames
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
-    from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
 
 __all__ = [
@@ -116,16 +115,14 @@ class BagFile:
         """
         with self._readable():
             reader = self._open()
-            for _, time, raw in reader.messages(self._connections(topic), start=start, stop=stop):
+            connections = [one for one in reader.connections if one.topic == topic]
+            for _, time, raw in reader.messages(connections, start=start, stop=stop):
                 yield time, bytes(raw)
 
     def decode(self, raw: bytes, kind: str) -> Message:
         """Decode a raw message of the given type."""
         with self._readable():
             return self._open().deserialize(raw, kind)
-
-    def _connections(self, topic: str) -> list[Connection]:
-        return [one for one in self._open().connections if one.topic == topic]
 
     def _open(self) -> AnyReader:
         if self._reader is not None:

@@ -76,8 +76,9 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     # 3. Make a part of each run of frames with the same layout.
     parts = []
     for number, run in runs_of(numbers.tolist()):
-        part = _part(scan, kept[run], scan.layouts[int(str(number))], coding)
-        part = with_motion(part, motion, run)
+        layout = scan.layouts[int(str(number))]
+        like, images = _like(layout, times[run], scan.topic.name), _Frames(scan, kept[run], layout, coding)
+        part = with_motion(Part(like, times[run], images), motion, run)
         if written is not None:
             like, span_db = written
             part = replace(part, like=like, images=part.images if span_db is None else _Levels(part.images, span_db))
@@ -161,12 +162,6 @@ def _coding(scan: TopicScan, kept: Index, notes: list[str]) -> Coding:
     if major:
         notes.append("samples are in the order of beams, unlike those of drivers, by how they correlate")
     return Coding(major, scale)
-
-
-def _part(scan: TopicScan, places: Index, layout: PingLayout, coding: Coding) -> Part:
-    """Return a part whose frames have the same layout."""
-    time_s = scan.frame_times()[places]
-    return Part(_like(layout, time_s, scan.topic.name), time_s, _Frames(scan, places, layout, coding))
 
 
 @dataclass(frozen=True)
