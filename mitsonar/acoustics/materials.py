@@ -205,7 +205,7 @@ def hearing_notes(materials: Sequence[Material], frequency_hz: float | None, sou
 # Mean grain sizes from -1 phi (sandy gravel) to 9 phi (clay) are mapped to the parameters of a rough fluid. The regressions
 # are those of APL-UW TR 9407 (1994), section IV, which could not be consulted: they are quoted from memory of the
 # literature. At 0.5, 1.5, 2.5 and 6 phi they reproduce the numbers of a program by D. R. Jackson as contained in the project
-# hyo2_openbst, an independent source (``tests/acoustics/test_grain_size.py``). They are valid from 10 to 100 kHz.
+# hyo2_openbst, an independent source (``tests/acoustics/test_materials.py``). They are valid from 10 to 100 kHz.
 
 
 COARSEST_PHI, FINEST_PHI = -1.0, 9.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal.windows import taylor
 
-from mitsonar.instruments.beams import SHADINGS, Aperture, Shading, series
+from mitsonar.instruments.beams import SHADINGS, Aperture, Pulse, Shading, series
 
 LOBES_DB = {"uniform": -13.26, "hann": -31.47, "hamming": -42.68, "taylor": -30.3}
 """Highest side lobe of each shading (Harris 1978, table 1; Taylor by design)."""
@@ -59,3 +59,29 @@ def test_reach_ends_the_side_lobes() -> None:
     aperture = Aperture(0.01, "hann", False)
     beyond = np.linspace(aperture.reach(40), 30 / aperture.length, 10_000)
     assert 20 * np.log10(np.abs(aperture.pattern(beyond[1:])).max()) <= -40
+
+
+# ---------------------------------------------------------------- the compressed pulse: width, side lobes, and the transfor
+
+
+def test_half_power_at_half_the_resolution() -> None:
+    assert Pulse(0.02).shape(0.01) ** 2 == pytest.approx(0.5, abs=1e-9)
+    r = np.linspace(0.03, 0.2, 10_000)
+    assert 20 * np.log10(np.abs(Pulse(0.02).shape(r)).max()) == pytest.approx(-31.5, abs=0.1)
+
+
+def test_it_is_the_transform_of_its_band() -> None:
+    band, speed = 30e3, 1480.0
+    pulse = Pulse.of_band(band, speed)
+    assert pulse.bandwidth_hz(speed) == pytest.approx(band)
+    f = (np.arange(4001) / 4000 - 0.5) * band
+    weight = 1 + np.cos(2 * np.pi * f / band)
+    r = np.linspace(-0.1, 0.1, 101)
+    sums = np.trapezoid(weight * np.cos(2 * np.pi * f * (2 * r[:, None] / speed)), f, axis=1) / band
+    np.testing.assert_allclose(pulse.shape(r), sums, atol=1e-6)
+
+
+def test_equivalent_length_is_the_energy() -> None:
+    # Parseval: 1.5 / B in delay for Hann's window, so 1.5 c / 2B in range
+    pulse = Pulse.of_band(50e3, 1500.0)
+    assert pulse.equivalent_m == pytest.approx(1.5 * 1500 / (2 * 50e3), rel=1e-4)

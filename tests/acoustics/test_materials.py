@@ -13,20 +13,30 @@ from scipy import integrate
 from scipy.special import j0
 
 from mitsonar.acoustics.materials import (
+    FLATTEST,
     GRAZING_DEG,
     LARGEST_MU,
     LAWS,
+    SEDIMENTS,
     Material,
     Sediment,
     band_warning,
+    depends_on_frequency,
+    hearing_notes,
     material,
     mirror_amplitude,
+    mu_at,
+    mu_table,
     named_materials,
+    normal_mu,
+    reference_hz,
     reflection,
     rough_fluid_sigma,
     roughness_sigma,
+    sediment_of,
     sigma_at,
     sigma_table,
+    single_mu,
     structure_constant,
     structure_integral,
     volume_sigma,
@@ -338,3 +348,142 @@ def test_create_takes_no_nonsense() -> None:
     for fields in nonsense:
         with pytest.raises(MitsonarError):
             Material.create(**fields)
+
+
+# ---------------------------------------------------------------- materials as rays read them: closed forms, bounds, the fr
+
+SINES = np.sin(np.radians(np.linspace(0.1, 90, 900)))
+TABULATED = Material(law="table", strength_db=tuple((-40 + 25 * np.sin(np.radians(GRAZING_DEG))).tolist()))
+
+
+def test_lambert_is_one_number_and_lommel_seeliger_goes_with_the_sine() -> None:
+    np.testing.assert_allclose(mu_at(mu_table(Material(mu=0.1), 1e6), [0.0, *SINES]), 0.1, rtol=1e-14)
+    lommel = mu_at(mu_table(Material(law="lommel-seeliger", mu=0.05), 1e6), SINES)
+    np.testing.assert_allclose(lommel, 0.05 / SINES, rtol=1e-14)
+
+
+def test_a_table_is_linear_in_sigma() -> None:
+    steep = SINES[SINES > 0.2]
+    np.testing.assert_allclose(
+        mu_at(mu_table(TABULATED, 1e6), steep) * steep**2, sigma_at(TABULATED, steep, 1e6), rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize("name", ["sand", "gravel", "steel", "wood"])
+def test_whole_degrees_meet_the_law(name: str) -> None:
+    one, sine = material(name), np.sin(np.radians(GRAZING_DEG[1:]))
+    got = mu_at(mu_table(one, 3e5), sine) * sine**2
+    np.testing.assert_allclose(got, np.minimum(sigma_table(one, 3e5)[1:], sine), rtol=1e-9)
+
+
+def test_no_level_exceeds_1() -> None:
+    loud = Material(law="table", strength_db=(60.0,) * 91)
+    cosine = np.concatenate([[0, 1e-9, FLATTEST / 2], SINES])
+    got = mu_at(mu_table(loud, 1e6), cosine)
+    assert np.isfinite(got).all()
+    assert (got * cosine).max() <= 1 + 1e-12
+
+
+def test_one_number_for_all_angles() -> None:
+    assert single_mu(material("steel")) == material("steel").mu
+    assert normal_mu(material("steel"), 1e6) == material("steel").mu
+    assert single_mu(TABULATED) == pytest.approx(2 * 10 ** (TABULATED.strength_db[45] / 10))  # type: ignore[index]
+    assert normal_mu(TABULATED, 1e6) == pytest.approx(10 ** (-15 / 10))
+    assert single_mu(material("sand"), 5e4) == pytest.approx(2 * sigma_table(material("sand"), 5e4)[45])
+
+
+def test_the_frequency_where_none_is_given() -> None:
+    assert reference_hz(material("sand")) == pytest.approx(np.sqrt(10e3 * 100e3))
+    assert reference_hz(Material(mu=0.1)) == 100e3
+    assert reference_hz(Material(mu=0.1, frequency_max_hz=5e4)) == 5e4
+    assert reference_hz(Material(mu=0.1, frequency_min_hz=2e5)) == 2e5
+    assert [depends_on_frequency(one) for one in (material("sand"), material("steel"), Material(mu=0.1), TABULATED)] == [
+        *(True, True, False, False)
+    ]
+
+
+def test_what_users_are_told() -> None:
+    assert hearing_notes([material("steel"), Material(mu=0.1), TABULATED], 1e6) == []
+    assert hearing_notes([Material(mu=0.1), TABULATED], None) == []
+    (lacking,) = hearing_notes([material("sand")], None)
+    assert "no frequency_hz" in lacking
+    assert "31.62 kHz" in lacking
+    (outside,) = hearing_notes([material("sand")], 1e6)
+    assert "1,000 kHz is extrapolated" in outside
+    loud = Material(name="loud", law="table", strength_db=(-30.0,) * 80 + (3.0,) * 11)
+    (clipped,) = hearing_notes([loud], 1e6)
+    assert "material loud" in clipped
+    assert "from 80 to 90 deg" in clipped
+
+
+# ---------------------------------------------------------------- sediments by their grain size, against numbers that reach
+
+JACKSON = {  # density, speed, loss, spectral strength in the project hyo2_openbst, after a program of D. R. Jackson
+    0.5: (2.231, 1.2503, 0.01638, 2.2e-4),
+    1.5: (1.845, 1.1782, 0.01624, 1.406e-4),
+    2.5: (1.451, 1.1072, 0.01602, 8.6e-5),
+    6.0: (1.149, 0.9873, 0.00386, 1.64e-5),
+}
+
+
+@pytest.mark.parametrize("phi", JACKSON)
+def test_the_regressions_meet_numbers_of_another_source(phi: float) -> None:
+    made, wanted = sediment_of(phi), JACKSON[phi]
+    assert (made.density_ratio, made.sound_speed_ratio) == pytest.approx(wanted[:2], abs=6e-4)
+    assert made.loss == pytest.approx(wanted[2], rel=2e-3)
+    assert made.spectral_strength == pytest.approx(wanted[3], rel=5e-3)
+
+
+@pytest.mark.parametrize("name", ["sand", "mud"])
+def test_named_materials_lie_on_them(name: str) -> None:
+    phi = {"sand": 1.5, "mud": 6.0}[name]
+    own, made = material(name), sediment_of(phi)
+    for key, value in made._asdict().items():
+        assert getattr(own, key) == pytest.approx(value, rel=5e-3), key
+
+
+def test_joints_of_the_regressions_are_small() -> None:
+    """Steps where one polynomial ends and the next begins: 10 % at 1 phi (density) and 5 phi (roughness), 2 % elsewhere."""
+    for joint, allowed in ((0.0, 0.002), (1.0, 0.11), (2.6, 0.01), (4.5, 0.01), (5.0, 0.1), (5.3, 0.02), (6.0, 0.02)):
+        below, above = sediment_of(joint - 1e-9), sediment_of(joint + 1e-9)
+        for key in ("density_ratio", "sound_speed_ratio", "loss", "spectral_strength"):
+            assert getattr(below, key) == pytest.approx(getattr(above, key), rel=allowed), (joint, key)
+
+
+def test_coarser_grains_reflect_more() -> None:
+    facing = np.array([math.pi / 2])
+    found = [abs(reflection(sediment_of(phi), facing)[0]) for phi in SEDIMENTS.values()]
+    assert np.all(np.diff(found) < 1e-3)
+    assert 0.3 < found[2] < 0.55
+    assert found[-1] < 0.1
+
+
+def test_a_file_names_the_grain_size(tmp_path: Path) -> None:
+    path = tmp_path / "fine.yaml"
+    path.write_text("grain_size_phi: 2.5\n")
+    made = material(path)
+    assert (made.law, made.name) == ("rough-fluid", "fine")
+    assert (made.loss, made.spectral_exponent) == (sediment_of(2.5).loss, 3.25)
+    assert made.band_hz == (10e3, 100e3)
+    assert np.isfinite(sigma_table(made, 50e3)).all()
+    path.write_text("grain_size_phi: 2.5\nloss: 0.02\n")
+    assert material(path).loss == 0.02
+    assert material(path).density_ratio == sediment_of(2.5).density_ratio
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("grain_size_phi: 9.5\n", r"must lie in -1\.\.9, sandy gravel to clay: got 9\.5"),
+        ("grain_size_phi: .nan\n", r"must lie in -1\.\.9"),
+        ("grain_size_phi: fine\n", "grain_size_phi in .* must be a number: got 'fine'"),
+        ("grain_size_phi: true\n", "must be a number: got True"),
+        ("grain_size_phi: 2\nmaterial: sand\n", "grain_size_phi and material both set the parameters"),
+        ("grain_size_phi: 2\nlaw: lambert\nmu: 0.1\n", "law lambert has no key"),
+    ],
+)
+def test_bad_grain_sizes(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(MitsonarError, match=message):
+        material(path)
