@@ -200,7 +200,7 @@ def arc_elevation(
     with np.errstate(invalid="ignore", divide="ignore"):
         swing = np.arccos((rise - fixed) / np.hypot(ahead, above))
     first, second = ((lean + sign * swing + np.pi) % (2 * np.pi) - np.pi for sign in (-1, 1))
-    return np.where(np.abs(first) <= np.abs(second), first, second)
+    return np.asarray(np.where(np.abs(first) <= np.abs(second), first, second))
 
 
 def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -14,7 +14,7 @@ __all__ = ["CheckedModel", "Preset", "presets_in"]
 
 
 if TYPE_CHECKING:  # editors and mypy then infer arguments from the fields of a model, not from its metaclass
-    Checked = BaseModel
+    from pydantic import BaseModel as Checked  # no alias: mypy's plugin would not see the configuration of CheckedModel
 else:
 
     class OneSentence(type(BaseModel)):
