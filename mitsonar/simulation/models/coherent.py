@@ -153,15 +153,9 @@ class CoherentImager:
             ping: ping number, which determines the noise.
             time_s: time at which moving bodies are placed [s].
         """
-        images, counts = zip(*(self._of_side(pose, ping, side, time_s) for side in self.sides), strict=True)
+        silent, counts = zip(*(self.echoes(pose, side, time_s) for side in self.sides), strict=True)
+        images = [self.receiver.add(image, ping, side) for image, side in zip(silent, self.sides, strict=True)]
         return np.concatenate(images, axis=1) if len(images) > 1 else images[0], FieldCounts.joined(counts)
-
-    def _of_side(
-        self, pose: NDArray[np.float64], ping: int, side: int, time_s: float
-    ) -> tuple[NDArray[np.complex64], FieldCounts]:
-        """Return the complex image of one side of the elevation ``(bins, beams)`` with its noise, and its ray counts."""
-        image, counts = self.echoes(pose, side, time_s)
-        return self.receiver.add(image, ping, side), counts
 
     def echoes(
         self, pose: NDArray[np.float64], side: int | None = None, time_s: float = 0.0
@@ -177,9 +171,7 @@ class CoherentImager:
         """
         # field of the scatterers, then of mirror images and paths of several reflections
         field, counts = (self.tracer if side is None else self.tracers[side]).field(pose, time_s)
-        if self.glints is not None:
-            self.glints.add(pose, field, time_s)
-        for further in (self.ghosts, self.corners, self.diffuse):
+        for further in (self.glints, self.ghosts, self.corners, self.diffuse):
             if further is not None:
                 further.add(pose, field, time_s)
         # beams and bins, absorption, and the crosstalk of all beams
