@@ -589,5 +589,5 @@ def _run_sensor(
 def _sensor_settings(sensor: Mounted) -> dict[str, Any]:
     """Return the keys and the mount that describe a sensor."""
     one = sensor.instrument
-    known = isinstance(one, Sonar | Sounder | ChannelSonar)
-    return {"keys": one.model_dump(mode="json") if known else told_of(one), "mount": list(sensor.mount)}
+    keys = one.model_dump(mode="json") if isinstance(one, Sonar | Sounder | ChannelSonar) else told_of(one)
+    return {"keys": keys, "mount": list(sensor.mount)}
