@@ -25,7 +25,6 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from datetime import date
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -67,7 +66,8 @@ from mitsonar.datasets.plan import run_poses
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named import create_estimator
-from mitsonar.mapping.odometry import odometry
+from mitsonar.mapping.odometry import OdometryOptions, odometry
+from mitsonar.mapping.pairs import EstimateStore
 from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
 from mitsonar.mapping.series import MotionSeries, kalman_smoothed, path_of, pose_covariances, spline_smoothed
 from mitsonar.motion.composition import motions
@@ -366,9 +366,13 @@ def mapped_paths(job: Job, frames: SonarFrames, found: list[Estimate]) -> dict[s
     """Return the errors with a local map, and with a gyroscope beside it."""
     assert frames.poses is not None
     true = Trajectory(frames.poses, frames.time_s)
-    pipeline = partial(odometry, frames, create_estimator(job.method), known=dict(enumerate(found)), local_map=True)
-    ways = {"map": pipeline(), "map, gyroscope": pipeline(sensors=simulated_sensors(true, GYRO, seed=0))}
-    return {name: path_errors(way.path, true, way.pose_covariances) for name, way in ways.items()}
+    store = EstimateStore(dict(enumerate(found)))
+    sensors = {"map": None, "map, gyroscope": simulated_sensors(true, GYRO, seed=0)}
+    paths = {
+        name: odometry(frames, job.method, OdometryOptions(local_map=True, sensors=one), store=store)
+        for name, one in sensors.items()
+    }
+    return {name: path_errors(one.path, true, one.pose_covariances) for name, one in paths.items()}
 
 
 def path_errors(path: Trajectory, true: Trajectory, covariances: Array | None) -> dict[str, float]:

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypedDict
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -18,11 +18,8 @@ from mitsonar.io.files import write_whole
 from mitsonar.io.runs import kind_of_run, refuse_to_replace
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from mitsonar.estimation.crlb.report import Subject, Value
+    from mitsonar.estimation.crlb.report import Value
     from mitsonar.estimation.height import HeightEstimate
-    from mitsonar.mapping.mosaic import Mosaic
     from mitsonar.mapping.open_source import ViewSource
     from mitsonar.mapping.sources import FrameSource
     from mitsonar.motion.trajectory import Trajectory
@@ -224,7 +221,7 @@ def mosaic(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
     """Lay frames on the ground plane along a path: mean level, standard deviation and count of each cell."""
-    from mitsonar.mapping.mosaic import MosaicOptions, build_mosaic, illumination, save_geotiff
+    from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, MosaicOptions, build_mosaic, illumination, save_geotiff
     from mitsonar.mapping.odometry_run import ODOMETRY
     from mitsonar.mapping.open_source import Reading, frames_for, with_assumed_plane
     from mitsonar.mapping.sources import is_recording
@@ -258,7 +255,7 @@ def mosaic(
     heights = source.height_m[index]
     light = None
     if flatten:
-        some = _spread(len(index))
+        some = np.unique(np.linspace(0, len(index) - 1, min(ILLUMINATION_FRAMES, len(index))).astype(np.intp))
         light = illumination(source.read(index[some]), poses[some], heights[some])
     with progress_bar("laying", len(index), "frames") as progress:
         found = build_mosaic(_counted(source.chunks(index), progress), poses, heights, options, illumination=light)
@@ -269,7 +266,11 @@ def mosaic(
     if quality is None:
         save_geotiff(out, found)
     else:
-        _save_figures(out, quality, found, paths, source, laid_along)
+        from mitsonar.plotting.figures import mosaic_figure, quality_figure, save_figure
+
+        name = Path(source.name).name
+        save_figure(out, mosaic_figure(found, paths, title=f"{name}, along the {laid_along} path"))
+        save_figure(quality, quality_figure(found, title=name))
     rows, columns = found.mean.shape
     spread = float(np.nanmedian(found.std)) if np.isfinite(found.std).any() else float("nan")
     say(
@@ -321,27 +322,10 @@ def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Tr
     return paths, height
 
 
-def _spread(count: int) -> NDArray[np.intp]:
-    """Choose the frames that the illumination is estimated from."""
-    from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES
-
-    return np.unique(np.linspace(0, count - 1, min(ILLUMINATION_FRAMES, count)).astype(np.intp))
-
-
 def _counted(chunks: Iterator[SonarFrames], progress: Callable[[int], None]) -> Iterator[SonarFrames]:
     for chunk in chunks:
         yield chunk
         progress(len(chunk))
-
-
-def _save_figures(
-    out: Path, quality: Path, found: Mosaic, paths: dict[str, Trajectory], source: FrameSource, along: str
-) -> None:
-    from mitsonar.plotting.figures import mosaic_figure, quality_figure, save_figure
-
-    name = Path(source.name).name
-    save_figure(out, mosaic_figure(found, paths, title=f"{name}, along the {along} path"))
-    save_figure(quality, quality_figure(found, title=name))
 
 
 # ---------------- ``mitsonar height``: estimate the height over the ground of each frame, from the frames alone
@@ -438,16 +422,6 @@ def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | Non
 # data set
 
 
-class _RequestedPoses(TypedDict):
-    """Options that define the poses in a scene."""
-
-    start: str | None
-    end: str | None
-    count: int | None
-    file: Path | None
-    frame: str
-
-
 @answered
 def crlb(
     source: Annotated[
@@ -497,12 +471,18 @@ def crlb(
     With --vary the gain is computed for each value. If height, pitch or a field of view varies, both ends of the range
     window follow the nearest and farthest range of the floor. The number of bins stays.
     """
-    from mitsonar.estimation.crlb.report import BoundOptions, bounds_report, report_lines, subject_of_data
+    from mitsonar.estimation.crlb.report import (
+        BoundOptions,
+        bounds_report,
+        report_lines,
+        subject_of_data,
+        subject_of_scene,
+    )
     from mitsonar.motion.trajectory import convention_named
+    from mitsonar.simulation.scene import load_scene
 
     name, values = _variable(vary)
     options = BoundOptions(noise=noise, height_m=height, vary=name, values=values, gain=gain, pings=pings)
-    requested: _RequestedPoses = {"start": start, "end": end, "count": poses, "file": trajectory, "frame": frame}
     convention_named(frame)
     if Path(source).suffix == ".zarr" or "://" in source:
         scene_only = (start, end, poses, trajectory, sonar, model, segments, parameter)
@@ -510,7 +490,11 @@ def crlb(
             raise MitsonarError(f"{source} is a data set, which has its own sonar, poses and segments: give none of them")
         subject = subject_of_data(source, pairs, part=part, seed=seed)
     else:
-        subject = _of_scene(source, sonar, model, seed, segments, scene_parameters(parameter or []), requested)
+        loaded = load_scene(source, **scene_parameters(parameter or []))
+        instrument, attitude = instrument_for(loaded, sonar, sonar_changes(None, None, model, seed))
+        count = poses or (20 if trajectory else None)
+        path = path_for(instrument, attitude, source, count, start, end, trajectory, frame)
+        subject = subject_of_scene(loaded, instrument, path.poses, segments=segments.split(",") if segments else [])
     noiseless = options.noise_for(subject.sonar).scale == 0 and subject.sonar.model != "coherent"
     with progress_bar("differentiating", subject.poses * max(1, len(values)), "poses") as progress:
         report = bounds_report(source, subject, options, progress)
@@ -556,26 +540,6 @@ def _variable(text: str | None) -> tuple[str | None, list[Value]]:
         example = "3.2..5.6,3..6" if name == "window" else "1,2.5,4"
         raise MitsonarError(f"--vary {name} takes numbers as {example}: got {rest!r}") from None
     return name, values
-
-
-def _of_scene(
-    source: str,
-    sonar: str | None,
-    model: str | None,
-    seed: int | None,
-    segments: str | None,
-    parameters: dict[str, str],
-    poses: _RequestedPoses,
-) -> Subject:
-    """Load a scene and the poses that the options define."""
-    from mitsonar.estimation.crlb.report import subject_of_scene
-    from mitsonar.simulation.scene import load_scene
-
-    loaded = load_scene(source, **parameters)
-    instrument, attitude = instrument_for(loaded, sonar, sonar_changes(None, None, model, seed))
-    count = poses["count"] or (20 if poses["file"] else None)
-    path = path_for(instrument, attitude, source, count, poses["start"], poses["end"], poses["file"], poses["frame"])
-    return subject_of_scene(loaded, instrument, path.poses, segments=segments.split(",") if segments else [])
 
 
 # ---------------- ``mitsonar compare``: estimators on the same pairs of a data set

@@ -215,37 +215,24 @@ def answers_of(
         keep_every: number of pairs between calls of ``keep``.
         progress: called with the number of pairs finished since the last call.
     """
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        return _answers_of(estimators, pairs, numbers, variation, known, keep, keep_every, progress)
-    finally:
-        cv2.setNumThreads(threads)
-
-
-def _answers_of(
-    estimators: Mapping[str, AnyEstimator],
-    pairs: Samples,
-    numbers: Sequence[int],
-    variation: str,
-    known: dict[str, Answers] | None,
-    keep: Callable[[dict[str, Answers]], None] | None,
-    keep_every: int,
-    progress: Callable[[int], object] | None,
-) -> dict[str, Answers]:
     table = {name: (known or {}).get(name) or Answers.unasked(len(numbers)) for name in estimators}
     index = {number: k for k, number in enumerate(numbers)}
     missing = [number for number in numbers if not all(table[name].asked[index[number]] for name in estimators)]
     if progress is not None:
         progress(len(numbers) - len(missing))
-    for count, (number, frames) in enumerate(frames_of(pairs, missing, variation), start=1):
-        for name, estimator in estimators.items():
-            if not table[name].asked[index[number]]:
-                table[name].ask(index[number], estimator, frames)
-        if progress is not None:
-            progress(1)
-        if keep is not None and count % keep_every == 0:
-            keep(table)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        for count, (number, frames) in enumerate(frames_of(pairs, missing, variation), start=1):
+            for name, estimator in estimators.items():
+                if not table[name].asked[index[number]]:
+                    table[name].ask(index[number], estimator, frames)
+            if progress is not None:
+                progress(1)
+            if keep is not None and count % keep_every == 0:
+                keep(table)
+    finally:
+        cv2.setNumThreads(threads)
     if keep is not None:
         keep(table)
     return table

@@ -351,10 +351,10 @@ def search_loops(
     source: FrameSource,
     estimator: AnyEstimator,
     numbers: Index,
+    store: EstimateStore,
     solution: GraphSolution,
     errors: ErrorCorrelation,
     canvas: Canvas,
-    store: EstimateStore,
 ) -> LoopSearch:
     """Search a path for loops, by appearance and registration.
 
@@ -366,10 +366,10 @@ def search_loops(
         source: source of the frames.
         estimator: registers two frames, with the motion found by appearance as prior.
         numbers: numbers of the frames used ``(frames,)``.
+        store: registrations of an earlier run, to which new ones are added.
         solution: solution of the pose graph without loops.
         errors: correlation of errors over the same ground, by which neighbouring loops count as fewer.
         canvas: canvas from :func:`canvas_of`.
-        store: registrations of an earlier run, to which new ones are added.
 
     Raises:
         MitsonarError: frames cannot be read, or lack height or pitch.

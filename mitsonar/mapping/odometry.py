@@ -14,7 +14,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -55,7 +55,6 @@ __all__ = [
     "Closure",
     "GraphPath",
     "HeightProfile",
-    "LoopTask",
     "Odometry",
     "OdometryOptions",
     "Row",
@@ -178,7 +177,7 @@ def odometry(
             first,
             start_known=options.start is not None or source.poses is not None,
             sensors=sensors,
-            loops=LoopTask(estimator, numbers, store) if options.loops else None,
+            search=None if not options.loops or shown is None else partial(search_loops, shown, estimator, numbers, store),
             source=shown,
             by_map=np.array([one.about.get("map") == USED for one in estimates], dtype=bool),
         )
@@ -516,21 +515,6 @@ MEASURED = 0.5
 
 
 @dataclass(frozen=True)
-class LoopTask:
-    """Request for a search for loops.
-
-    Attributes:
-        estimator: registers two frames.
-        numbers: numbers of the frames used ``(frames,)``.
-        store: registrations of an earlier run, to which new ones are added.
-    """
-
-    estimator: AnyEstimator
-    numbers: Index
-    store: EstimateStore
-
-
-@dataclass(frozen=True)
 class GraphPath:
     """A path computed by a pose graph.
 
@@ -616,7 +600,7 @@ def graph_path(
     *,
     start_known: bool,
     sensors: VehicleSensors | None,
-    loops: LoopTask | None,
+    search: Callable[[GraphSolution, ErrorCorrelation, Canvas], LoopSearch] | None,
     source: FrameSource | None,
     by_map: NDArray[np.bool_] | None = None,
 ) -> GraphPath:
@@ -627,7 +611,7 @@ def graph_path(
         start: first pose.
         start_known: whether the heading of the first pose is known; otherwise a compass determines it, if there is one.
         sensors: sensors of the vehicle, if any.
-        loops: request for a search for loops; None for none.
+        search: searches for loops, given the solution without them; None for no search.
         source: source of the frames if they show the ground, from which the distance of the ground is known.
         by_map: whether each motion comes from a local map ``(motions,)``, whose errors are not correlated with those of
             pairs of frames. None: no map.
@@ -650,13 +634,13 @@ def graph_path(
     graph = replace(graph, correlated=correlated._replace(onward=onward))
     # 3. solve without loops; its covariances guide the search for loops, with which the graph is solved again
     before = after = solved(graph)
-    search = None
-    if loops is not None:
-        if source is None or canvas is None:
+    loops = None
+    if search is not None:
+        if canvas is None:
             raise MitsonarError("a search for loops needs frames that show level ground: give the height and the pitch")
-        search = search_loops(source, loops.estimator, loops.numbers, before, errors, canvas, loops.store)
-        after = _closed(replace(graph, start=before.poses), search, before)
-    return _path_of(after, before, measured.time_s, start, sensors, search)
+        loops = search(before, errors, canvas)
+        after = _closed(replace(graph, start=before.poses), loops, before)
+    return _path_of(after, before, measured.time_s, start, sensors, loops)
 
 
 def _closed(graph: PoseGraph, search: LoopSearch, before: GraphSolution) -> GraphSolution:

@@ -322,7 +322,7 @@ def test_errors_of_the_map_say_nothing_of_those_of_two_frames() -> None:
     measured = MotionSeries(motions, time, covariances)
     true = path_of(np.tile([0.02, 0.0, 0.0], (count, 1)), Pose(0, 0, 2.5, 0.6, 0, 0), time)
     gyroscope = simulated_sensors(true, SensorNoise(gyro_deg_rth=0.01), seed=0)
-    graph = partial(graph_path, start_known=True, sensors=gyroscope, loops=None, source=None)
+    graph = partial(graph_path, start_known=True, sensors=gyroscope, search=None, source=None)
     start = Pose(*true.poses[0])
     apart = graph(measured, start, by_map=by_map)
     alike = graph(measured, start)
