@@ -10,7 +10,7 @@ import griffe
 ROOT = Path(__file__).resolve().parents[1]
 
 
-class PackagesElsewhere(griffe.Extension):
+class PackagesElsewhere(griffe.Extension):  # type: ignore[misc, unused-ignore]  # Any where griffe is not installed
     """Adds ``mitsonar.reproduction``, where the public names of reproduction are defined."""
 
     def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
