@@ -5,7 +5,7 @@
 Runs five commands on small inputs, each in a process of its own with `sys.settrace`, and counts the files of mitsonar that
 were entered and the distinct lines that were run. A file of which fewer than MUCH lines run is entered in passing. Lines of
 imports and class bodies do not count. The code is only reached through `python -m mitsonar`, so that a checkout of another
-version can be traced (`--house`). `--quick` traces two commands.
+version can be traced (`--house`). `--quick` traces two commands. Ends with code 1 if a path exceeds its budget by a tenth.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import argparse
 import ast
 import inspect
 import json
+import math
 import os
 import runpy
 import subprocess
@@ -36,7 +37,7 @@ RECIPE = """\
 """
 
 RUN = ("render", "pattern", "--frames", "2", "--from=0,-4,2.5,35,0,0", "--to=0.01,-3.99,2.5,35,0,0", "-o", "run")
-WAYS: dict[str, tuple[str, ...]] = {
+PATHS: dict[str, tuple[str, ...]] = {
     "XML to frames": RUN,
     "pair to path": ("odometry", "run", "--workers", "1", "-o", "path"),
     "frames to mosaic": ("mosaic", "run", "path", "-o", "map.png"),
@@ -46,8 +47,11 @@ WAYS: dict[str, tuple[str, ...]] = {
         *("--pairs", "8", "--workers", "0", "-o", "checkpoint"),
     ),
 }
+BUDGET = {"XML to frames": (53, 1_800), "pair to path": (35, 1_700)}
+"""Files entered and lines run that a path may have, and a tenth more."""
+
 MADE_FIRST = {"recipe to checkpoint": ("dataset", "make", "tiny.yaml", "--workers", "1", "-o", "tiny.zarr")}
-"""Input of a way that no way before it makes."""
+"""Input of a path that no path before it makes."""
 
 
 def main() -> None:
@@ -60,20 +64,24 @@ def main() -> None:
     house = asked.house.resolve()
     if asked.child:
         return traced(house, Path(asked.child[0]), asked.child[1:])
-    print(f"| way | files entered | of these {MUCH} lines or more | lines run |\n|---|---|---|---|")
-    for name, lines in ways(house, 2 if asked.quick else len(WAYS)):
+    exceeded: list[str] = []
+    print(f"| path | files entered | of these {MUCH} lines or more | lines run |\n|---|---|---|---|")
+    for name, lines in paths(house, 2 if asked.quick else len(PATHS)):
         much = sum(count >= MUCH for count in lines.values())
         print(f"| {name} | {len(lines)} | {much} | {sum(lines.values()):,} |", flush=True)
+        exceeded += [name] if exceeds_budget(name, lines) else []
     print("\n| code | count |\n|---|---|")
     for name, count in counts(house):
         print(f"| {name} | {count} |")
+    if exceeded:
+        sys.exit(f"these paths exceed their BUDGET by more than a tenth: {', '.join(exceeded)}")
 
 
 # ---------------------------------------------------------------- tracing
 
 
-def ways(house: Path, many: int) -> Iterable[tuple[str, dict[str, int]]]:
-    """Name of each way and the lines run of each file that it entered."""
+def paths(house: Path, many: int) -> Iterable[tuple[str, dict[str, int]]]:
+    """Yield the name of each path and the lines run in each file that it enters."""
     environment = {**os.environ, "PYTHONPATH": str(house), "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "tiny.yaml").write_text(RECIPE, encoding="utf-8")
@@ -83,11 +91,17 @@ def ways(house: Path, many: int) -> Iterable[tuple[str, dict[str, int]]]:
             if done.returncode:
                 raise SystemExit(f"{' '.join(words)}\n{done.stdout}{done.stderr}")
 
-        for name, words in list(WAYS.items())[:many]:
+        for name, words in list(PATHS.items())[:many]:
             if name in MADE_FIRST:
                 run("-m", "mitsonar", *MADE_FIRST[name])
             run(__file__, "--house", str(house), "--child", "lines.json", *words)
             yield name, json.loads(Path(folder, "lines.json").read_text(encoding="utf-8"))
+
+
+def exceeds_budget(name: str, lines: dict[str, int]) -> bool:
+    """Return whether a path enters more files or runs more lines than its budget and a tenth."""
+    files, run = BUDGET.get(name, (math.inf, math.inf))
+    return len(lines) > 1.1 * files or sum(lines.values()) > 1.1 * run
 
 
 def traced(house: Path, out: Path, words: list[str]) -> None:
