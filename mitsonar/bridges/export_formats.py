@@ -98,36 +98,36 @@ def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) 
                     like.shape_names[region.shape] if region.shape < len(like.shape_names) else f"shape {region.shape}",
                     like.object_names[region.number] if region.number < len(like.object_names) else "",
                 )
-                found = _annotation(count, shot.number + 1, region, names, (rows, columns))
-                tables[shot.part][1].write(f"{json_line(found)}\n")
+                record = _annotation(count, shot.number + 1, region, names, (rows, columns))
+                tables[shot.part][1].write(f"{json_line(record)}\n")
             yield 1
     # 2. Join the temporary files of each part into one JSON document.
     pictures.refuse_none(source.frames)
     table = [{"id": kind + 1, "name": name, "supercategory": "shape"} for kind, name in enumerate(pictures.classes)]
     about = {"description": source.about or source.name, "contributor": "mitsonar", "picture": pictures.picture_kind}
     for part in parts:
-        with (folder / "annotations" / f"{part}.json").open("w") as whole:  # streamed, without a copy in memory
-            whole.write(f'{{"info":{json_line(about)},"licenses":[],"categories":{json_line(table)},"images":[')
-            _copy(folder / f"{part}.images", whole)
-            whole.write('],"annotations":[')
-            _copy(folder / f"{part}.annotations", whole)
-            whole.write("]}\n")
+        with (folder / "annotations" / f"{part}.json").open("w") as document:  # streamed, without a copy in memory
+            document.write(f'{{"info":{json_line(about)},"licenses":[],"categories":{json_line(table)},"images":[')
+            _copy(folder / f"{part}.images", document)
+            document.write('],"annotations":[')
+            _copy(folder / f"{part}.annotations", document)
+            document.write("]}\n")
 
 
 def _parts_of(source: ExportSource) -> list[str]:
     """Return the names of the parts that have frames; warn if training or validation, which a detector needs, has none."""
     parts = [part for part in YOLO_PARTS if (source.part == part).any()]
-    lacking = [part for part in ("train", "validation") if part not in parts]
-    if lacking:
-        warnings.warn(f"no frames are for {' and '.join(lacking)}: give --split", MitsonarWarning, stacklevel=3)
+    missing = [part for part in ("train", "validation") if part not in parts]
+    if missing:
+        warnings.warn(f"no frames are in the parts {' and '.join(missing)}: give --split", MitsonarWarning, stacklevel=3)
     return parts
 
 
 def _regions(source: ExportSource, pictures: LabelledPictures, shot: Shot) -> list[Region]:
     """Return the regions of a frame, and add them to the counts of ``pictures``."""
-    found = pictures.regions(shot.frames, shot.index, float(source.raised_db[shot.number]))
-    pictures.count(shot.part, found)
-    return found
+    regions = pictures.regions(shot.frames, shot.index, float(source.raised_db[shot.number]))
+    pictures.count(shot.part, regions)
+    return regions
 
 
 def _annotation(number: int, image: int, region: Region, names: tuple[str, str], size: tuple[int, int]) -> dict[str, object]:
@@ -143,12 +143,12 @@ def _annotation(number: int, image: int, region: Region, names: tuple[str, str],
     }
 
 
-def _copy(part: Path, whole: IO[str]) -> None:
+def _copy(source: Path, target: IO[str]) -> None:
     """Append the lines of a file to another, separated by commas, and remove the first file."""
-    with part.open() as lines:
-        for place, line in enumerate(lines):
-            whole.write(("," if place else "") + line.rstrip("\n"))
-    part.unlink()
+    with source.open() as lines:
+        for number, line in enumerate(lines):
+            target.write(("," if number else "") + line.rstrip("\n"))
+    source.unlink()
 
 
 def export_yolo(source: ExportSource, pictures: LabelledPictures, folder: Path, *, polygons: bool = False) -> Iterator[int]:
@@ -177,7 +177,7 @@ def _yolo_lines(region: Region, size: tuple[int, int], polygons: bool) -> list[s
     columns, rows = size
     if polygons:
         outlines = [outline / size for outline in _outlines(region)]
-        return [" ".join([str(region.kind), *(f"{value:.6f}" for value in one.ravel())]) for one in outlines]
+        return [" ".join([str(region.kind), *(f"{value:.6f}" for value in outline.ravel())]) for outline in outlines]
     column, row, width, height = region.box
     values = ((column + width / 2) / columns, (row + height / 2) / rows, width / columns, height / rows)
     return [" ".join([str(region.kind), *(f"{value:.6f}" for value in values)])]
@@ -187,24 +187,24 @@ def _outlines(region: Region) -> list[np.ndarray[tuple[int, ...], np.dtype[np.fl
     """Return the outer outlines of a region ``(points, 2)`` through pixel centres, without those of fewer than 3 points."""
     import cv2
 
-    found, _ = cv2.findContours(region.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    return [one[:, 0, :].astype(float) + 0.5 for one in found if len(one) >= 3]
+    contours, _ = cv2.findContours(region.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    return [contour[:, 0, :].astype(float) + 0.5 for contour in contours if len(contour) >= 3]
 
 
 # ---------------- Data set recipe for a detector
 
 
-CLEAR_M = 0.3
+CLEARANCE_M = 0.3
 """Smallest distance of the sonar from the bounding box of an object and from the ground [m]."""
 
-GROUND = 0.9
+MIN_GROUND_FRACTION = 0.9
 """Smallest fraction of the scene's edge that a shape covers if it counts as ground."""
 
-REACH = 0.6
+MAX_RANGE_FRACTION = 0.6
 """Largest range of the sonar as a fraction of the scene's edge; a longer fan would hardly fit inside the scene."""
 
-SHARES = 0.7, 0.15, 0.15
-FRAMES_OF_WORLD = 10
+DEFAULT_SPLIT = 0.7, 0.15, 0.15
+FRAMES_PER_WORLD = 10
 """Number of frames per generated world, if there are enough worlds."""
 
 
@@ -226,7 +226,7 @@ class DetectorViews:
     heights: tuple[float, float] | None = None
     pitch_deg: tuple[float, float] | None = None
     noise_db: tuple[float, ...] = ()
-    split: tuple[float, float, float] = SHARES
+    split: tuple[float, float, float] = DEFAULT_SPLIT
     seed: int = 0
 
 
@@ -256,10 +256,12 @@ def detector_recipe(
     parts = sum(share > 0 for share in views.split)
     if views.frames < parts:
         raise MitsonarError(f"--frames must be at least {parts}, one for each part of --split: got {views.frames}")
-    of_recipe = str(scene).lower().endswith((".yaml", ".yml")) or str(scene) in shipped_recipes()
-    chosen = "sonar.range_max" in (changes or {})
-    fields, rules, notes = _of_recipe(str(scene), views) if of_recipe else _of_scene(str(scene), views, sonar, chosen)
-    if of_recipe and sonar is not None:
+    is_recipe = str(scene).lower().endswith((".yaml", ".yml")) or str(scene) in shipped_recipes()
+    range_given = "sonar.range_max" in (changes or {})
+    fields, rules, notes = (
+        _fields_from_recipe(str(scene), views) if is_recipe else _fields_from_scene(str(scene), views, sonar, range_given)
+    )
+    if is_recipe and sonar is not None:
         fields["sonar"] = _sonar_fields(sonar)
     # 2. Apply the views: isolated pings anywhere, with the requested heights, pitches, noise and split.
     flight = fields["flight"]
@@ -293,12 +295,15 @@ def _scenes(frames: int, worlds: Sequence[Keys]) -> list[Keys]:
     return [{"count": 1, "sequences": int(count), "world": world} for count, world in zip(counts, worlds, strict=True)]
 
 
-def _of_recipe(name: str, views: DetectorViews) -> tuple[Keys, list[tuple[str, str]], list[str]]:
+def _fields_from_recipe(name: str, views: DetectorViews) -> tuple[Keys, list[tuple[str, str]], list[str]]:
     """Return keys, class rules and notes for the worlds of a recipe. Worlds that depend on a seed are split by scene."""
     recipe = load_recipe(name)
-    groups = [group for group, one in enumerate(recipe.scenes) for _ in range(one.count)]
-    wanted = max(3, len(views.noise_db), views.frames // FRAMES_OF_WORLD)
-    chosen = [groups[int(at)] for at in np.linspace(0, len(groups) - 1, min(len(groups), wanted, views.frames)).round()]
+    groups = [group for group, scene in enumerate(recipe.scenes) for _ in range(scene.count)]
+    target_worlds = max(3, len(views.noise_db), views.frames // FRAMES_PER_WORLD)
+    chosen = [
+        groups[int(position)]
+        for position in np.linspace(0, len(groups) - 1, min(len(groups), target_worlds, views.frames)).round()
+    ]
     fields = recipe.model_dump(mode="json")
     fields["scenes"] = _scenes(views.frames, [dict(recipe.scenes[group].world) for group in chosen])
     seeded = all(recipe.family(group).seeded for group in chosen) and len(chosen) >= 3
@@ -307,37 +312,40 @@ def _of_recipe(name: str, views: DetectorViews) -> tuple[Keys, list[tuple[str, s
     return fields, [(shape, "") for shape in ground if shape in recipe.family(0).build(0).shape_names], []
 
 
-def _of_scene(
-    name: str, views: DetectorViews, sonar: str | None, chosen: bool
+def _fields_from_scene(
+    name: str, views: DetectorViews, sonar: str | None, range_given: bool
 ) -> tuple[Keys, list[tuple[str, str]], list[str]]:
-    """Return keys, class rules and notes for a scene file. The ground limits the range, unless it was ``chosen``."""
+    """Return keys, class rules and notes for a scene file. The ground limits the range, unless it was ``range_given``."""
     # 1. Separate the ground from the objects.
     path = find_scene(name).resolve()
-    loaded = load_scene(path)
-    names, boxes = shape_names_in(loaded), shape_boxes_in(loaded)
-    size, ground = _ground(path, covered_squares_in(loaded))
-    objects = [box for box, flat in zip(boxes, ground, strict=True) if not flat]
+    scene = load_scene(path)
+    names, boxes = shape_names_in(scene), shape_boxes_in(scene)
+    size, ground = _ground(path, covered_squares_in(scene))
+    objects = [box for box, is_ground in zip(boxes, ground, strict=True) if not is_ground]
     if not objects:
-        raise MitsonarError(f"{path} holds its ground and no objects: a detector needs some to find")
+        raise MitsonarError(f"{path} contains only ground: a detector needs objects")
     # 2. Keep the sonar above the highest point of the ground.
     top = float(boxes[ground, 1, 2].max())
     heights = views.heights or (top + 1.5, top + 3.0)
-    if heights[0] < top + CLEAR_M:
+    if heights[0] < top + CLEARANCE_M:
         raise MitsonarError(
-            f"--height must be at least {top + CLEAR_M:.3g} m, {CLEAR_M:g} m over the ground of {path}: got {heights[0]:g}"
+            f"--height must be at least {top + CLEARANCE_M:.3g} m, {CLEARANCE_M:g} m above the ground of {path}: "
+            f"got {heights[0]:g}"
         )
     # 3. Choose the sonar, and limit its range to the size of the scene.
-    found = sonar_in(loaded)
+    scene_sonar = sonar_in(scene)
     if sonar is not None:
         instrument, keys = load_sonar(sonar), _sonar_fields(sonar)
-    elif found is not None:
-        instrument = found[0]
+    elif scene_sonar is not None:
+        instrument = scene_sonar[0]
         keys = instrument.model_dump(exclude_unset=True)
     else:
-        raise MitsonarError(f"{path} has no sensor of type imaging_sonar: name a sonar, --sonar oculus-m750d-1200khz")
-    left_out = list(dict.fromkeys(name for name, flat in zip(names, ground, strict=True) if flat))
+        raise MitsonarError(
+            f"{path} has no sensor of type imaging_sonar: give a sonar, such as --sonar oculus-m750d-1200khz"
+        )
+    left_out = list(dict.fromkeys(name for name, is_ground in zip(names, ground, strict=True) if is_ground))
     notes = [f"ground, without a class: {', '.join(left_out)}"]
-    keys, note = (keys, []) if chosen else _within(instrument, keys, size)
+    keys, range_notes = (keys, []) if range_given else _limit_range(instrument, keys, size)
     fields: Keys = {
         "name": path.stem,
         "about": f"views of {path.name} for a detector",
@@ -348,11 +356,11 @@ def _of_scene(
         "flight": {
             "height_m": list(heights),
             "pitch_deg": [10.0, 30.0],
-            "keep_out": [[*(box[0] - CLEAR_M), *(box[1] + CLEAR_M)] for box in objects],
+            "keep_out": [[*(box[0] - CLEARANCE_M), *(box[1] + CLEARANCE_M)] for box in objects],
         },
         "split": {"by": "sequence"},
     }
-    return fields, [(name, "") for name in left_out], [*notes, *note]
+    return fields, [(name, "") for name in left_out], [*notes, *range_notes]
 
 
 def _ground(path: Path, halves: NDArray[np.float64]) -> tuple[float, NDArray[np.bool_]]:
@@ -366,16 +374,16 @@ def _ground(path: Path, halves: NDArray[np.float64]) -> tuple[float, NDArray[np.
         MitsonarError: no shape covers the origin.
     """
     if not len(halves):
-        raise MitsonarError(f"{path} holds no shapes: give a scene with a ground and objects")
+        raise MitsonarError(f"{path} contains no shapes: give a scene with a ground and objects")
     size = 2 * float(halves.max())
     if size <= 0:
-        raise MitsonarError(f"no shape of {path} lies around the origin: its ground must, since views are drawn there")
-    return math.floor(size * 1000) / 1000, 2 * halves >= GROUND * size
+        raise MitsonarError(f"no shape of {path} covers the origin: views are drawn around it, so the ground must cover it")
+    return math.floor(size * 1000) / 1000, 2 * halves >= MIN_GROUND_FRACTION * size
 
 
-def _within(sonar: Sonar, keys: Keys, size: float) -> tuple[Keys, list[str]]:
+def _limit_range(sonar: Sonar, keys: Keys, size: float) -> tuple[Keys, list[str]]:
     """Limit the range of a sonar to the size of its scene. Return its keys, and a note if the range was changed."""
-    reach = REACH * size
+    reach = MAX_RANGE_FRACTION * size
     if sonar.range_max <= reach:
         return keys, []
     if reach <= sonar.range_min:
@@ -383,14 +391,14 @@ def _within(sonar: Sonar, keys: Keys, size: float) -> tuple[Keys, list[str]]:
             f"a scene of {size:g} m is too small for a window from {sonar.range_min:g} m: give another sonar"
         )
     bins = max(1, round(sonar.range_bins * (reach - sonar.range_min) / (sonar.range_max - sonar.range_min)))
-    note = f"range_max is {reach:.3g} m in place of {sonar.range_max:g}, so that fans fit into {size:g} m of ground"
-    return {**keys, "range_max": reach, "range_bins": bins}, [f"{note}; --set sonar.range_max=... changes it"]
+    note = f"range_max was reduced from {sonar.range_max:g} to {reach:.3g} m to fit into {size:g} m of ground"
+    return {**keys, "range_max": reach, "range_bins": bins}, [f"{note}; override it with --set sonar.range_max=..."]
 
 
 # ---------------- Hugging Face
 
 
-CONTEXT: dict[str, PlainValue] = {
+CROISSANT_CONTEXT: dict[str, PlainValue] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
     "citeAs": "cr:citeAs",
@@ -437,21 +445,21 @@ def export_hugging_face(source: ExportSource, pictures: LabelledPictures, folder
     """
     counts: dict[str, int] = {}
     keys: dict[str, str] = {}
-    with contextlib.ExitStack() as ends:
+    with contextlib.ExitStack() as files:
         tables: dict[str, IO[str]] = {}
         for shot in shots(source):
-            place = folder / "data" / shot.part
+            part_folder = folder / "data" / shot.part
             if shot.part not in tables:
-                place.mkdir(parents=True)
-                tables[shot.part] = ends.enter_context((place / "metadata.jsonl").open("w"))
+                part_folder.mkdir(parents=True)
+                tables[shot.part] = files.enter_context((part_folder / "metadata.jsonl").open("w"))
             counts[shot.part] = counts.get(shot.part, 0) + 1
-            write_whole(place / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
-            told: dict[str, PlainValue] = {"file_name": f"{shot.name}.png", **pose_of(shot)}
-            told["sequence"] = int(source.sequence[shot.number])
-            keys = {key: "sc:Integer" if isinstance(value, int) else "sc:Float" for key, value in told.items()}
+            write_whole(part_folder / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
+            record: dict[str, PlainValue] = {"file_name": f"{shot.name}.png", **pose_of(shot)}
+            record["sequence"] = int(source.sequence[shot.number])
+            keys = {key: "sc:Integer" if isinstance(value, int) else "sc:Float" for key, value in record.items()}
             if "shape_id" in source.labels:
-                told["objects"] = regions_of(shot, pictures, source)
-            tables[shot.part].write(f"{json_line(told)}\n")
+                record["objects"] = regions_of(shot, pictures, source)
+            tables[shot.part].write(f"{json_line(record)}\n")
             yield 1
     keys["file_name"] = "sc:Text"
     write_whole(folder / "README.md", _card(source, pictures, counts).encode())
@@ -477,8 +485,8 @@ def _croissant(source: ExportSource, folder: Path, parts: list[str], keys: dict[
     records: list[PlainValue] = []
     for part in parts:
         path, table = f"data/{part}/metadata.jsonl", f"{part}-metadata"
-        one = {"@type": "cr:FileObject", "@id": table, "name": table, "contentUrl": path}
-        objects.append({**one, "encodingFormat": "application/jsonlines", "sha256": digest_of(folder / path)})
+        file_object = {"@type": "cr:FileObject", "@id": table, "name": table, "contentUrl": path}
+        objects.append({**file_object, "encodingFormat": "application/jsonlines", "sha256": digest_of(folder / path)})
         fields = [
             {
                 "@type": "cr:Field",
@@ -491,7 +499,7 @@ def _croissant(source: ExportSource, folder: Path, parts: list[str], keys: dict[
         ]
         records.append({"@type": "cr:RecordSet", "@id": part, "name": part, "field": fields})
     return {
-        "@context": CONTEXT,
+        "@context": CROISSANT_CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         "name": "sonar-frames",
@@ -504,7 +512,7 @@ def _croissant(source: ExportSource, folder: Path, parts: list[str], keys: dict[
 # ---------------- WebDataset
 
 
-OF_SHARD = 1000
+SAMPLES_PER_SHARD = 1000
 """Number of samples in a shard."""
 
 
@@ -519,10 +527,10 @@ def export_webdataset(source: ExportSource, pictures: LabelledPictures, folder: 
         files: dict[str, tarfile.TarFile] = {}
         for shot in shots(source):
             number = counts.get(shot.part, 0)
-            if number % OF_SHARD == 0:
+            if number % SAMPLES_PER_SHARD == 0:
                 if shot.part in files:
                     files[shot.part].close()
-                path = folder / f"{shot.part}-{number // OF_SHARD:06d}.tar"
+                path = folder / f"{shot.part}-{number // SAMPLES_PER_SHARD:06d}.tar"
                 files[shot.part] = ends.enter_context(tarfile.open(path, "w", format=tarfile.USTAR_FORMAT))
             counts[shot.part] = number + 1
             about = {"sequence": int(source.sequence[shot.number]), **pose_of(shot)}
@@ -532,20 +540,20 @@ def export_webdataset(source: ExportSource, pictures: LabelledPictures, folder: 
                     label = pictures.label(shot.frames, f"{name}_id", shot.index) + 1
                     parts[f"{name}.png"] = png(np.clip(label, 0, 65535).astype(np.uint16))
             parts["json"] = json_line({**about, "regions": regions_of(shot, pictures, source)}).encode()
-            for ending, content in parts.items():
-                entry = tarfile.TarInfo(f"{shot.name}.{ending}")
+            for extension, content in parts.items():
+                entry = tarfile.TarInfo(f"{shot.name}.{extension}")
                 entry.size = len(content)
                 files[shot.part].addfile(entry, io.BytesIO(content))
             yield 1
     names = {"shapes": list(source.like.shape_names), "objects": list(source.like.object_names)}
-    told = {"source": source.name, "about": source.about, "picture": pictures.picture_kind, "samples": counts, **names}
-    write_whole(folder / "about.json", as_json(told))
+    metadata = {"source": source.name, "about": source.about, "picture": pictures.picture_kind, "samples": counts, **names}
+    write_whole(folder / "about.json", as_json(metadata))
 
 
 # ---------------- KITTI and neusis
 
 
-CAMERA = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+CAMERA_AXES = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Axes of a camera (starboard, down, forward), as columns in (starboard, forward, up)."""
 
 
@@ -571,15 +579,15 @@ def export_kitti(source: ExportSource, pictures: LabelledPictures, folder: Path)
                         file.close()
                 poses = (folder / "poses" / f"{name}.txt").open("w")
                 times = (folder / "sequences" / name / "times.txt").open("w")
-                begun = float(np.mean(shot.frames.time_s[shot.index]))
+                start_s = float(np.mean(shot.frames.time_s[shot.index]))
             assert shot.frames.poses is not None
             matrix = np.eye(4)
-            matrix[:3, :3] = vehicle_rotation(shot.frames.poses[shot.index]).as_matrix()[0] @ CAMERA
+            matrix[:3, :3] = vehicle_rotation(shot.frames.poses[shot.index]).as_matrix()[0] @ CAMERA_AXES
             matrix[:3, 3] = shot.frames.poses[shot.index, :3]
             first = matrix if number == 0 else first
             relative = np.linalg.inv(first) @ matrix
             poses.write(" ".join(f"{value:.12e}" for value in relative[:3].ravel()) + "\n")
-            times.write(f"{float(np.mean(shot.frames.time_s[shot.index])) - begun:.9e}\n")
+            times.write(f"{float(np.mean(shot.frames.time_s[shot.index])) - start_s:.9e}\n")
             picture = png(pictures.picture(shot.frames, shot.index))
             write_whole(folder / "sequences" / f"{sequence:02d}" / "image_0" / f"{number:06d}.png", picture)
             number += 1
@@ -606,25 +614,25 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
         write_whole(folder / "Data" / f"{shot.name}.pkl", pickle.dumps(state, protocol=4))
         yield 1
     sonar = source.like.sonar
-    across = source.like.bearing_rad
-    fov = float(np.ptp(across)) * (1 + 1 / max(1, len(across) - 1))
-    told = {
+    bearing_rad = source.like.bearing_rad
+    fov = float(np.ptp(bearing_rad)) * (1 + 1 / max(1, len(bearing_rad) - 1))
+    configuration = {
         "Azimuth": math.degrees(fov),
         "Elevation": sonar.elevation_fov_deg,
         "RangeMin": sonar.range_min,
         "RangeMax": sonar.range_max,
         "RangeBins": sonar.range_bins,
-        "AzimuthBins": len(across),
+        "AzimuthBins": len(bearing_rad),
     }
-    agent = {"sensors": [{"sensor_type": "ImagingSonar", "configuration": told}]}
+    agent = {"sensors": [{"sensor_type": "ImagingSonar", "configuration": configuration}]}
     write_whole(folder / "Config.json", as_json({"name": source.name, "agents": [agent]}))
 
 
 def port_matrix(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrix ``(4, 4)`` from (forward, port, up) to the world for a pose ``(6,)`` [m, rad]."""
-    place, turn = CONVENTIONS["ros-enu"].from_ours(pose[None, :3], vehicle_rotation(pose))
+    positions, rotations = CONVENTIONS["ros-enu"].from_ours(pose[None, :3], vehicle_rotation(pose))
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn.as_matrix()[0], place[0]
+    matrix[:3, :3], matrix[:3, 3] = rotations.as_matrix()[0], positions[0]
     return matrix
 
 
@@ -684,9 +692,9 @@ def export_to(
     if layout not in EXPORTS:
         raise MitsonarError(f"unknown layout {layout!r}: {nearest_names(layout, EXPORTS)}")
     if polygons and layout != "yolo":
-        raise MitsonarError(f"--polygons is of the layout yolo: got {layout}; COCO has masks in any case")
+        raise MitsonarError(f"--polygons applies only to the layout yolo: got {layout}; COCO always has masks")
     if layout == "neusis" and picture != "polar":
-        raise MitsonarError("the layout neusis has polar pictures only: leave --picture out")
+        raise MitsonarError("the layout neusis supports polar pictures only: leave --picture out")
     exporter = partial(export_yolo, polygons=True) if polygons else EXPORTS[layout]
     pictures = LabelledPictures(source.like, picture, classes, least, least_snr_db)
     with new_folder(out) as folder:
@@ -695,7 +703,7 @@ def export_to(
         missing = [name for name in pictures.classes if every_class and not pictures.boxes["train", name]]
         if missing:
             raise MitsonarError(
-                f"the class {missing[0]} is in no picture of the training part: make more frames, nearer to it, lower "
+                f"no picture of the training part shows the class {missing[0]}: render more frames, nearer to it, lower "
                 f"--least-snr-db or --least, or leave it out with --classes {missing[0]}="
             )
     return pictures

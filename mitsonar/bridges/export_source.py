@@ -73,7 +73,7 @@ __all__ = [
 ]
 
 
-AT_ONCE_BYTES = 2**24
+CHUNK_BYTES = 2**24
 """Approximate size of the pixels and labels that are read at once [bytes]."""
 
 Read = Callable[[slice], SonarFrames]
@@ -114,9 +114,9 @@ class ExportSource:
     def pieces(self) -> Iterator[tuple[int, SonarFrames]]:
         """Yield the frames in chunks, each with the number of its first frame."""
         cells = max(1, self.like.image.shape[1] * self.like.image.shape[2])
-        many = max(1, AT_ONCE_BYTES // (cells * (4 + 4 * len(self.labels))))
-        for first in range(0, self.frames, many):
-            yield first, self.read(slice(first, min(first + many, self.frames)))
+        chunk_frames = max(1, CHUNK_BYTES // (cells * (4 + 4 * len(self.labels))))
+        for first in range(0, self.frames, chunk_frames):
+            yield first, self.read(slice(first, min(first + chunk_frames, self.frames)))
 
 
 def open_export(
@@ -135,45 +135,45 @@ def open_export(
         MitsonarError: there are no frames, the shares do not add up to 1, or there are too few sequences or frames for them.
     """
     if split is not None and not (min(split) >= 0 and abs(sum(split) - 1) < 1e-6):
-        raise MitsonarError(f"--split is three shares that add up to 1, 0.7,0.15,0.15 for example: got {split}")
+        raise MitsonarError(f"--split must be three shares that add up to 1, such as 0.7,0.15,0.15: got {split}")
     if is_data_set(where):
-        return _of_data_set(str(where), view, split)
-    source = _of_frames(where, view)
-    return source if split is None else replace(source, part=_stretches(source.frames, split))
+        return _open_data_set(str(where), view, split)
+    source = _open_frames(where, view)
+    return source if split is None else replace(source, part=_parts_by_time(source.frames, split))
 
 
-def _of_frames(where: str | Path, view: str | None) -> ExportSource:
+def _open_frames(where: str | Path, view: str | None) -> ExportSource:
     """Open the frames of a run or of a recording."""
     if view is not None:
-        raise MitsonarError(f"{where} is no data set: --view chooses among the views of one; leave it out")
+        raise MitsonarError(f"{where} is not a data set, so it has no views: leave --view out")
     path = Path(where)
     if os.path.isdir(path):
-        found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
-        path = found[0] if found else path
+        candidates = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
+        path = candidates[0] if candidates else path
     if path.suffix == ".npz":
         return _in_memory(SonarFrames.load(path), str(where))
     source = open_frames(where)
     if not len(source):
-        raise MitsonarError(f"{source.name} holds no frames: give those of a finished run")
+        raise MitsonarError(f"{source.name} contains no frames: give a finished run")
     stored, like = _labels_of_zarr(path) if path.suffix == ".zarr" else ({}, {})
 
-    def read(part: slice) -> SonarFrames:
-        index = np.arange(part.start, part.stop)
+    def read(span: slice) -> SonarFrames:
+        index = np.arange(span.start, span.stop)
         frames = source.read(index)
-        labels: dict[str, Any] = {name: np.asarray(array[part]) for name, array in stored.items()}
+        labels: dict[str, Any] = {name: np.asarray(array[span]) for name, array in stored.items()}
         # The source withholds these from estimators; exports include them.
-        poses, attitude = (None if values is None else values[part] for values in (source.poses, source.attitude_rad))
+        poses, attitude = (None if values is None else values[span] for values in (source.poses, source.attitude_rad))
         return replace(frames, poses=poses, attitude_rad=attitude, **like, **labels)
 
-    base = replace(source.like, **like)
+    template = replace(source.like, **like)
     sequence, posed = np.zeros(len(source), np.int64), source.poses is not None
-    return ExportSource(source.name, len(source), sequence, base, tuple(stored), posed, _all_train(len(source)), read)
+    return ExportSource(source.name, len(source), sequence, template, tuple(stored), posed, _all_train(len(source)), read)
 
 
 def _in_memory(frames: SonarFrames, name: str) -> ExportSource:
     """Return frames in memory as a source."""
     if not len(frames):
-        raise MitsonarError(f"{name} holds no frames: give those of a finished run")
+        raise MitsonarError(f"{name} contains no frames: give a finished run")
     labels = tuple(label for label in LABELS if getattr(frames, label) is not None)
     sequence, posed = np.zeros(len(frames), np.int64), frames.poses is not None
     like = frames.select(slice(0))
@@ -186,68 +186,69 @@ def _all_train(frames: int) -> NDArray[np.str_]:
 
 def _labels_of_zarr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the label arrays of a long run, not read yet, and the names of shapes and objects that they refer to."""
-    found, _ = open_group(path, COLUMNS, "time_s", "frames_done")
-    stored = {name: found[name] for name in LABELS if name in found}
-    nothing = {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
+    arrays, _ = open_group(path, COLUMNS, "time_s", "frames_done")
+    stored = {name: arrays[name] for name in LABELS if name in arrays}
+    empty_arrays = {name: array for name, array in arrays.items() if isinstance(array, np.ndarray)}
     for name in COLUMNS:
-        if name in found:
-            nothing[name] = found[name][:0] if name not in ("range_m", "bearing_rad") else found[name][...]
-    like = SonarFrames.from_arrays(nothing, str(path))
+        if name in arrays:
+            empty_arrays[name] = arrays[name][:0] if name not in ("range_m", "bearing_rad") else arrays[name][...]
+    like = SonarFrames.from_arrays(empty_arrays, str(path))
     return stored, {"shape_names": like.shape_names, "object_names": like.object_names}
 
 
-def _stretches(frames: int, split: tuple[float, float, float]) -> NDArray[np.str_]:
+def _parts_by_time(frames: int, split: tuple[float, float, float]) -> NDArray[np.str_]:
     """Return the part of each frame ``(frames,)`` for a division into consecutive intervals, one for each part.
 
     Raises:
         MitsonarError: there are too few frames for the parts.
     """
-    wanted = [share > 0 for share in split]
+    has_share = [share > 0 for share in split]
     ends = np.rint(np.cumsum(split) * frames).astype(int)
-    counts = np.maximum(np.diff(ends, prepend=0), wanted)
+    counts = np.maximum(np.diff(ends, prepend=0), has_share)
     counts[int(np.argmax(split))] -= counts.sum() - frames
-    if (counts[wanted] < 1).any():
+    if (counts[has_share] < 1).any():
         raise MitsonarError(
-            f"{frames} frames are too few for training, validation and test of {split}: give more, or another --split"
+            f"{frames} frames are too few for the shares {split} of training, validation and test: "
+            "give more frames, or another --split"
         )
     return np.repeat(np.array(PARTS, dtype="<U10"), counts)
 
 
-def _of_data_set(url: str, view: str | None, split: tuple[float, float, float] | None) -> ExportSource:
+def _open_data_set(url: str, view: str | None, split: tuple[float, float, float] | None) -> ExportSource:
     """Open all frames of one view of a data set.
 
     Raises:
         MitsonarError: there are too few sequences or scenes for the given split.
     """
     store = DataStore.open(url)
-    chosen = view_in(store, view)
-    labels = {label: f"{label}{store.recipe.suffix(chosen.name)}" for label in store.recipe.labels}
+    stored_view = view_in(store, view)
+    labels = {label: f"{label}{store.recipe.suffix(stored_view.name)}" for label in store.recipe.labels}
     scene = np.asarray(store.read("scene"))
-    names, places = names_of_scenes(store) if "shape_id" in labels else ((), {})
+    shape_names, shape_indices = names_of_scenes(store) if "shape_id" in labels else ((), {})
 
-    def read(part: slice) -> SonarFrames:
-        told: dict[str, Any] = {label: store.read(array, part) for label, array in labels.items()}
-        for number in np.unique(scene[part]) if places else ():
-            own = scene[part] == number
-            told["shape_id"][own] = places[int(number)][told["shape_id"][own]]
+    def read(span: slice) -> SonarFrames:
+        label_maps: dict[str, Any] = {label: store.read(array, span) for label, array in labels.items()}
+        for number in np.unique(scene[span]) if shape_indices else ():
+            in_scene = scene[span] == number
+            label_maps["shape_id"][in_scene] = shape_indices[int(number)][label_maps["shape_id"][in_scene]]
         return replace(
-            chosen.like,
-            image=store.read(chosen.array, part),
-            time_s=store.read("time_s", part),
-            poses=store.read("pose", part),
-            height_m=store.read("height_m", part),
-            shape_names=names,
-            **told,
+            stored_view.like,
+            image=store.read(stored_view.array, span),
+            time_s=store.read("time_s", span),
+            poses=store.read("pose", span),
+            height_m=store.read("height_m", span),
+            shape_names=shape_names,
+            **label_maps,
         )
 
     sequence = np.asarray(store.read("sequence"), dtype=np.int64)
     about = str(store.about["recipe"].get("about") or store.recipe.name)
     raised = store.recipe.noise_raised_db(scene)
-    parts = _parts(store, split)
+    parts = _parts_by_split(store, split)
     return ExportSource(url, len(store), sequence, read(slice(0, 0)), tuple(labels), True, parts, read, about, raised)
 
 
-def _parts(store: DataStore, shares: tuple[float, float, float] | None) -> NDArray[np.str_]:
+def _parts_by_split(store: DataStore, shares: tuple[float, float, float] | None) -> NDArray[np.str_]:
     """Return the part of each frame ``(frames,)`` by the recipe's split, or by the given shares.
 
     A split by sample does not divide frames: all are for training.
@@ -278,7 +279,7 @@ def _parts(store: DataStore, shares: tuple[float, float, float] | None) -> NDArr
 # ---------------- Writing an export
 
 
-MARK = ".mitsonar-export"
+MARKER = ".mitsonar-export"
 """Name of a file that marks a folder being written; only marked folders are ever removed."""
 
 
@@ -294,17 +295,17 @@ def new_folder(out: Path) -> Iterator[Path]:
     part = out.with_name(f".{out.name}.part")
     if out.exists():
         raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or remove it")
-    if part.exists() and not (part / MARK).is_file():
-        raise MitsonarError(f"{part} is in the way and no export of mitsonar made it: remove it, or choose another -o")
+    if part.exists() and not (part / MARKER).is_file():
+        raise MitsonarError(f"{part} exists and is not an unfinished export of mitsonar: remove it, or choose another -o")
     try:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
-        (part / MARK).touch()
+        (part / MARKER).touch()
         yield part
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
         raise
-    (part / MARK).unlink()
+    (part / MARKER).unlink()
     part.rename(out)
 
 
@@ -370,18 +371,18 @@ def refuse_unposed(source: ExportSource) -> None:
         MitsonarError: the frames have no poses.
     """
     if not source.posed:
-        raise MitsonarError(f"{source.name} has no poses, which this layout is made of: choose another --to")
+        raise MitsonarError(f"{source.name} has no poses, which this layout needs: choose another --to")
 
 
 def regions_of(shot: Shot, pictures: LabelledPictures, source: ExportSource) -> dict[str, list[object]]:
     """Return boxes, classes, names and objects of a frame's regions as plain lists; empty without labels."""
     raised_db = float(source.raised_db[shot.number])
-    found = pictures.regions(shot.frames, shot.index, raised_db) if "shape_id" in source.labels else []
+    regions = pictures.regions(shot.frames, shot.index, raised_db) if "shape_id" in source.labels else []
     return {
-        "bbox": [list(region.box) for region in found],
-        "category": [region.kind for region in found],
-        "name": [pictures.classes[region.kind] for region in found],
-        "object": [region.number for region in found],
+        "bbox": [list(region.box) for region in regions],
+        "category": [region.kind for region in regions],
+        "name": [pictures.classes[region.kind] for region in regions],
+        "object": [region.number for region in regions],
     }
 
 
@@ -390,11 +391,11 @@ def pose_of(shot: Shot) -> dict[str, float]:
     time = float(np.mean(shot.frames.time_s[shot.index]))
     if shot.frames.poses is None:
         return {"time_s": time}
-    six = shot.frames.poses[shot.index]
-    angles = np.degrees(six[3:])
-    place = dict(zip(("x_m", "y_m", "z_m"), map(float, six[:3]), strict=True))
-    turned = dict(zip(("pitch_deg", "roll_deg", "heading_deg"), map(float, angles), strict=True))
-    return {"time_s": time, **place, **turned}
+    pose = shot.frames.poses[shot.index]
+    angles = np.degrees(pose[3:])
+    position = dict(zip(("x_m", "y_m", "z_m"), map(float, pose[:3]), strict=True))
+    attitude = dict(zip(("pitch_deg", "roll_deg", "heading_deg"), map(float, angles), strict=True))
+    return {"time_s": time, **position, **attitude}
 
 
 def as_json(value: object) -> bytes:
@@ -412,7 +413,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 LEAST_SNR_DB = 3.0
 """Default of the smallest signal-to-noise ratio of a labelled object [dB]."""
 
-NUMBER = re.compile(r"[\s_.-]*\d+$")
+FINAL_NUMBER = re.compile(r"[\s_.-]*\d+$")
 """Pattern of the number at the end of a shape's name, with its separator."""
 
 
@@ -467,7 +468,7 @@ class LabelledPictures:
         least_snr_db: float = LEAST_SNR_DB,
     ) -> None:
         if picture not in ("polar", "fan"):
-            raise MitsonarError(f"--picture is polar or fan: got {picture!r}")
+            raise MitsonarError(f"--picture must be polar or fan: got {picture!r}")
         self.picture_kind, self.least, self.least_snr_db = picture, least, least_snr_db
         self._rules = tuple(classes)
         names = like.shape_names
@@ -478,8 +479,10 @@ class LabelledPictures:
         self.classes = list(dict.fromkeys(name for name in class_of if name))
         self.left_out = [shape for shape, name in zip(names, class_of, strict=True) if not name]
         if names and not self.classes:
-            raise MitsonarError(f"no class is left of the shapes {', '.join(names[:6])}: leave fewer of them out")
-        self._kinds = {place: self.classes.index(name) if name else None for place, name in enumerate(class_of)}
+            raise MitsonarError(
+                f"all shapes are left out ({', '.join(names[:6])}), so no class is left: leave out fewer of them"
+            )
+        self._kinds = {index: self.classes.index(name) if name else None for index, name in enumerate(class_of)}
         self.fan = FanPictures(like) if picture == "fan" else None
         rows, columns = like.image.shape[1:] if self.fan is None else self.fan.fan.index.shape[1:]
         self.size = int(columns), int(rows)
@@ -488,15 +491,15 @@ class LabelledPictures:
 
     def _class_names(self, names: Sequence[str]) -> list[str]:
         """Return the class of each shape; empty for shapes that are left out."""
-        stems = [NUMBER.sub("", name) or name for name in names]
+        stems = [FINAL_NUMBER.sub("", name) or name for name in names]
         shared = Counter(stems)
-        own = [stem if shared[stem] > 1 else name for name, stem in zip(names, stems, strict=True)]
+        default_names = [stem if shared[stem] > 1 else name for name, stem in zip(names, stems, strict=True)]
         return [
-            next((kind for glob, kind in self._rules if fnmatchcase(name, glob)), mine)
-            for name, mine in zip(names, own, strict=True)
+            next((kind for glob, kind in self._rules if fnmatchcase(name, glob)), default)
+            for name, default in zip(names, default_names, strict=True)
         ]
 
-    def _kind_of(self, shape: int) -> int | None:
+    def _class_number(self, shape: int) -> int | None:
         """Return the number of a shape's class, None if it is left out; shapes without names add their class."""
         if shape not in self._kinds:
             name = f"shape {shape}"
@@ -519,8 +522,8 @@ class LabelledPictures:
         Raises:
             MitsonarError: the frames lack the label.
         """
-        shown = _label(frames, name, index)
-        return shown if self.fan is None else np.asarray(nearest_cells(self.fan.fan, shown, -1), dtype=np.int64)
+        label_map = _label_map(frames, name, index)
+        return label_map if self.fan is None else np.asarray(nearest_cells(self.fan.fan, label_map, -1), dtype=np.int64)
 
     def regions(self, frames: SonarFrames, index: int, raised_db: float = 0.0) -> list[Region]:
         """Return the region of each visible object in a frame, ordered by shape and object.
@@ -533,24 +536,24 @@ class LabelledPictures:
         Raises:
             MitsonarError: the frames have no ``shape_id``.
         """
-        shape = self.label(frames, "shape_id", index)
-        part = self.label(frames, "object_id", index) if frames.object_id is not None else np.zeros_like(shape)
+        shape_map = self.label(frames, "shape_id", index)
+        object_map = self.label(frames, "object_id", index) if frames.object_id is not None else np.zeros_like(shape_map)
         snr = self.snr_db(frames, index, raised_db) if self.least_snr_db > -np.inf else {}
-        found = []
-        for place in (int(one) for one in np.unique(shape) if one >= 0):
-            kind = self._kind_of(place)
+        regions = []
+        for shape_index in (int(value) for value in np.unique(shape_map) if value >= 0):
+            kind = self._class_number(shape_index)
             if kind is None:
                 continue
-            of_kind = shape == place
-            for number in (int(one) for one in np.unique(part[of_kind])):
-                mask = of_kind & (part == number)
-                if snr.get((place, number), np.inf) < self.least_snr_db:
+            in_shape = shape_map == shape_index
+            for object_number in (int(value) for value in np.unique(object_map[in_shape])):
+                mask = in_shape & (object_map == object_number)
+                if snr.get((shape_index, object_number), np.inf) < self.least_snr_db:
                     self.faint += 1
                 elif np.count_nonzero(mask) < self.least:
                     self.small += 1
                 else:
-                    found.append(Region(kind, place, max(0, number), mask, _box(mask)))
-        return found
+                    regions.append(Region(kind, shape_index, max(0, object_number), mask, _box(mask)))
+        return regions
 
     def snr_db(self, frames: SonarFrames, index: int, raised_db: float = 0.0) -> dict[tuple[int, int], float]:
         """Compute the signal-to-noise ratio of each object in a frame [dB], keyed by shape and object.
@@ -564,21 +567,23 @@ class LabelledPictures:
             return {}
         # 1. Separate the cells with an echo, and determine the mean noise of each range.
         level = frames.select(slice(index, index + 1)).linear_values()[0].astype(float)
-        shape = _label(frames, "shape_id", index)
-        part = _label(frames, "object_id", index) if frames.object_id is not None else np.zeros_like(shape)
-        echo = shape >= 0
+        shape_map = _label_map(frames, "shape_id", index)
+        object_map = _label_map(frames, "object_id", index) if frames.object_id is not None else np.zeros_like(shape_map)
+        echo = shape_map >= 0
         noise = _noise_levels(frames, raised_db)
         if noise is None:
             dark = level[~echo]
             noise = np.full(len(level), float(dark.mean()) if dark.size else 0.0)
         # 2. Sum level and noise over the cells of each object; the cell counts cancel in the ratio.
-        pairs, place = np.unique(np.stack([shape[echo], part[echo]], axis=-1), axis=0, return_inverse=True)
-        place = place.ravel()
-        alone = np.bincount(place, np.broadcast_to(noise[:, None], level.shape)[echo])
+        pairs, pair_index = np.unique(np.stack([shape_map[echo], object_map[echo]], axis=-1), axis=0, return_inverse=True)
+        pair_index = pair_index.ravel()
+        noise_sum = np.bincount(pair_index, np.broadcast_to(noise[:, None], level.shape)[echo])
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(alone > 0, np.maximum(0.0, np.bincount(place, level[echo]) - alone) / alone, np.inf)
+            ratio = np.where(
+                noise_sum > 0, np.maximum(0.0, np.bincount(pair_index, level[echo]) - noise_sum) / noise_sum, np.inf
+            )
             decibels = 10 * np.log10(ratio)
-        return {(int(kind), int(number)): float(one) for (kind, number), one in zip(pairs, decibels, strict=True)}
+        return {(int(shape), int(number)): float(value) for (shape, number), value in zip(pairs, decibels, strict=True)}
 
     def count(self, part: str, regions: Sequence[Region]) -> None:
         """Add the regions of a written frame to :attr:`boxes`."""
@@ -592,7 +597,7 @@ class LabelledPictures:
         """
         if not self.boxes:
             raise MitsonarError(
-                f"no object is seen in any of {frames:,} frames ({self.faint:,} are below --least-snr-db "
+                f"no object is visible in any of {frames:,} frames ({self.faint:,} are below --least-snr-db "
                 f"{self.least_snr_db:g}, {self.small:,} have fewer pixels than --least {self.least}): move the sonar nearer "
                 "to the objects, or lower these"
             )
@@ -605,17 +610,17 @@ def class_rules(text: str) -> list[tuple[str, str]]:
         MitsonarError: a part is not GLOB=CLASS.
     """
     rules = []
-    for one in filter(None, (part.strip() for part in text.split(","))):
-        glob, equals, kind = (word.strip() for word in one.partition("="))
+    for rule in filter(None, (part.strip() for part in text.split(","))):
+        glob, equals, kind = (word.strip() for word in rule.partition("="))
         if not glob or not equals:
             raise MitsonarError(
-                f"--classes is GLOB=CLASS, with commas between, an empty class leaves shapes out: got {one!r}"
+                f"--classes must be GLOB=CLASS, separated by commas (an empty class leaves shapes out): got {rule!r}"
             )
         rules.append((glob, kind))
     return rules
 
 
-def _label(frames: SonarFrames, name: str, index: int) -> NDArray[np.int64]:
+def _label_map(frames: SonarFrames, name: str, index: int) -> NDArray[np.int64]:
     """Return a label of a frame ``(bins, beams)``.
 
     Raises:
@@ -654,8 +659,8 @@ def runs_of(mask: NDArray[np.bool_]) -> list[int]:
 def compressed(runs: list[int]) -> str:
     """Encode run lengths in COCO's compressed text: differences to the run two places before, 5 bits per character."""
     letters = []
-    for place, run in enumerate(runs):
-        value = run - runs[place - 2] if place > 2 else run
+    for index, run in enumerate(runs):
+        value = run - runs[index - 2] if index > 2 else run
         while True:
             bits = value & 31
             value >>= 5
@@ -671,19 +676,29 @@ def compressed(runs: list[int]) -> str:
 
 Array = NDArray[np.float64]
 
-TENTH = 0.1
+MAX_AXIS_DEVIATION = 0.1
 """Largest deviation of a bin or beam from its place in the sonar, as a fraction of the step to the next."""
 
-EXACT = 1e-6
+EQUAL_AXIS_DEVIATION = 1e-6
 """Deviation, as such a fraction, below which ranges and bearings are those of the sonar; files round them."""
 
-SAME = 1e-3
+FIELD_TOLERANCE = 1e-3
 """Largest relative difference of numbers of one sonar between two files."""
 
-OTHER = ("name", "seed", "frame_rate_hz", "quality", "thesis_rays", "rays_per_beam", "rays_across", "jitter", *NOISE_FIELDS)
+IGNORED_FIELDS = (
+    "name",
+    "seed",
+    "frame_rate_hz",
+    "quality",
+    "thesis_rays",
+    "rays_per_beam",
+    "rays_across",
+    "jitter",
+    *NOISE_FIELDS,
+)
 """Fields of a sonar in which frames of one data set may differ."""
 
-AXES = ("range_min", "range_max", "azimuth_fov_deg", "beam_layout")
+AXIS_FIELDS = ("range_min", "range_max", "azimuth_fov_deg", "beam_layout")
 """Fields that are compared as ranges and bearings."""
 
 
@@ -706,16 +721,20 @@ class Axes:
         """Return the bearings of the beams ``(beams,)`` [rad]."""
         return self.sonar.bearing_rad if self.bearing_rad is None else self.bearing_rad
 
-    def other(self, than: Axes) -> list[str]:
+    def differences_from(self, other: Axes) -> list[str]:
         """Return the differences from another sonar, with both values: ``range_bins 128, not 256``."""
-        mine, its = ({**one.sonar.model_dump(), "level": one.level} for one in (self, than))
-        keys = [key for key in mine if key not in (*OTHER, *AXES) and not _same(mine[key], its[key])]
-        if self.sonar.range_bins == than.sonar.range_bins and not _near(self.sonar.range_m, than.sonar.range_m, TENTH):
+        values, other_values = ({**axes.sonar.model_dump(), "level": axes.level} for axes in (self, other))
+        keys = [
+            key for key in values if key not in (*IGNORED_FIELDS, *AXIS_FIELDS) and not _same(values[key], other_values[key])
+        ]
+        if self.sonar.range_bins == other.sonar.range_bins and not _near(
+            self.sonar.range_m, other.sonar.range_m, MAX_AXIS_DEVIATION
+        ):
             keys += ["range_min", "range_max"]
-        if self.sonar.beams == than.sonar.beams and not _near(self.bearings, than.bearings, TENTH):
+        if self.sonar.beams == other.sonar.beams and not _near(self.bearings, other.bearings, MAX_AXIS_DEVIATION):
             keys += ["azimuth_fov_deg", "bearings"]
-        mine, its = ({**table, "bearings": "of other beams"} for table in (mine, its))
-        return [f"{key} {shown(mine[key])}, not {shown(its[key])}" for key in keys]
+        values, other_values = ({**fields, "bearings": "of other beams"} for fields in (values, other_values))
+        return [f"{key} {shown(values[key])}, not {shown(other_values[key])}" for key in keys]
 
 
 @dataclass(frozen=True)
@@ -804,19 +823,19 @@ def frames_with_poses(
     longest = recording.part()
     axes = axes_of(longest.like, where)
     known = None if path is None else Trajectory.load(path, frame)
-    found: list[Stretch] = []
+    pieces: list[Stretch] = []
     for number, part in enumerate(recording.parts):
-        if number == recording.longest or (len(part) and not axes_of(part.like, where).other(axes)):
-            found += _stretches_of(part, where, known, height_m, cut)
-    if not found:
+        if number == recording.longest or (len(part) and not axes_of(part.like, where).differences_from(axes)):
+            pieces += _stretches_of(part, where, known, height_m, cut)
+    if not pieces:
         raise MitsonarError(
             f"{where} has no two consecutive frames with a pose: give --poses with a path that has the times of its frames"
         )
-    taken = sum(map(len, found))
+    frame_count = sum(map(len, pieces))
     poses = "its own" if path is None else str(path)
     scale = float(longest.like.level_scale)
     notes = recording.notes
-    return FramesWithPoses(str(where), recording.format, poses, axes, scale, found, len(recording) - taken, notes)
+    return FramesWithPoses(str(where), recording.format, poses, axes, scale, pieces, len(recording) - frame_count, notes)
 
 
 def axes_of(like: SonarFrames, name: str) -> Axes:
@@ -830,20 +849,29 @@ def axes_of(like: SonarFrames, name: str) -> Axes:
         MitsonarError: the frames contain contrast, or their ranges are not evenly spaced.
     """
     if like.level == "contrast":
-        raise MitsonarError(f"{name} holds contrast, no levels: give the frames before their contrast")
-    sonar = like.sonar
-    own = sonar.range_bins == len(like.range_m) and sonar.beams == len(like.bearing_rad)
-    if not (own and _near(sonar.range_m, like.range_m, EXACT) and _near(sonar.bearing_rad, like.bearing_rad, EXACT)):
-        if min(len(like.range_m), len(like.bearing_rad)) < 2:
-            raise MitsonarError(f"{name} has frames of one bin or one beam: their sonar must tell its window")
-        sonar = as_instrument(like)[0].sonar
-    if not _near(sonar.range_m, like.range_m, TENTH):
         raise MitsonarError(
-            f"the ranges of {name} are not at even steps, and a data set holds no others: resample its frames, or give a "
+            f"{name} contains contrast instead of levels: give the frames from which the contrast was computed"
+        )
+    sonar = like.sonar
+    same_size = sonar.range_bins == len(like.range_m) and sonar.beams == len(like.bearing_rad)
+    if not (
+        same_size
+        and _near(sonar.range_m, like.range_m, EQUAL_AXIS_DEVIATION)
+        and _near(sonar.bearing_rad, like.bearing_rad, EQUAL_AXIS_DEVIATION)
+    ):
+        if min(len(like.range_m), len(like.bearing_rad)) < 2:
+            raise MitsonarError(
+                f"{name} has frames of one bin or one beam, and they do not match the window of their sonar: correct "
+                "range_min, range_max and azimuth_fov_deg of the sonar"
+            )
+        sonar = as_instrument(like)[0].sonar
+    if not _near(sonar.range_m, like.range_m, MAX_AXIS_DEVIATION):
+        raise MitsonarError(
+            f"the ranges of {name} are not at even steps, which a data set needs: resample its frames, or give a "
             "recording whose bins are even"
         )
-    even = _near(sonar.bearing_rad, like.bearing_rad, EXACT)
-    return Axes(sonar, None if even else np.asarray(like.bearing_rad, dtype=float), like.level)
+    as_in_sonar = _near(sonar.bearing_rad, like.bearing_rad, EQUAL_AXIS_DEVIATION)
+    return Axes(sonar, None if as_in_sonar else np.asarray(like.bearing_rad, dtype=float), like.level)
 
 
 def _stretches_of(part: Part, name: str, path: Trajectory | None, height_m: float | None, cut: int | None) -> list[Stretch]:
@@ -852,14 +880,14 @@ def _stretches_of(part: Part, name: str, path: Trajectory | None, height_m: floa
     time = np.asarray(part.time_s, dtype=float)
     time = time.mean(axis=1) if time.ndim == 2 else time
     if not np.isfinite(time).all() or not (np.diff(time) > 0).all():
-        raise MitsonarError(f"the times of {name} do not rise: its frames have no order")
+        raise MitsonarError(f"the times of {name} do not increase: sort its frames by time")
     # 2. Take the poses from the path, or from the frames.
     if path is not None:
         poses, known = poses_at(path, time, name, part.attitude_rad)
     elif part.poses is None:
         raise MitsonarError(
-            f"{name} holds no poses: give --poses PATH.tum, the path of the sonar by DVL and INS, by another instrument or "
-            "by `mitsonar odometry`"
+            f"{name} contains no poses: give --poses PATH.tum, the path of the sonar by DVL and INS, by another instrument "
+            "or by `mitsonar odometry`"
         )
     else:
         poses = np.asarray(part.poses, dtype=float)
@@ -867,13 +895,13 @@ def _stretches_of(part: Part, name: str, path: Trajectory | None, height_m: floa
     # 3. Fill in missing heights, and cut stretches that are too long.
     height = np.full(len(time), np.nan) if part.height_m is None else np.array(part.height_m, dtype=float)
     height = np.where(np.isfinite(height) | (height_m is None), height, np.nan if height_m is None else height_m)
-    found = []
-    for one in stretches(known, time):
-        step = cut or one.stop - one.start
-        for first in range(one.start, one.stop - 1, step):
-            here = slice(first, min(first + step, one.stop))
-            found.append(Stretch(part, first, time[here], poses[here], height[here]))
-    return [one for one in found if len(one) > 1]
+    pieces = []
+    for run in stretches(known, time):
+        step = cut or run.stop - run.start
+        for first in range(run.start, run.stop - 1, step):
+            interval = slice(first, min(first + step, run.stop))
+            pieces.append(Stretch(part, first, time[interval], poses[interval], height[interval]))
+    return [run for run in pieces if len(run) > 1]
 
 
 def as_pixels(image: NDArray[np.generic], pixel: str, name: str) -> NDArray[np.generic]:
@@ -890,24 +918,24 @@ def as_pixels(image: NDArray[np.generic], pixel: str, name: str) -> NDArray[np.g
     return values
 
 
-def _near(one: Array, other: Array, part: float) -> bool:
-    """Return whether two axes agree within the fraction ``part`` of the smallest step."""
-    if len(one) != len(other):
+def _near(axis: Array, other: Array, fraction: float) -> bool:
+    """Return whether two axes agree within the fraction ``fraction`` of the smallest step."""
+    if len(axis) != len(other):
         return False
     step = float(np.diff(other).min()) if len(other) > 1 else max(abs(float(other[0])), 1.0)
-    return bool(np.abs(one - other).max() <= part * step)
+    return bool(np.abs(axis - other).max() <= fraction * step)
 
 
-def _same(one: object, other: object) -> bool:
-    if isinstance(one, float) and isinstance(other, float):
-        return math.isclose(one, other, rel_tol=SAME, abs_tol=1e-9)
-    return one == other
+def _same(value: object, other: object) -> bool:
+    if isinstance(value, float) and isinstance(other, float):
+        return math.isclose(value, other, rel_tol=FIELD_TOLERANCE, abs_tol=1e-9)
+    return value == other
 
 
 # ---------------- Data set of recorded frames
 
 
-OTHER_GAIN = 0.01
+GAIN_TOLERANCE = 0.01
 """Relative difference of the level scales of two files above which a note mentions it."""
 
 
@@ -962,9 +990,9 @@ def write_recorded(
     with new_folder(path) as folder:
         store = DataStore.create(Storage(folder), recipe, plan, about)
         for shard in range(store.shards):
-            here = store.frames_of(shard)
-            store.write_shard(shard, _values(store, stretches, here))
-            progress(here.stop - here.start)
+            frame_slice = store.frames_of(shard)
+            store.write_shard(shard, _shard_arrays(store, stretches, frame_slice))
+            progress(frame_slice.stop - frame_slice.start)
         store.finish()
     return RecordedDataSet(path, len(plan), len(stretches), _notes(sources, len(stretches)))
 
@@ -977,26 +1005,26 @@ def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
     """
     # 1. Check that the sources fit together.
     if not sources:
-        raise MitsonarError("a data set needs frames: give a run or a recording, or more")
+        raise MitsonarError("a data set needs frames: give at least one run or recording")
     first = sources[0]
     for one in sources[1:]:
-        other = one.axes.other(first.axes)
-        if other:
+        differences = one.axes.differences_from(first.axes)
+        if differences:
             raise MitsonarError(
-                f"{one.name} is of another sonar than {first.name}: {'; '.join(other[:6])}; make a data set of each"
+                f"{one.name} has another sonar than {first.name}: {'; '.join(differences[:6])}; make one data set for each"
             )
     names = [one.name for one in sources]
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise MitsonarError(f"{twice[0]} is given twice: its frames would be in training and in validation")
+    duplicates = [name for name in names if names.count(name) > 1]
+    if duplicates:
+        raise MitsonarError(f"{duplicates[0]} is given twice: its frames would be in both training and validation")
     # 2. Derive mount and flight from the poses: median attitude, range of heights, largest motion between frames.
     stretches = [stretch for source in sources for stretch in source.stretches]
     poses = np.concatenate([one.poses for one in stretches])
-    moved = np.abs(np.concatenate([motions(one.poses) for one in stretches])).max(axis=0)
+    largest_motion = np.abs(np.concatenate([motions(one.poses) for one in stretches])).max(axis=0)
     low, high = _heights(stretches)
     pitch, roll = (float(np.round(np.degrees(np.median(poses[:, axis])), 2)) for axis in (3, 4))
-    floats = any(one.part.like.image.dtype != np.uint8 for one in stretches)
-    several = {"by": "scene", "train": 0.8, "validation": 0.2, "test": 0.0}
+    has_floats = any(one.part.like.image.dtype != np.uint8 for one in stretches)
+    split_by_scene = {"by": "scene", "train": 0.8, "validation": 0.2, "test": 0.0}
     bearings = first.axes.bearing_rad
     return recipe_from(
         {
@@ -1008,32 +1036,32 @@ def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
             "flight": {
                 "kind": "recorded",
                 "height_m": [low, high],
-                "sideways_mm": 1e3 * float(moved[0]),
-                "forward_mm": 1e3 * float(moved[1]),
-                "yaw_deg": float(np.degrees(moved[2])),
+                "sideways_mm": 1e3 * float(largest_motion[0]),
+                "forward_mm": 1e3 * float(largest_motion[1]),
+                "yaw_deg": float(np.degrees(largest_motion[2])),
                 "jump_m": None,
             },
-            "pixel": "float32" if floats else "uint8",
-            **({"split": several} if len(sources) > 1 else {}),
+            "pixel": "float32" if has_floats else "uint8",
+            **({"split": split_by_scene} if len(sources) > 1 else {}),
             "recorded": {
                 "level": first.axes.level,
                 "bearings": None if bearings is None else bearings.tolist(),
-                "sources": [_source(one) for one in sources],
+                "sources": [_source_fields(one) for one in sources],
             },
         }
     )
 
 
-def _source(one: FramesWithPoses) -> dict[str, str | int | float]:
+def _source_fields(source: FramesWithPoses) -> dict[str, str | int | float]:
     """Return the keys that describe a source in the recipe."""
     return {
-        "name": one.name,
-        "format": one.format,
-        "poses": one.poses,
-        "frames": len(one),
-        "left_out": one.left_out,
-        "level_scale": one.level_scale,
-        "start_s": float(one.stretches[0].time_s[0]),
+        "name": source.name,
+        "format": source.format,
+        "poses": source.poses,
+        "frames": len(source),
+        "left_out": source.left_out,
+        "level_scale": source.level_scale,
+        "start_s": float(source.stretches[0].time_s[0]),
     }
 
 
@@ -1043,13 +1071,13 @@ def _heights(stretches: Sequence[Stretch]) -> tuple[float, float]:
     Raises:
         MitsonarError: no frame has a height, and not all poses lie above z = 0.
     """
-    told = np.concatenate([one.height_m for one in stretches])
-    told = told[np.isfinite(told) & (told > 0)]
-    if not told.size:
-        told = np.concatenate([one.poses[:, 2] for one in stretches])
-    if told.min() <= 0:
-        raise MitsonarError("no frame tells its height over the ground, and their poses are below z = 0: give --height")
-    return float(told.min()), float(told.max())
+    height_m = np.concatenate([one.height_m for one in stretches])
+    height_m = height_m[np.isfinite(height_m) & (height_m > 0)]
+    if not height_m.size:
+        height_m = np.concatenate([one.poses[:, 2] for one in stretches])
+    if height_m.min() <= 0:
+        raise MitsonarError("no frame has a height above the ground, and some poses are not above z = 0: give --height")
+    return float(height_m.min()), float(height_m.max())
 
 
 def _plan(sources: Sequence[FramesWithPoses]) -> Plan:
@@ -1071,23 +1099,23 @@ def _plan(sources: Sequence[FramesWithPoses]) -> Plan:
     )
 
 
-def _values(store: DataStore, stretches: Sequence[Stretch], here: slice) -> dict[str, Values]:
+def _shard_arrays(store: DataStore, stretches: Sequence[Stretch], frame_slice: slice) -> dict[str, Values]:
     """Read the frames of a shard, and return their stored arrays, keyed by name."""
     images, heights, first = [], [], 0
-    for one in stretches:
-        part = slice(max(here.start - first, 0), min(here.stop - first, len(one)))
-        if part.start < part.stop:
-            frames = one.read(part)
-            images.append(as_pixels(frames.image, store.recipe.pixel, f"frame {first + part.start} and those after it"))
-            heights.append(one.height_m[part])
-        first += len(one)
+    for stretch in stretches:
+        overlap = slice(max(frame_slice.start - first, 0), min(frame_slice.stop - first, len(stretch)))
+        if overlap.start < overlap.stop:
+            frames = stretch.read(overlap)
+            images.append(as_pixels(frames.image, store.recipe.pixel, f"frame {first + overlap.start} and those after it"))
+            heights.append(stretch.height_m[overlap])
+        first += len(stretch)
     image = np.concatenate(images)
-    full = 255 if store.recipe.pixel == "uint8" else 1
+    full_scale = 255 if store.recipe.pixel == "uint8" else 1
     return {
         "image": image,
         "height_m": np.concatenate(heights),
         "dropped": np.zeros(len(image), dtype=np.uint32),
-        "saturated": (image == full).sum(axis=(1, 2), dtype=np.uint32),
+        "saturated": (image == full_scale).sum(axis=(1, 2), dtype=np.uint32),
     }
 
 
@@ -1095,18 +1123,18 @@ def _notes(sources: Sequence[FramesWithPoses], sequences: int) -> list[str]:
     """Return notes for the user, one sentence each."""
     notes = [f"{one.name}: {note}" for one in sources for note in one.notes]
     notes += [
-        f"{one.name}: left out: {counted(one.left_out, 'frame')} without a pose, of another geometry, or with no neighbour"
+        f"{one.name}: left out: {counted(one.left_out, 'frame')} without pose, with another geometry, or without neighbour"
         for one in sources
         if one.left_out
     ]
     scales = np.array([one.level_scale for one in sources])
-    if np.ptp(scales) > OTHER_GAIN * scales.max():
+    if np.ptp(scales) > GAIN_TOLERANCE * scales.max():
         notes.append(
             f"the gains of the files differ (levels of a pixel of 1 from {scales.min():.3g} to {scales.max():.3g}): pixels "
-            "stay as they are, and levels can be compared within a file only"
+            "are unchanged, and levels are comparable only within a file"
         )
     if not all(np.isfinite(one.height_m).all() for source in sources for one in source.stretches):
-        notes.append("not all frames have a height over the ground, which most estimators need: --height gives one")
+        notes.append("not all frames have a height above the ground, which most estimators need: give --height")
     if sequences == 1:
         notes.append(
             "one sequence cannot be split: read it with `--part all`, or cut it with --cut to train on some sequences and "

@@ -162,7 +162,7 @@ def test_webdataset_decodes_samples(
     webdataset = pytest.importorskip("webdataset")
     from mitsonar.bridges import export_formats
 
-    monkeypatch.setattr(export_formats, "OF_SHARD", 2)
+    monkeypatch.setattr(export_formats, "SAMPLES_PER_SHARD", 2)
     assert mitsonar("frames", "export", run, "--to", "webdataset", "-o", tmp_path / "wds").returncode == 0
     shards = sorted(map(str, (tmp_path / "wds").glob("train-*.tar")))
     assert [Path(one).name for one in shards] == [f"train-{k:06d}.tar" for k in range(3)]
@@ -322,7 +322,7 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--polygons"), "--polygons")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--classes", "sand"), "GLOB=CLASS")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--classes", "*="), "no class is left")
-    refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--least", "1000"), "no object is seen", "--least")
+    refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--least", "1000"), "no object is visible", "--least")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--split", "0.5,0.5"), "3 numbers")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--split", "0.5,0.5,0.5"), "add up to 1")
     bare = SonarFrames(frames.image, frames.range_m, frames.bearing_rad, frames.time_s, SONAR)
@@ -344,7 +344,7 @@ def test_an_export_that_breaks_off_leaves_nothing_and_a_killed_one_is_replaced(r
     assert not list(tmp_path.iterdir())
     part = tmp_path / ".out.part"
     part.mkdir()
-    with pytest.raises(MitsonarError, match="no export of mitsonar made it"):
+    with pytest.raises(MitsonarError, match="not an unfinished export of mitsonar"):
         export_to("coco", source, out)
     (part / ".mitsonar-export").touch()
     (part / "half").touch()
@@ -356,7 +356,7 @@ def test_an_export_that_breaks_off_leaves_nothing_and_a_killed_one_is_replaced(r
 def test_few_frames_are_read_at_a_time(frames: SonarFrames, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from mitsonar.bridges import export_source
 
-    monkeypatch.setattr(export_source, "AT_ONCE_BYTES", 2 * BINS * BEAMS * 12)
+    monkeypatch.setattr(export_source, "CHUNK_BYTES", 2 * BINS * BEAMS * 12)
     sizes = [len(piece) for _, piece in open_export(run).pieces()]
     assert sizes == [2, 2, 1]
 
@@ -541,7 +541,7 @@ def test_what_a_detectors_data_set_cannot_be_made_of(mitsonar: Command, tmp_path
     refused(mitsonar(*named, "--to", "kitti"), "--to is coco or yolo")
     refused(mitsonar(*named, "--height", "0.1,2"), "--height must be at least 0.3 m")
     refused(mitsonar(*named, "--height", "2"), "--height takes 2 numbers")
-    refused(mitsonar("dataset", "detector", tmp_path / "bare.xml", "-o", tmp_path / "out"), "its ground and no objects")
+    refused(mitsonar("dataset", "detector", tmp_path / "bare.xml", "-o", tmp_path / "out"), "contains only ground")
     assert {path.name for path in tmp_path.iterdir()} == {"scene.xml", "bare.xml"}
 
 
@@ -578,10 +578,10 @@ def test_a_window_is_cut_to_the_ground_unless_it_is_chosen(tmp_path: Path, varia
     named = tmp_path / "scene.xml", DetectorViews(6, heights=(0.6, 1.8)), "oculus-m750d-750khz"
     cut, _, notes = detector_recipe(*named)
     assert cut.instrument.range_max < 20
-    assert any("so that fans fit into" in note for note in notes)
+    assert any("to fit into" in note for note in notes)
     chosen, _, notes = detector_recipe(*named, {"sonar.range_max": 3.0})
     assert (chosen.instrument.range_max, chosen.instrument.range_bins) == (3.0, load_sonar(named[2]).range_bins)
-    assert not any("so that fans fit into" in note for note in notes)
+    assert not any("to fit into" in note for note in notes)
 
 
 def test_visible_labels_reach_beyond_the_half_power_beam(variant: str) -> None:

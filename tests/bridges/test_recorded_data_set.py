@@ -124,7 +124,7 @@ def test_what_the_user_should_know_is_said(places: dict[str, Path], frames: Sona
     left, gains, heights = made.notes
     assert "quiet.npz: left out: 4 frames" in left
     assert "the gains of the files differ (levels of a pixel of 1 from 0.5 to 1)" in gains
-    assert "--height gives one" in heights
+    assert "give --height" in heights
     recipe = DataStore.open(tmp_path / "data.zarr").recipe
     assert recipe.recorded is not None
     assert [(one.frames, one.level_scale) for one in recipe.recorded.sources] == [(24, 1.0), (20, 0.5)]
@@ -251,7 +251,7 @@ def test_a_network_is_trained_on_it_and_evaluated(places: dict[str, Path], tmp_p
 def test_refusals_say_what_to_give(mitsonar: Command, places: dict[str, Path], frames: SonarFrames, tmp_path: Path) -> None:
     out = tmp_path / "data.zarr"
     replace(frames, poses=None).save(tmp_path / "bare.npz")
-    refused(mitsonar("dataset", "from-frames", tmp_path / "bare.npz", "-o", out), "holds no poses", "--poses")
+    refused(mitsonar("dataset", "from-frames", tmp_path / "bare.npz", "-o", out), "contains no poses", "--poses")
     unknown = replace(frames, height_m=None, poses=true_poses(frames) * [1, 1, 0, 1, 1, 1])
     unknown.save(tmp_path / "low.npz")
     refused(mitsonar("dataset", "from-frames", tmp_path / "low.npz", "-o", out), "give --height")
@@ -297,7 +297,7 @@ def test_axes_that_no_sonar_has_are_refused_or_kept(frames: SonarFrames) -> None
     assert found.bearing_rad is not None
     assert np.array_equal(found.bearing_rad, bent)
     assert axes_of(frames, "dive").bearing_rad is None
-    assert "bearings" in found.other(axes_of(frames, "dive"))[-1]
+    assert "bearings" in found.differences_from(axes_of(frames, "dive"))[-1]
 
 
 def test_nothing_is_rendered_of_recorded_frames(places: dict[str, Path], tmp_path: Path) -> None:
