@@ -19,7 +19,7 @@ from mitsonar.bridges.live import (
     FanEncoder,
     LivePing,
     PoseMailbox,
-    asked_pose,
+    parse_pose,
     pose_in_ros,
     projected_image,
     timing,
@@ -30,15 +30,15 @@ __all__ = ["SONAR_FRAME", "WORLD_FRAME", "FoxgloveServer"]
 
 SONAR_FRAME, WORLD_FRAME, POSE_TOPIC = "sonar", "world", "/pose"
 
-FAREWELL_S = 1.0
+CLOSE_TIMEOUT_S = 1.0
 """Longest time that :meth:`FoxgloveServer.close` waits for clients to disconnect [s]."""
 
-NUMBERS = ("number", "dropped", "pose_ns", "published_ns", "render_ms", "latency_ms")
-TIMING = {
+NUMBER_FIELDS = ("number", "dropped", "pose_ns", "published_ns", "render_ms", "latency_ms")
+TIMING_SCHEMA = {
     "type": "object",
     "title": "mitsonar.Timing",
     "properties": {
-        **{name: {"type": "number"} for name in (*NUMBERS, "x", "y", "z", "pitch", "roll", "heading")},
+        **{name: {"type": "number"} for name in (*NUMBER_FIELDS, "x", "y", "z", "pitch", "roll", "heading")},
         "source": {"type": "string"},
     },
 }
@@ -66,7 +66,7 @@ class FoxgloveServer:
         self._polar = foxglove.Channel("/sonar/image", schema=schema, message_encoding="cdr", context=context)
         self._transform = FrameTransformChannel("/tf", context=context)
         self._pose = PoseInFrameChannel("/sonar/pose", context=context)
-        self._timing = foxglove.Channel("/sonar/timing", schema=TIMING, message_encoding="json", context=context)
+        self._timing = foxglove.Channel("/sonar/timing", schema=TIMING_SCHEMA, message_encoding="json", context=context)
         self._encoder = FanEncoder()
         try:
             self._server = foxglove.start_server(
@@ -76,7 +76,7 @@ class FoxgloveServer:
                 context=context,
                 capabilities=[Capability.ClientPublish],
                 supported_encodings=["json"],
-                server_listener=_Poses(mailbox, self.complain),
+                server_listener=_PoseListener(mailbox, self.warn),
                 message_backlog_size=16,
             )
         except (RuntimeError, OSError) as error:
@@ -90,15 +90,15 @@ class FoxgloveServer:
 
         Images are encoded only for subscribers. The fan is sent first, because TCP may delay later messages.
         """
-        frames, when = ping.frames, ping.time_ns
-        stamp = Timestamp(sec=when // 10**9, nsec=when % 10**9)
+        frames, time_ns = ping.frames, ping.time_ns
+        stamp = Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
         if self._fan.has_sinks():
             data = self._encoder.jpeg(frames)
             image = CompressedImage(timestamp=stamp, frame_id=SONAR_FRAME, data=data, format="jpeg")
-            self._fan.log(image, log_time=when)
+            self._fan.log(image, log_time=time_ns)
         assert frames.poses is not None
-        place, turn = pose_in_ros(frames.poses[0])
-        position, rotation = _vector(place), _quaternion(turn)
+        position_m, quaternion = pose_in_ros(frames.poses[0])
+        position, rotation = _vector(position_m), _quaternion(quaternion)
         transform = FrameTransform(
             timestamp=stamp,
             parent_frame_id=WORLD_FRAME,
@@ -106,39 +106,39 @@ class FoxgloveServer:
             translation=position,
             rotation=rotation,
         )
-        self._transform.log(transform, log_time=when)
+        self._transform.log(transform, log_time=time_ns)
         pose = PoseInFrame(timestamp=stamp, frame_id=WORLD_FRAME, pose=Pose(position=position, orientation=rotation))
-        self._pose.log(pose, log_time=when)
+        self._pose.log(pose, log_time=time_ns)
         if self._polar.has_sinks():
-            self._polar.log(projected_image(frames, when, SONAR_FRAME), log_time=when)
-        self._timing.log(json.dumps(timing(ping)).encode(), log_time=when)
+            self._polar.log(projected_image(frames, time_ns, SONAR_FRAME), log_time=time_ns)
+        self._timing.log(json.dumps(timing(ping)).encode(), log_time=time_ns)
 
-    def complain(self, sentence: str) -> None:
+    def warn(self, message: str) -> None:
         """Send a warning to all clients; Foxglove shows it in its Problems panel."""
-        self._server.publish_status(sentence, foxglove.StatusLevel.Warning)
+        self._server.publish_status(message, foxglove.StatusLevel.Warning)
 
     def close(self) -> None:
-        """Close all connections. Wait at most :data:`FAREWELL_S`: a client that has stopped reading never disconnects."""
+        """Close all connections. Wait at most :data:`CLOSE_TIMEOUT_S`: a client that has stopped reading never disconnects."""
         stopping = threading.Thread(target=self._server.stop, daemon=True)
         stopping.start()
-        stopping.join(FAREWELL_S)
+        stopping.join(CLOSE_TIMEOUT_S)
 
 
-class _Poses(ServerListener):
+class _PoseListener(ServerListener):
     """Listener that parses the clients' poses in the server's threads, and answers invalid ones with a warning."""
 
-    def __init__(self, mailbox: PoseMailbox, complain: Any) -> None:
-        self.mailbox, self.complain = mailbox, complain
+    def __init__(self, mailbox: PoseMailbox, warn: Any) -> None:
+        self.mailbox, self.warn = mailbox, warn
         self._lock, self._channels = threading.Lock(), dict[tuple[int, int], str]()
 
     def on_client_advertise(self, client: Any, channel: Any) -> None:
-        fault = None
+        message = None
         if channel.topic != POSE_TOPIC:
-            fault = f"poses are read from {POSE_TOPIC}: got the topic {shortened(channel.topic)}"
+            message = f"poses must be published on {POSE_TOPIC}: got the topic {shortened(channel.topic)}"
         elif channel.encoding != "json":
-            fault = f"poses are read as json: got the encoding {shortened(channel.encoding)}"
-        if fault is not None:
-            self.complain(fault)
+            message = f"poses must be encoded as json: got the encoding {shortened(channel.encoding)}"
+        if message is not None:
+            self.warn(message)
             return
         with self._lock:
             self._channels[client.id, channel.id] = channel.topic
@@ -151,9 +151,9 @@ class _Poses(ServerListener):
         if (client.id, client_channel_id) not in self._channels:
             return
         try:
-            self.mailbox.put(asked_pose(data))
+            self.mailbox.put(parse_pose(data))
         except MitsonarError as error:
-            self.complain(f"a pose was refused: {error}")
+            self.warn(f"invalid pose: {error}")
 
 
 def _vector(values: NDArray[np.float64]) -> Vector3:

@@ -60,7 +60,7 @@ __all__ = [
 SonarSource: TypeAlias = "Simulator | mi.Scene | str | Path"
 """Source of pings: a simulator, a scene, or the file or name of a scene."""
 
-FIRST_PINGS = 2**31
+MAX_FIRST_PING = 2**31
 """Upper limit of the number of an episode's first ping, which is drawn at random."""
 
 
@@ -82,7 +82,7 @@ class SonarFleet:
         steps: number of steps since the start of each episode ``(count,)``.
 
     Raises:
-        MitsonarError: there are no vehicles, the source is no scene, there is no start, or every episode would end at once.
+        MitsonarError: there are no vehicles, no start, the source is not a scene, or every episode would end at once.
 
     Warns:
         MitsonarWarning: the start seems to lie below the seabed.
@@ -94,10 +94,10 @@ class SonarFleet:
         if not (isinstance(count, int | np.integer) and 1 <= count <= 100_000):
             raise MitsonarError(f"num_envs must be a whole number in 1..100000: got {count!r}")
         if not isinstance(source, Simulator | str | Path) and not hasattr(source, "shapes"):
-            raise MitsonarError(f"scene is a scene, its file or name, or a Simulator: got {type(source).__name__}")
+            raise MitsonarError(f"scene must be a scene, its file or name, or a Simulator: got {type(source).__name__}")
         if isinstance(source, Simulator):
             if sonar is not None or moving is not None:
-                raise MitsonarError("a simulator has its sonar and its moving bodies: leave sonar and moving out")
+                raise MitsonarError("a Simulator defines its sonar and its moving bodies: leave out sonar and moving")
             self.simulator = source
         else:
             scene = load_scene(source) if isinstance(source, str | Path) else source
@@ -109,12 +109,12 @@ class SonarFleet:
         from mitsonar.simulation.tracing import Clearance  # needs the variant that the simulator has set
 
         self._clearance = Clearance(self.simulator.tracer)
-        self._span = self._start_of(task)
+        self._span = self._start_poses(task)
         self._check_start()
         self.gain = self._gain() if task.gain is None else task.gain
         self.poses = np.repeat(self._span[:1], count, axis=0)
         self.steps = np.zeros(count, dtype=np.int64)
-        self._first = np.zeros(count, dtype=np.int64)
+        self._first_pings = np.zeros(count, dtype=np.int64)
 
     @property
     def clearance(self) -> Clearance:
@@ -123,58 +123,58 @@ class SonarFleet:
             self._clearance = type(self._clearance)(self.simulator.tracer)
         return self._clearance
 
-    def _start_of(self, task: SonarTask) -> Table:
+    def _start_poses(self, task: SonarTask) -> Table:
         """Return the two poses between which episodes begin ``(2, 6)`` [m, rad]."""
         if task.start is not None:
             return task.span
-        found = sonar_in(self.simulator.tracer.scene)
-        if found is None:
-            raise MitsonarError("the scene has no sonar whose pose episodes could begin at: give start, a pose or two")
-        span = np.repeat(np.asarray(found[1], dtype=float)[None], 2, axis=0)
+        scene_sonar = sonar_in(self.simulator.tracer.scene)
+        if scene_sonar is None:
+            raise MitsonarError("the scene has no sonar, at whose pose episodes would begin: give start, one pose or two")
+        span = np.repeat(np.asarray(scene_sonar[1], dtype=float)[None], 2, axis=0)
         task.refuse_outside(span)
         return span
 
     def _check_start(self) -> None:
         """Refuse a start whose two poses both collide; warn if it seems to lie below the seabed."""
-        places = self._span[:, :3]
-        clearance_m = self.clearance.of(places, places, np.zeros(2))
+        positions = self._span[:, :3]
+        clearance_m = self.clearance.of(positions, positions, np.zeros(2))
         if (clearance_m < self.task.clearance_m).all():
             raise MitsonarError(
-                f"start is {clearance_m.max():.3g} m from a surface, nearer than clearance_m {self.task.clearance_m:g}: "
-                "every episode would end at its first step; move it, or lower clearance_m"
+                f"start is {clearance_m.max():.3g} m from a surface, which is less than clearance_m "
+                f"{self.task.clearance_m:g}, so every episode would end at its first step; move start, or lower clearance_m"
             )
-        below, above = (self.clearance.straight(places, way) for way in ((0, 0, -1), (0, 0, 1)))
+        below, above = (self.clearance.straight(positions, direction) for direction in ((0, 0, -1), (0, 0, 1)))
         if (np.isinf(below) & np.isfinite(above)).all():
             warnings.warn(
-                f"below start there is nothing, and a surface {above.min():.3g} m above it: a vehicle under the seabed sees "
-                "it from below; nothing is wrong where that is a hull or ice",
+                f"there is no surface below start, and one {above.min():.3g} m above it: a vehicle under the seabed sees it "
+                "from below; ignore this if the surface is a hull or ice",
                 MitsonarWarning,
                 stacklevel=4,
             )
 
     def _gain(self) -> float:
         """Return the constant gain, determined from eight poses between those of the start, always the same ones."""
-        part = np.random.Generator(np.random.PCG64(0)).random((8, 6))
-        return constant_gain(self.simulator.pings(self._span[0] + part * np.ptp(self._span, axis=0)))[0]
+        fractions = np.random.Generator(np.random.PCG64(0)).random((8, 6))
+        return constant_gain(self.simulator.pings(self._span[0] + fractions * np.ptp(self._span, axis=0)))[0]
 
     def renew(self, which: NDArray[np.bool_], generators: Sequence[np.random.Generator]) -> None:
         """Begin new episodes for the vehicles selected by the mask ``which`` ``(count,)``."""
-        for number in map(int, np.flatnonzero(which)):
-            part = generators[number].random(6)
-            self.poses[number] = self._span[0] + part * (self._span[1] - self._span[0])
-            self._first[number] = generators[number].integers(FIRST_PINGS)
-            self.steps[number] = 0
+        for vehicle in map(int, np.flatnonzero(which)):
+            fractions = generators[vehicle].random(6)
+            self.poses[vehicle] = self._span[0] + fractions * (self._span[1] - self._span[0])
+            self._first_pings[vehicle] = generators[vehicle].integers(MAX_FIRST_PING)
+            self.steps[vehicle] = 0
 
     def look(self) -> tuple[NDArray[np.uint8], Table]:
         """Ping from all vehicles in one launch; return images ``(count, bins, beams)`` and altitudes ``(count,)`` [m].
 
         With the model ``coherent`` the vehicles ping one after the other.
         """
-        numbers = [int(number) for number in self._first + self.steps]
-        batches = list(self.simulator.pings(self.poses, first=numbers, time_s=self.time_s))
+        ping_numbers = [int(number) for number in self._first_pings + self.steps]
+        batches = list(self.simulator.pings(self.poses, first=ping_numbers, time_s=self.time_s))
         image = to_image(np.concatenate([pings.levels for pings in batches]), self.gain, self.sonar)
         if self.task.noise is not None:
-            image = self.task.noise.apply(image, seed=self.sonar.seed, frames=np.array(numbers))
+            image = self.task.noise.apply(image, seed=self.sonar.seed, frames=np.array(ping_numbers))
         height_m = np.concatenate([pings.height_m for pings in batches])
         altitude_m = np.minimum(np.nan_to_num(height_m, nan=np.inf), self.task.altimeter_m)
         return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8), altitude_m
@@ -198,11 +198,13 @@ class SonarFleet:
             MitsonarError: the actions have a wrong shape, or are not finite.
         """
         # 1. Move all vehicles, and put those with a new episode at its start.
-        given = np.asarray(action, dtype=float)
-        if given.shape != (len(self.poses), 4) or not np.isfinite(given).all():
-            raise MitsonarError(f"an action is four finite numbers for each of {len(self.poses)}: got {_wrong(given)}")
-        taken, before = np.clip(given, -1, 1), self.poses.copy()
-        self.poses = steered(before, taken * np.asarray(self.task.max_velocity), self.step_s)
+        actions = np.asarray(action, dtype=float)
+        if actions.shape != (len(self.poses), 4) or not np.isfinite(actions).all():
+            raise MitsonarError(
+                f"an action must be four finite numbers for each of {len(self.poses)}: got {_fault_of(actions)}"
+            )
+        clipped, before = np.clip(actions, -1, 1), self.poses.copy()
+        self.poses = steered(before, clipped * np.asarray(self.task.max_velocity), self.step_s)
         self.steps += 1
         self.renew(renewed, generators)
         before[renewed] = self.poses[renewed]
@@ -212,7 +214,7 @@ class SonarFleet:
         low, high = self.task.box
         outside = ((self.poses[:, :3] < low) | (self.poses[:, :3] > high)).any(axis=1)
         collided = clearance_m < self.task.clearance_m
-        return Transition(taken, before, self.poses.copy(), image, altitude_m, clearance_m, collided, outside)
+        return Transition(clipped, before, self.poses.copy(), image, altitude_m, clearance_m, collided, outside)
 
     def rewards(self, step: Transition) -> Table:
         """Return the rewards of a step ``(count,)``.
@@ -222,17 +224,19 @@ class SonarFleet:
         """
         if self.task.reward is None:
             return np.zeros(len(self.poses))
-        found = np.asarray(self.task.reward(step), dtype=float)
-        if found.shape not in ((len(self.poses),), ()) or not np.isfinite(found).all():
-            raise MitsonarError(f"reward must give {len(self.poses)} finite numbers, or one for all: got {_wrong(found)}")
-        return np.array(np.broadcast_to(found, len(self.poses)))
+        rewards = np.asarray(self.task.reward(step), dtype=float)
+        if rewards.shape not in ((len(self.poses),), ()) or not np.isfinite(rewards).all():
+            raise MitsonarError(
+                f"reward must return {len(self.poses)} finite numbers, or one for all: got {_fault_of(rewards)}"
+            )
+        return np.array(np.broadcast_to(rewards, len(self.poses)))
 
 
-def _wrong(given: Table) -> str:
+def _fault_of(values: Table) -> str:
     """Describe the fault of an array: its first value that is not finite, with its index, otherwise its shape."""
-    bad = np.argwhere(~np.isfinite(given))
-    place = bad[0].tolist() if len(bad) else []
-    return f"{given[tuple(place)]} at {place}" if len(bad) else f"the shape {given.shape}"
+    faulty = np.argwhere(~np.isfinite(values))
+    index = faulty[0].tolist() if len(faulty) else []
+    return f"{values[tuple(index)]} at {index}" if len(faulty) else f"the shape {values.shape}"
 
 
 # ---------------- Spaces and observations
@@ -242,7 +246,7 @@ Array: TypeAlias = NDArray[np.generic]
 Observation: TypeAlias = "Array | dict[str, Array]"
 """The image, or several arrays keyed by name."""
 
-FARTHEST = 1e9
+MAX_POSE = 1e9
 """Bound of the numbers of a pose in the observation space [m, rad]."""
 
 PICTURE_ROWS = 400
@@ -256,25 +260,25 @@ def action_space() -> spaces.Box:
 def observation_space(fleet: SonarFleet) -> spaces.Space[Observation]:
     """Return the observation space of one vehicle: the image ``(bins, beams, 1)`` uint8, or a dictionary with it."""
     sonar, task = fleet.sonar, fleet.task
-    known: dict[str, spaces.Space[Array]] = {
+    available: dict[str, spaces.Space[Array]] = {
         "image": spaces.Box(0, 255, (sonar.range_bins, sonar.beams, 1), np.uint8),
         "altitude": spaces.Box(0.0, task.altimeter_m, (1,), np.float32),
-        "pose": spaces.Box(-FARTHEST, FARTHEST, (6,), np.float64),
+        "pose": spaces.Box(-MAX_POSE, MAX_POSE, (6,), np.float64),
     }
-    chosen = {name: known[name] for name in task.observe}
-    made: spaces.Space[Observation] = known["image"] if len(chosen) == 1 else spaces.Dict(chosen)  # type: ignore[assignment]
-    return made
+    selected = {name: available[name] for name in task.observe}
+    space: spaces.Space[Observation] = available["image"] if len(selected) == 1 else spaces.Dict(selected)  # type: ignore[assignment]
+    return space
 
 
 def observed(fleet: SonarFleet, image: NDArray[np.uint8], altitude_m: Table) -> Observation:
     """Return the observations of all vehicles; the first axis is the vehicle."""
-    known: dict[str, Array] = {
+    available: dict[str, Array] = {
         "image": image[..., None].copy(),
         "altitude": altitude_m[:, None].astype(np.float32),
         "pose": fleet.poses.copy(),
     }
-    chosen = {name: known[name] for name in fleet.task.observe}
-    return known["image"] if len(chosen) == 1 else chosen
+    selected = {name: available[name] for name in fleet.task.observe}
+    return available["image"] if len(selected) == 1 else selected
 
 
 def fan_of(sonar: Sonar) -> CartesianMap:
@@ -320,8 +324,10 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         **task: Unpack[TaskFields],
     ) -> None:
         if render_mode not in (None, "rgb_array"):
-            raise MitsonarError(f"render_mode is rgb_array or None: got {render_mode!r}")
-        self.fleet = SonarFleet(scene, sonar, 1, moving, SonarTask.create({**task}, own=("moving", "render_mode")))
+            raise MitsonarError(f"render_mode must be rgb_array or None: got {render_mode!r}")
+        self.fleet = SonarFleet(
+            scene, sonar, 1, moving, SonarTask.create({**task}, other_arguments=("moving", "render_mode"))
+        )
         self.render_mode = render_mode
         self.action_space, self.observation_space = action_space(), observation_space(self.fleet)
         self._image: NDArray[np.uint8] | None = None
@@ -338,7 +344,7 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         self.fleet.renew(np.array([True]), [self.np_random])
         image, altitude_m = self.fleet.look()
         self._image = image[0]
-        return _first(observed(self.fleet, image, altitude_m)), {"pose": self.fleet.poses[0].copy()}
+        return _single(observed(self.fleet, image, altitude_m)), {"pose": self.fleet.poses[0].copy()}
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move by the action ``(4,)``, then ping.
@@ -355,18 +361,18 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         if self._image is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         fleet = self.fleet
-        moved = fleet.advance(np.asarray(action, dtype=float)[None], np.array([False]), [self.np_random])
-        self._image = moved.image[0]
+        transition = fleet.advance(np.asarray(action, dtype=float)[None], np.array([False]), [self.np_random])
+        self._image = transition.image[0]
         info = {
-            "pose": moved.poses[0].copy(),
-            "clearance_m": float(moved.clearance_m[0]),
-            "collided": bool(moved.collided[0]),
-            "outside": bool(moved.outside[0]),
+            "pose": transition.poses[0].copy(),
+            "clearance_m": float(transition.clearance_m[0]),
+            "collided": bool(transition.collided[0]),
+            "outside": bool(transition.outside[0]),
         }
         terminated = info["collided"] or info["outside"]
         truncated = fleet.task.max_steps is not None and int(fleet.steps[0]) >= fleet.task.max_steps
-        reward = float(fleet.rewards(moved)[0])
-        return _first(observed(fleet, moved.image, moved.altitude_m)), reward, terminated, truncated, info
+        reward = float(fleet.rewards(transition)[0])
+        return _single(observed(fleet, transition.image, transition.altitude_m)), reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture of the last ping's fan ``(rows, columns, 3)``, forward up.
@@ -378,9 +384,9 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         return fan_picture(fan_of(self.fleet.sonar), self._image)
 
 
-def _first(many: Observation) -> Observation:
+def _single(observation: Observation) -> Observation:
     """Return the observation of the only vehicle."""
-    return {name: values[0] for name, values in many.items()} if isinstance(many, dict) else many[0]
+    return {name: values[0] for name, values in observation.items()} if isinstance(observation, dict) else observation[0]
 
 
 # ---------------- Task of the vehicles
@@ -391,9 +397,9 @@ Table: TypeAlias = NDArray[np.float64]
 OBSERVABLE = ("image", "altitude", "pose")
 """Names of the observations that an environment can return."""
 
-VELOCITY = ("starboard", "forward", "up", "turn")
+VELOCITY_NAMES = ("starboard", "forward", "up", "turn")
 
-FULL_TURNS = np.array([np.pi, np.pi, 4 * np.pi])
+MAX_START_ANGLES_RAD = np.array([np.pi, np.pi, 4 * np.pi])
 """Largest pitch, roll and heading of a start [rad]; the interval of headings may cross 360 deg."""
 
 
@@ -479,23 +485,35 @@ class SonarTask:
     altimeter_m: float = 100.0
 
     def __post_init__(self) -> None:
-        for name, least in (("step_s", 1e-6), ("gain", 0.0), ("max_steps", 1), ("clearance_m", 0.0), ("altimeter_m", 1e-6)):
+        for name, minimum in (
+            ("step_s", 1e-6),
+            ("gain", 0.0),
+            ("max_steps", 1),
+            ("clearance_m", 0.0),
+            ("altimeter_m", 1e-6),
+        ):
             value = getattr(self, name)
-            known = int | np.integer if name == "max_steps" else int | float | np.number
-            if value is not None and not (isinstance(value, known) and least <= value < np.inf):
+            types = int | np.integer if name == "max_steps" else int | float | np.number
+            if value is not None and not (isinstance(value, types) and minimum <= value < np.inf):
                 kind = "whole" if name == "max_steps" else "finite"
-                raise MitsonarError(f"{argument(name)} must be a {kind} number of at least {least:g}: got {value!r}")
+                raise MitsonarError(f"{argument(name)} must be a {kind} number of at least {minimum:g}: got {value!r}")
         if self.noise is not None and not isinstance(self.noise, NoiseModel):
-            raise MitsonarError(f"noise is a NoiseModel, as mitsonar.acoustics.noise.load_noise gives: got {self.noise!r}")
+            raise MitsonarError(
+                f"noise must be a NoiseModel, such as mitsonar.acoustics.noise.load_noise returns: got {self.noise!r}"
+            )
         speeds = _numbers("max_velocity", self.max_velocity)
         if speeds.shape != (4,) or not (np.isfinite(speeds).all() and (speeds >= 0).all()):
-            raise MitsonarError(f"max_velocity is four numbers of 0 or more, {', '.join(VELOCITY)}: got {self.max_velocity}")
+            raise MitsonarError(
+                f"max_velocity must be four numbers of 0 or more, {', '.join(VELOCITY_NAMES)}: got {self.max_velocity}"
+            )
         if not isinstance(self.observe, tuple | list):
-            raise MitsonarError(f"observe is a tuple of image and others: got {self.observe!r}; give ('image',)")
+            raise MitsonarError(f"observe must be a tuple that contains image: got {self.observe!r}; give ('image',)")
         unknown = [name for name in self.observe if name not in OBSERVABLE]
         if unknown or "image" not in self.observe:
             wrong = str(unknown[0] if unknown else self.observe)
-            raise MitsonarError(f"observe is a tuple of image and others: got {wrong!r}; {nearest_names(wrong, OBSERVABLE)}")
+            raise MitsonarError(
+                f"observe must be a tuple that contains image: got {wrong!r}; {nearest_names(wrong, OBSERVABLE)}"
+            )
         self.refuse_outside(self.span)
 
     def refuse_outside(self, span: Table) -> None:
@@ -509,24 +527,26 @@ class SonarTask:
             shown = ", ".join(f"{value:g}" for value in pose)
             if (pose[:3] < low).any() or (pose[:3] > high).any():
                 raise MitsonarError(
-                    f"start lies outside bounds, where every episode ends at its first step: got {shown}, and bounds "
+                    f"start lies outside bounds, so every episode would end at its first step: got {shown}, and bounds "
                     f"{low.tolist()}, {high.tolist()}; move one of them"
                 )
-            if (np.abs(pose[3:]) > FULL_TURNS).any():
-                raise MitsonarError(f"start is x, y, z [m], pitch, roll, heading in rad: got {shown}; are these degrees?")
+            if (np.abs(pose[3:]) > MAX_START_ANGLES_RAD).any():
+                raise MitsonarError(
+                    f"start must be x, y, z [m], pitch, roll, heading in rad: got {shown}; are these degrees?"
+                )
 
     @classmethod
-    def create(cls, given: dict[str, Any], own: Sequence[str] = ()) -> Self:
+    def create(cls, given: dict[str, Any], other_arguments: Sequence[str] = ()) -> Self:
         """Create a task from its fields.
 
         Args:
             given: fields, keyed by name.
-            own: other arguments of the environment, named in the error message for an unknown field.
+            other_arguments: other arguments of the environment, named in the error message for an unknown field.
 
         Raises:
             MitsonarError: a field is unknown, or a value is not allowed.
         """
-        refuse_unknown(given, (*(field.name for field in fields(cls)), *own), "an environment")
+        refuse_unknown(given, (*(field.name for field in fields(cls)), *other_arguments), "an environment")
         return cls(**given)
 
     @property
@@ -540,7 +560,9 @@ class SonarTask:
             return np.full((2, 6), np.nan)
         table = np.atleast_2d(_numbers("start", self.start))
         if table.shape not in ((1, 6), (2, 6)) or not np.isfinite(table).all():
-            raise MitsonarError(f"start is one pose or two, of x, y, z [m], pitch, roll, heading [rad]: got {table.shape}")
+            raise MitsonarError(
+                f"start must be one pose or two, of x, y, z [m], pitch, roll, heading [rad]: got {table.shape}"
+            )
         return np.asarray(np.broadcast_to(table, (2, 6)))
 
     @property
@@ -554,7 +576,7 @@ class SonarTask:
             return np.array([[-np.inf] * 3, [np.inf] * 3])
         box = _numbers("bounds", self.bounds)
         if box.shape != (2, 3) or not (box[0] < box[1]).all():
-            raise MitsonarError(f"bounds are the lowest and the highest x, y, z [m]: got {box.tolist()}")
+            raise MitsonarError(f"bounds must be the lowest and the highest x, y, z [m]: got {box.tolist()}")
         return box
 
 
@@ -567,7 +589,7 @@ def _numbers(name: str, value: object) -> Table:
     try:
         return np.asarray(value, dtype=float)
     except (TypeError, ValueError):
-        raise MitsonarError(f"{name} is made of numbers, rows of one length: got {value!r}") from None
+        raise MitsonarError(f"{name} must consist of numbers, in rows of equal length: got {value!r}") from None
 
 
 # ---------------- Vector environment of many vehicles
@@ -610,17 +632,17 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         **task: Unpack[TaskFields],
     ) -> None:
         if render_mode not in (None, "rgb_array"):
-            raise MitsonarError(f"render_mode is rgb_array or None: got {render_mode!r}")
+            raise MitsonarError(f"render_mode must be rgb_array or None: got {render_mode!r}")
         modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)}
         name = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         if name not in modes:
-            raise MitsonarError(f"autoreset_mode is {' or '.join(modes)}: got {name!r}")
+            raise MitsonarError(f"autoreset_mode must be {' or '.join(modes)}: got {name!r}")
         self.fleet = SonarFleet(
             scene,
             sonar,
             num_envs,
             moving,
-            SonarTask.create({**task}, own=("num_envs", "moving", "render_mode", "autoreset_mode")),
+            SonarTask.create({**task}, other_arguments=("num_envs", "moving", "render_mode", "autoreset_mode")),
         )
         self.num_envs, self.render_mode, self._mode = num_envs, render_mode, modes[name]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
@@ -649,20 +671,21 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         Raises:
             MitsonarError: the number of seeds or the shape of the mask is wrong, or the mask is not boolean.
         """
-        seeds = [seed + place for place in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+        seeds = [seed + vehicle for vehicle in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
         seeds = [None] * self.num_envs if seeds is None else list(seeds)
-        which = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
-        if len(seeds) != self.num_envs or which.shape != (self.num_envs,) or which.dtype != bool:
+        renewed = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if len(seeds) != self.num_envs or renewed.shape != (self.num_envs,) or renewed.dtype != bool:
             raise MitsonarError(
-                f"a seed and a boolean of reset_mask for each of {self.num_envs}: got {len(seeds)}, {which.shape}"
+                f"reset needs a seed and a boolean of reset_mask for each of {self.num_envs} vehicles: got {len(seeds)} "
+                f"seeds and a mask of shape {renewed.shape}"
             )
-        for place in np.flatnonzero(which):
-            if seeds[place] is not None:
-                self._generators[place] = seeding.np_random(seeds[place])[0]
-        self.fleet.renew(which, self._generators)
-        self._ended[which] = False
+        for vehicle in np.flatnonzero(renewed):
+            if seeds[vehicle] is not None:
+                self._generators[vehicle] = seeding.np_random(seeds[vehicle])[0]
+        self.fleet.renew(renewed, self._generators)
+        self._ended[renewed] = False
         self._image, altitude_m = self.fleet.look()
-        return observed(self.fleet, self._image, altitude_m), _masked({"pose": self.fleet.poses.copy()}, which)
+        return observed(self.fleet, self._image, altitude_m), _masked({"pose": self.fleet.poses.copy()}, renewed)
 
     def step(self, actions: ArrayLike) -> tuple[Observation, Table, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Move all vehicles by their actions ``(num_envs, 4)``, then ping in one launch.
@@ -681,13 +704,19 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         fleet, renewed = self.fleet, self._ended.copy()
         if renewed.any() and self._mode is AutoresetMode.DISABLED:
             raise MitsonarError(f"{renewed.sum()} episodes have ended: reset them with options={{'reset_mask': ...}}")
-        moved = fleet.advance(actions, renewed, self._generators)
-        self._image = moved.image
-        rewards = np.where(renewed, 0.0, fleet.rewards(moved))
-        terminated = (moved.collided | moved.outside) & ~renewed
+        transition = fleet.advance(actions, renewed, self._generators)
+        self._image = transition.image
+        rewards = np.where(renewed, 0.0, fleet.rewards(transition))
+        terminated = (transition.collided | transition.outside) & ~renewed
         truncated = (fleet.steps >= (np.inf if fleet.task.max_steps is None else fleet.task.max_steps)) & ~renewed
         self._ended = terminated | truncated
-        return observed(fleet, moved.image, moved.altitude_m), rewards, terminated, truncated, _infos(moved, ~renewed)
+        return (
+            observed(fleet, transition.image, transition.altitude_m),
+            rewards,
+            terminated,
+            truncated,
+            _infos(transition, ~renewed),
+        )
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each vehicle's fan ``(rows, columns, 3)``, forward up.
@@ -700,16 +729,20 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         return tuple(fan_picture(fan, image) for image in self._image)
 
 
-def _infos(moved: Transition, which: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return the infos of a step; ``which`` masks the vehicles for which clearance and ends are valid."""
-    whole = _masked({"pose": moved.poses.copy()}, np.ones(len(which), dtype=bool))
-    table = {"clearance_m": moved.clearance_m.copy(), "collided": moved.collided.copy(), "outside": moved.outside.copy()}
-    return whole | _masked(table, which)
+def _infos(transition: Transition, valid: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return the infos of a step; ``valid`` masks the vehicles for which clearance and ends are valid."""
+    pose_info = _masked({"pose": transition.poses.copy()}, np.ones(len(valid), dtype=bool))
+    arrays = {
+        "clearance_m": transition.clearance_m.copy(),
+        "collided": transition.collided.copy(),
+        "outside": transition.outside.copy(),
+    }
+    return pose_info | _masked(arrays, valid)
 
 
-def _masked(values: dict[str, Array], which: NDArray[np.bool_]) -> dict[str, Any]:
+def _masked(values: dict[str, Array], valid: NDArray[np.bool_]) -> dict[str, Any]:
     """Add to each array the mask of the vehicles for which it is valid, in Gymnasium's convention."""
-    return values | {f"_{name}": which.copy() for name in values}
+    return values | {f"_{name}": valid.copy() for name in values}
 
 
 register(

@@ -30,15 +30,15 @@ from mitsonar.records.frames import SonarFrames, to_uint8
 __all__ = [
     "PROJECTED",
     "PROJECTED_TYPE",
-    "AskedPose",
-    "Delivered",
     "FanEncoder",
     "LivePing",
     "LivePublisher",
     "Pinger",
     "PoseMailbox",
-    "asked_pose",
+    "PoseRequest",
+    "ReceivedPose",
     "live_pings",
+    "parse_pose",
     "pose_from_ros",
     "pose_in_ros",
     "projected_image",
@@ -46,7 +46,7 @@ __all__ = [
 ]
 
 
-LOOK_S = 0.25
+POLL_INTERVAL_S = 0.25
 """Longest wait for a pose before the loop checks again whether it should end [s]."""
 
 
@@ -59,7 +59,7 @@ class LivePing:
         number: number of the ping since the start.
         time_ns: wall clock time when the pose arrived, or was taken from the path [ns].
         source: origin of the pose: ``client``, or ``path`` for the path that is played.
-        mark: value of ``id`` in the client's pose.
+        request_id: value of ``id`` in the client's pose.
         dropped: number of poses that arrived since the previous ping and were not rendered.
         render_s: rendering time of the frame [s].
     """
@@ -68,7 +68,7 @@ class LivePing:
     number: int
     time_ns: int
     source: str
-    mark: PlainValue
+    request_id: PlainValue
     dropped: int
     render_s: float
 
@@ -79,8 +79,8 @@ class LivePublisher(Protocol):
     def publish(self, ping: LivePing) -> None:
         """Publish a ping to all subscribers."""
 
-    def complain(self, sentence: str) -> None:
-        """Send all subscribers a warning, for example about a pose that was refused."""
+    def warn(self, message: str) -> None:
+        """Send all subscribers a warning, for example about an invalid pose."""
 
     def close(self) -> None:
         """End all connections."""
@@ -127,30 +127,33 @@ def live_pings(
     if not (rate_hz > 0 and quiet_s > 0):
         raise MitsonarError(f"rate_hz and quiet_s must be positive: got {rate_hz:g}, {quiet_s:g}")
     ends = Event() if ends is None else ends
-    numbers, next_in_path, heard, due = count(), 0, -float("inf"), time.monotonic()
+    numbers, path_index, last_pose_s, due_s = count(), 0, -float("inf"), time.monotonic()
     while not ends.is_set():
         # 1. Wait for a pose. While the path plays, wait no longer than until its next ping is due.
-        now = time.monotonic()
-        playing = now - heard > quiet_s and (len(path) > 1 or next_in_path == 0)
-        delivered, source = mailbox.take(min(LOOK_S, max(0.0, due - now)) if playing else LOOK_S), "client"
-        if delivered is not None:
-            heard = time.monotonic()
-        elif playing and time.monotonic() >= due:
-            pose = Pose.from_row(float(value) for value in path.poses[next_in_path % len(path)])  # the path plays in a loop
-            delivered, source = Delivered(AskedPose(pose), time.time_ns(), 0), "path"
-            next_in_path += 1
-            due = max(due, time.monotonic() - 1 / rate_hz) + 1 / rate_hz  # at most one late ping is caught up
+        time_s = time.monotonic()
+        playing = time_s - last_pose_s > quiet_s and (len(path) > 1 or path_index == 0)
+        received, source = (
+            mailbox.take(min(POLL_INTERVAL_S, max(0.0, due_s - time_s)) if playing else POLL_INTERVAL_S),
+            "client",
+        )
+        if received is not None:
+            last_pose_s = time.monotonic()
+        elif playing and time.monotonic() >= due_s:
+            pose = Pose.from_row(float(value) for value in path.poses[path_index % len(path)])  # the path plays in a loop
+            received, source = ReceivedPose(PoseRequest(pose), time.time_ns(), 0), "path"
+            path_index += 1
+            due_s = max(due_s, time.monotonic() - 1 / rate_hz) + 1 / rate_hz  # at most one late ping is caught up
         else:
             continue
         # 2. Render the pose, and publish the ping. A pose that cannot be rendered gives a warning.
-        begun = time.perf_counter()
+        start_s = time.perf_counter()
         try:
-            frames = simulator.step(delivered.asked.pose, noise=noise, seed=seed)
+            frames = simulator.step(received.request.pose, noise=noise, seed=seed)
         except MitsonarError as error:
-            publisher.complain(f"this pose cannot be rendered: {error}")
+            publisher.warn(f"this pose cannot be rendered: {error}")
             continue
-        render_s, mark = time.perf_counter() - begun, delivered.asked.mark
-        ping = LivePing(frames, next(numbers), delivered.came_ns, source, mark, delivered.dropped, render_s)
+        render_s, request_id = time.perf_counter() - start_s, received.request.request_id
+        ping = LivePing(frames, next(numbers), received.received_ns, source, request_id, received.dropped, render_s)
         publisher.publish(ping)
         yield ping
 
@@ -158,32 +161,32 @@ def live_pings(
 # ---------------- Messages with poses
 
 
-SIX = ("x", "y", "z", "pitch", "roll", "heading")
-ALSO = ("id", "header", "timestamp", "frame_id", "pose")
+POSE_KEYS = ("x", "y", "z", "pitch", "roll", "heading")
+OTHER_KEYS = ("id", "header", "timestamp", "frame_id", "pose")
 
-FARTHEST_M = 1e6
+MAX_POSITION_M = 1e6
 """Largest coordinate of a pose [m]; beyond it single precision would round to decimetres."""
 
-LONGEST = 2**16
+MAX_MESSAGE_BYTES = 2**16
 """Largest size of a message with a pose [bytes]."""
 
-ROS = CONVENTIONS["ros-enu"]
+ROS_CONVENTION = CONVENTIONS["ros-enu"]
 
 
 @dataclass(frozen=True)
-class AskedPose:
+class PoseRequest:
     """A pose requested by a client.
 
     Attributes:
         pose: pose of the sonar [m, rad].
-        mark: value of ``id`` in the client's message; the timing of the ping returns it.
+        request_id: value of ``id`` in the client's message; the timing of the ping returns it.
     """
 
     pose: Pose
-    mark: PlainValue = None
+    request_id: PlainValue = None
 
 
-def asked_pose(message: bytes) -> AskedPose:
+def parse_pose(message: bytes) -> PoseRequest:
     """Parse a pose from JSON.
 
     There are two forms. ``{"x", "y", "z", "pitch", "roll", "heading"}`` follows mitsonar's conventions, in m and deg;
@@ -191,39 +194,43 @@ def asked_pose(message: bytes) -> AskedPose:
     ``foxglove.PoseInFrame`` and ``geometry_msgs/PoseStamped``, follows REP 103: x forward, y to port, z up.
 
     Raises:
-        MitsonarError: the message is not JSON, a key is unknown or missing, a value is no finite number, the quaternion has
-            length 0, or the position lies beyond 1000 km.
+        MitsonarError: the message is not JSON, a key is unknown or missing, a value is not a finite number, the quaternion
+            has length 0, or the position lies beyond 1000 km.
     """
     # 1. Parse the JSON, and check its keys and its id.
-    if len(message) > LONGEST:
-        raise MitsonarError(f"a pose is at most {LONGEST:,} bytes: got {len(message):,}")
+    if len(message) > MAX_MESSAGE_BYTES:
+        raise MitsonarError(f"a pose must have at most {MAX_MESSAGE_BYTES:,} bytes: got {len(message):,}")
     table = parse_json(message, "the pose")
     if not isinstance(table, dict):
         raise MitsonarError(
-            f"a pose is a JSON object of {', '.join(SIX)} (m, deg), or has a key pose: got {shortened(table)}"
+            f"a pose must be a JSON object with {', '.join(POSE_KEYS)} (m, deg), or with the key pose: "
+            f"got {shortened(table)}"
         )
-    unknown = [key for key in table if key not in (*SIX, *ALSO)]
+    unknown = [key for key in table if key not in (*POSE_KEYS, *OTHER_KEYS)]
     if unknown:
         raise MitsonarError(
-            f"a pose has no key {shortened(unknown[0])}{meant(unknown[0], SIX)}: give {', '.join(SIX)} in m and deg, or pose"
+            f"a pose has no key {shortened(unknown[0])}{meant(unknown[0], POSE_KEYS)}: "
+            f"give {', '.join(POSE_KEYS)} in m and deg, or pose"
         )
-    mark = table.get("id")
-    if not isinstance(mark, int | float | str | None) or (isinstance(mark, float) and not math.isfinite(mark)):
-        raise MitsonarError(f"id of a pose is a finite number or a text: got {shortened(mark)}")
+    request_id = table.get("id")
+    if not isinstance(request_id, int | float | str | None) or (
+        isinstance(request_id, float) and not math.isfinite(request_id)
+    ):
+        raise MitsonarError(f"id of a pose must be a finite number or a string: got {shortened(request_id)}")
     # 2. Read the form of REP 103.
     if "pose" in table:
-        both = [key for key in SIX if key in table]
-        if both:
-            raise MitsonarError(f"a pose gives pose or {both[0]}, not both")
-        inner = _table(table["pose"], "pose", ("position", "orientation"))
-        position = _numbers(inner.get("position", {}), "position", ("x", "y", "z"))
-        turn = _numbers(inner.get("orientation", {"w": 1.0}), "orientation", ("x", "y", "z", "w"))
-        return AskedPose(pose_from_ros(position, turn), mark)
+        extra_keys = [key for key in POSE_KEYS if key in table]
+        if extra_keys:
+            raise MitsonarError(f"a pose has both pose and {extra_keys[0]}: give one of them")
+        nested = _check_keys(table["pose"], "pose", ("position", "orientation"))
+        position = _numbers(nested.get("position", {}), "position", ("x", "y", "z"))
+        orientation = _numbers(nested.get("orientation", {"w": 1.0}), "orientation", ("x", "y", "z", "w"))
+        return PoseRequest(pose_from_ros(position, orientation), request_id)
     # 3. Read the form of six numbers.
-    if not any(key in table for key in SIX):
-        raise MitsonarError(f"a pose has none of {', '.join(SIX)}, and no pose: give numbers in m and deg")
-    values = _numbers({key: table[key] for key in SIX if key in table}, "pose", SIX)
-    return AskedPose(_near(Pose.from_degrees(values)), mark)
+    if not any(key in table for key in POSE_KEYS):
+        raise MitsonarError(f"a pose has none of the keys {', '.join(POSE_KEYS)} and pose: give numbers in m and deg")
+    values = _numbers({key: table[key] for key in POSE_KEYS if key in table}, "pose", POSE_KEYS)
+    return PoseRequest(_check_position(Pose.from_degrees(values)), request_id)
 
 
 def pose_from_ros(position: ArrayLike, quaternion: ArrayLike) -> Pose:
@@ -236,45 +243,47 @@ def pose_from_ros(position: ArrayLike, quaternion: ArrayLike) -> Pose:
     Raises:
         MitsonarError: the quaternion has length 0, or the position lies beyond 1000 km.
     """
-    turn = np.asarray(quaternion, dtype=float)
-    length = float(np.linalg.norm(turn))
+    rotation_xyzw = np.asarray(quaternion, dtype=float)
+    length = float(np.linalg.norm(rotation_xyzw))
     if not 1e-6 < length < 1e6:
         raise MitsonarError(f"the orientation of a pose must be a quaternion of length 1: got length {length:g}")
-    placed, rotation = ROS.to_ours(np.asarray(position, dtype=float).reshape(1, 3), Rotation.from_quat(turn[None] / length))
-    return _near(Pose(*(float(value) for value in poses_from(placed, rotation)[0])))
+    positions, rotations = ROS_CONVENTION.to_ours(
+        np.asarray(position, dtype=float).reshape(1, 3), Rotation.from_quat(rotation_xyzw[None] / length)
+    )
+    return _check_position(Pose(*(float(value) for value in poses_from(positions, rotations)[0])))
 
 
 def pose_in_ros(pose: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Convert a pose ``(6,)`` [m, rad] to REP 103: position ``(3,)`` [m] and quaternion ``(4,)`` x, y, z, w."""
     table = np.atleast_2d(np.asarray(pose, dtype=float))
-    position, rotation = ROS.from_ours(table[:, :3], vehicle_rotation(table))
+    position, rotation = ROS_CONVENTION.from_ours(table[:, :3], vehicle_rotation(table))
     return position[0], rotation.as_quat(canonical=True)[0]
 
 
-def _near(pose: Pose) -> Pose:
+def _check_position(pose: Pose) -> Pose:
     """Return the pose, after checking that it is near enough to the origin to be rendered.
 
     Raises:
         MitsonarError: the pose is too far away.
     """
-    if max(abs(value) for value in pose[:3]) > FARTHEST_M:
+    if max(abs(value) for value in pose[:3]) > MAX_POSITION_M:
         raise MitsonarError(
-            f"a pose must lie within {FARTHEST_M:g} m of the origin: got {', '.join(f'{v:g}' for v in pose[:3])}"
+            f"a pose must lie within {MAX_POSITION_M:g} m of the origin: got {', '.join(f'{v:g}' for v in pose[:3])}"
         )
     return pose
 
 
-def _table(value: PlainValue, name: str, keys: tuple[str, ...]) -> dict[str, PlainValue]:
+def _check_keys(value: PlainValue, name: str, keys: tuple[str, ...]) -> dict[str, PlainValue]:
     """Return a JSON object, after checking that it has known keys only.
 
     Raises:
-        MitsonarError: the value is no object, or has unknown keys.
+        MitsonarError: the value is not an object, or has unknown keys.
     """
     if not isinstance(value, dict):
         raise MitsonarError(f"{name} must be an object with {', '.join(keys)}: got {shortened(value)}")
     unknown = [key for key in value if key not in keys]
     if unknown:
-        raise MitsonarError(f"{name} has no key {shortened(unknown[0])}: it has {', '.join(keys)}")
+        raise MitsonarError(f"{name} has no key {shortened(unknown[0])}: allowed are {', '.join(keys)}")
     return value
 
 
@@ -282,9 +291,9 @@ def _numbers(value: PlainValue, name: str, keys: tuple[str, ...]) -> list[float]
     """Return the numbers of a JSON object in the order of ``keys``; missing ones are 0.
 
     Raises:
-        MitsonarError: a key is unknown, or a value is no finite number.
+        MitsonarError: a key is unknown, or a value is not a finite number.
     """
-    table = _table(value, name, keys)
+    table = _check_keys(value, name, keys)
     for key, number in table.items():
         fine = isinstance(number, int | float) and not isinstance(number, bool)
         if not fine or not math.isfinite(number):
@@ -296,17 +305,17 @@ def _numbers(value: PlainValue, name: str, keys: tuple[str, ...]) -> list[float]
 
 
 @dataclass(frozen=True)
-class Delivered:
+class ReceivedPose:
     """A pose and the time of its arrival.
 
     Attributes:
-        asked: the requested pose.
-        came_ns: wall clock time of its arrival [ns].
+        request: the requested pose.
+        received_ns: wall clock time of its arrival [ns].
         dropped: number of earlier poses that it replaced before they were rendered.
     """
 
-    asked: AskedPose
-    came_ns: int
+    request: PoseRequest
+    received_ns: int
     dropped: int
 
 
@@ -315,17 +324,17 @@ class PoseMailbox:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._newest: Delivered | None = None
+        self._newest: ReceivedPose | None = None
 
-    def put(self, asked: AskedPose) -> None:
+    def put(self, request: PoseRequest) -> None:
         """Deliver a pose, and drop the one that is still waiting, if any."""
         with self._changed:
             waiting = self._newest
             dropped = 0 if waiting is None else waiting.dropped + 1
-            self._newest = Delivered(asked, time.time_ns(), dropped)
+            self._newest = ReceivedPose(request, time.time_ns(), dropped)
             self._changed.notify_all()
 
-    def take(self, wait_s: float) -> Delivered | None:
+    def take(self, wait_s: float) -> ReceivedPose | None:
         """Return the newest pose and empty the mailbox; return None if no pose arrives within ``wait_s`` [s]."""
         with self._changed:
             if self._newest is None and wait_s > 0:
@@ -406,10 +415,10 @@ class FanEncoder:
             self._shape = fan.index.shape[1:]
             self._inside = np.flatnonzero(fan.weight.any(axis=0))
             cells = fan.index.reshape(4, -1)[:, self._inside].T
-            parts = fan.weight.reshape(4, -1)[:, self._inside].T
+            weights = fan.weight.reshape(4, -1)[:, self._inside].T
             rows = np.arange(0, 4 * len(cells) + 1, 4)
             size = (len(cells), frames.image[0].size)
-            self._matrix = csr_array((parts.ravel(), cells.ravel().astype(np.int32), rows), shape=size)
+            self._matrix = csr_array((weights.ravel(), cells.ravel().astype(np.int32), rows), shape=size)
         image = frames.image[index]
         levels = image if image.dtype == np.uint8 else to_uint8(image)  # quantised in polar coordinates, as sonars send them
         picture = np.zeros(self._shape, np.uint8)
@@ -449,21 +458,21 @@ def projected_image(frames: SonarFrames, time_ns: int, frame_id: str, index: int
 def timing(ping: LivePing, published_ns: int | None = None) -> dict[str, PlainValue]:
     """Return the number, source, times and pose of a ping (m, deg) as a JSON object."""
     assert ping.frames.poses is not None
-    six = ping.frames.poses[0]
-    angles = np.degrees(six[3:])
-    now = time.time_ns() if published_ns is None else published_ns
+    pose = ping.frames.poses[0]
+    angles = np.degrees(pose[3:])
+    sent_ns = time.time_ns() if published_ns is None else published_ns
     return {
         "number": ping.number,
-        "id": ping.mark,
+        "id": ping.request_id,
         "source": ping.source,
         "dropped": ping.dropped,
         "pose_ns": ping.time_ns,
-        "published_ns": now,
+        "published_ns": sent_ns,
         "render_ms": round(1e3 * ping.render_s, 3),
-        "latency_ms": round((now - ping.time_ns) / 1e6, 3),
-        "x": float(six[0]),
-        "y": float(six[1]),
-        "z": float(six[2]),
+        "latency_ms": round((sent_ns - ping.time_ns) / 1e6, 3),
+        "x": float(pose[0]),
+        "y": float(pose[1]),
+        "z": float(pose[2]),
         "pitch": float(angles[0]),
         "roll": float(angles[1]),
         "heading": float(angles[2]),

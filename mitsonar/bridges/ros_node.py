@@ -8,10 +8,10 @@ import threading
 from typing import Any
 
 from mitsonar.bridges.live import (
-    AskedPose,
     FanEncoder,
     LivePing,
     PoseMailbox,
+    PoseRequest,
     pose_from_ros,
     pose_in_ros,
     projected_image,
@@ -49,7 +49,7 @@ class RosNode:
             polar = importlib.import_module("marine_acoustic_msgs.msg").ProjectedSonarImage
         except ModuleNotFoundError:
             self._polar = None
-            self.complain("marine_acoustic_msgs is not installed: sonar/image is not published")
+            self.warn("marine_acoustic_msgs is not installed: sonar/image is not published")
         else:
             self._polar = self.node.create_publisher(polar, "sonar/image", 4)
         self.node.create_subscription(messages.PoseStamped, "pose", self._take, 1)
@@ -58,32 +58,32 @@ class RosNode:
 
     def publish(self, ping: LivePing) -> None:
         """Publish a ping; the polar image is published as serialized bytes, which rclpy accepts instead of a message."""
-        frames, when = ping.frames, ping.time_ns
+        frames, time_ns = ping.frames, ping.time_ns
         assert frames.poses is not None
-        place, turn = pose_in_ros(frames.poses[0])
-        pose, moved = self._messages.PoseStamped(), self._messages.TransformStamped()
+        position, quaternion = pose_in_ros(frames.poses[0])
+        pose, transform = self._messages.PoseStamped(), self._messages.TransformStamped()
         fan = self._sensor.CompressedImage()
-        for message, frame in ((pose, "world"), (moved, "world"), (fan, "sonar")):
+        for message, frame in ((pose, "world"), (transform, "world"), (fan, "sonar")):
             message.header.frame_id = frame
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(when, 10**9)
-        moved.child_frame_id = "sonar"
-        for key, value in zip("xyz", place, strict=True):
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(time_ns, 10**9)
+        transform.child_frame_id = "sonar"
+        for key, value in zip("xyz", position, strict=True):
             setattr(pose.pose.position, key, float(value))
-            setattr(moved.transform.translation, key, float(value))
-        for key, value in zip("xyzw", turn, strict=True):
+            setattr(transform.transform.translation, key, float(value))
+        for key, value in zip("xyzw", quaternion, strict=True):
             setattr(pose.pose.orientation, key, float(value))
-            setattr(moved.transform.rotation, key, float(value))
-        self._transform.sendTransform(moved)
+            setattr(transform.transform.rotation, key, float(value))
+        self._transform.sendTransform(transform)
         self._pose.publish(pose)
         fan.format, fan.data = "jpeg", self._encoder.jpeg(frames)
         self._fan.publish(fan)
         if self._polar is not None:
-            self._polar.publish(projected_image(frames, when, "sonar"))
+            self._polar.publish(projected_image(frames, time_ns, "sonar"))
         self._timing.publish(self._text.String(data=json.dumps(timing(ping))))
 
-    def complain(self, sentence: str) -> None:
+    def warn(self, message: str) -> None:
         """Log a warning."""
-        self.node.get_logger().warning(sentence)
+        self.node.get_logger().warning(message)
 
     def close(self) -> None:
         """Shut the node down."""
@@ -99,14 +99,16 @@ class RosNode:
                 raise
 
     def _take(self, message: Any) -> None:
-        """Put a received pose into the mailbox, or log why it was refused."""
-        place, turn = message.pose.position, message.pose.orientation
+        """Put a received pose into the mailbox, or log why it is invalid."""
+        position, orientation = message.pose.position, message.pose.orientation
         try:
-            pose = pose_from_ros([place.x, place.y, place.z], [turn.x, turn.y, turn.z, turn.w])
+            pose = pose_from_ros(
+                [position.x, position.y, position.z], [orientation.x, orientation.y, orientation.z, orientation.w]
+            )
         except MitsonarError as error:
-            self.complain(f"a pose was refused: {error}")
+            self.warn(f"invalid pose: {error}")
             return
-        self._mailbox.put(AskedPose(pose))
+        self._mailbox.put(PoseRequest(pose))
 
 
 def _ros(name: str) -> Any:
@@ -119,6 +121,6 @@ def _ros(name: str) -> Any:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
         raise MitsonarError(
-            f"--ros needs {error.name}, which comes with ROS 2 and not from pip: install ROS 2, type "
-            "`source /opt/ros/DISTRO/setup.bash` and use its Python; or leave --ros out and connect Foxglove"
+            f"--ros needs {error.name}, which comes with ROS 2, not from pip: install ROS 2, type "
+            "`source /opt/ros/DISTRO/setup.bash` and use its Python; or leave out --ros and connect Foxglove"
         ) from None

@@ -87,9 +87,9 @@ def live(simulator: Simulator) -> Iterator[Live]:
 
 
 def mailbox_pose(mailbox: PoseMailbox) -> None:
-    from mitsonar.bridges.live import AskedPose
+    from mitsonar.bridges.live import PoseRequest
 
-    mailbox.put(AskedPose(START))
+    mailbox.put(PoseRequest(START))
 
 
 def ping_of(client: LiveClient, mark: str) -> dict[str, Any]:
@@ -111,7 +111,7 @@ def test_a_pose_becomes_the_image_that_the_simulator_makes(live: Live) -> None:
     assert client.channels["/sonar/fan"]["schemaName"] == "foxglove.CompressedImage"
     client.publish({"x": -3.4, "y": -4.0, "z": 2.2, "pitch": 25, "heading": 10, "id": "first"})
     got = ping_of(client, "first")
-    ping = next(one for one in live.pings if one.mark == "first")
+    ping = next(one for one in live.pings if one.request_id == "first")
     np.testing.assert_allclose(ping.frames.poses, [[-3.4, -4.0, 2.2, np.radians(25), 0, np.radians(10)]])
     wanted = ping.frames.image[0]
     assert wanted.max() > 0.1
@@ -150,19 +150,19 @@ def test_bad_poses_are_refused_with_one_sentence_each_and_the_next_is_rendered(l
         b"no json": "not JSON",
         b'{"x": "far"}': "x of pose must be a finite number",
         b'{"x": NaN}': "x of pose must be a finite number",
-        b'{"x": 1, "id": 1e999}': "id of a pose is a finite number or a text",  # JSON has no word for it
-        b'{"x": 1, "id": NaN}': "id of a pose is a finite number or a text",
+        b'{"x": 1, "id": 1e999}': "id of a pose must be a finite number or a string",  # JSON has no word for it
+        b'{"x": 1, "id": NaN}': "id of a pose must be a finite number or a string",
         b'{"yaw": 3}': "has no key 'yaw'",
         b'{"x": 1e9}': "within 1e+06 m of the origin",
         b'{"pose": {"position": {"x": 1}, "orientation": {}}}': "quaternion of length 1",
-        b"[1, 2, 3]": "a pose is a JSON object",
+        b"[1, 2, 3]": "a pose must be a JSON object",
         b"{" * 5000: "",
         b" " * 70_000: "at most 65,536 bytes",
     }
     for content, words in bad.items():
         client.publish(content)
         sentence = client.wait_for_status()
-        assert sentence.startswith("a pose was refused: "), sentence
+        assert sentence.startswith("invalid pose: "), sentence
         assert words in sentence
     assert len(client.status) == len(bad)
     client.publish({"x": -3.4, "y": -4.6, "z": 2.2, "pitch": 25, "id": "good"})
@@ -283,8 +283,8 @@ class Recorder:
     def publish(self, ping: Any) -> None:
         self.pings.append(ping)
 
-    def complain(self, sentence: str) -> None:
-        self.said.append(sentence)
+    def warn(self, message: str) -> None:
+        self.said.append(message)
 
     def close(self) -> None: ...
 
@@ -302,12 +302,12 @@ def test_the_newest_pose_wins_and_the_path_goes_on_after_a_pause() -> None:
     first = [next(pings) for _ in range(5)]
     assert 0.06 < time.monotonic() - begun < 2
     assert [one.frames.poses[0, 0] for one in first if one.frames.poses is not None] == [0, 1, 2, 0, 1]
-    from mitsonar.bridges.live import AskedPose
+    from mitsonar.bridges.live import PoseRequest
 
     for place in (7.0, 8.0, 9.0):
-        mailbox.put(AskedPose(Pose(place, 0, 2), mark=place))
+        mailbox.put(PoseRequest(Pose(place, 0, 2), request_id=place))
     asked = next(pings)
-    assert (asked.mark, asked.dropped, asked.source, asked.number) == (9.0, 2, "client", 5)
+    assert (asked.request_id, asked.dropped, asked.source, asked.number) == (9.0, 2, "client", 5)
     begun = time.monotonic()
     resumed = next(pings)
     assert time.monotonic() - begun > 0.15

@@ -108,10 +108,10 @@ def test_a_pose_is_taken_and_a_wrong_one_refused(ros: Ros) -> None:
     np.testing.assert_allclose(taken.asked.pose, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-12)
     ros.taken["pose"](Message(pose=Message(position=place, orientation=Message(x=0.0, y=0.0, z=0.0, w=0.0))))
     assert mailbox.take(0) is None
-    assert ros.said[-1].startswith("a pose was refused: the orientation")
+    assert ros.said[-1].startswith("invalid pose: the orientation")
     node.close()
 
 
 def test_without_ros_a_sentence_says_what_to_do() -> None:
-    with pytest.raises(MitsonarError, match="comes with ROS 2 and not from pip"):
+    with pytest.raises(MitsonarError, match="comes with ROS 2, not from pip"):
         RosNode(PoseMailbox())

@@ -108,15 +108,15 @@ def test_masked_resets_and_wrong_arguments(simulator: Simulator) -> None:
     ("wrong", "said"),
     [
         ({"strat": [0, 0, 2, 0, 0, 0]}, "no argument strat: did you mean start"),
-        ({"start": "here"}, "start is made of numbers"),
-        ({"start": [[1, 2], [3]]}, "start is made of numbers"),
-        ({"bounds": "wide"}, "bounds is made of numbers"),
-        ({"max_velocity": "fast"}, "max_velocity is made of numbers"),
+        ({"start": "here"}, "start must consist of numbers"),
+        ({"start": [[1, 2], [3]]}, "start must consist of numbers"),
+        ({"bounds": "wide"}, "bounds must consist of numbers"),
+        ({"max_velocity": "fast"}, "max_velocity must consist of numbers"),
         ({"max_steps": "9"}, "whole number"),
         ({"max_steps": 2.5}, "whole number"),
-        ({"observe": "image"}, "tuple of image"),
-        ({"observe": 3}, "tuple of image"),
-        ({"noise": "low"}, "noise is a NoiseModel"),
+        ({"observe": "image"}, "tuple that contains image"),
+        ({"observe": 3}, "tuple that contains image"),
+        ({"noise": "low"}, "noise must be a NoiseModel"),
     ],
 )
 def test_mistakes_are_answered_in_a_sentence(simulator: Simulator, wrong: dict[str, Any], said: str) -> None:
@@ -139,7 +139,7 @@ def test_what_is_no_scene_is_refused(simulator: Simulator) -> None:
         ({"start": [0, -5, 12, 0.4, 0, 0], "bounds": [[-9, -9, 0.3], [9, 9, 5]]}, "start lies outside bounds"),
         ({"start": [[0, -5, 2, 0, 0, 0], [0, -5, 0.1, 0, 0, 0]], "bounds": [[-9, -9, 0.3], [9, 9, 5]]}, "outside bounds"),
         ({"start": [0, -5, 2, 25, 0, 90]}, "heading in rad: got 0, -5, 2, 25, 0, 90; are these degrees"),
-        ({"start": [0, -5, 0.05, 0.4, 0, 0]}, r"start is 0.05 m from a surface, nearer than clearance_m 0.3"),
+        ({"start": [0, -5, 0.05, 0.4, 0, 0]}, r"start is 0.05 m from a surface, which is less than clearance_m 0.3"),
         ({"start": START, "foo": 1}, "no argument foo: known: start, bounds"),
         ({"start": START, "bound": 1}, "did you mean bounds"),
     ],
@@ -152,7 +152,7 @@ def test_a_start_where_every_episode_ends_is_refused(task: dict[str, Any], said:
 
 
 def test_a_start_below_the_seabed_is_warned_of(simulator: Simulator) -> None:
-    with pytest.warns(MitsonarWarning, match="below start there is nothing, and a surface 2 m above it"):
+    with pytest.warns(MitsonarWarning, match="there is no surface below start, and one 2 m above it"):
         SonarEnv(simulator, start=[0, -5, -2, 0.4, 0, 0], gain=1.0)
 
 
