@@ -118,7 +118,7 @@ class FoxgloveServer:
         self._server.publish_status(message, foxglove.StatusLevel.Warning)
 
     def close(self) -> None:
-        """Close all connections. Wait at most :data:`CLOSE_TIMEOUT_S`: a client that has stopped reading never disconnects."""
+        """Close all connections. Wait at most :data:`CLOSE_TIMEOUT_S`: a client that stopped reading never disconnects."""
         stopping = threading.Thread(target=self._server.stop, daemon=True)
         stopping.start()
         stopping.join(CLOSE_TIMEOUT_S)

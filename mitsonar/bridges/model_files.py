@@ -96,39 +96,39 @@ def placed(position: ArrayLike, rotation: Rotation | None = None) -> Matrix:
 
 def rigid(matrix: Matrix) -> Matrix:
     """Return the nearest rigid transform, without scale, shear or reflection."""
-    first, _, last = np.linalg.svd(matrix[:3, :3])
-    turn = first @ np.diag([1, 1, np.linalg.det(first @ last)]) @ last
-    return placed(matrix[:3, 3], Rotation.from_matrix(turn))
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    return placed(matrix[:3, 3], Rotation.from_matrix(rotation))
 
 
 def _box(size: Mapping[str, float]) -> trimesh.Trimesh:
-    made: trimesh.Trimesh = trimesh.creation.box((size["x"], size["y"], size["z"]))
-    return made
+    mesh: trimesh.Trimesh = trimesh.creation.box((size["x"], size["y"], size["z"]))
+    return mesh
 
 
 def _sphere(size: Mapping[str, float]) -> trimesh.Trimesh:
-    made: trimesh.Trimesh = trimesh.creation.icosphere(SUBDIVISIONS, size["radius"])
-    return made
+    mesh: trimesh.Trimesh = trimesh.creation.icosphere(SUBDIVISIONS, size["radius"])
+    return mesh
 
 
 def _ellipsoid(size: Mapping[str, float]) -> trimesh.Trimesh:
-    ball = trimesh.creation.icosphere(SUBDIVISIONS, 1.0)
-    return trimesh.Trimesh(ball.vertices * (size["x"], size["y"], size["z"]), ball.faces, process=False)
+    sphere = trimesh.creation.icosphere(SUBDIVISIONS, 1.0)
+    return trimesh.Trimesh(sphere.vertices * (size["x"], size["y"], size["z"]), sphere.faces, process=False)
 
 
 def _cylinder(size: Mapping[str, float]) -> trimesh.Trimesh:
-    made: trimesh.Trimesh = trimesh.creation.cylinder(size["radius"], size["length"], SECTIONS)
-    return made
+    mesh: trimesh.Trimesh = trimesh.creation.cylinder(size["radius"], size["length"], SECTIONS)
+    return mesh
 
 
 def _capsule(size: Mapping[str, float]) -> trimesh.Trimesh:
-    made = trimesh.creation.capsule(size["length"], size["radius"], count=[SECTIONS, SECTIONS // 2])
-    return trimesh.Trimesh(made.vertices - made.bounds.mean(axis=0), made.faces, process=False)
+    mesh = trimesh.creation.capsule(size["length"], size["radius"], count=[SECTIONS, SECTIONS // 2])
+    return trimesh.Trimesh(mesh.vertices - mesh.bounds.mean(axis=0), mesh.faces, process=False)
 
 
 def _cone(size: Mapping[str, float]) -> trimesh.Trimesh:
-    made = trimesh.creation.cone(size["radius"], size["length"], SECTIONS)
-    return trimesh.Trimesh(made.vertices - (0, 0, size["length"] / 2), made.faces, process=False)
+    mesh = trimesh.creation.cone(size["radius"], size["length"], SECTIONS)
+    return trimesh.Trimesh(mesh.vertices - (0, 0, size["length"] / 2), mesh.faces, process=False)
 
 
 def _plane(size: Mapping[str, float]) -> trimesh.Trimesh:
@@ -163,8 +163,8 @@ def primitive(kind: str, size: Mapping[str, float], reflectivity: float, source:
     wrong = [f"{name} {value:g}" for name, value in size.items() if not 1e-6 <= value <= 1e6]
     if wrong:
         raise MitsonarError(f"{source}: a {kind} needs sizes of 1e-6 to 1e6 m: got {wrong[0]}")
-    made = PRIMITIVES[kind](size)
-    vertices, faces = np.asarray(made.vertices, dtype=float), np.asarray(made.faces)
+    mesh = PRIMITIVES[kind](size)
+    vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces)
     return Piece(vertices, faces, np.full(len(faces), reflectivity))
 
 
@@ -188,7 +188,7 @@ class Shapes:
         """
         self._triangles += sum(len(piece.faces) for piece in pieces)
         if self._triangles > MOST_TRIANGLES:
-            raise MitsonarError(f"{source} places more than {MOST_TRIANGLES:,} triangles: give a smaller scene")
+            raise MitsonarError(f"{source} contains more than {MOST_TRIANGLES:,} triangles: give a smaller scene")
         return pieces
 
     def of_file(self, path: Path, scale: ArrayLike, reflectivity: float | None) -> list[Piece]:
@@ -206,8 +206,8 @@ class Shapes:
             self._files[path] = read_pieces(path, self.value)
         suffix = path.suffix.lower()
         unit = _unit_m(path) if suffix == ".dae" else 1.0
-        turn = np.asarray(UP["y" if suffix in (".glb", ".gltf") else "z"], dtype=float) * unit
-        pieces = [piece.moved(np.diag(np.asarray(scale, dtype=float)) @ turn, np.zeros(3)) for piece in self._files[path]]
+        axes = np.asarray(UP["y" if suffix in (".glb", ".gltf") else "z"], dtype=float) * unit
+        pieces = [piece.moved(np.diag(np.asarray(scale, dtype=float)) @ axes, np.zeros(3)) for piece in self._files[path]]
         return [piece if reflectivity is None else piece.uniform(reflectivity) for piece in self.counted(pieces, str(path))]
 
 
@@ -223,10 +223,10 @@ def _unit_m(path: Path) -> float:
 # ---------------- File search
 
 
-LONGEST = 1024
+MAX_NAME_LENGTH = 1024
 """Largest length of a file name in a scene [characters]."""
 
-PACKAGES = ("model://", "package://")
+PACKAGE_SCHEMES = ("model://", "package://")
 """Schemes of Gazebo and ROS, which are followed by the name of a folder."""
 
 
@@ -249,49 +249,51 @@ class ModelSearch:
             raise MitsonarError(f"no such file: {file}")
         missing = [folder for folder in folders if not os.path.isdir(folder)]
         if missing:
-            raise MitsonarError(f"there is no folder {missing[0]} to search: give a folder that holds models or packages")
+            raise MitsonarError(f"there is no folder {missing[0]} to search: give a folder that contains models or packages")
         roots = (_without_links(file).parent, *(_without_links(folder) for folder in folders))
         self.roots = list(dict.fromkeys(roots))  # without duplicates
 
-    def find(self, name: str, beside: Path) -> Path:
+    def find(self, name: str, referrer: Path) -> Path:
         """Find the file or folder that a scene names.
 
         Args:
             name: a path, possibly with the scheme ``model://``, ``package://`` or ``file://``. In ``model://NAME/...`` NAME
                 is a folder within a searched folder, or the searched folder itself.
-            beside: file that contains the name; a path without a scheme is relative to its folder, or else to the searched
+            referrer: file that contains the name; a path without a scheme is relative to its folder, or else to the searched
                 folders.
 
         Raises:
             MitsonarError: the file does not exist, lies outside the folders, or is a network address.
         """
         name = name.strip()
-        if len(name) > LONGEST or "\0" in name or not name:
-            raise MitsonarError(f"{beside} names the file {shortened(name)}: give a path of 1 to {LONGEST} letters")
-        scheme = next((scheme for scheme in PACKAGES if name.startswith(scheme)), "")
+        if len(name) > MAX_NAME_LENGTH or "\0" in name or not name:
+            raise MitsonarError(
+                f"{referrer} names the file {shortened(name)}: give a path of 1 to {MAX_NAME_LENGTH} characters"
+            )
+        scheme = next((scheme for scheme in PACKAGE_SCHEMES if name.startswith(scheme)), "")
         if not scheme and "://" in name and not name.startswith("file://"):
             raise MitsonarError(
-                f"{beside} names {shortened(name)}: nothing is fetched from the net; download it, name it model://..., and "
-                "give the folder by --search"
+                f"{referrer} names {shortened(name)}: nothing is downloaded; download it, name it model://..., and "
+                "give its folder by --search"
             )
-        for candidate in self._candidates(name, scheme, beside):
-            found = _without_links(candidate)
-            if any(found.is_relative_to(root) for root in self.roots) and os.path.exists(found):
-                return found
-        candidates = [_without_links(path) for path in self._candidates(name, scheme, beside)]
+        for candidate in self._candidates(name, scheme, referrer):
+            resolved = _without_links(candidate)
+            if any(resolved.is_relative_to(root) for root in self.roots) and os.path.exists(resolved):
+                return resolved
+        candidates = [_without_links(path) for path in self._candidates(name, scheme, referrer)]
         inside = any(path.is_relative_to(root) for path in candidates for root in self.roots)
         outside = any(os.path.exists(path) for path in candidates)
         missing = "there is no such file" if inside and not outside else "which is not"
         raise MitsonarError(
-            f"{beside} names {shortened(name)}, {missing} within {', '.join(map(str, self.roots))}: give the folder that "
-            "holds it by --search"
+            f"{referrer} names {shortened(name)}, {missing} within {', '.join(map(str, self.roots))}: give the folder that "
+            "contains it by --search"
         )
 
-    def _candidates(self, name: str, scheme: str, beside: Path) -> list[Path]:
+    def _candidates(self, name: str, scheme: str, referrer: Path) -> list[Path]:
         """Return the paths where a file may be, in the order of preference."""
         path = Path(name.removeprefix(scheme) if scheme else name.removeprefix("file://"))
         if not scheme:
-            return [beside.parent / path, *(root / path for root in self.roots)]
+            return [referrer.parent / path, *(root / path for root in self.roots)]
         package, *rest = [part for part in path.parts if part not in ("/", ".")] or [""]
         return [
             *(root / package / Path(*rest) for root in self.roots),
@@ -307,20 +309,20 @@ def _without_links(path: str | Path) -> Path:
 # ---------------- XML from untrusted sources
 
 
-DEEPEST = 100
+MAX_DEPTH = 100
 """Largest depth of nested elements."""
 
-MOST_ELEMENTS = 2_000_000
+MAX_ELEMENTS = 2_000_000
 """Largest number of elements of a file."""
 
-LARGEST = 2**28
+MAX_FILE_BYTES = 2**28
 """Largest size of a file [bytes]."""
 
-FARTHEST = 1e9
+MAX_NUMBER = 1e9
 """Largest magnitude of a number in a file [m, rad]."""
 
 
-class _Bounded(TreeBuilder):
+class _BoundedTreeBuilder(TreeBuilder):
     """A tree builder with limits of depth and size that accepts no document type."""
 
     def __init__(self) -> None:
@@ -330,10 +332,10 @@ class _Bounded(TreeBuilder):
     def start(self, tag: str, attrs: dict[str, str]) -> Element:
         self.depth += 1
         self.count += 1
-        if self.depth > DEEPEST:
-            raise ValueError(f"its elements nest more than {DEEPEST} deep")
-        if self.count > MOST_ELEMENTS:
-            raise ValueError(f"it has more than {MOST_ELEMENTS:,} elements")
+        if self.depth > MAX_DEPTH:
+            raise ValueError(f"its elements nest more than {MAX_DEPTH} deep")
+        if self.count > MAX_ELEMENTS:
+            raise ValueError(f"it has more than {MAX_ELEMENTS:,} elements")
         return super().start(tag, attrs)
 
     def end(self, tag: str) -> Element:
@@ -355,16 +357,16 @@ def read_xml(path: Path, what: str) -> Element:
         what: kind of file, for error messages, such as ``URDF file``.
 
     Raises:
-        MitsonarError: the file is unreadable, is no XML, has a document type, or is too large or too deep.
+        MitsonarError: the file is unreadable, is not XML, has a document type, or is too large or too deep.
     """
-    parser = XMLParser(target=_Bounded())
+    parser = XMLParser(target=_BoundedTreeBuilder())
     try:
-        parser.feed(read_bytes(path, what, LARGEST))
+        parser.feed(read_bytes(path, what, MAX_FILE_BYTES))
         tree = parser.close()
     except (ParseError, ValueError, LookupError) as error:
         if isinstance(error, MitsonarError):
             raise
-        raise MitsonarError(f"{path} is no {what}: {' '.join(str(error).split())[:160]}; export it again") from None
+        raise MitsonarError(f"{path} is not a valid {what}: {' '.join(str(error).split())[:160]}; export it again") from None
     assert isinstance(tree, Element)
     return tree
 
@@ -407,8 +409,8 @@ def numbers_of(path: Path, element: Element, text: str | None, count: int, defau
         values = tuple(float(word) for word in text.split()) if "_" not in text else ()
     except ValueError:
         values = ()
-    if len(values) != count or not all(math.isfinite(value) and abs(value) <= FARTHEST for value in values):
-        raise refused(path, element, f"{count} finite numbers up to {FARTHEST:g} are needed: got {shortened(text.strip())}")
+    if len(values) != count or not all(math.isfinite(value) and abs(value) <= MAX_NUMBER for value in values):
+        raise refused(path, element, f"expected {count} finite numbers up to {MAX_NUMBER:g}: got {shortened(text.strip())}")
     return values
 
 
@@ -416,7 +418,7 @@ def number_of(path: Path, element: Element, text: str | None, default: float | N
     """Parse a single number, as :func:`numbers_of` does.
 
     Raises:
-        MitsonarError: the text is no finite number, or is missing without a default.
+        MitsonarError: the text is not a finite number, or is missing without a default.
     """
     if default is None and (text is None or not text.strip()):
         raise refused(path, element, "a number is missing")

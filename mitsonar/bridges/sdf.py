@@ -35,10 +35,10 @@ __all__ = ["Scope", "pose_of", "read_sdf"]
 # ---------------- Frames
 
 
-OWN = ("__model__", "world", "")
+SELF_NAMES = ("__model__", "world", "")
 """Names that refer to the frame of the scope itself."""
 
-DEEPEST = 1000
+MAX_CHAIN = 1000
 """Largest length of a chain of frames that are relative to one another."""
 
 
@@ -59,7 +59,7 @@ def pose_of(path: Path, element: Element) -> tuple[Matrix, str]:
             raise refused(path, element, "the quaternion of its pose has length 0")
         return placed(numbers[:3], Rotation.from_quat(numbers[3:])), frame
     if form != "euler_rpy":
-        raise refused(path, element, f"rotation_format is euler_rpy or quat_xyzw: got {shortened(form)}")
+        raise refused(path, element, f"rotation_format must be euler_rpy or quat_xyzw: got {shortened(form)}")
     numbers = numbers_of(path, element, pose.text, 6, (0,) * 6)
     degrees = pose.get("degrees", "false").strip().lower() in ("true", "1")
     return placed(numbers[:3], Rotation.from_euler("xyz", numbers[3:], degrees=degrees)), frame
@@ -78,8 +78,8 @@ class Scope:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.nested: dict[str, Scope] = {}
-        self._given: dict[str, tuple[str, Matrix]] = {}
-        self._known: dict[str, Matrix] = {}
+        self._definitions: dict[str, tuple[str, Matrix]] = {}
+        self._poses: dict[str, Matrix] = {}
 
     def add(self, name: str, base: str, pose: Matrix) -> None:
         """Add a frame whose pose is relative to the frame ``base``.
@@ -87,9 +87,11 @@ class Scope:
         Raises:
             MitsonarError: the name is already in use.
         """
-        if name in self._given or name in OWN:
-            raise MitsonarError(f"{self.path}: the name {shortened(name)} is given twice, or means the model itself")
-        self._given[name] = (base, pose)
+        if name in self._definitions or name in SELF_NAMES:
+            raise MitsonarError(
+                f"{self.path}: the name {shortened(name)} is given twice, or is reserved for the model itself"
+            )
+        self._definitions[name] = (base, pose)
 
     def pose(self, name: str) -> Matrix:
         """Return the pose of a frame in the axes of the scope; ``model::frame`` is a frame of a nested model.
@@ -98,40 +100,41 @@ class Scope:
             MitsonarError: there is no such frame, or frames are relative to each other in a circle.
         """
         chain: dict[str, Matrix] = {}
-        one = name
-        while one not in OWN and one not in self._known:
-            if one in chain or len(chain) > DEEPEST:
+        frame = name
+        while frame not in SELF_NAMES and frame not in self._poses:
+            if frame in chain or len(chain) > MAX_CHAIN:
                 raise MitsonarError(
-                    f"{self.path}: the pose of {shortened(name)} is relative to itself, or by a long way round"
+                    f"{self.path}: the pose of {shortened(name)} is relative to itself, or "
+                    f"has a chain of more than {MAX_CHAIN} frames"
                 )
-            base, chain[one] = self._step(one)
-            one = base
-        pose = self._known.get(one, np.eye(4))
+            base, chain[frame] = self._base_of(frame)
+            frame = base
+        pose = self._poses.get(frame, np.eye(4))
         for key in reversed(chain):
             pose = pose @ chain[key]
-            self._known[key] = pose
+            self._poses[key] = pose
         return pose
 
-    def _step(self, name: str) -> tuple[str, Matrix]:
+    def _base_of(self, name: str) -> tuple[str, Matrix]:
         """Return the name of the frame that a frame is relative to, and its pose there."""
-        if name in self._given:
-            return self._given[name]
+        if name in self._definitions:
+            return self._definitions[name]
         model, _, inner = name.partition("::")
         if inner and model in self.nested:
             return model, self.nested[model].pose(inner)
-        raise MitsonarError(f"{self.path} names the frame {shortened(name)}, which is not there")
+        raise MitsonarError(f"{self.path} names the frame {shortened(name)}, which does not exist")
 
 
 # ---------------- Models, links and geometries
 
 
-MOST_INCLUDES = 20
+MAX_NESTING = 20
 """Largest depth of nested includes, and of nested models."""
 
-MOST_MODELS = 10_000
+MAX_MODELS = 10_000
 """Largest number of models including those of included files, since a few files can place a model very often."""
 
-NOT_READ = ("heightmap", "polyline", "image")
+UNSUPPORTED = ("heightmap", "polyline", "image")
 """Geometries that are left out."""
 
 
@@ -159,7 +162,7 @@ class _Reader:
 
     def __init__(self, search: ModelSearch, shapes: Shapes, joints: Mapping[str, float], collision: bool) -> None:
         self.search, self.shapes, self.joints, self.collision = search, shapes, dict(joints), collision
-        self.found = ReadScene()
+        self.scene = ReadScene()
         self.joint_names: list[str] = []
         self.models = 0
 
@@ -167,23 +170,25 @@ class _Reader:
 
     def model(self, file: Path, element: Element, name: str, files: tuple[Path, ...], depth: int) -> _Model:
         """Read the frames of a model and of its nested models; geometries are read later."""
-        if depth > MOST_INCLUDES:
-            raise refused(file, element, f"models lie within each other more than {MOST_INCLUDES} deep")
+        if depth > MAX_NESTING:
+            raise refused(file, element, f"models are nested more than {MAX_NESTING} deep")
         self.models += 1
-        if self.models > MOST_MODELS:
-            raise refused(file, element, f"there are more than {MOST_MODELS:,} models, with those of included files")
-        made = _Model(name, file, element, Scope(file))
+        if self.models > MAX_MODELS:
+            raise refused(file, element, f"there are more than {MAX_MODELS:,} models, with those of included files")
+        model = _Model(name, file, element, Scope(file))
         for child in element:
             if child.tag in ("link", "frame", "joint"):
-                self._frame(made, child)
+                self._frame(model, child)
             elif child.tag == "model":
-                own = attribute_of(file, child, "name")
-                self._nest(made, self.model(file, child, _joined(name, own), files, depth + 1), own, child, file)
+                child_name = attribute_of(file, child, "name")
+                self._nest(
+                    model, self.model(file, child, _joined(name, child_name), files, depth + 1), child_name, child, file
+                )
             elif child.tag == "include":
-                self._include(made, child, files, depth + 1)
+                self._include(model, child, files, depth + 1)
             elif child.tag in ("actor", "population", "road"):
-                self.found.leave_out(child.tag)
-        return made
+                self.scene.leave_out(child.tag)
+        return model
 
     def _frame(self, model: _Model, child: Element) -> None:
         """Add the frame that a link, joint or frame element defines."""
@@ -195,59 +200,61 @@ class _Reader:
             base = (child.findtext("child") or "").strip()
         model.scope.add(name, base, pose)
 
-    def _nest(self, model: _Model, inner: _Model, own: str, placing: Element, file: Path) -> None:
-        """Place a model in another, at the pose of the element ``placing``; the pose applies to the placement frame."""
-        has_pose = placing.find("pose") is not None
-        pose, base = pose_of(file, placing if has_pose else inner.element)
-        frame = placing.get("placement_frame") or placing.findtext("placement_frame") or inner.element.get("placement_frame")
+    def _nest(self, model: _Model, inner: _Model, name: str, placement: Element, file: Path) -> None:
+        """Place a model in another, at the pose of the element ``placement``; the pose applies to the placement frame."""
+        has_pose = placement.find("pose") is not None
+        pose, base = pose_of(file, placement if has_pose else inner.element)
+        frame = (
+            placement.get("placement_frame") or placement.findtext("placement_frame") or inner.element.get("placement_frame")
+        )
         if frame:
             pose = pose @ np.linalg.inv(inner.scope.pose(frame.strip()))
-        model.scope.add(own, base, pose)
-        model.scope.nested[own] = inner.scope
-        model.models[own] = inner
+        model.scope.add(name, base, pose)
+        model.scope.nested[name] = inner.scope
+        model.models[name] = inner
 
     def _include(self, model: _Model, include: Element, files: tuple[Path, ...], depth: int) -> None:
         """Read an included model."""
         uri = (include.findtext("uri") or "").strip()
         if not uri:
-            raise refused(model.file, include, "it names no uri")
-        file = _sdf_in(self.search.find(uri, model.file), self.search)
-        if file in files or len(files) > MOST_INCLUDES:
+            raise refused(model.file, include, "it has no uri")
+        file = _sdf_file(self.search.find(uri, model.file), self.search)
+        if file in files or len(files) > MAX_NESTING:
             raise refused(model.file, include, f"{file.name} includes itself, or files include each other in a long chain")
         root = _root(file)
         element = root.find("model")
         if element is None:
-            self.found.leave_out(next((child.tag for child in root), "empty file"))
+            self.scene.leave_out(next((child.tag for child in root), "empty file"))
             return
-        own = (include.findtext("name") or element.get("name") or "").strip()
-        if not own:
+        name = (include.findtext("name") or element.get("name") or "").strip()
+        if not name:
             raise refused(file, element, "the attribute name is missing")
-        inner = self.model(file, element, _joined(model.name, own), (*files, file), depth)
-        self._nest(model, inner, own, include, model.file)
+        inner = self.model(file, element, _joined(model.name, name), (*files, file), depth)
+        self._nest(model, inner, name, include, model.file)
 
     # ---------------- Links
 
-    def collect(self, model: _Model, place: Matrix, within: tuple[str, ...]) -> None:
-        """Collect the links of a model and of its nested models; ``place`` is the pose of the model in the world."""
-        groups = (*within, model.name) if model.name else within
+    def collect(self, model: _Model, model_pose: Matrix, parents: tuple[str, ...]) -> None:
+        """Collect the links of a model and of its nested models; ``model_pose`` is the pose of the model in the world."""
+        groups = (*parents, model.name) if model.name else parents
         if model.name:
-            self.found.frames[model.name] = place
-        moved = self._moved_links(model)
+            self.scene.frames[model.name] = model_pose
+        link_poses = self._link_poses(model)
         for link in model.element.findall("link"):
-            own = attribute_of(model.file, link, "name")
-            name, pose = _joined(model.name, own), place @ moved[own]
-            self.found.frames[name] = pose
+            link_name = attribute_of(model.file, link, "name")
+            name, pose = _joined(model.name, link_name), model_pose @ link_poses[link_name]
+            self.scene.frames[name] = pose
             pieces = [
                 piece
-                for part in link.findall("collision" if self.collision else "visual")
-                for piece in self._pieces(model.file, part, model.scope, own)
+                for element in link.findall("collision" if self.collision else "visual")
+                for piece in self._pieces(model.file, element, model.scope, link_name)
             ]
             if pieces:
-                self.found.bodies.append(Body(name, pose, pieces, groups))
-        for own, inner in model.models.items():
-            self.collect(inner, place @ model.scope.pose(own), groups)
+                self.scene.bodies.append(Body(name, pose, pieces, groups))
+        for model_name, inner in model.models.items():
+            self.collect(inner, model_pose @ model.scope.pose(model_name), groups)
 
-    def _moved_links(self, model: _Model) -> dict[str, Matrix]:
+    def _link_poses(self, model: _Model) -> dict[str, Matrix]:
         """Return the poses of links in their model; joints with a value move their child and everything attached to it."""
         # 1. Collect the parent of each link, and the motion of the joint between them in the axes of the model.
         links = [attribute_of(model.file, link, "name") for link in model.element.findall("link")]
@@ -259,69 +266,71 @@ class _Reader:
             if joint.get("type") in ("revolute", "continuous", "prismatic"):
                 self.joint_names.append(_joined(model.name, name))
             value = self.joints.get(_joined(model.name, name), self.joints.get(name, 0.0))
-            at = model.scope.pose(name)
-            joints[child] = (parent, at @ self._turn(model, joint, value) @ np.linalg.inv(at))
+            joint_pose = model.scope.pose(name)
+            joints[child] = (parent, joint_pose @ self._joint_transform(model, joint, value) @ np.linalg.inv(joint_pose))
         # 2. Apply the motions of all joints between each link and the root.
         if not self.joints:
             return poses
         for link in links:
-            one, seen = link, set[str]()
-            while one in joints:
-                if one in seen:
-                    raise refused(model.file, model.element, f"the joints of link {shortened(link)} lead round in a circle")
-                seen.add(one)
-                one, motion = joints[one]
+            ancestor, seen = link, set[str]()
+            while ancestor in joints:
+                if ancestor in seen:
+                    raise refused(model.file, model.element, f"the joints of link {shortened(link)} form a circle")
+                seen.add(ancestor)
+                ancestor, motion = joints[ancestor]
                 poses[link] = motion @ poses[link]
         return poses
 
-    def _turn(self, model: _Model, joint: Element, value: float) -> Matrix:
+    def _joint_transform(self, model: _Model, joint: Element, value: float) -> Matrix:
         """Return the transform by which a joint moves its child, in the axes of the joint."""
         axis = joint.find("axis/xyz")
         if axis is None or value == 0:
-            along: tuple[float, ...] = (0.0, 0.0, 1.0)
+            direction: tuple[float, ...] = (0.0, 0.0, 1.0)
         else:
-            along = numbers_of(model.file, joint, axis.text, 3, (0.0, 0.0, 1.0))
+            direction = numbers_of(model.file, joint, axis.text, 3, (0.0, 0.0, 1.0))
             frame = axis.get("expressed_in", "")
             if frame:
-                turn = model.scope.pose(attribute_of(model.file, joint, "name"))[:3, :3].T @ model.scope.pose(frame)[:3, :3]
-                along = tuple((turn @ along).tolist())
-        return joint_motion(model.file, joint, joint.get("type", ""), along, value)
+                rotation = (
+                    model.scope.pose(attribute_of(model.file, joint, "name"))[:3, :3].T @ model.scope.pose(frame)[:3, :3]
+                )
+                direction = tuple((rotation @ direction).tolist())
+        return joint_motion(model.file, joint, joint.get("type", ""), direction, value)
 
     # ---------------- Geometries and colours of links
 
-    def _pieces(self, file: Path, part: Element, scope: Scope, link: str) -> list[Piece]:
+    def _pieces(self, file: Path, element: Element, scope: Scope, link: str) -> list[Piece]:
         """Return the geometries of a visual or collision element, in the axes of its link."""
-        geometry = part.find("geometry")
+        geometry = element.find("geometry")
         kind = None if geometry is None else next(iter(geometry), None)
         if kind is None or kind.tag == "empty":
             return []
-        if kind.tag in NOT_READ or kind.find("submesh") is not None:
-            self.found.leave_out("submesh" if kind.tag == "mesh" else kind.tag)
+        if kind.tag in UNSUPPORTED or kind.find("submesh") is not None:
+            self.scene.leave_out("submesh" if kind.tag == "mesh" else kind.tag)
             return []
-        colour = self._reflectivity(file, part)
+        colour = self._reflectivity(file, element)
         if kind.tag == "mesh":
             scale = numbers_of(file, kind, kind.findtext("scale"), 3, (1.0, 1.0, 1.0))
             uri = (kind.findtext("uri") or "").strip()
             pieces = self.shapes.of_file(self.search.find(uri, file), scale, colour)
         else:
-            made = primitive(kind.tag, _size(file, kind), UNCOLOURED if colour is None else colour, f"{file}, <{kind.tag}>")
-            pieces = self.shapes.counted([made], str(file))
-        pose, base = pose_of(file, part)
+            solid = primitive(kind.tag, _size(file, kind), UNCOLOURED if colour is None else colour, f"{file}, <{kind.tag}>")
+            pieces = self.shapes.counted([solid], str(file))
+        pose, base = pose_of(file, element)
         if base:
             pose = np.linalg.inv(scope.pose(link)) @ scope.pose(base) @ pose
         if kind.tag == "plane":
             normal = numbers_of(file, kind, kind.findtext("normal"), 3, (0.0, 0.0, 1.0))
-            pose = pose @ _upon(file, kind, normal)
+            pose = pose @ _rotation_to_normal(file, kind, normal)
         return [piece.moved(pose[:3, :3], -pose[:3, 3]) for piece in pieces]
 
-    def _reflectivity(self, file: Path, part: Element) -> float | None:
+    def _reflectivity(self, file: Path, element: Element) -> float | None:
         """Return the reflectivity of the diffuse colour of a visual; None without a colour."""
         if not isinstance(self.shapes.value, str):
             return float(self.shapes.value)
-        text = part.findtext("material/diffuse")
+        text = element.findtext("material/diffuse")
         if text is None:
             return None
-        rgb = numbers_of(file, part, " ".join(text.split()[:3]), 3, (0.7, 0.7, 0.7))
+        rgb = numbers_of(file, element, " ".join(text.split()[:3]), 3, (0.7, 0.7, 0.7))
         return float(one_number(np.clip(np.array([rgb]), 0, 1), self.shapes.value)[0])
 
 
@@ -343,22 +352,22 @@ def read_sdf(
     root = _root(path)
     worlds = root.findall("world")
     if len(worlds) > 1:
-        raise MitsonarError(f"{path} holds {len(worlds)} worlds: leave all but one out")
+        raise MitsonarError(f"{path} contains {len(worlds)} worlds: keep only one")
     reader = _Reader(search, shapes, joints, collision)
-    top = worlds[0] if worlds else root
-    whole = reader.model(path, top, "", (path.resolve(),), 0)
-    reader.collect(whole, np.eye(4), ())
+    root_element = worlds[0] if worlds else root
+    model = reader.model(path, root_element, "", (path.resolve(),), 0)
+    reader.collect(model, np.eye(4), ())
     for name in joints:
-        if name not in reader.joint_names and not any(one.endswith(f"::{name}") for one in reader.joint_names):
-            there = nearest_names(name, reader.joint_names) if reader.joint_names else "it has none"
-            raise MitsonarError(f"{path} has no joint {shortened(name)} that moves: {there}")
-    return reader.found
+        if name not in reader.joint_names and not any(known.endswith(f"::{name}") for known in reader.joint_names):
+            hint = nearest_names(name, reader.joint_names) if reader.joint_names else "it has none"
+            raise MitsonarError(f"{path} has no joint {shortened(name)} that moves: {hint}")
+    return reader.scene
 
 
 def _root(path: Path) -> Element:
     root = read_xml(path, "SDF file")
     if root.tag != "sdf":
-        raise MitsonarError(f"{path} is no SDF file: its first element is <{root.tag[:40]}>, not <sdf>")
+        raise MitsonarError(f"{path} is not an SDF file: its root element is <{root.tag[:40]}>, not <sdf>")
     return root
 
 
@@ -366,17 +375,17 @@ def _joined(model: str, name: str) -> str:
     return f"{model}::{name}" if model else name
 
 
-def _sdf_in(found: Path, search: ModelSearch) -> Path:
+def _sdf_file(path: Path, search: ModelSearch) -> Path:
     """Return an SDF file, or that of a model's folder: the newest one in its model.config, or model.sdf."""
-    if found.is_file():
-        return found
-    config = found / "model.config"
+    if path.is_file():
+        return path
+    config = path / "model.config"
     if not config.is_file():
-        return search.find(str(found / "model.sdf"), found)
+        return search.find(str(path / "model.sdf"), path)
     tree = read_xml(config, "model.config")
-    files = [(one.get("version", ""), (one.text or "").strip()) for one in tree.findall("sdf")]
+    files = [(element.get("version", ""), (element.text or "").strip()) for element in tree.findall("sdf")]
     if not files:
-        raise MitsonarError(f"{config} names no sdf file")
+        raise MitsonarError(f"{config} names no SDF file")
     newest = max(files, key=lambda file: [int(part) if part.isdecimal() else 0 for part in file[0][:20].split(".")])
     return search.find(newest[1], config)
 
@@ -392,12 +401,14 @@ def _size(path: Path, kind: Element) -> dict[str, float]:
     keys = {"sphere": ("radius",), **dict.fromkeys(("cylinder", "capsule", "cone"), ("radius", "length"))}
     if kind.tag not in keys:
         raise refused(
-            path, kind, f"geometries are box, sphere, cylinder, capsule, ellipsoid, cone, plane, mesh: got {kind.tag[:40]}"
+            path,
+            kind,
+            f"a geometry must be box, sphere, cylinder, capsule, ellipsoid, cone, plane or mesh: got {kind.tag[:40]}",
         )
     return {key: number_of(path, kind, kind.findtext(key), 1.0) for key in keys[kind.tag]}
 
 
-def _upon(path: Path, kind: Element, normal: tuple[float, ...]) -> Matrix:
+def _rotation_to_normal(path: Path, kind: Element, normal: tuple[float, ...]) -> Matrix:
     """Return the rotation that turns the normal z of a plane to the given normal."""
     length = float(np.linalg.norm(normal))
     if not length >= 1e-9:
@@ -405,6 +416,6 @@ def _upon(path: Path, kind: Element, normal: tuple[float, ...]) -> Matrix:
     z = np.asarray(normal) / length
     x = np.cross((0.0, 1.0, 0.0), z) if abs(z[1]) < 0.9 else np.cross((0.0, 0.0, 1.0), z)
     x = x / np.linalg.norm(x)
-    made = np.eye(4)
-    made[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    return made
+    rotation = np.eye(4)
+    rotation[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    return rotation

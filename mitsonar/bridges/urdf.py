@@ -35,12 +35,12 @@ from mitsonar.worlds.meshes import UNCOLOURED, Piece, one_number
 
 __all__ = ["check_joint_names", "joint_motion", "read_urdf"]
 
-MOVING = ("revolute", "continuous", "prismatic")
+MOVING_TYPES = ("revolute", "continuous", "prismatic")
 """Types of joints with a single value; others are read as fixed."""
 
-MOST_MIMICS = 20
+MAX_MIMICS = 20
 
-FULL_TURN = 6.3
+MAX_ANGLE_RAD = 6.3
 """Angle above which a warning suspects degrees [rad]."""
 
 
@@ -61,116 +61,118 @@ def read_urdf(
     """
     robot = read_xml(path, "URDF file")
     if robot.tag != "robot":
-        raise MitsonarError(f"{path} is no URDF file: its first element is <{robot.tag[:40]}>, not <robot>")
-    links = _by_name(path, robot, "link")
-    found = ReadScene()
-    found.frames = _link_poses(path, links, _by_name(path, robot, "joint"), joints)
+        raise MitsonarError(f"{path} is not a URDF file: its root element is <{robot.tag[:40]}>, not <robot>")
+    links = _children_by_name(path, robot, "link")
+    scene = ReadScene()
+    scene.frames = _link_poses(path, links, _children_by_name(path, robot, "joint"), joints)
     name = robot.get("name", "")
     group = (name,) if name and name not in links else ()
-    found.frames |= {name: np.eye(4) for name in group}
-    colours = {one.get("name", ""): one for one in robot.findall("material")}
+    scene.frames |= {name: np.eye(4) for name in group}
+    colours = {material.get("name", ""): material for material in robot.findall("material")}
     for link, element in links.items():
         pieces = [
             piece
-            for part in element.findall("collision" if collision else "visual")
-            for piece in _pieces(path, part, search, shapes, colours)
+            for child in element.findall("collision" if collision else "visual")
+            for piece in _pieces(path, child, search, shapes, colours)
         ]
         if pieces:
-            found.bodies.append(Body(link, found.frames[link], pieces, group))
-    return found
+            scene.bodies.append(Body(link, scene.frames[link], pieces, group))
+    return scene
 
 
-def _by_name(path: Path, parent: Element, tag: str) -> dict[str, Element]:
+def _children_by_name(path: Path, parent: Element, tag: str) -> dict[str, Element]:
     """Return the children with a given tag, keyed by their names, which must be unique."""
-    found: dict[str, Element] = {}
+    children: dict[str, Element] = {}
     for element in parent.findall(tag):
         name = attribute_of(path, element, "name")
-        if name in found:
-            raise refused(path, element, f"there are two of this {tag}: name each differently")
-        found[name] = element
-    return found
+        if name in children:
+            raise refused(path, element, f"the name of this {tag} is used twice: give each another name")
+        children[name] = element
+    return children
 
 
 # ---------------- Poses of links
 
 
 def _link_poses(
-    path: Path, links: dict[str, Element], joints: dict[str, Element], asked: Mapping[str, float]
+    path: Path, links: dict[str, Element], joints: dict[str, Element], joint_values: Mapping[str, float]
 ) -> dict[str, Matrix]:
-    """Return the pose of each link relative to the root, the only link that is no joint's child."""
+    """Return the pose of each link relative to the root, the only link that is not the child of a joint."""
     # 1. Collect the parent of each link, and the link's pose in the axes of its parent.
-    check_joint_names(path, asked, [name for name, joint in joints.items() if joint.get("type") in MOVING])
+    check_joint_names(path, joint_values, [name for name, joint in joints.items() if joint.get("type") in MOVING_TYPES])
     parents: dict[str, tuple[str, Matrix]] = {}
     for name, joint in joints.items():
-        ends = [_end(path, joint, tag, links) for tag in ("parent", "child")]
+        ends = [_linked_name(path, joint, tag, links) for tag in ("parent", "child")]
         if ends[1] in parents:
             raise refused(path, joint, f"link {shortened(ends[1])} is the child of two joints: URDF is a tree")
-        value = _value_of(path, name, joints, asked)
+        value = _joint_value(path, name, joints, joint_values)
         origin = _origin(path, joint)
         axis = joint.find("axis")
-        along = (1.0, 0.0, 0.0) if axis is None else numbers_of(path, axis, axis.get("xyz"), 3, (1.0, 0.0, 0.0))
+        direction = (1.0, 0.0, 0.0) if axis is None else numbers_of(path, axis, axis.get("xyz"), 3, (1.0, 0.0, 0.0))
         kind = joint.get("type", "fixed")
-        parents[ends[1]] = (ends[0], origin @ joint_motion(path, joint, kind, along, value))
+        parents[ends[1]] = (ends[0], origin @ joint_motion(path, joint, kind, direction, value))
     # 2. Find the root.
     roots = [link for link in links if link not in parents]
     if len(roots) != 1:
-        told = "none" if not roots else f"{len(roots)}: {', '.join(roots[:3])[:80]}"
-        raise MitsonarError(f"{path}: one link must be the child of no joint, the root of the tree: got {told}")
+        root_names = "none" if not roots else f"{len(roots)}: {', '.join(roots[:3])[:80]}"
+        raise MitsonarError(
+            f"{path}: exactly one link, the root of the tree, must not be the child of a joint: got {root_names}"
+        )
     # 3. Follow each link up to one with a known pose, then multiply the poses on the way back down.
     poses = {roots[0]: np.eye(4)}
     for link in links:
         chain: dict[str, None] = {}
-        one = link
-        while one not in poses:
-            if one in chain:
-                raise MitsonarError(f"{path}: the joints of link {shortened(link)} lead round in a circle")
-            chain[one] = None
-            one = parents[one][0]
-        for one in reversed(chain):
-            poses[one] = poses[parents[one][0]] @ parents[one][1]
+        ancestor = link
+        while ancestor not in poses:
+            if ancestor in chain:
+                raise MitsonarError(f"{path}: the joints of link {shortened(link)} form a circle")
+            chain[ancestor] = None
+            ancestor = parents[ancestor][0]
+        for ancestor in reversed(chain):
+            poses[ancestor] = poses[parents[ancestor][0]] @ parents[ancestor][1]
     return poses
 
 
-def check_joint_names(path: Path, asked: Mapping[str, float], known: list[str]) -> None:
+def check_joint_names(path: Path, joint_values: Mapping[str, float], known: list[str]) -> None:
     """Check that requested joints exist, can move, and have finite values.
 
     Args:
         path: the file, for error messages.
-        asked: requested values of joints, keyed by name [rad, m].
+        joint_values: requested values of joints, keyed by name [rad, m].
         known: names of the joints that can move.
 
     Raises:
         MitsonarError: a joint does not exist or cannot move, or a value is not finite.
     """
-    for name, value in asked.items():
+    for name, value in joint_values.items():
         if name not in known:
-            there = nearest_names(name, known) if known else "it has none"
-            raise MitsonarError(f"{path} has no joint {shortened(name)} that moves: {there}"[:400])
+            hint = nearest_names(name, known) if known else "it has none"
+            raise MitsonarError(f"{path} has no joint {shortened(name)} that moves: {hint}"[:400])
         if not abs(value) <= 1e6:
             raise MitsonarError(f"joint {name} needs a finite number [rad, m]: got {value:g}")
 
 
-def _end(path: Path, joint: Element, tag: str, links: dict[str, Element]) -> str:
+def _linked_name(path: Path, joint: Element, tag: str, links: dict[str, Element]) -> str:
     """Return the name of a joint's parent or child link."""
     element = joint.find(tag)
     if element is None:
         raise refused(path, joint, f"it has no {tag}")
     name = attribute_of(path, element, "link")
     if name not in links:
-        raise refused(path, joint, f"its {tag} is the link {shortened(name)}, which is not there")
+        raise refused(path, joint, f"its {tag} is the link {shortened(name)}, which does not exist")
     return name
 
 
-def _value_of(path: Path, name: str, joints: dict[str, Element], asked: Mapping[str, float]) -> float:
+def _joint_value(path: Path, name: str, joints: dict[str, Element], joint_values: Mapping[str, float]) -> float:
     """Return the value of a joint: the requested value, that of the joint that it mimics, or 0 [rad, m]."""
     factor, offset = 1.0, 0.0
-    for _ in range(MOST_MIMICS):
+    for _ in range(MAX_MIMICS):
         joint = joints[name]
         mimic = joint.find("mimic")
-        if name in asked or mimic is None:
+        if name in joint_values or mimic is None:
             limit = joint.find("limit")
-            value = asked.get(name, 0.0)
-            if name in asked and limit is not None and joint.get("type") != "continuous":
+            value = joint_values.get(name, 0.0)
+            if name in joint_values and limit is not None and joint.get("type") != "continuous":
                 low = number_of(path, joint, limit.get("lower"), 0.0)
                 high = number_of(path, joint, limit.get("upper"), 0.0)
                 if not low <= value <= high:
@@ -182,7 +184,7 @@ def _value_of(path: Path, name: str, joints: dict[str, Element], asked: Mapping[
         factor *= number_of(path, joint, mimic.get("multiplier"), 1.0)
         name = attribute_of(path, mimic, "joint")
         if name not in joints:
-            raise refused(path, joint, f"it mimics the joint {shortened(name)}, which is not there")
+            raise refused(path, joint, f"it mimics the joint {shortened(name)}, which does not exist")
     raise refused(path, joints[name], "joints mimic each other in a circle")
 
 
@@ -199,21 +201,21 @@ def joint_motion(path: Path, joint: Element, kind: str, axis: tuple[float, ...],
     Raises:
         MitsonarError: the axis has length 0.
     """
-    if kind not in MOVING or value == 0:
+    if kind not in MOVING_TYPES or value == 0:
         return np.eye(4)
     length = float(np.linalg.norm(axis))
     if not length >= 1e-9:
         raise refused(path, joint, "its axis has length 0")
-    along = np.asarray(axis) / length * value
-    return placed(along) if kind == "prismatic" else placed(np.zeros(3), Rotation.from_rotvec(along))
+    motion = np.asarray(axis) / length * value
+    return placed(motion) if kind == "prismatic" else placed(np.zeros(3), Rotation.from_rotvec(motion))
 
 
 def _warn_of_degrees(what: str, angles: Iterable[float]) -> None:
     """Warn if an angle [rad] exceeds a full turn, because it is probably in degrees."""
     largest = max(map(abs, angles))
-    if largest > FULL_TURN:
-        told = f"{what} is in radians and holds {largest:g}, more than a turn: are these degrees?"
-        warnings.warn(told, MitsonarWarning, stacklevel=2)
+    if largest > MAX_ANGLE_RAD:
+        message = f"{what} is in radians, but {largest:g} is more than a turn: are these degrees?"
+        warnings.warn(message, MitsonarWarning, stacklevel=2)
 
 
 def _origin(path: Path, element: Element) -> Matrix:
@@ -230,22 +232,22 @@ def _origin(path: Path, element: Element) -> Matrix:
 # ---------------- Geometries and colours of links
 
 
-def _pieces(path: Path, part: Element, search: ModelSearch, shapes: Shapes, colours: dict[str, Element]) -> list[Piece]:
+def _pieces(path: Path, element: Element, search: ModelSearch, shapes: Shapes, colours: dict[str, Element]) -> list[Piece]:
     """Return the geometries of a visual or collision element, in the axes of its link."""
-    geometry = part.find("geometry")
+    geometry = element.find("geometry")
     kind = None if geometry is None else next(iter(geometry), None)
     if kind is None:
-        raise refused(path, part, "it has no geometry")
-    colour = _reflectivity(path, part, shapes, colours)
+        raise refused(path, element, "it has no geometry")
+    colour = _reflectivity(path, element, shapes, colours)
     if kind.tag == "mesh":
         file = search.find(attribute_of(path, kind, "filename"), path)
         scale = numbers_of(path, kind, kind.get("scale"), 3, (1.0, 1.0, 1.0))
         pieces = shapes.of_file(file, scale, colour)
     else:
         size = _size(path, kind)
-        made = primitive(kind.tag, size, UNCOLOURED if colour is None else colour, f"{path}, <{kind.tag}>")
-        pieces = shapes.counted([made], str(path))
-    pose = _origin(path, part)
+        solid = primitive(kind.tag, size, UNCOLOURED if colour is None else colour, f"{path}, <{kind.tag}>")
+        pieces = shapes.counted([solid], str(path))
+    pose = _origin(path, element)
     return [piece.moved(pose[:3, :3], -pose[:3, 3]) for piece in pieces]
 
 
@@ -255,15 +257,17 @@ def _size(path: Path, kind: Element) -> dict[str, float]:
         return dict(zip("xyz", numbers_of(path, kind, attribute_of(path, kind, "size"), 3, ()), strict=True))
     keys = {"sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
     if kind.tag not in keys:
-        raise refused(path, kind, f"a geometry is a box, a cylinder, a sphere, a capsule or a mesh: got {kind.tag[:40]}")
+        raise refused(
+            path, kind, f"a geometry must be a box, a cylinder, a sphere, a capsule or a mesh: got {kind.tag[:40]}"
+        )
     return {key: number_of(path, kind, kind.get(key)) for key in keys[kind.tag]}
 
 
-def _reflectivity(path: Path, part: Element, shapes: Shapes, colours: dict[str, Element]) -> float | None:
+def _reflectivity(path: Path, element: Element, shapes: Shapes, colours: dict[str, Element]) -> float | None:
     """Return the reflectivity of the colour of a visual, or of the robot's material that it names; None without a colour."""
     if not isinstance(shapes.value, str):
         return float(shapes.value)
-    material = part.find("material")
+    material = element.find("material")
     if material is None:
         return None
     named = colours.get(material.get("name", ""), material)

@@ -21,7 +21,7 @@ from mitsonar.worlds.meshes import LUMINANCE, UNCOLOURED, UP, Piece
 
 __all__ = ["read_usd"]
 
-SECONDS = 600
+TIMEOUT_S = 600
 """Longest time for reading a stage [s]."""
 
 
@@ -39,52 +39,54 @@ def read_usd(path: Path, search: ModelSearch, shapes: Shapes, collision: bool = 
     """
     if find_spec("pxr") is None:
         raise explain_missing(ModuleNotFoundError(name="pxr"))
-    told, arrays = _read_apart(path, search, collision)
-    metres, up = told["metres"], told["up"]
+    report, arrays = _read_in_subprocess(path, search, collision)
+    metres, up = report["metres"], report["up"]
     if not (np.isfinite(metres) and 1e-9 <= metres <= 1e9) or up not in UP:
         raise MitsonarError(f"{path}: metersPerUnit must lie in 1e-9..1e9 and upAxis be X, Y or Z: got {metres:g}, {up}")
-    # Frames and geometries have z upwards: `lift` leads from the stage's axes and units to the world, and `back` from axes
-    # with z upwards to those of the stage.
-    lift = np.eye(4)
-    lift[:3, :3] = np.asarray(UP[up], dtype=float) * metres
-    found = ReadScene(left_out={str(kind): int(count) for kind, count in told["left_out"].items()})
-    back = placed(np.zeros(3))
-    back[:3, :3] = np.asarray(UP[up], dtype=float).T
-    found.frames = {name: _finite(path, name, lift @ np.array(matrix) @ back) for name, matrix in told["frames"].items()}
-    for number, body in enumerate(told["bodies"]):
+    # Frames and geometries have z upwards: `to_world` leads from the stage's axes and units to the world, and `to_stage`
+    # from axes with z upwards to those of the stage.
+    to_world = np.eye(4)
+    to_world[:3, :3] = np.asarray(UP[up], dtype=float) * metres
+    scene = ReadScene(left_out={str(kind): int(count) for kind, count in report["left_out"].items()})
+    to_stage = placed(np.zeros(3))
+    to_stage[:3, :3] = np.asarray(UP[up], dtype=float).T
+    scene.frames = {
+        name: _finite(path, name, to_world @ np.array(matrix) @ to_stage) for name, matrix in report["frames"].items()
+    }
+    for number, body in enumerate(report["bodies"]):
         name = body["path"]
-        own = {key.partition(":")[2]: value for key, value in arrays.items() if key.startswith(f"{number}:")}
-        piece = _piece(path, body, own, shapes)
+        body_arrays = {key.partition(":")[2]: value for key, value in arrays.items() if key.startswith(f"{number}:")}
+        piece = _piece(path, body, body_arrays, shapes)
         if len(piece.faces):
-            turned = piece.moved(back[:3, :3].T, np.zeros(3))  # to axes with z upwards
+            upright = piece.moved(to_stage[:3, :3].T, np.zeros(3))  # to axes with z upwards
             parents = [str(parent) for parent in Path(name).parents][-2::-1]
-            found.bodies.append(Body(name, found.frames[name], shapes.counted([turned], str(path)), tuple(parents)))
-    return found
+            scene.bodies.append(Body(name, scene.frames[name], shapes.counted([upright], str(path)), tuple(parents)))
+    return scene
 
 
-def _read_apart(path: Path, search: ModelSearch, collision: bool) -> tuple[PlainValue, dict[str, NDArray[Any]]]:
+def _read_in_subprocess(path: Path, search: ModelSearch, collision: bool) -> tuple[PlainValue, dict[str, NDArray[Any]]]:
     """Read a stage in another process; return its report on the prims, and their arrays, keyed by name."""
     if not os.path.isfile(path):
         raise MitsonarError(f"no such file: {path}")
-    asked = {"path": str(path.resolve()), "roots": [str(root) for root in search.roots], "collision": collision}
-    settings = {name: value for name, value in os.environ.items() if not name.startswith(("PXR_", "USD_"))}
+    request = {"path": str(path.resolve()), "roots": [str(root) for root in search.roots], "collision": collision}
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PXR_", "USD_"))}
     with tempfile.TemporaryDirectory() as folder:
         # -P: do not import modules from the current folder, which may be that of an untrusted scene
         command = [sys.executable, "-P", "-m", "mitsonar.bridges.usd_reading", f"{folder}/prims.npz"]
         try:
-            done = subprocess.run(
-                command, input=json.dumps(asked).encode(), capture_output=True, timeout=SECONDS, env=settings
+            process = subprocess.run(
+                command, input=json.dumps(request).encode(), capture_output=True, timeout=TIMEOUT_S, env=environment
             )
         except subprocess.TimeoutExpired:
-            raise MitsonarError(f"cannot read {path}: it takes more than {SECONDS} s; give a smaller stage") from None
+            raise MitsonarError(f"cannot read {path}: it takes more than {TIMEOUT_S} s; give a smaller stage") from None
         try:
-            told = json.loads(done.stdout)
+            report = json.loads(process.stdout)
         except ValueError:
-            raise MitsonarError(f"cannot read {path}: USD's reader ended on it; export the stage again") from None
-        if "error" in told:
-            raise MitsonarError(f"cannot read {path}: {told['error']}")
-        with np.load(f"{folder}/prims.npz", allow_pickle=False) as table:
-            return told, dict(table)
+            raise MitsonarError(f"cannot read {path}: the USD reader crashed; export the stage again") from None
+        if "error" in report:
+            raise MitsonarError(f"cannot read {path}: {report['error']}")
+        with np.load(f"{folder}/prims.npz", allow_pickle=False) as arrays:
+            return report, dict(arrays)
 
 
 def _finite(path: Path, name: str, matrix: Matrix) -> Matrix:
@@ -101,15 +103,15 @@ def _finite(path: Path, name: str, matrix: Matrix) -> Matrix:
 def _piece(path: Path, body: PlainValue, arrays: dict[str, NDArray[Any]], shapes: Shapes) -> Piece:
     """Return the geometry of a prim, in the axes and units of the prim."""
     if body["kind"] != "mesh":
-        made = primitive(body["kind"], body["sizes"], UNCOLOURED, f"{path}, {body['path'][:80]}")
-        made = made.moved(np.asarray(UP[body["axis"]], dtype=float).T, np.zeros(3))
-        colours = np.nan if body["colour"] is None else np.array(body["colour"])
-        table = np.broadcast_to(colours, (len(made.faces), 3))
+        piece = primitive(body["kind"], body["sizes"], UNCOLOURED, f"{path}, {body['path'][:80]}")
+        piece = piece.moved(np.asarray(UP[body["axis"]], dtype=float).T, np.zeros(3))
+        uniform_colour = np.nan if body["colour"] is None else np.array(body["colour"])
+        colours = np.broadcast_to(uniform_colour, (len(piece.faces), 3))
     else:
-        made = Piece(arrays["vertices"], arrays["faces"])
-        table = arrays.get("colours", np.full((len(made.faces), 3), np.nan))
+        piece = Piece(arrays["vertices"], arrays["faces"])
+        colours = arrays.get("colours", np.full((len(piece.faces), 3), np.nan))
     if not isinstance(shapes.value, str):
-        return made.uniform(float(shapes.value))
-    linear = np.clip(table, 0, 1)
+        return piece.uniform(float(shapes.value))
+    linear = np.clip(colours, 0, 1)
     value = linear[:, 0] if shapes.value == "red" else linear @ LUMINANCE
-    return Piece(made.vertices, made.faces, np.where(np.isnan(value), UNCOLOURED, value))
+    return Piece(piece.vertices, piece.faces, np.where(np.isnan(value), UNCOLOURED, value))

@@ -25,15 +25,15 @@ __all__: list[str] = []
 Prim: TypeAlias = Any
 """A prim, attribute or layer of USD, whose Python bindings have no types."""
 
-MEMORY = 2**34
+MAX_MEMORY_BYTES = 2**34
 """Limit of the address space [bytes]."""
 
-SECONDS = 300
+MAX_CPU_S = 300
 """Limit of the processor time [s]."""
 
-MOST_LAYERS = 10_000
-MOST_PRIMS = 200_000
-MOST_TRIANGLES = 50_000_000
+MAX_LAYERS = 10_000
+MAX_PRIMS = 200_000
+MAX_TRIANGLES = 50_000_000
 
 GPRIMS = {
     "Cube": ("box", ("size",)),
@@ -45,7 +45,7 @@ GPRIMS = {
 }
 """Primitive and attributes of each type of prim that is defined by sizes."""
 
-WHEN = Usd.TimeCode.EarliestTime()
+TIME = Usd.TimeCode.EarliestTime()
 
 
 class RefusedError(Exception):
@@ -54,24 +54,28 @@ class RefusedError(Exception):
 
 def main() -> None:
     """Read the stage that is requested on standard input; print a report, or ``{"error": ...}`` if it cannot be read."""
-    for kind, most in ((resource.RLIMIT_AS, MEMORY), (resource.RLIMIT_CPU, SECONDS), (resource.RLIMIT_CORE, 0)):
-        known = [limit for limit in resource.getrlimit(kind) if limit != resource.RLIM_INFINITY]
-        resource.setrlimit(kind, (min([most, *known]), min([most, *known])))
-    asked = json.loads(sys.stdin.read())
+    for kind, maximum in (
+        (resource.RLIMIT_AS, MAX_MEMORY_BYTES),
+        (resource.RLIMIT_CPU, MAX_CPU_S),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        finite_limits = [limit for limit in resource.getrlimit(kind) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(kind, (min([maximum, *finite_limits]), min([maximum, *finite_limits])))
+    request = json.loads(sys.stdin.read())
     try:
-        check_layers(asked["path"], [Path(root) for root in asked["roots"]])
-        stage = Usd.Stage.Open(asked["path"])
+        check_layers(request["path"], [Path(root) for root in request["roots"]])
+        stage = Usd.Stage.Open(request["path"])
         arrays: dict[str, NDArray[Any]] = {}
-        told = read_stage(stage, asked["collision"], arrays)
+        report = read_stage(stage, request["collision"], arrays)
         np.savez(sys.argv[1], **arrays)  # type: ignore[arg-type]  # the stubs take a name for allow_pickle
     except RefusedError as error:
-        told = {"error": str(error)}
+        report = {"error": str(error)}
     except Tf.ErrorException as error:
         reason = str(error).partition(" : '")[2].splitlines() or ["it is damaged"]
-        told = {"error": f"USD's reader refuses it ({reason[0].strip()[:160]})"}
+        report = {"error": f"the USD reader refuses it ({reason[0].strip()[:160]})"}
     except MemoryError:
-        told = {"error": "it needs too much memory"}
-    json.dump(told, sys.stdout)
+        report = {"error": "it needs too much memory"}
+    json.dump(report, sys.stdout)
 
 
 # ---------------- Layers
@@ -87,43 +91,45 @@ def check_layers(path: str, roots: list[Path]) -> None:
     Raises:
         RefusedError: a layer lies elsewhere, is missing, or cannot be read; or a prim has value clips.
     """
-    waiting, seen = [path], {path}
-    while waiting:
-        name = waiting.pop()
+    unread, seen = [path], {path}
+    while unread:
+        name = unread.pop()
         layer = Sdf.Layer.FindOrOpen(name)
         if layer is None:
-            raise RefusedError(f"the layer {short(name)} cannot be read: it is damaged, or no USD")
+            raise RefusedError(f"the layer {short(name)} cannot be read: it is damaged, or is not USD")
         clips: list[str] = []
 
-        def note(at: Prim, layer: Prim = layer, clips: list[str] = clips) -> None:
-            if at.IsPrimPath() and layer.GetObjectAtPath(at).HasInfo("clips"):
-                clips.append(str(at))
+        def collect_clips(prim_path: Prim, layer: Prim = layer, clips: list[str] = clips) -> None:
+            if prim_path.IsPrimPath() and layer.GetObjectAtPath(prim_path).HasInfo("clips"):
+                clips.append(str(prim_path))
 
-        layer.Traverse(Sdf.Path.absoluteRootPath, note)
+        layer.Traverse(Sdf.Path.absoluteRootPath, collect_clips)
         if clips:
             raise RefusedError(f"the prim {short(clips[0])} has value clips, which are not read: flatten the stage")
         for asset in layer.GetCompositionAssetDependencies():
-            found = _allowed(layer, asset, roots)
-            if found not in seen:
-                seen.add(found)
-                waiting.append(found)
-        if len(seen) > MOST_LAYERS:
-            raise RefusedError(f"it is composed of more than {MOST_LAYERS:,} layers")
+            dependency = _allowed_layer(layer, asset, roots)
+            if dependency not in seen:
+                seen.add(dependency)
+                unread.append(dependency)
+        if len(seen) > MAX_LAYERS:
+            raise RefusedError(f"it is composed of more than {MAX_LAYERS:,} layers")
 
 
-def _allowed(layer: Prim, asset: str, roots: list[Path]) -> str:
+def _allowed_layer(layer: Prim, asset: str, roots: list[Path]) -> str:
     """Return the path of a layer that another layer names."""
     if "://" in asset or "`" in asset:
-        raise RefusedError(f"it names the layer {short(asset)}: only files beside it, or in folders of --search, are read")
-    found = str(Sdf.ComputeAssetPathRelativeToLayer(layer, asset))
-    outer = Path(Ar.SplitPackageRelativePathOuter(found)[0] if Ar.IsPackageRelativePath(found) else found)
-    if not outer.is_file():
-        raise RefusedError(f"it names the layer {short(asset)}, which is not there")
-    if not any(outer.resolve().is_relative_to(root) for root in roots):
         raise RefusedError(
-            f"it names the layer {short(asset)}, outside its folder: give the folder that holds it by --search"
+            f"it names the layer {short(asset)}: only files in its folder, or in folders of --search, are read"
         )
-    return found
+    resolved = str(Sdf.ComputeAssetPathRelativeToLayer(layer, asset))
+    outer_file = Path(Ar.SplitPackageRelativePathOuter(resolved)[0] if Ar.IsPackageRelativePath(resolved) else resolved)
+    if not outer_file.is_file():
+        raise RefusedError(f"it names the layer {short(asset)}, which does not exist")
+    if not any(outer_file.resolve().is_relative_to(root) for root in roots):
+        raise RefusedError(
+            f"it names the layer {short(asset)}, outside its folder: give the folder that contains it by --search"
+        )
+    return resolved
 
 
 def short(name: str) -> str:
@@ -149,18 +155,18 @@ def read_stage(stage: Prim, collision: bool, arrays: dict[str, NDArray[Any]]) ->
     Raises:
         RefusedError: a geometry is damaged, or there are too many prims or triangles.
     """
-    cache = UsdGeom.XformCache(WHEN)
+    cache = UsdGeom.XformCache(TIME)
     bodies: list[dict[str, Any]] = []
     frames: dict[str, list[list[float]]] = {}
     left_out: dict[str, int] = {}
     triangles = 0
     for count, prim in enumerate(prims_of(stage)):
-        if count >= MOST_PRIMS:
-            raise RefusedError(f"it has more than {MOST_PRIMS:,} prims")
+        if count >= MAX_PRIMS:
+            raise RefusedError(f"it has more than {MAX_PRIMS:,} prims")
         kind = str(prim.GetTypeName())
         if prim.IsA(UsdGeom.Xformable):
             frames[str(prim.GetPath())] = np.array(cache.GetLocalToWorldTransform(prim)).T.tolist()
-        if not _wanted(prim, collision):
+        if not _is_selected(prim, collision):
             continue
         if kind == "Mesh":
             shape, faces = read_mesh(prim)
@@ -173,9 +179,9 @@ def read_stage(stage: Prim, collision: bool, arrays: dict[str, NDArray[Any]]) ->
             if prim.IsA(UsdGeom.Gprim) or kind == "PointInstancer":
                 left_out[kind] = left_out.get(kind, 0) + 1
             continue
-        if triangles > MOST_TRIANGLES:
-            raise RefusedError(f"it has more than {MOST_TRIANGLES:,} triangles")
-        bodies.append({**body, "path": str(prim.GetPath()), "colour": _colour_of_all(prim)})
+        if triangles > MAX_TRIANGLES:
+            raise RefusedError(f"it has more than {MAX_TRIANGLES:,} triangles")
+        bodies.append({**body, "path": str(prim.GetPath()), "colour": _uniform_colour(prim)})
     up, metres = str(UsdGeom.GetStageUpAxis(stage)), float(UsdGeom.GetStageMetersPerUnit(stage))
     return {"bodies": bodies, "frames": frames, "left_out": left_out, "up": up.lower(), "metres": metres}
 
@@ -189,7 +195,7 @@ def prims_of(stage: Prim) -> Iterator[Prim]:
         yield prim
 
 
-def _wanted(prim: Prim, collision: bool) -> bool:
+def _is_selected(prim: Prim, collision: bool) -> bool:
     """Return whether a prim is visible, or, for collision shapes, takes part in collisions."""
     imageable = UsdGeom.Imageable(prim)
     if not imageable:
@@ -197,20 +203,20 @@ def _wanted(prim: Prim, collision: bool) -> bool:
     if collision:
         return bool(prim.HasAPI(UsdPhysics.CollisionAPI)) or prim.GetTypeName() == "PointInstancer"
     purpose = imageable.ComputePurpose()
-    return purpose in ("default", "render") and imageable.ComputeVisibility(WHEN) != "invisible"
+    return purpose in ("default", "render") and imageable.ComputeVisibility(TIME) != "invisible"
 
 
 def _gprim(prim: Prim, kind: str) -> dict[str, Any]:
     """Return the kind, the sizes and the axis of a prim that is defined by sizes."""
     primitive, names = GPRIMS[kind]
-    values = [float(prim.GetAttribute(name).Get(WHEN)) for name in names]
+    values = [float(prim.GetAttribute(name).Get(TIME)) for name in names]
     sizes: dict[str, float] = dict(zip(("radius", "length"), values, strict=False))
     if kind == "Cube":
         sizes = dict.fromkeys("xyz", values[0])
     if kind == "Plane":
         sizes = {"x": values[0], "y": values[1]}
     axis = prim.GetAttribute("axis")
-    return {"kind": primitive, "sizes": sizes, "axis": str(axis.Get(WHEN)).lower() if axis else "z"}
+    return {"kind": primitive, "sizes": sizes, "axis": str(axis.Get(TIME)).lower() if axis else "z"}
 
 
 def read_mesh(prim: Prim) -> tuple[dict[str, NDArray[Any]], int]:
@@ -221,37 +227,37 @@ def read_mesh(prim: Prim) -> tuple[dict[str, NDArray[Any]], int]:
     """
     # 1. Read the arrays, and check that they fit together.
     mesh = UsdGeom.Mesh(prim)
-    points = np.array(mesh.GetPointsAttr().Get(WHEN) or [], dtype=np.float64).reshape(-1, 3)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(WHEN) or [], dtype=np.int64)
-    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(WHEN) or [], dtype=np.int64)
-    what = f"the mesh {short(str(prim.GetPath()))}"
+    points = np.array(mesh.GetPointsAttr().Get(TIME) or [], dtype=np.float64).reshape(-1, 3)
+    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(TIME) or [], dtype=np.int64)
+    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(TIME) or [], dtype=np.int64)
+    mesh_name = f"the mesh {short(str(prim.GetPath()))}"
     if counts.size and (counts.min() < 0 or counts.sum() != len(corners)):
-        raise RefusedError(f"{what} counts {counts.sum():,} corners of faces and has {len(corners):,}")
+        raise RefusedError(f"{mesh_name} states {counts.sum():,} corners of faces, but has {len(corners):,}")
     if corners.size and (corners.min() < 0 or corners.max() >= len(points)):
-        raise RefusedError(f"a face of {what} names a point that is not there")
+        raise RefusedError(f"a face of {mesh_name} refers to a point that does not exist")
     if not np.isfinite(points).all():
-        raise RefusedError(f"{what} has points that are not finite")
-    # 2. Split each face of n corners into a fan of n - 2 triangles: `face` is the face of each triangle, `place` its number
-    #    in the fan, and `begin` the index of the face's first corner.
-    cut = np.maximum(counts - 2, 0)
-    face = np.repeat(np.arange(len(counts)), cut)
-    place = np.arange(int(cut.sum())) - np.repeat(np.cumsum(cut) - cut, cut)
-    begin = (np.cumsum(counts) - counts)[face]
-    fan = np.stack([begin, begin + place + 1, begin + place + 2], -1)
-    if mesh.GetOrientationAttr().Get(WHEN) == UsdGeom.Tokens.leftHanded:
-        fan = fan[:, ::-1]
+        raise RefusedError(f"{mesh_name} has points that are not finite")
+    # 2. Split each face of n corners into a fan of n - 2 triangles: `face` is the face of each triangle, `number` its number
+    #    in the fan, and `first_corner` the index of the face's first corner.
+    triangle_counts = np.maximum(counts - 2, 0)
+    face = np.repeat(np.arange(len(counts)), triangle_counts)
+    number = np.arange(int(triangle_counts.sum())) - np.repeat(np.cumsum(triangle_counts) - triangle_counts, triangle_counts)
+    first_corner = (np.cumsum(counts) - counts)[face]
+    triangle_corners = np.stack([first_corner, first_corner + number + 1, first_corner + number + 2], -1)
+    if mesh.GetOrientationAttr().Get(TIME) == UsdGeom.Tokens.leftHanded:
+        triangle_corners = triangle_corners[:, ::-1]
     # 3. Give each triangle the colour of its face.
-    shape = {"vertices": points, "faces": corners[fan].reshape(-1, 3)}
-    colours = _own_colours(prim, counts, corners, len(points))
+    shape = {"vertices": points, "faces": corners[triangle_corners].reshape(-1, 3)}
+    colours = _face_colours(prim, counts, corners, len(points))
     if colours is not None:
         shape["colours"] = colours[face]
-    return shape, len(fan)
+    return shape, len(triangle_corners)
 
 
 # ---------------- Colours
 
 
-def _own_colours(
+def _face_colours(
     prim: Prim, counts: NDArray[np.int64], corners: NDArray[np.int64], points: int
 ) -> NDArray[np.float64] | None:
     """Return the linear colours of faces ``(faces, 3)`` from materials, otherwise from ``displayColor``, or None."""
@@ -259,13 +265,13 @@ def _own_colours(
     colours = np.full((len(counts), 3), np.nan)
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
         colour = _material_colour(subset.GetPrim())
-        faces = np.array(subset.GetIndicesAttr().Get(WHEN) or [], dtype=np.int64)
+        faces = np.array(subset.GetIndicesAttr().Get(TIME) or [], dtype=np.int64)
         if colour is not None and faces.size and faces.min() >= 0 and faces.max() < len(counts):
             colours[faces] = colour
-    whole = _material_colour(prim)
-    whole = _display_colours(prim, counts, corners, points) if whole is None else whole
-    if whole is not None:
-        colours = np.where(np.isnan(colours), whole, colours)
+    default = _material_colour(prim)
+    default = _display_colours(prim, counts, corners, points) if default is None else default
+    if default is not None:
+        colours = np.where(np.isnan(colours), default, colours)
     return None if np.isnan(colours).all() else colours
 
 
@@ -275,7 +281,7 @@ def _display_colours(
     """Return the ``displayColor`` of each face ``(faces, 3)``, averaged over its corners, or None."""
     # The colours may be one for all, one per face, one per point or one per corner.
     primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
-    values = primvar.ComputeFlattened(WHEN) if primvar and primvar.HasValue() else None
+    values = primvar.ComputeFlattened(TIME) if primvar and primvar.HasValue() else None
     if values is None or not len(values):
         return None
     table = np.array(values, dtype=np.float64).reshape(-1, 3)
@@ -291,12 +297,12 @@ def _display_colours(
     return np.asarray(sums / np.maximum(counts, 1)[:, None], dtype=np.float64)
 
 
-def _colour_of_all(prim: Prim) -> list[float] | None:
+def _uniform_colour(prim: Prim) -> list[float] | None:
     """Return the uniform colour of a primitive, or None."""
     colour = _material_colour(prim)
     if colour is None:
-        painted = _display_colours(prim, np.array([1]), np.array([0]), 1)
-        colour = None if painted is None else painted[0]
+        display_colours = _display_colours(prim, np.array([1]), np.array([0]), 1)
+        colour = None if display_colours is None else display_colours[0]
     return None if colour is None else [float(value) for value in colour]
 
 
@@ -307,9 +313,9 @@ def _material_colour(prim: Prim) -> NDArray[np.float64] | None:
         return None
     for shader in Usd.PrimRange(material.GetPrim()):
         for name in ("diffuseColor", "diffuse_color_constant", "base_color"):
-            given = UsdShade.Shader(shader).GetInput(name) if shader.IsA(UsdShade.Shader) else None
-            if given and not given.HasConnectedSource() and given.Get(WHEN) is not None:
-                colour = np.array(given.Get(WHEN), dtype=np.float64).ravel()
+            shader_input = UsdShade.Shader(shader).GetInput(name) if shader.IsA(UsdShade.Shader) else None
+            if shader_input and not shader_input.HasConnectedSource() and shader_input.Get(TIME) is not None:
+                colour = np.array(shader_input.Get(TIME), dtype=np.float64).ravel()
                 return colour[:3] if len(colour) >= 3 and np.isfinite(colour).all() else None
     return None
 

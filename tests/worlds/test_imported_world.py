@@ -70,11 +70,11 @@ def test_degrees_in_place_of_radians_are_told(tmp_path: Path) -> None:
     box = '<visual><geometry><box size="1 1 1"/></geometry></visual>'
     joint = '<joint name="hinge" type="continuous"><parent link="a"/><child link="b"/><origin rpy="0 90 0"/></joint>'
     (tmp_path / "arm.urdf").write_text(f'<robot><link name="a">{box}</link><link name="b">{box}</link>{joint}</robot>')
-    with pytest.warns(MitsonarWarning, match=r"rpy is in radians and holds 90, more than a turn"):
+    with pytest.warns(MitsonarWarning, match=r"rpy is in radians, but 90 is more than a turn"):
         imported_world(tmp_path / "arm.urdf")
     with (
         pytest.warns(MitsonarWarning, match=r"rpy"),
-        pytest.warns(MitsonarWarning, match=r"joint hinge is in radians and holds 45"),
+        pytest.warns(MitsonarWarning, match=r"joint hinge is in radians, but 45"),
     ):
         imported_world(tmp_path / "arm.urdf", joints={"hinge": 45})
 
@@ -98,19 +98,19 @@ def test_collision_shapes_are_read_in_place_of_visual_ones(tmp_path: Path) -> No
     [
         (("<robot", '<!DOCTYPE r [<!ENTITY a "b">]><robot'), "document type"),
         (('child link="hand"', 'child link="arm"'), "child of two joints"),
-        (('parent link="base"/><child link="arm"', 'parent link="hand"/><child link="arm"'), "in a circle"),
+        (('parent link="base"/><child link="arm"', 'parent link="hand"/><child link="arm"'), "form a circle"),
         (("0 0 1", "0 0 nan"), "3 finite numbers"),
         (("0 0 1", "0 0 1e300"), "3 finite numbers"),
         (("package://crane/ball.stl", "../../etc/passwd"), "not within"),
         (("package://crane/ball.stl", "/etc/passwd"), "not within"),
         (("package://crane/ball.stl", "package://crane/../../../etc/passwd"), "not within"),
-        (("package://crane/ball.stl", "https://models.org/ball.stl"), "nothing is fetched from the net"),
+        (("package://crane/ball.stl", "https://models.org/ball.stl"), "nothing is downloaded"),
         (('radius="0.1" length="1"', 'radius="-0.1" length="1"'), "sizes of 1e-6 to 1e6 m"),
         (('joint="shoulder" multi', 'joint="follower" multi'), "mimic each other in a circle"),
         (('axis xyz="0 0 2"', 'axis xyz="0 0 0"'), "its axis has length 0"),
-        (('link name="twin"', 'link name="hand"'), "two of this link"),
-        (("</robot>", ""), "no URDF file"),
-        (("<robot", "<sdf"), "no URDF file"),
+        (('link name="twin"', 'link name="hand"'), "this link is used twice"),
+        (("</robot>", ""), "not a (valid )?URDF file"),
+        (("<robot", "<sdf"), "not a (valid )?URDF file"),
     ],
 )
 def test_damaged_and_harmful_urdf_is_refused_in_one_sentence(change: tuple[str, str], reason: str, tmp_path: Path) -> None:
@@ -170,11 +170,11 @@ def test_what_a_harbour_cannot_hold_is_left_out_with_a_warning(tmp_path: Path) -
         (('attached_to="bulb"', 'attached_to="knob"'), "relative to itself"),
         (("<uri>model://buoy</uri>", "<uri>model://../harbour.sdf</uri>"), "not within|includes itself"),
         (("<uri>model://buoy</uri>", "<uri>harbour.sdf</uri>"), "includes itself"),
-        (("<uri>model://buoy</uri>", "<uri>https://fuel.org/buoy</uri>"), "nothing is fetched"),
+        (("<uri>model://buoy</uri>", "<uri>https://fuel.org/buoy</uri>"), "nothing is downloaded"),
         (("10 0 0 0 0 1.57", "10 0 0 0 inf 1.57"), "6 finite numbers"),
         (("<name>red</name>", "<name>pier</name>"), "given twice"),
         (("<child>door</child>", "<child>gate</child>"), "names the frame 'gate'"),
-        (("<parent>wall</parent>", "<parent>door</parent>"), "in a circle"),
+        (("<parent>wall</parent>", "<parent>door</parent>"), "form a circle"),
         (("<radius>0.2</radius>", "<radius>nan</radius>"), "1 finite numbers"),
         (('<sdf version="1.9">', '<!DOCTYPE s SYSTEM "/etc/passwd"><sdf version="1.9">'), "document type"),
     ],
@@ -215,7 +215,7 @@ def test_models_elsewhere_need_the_search_path(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
     make_sdf(tmp_path / "worlds")
     (tmp_path / "worlds" / "buoy").rename(tmp_path / "models" / "buoy")
-    with pytest.raises(MitsonarError, match="give the folder that holds it by --search"):
+    with pytest.raises(MitsonarError, match="give the folder that contains it by --search"):
         imported_world(tmp_path / "worlds" / "harbour.sdf")
     assert len(imported_world(tmp_path / "worlds" / "harbour.sdf", search=[tmp_path / "models"]).meshes) == 4
     (tmp_path / "models" / "buoy" / "ball.stl").unlink()
