@@ -20,7 +20,7 @@ from mitsonar.io.files import PlainValue
 __all__ = ["LiveClient", "LiveMessage", "image_of"]
 
 PROTOCOL = Subprotocol("foxglove.sdk.v1")
-POSES, MESSAGE = 1, 1
+POSE_CHANNEL, MESSAGE_OPCODE = 1, 1
 
 
 class LiveMessage(NamedTuple):
@@ -68,27 +68,31 @@ class LiveClient:
         self.status: list[str] = []
         self.info: dict[str, PlainValue] = {}
         self.channels: dict[str, dict[str, PlainValue]] = {}
-        self._ends = contextlib.ExitStack()
+        self._exit_stack = contextlib.ExitStack()
         try:
-            self._socket = self._ends.enter_context(connect(address, subprotocols=[PROTOCOL], max_size=None))
+            self._socket = self._exit_stack.enter_context(connect(address, subprotocols=[PROTOCOL], max_size=None))
         except (OSError, WebSocketException) as error:
             raise MitsonarError(f"no live sonar answers at {address} ({error}): start `mitsonar serve`") from None
-        end = time.monotonic() + 20
+        deadline = time.monotonic() + 20
         while not (self.info and all(topic in self.channels for topic in topics)):
             try:
-                self._text(self._socket.recv(timeout=max(0.01, end - time.monotonic())))
+                self._process_text(self._socket.recv(timeout=max(0.01, deadline - time.monotonic())))
             except TimeoutError:
-                known = ", ".join(self.channels)
-                raise MitsonarError(f"{address} lacks one of the topics {', '.join(topics)}: it has {known}") from None
+                known_topics = ", ".join(self.channels)
+                raise MitsonarError(
+                    f"{address} lacks one of the topics {', '.join(topics)}: it has {known_topics}"
+                ) from None
         self._topics = dict(enumerate(topics))
-        wanted = [{"id": number, "channelId": self.channels[topic]["id"]} for number, topic in self._topics.items()]
-        self._send(op="subscribe", subscriptions=wanted)
-        self._send(op="advertise", channels=[{"id": POSES, "topic": pose_topic, "encoding": encoding, "schemaName": "pose"}])
+        subscriptions = [{"id": number, "channelId": self.channels[topic]["id"]} for number, topic in self._topics.items()]
+        self._send(op="subscribe", subscriptions=subscriptions)
+        self._send(
+            op="advertise", channels=[{"id": POSE_CHANNEL, "topic": pose_topic, "encoding": encoding, "schemaName": "pose"}]
+        )
 
     def publish(self, pose: dict[str, Any] | bytes) -> None:
         """Publish a pose: ``{"x": 1, "y": 0, "z": 2, "pitch": 30, "id": 7}``, in m and deg."""
         content = pose if isinstance(pose, bytes) else json.dumps(pose).encode()
-        self._socket.send(struct.pack("<BI", MESSAGE, POSES) + content)
+        self._socket.send(struct.pack("<BI", MESSAGE_OPCODE, POSE_CHANNEL) + content)
 
     def receive(self, timeout_s: float = 30.0) -> LiveMessage:
         """Wait for the next message and return it; status messages received meanwhile are added to ``status``.
@@ -96,16 +100,16 @@ class LiveClient:
         Raises:
             TimeoutError: no message arrived in time.
         """
-        end = time.monotonic() + timeout_s
+        deadline = time.monotonic() + timeout_s
         while True:
             self._acknowledge()
-            got = self._socket.recv(timeout=max(0.01, end - time.monotonic()))
-            if isinstance(got, bytes):
-                kind, subscription, when = struct.unpack_from("<BIQ", got)
-                if kind == MESSAGE:
-                    return LiveMessage(self._topics[subscription], when, got[13:])
+            frame = self._socket.recv(timeout=max(0.01, deadline - time.monotonic()))
+            if isinstance(frame, bytes):
+                opcode, subscription, time_ns = struct.unpack_from("<BIQ", frame)
+                if opcode == MESSAGE_OPCODE:
+                    return LiveMessage(self._topics[subscription], time_ns, frame[13:])
             else:
-                self._text(got)
+                self._process_text(frame)
 
     def wait_for_status(self, timeout_s: float = 10.0) -> str:
         """Wait for the next status message of the server and return it; other messages received meanwhile are lost.
@@ -113,14 +117,14 @@ class LiveClient:
         Raises:
             TimeoutError: no status message arrived in time.
         """
-        known, end = len(self.status), time.monotonic() + timeout_s
-        while len(self.status) == known:
-            self._text(self._socket.recv(timeout=max(0.01, end - time.monotonic())))
-        return self.status[known]
+        count, deadline = len(self.status), time.monotonic() + timeout_s
+        while len(self.status) == count:
+            self._process_text(self._socket.recv(timeout=max(0.01, deadline - time.monotonic())))
+        return self.status[count]
 
     def close(self) -> None:
         """Close the connection."""
-        self._ends.close()
+        self._exit_stack.close()
 
     def __enter__(self) -> Self:
         return self
@@ -133,18 +137,18 @@ class LiveClient:
         with contextlib.suppress(AttributeError, OSError):  # the option exists on Linux only
             self._socket.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
-    def _send(self, **words: PlainValue) -> None:
-        self._socket.send(json.dumps(words))
+    def _send(self, **fields: PlainValue) -> None:
+        self._socket.send(json.dumps(fields))
 
-    def _text(self, got: str | bytes) -> None:
+    def _process_text(self, frame: str | bytes) -> None:
         """Process a JSON frame of the server; ignore binary messages."""
-        if isinstance(got, bytes):
+        if isinstance(frame, bytes):
             return
-        table = json.loads(got)
+        table = json.loads(frame)
         if table["op"] == "serverInfo":
             self.info = table
         elif table["op"] == "advertise":
-            self.channels |= {one["topic"]: one for one in table["channels"]}
+            self.channels |= {channel["topic"]: channel for channel in table["channels"]}
         elif table["op"] == "status":
             self.status.append(table["message"])
 
@@ -155,25 +159,25 @@ def image_of(content: bytes) -> bytes:
     Raises:
         MitsonarError: the message is not of this type.
     """
-    place = 0
+    offset = 0
     try:
-        while place < len(content):
-            key, place = _varint(content, place)
-            length, place = _varint(content, place)
+        while offset < len(content):
+            key, offset = _varint(content, offset)
+            length, offset = _varint(content, offset)
             if key == (2 << 3 | 2):
-                return content[place : place + length]
-            place += length
+                return content[offset : offset + length]
+            offset += length
     except IndexError:
         pass
-    raise MitsonarError("this message is no foxglove.CompressedImage: subscribe to /sonar/fan")
+    raise MitsonarError("this message is not a foxglove.CompressedImage: subscribe to /sonar/fan")
 
 
-def _varint(content: bytes, place: int) -> tuple[int, int]:
+def _varint(content: bytes, offset: int) -> tuple[int, int]:
     """Return a variable-length integer of protobuf, and the offset of what follows."""
     value = shift = 0
     while True:
-        byte = content[place]
+        byte = content[offset]
         value |= (byte & 127) << shift
-        place, shift = place + 1, shift + 7
+        offset, shift = offset + 1, shift + 7
         if byte < 128:
-            return value, place
+            return value, offset

@@ -18,9 +18,11 @@ __all__ = ["RECORDING", "VIEWER", "write_page"]
 RECORDING = "recording.rrd"
 VIEWER = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
 
-SERVE = "import sys, time, rerun; rerun.serve_web_viewer(web_port=int(sys.argv[1]), open_browser=False); time.sleep(600)"
+SERVER_SCRIPT = (
+    "import sys, time, rerun; rerun.serve_web_viewer(web_port=int(sys.argv[1]), open_browser=False); time.sleep(600)"
+)
 
-ONLY_HERE = """    <meta
+NETWORK_BLOCK = """    <meta
       http-equiv="Content-Security-Policy"
       content="default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
     />
@@ -37,62 +39,62 @@ ONLY_HERE = """    <meta
 The browser holds the policy. The answer 403 keeps the refusals out of the console.
 """
 
-OPEN = f"""    <script>
-      const asked = new URL(window.location);
-      if (!asked.searchParams.has("url")) {{
-        asked.searchParams.set("url", new URL("{RECORDING}", asked).href);
-        window.history.replaceState(null, "", asked);
+OPEN_RECORDING = f"""    <script>
+      const address = new URL(window.location);
+      if (!address.searchParams.has("url")) {{
+        address.searchParams.set("url", new URL("{RECORDING}", address).href);
+        window.history.replaceState(null, "", address);
       }}
     </script>
 """
 """Makes the viewer open the recording beside it: the viewer reads the parameter ``url`` of its address."""
 
-LONGEST_S = 60.0
+TIMEOUT_S = 60.0
 
 
 def write_page(folder: Path) -> None:
     """Write the web viewer of the installed rerun-sdk beside ``recording.rrd`` into a folder, and make it open that.
 
     The page reaches no other host: neither the fonts nor the viewer's search for updates and its reports of use.
-    The viewer is inside the package and is read from its own server on this machine. A page cannot read files of a disk:
-    it needs a web server, such as ``python -m http.server``.
+    The viewer is part of the package, and is read from the server that it starts on this machine. A page cannot read
+    local files: it needs a web server, such as ``python -m http.server``.
 
     Raises:
-        MitsonarError: the viewer of this rerun-sdk does not answer, or is not of the form that is known.
+        MitsonarError: the viewer of this rerun-sdk does not answer, or has an unknown form.
     """
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = int(free.getsockname()[1])
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
     process = subprocess.Popen(
-        [sys.executable, "-c", SERVE, str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [sys.executable, "-c", SERVER_SCRIPT, str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     try:
-        files = {name: _fetched(port, name, process) for name in VIEWER}
+        files = {name: _fetch(port, name, process) for name in VIEWER}
     finally:
         process.kill()
         process.wait()
     page, head, script = files["index.html"].decode(), "<head>\n", '<script src="re_viewer.js"></script>'
     if page.count(head) != 1 or page.count(script) != 1 or not files["re_viewer_bg.wasm"].startswith(b"\0asm"):
-        raise MitsonarError("the web viewer of this rerun-sdk has another form than known: use --save, and `rerun FILE.rrd`")
+        raise MitsonarError("the web viewer of this rerun-sdk has an unknown form: use --save, and `rerun FILE.rrd`")
     # A page without network must not wait for a font on another host: remove the link, and what is left of its element.
     page = "".join(line for line in page.splitlines(keepends=True) if "fonts.g" not in line)
-    page = page.replace('    <link\n      rel="stylesheet"\n    />\n', "").replace(head, head + ONLY_HERE)
-    files["index.html"] = page.replace(script, f"{OPEN.strip()}\n    {script}").encode()
+    page = page.replace('    <link\n      rel="stylesheet"\n    />\n', "").replace(head, head + NETWORK_BLOCK)
+    files["index.html"] = page.replace(script, f"{OPEN_RECORDING.strip()}\n    {script}").encode()
     for name, content in files.items():
         write_whole(folder / name, content)
 
 
-def _fetched(port: int, name: str, process: subprocess.Popen[bytes]) -> bytes:
+def _fetch(port: int, name: str, process: subprocess.Popen[bytes]) -> bytes:
     """Read a file from the viewer's own server, which takes a moment to start.
 
     Raises:
         MitsonarError: it does not answer.
     """
-    end = time.monotonic() + LONGEST_S
-    while time.monotonic() < end and process.poll() is None:
+    deadline = time.monotonic() + TIMEOUT_S
+    while time.monotonic() < deadline and process.poll() is None:
         try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/{name}", timeout=30) as answer:
-                return bytes(answer.read())
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/{name}", timeout=30) as response:
+                return bytes(response.read())
         except urllib.error.HTTPError as error:
             raise MitsonarError(f"this rerun-sdk has no web viewer ({name}: {error.code}): use --save") from None
         except OSError:

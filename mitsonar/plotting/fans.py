@@ -109,13 +109,13 @@ class FanPictures:
 
     def labels(self, frames: SonarFrames, index: int) -> dict[str, NDArray[Any]]:
         """Return the label pictures of one frame, keyed by name; each pixel has the label of the nearest cell."""
-        found = {}
+        pictures = {}
         for label, (name, kind) in LABELS.items():
             values = getattr(frames, label)
             if values is not None:
-                shown = values[index] + (0 if label == "shadow" else 1)
-                found[name] = nearest_cells(self.fan, np.clip(shown, 0, np.iinfo(kind).max).astype(kind), 0)
-        return found
+                label_map = values[index] + (0 if label == "shadow" else 1)
+                pictures[name] = nearest_cells(self.fan, np.clip(label_map, 0, np.iinfo(kind).max).astype(kind), 0)
+        return pictures
 
     def save(self, folder: Path, frames: SonarFrames, index: int, number: int) -> None:
         """Write ``NUMBER.png`` and ``NUMBER.LABEL.png`` of one frame, and ``fan.json`` unless it exists.
@@ -178,16 +178,16 @@ def write_fan_video(
     """
     path = Path(path)
     if path.suffix.lower() not in CODECS:
-        raise MitsonarError(f"{path}: videos end with {' or '.join(CODECS)}")
+        raise MitsonarError(f"{path}: videos must end in {' or '.join(CODECS)}")
     refuse_to_replace(path, overwrite=overwrite)
     if not path.parent.is_dir():
-        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; make it first")
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
+        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first")
+    temporary = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
-        count = _write(chunks, part, rate_hz, span_db, rows, progress or (lambda done: None))
-        part.replace(path)
+        count = _write(chunks, temporary, rate_hz, span_db, rows, progress or (lambda done: None))
+        temporary.replace(path)
     finally:
-        part.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     return count
 
 
@@ -200,23 +200,23 @@ def _write(
     except ModuleNotFoundError as error:
         raise explain_missing(error) from None
     colours = _colours()
-    writer, fan, count, begin = None, None, 0, 0.0
+    writer, fan, count, first_s = None, None, 0, 0.0
     try:
         for frames in chunks:
             if fan is None:
                 fan = cartesian_map(frames.range_m, frames.bearing_rad, rows=2 * (rows // 2))
-            shown = coded_in_decibels(frames, span_db).image
-            for image, time in zip(shown, np.atleast_2d(frames.time_s.T).T.mean(axis=1), strict=True):
+            decibel_images = coded_in_decibels(frames, span_db).image
+            for image, time in zip(decibel_images, np.atleast_2d(frames.time_s.T).T.mean(axis=1), strict=True):
                 values = np.asarray(fan.apply(np.asarray(image, np.float32)))
                 picture = _even(colours[np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)])
-                begin = begin if count else float(time)
-                text = f"{count}   {time - begin:.2f} s"
+                first_s = first_s if count else float(time)
+                text = f"{count}   {time - first_s:.2f} s"
                 cv2.putText(picture, text, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
                 if writer is None:
                     codec = cv2.VideoWriter.fourcc(*CODECS[path.suffix.lower()])
                     writer = cv2.VideoWriter(str(path), codec, rate_hz, (picture.shape[1], picture.shape[0]))
                     if not writer.isOpened():
-                        raise MitsonarError(f"OpenCV cannot write {path.suffix} here: choose another ending")
+                        raise MitsonarError(f"OpenCV cannot write {path.suffix} here: choose another extension")
                 writer.write(picture)
                 count += 1
                 progress(1)
@@ -256,10 +256,10 @@ def coded_in_decibels(frames: SonarFrames, span_db: float) -> SonarFrames:
         raise MitsonarError(f"the span must lie in 0..300 dB: got {span_db:g}")
     values = to_float32(frames.image)
     if frames.level == "dB":
-        shown = 1 + (values - 1) * np.float32(frames.sonar.coding_db / span_db)
-        shown[values <= 0] = 0
+        coded = 1 + (values - 1) * np.float32(frames.sonar.coding_db / span_db)
+        coded[values <= 0] = 0
     else:
         with np.errstate(divide="ignore"):
-            shown = 1 + 10 * np.log10(decoded(np.clip(values, 0, 1), frames.sonar, frames.level)) / span_db
+            coded = 1 + 10 * np.log10(decoded(np.clip(values, 0, 1), frames.sonar, frames.level)) / span_db
     sonar = frames.sonar.replace(coding="dB", coding_db=span_db)
-    return replace(frames, image=np.clip(shown, 0, 1).astype(np.float32), level="dB", sonar=sonar)
+    return replace(frames, image=np.clip(coded, 0, 1).astype(np.float32), level="dB", sonar=sonar)

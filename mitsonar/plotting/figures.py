@@ -52,10 +52,10 @@ OTHER_COLOURS = (("tab:orange", "tab:brown"), ("tab:purple", "tab:pink"), ("tab:
 ARROWS = 20
 """Approximate number of headings drawn along a path."""
 
-UNSEEN = "0.9"
+UNSEEN_COLOUR = "0.9"
 """Grey of cells that no frame observed."""
 
-BAND = 2
+BAND_STD = 2
 """Half width of error bands [standard deviations]."""
 
 
@@ -91,8 +91,8 @@ def mosaic_figure(mosaic: LevelMap, paths: Mapping[str, Trajectory] | None = Non
     figure, (axes,) = _maps(1, mosaic, paths)
     level = mosaic.mean
     norm = PowerNorm(GAMMA, vmin=0, vmax=float(np.nanpercentile(level, 99.9)) or 1.0)
-    shown = axes.imshow(level, extent=mosaic.extent, cmap="copper", norm=norm, interpolation="antialiased")
-    figure.colorbar(shown, ax=axes, label=f"mean level (1 = full scale; shown with gamma {GAMMA:g})", fraction=0.04)
+    image = axes.imshow(level, extent=mosaic.extent, cmap="copper", norm=norm, interpolation="antialiased")
+    figure.colorbar(image, ax=axes, label=f"mean level (1 = full scale; shown with gamma {GAMMA:g})", fraction=0.04)
     _draw_paths(axes, paths or {})
     _finish_map(axes, mosaic, paths or {}, title)
     return figure
@@ -101,13 +101,13 @@ def mosaic_figure(mosaic: LevelMap, paths: Mapping[str, Trajectory] | None = Non
 def quality_figure(mosaic: LevelMap, *, title: str = "") -> Figure:
     """Draw the standard deviation of the levels of the frames that observed each cell, and the number of these frames."""
     figure, (left, right) = _maps(2, mosaic, None)
-    spread = mosaic.std
-    top = float(np.nanpercentile(spread, 99.5)) if np.isfinite(spread).any() else 1.0
-    shown = left.imshow(spread, extent=mosaic.extent, cmap="magma", vmin=0, vmax=top or 1.0, interpolation="antialiased")
-    figure.colorbar(shown, ax=left, label="standard deviation of the frames' levels", fraction=0.04)
+    std = mosaic.std
+    maximum = float(np.nanpercentile(std, 99.5)) if np.isfinite(std).any() else 1.0
+    image = left.imshow(std, extent=mosaic.extent, cmap="magma", vmin=0, vmax=maximum or 1.0, interpolation="antialiased")
+    figure.colorbar(image, ax=left, label="standard deviation of the frames' levels", fraction=0.04)
     count = np.where(mosaic.count > 0, mosaic.count, np.nan)
-    shown = right.imshow(count, extent=mosaic.extent, cmap="viridis", vmin=0, interpolation="antialiased")
-    figure.colorbar(shown, ax=right, label="frames that saw the cell", fraction=0.04)
+    image = right.imshow(count, extent=mosaic.extent, cmap="viridis", vmin=0, interpolation="antialiased")
+    figure.colorbar(image, ax=right, label="frames that observed the cell", fraction=0.04)
     for axes in (left, right):
         _finish_map(axes, mosaic, {}, title if axes is left else "")
     return figure
@@ -135,24 +135,24 @@ def path_figure(
     """
     if not paths:
         raise MitsonarError("there is no path to draw: give at least one")
-    of_motions = _checked(paths, motion_covariances or {}, "motion_covariances", fewer=1)
-    of_poses = _checked(paths, pose_covariances or {}, "pose_covariances", fewer=0)
+    motion_bands = _checked_covariances(paths, motion_covariances or {}, "motion_covariances", fewer=1)
+    pose_bands = _checked_covariances(paths, pose_covariances or {}, "pose_covariances", fewer=0)
     figure = Figure(figsize=(13.0, 7.0), layout="constrained")
     grid = figure.add_gridspec(len(AXES) + 1, 2)
     above = figure.add_subplot(grid[:, 0])
     over_time = [figure.add_subplot(grid[0, 1])]
     over_time += [figure.add_subplot(grid[row, 1], sharex=over_time[0]) for row in range(1, len(AXES) + 1)]
     _draw_paths(above, paths)
-    for name, line, _ in _colours(paths):
+    for name, line, _ in _path_colours(paths):
         path = paths[name]
-        if name in of_poses:
-            _draw_ellipses(above, path.poses[:, :2], of_poses[name][:, :2, :2], line)
+        if name in pose_bands:
+            _draw_ellipses(above, path.poses[:, :2], pose_bands[name][:, :2, :2], line)
         heading = np.degrees(np.unwrap(path.poses[:, 5]))
-        _banded(over_time[0], path.time_s, heading, _std(of_poses.get(name), 2, math.degrees(1)), line)
-        moved = motions(path.poses)
+        _plot_with_band(over_time[0], path.time_s, heading, _std(pose_bands.get(name), 2, math.degrees(1)), line)
+        path_motions = motions(path.poses)
         for axis, (_, _, scale) in enumerate(AXES):
-            band = _std(of_motions.get(name), axis, scale)
-            _banded(over_time[1 + axis], path.time_s[1:], moved[:, axis] * scale, band, line)
+            band = _std(motion_bands.get(name), axis, scale)
+            _plot_with_band(over_time[1 + axis], path.time_s[1:], path_motions[:, axis] * scale, band, line)
     _label_path(above, over_time, title)
     return figure
 
@@ -163,7 +163,7 @@ def save_figure(path: str | Path, figure: Figure, *, dpi: int = 130) -> None:
     The file is written completely or not at all.
 
     Raises:
-        MitsonarError: the extension is no format of figures.
+        MitsonarError: the extension is not a format of figures.
     """
     kind = Path(path).suffix.lstrip(".").lower()
     known = figure.canvas.get_supported_filetypes()
@@ -188,15 +188,18 @@ def _maps(panels: int, mosaic: LevelMap, paths: Mapping[str, Trajectory] | None)
     height = float(np.clip(9.0 * (north - south) / (east - west), 3.5, 9.0))
     width = float(np.clip(height * (east - west) / (north - south), 3.5, 11.0))
     figure = Figure(figsize=(panels * (width + 1.6), height + 0.8), layout="compressed")
-    axes = [figure.add_subplot(1, panels, 1 + panel, facecolor=UNSEEN) for panel in range(panels)]
+    axes = [figure.add_subplot(1, panels, 1 + panel, facecolor=UNSEEN_COLOUR) for panel in range(panels)]
     return figure, axes
 
 
 def _view(mosaic: LevelMap, paths: Mapping[str, Trajectory]) -> tuple[float, float, float, float]:
     """Return the west, east, south and north limits of a map and its paths [m], with a margin."""
     west, east, south, north = mosaic.extent
-    places = [np.array([[west, south], [east, north]]), *(path.poses[:, :2] for path in paths.values())]
-    low, high = np.min([p.min(axis=0) for p in places], axis=0), np.max([p.max(axis=0) for p in places], axis=0)
+    point_sets = [np.array([[west, south], [east, north]]), *(path.poses[:, :2] for path in paths.values())]
+    low, high = (
+        np.min([points.min(axis=0) for points in point_sets], axis=0),
+        np.max([points.max(axis=0) for points in point_sets], axis=0),
+    )
     margin = 0.04 * float((high - low).max())
     return low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin
 
@@ -225,16 +228,16 @@ def _scale_bar(axes: Axes, width_m: float) -> None:
     axes.text(right - length / 2, low + 2 * thick, label, ha="center", va="bottom", bbox=box, zorder=5)
 
 
-def _round_length(wanted: float) -> float:
-    """Return the largest number <= ``wanted`` that is 1, 2 or 5 times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return max(step * power for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
+def _round_length(limit: float) -> float:
+    """Return the largest number <= ``limit`` that is 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(limit))
+    return max(step * power for step in (1, 2, 5) if step * power <= limit * (1 + 1e-9))
 
 
 # ---------------- Paths
 
 
-def _colours(paths: Mapping[str, Trajectory]) -> Iterator[tuple[str, str, str]]:
+def _path_colours(paths: Mapping[str, Trajectory]) -> Iterator[tuple[str, str, str]]:
     """Yield name, line colour and arrow colour of each path."""
     others = 0
     for name in paths:
@@ -260,33 +263,35 @@ def _label_path(above: Axes, over_time: list[Axes], title: str) -> None:
 
 def _draw_paths(axes: Axes, paths: Mapping[str, Trajectory]) -> None:
     """Draw lines with arrows along the heading, and mark the start."""
-    for name, line, arrow in _colours(paths):
+    for name, line, arrow in _path_colours(paths):
         poses = paths[name].poses
         axes.plot(poses[:, 0], poses[:, 1], color=line, label=name, linewidth=1.5, zorder=3)
         axes.plot(*poses[0, :2], marker="o", color=line, markersize=4, zorder=3)
-        some = poses[_some(len(poses))]
-        ahead = np.sin(some[:, 5]), np.cos(some[:, 5])
-        axes.quiver(*some[:, :2].T, *ahead, color=arrow, scale=25, width=0.003, zorder=4)
+        arrow_poses = poses[_sample_indices(len(poses))]
+        direction = np.sin(arrow_poses[:, 5]), np.cos(arrow_poses[:, 5])
+        axes.quiver(*arrow_poses[:, :2].T, *direction, color=arrow, scale=25, width=0.003, zorder=4)
 
 
-def _some(frames: int) -> NDArray[np.intp]:
+def _sample_indices(frames: int) -> NDArray[np.intp]:
     """Return the numbers of the frames that get arrows and ellipses, evenly spread."""
     return np.unique(np.linspace(0, frames - 1, min(ARROWS, frames)).astype(np.intp))
 
 
-def _draw_ellipses(axes: Axes, place: NDArray[np.float64], covariance: NDArray[np.float64], colour: str) -> None:
+def _draw_ellipses(axes: Axes, positions: NDArray[np.float64], covariance: NDArray[np.float64], colour: str) -> None:
     """Draw ellipses of two standard deviations around some of the positions ``(frames, 2)`` [m]."""
     from matplotlib.patches import Ellipse
 
-    for one in _some(len(place)):
-        if np.isfinite(covariance[one]).all():
-            variance, direction = np.linalg.eigh(covariance[one])
-            width, height = 2 * BAND * np.sqrt(np.maximum(variance, 0))
-            turn = math.degrees(math.atan2(direction[1, 0], direction[0, 0]))
-            axes.add_patch(Ellipse(tuple(place[one]), width, height, angle=turn, color=colour, alpha=0.2, linewidth=0))
+    for index in _sample_indices(len(positions)):
+        if np.isfinite(covariance[index]).all():
+            variance, direction = np.linalg.eigh(covariance[index])
+            width, height = 2 * BAND_STD * np.sqrt(np.maximum(variance, 0))
+            angle = math.degrees(math.atan2(direction[1, 0], direction[0, 0]))
+            axes.add_patch(
+                Ellipse(tuple(positions[index]), width, height, angle=angle, color=colour, alpha=0.2, linewidth=0)
+            )
 
 
-def _checked(
+def _checked_covariances(
     paths: Mapping[str, Trajectory], covariances: Mapping[str, NDArray[np.float64]], what: str, fewer: int
 ) -> dict[str, NDArray[np.float64]]:
     """Return covariances as arrays, after checking that they fit their paths.
@@ -302,10 +307,10 @@ def _checked(
     """
     for name, values in covariances.items():
         if name not in paths:
-            raise MitsonarError(f"{what} names no path that is drawn: got {name!r}; paths: {', '.join(paths)}")
-        wanted = (len(paths[name]) - fewer, 3, 3)
-        if np.shape(values) != wanted:
-            raise MitsonarError(f"{what} of {name} must be {wanted}: got {np.shape(values)}")
+            raise MitsonarError(f"{what} names a path that is not drawn: got {name!r}; paths: {', '.join(paths)}")
+        expected_shape = (len(paths[name]) - fewer, 3, 3)
+        if np.shape(values) != expected_shape:
+            raise MitsonarError(f"{what} of {name} must be {expected_shape}: got {np.shape(values)}")
     return {name: np.asarray(values, dtype=float) for name, values in covariances.items()}
 
 
@@ -313,19 +318,19 @@ def _std(covariances: NDArray[np.float64] | None, axis: int, scale: float) -> ND
     return None if covariances is None else scale * np.sqrt(covariances[:, axis, axis])
 
 
-def _banded(
+def _plot_with_band(
     axes: Axes, time: NDArray[np.float64], value: NDArray[np.float64], std: NDArray[np.float64] | None, colour: str
 ) -> None:
     """Draw a line with a band of two standard deviations."""
     axes.plot(time, value, color=colour, linewidth=1.0)
     if std is not None:
-        axes.fill_between(time, value - BAND * std, value + BAND * std, color=colour, alpha=0.2, linewidth=0)
+        axes.fill_between(time, value - BAND_STD * std, value + BAND_STD * std, color=colour, alpha=0.2, linewidth=0)
 
 
 # ---------------- Impulse responses
 
 
-FAINT_DB = -40.0
+MIN_LEVEL_DB = -40.0
 """Lower end of the scale of a waterfall [dB]."""
 
 
@@ -337,15 +342,17 @@ def response_figure(responses: ImpulseResponses, ping: int = 0) -> Figure:
     figure = Figure(figsize=(9, 1.2 + 1.5 * count), layout="constrained")
     grid = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     taps = np.arange(begin, end)
-    for axes, one, receiver in zip(grid, values, sonar.receivers, strict=True):
-        axes.plot(taps, np.abs(one[begin:end]), color="black", lw=1.2, label="magnitude")
-        axes.plot(taps, one[begin:end].real, color="tab:blue", lw=0.7, label="real")
-        axes.plot(taps, one[begin:end].imag, color="tab:orange", lw=0.7, label="imaginary")
+    for axes, response, receiver in zip(grid, values, sonar.receivers, strict=True):
+        axes.plot(taps, np.abs(response[begin:end]), color="black", lw=1.2, label="magnitude")
+        axes.plot(taps, response[begin:end].real, color="tab:blue", lw=0.7, label="real")
+        axes.plot(taps, response[begin:end].imag, color="tab:orange", lw=0.7, label="imaginary")
         axes.set_ylabel(receiver.name)
         axes.grid(alpha=0.3)
-    per_m = 2 * sonar.sampling_hz / sonar.sound_speed
-    above = grid[0].secondary_xaxis("top", functions=(lambda tap: tap / per_m, lambda range_m: range_m * per_m))
-    above.set_xlabel("half the path's length (m)")
+    taps_per_m = 2 * sonar.sampling_hz / sonar.sound_speed
+    range_axis = grid[0].secondary_xaxis(
+        "top", functions=(lambda tap: tap / taps_per_m, lambda range_m: range_m * taps_per_m)
+    )
+    range_axis.set_xlabel("half the path's length (m)")
     grid[0].legend(loc="upper right", fontsize=8, ncols=3)
     grid[-1].set_xlabel(f"tap ({1e3 / sonar.sampling_hz:.4g} ms each)")
     figure.suptitle(_title(responses, f"ping {ping}, divided by the largest magnitude"), fontsize=10)
@@ -357,7 +364,7 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
     sonar, count = responses.sonar, len(responses.sonar.receivers)
     begin, end = _strong_taps(responses)
     level = np.abs(responses.response[:, :, begin:end])
-    decibel = 20 * np.log10(np.maximum(level / max(float(level.max()), 1e-30), 10 ** (FAINT_DB / 20)))
+    decibel = 20 * np.log10(np.maximum(level / max(float(level.max()), 1e-30), 10 ** (MIN_LEVEL_DB / 20)))
     time = responses.time_s
     half = 0.5 * (time[1] - time[0]) if len(time) > 1 else 0.5 / sonar.frame_rate_hz
     # Each row is centred on the time of its ping.
@@ -365,12 +372,18 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
     figure = Figure(figsize=(2.6 * count + 1.6, 4.5), layout="constrained")
     grid = figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0]
     for number, (axes, receiver) in enumerate(zip(grid, sonar.receivers, strict=True)):
-        shown = axes.imshow(
-            decibel[:, number], extent=extent, aspect="auto", cmap="magma", vmin=FAINT_DB, vmax=0, interpolation="nearest"
+        image = axes.imshow(
+            decibel[:, number],
+            extent=extent,
+            aspect="auto",
+            cmap="magma",
+            vmin=MIN_LEVEL_DB,
+            vmax=0,
+            interpolation="nearest",
         )
         axes.set(title=receiver.name, xlabel="delay (ms)")
     grid[0].set_ylabel("time (s)")
-    figure.colorbar(shown, ax=list(grid), label="dB of the largest of all receivers", fraction=0.04)
+    figure.colorbar(image, ax=list(grid), label="dB of the largest of all receivers", fraction=0.04)
     figure.suptitle(_title(responses, counted(len(responses), "ping")), fontsize=10)
     return figure
 
@@ -388,11 +401,11 @@ def waterfall_png(responses: ImpulseResponses) -> bytes:
 def _strong_taps(responses: ImpulseResponses) -> tuple[int, int]:
     """Return the first tap with a visible level and the end of the last one (exclusive), with a margin."""
     level = np.abs(responses.response).max(axis=(0, 1))
-    loud = np.flatnonzero(level > level.max() * 10 ** (FAINT_DB / 20))
+    strong = np.flatnonzero(level > level.max() * 10 ** (MIN_LEVEL_DB / 20))
     if not level.max() > 0:
         return 0, len(level)
-    margin = max(4, (loud[-1] - loud[0]) // 10)
-    return max(0, int(loud[0] - margin)), min(len(level), int(loud[-1] + margin + 1))
+    margin = max(4, (strong[-1] - strong[0]) // 10)
+    return max(0, int(strong[0] - margin)), min(len(level), int(strong[-1] + margin + 1))
 
 
 def _title(responses: ImpulseResponses, what: str) -> str:
@@ -404,10 +417,10 @@ def _title(responses: ImpulseResponses, what: str) -> str:
 # ---------------- Echo sounders, side-scan sonars and DVLs
 
 
-SPAN_DB = 50.0
+SHOWN_SPAN_DB = 50.0
 """Range of levels shown, downwards from full scale [dB]."""
 
-MOST_POINTS = 200_000
+MAX_POINTS = 200_000
 """Approximate largest number of points drawn of a point cloud."""
 
 
@@ -418,61 +431,74 @@ def save_sounding_figure(figure: Figure, path: Path) -> None:
 
 def waterfall_figure_of(echogram: Echogram) -> Figure:
     """Draw the waterfall of a side-scan sonar: slant range across with port to the left, the first ping at the bottom."""
-    figure, axes = _figure(8.4, 5.2)
-    level, channels = echogram.decibels(SPAN_DB), echogram.sounder.channels
+    figure, axes = _single_axes(8.4, 5.2)
+    level, channels = echogram.decibels(SHOWN_SPAN_DB), echogram.sounder.channels
     port, starboard = (level[:, channels.index(side)] for side in ("port", "starboard"))
     far, near = echogram.sounder.fan.range_max, echogram.sounder.fan.range_min
-    along = _along(echogram)
-    shown = {"cmap": "copper", "vmin": -SPAN_DB, "vmax": 0, "aspect": "auto", "origin": "lower", "interpolation": "nearest"}
-    picture = axes.imshow(port[:, ::-1], extent=(-far, -near, *along), **shown)
-    axes.imshow(starboard, extent=(near, far, *along), **shown)
+    along = _path_extent(echogram)
+    options = {
+        "cmap": "copper",
+        "vmin": -SHOWN_SPAN_DB,
+        "vmax": 0,
+        "aspect": "auto",
+        "origin": "lower",
+        "interpolation": "nearest",
+    }
+    image = axes.imshow(port[:, ::-1], extent=(-far, -near, *along), **options)
+    axes.imshow(starboard, extent=(near, far, *along), **options)
     axes.set(xlim=(-far, far), ylim=along, xlabel="slant range, port - starboard (m)", ylabel="along the path (m)")
-    figure.colorbar(picture, ax=axes, label="level (dB)")
+    figure.colorbar(image, ax=axes, label="level (dB)")
     axes.set_title(f"{echogram.sounder.name}, {echogram.sounder.fan.model}, {counted(len(echogram), 'ping')}", fontsize=10)
     return figure
 
 
 def echogram_figure(echogram: Echogram, soundings: Soundings | None = None) -> Figure:
     """Draw the levels of the first channel over time and range, with the detections on top."""
-    figure, axes = _figure(8.4, 3.8)
+    figure, axes = _single_axes(8.4, 3.8)
     time_s, fan = echogram.time_s, echogram.sounder.fan
     half = 0.5 * (time_s[-1] - time_s[0]) / max(1, len(time_s) - 1) or 0.5 / fan.frame_rate_hz
     extent = (time_s[0] - half, time_s[-1] + half, fan.range_max, fan.range_min)
-    shown = {"cmap": "viridis", "vmin": -SPAN_DB, "vmax": 0, "aspect": "auto", "interpolation": "nearest"}
-    picture = axes.imshow(echogram.decibels(SPAN_DB)[:, 0].T, extent=extent, **shown)
+    options = {"cmap": "viridis", "vmin": -SHOWN_SPAN_DB, "vmax": 0, "aspect": "auto", "interpolation": "nearest"}
+    image = axes.imshow(echogram.decibels(SHOWN_SPAN_DB)[:, 0].T, extent=extent, **options)
     if soundings is not None:
         axes.plot(time_s, soundings.range_m[:, 0, 0], color="tab:red", lw=1, label="first echo")
         axes.legend(loc="lower right", fontsize=8)
     axes.set(xlabel="time (s)", ylabel="range (m)")
     axes.set_title(f"{echogram.sounder.name}, {fan.model}, {counted(len(echogram), 'ping')}", fontsize=10)
-    figure.colorbar(picture, ax=axes, label="level (dB)")
+    figure.colorbar(image, ax=axes, label="level (dB)")
     return figure
 
 
 def soundings_figure(soundings: Soundings) -> Figure:
     """Draw the soundings from above, coloured by their height."""
-    figure, axes = _figure(6.4, 5.2)
+    figure, axes = _single_axes(6.4, 5.2)
     points = soundings.points()[soundings.found]
-    points = points[:: max(1, len(points) // MOST_POINTS)]
+    points = points[:: max(1, len(points) // MAX_POINTS)]
     low, high = np.percentile(points[:, 2], [1, 99]) if len(points) else (0, 1)
-    drawn = axes.scatter(*points.T[:2], c=points[:, 2], s=1.5, lw=0, cmap="viridis", vmin=low, vmax=high)
+    scatter = axes.scatter(*points.T[:2], c=points[:, 2], s=1.5, lw=0, cmap="viridis", vmin=low, vmax=high)
     axes.set(xlabel="x, east (m)", ylabel="y, north (m)", aspect="equal")
     axes.set_title(f"{soundings.sounder.name}: {counted(int(soundings.found.sum()), 'sounding')}", fontsize=10)
-    figure.colorbar(drawn, ax=axes, label="z (m)")
+    figure.colorbar(scatter, ax=axes, label="z (m)")
     return figure
 
 
 def range_figure(soundings: Soundings, ping: int = 0) -> Figure:
     """Draw the range image of one ping: rows over beams."""
-    figure, axes = _figure(7.6, 4.2)
+    figure, axes = _single_axes(7.6, 4.2)
     sounder = soundings.sounder
-    half = np.degrees(np.abs(sounder.fan.bearing_rad).max())
-    tall = sounder.rows * sounder.fan.elevation_fov_deg / 2
-    image = soundings.range_m[ping, : sounder.rows]
-    picture = axes.imshow(image, extent=(-half, half, -tall, tall), cmap="viridis_r", aspect="auto", interpolation="nearest")
+    half_bearing = np.degrees(np.abs(sounder.fan.bearing_rad).max())
+    half_elevation = sounder.rows * sounder.fan.elevation_fov_deg / 2
+    range_image = soundings.range_m[ping, : sounder.rows]
+    image = axes.imshow(
+        range_image,
+        extent=(-half_bearing, half_bearing, -half_elevation, half_elevation),
+        cmap="viridis_r",
+        aspect="auto",
+        interpolation="nearest",
+    )
     axes.set(xlabel="bearing (deg)", ylabel="elevation (deg)")
     axes.set_title(f"{sounder.name}, {sounder.fan.model}, ping {ping}", fontsize=10)
-    figure.colorbar(picture, ax=axes, label="range (m)")
+    figure.colorbar(image, ax=axes, label="range (m)")
     return figure
 
 
@@ -488,29 +514,29 @@ def dvl_figure(readings: DvlReadings, true: NDArray[np.float64] | None = None) -
     time_s = readings.soundings.time_s
     std = np.sqrt(np.diagonal(readings.covariance, axis1=1, axis2=2))
     for axis, (name, colour) in enumerate((("starboard", "tab:blue"), ("forward", "tab:orange"), ("up", "tab:green"))):
-        middle = readings.velocity[:, axis]
-        above.plot(time_s, middle, ".", ms=3, color=colour, label=name)
-        above.fill_between(time_s, middle - 2 * std[:, axis], middle + 2 * std[:, axis], color=colour, alpha=0.2, lw=0)
+        velocity = readings.velocity[:, axis]
+        above.plot(time_s, velocity, ".", ms=3, color=colour, label=name)
+        above.fill_between(time_s, velocity - 2 * std[:, axis], velocity + 2 * std[:, axis], color=colour, alpha=0.2, lw=0)
         if true is not None:
             above.plot(time_s, true[:, axis], color="black", lw=0.8)
     above.set_ylabel("velocity (m/s)")
     above.legend(loc="upper right", fontsize=8, ncols=3)
     below.plot(time_s, readings.altitude_m, ".", ms=3, color="black")
     below.set(xlabel="time (s)", ylabel="altitude (m)")
-    lost = int((~readings.locked).sum())
+    unlocked = int((~readings.locked).sum())
     above.set_title(
-        f"{readings.soundings.sounder.name}: {counted(len(time_s), 'ping')}, {lost} without bottom lock", fontsize=10
+        f"{readings.soundings.sounder.name}: {counted(len(time_s), 'ping')}, {unlocked} without bottom lock", fontsize=10
     )
     return figure
 
 
-def _figure(width: float, height: float) -> tuple[Figure, Any]:
+def _single_axes(width: float, height: float) -> tuple[Figure, Any]:
     """Return a figure with one pair of axes."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots()
 
 
-def _along(echogram: Echogram) -> tuple[float, float]:
+def _path_extent(echogram: Echogram) -> tuple[float, float]:
     """Return where the first ping begins and the last one ends along the path [m], or in pings for a vehicle at rest."""
     steps = np.linalg.norm(np.diff(echogram.poses[:, :3], axis=0), axis=1)
     length = float(steps.sum())

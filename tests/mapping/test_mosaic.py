@@ -577,7 +577,7 @@ def test_wrong_figures_are_refused(tmp_path: Path) -> None:
         options: dict[str, Any] = {what: {"true": np.zeros((count, 3, 3))}}
         with pytest.raises(MitsonarError, match=f"{what} of true must be"):
             path_figure({"true": path}, **options)
-    with pytest.raises(MitsonarError, match="names no path that is drawn: got 'other'"):
+    with pytest.raises(MitsonarError, match="names a path that is not drawn: got 'other'"):
         path_figure({"true": path}, pose_covariances={"other": np.zeros((11, 3, 3))})
     with pytest.raises(MitsonarError, match="must end in one of"):
         save_figure(tmp_path / "path.tum", path_figure({"true": path}))

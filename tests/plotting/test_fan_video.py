@@ -40,7 +40,7 @@ def test_each_frame_is_a_picture_of_the_video(tmp_path: Path, ending: str) -> No
 
 def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
     frames = over_ground(sway(3))
-    with pytest.raises(MitsonarError, match=r"videos end with \.mp4 or \.avi"):
+    with pytest.raises(MitsonarError, match=r"videos must end in \.mp4 or \.avi"):
         write_fan_video([frames], tmp_path / "a.gif", 10)
     with pytest.raises(MitsonarError, match="there is no folder"):
         write_fan_video([frames], tmp_path / "no/a.mp4", 10)
