@@ -27,16 +27,16 @@ from mitsonar.bridges.export_source import (
     Region,
     Shot,
     as_json,
-    compressed,
+    compress_run_lengths,
     digest_of,
     json_line,
     new_folder,
     png,
-    pose_of,
-    refuse_unlabelled,
-    refuse_unposed,
-    regions_of,
-    runs_of,
+    pose_fields,
+    region_fields,
+    require_labels,
+    require_poses,
+    run_lengths,
     shots,
 )
 from mitsonar.config.data import Keys, Recipe, load_recipe, recipe_from, set_key, shipped_recipes
@@ -76,7 +76,7 @@ def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) 
     """
     # 1. Write the pictures. Write the records of images and annotations line by line into temporary files, because all of
     #    them together may exceed the memory.
-    refuse_unlabelled(source)
+    require_labels(source)
     (folder / "annotations").mkdir()
     columns, rows = pictures.size
     count, like, parts = 0, source.like, _parts_of(source)
@@ -102,7 +102,7 @@ def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) 
                 tables[shot.part][1].write(f"{json_line(record)}\n")
             yield 1
     # 2. Join the temporary files of each part into one JSON document.
-    pictures.refuse_none(source.frames)
+    pictures.require_regions(source.frames)
     table = [{"id": kind + 1, "name": name, "supercategory": "shape"} for kind, name in enumerate(pictures.classes)]
     about = {"description": source.about or source.name, "contributor": "mitsonar", "picture": pictures.picture_kind}
     for part in parts:
@@ -138,7 +138,7 @@ def _annotation(number: int, image: int, region: Region, names: tuple[str, str],
         "bbox": list(region.box),
         "area": int(np.count_nonzero(region.mask)),
         "iscrowd": 0,
-        "segmentation": {"size": list(size), "counts": compressed(runs_of(region.mask))},
+        "segmentation": {"size": list(size), "counts": compress_run_lengths(run_lengths(region.mask))},
         "attributes": {"shape": names[0], "object": region.number, "object_name": names[1]},
     }
 
@@ -157,18 +157,20 @@ def export_yolo(source: ExportSource, pictures: LabelledPictures, folder: Path, 
     A line of a label file has the class and the centre and size of the box, or with ``polygons`` the outline, as fractions
     of the picture's size. Parts are train, val and test; ``data.yaml`` lists those that have frames.
     """
-    refuse_unlabelled(source)
+    require_labels(source)
     parts = [YOLO_PARTS[part] for part in _parts_of(source)]
     for part in parts:
         for kind in ("images", "labels"):
             (folder / kind / part).mkdir(parents=True)
     for shot in shots(source):
         part = YOLO_PARTS[shot.part]
-        lines = [line for one in _regions(source, pictures, shot) for line in _yolo_lines(one, pictures.size, polygons)]
+        lines = [
+            line for region in _regions(source, pictures, shot) for line in _yolo_lines(region, pictures.size, polygons)
+        ]
         write_whole(folder / "images" / part / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
         write_whole(folder / "labels" / part / f"{shot.name}.txt", "".join(f"{line}\n" for line in lines).encode())
         yield 1
-    pictures.refuse_none(source.frames)
+    pictures.require_regions(source.frames)
     table = {**{part: f"images/{part}" for part in parts}, "names": dict(enumerate(pictures.classes))}
     write_whole(folder / "data.yaml", yaml.safe_dump(table, sort_keys=False, allow_unicode=True).encode())
 
@@ -454,11 +456,11 @@ def export_hugging_face(source: ExportSource, pictures: LabelledPictures, folder
                 tables[shot.part] = files.enter_context((part_folder / "metadata.jsonl").open("w"))
             counts[shot.part] = counts.get(shot.part, 0) + 1
             write_whole(part_folder / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
-            record: dict[str, PlainValue] = {"file_name": f"{shot.name}.png", **pose_of(shot)}
+            record: dict[str, PlainValue] = {"file_name": f"{shot.name}.png", **pose_fields(shot)}
             record["sequence"] = int(source.sequence[shot.number])
             keys = {key: "sc:Integer" if isinstance(value, int) else "sc:Float" for key, value in record.items()}
             if "shape_id" in source.labels:
-                record["objects"] = regions_of(shot, pictures, source)
+                record["objects"] = region_fields(shot, pictures, source)
             tables[shot.part].write(f"{json_line(record)}\n")
             yield 1
     keys["file_name"] = "sc:Text"
@@ -533,13 +535,13 @@ def export_webdataset(source: ExportSource, pictures: LabelledPictures, folder: 
                 path = folder / f"{shot.part}-{number // SAMPLES_PER_SHARD:06d}.tar"
                 files[shot.part] = ends.enter_context(tarfile.open(path, "w", format=tarfile.USTAR_FORMAT))
             counts[shot.part] = number + 1
-            about = {"sequence": int(source.sequence[shot.number]), **pose_of(shot)}
+            about = {"sequence": int(source.sequence[shot.number]), **pose_fields(shot)}
             parts = {"png": png(pictures.picture(shot.frames, shot.index))}
             for name in ("shape", "object"):
                 if f"{name}_id" in source.labels:
                     label = pictures.label(shot.frames, f"{name}_id", shot.index) + 1
                     parts[f"{name}.png"] = png(np.clip(label, 0, 65535).astype(np.uint16))
-            parts["json"] = json_line({**about, "regions": regions_of(shot, pictures, source)}).encode()
+            parts["json"] = json_line({**about, "regions": region_fields(shot, pictures, source)}).encode()
             for extension, content in parts.items():
                 entry = tarfile.TarInfo(f"{shot.name}.{extension}")
                 entry.size = len(content)
@@ -563,7 +565,7 @@ def export_kitti(source: ExportSource, pictures: LabelledPictures, folder: Path)
     Each line of ``poses`` contains the first three rows of the matrix from the sonar's axes (x starboard, y down, z forward)
     to those of the first frame in the sequence. The frames of a sequence must be consecutive.
     """
-    refuse_unposed(source)
+    require_poses(source)
     (folder / "poses").mkdir()
     sequence, first, number = -1, np.eye(4), 0
     poses: IO[str] | None = None
@@ -605,7 +607,7 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
     farthest to *starboard* in column 0, and ``PoseSensor``, the matrix ``(4, 4)`` from the sonar's axes (x forward, y to
     port, z up) to the world. In neusis the bearing of a pixel increases to port with its column. Pictures must be polar.
     """
-    refuse_unposed(source)
+    require_poses(source)
     (folder / "Data").mkdir()
     for shot in shots(source):
         assert shot.frames.poses is not None

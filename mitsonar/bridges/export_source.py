@@ -55,19 +55,19 @@ __all__ = [
     "as_pixels",
     "axes_of",
     "class_rules",
-    "compressed",
+    "compress_run_lengths",
     "digest_of",
     "frames_with_poses",
     "json_line",
     "new_folder",
     "open_export",
     "png",
-    "pose_of",
+    "pose_fields",
     "recorded_recipe",
-    "refuse_unlabelled",
-    "refuse_unposed",
-    "regions_of",
-    "runs_of",
+    "region_fields",
+    "require_labels",
+    "require_poses",
+    "run_lengths",
     "shots",
     "write_recorded",
 ]
@@ -111,7 +111,7 @@ class ExportSource:
         if not len(self.raised_db):
             object.__setattr__(self, "raised_db", np.zeros(self.frames))
 
-    def pieces(self) -> Iterator[tuple[int, SonarFrames]]:
+    def chunks(self) -> Iterator[tuple[int, SonarFrames]]:
         """Yield the frames in chunks, each with the number of its first frame."""
         cells = max(1, self.like.image.shape[1] * self.like.image.shape[2])
         chunk_frames = max(1, CHUNK_BYTES // (cells * (4 + 4 * len(self.labels))))
@@ -347,12 +347,12 @@ class Shot:
 
 def shots(source: ExportSource) -> Iterator[Shot]:
     """Yield the frames of a source one by one; only a few are in memory at a time."""
-    for first, frames in source.pieces():
+    for first, frames in source.chunks():
         for index in range(len(frames)):
             yield Shot(first + index, str(source.part[first + index]), frames, index)
 
 
-def refuse_unlabelled(source: ExportSource) -> None:
+def require_labels(source: ExportSource) -> None:
     """Check that frames have labels.
 
     Raises:
@@ -364,7 +364,7 @@ def refuse_unlabelled(source: ExportSource) -> None:
         )
 
 
-def refuse_unposed(source: ExportSource) -> None:
+def require_poses(source: ExportSource) -> None:
     """Check that frames have poses.
 
     Raises:
@@ -374,7 +374,7 @@ def refuse_unposed(source: ExportSource) -> None:
         raise MitsonarError(f"{source.name} has no poses, which this layout needs: choose another --to")
 
 
-def regions_of(shot: Shot, pictures: LabelledPictures, source: ExportSource) -> dict[str, list[object]]:
+def region_fields(shot: Shot, pictures: LabelledPictures, source: ExportSource) -> dict[str, list[object]]:
     """Return boxes, classes, names and objects of a frame's regions as plain lists; empty without labels."""
     raised_db = float(source.raised_db[shot.number])
     regions = pictures.regions(shot.frames, shot.index, raised_db) if "shape_id" in source.labels else []
@@ -386,7 +386,7 @@ def regions_of(shot: Shot, pictures: LabelledPictures, source: ExportSource) -> 
     }
 
 
-def pose_of(shot: Shot) -> dict[str, float]:
+def pose_fields(shot: Shot) -> dict[str, float]:
     """Return the time and the pose of a frame [s, m, deg]; without a known pose, the time alone."""
     time = float(np.mean(shot.frames.time_s[shot.index]))
     if shot.frames.poses is None:
@@ -589,7 +589,7 @@ class LabelledPictures:
         """Add the regions of a written frame to :attr:`boxes`."""
         self.boxes.update((part, self.classes[region.kind]) for region in regions)
 
-    def refuse_none(self, frames: int) -> None:
+    def require_regions(self, frames: int) -> None:
         """Check that at least one region was counted.
 
         Raises:
@@ -647,7 +647,7 @@ def _box(mask: Mask) -> tuple[int, int, int, int]:
 # ---------------- Run-length encoding of COCO's masks
 
 
-def runs_of(mask: NDArray[np.bool_]) -> list[int]:
+def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
     """Return the lengths of the runs of a mask ``(rows, columns)``, column by column, starting with a run of zeros."""
     flat = mask.ravel(order="F")
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
@@ -656,7 +656,7 @@ def runs_of(mask: NDArray[np.bool_]) -> list[int]:
     return [0, *lengths] if flat[0] else lengths
 
 
-def compressed(runs: list[int]) -> str:
+def compress_run_lengths(runs: list[int]) -> str:
     """Encode run lengths in COCO's compressed text: differences to the run two places before, 5 bits per character."""
     letters = []
     for index, run in enumerate(runs):
@@ -759,9 +759,9 @@ class Stretch:
         """Return the number of frames."""
         return len(self.time_s)
 
-    def read(self, here: slice) -> SonarFrames:
+    def read(self, frame_slice: slice) -> SonarFrames:
         """Read a slice of the frames, counted from the start of the stretch."""
-        return self.part.read(np.arange(self.first + here.start, self.first + here.stop))
+        return self.part.read(np.arange(self.first + frame_slice.start, self.first + frame_slice.stop))
 
 
 @dataclass(frozen=True)
@@ -1007,30 +1007,30 @@ def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
     if not sources:
         raise MitsonarError("a data set needs frames: give at least one run or recording")
     first = sources[0]
-    for one in sources[1:]:
-        differences = one.axes.differences_from(first.axes)
+    for source in sources[1:]:
+        differences = source.axes.differences_from(first.axes)
         if differences:
             raise MitsonarError(
-                f"{one.name} has another sonar than {first.name}: {'; '.join(differences[:6])}; make one data set for each"
+                f"{source.name} has another sonar than {first.name}: {'; '.join(differences[:6])}; make a data set for each"
             )
-    names = [one.name for one in sources]
+    names = [source.name for source in sources]
     duplicates = [name for name in names if names.count(name) > 1]
     if duplicates:
         raise MitsonarError(f"{duplicates[0]} is given twice: its frames would be in both training and validation")
     # 2. Derive mount and flight from the poses: median attitude, range of heights, largest motion between frames.
     stretches = [stretch for source in sources for stretch in source.stretches]
-    poses = np.concatenate([one.poses for one in stretches])
-    largest_motion = np.abs(np.concatenate([motions(one.poses) for one in stretches])).max(axis=0)
+    poses = np.concatenate([stretch.poses for stretch in stretches])
+    largest_motion = np.abs(np.concatenate([motions(stretch.poses) for stretch in stretches])).max(axis=0)
     low, high = _heights(stretches)
     pitch, roll = (float(np.round(np.degrees(np.median(poses[:, axis])), 2)) for axis in (3, 4))
-    has_floats = any(one.part.like.image.dtype != np.uint8 for one in stretches)
+    has_floats = any(stretch.part.like.image.dtype != np.uint8 for stretch in stretches)
     split_by_scene = {"by": "scene", "train": 0.8, "validation": 0.2, "test": 0.0}
     bearings = first.axes.bearing_rad
     return recipe_from(
         {
             "name": name,
             "about": f"frames of {len(sources)} runs or recordings, with known poses",
-            "scenes": [{"sequences": len(one.stretches)} for one in sources],
+            "scenes": [{"sequences": len(source.stretches)} for source in sources],
             "sonar": first.axes.sonar.model_dump(mode="json"),
             "mount": {"pitch_deg": pitch, "roll_deg": roll},
             "flight": {
@@ -1046,7 +1046,7 @@ def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
             "recorded": {
                 "level": first.axes.level,
                 "bearings": None if bearings is None else bearings.tolist(),
-                "sources": [_source_fields(one) for one in sources],
+                "sources": [_source_fields(source) for source in sources],
             },
         }
     )
@@ -1071,10 +1071,10 @@ def _heights(stretches: Sequence[Stretch]) -> tuple[float, float]:
     Raises:
         MitsonarError: no frame has a height, and not all poses lie above z = 0.
     """
-    height_m = np.concatenate([one.height_m for one in stretches])
+    height_m = np.concatenate([stretch.height_m for stretch in stretches])
     height_m = height_m[np.isfinite(height_m) & (height_m > 0)]
     if not height_m.size:
-        height_m = np.concatenate([one.poses[:, 2] for one in stretches])
+        height_m = np.concatenate([stretch.poses[:, 2] for stretch in stretches])
     if height_m.min() <= 0:
         raise MitsonarError("no frame has a height above the ground, and some poses are not above z = 0: give --height")
     return float(height_m.min()), float(height_m.max())
@@ -1083,19 +1083,19 @@ def _heights(stretches: Sequence[Stretch]) -> tuple[float, float]:
 def _plan(sources: Sequence[FramesWithPoses]) -> Plan:
     """Return the plan of the data set: scenes, sequences, times, poses and motions of all frames in stored order."""
     stretches = [stretch for source in sources for stretch in source.stretches]
-    counts = [len(one) for one in stretches]
+    counts = [len(stretch) for stretch in stretches]
     scene = [number for number, source in enumerate(sources) for _ in source.stretches]
-    poses = np.concatenate([one.poses for one in stretches])
+    poses = np.concatenate([stretch.poses for stretch in stretches])
     nan = np.full((1, 3), np.nan)
     return Plan(
         scenes=[Scene(number, number, 0, len(source.stretches)) for number, source in enumerate(sources)],
         scene=np.repeat(scene, counts).astype(np.int32),
         sequence=np.repeat(np.arange(len(counts)), counts).astype(np.int32),
-        time_s=np.concatenate([one.time_s - one.time_s[0] for one in stretches]),
+        time_s=np.concatenate([stretch.time_s - stretch.time_s[0] for stretch in stretches]),
         vehicle=poses * [1, 1, 1, 0, 0, 1],
         poses=poses,
-        motion=np.concatenate([part for one in stretches for part in (motions(one.poses), nan)]),
-        velocity=np.concatenate([velocities(Trajectory(one.poses, one.time_s)) for one in stretches]),
+        motion=np.concatenate([rows for stretch in stretches for rows in (motions(stretch.poses), nan)]),
+        velocity=np.concatenate([velocities(Trajectory(stretch.poses, stretch.time_s)) for stretch in stretches]),
     )
 
 
@@ -1121,19 +1121,19 @@ def _shard_arrays(store: DataStore, stretches: Sequence[Stretch], frame_slice: s
 
 def _notes(sources: Sequence[FramesWithPoses], sequences: int) -> list[str]:
     """Return notes for the user, one sentence each."""
-    notes = [f"{one.name}: {note}" for one in sources for note in one.notes]
+    notes = [f"{source.name}: {note}" for source in sources for note in source.notes]
     notes += [
-        f"{one.name}: left out: {counted(one.left_out, 'frame')} without pose, with another geometry, or without neighbour"
-        for one in sources
-        if one.left_out
+        f"{source.name}: left out: {counted(source.left_out, 'frame')} without pose or neighbour, or with another geometry"
+        for source in sources
+        if source.left_out
     ]
-    scales = np.array([one.level_scale for one in sources])
+    scales = np.array([source.level_scale for source in sources])
     if np.ptp(scales) > GAIN_TOLERANCE * scales.max():
         notes.append(
             f"the gains of the files differ (levels of a pixel of 1 from {scales.min():.3g} to {scales.max():.3g}): pixels "
             "are unchanged, and levels are comparable only within a file"
         )
-    if not all(np.isfinite(one.height_m).all() for source in sources for one in source.stretches):
+    if not all(np.isfinite(stretch.height_m).all() for source in sources for stretch in source.stretches):
         notes.append("not all frames have a height above the ground, which most estimators need: give --height")
     if sequences == 1:
         notes.append(

@@ -267,7 +267,7 @@ def _read_scene(path: Path, search: ModelSearch, shapes: Shapes, joints: Mapping
     if suffix not in SCENE_FORMATS:
         known = ", ".join(SCENE_FORMATS)
         raise MitsonarError(
-            f"cannot read scenes of type {suffix or 'without ending'}: {path}; known: {known}; single models: mesh"
+            f"cannot read scenes of type {suffix or '(no extension)'}: {path}; known: {known}; single models: mesh"
         )
     if suffix.startswith(".usd"):
         if joints:

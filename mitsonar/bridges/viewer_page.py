@@ -1,4 +1,4 @@
-"""A static page: a recording beside the web viewer that rerun-sdk ships, for any web server and without a network."""
+"""A static page: a recording next to the web viewer of rerun-sdk, for any web server, without network access."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NETWORK_BLOCK = """    <meta
 """
 """Keeps the viewer from other hosts: it asks one for its newest version and reports its use to another.
 
-The browser holds the policy. The answer 403 keeps the refusals out of the console.
+The browser enforces the policy. The response 403 keeps the refusals out of the console.
 """
 
 OPEN_RECORDING = f"""    <script>
@@ -47,13 +47,13 @@ OPEN_RECORDING = f"""    <script>
       }}
     </script>
 """
-"""Makes the viewer open the recording beside it: the viewer reads the parameter ``url`` of its address."""
+"""Makes the viewer open the recording next to it: the viewer reads the parameter ``url`` of its address."""
 
 TIMEOUT_S = 60.0
 
 
 def write_page(folder: Path) -> None:
-    """Write the web viewer of the installed rerun-sdk beside ``recording.rrd`` into a folder, and make it open that.
+    """Write the web viewer of the installed rerun-sdk next to ``recording.rrd`` in a folder, and make it open this file.
 
     The page reaches no other host: neither the fonts nor the viewer's search for updates and its reports of use.
     The viewer is part of the package, and is read from the server that it starts on this machine. A page cannot read

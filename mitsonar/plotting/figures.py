@@ -107,7 +107,7 @@ def quality_figure(mosaic: LevelMap, *, title: str = "") -> Figure:
     figure.colorbar(image, ax=left, label="standard deviation of the frames' levels", fraction=0.04)
     count = np.where(mosaic.count > 0, mosaic.count, np.nan)
     image = right.imshow(count, extent=mosaic.extent, cmap="viridis", vmin=0, interpolation="antialiased")
-    figure.colorbar(image, ax=right, label="frames that observed the cell", fraction=0.04)
+    figure.colorbar(image, ax=right, label="frames that saw the cell", fraction=0.04)
     for axes in (left, right):
         _finish_map(axes, mosaic, {}, title if axes is left else "")
     return figure

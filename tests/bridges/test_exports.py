@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mitsonar.bridges.export_formats import DetectorViews, detector_recipe, export_to
-from mitsonar.bridges.export_source import LabelledPictures, class_rules, compressed, open_export, runs_of
+from mitsonar.bridges.export_source import LabelledPictures, class_rules, compress_run_lengths, open_export, run_lengths
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.fan import nearest_cells
 from mitsonar.instruments.sonar import Sonar
@@ -121,7 +121,7 @@ def test_coco_reads_boxes_masks_and_classes(
 @settings(max_examples=60, deadline=None)
 def test_masks_are_those_of_the_tool(mask: NDArray[np.bool_]) -> None:
     masks = pytest.importorskip("pycocotools.mask")
-    counts = compressed(runs_of(mask))
+    counts = compress_run_lengths(run_lengths(mask))
     assert counts.encode() == masks.encode(np.asfortranarray(mask.astype(np.uint8)))["counts"]
 
 
@@ -357,7 +357,7 @@ def test_few_frames_are_read_at_a_time(frames: SonarFrames, run: Path, monkeypat
     from mitsonar.bridges import export_source
 
     monkeypatch.setattr(export_source, "CHUNK_BYTES", 2 * BINS * BEAMS * 12)
-    sizes = [len(piece) for _, piece in open_export(run).pieces()]
+    sizes = [len(piece) for _, piece in open_export(run).chunks()]
     assert sizes == [2, 2, 1]
 
 
