@@ -102,7 +102,8 @@ def bounds_report(source: str, subject: Subject, options: BoundOptions, progress
         MitsonarError: noise or values that do not fit, or no echo at all.
     """
     name, rows = options.vary, []
-    for value in options.values or [None]:
+    values: Sequence[Value | None] = options.values or [None]
+    for value in values:
         for (portion, kind, law), bounds in bounds_of_subject(subject, options, value, progress).items():
             row: PlainTable = {} if name is None else {name: value}
             row |= {"portion": portion, "data": kind, "law": law, "poses": len(bounds)}
