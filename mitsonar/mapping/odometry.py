@@ -185,8 +185,9 @@ def odometry(
     # 6. complete the planar path: height, pitch and roll of the frames, height profile, correlation of the errors
     path = _with_known(path, source, numbers, by_sensors=sensors is not None and sensors.rises(time_s) is not None)
     heights = height_profile(source, numbers, pairs, sensors, path)
-    plain = shown is not None and options.smooth == "none" and graph is None
-    correlated = errors_along(series.motions, canvas_of(shown)) if plain and shown is not None else None
+    correlated = None
+    if shown is not None and options.smooth == "none" and graph is None:
+        correlated = errors_along(series.motions, canvas_of(shown))
     return Odometry(numbers, estimates, series, path, source.true, options, factors, heights, closing, graph, correlated)
 
 
