@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, axes, direction, files_of, refused, tiny_recipe
+from helpers import TINY, Command, axes, direction, files_of, refused, tiny_recipe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
@@ -545,10 +545,10 @@ def test_what_a_detectors_data_set_cannot_be_made_of(mitsonar: Command, tmp_path
     assert {path.name for path in tmp_path.iterdir()} == {"scene.xml", "bare.xml"}
 
 
-def test_worlds_of_a_recipe_are_split_by_scene() -> None:
-    recipe, rules, _ = detector_recipe(
-        "rocky-field", DetectorViews(60, split=(0.5, 0.25, 0.25)), "oculus-m750d-1200khz", {"world": ROCKS}
-    )
+def test_worlds_of_a_recipe_are_split_by_scene(tmp_path: Path) -> None:
+    (tmp_path / "rocks.yaml").write_text(json.dumps({**TINY, "world": ROCKS, "scenes": [{"count": 6, "sequences": 10}]}))
+    views = DetectorViews(60, split=(0.5, 0.25, 0.25))
+    recipe, rules, _ = detector_recipe(tmp_path / "rocks.yaml", views, "oculus-m750d-1200khz")
     assert (len(recipe.scenes), recipe.sequences, recipe.split.by, recipe.flight.pings) == (6, 60, "scene", 1)
     assert rules == [("seabed", "")]
 
