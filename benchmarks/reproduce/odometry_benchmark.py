@@ -1,4 +1,4 @@
-"""The odometry benchmark: methods on simulated sets and recordings, a row each, in a folder that can go on."""
+"""The odometry benchmark: methods on simulated sets and recordings, one row each, in a folder that can be resumed."""
 
 from __future__ import annotations
 
@@ -89,14 +89,14 @@ TIMED_PAIRS = 15
 
 @dataclass(frozen=True)
 class Case:
-    """What a row is of.
+    """What a row measures: a method on a set with a texture and noise.
 
     Attributes:
         name: of the set, or the path of a recording.
         texture: ``still``, ``speckle``, or ``recorded``.
         noise: level.
         method: name of the estimator.
-        geometry: file that tells how the pictures of a recording are laid out.
+        geometry: file that describes the layout of a recording's pictures.
     """
 
     name: str
@@ -106,13 +106,13 @@ class Case:
     geometry: Path | None = field(default=None, compare=False)
 
     @property
-    def words(self) -> tuple[str, str, str, str]:
+    def key(self) -> tuple[str, str, str, str]:
         """Return set, texture, noise and method."""
         return self.name, self.texture, self.noise, self.method
 
     @property
     def command(self) -> str:
-        """Return the words of the command line that make this row, after ``mitsonar benchmark odometry``."""
+        """Return the arguments of ``mitsonar benchmark odometry`` that produce this row."""
         geometry = [] if self.geometry is None else [f"--geometry {self.geometry}"]
         if self.texture == "recorded":
             return " ".join([f"--set {self.name}", *geometry, f"--method {self.method}"])
@@ -135,12 +135,12 @@ def measured_row(
     Invalid motions are failures; they are bridged from their neighbours, as :func:`mitsonar.mapping.odometry.odometry` does.
 
     Args:
-        case: what the row is of.
+        case: what the row measures.
         source: of its frames.
         estimator: the method.
-        folder: of the odometry; an interrupted one goes on.
+        folder: of the odometry; an interrupted run is resumed.
         bound: of a motion ``(3,)`` [m, m, rad], where it is known.
-        workers: processes beside this one.
+        workers: number of worker processes; 1 computes in this process.
         progress: called with the number of pairs that were added.
 
     Returns:
@@ -150,90 +150,90 @@ def measured_row(
         MitsonarError: frames that the estimator does not take.
     """
     pairs = len(source) - 1
-    row: PlainTable = dict(zip(("set", "texture", "noise", "method"), case.words, strict=True))
+    row: PlainTable = dict(zip(("set", "texture", "noise", "method"), case.key, strict=True))
     row |= {"command": case.command, "inputs": estimator.inputs, "frames": len(source), "pairs": pairs, "note": ""}
     loop = LOOP if source.true is None and pairs > LOOP else 0
     try:
         options = OdometryOptions(closure=loop, workers=workers)
-        found = run_odometry(source, case.method, estimator, folder, options, resume=True, progress=progress)
+        odometry = run_odometry(source, case.method, estimator, folder, options, resume=True, progress=progress)
     except MitsonarError as error:
-        estimates = _kept(folder)
-        if len(estimates) < pairs or any(one.valid for one in estimates):
+        estimates = _failed_estimates(folder)
+        if len(estimates) < pairs or any(estimate.valid for estimate in estimates):
             raise
         return row | {"failures": pairs, "note": str(error), "ms": _milliseconds(source, estimator)}
-    row |= {"failures": int((~found.valid).sum()), "ms": _milliseconds(source, estimator)}
-    row |= {"estimated_path_m": path_length(found.path)}
-    return row | (_without_truth(found) if found.true is None else _against_truth(found, found.true, bound))
+    row |= {"failures": int((~odometry.valid).sum()), "ms": _milliseconds(source, estimator)}
+    row |= {"estimated_path_m": path_length(odometry.path)}
+    return row | (_without_truth(odometry) if odometry.true is None else _against_truth(odometry, odometry.true, bound))
 
 
-def _kept(folder: Path) -> list[Estimate]:
+def _failed_estimates(folder: Path) -> list[Estimate]:
     """Return the estimates of a row that failed."""
     if not (folder / "run.json").exists():
         return []
     return list(OdometryFolder(RunDirectory.open(folder, ODOMETRY)).read_journals().pairs.values())
 
 
-def _without_truth(found: Odometry) -> PlainTable:
-    """Return what is known of a path without truth: its ends, and what loops leave over."""
-    end = found.path.poses[-1] - found.path.poses[0]
+def _without_truth(odometry: Odometry) -> PlainTable:
+    """Return the results of a path without truth: net motion, and the closure error of loops."""
+    end = odometry.path.poses[-1] - odometry.path.poses[0]
     row: PlainTable = {"net": [float(end[0]), float(end[1]), float(np.degrees(end[5]))]}
-    row |= {"sums": in_units(found.series.motions.sum(axis=0)).tolist()}
-    if found.closure is not None:
-        row |= {"closure_steps": found.closure.steps, "closure": in_units(found.closure.rms).tolist()}
+    row |= {"sums": in_units(odometry.series.motions.sum(axis=0)).tolist()}
+    if odometry.closure is not None:
+        row |= {"closure_steps": odometry.closure.steps, "closure": in_units(odometry.closure.rms).tolist()}
     return row
 
 
-def _against_truth(found: Odometry, true: Trajectory, bound: Array | None) -> PlainTable:
+def _against_truth(odometry: Odometry, true: Trajectory, bound: Array | None) -> PlainTable:
     """Return the errors of a path: drift over segments, at the end, and of single motions."""
-    at_frames = Trajectory(true.poses[found.frames], true.time_s[found.frames])
+    at_frames = Trajectory(true.poses[odometry.frames], true.time_s[odometry.frames])
     row: PlainTable = {"path_m": path_length(at_frames)}
-    drift = segment_drift(found.path, at_frames, LENGTHS_M)
+    drift = segment_drift(odometry.path, at_frames, LENGTHS_M)
     if drift is not None:
         percent, degrees = drift.intervals()
         row |= {"drift_percent": [drift.percent, *percent], "drift_deg_per_100m": [drift.deg_per_100m, *degrees]}
         row |= {"lengths_m": list(drift.lengths_m), "segments": len(drift.length_m), "blocks": len(np.unique(drift.blocks))}
-    end = 100 * assess(found.path, at_frames).end_drift
+    end = 100 * assess(odometry.path, at_frames).end_drift
     row |= {"end_percent": end if np.isfinite(end) else None}
     truth, block = motions(at_frames.poses), distance_driven(at_frames)[:-1] // LENGTHS_M[0]
-    errors = motion_errors(found.series.motions, truth, np.ones(len(truth), dtype=bool), None, cluster_resamples(block))
+    errors = motion_errors(odometry.series.motions, truth, np.ones(len(truth), dtype=bool), None, cluster_resamples(block))
     row |= {name: getattr(errors, name).tolist() for name in ("rmse", "rmse_low", "rmse_high", "zero", "bias")}
-    nees = _nees(found.estimates, truth)
+    nees = _nees(odometry.estimates, truth)
     row |= {"nees": nees if np.isfinite(nees) else None}
     if bound is not None:
         units = in_units(bound)
         known = (units > 0) & np.isfinite(units)
-        times = np.divide(errors.rmse, units, out=np.zeros(3), where=known)
+        ratios = np.divide(errors.rmse, units, out=np.zeros(3), where=known)
         row |= {"bound": units.tolist()} if np.isfinite(units).all() else {}
-        row |= {"over_bound": [float(t) if k else None for t, k in zip(times, known, strict=True)]}
+        row |= {"over_bound": [float(ratio) if is_known else None for ratio, is_known in zip(ratios, known, strict=True)]}
     return row
 
 
 def _nees(estimates: list[Estimate], truth: Array) -> float:
     """Return a third of the mean normalised squared error of the valid estimates; nan where no covariance is known."""
     unknown = np.full((3, 3), np.nan)
-    motion = np.array([one.motion for one in estimates], dtype=float)
-    covariance = np.array([unknown if one.covariance is None else one.covariance for one in estimates])
-    return motion_errors(motion, truth, np.array([one.valid for one in estimates], dtype=bool), covariance).nees
+    motion = np.array([estimate.motion for estimate in estimates], dtype=float)
+    covariance = np.array([unknown if estimate.covariance is None else estimate.covariance for estimate in estimates])
+    return motion_errors(motion, truth, np.array([estimate.valid for estimate in estimates], dtype=bool), covariance).nees
 
 
 def _milliseconds(source: FrameSource, estimator: AnyEstimator) -> float:
     """Return the median processor time of an estimate, all threads together, after a first one that loads [ms]."""
-    first = np.unique(np.linspace(0, len(source) - 2, TIMED_PAIRS).astype(int))
-    timed, threads = Answers.unasked(len(first)), cv2.getNumThreads()
+    first_frames = np.unique(np.linspace(0, len(source) - 2, TIMED_PAIRS).astype(int))
+    answers, threads = Answers.unasked(len(first_frames)), cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        estimator.estimate(source.read([first[0], first[0] + 1]))
-        for index, number in enumerate(first):
-            timed.ask(index, estimator, source.read([number, number + 1]))
+        estimator.estimate(source.read([first_frames[0], first_frames[0] + 1]))
+        for index, start in enumerate(first_frames):
+            answers.ask(index, estimator, source.read([start, start + 1]))
     finally:
         cv2.setNumThreads(threads)
-    return float(np.median(timed.ms))
+    return float(np.median(answers.ms))
 
 
 # ---------------- The simulated sets of the odometry benchmark: worlds that no training saw, dives and one course,
 # still texture or speckle
-# A set is rendered once into the folder of the benchmark and kept. *Still texture*: the model ``physical``, in which a
-# cell of the ground is as bright in every frame. *Speckle*: the model ``coherent``, in which grain changes as the sonar
+# A set is rendered once into the folder of the benchmark. *Still texture*: the model ``physical``, in which a cell of the
+# ground has the same brightness in every frame. *Speckle*: the model ``coherent``, in which grain changes as the sonar
 # moves.
 
 
@@ -241,13 +241,13 @@ SEED = 730_022
 """Of the worlds, the rays and the noise. Worlds of recipes have other seeds, hashes of the data set's seed and the scene."""
 
 STEP_M = 0.02
-"""Way of the vehicle from frame to frame [m]: the largest that the shipped networks were trained for."""
+"""Distance of the vehicle from frame to frame [m]: the largest that the shipped networks were trained for."""
 
 TURN_RAD, TURN_M = np.radians(6.0), 2.5
-"""The heading swings by this angle, over so many metres of way: 0.3 deg a frame at most."""
+"""The heading swings by this angle, with this period along the path [m]: at most 0.3 deg per frame."""
 
 CRAB_RAD, CRAB_M = np.radians(30.0), 1.7
-"""So does the angle between way and heading: sideways motions of 10 mm at most."""
+"""The same for the angle between path and heading: sideways motions of at most 10 mm."""
 
 DIVE_M_PER_S, DIVE_HZ = 0.4, 10.0
 
@@ -255,17 +255,17 @@ TEXTURES: dict[str, dict[str, Any]] = {
     "still": {"model": "physical", "quality": "standard"},
     "speckle": {"model": "coherent", "quality": "standard", "coding": "gamma", "coding_gamma": 0.5, "gain_exponent": 4},
 }
-"""What a texture is, as changes of the sonar."""
+"""Changes of the sonar for each texture."""
 
 PRESET = "preset"
-"""The noise of a dive: what the preset has in its model, which is none in ``physical``."""
+"""The noise of a dive: that of the preset in its model, which is none in ``physical``."""
 
 NOISES = ("none", "low", "high")
 """Levels of noise. Of still texture: Almanza-Medina's. Of speckle the receiver's: none, the preset's, or one raised to 6 dB
 below the echo of the median cell."""
 
 Begin = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
-"""Called with what begins and its length; while it is open, its value is called with how much more is done."""
+"""Called with the name and the length of a stage; the value of its context is called with the amount newly done."""
 
 
 @dataclass(frozen=True)
@@ -280,10 +280,10 @@ class SimulatedSet:
         pitch_deg: of the sonar [deg].
         raised_db: by which the preset's receiver noise is raised for ``high`` [dB].
         slope_deg: angle at which the ground rises forward [deg].
-        flight: None for the course of :func:`benchmark_course`, or a name of :data:`FLIGHTS`: a dive, with the preset's own
-            quality, coding and noise.
+        flight: None for the course of :func:`benchmark_course`, or a name of :data:`FLIGHTS`: a dive, with quality, coding
+            and noise of the preset.
         seed: of world, rays and dive.
-        frames: how many, unasked.
+        frames: default number of frames.
     """
 
     family: Family
@@ -302,11 +302,11 @@ class SimulatedSet:
         if self.flight is not None:
             changes = {**self.window, "model": TEXTURES[texture]["model"], "seed": self.seed}
             return load_sonar(self.preset).replace(**changes)
-        made = load_sonar(self.preset).replace(**self.window, **TEXTURES[texture], seed=SEED)
-        if texture == "still" or made.noise_level_db is None:
-            return made
-        levels = {"none": None, "low": made.noise_level_db, "high": made.noise_level_db + self.raised_db}
-        return made.replace(noise_level_db=levels[noise])
+        sonar = load_sonar(self.preset).replace(**self.window, **TEXTURES[texture], seed=SEED)
+        if texture == "still" or sonar.noise_level_db is None:
+            return sonar
+        levels = {"none": None, "low": sonar.noise_level_db, "high": sonar.noise_level_db + self.raised_db}
+        return sonar.replace(noise_level_db=levels[noise])
 
     def path(self, frames: int, rate_hz: float) -> Trajectory:
         """Return the poses of the sonar on its course; a dive has ten frames a second of every sonar."""
@@ -319,7 +319,7 @@ class SimulatedSet:
         return Trajectory(mounted(vehicle, Pose.from_degrees([0, 0, 0, self.pitch_deg, 0, 0])), np.arange(frames) / rate_hz)
 
     def world(self, folder: Path) -> Path:
-        """Write the world into a folder, where it is not there, and return its scene."""
+        """Write the world into a folder, if it is missing there, and return its scene."""
         scene = folder / "scene.xml"
         if not scene.exists():
             built = self.family.build(self.seed)
@@ -340,12 +340,12 @@ DIVE_SONARS: dict[str, tuple[dict[str, Any], float, float]] = {
 """The presets that dive: changes that save time, height [m], pitch [deg]."""
 
 FLIGHTS = {"level": 0.0, "gentle": 1.0}
-"""How much a vehicle moves beside its way, as a share of a calm day: see :func:`dive_course`."""
+"""Amplitude of the vehicle's swing, relative to a calm day: see :func:`dive_course`."""
 
 DIVE_SEEDS = (3, 11, 20)
 
 DIVE = "dive"
-"""What the names of all dives begin with."""
+"""Prefix of the names of all dives."""
 
 SETS: dict[str, SimulatedSet] = {
     **{
@@ -377,11 +377,11 @@ SETS: dict[str, SimulatedSet] = {
 def benchmark_course(frames: int) -> NDArray[np.float64]:
     """Return the course of all sets, about the origin: poses ``(frames, 6)`` [m, rad] at z = 0.
 
-    The vehicle goes forward by :data:`STEP_M` a frame along a line that swings, and crabs.
+    The vehicle moves by :data:`STEP_M` per frame along a swinging line, and crabs.
     """
-    way = np.arange(frames) * STEP_M
-    heading = TURN_RAD * np.sin(2 * np.pi * way / TURN_M)
-    course = heading + CRAB_RAD * np.sin(2 * np.pi * way / CRAB_M)
+    distance_m = np.arange(frames) * STEP_M
+    heading = TURN_RAD * np.sin(2 * np.pi * distance_m / TURN_M)
+    course = heading + CRAB_RAD * np.sin(2 * np.pi * distance_m / CRAB_M)
     poses = np.zeros((frames, 6))
     middle = (course[1:] + course[:-1]) / 2
     poses[1:, 0], poses[1:, 1] = np.cumsum(STEP_M * np.sin(middle)), np.cumsum(STEP_M * np.cos(middle))
@@ -391,14 +391,14 @@ def benchmark_course(frames: int) -> NDArray[np.float64]:
 
 
 def dive_course(frames: int, rate_hz: float, seed: int, moves: float) -> NDArray[np.float64]:
-    """Return the way of a vehicle at 0.4 m/s from the origin: poses ``(frames, 6)`` [m, rad].
+    """Return the course of a vehicle at 0.4 m/s from the origin: poses ``(frames, 6)`` [m, rad].
 
     Args:
-        frames: how many.
+        frames: number of poses.
         rate_hz: of them [1/s].
         seed: of the phases.
-        moves: 1 for a calm day: heading +-8 deg in 6 s, heave +-4 cm in 3.1 s, pitch +-2 deg in 2.3 s and roll +-2 deg in
-            2.9 s; 0 for none of these, straight ahead.
+        moves: amplitude of the swing. 1 is a calm day: heading +-8 deg in 6 s, heave +-4 cm in 3.1 s, pitch +-2 deg in
+            2.3 s and roll +-2 deg in 2.9 s; 0 is straight ahead.
     """
     time_s, phase = np.arange(frames) / rate_hz, np.random.default_rng(seed).uniform(0, 2 * np.pi, 4)
     periods, sizes = np.array([6.0, 3.1, 2.3, 2.9]), np.array([np.radians(8), 0.04, np.radians(2), np.radians(2)])
@@ -419,7 +419,7 @@ class RenderedSet:
         name: of the set, of :data:`SETS`.
         texture: of :data:`TEXTURES`.
         noise: of :data:`NOISES`.
-        frames: how many.
+        frames: number of frames.
         out: folder of the benchmark.
     """
 
@@ -474,31 +474,31 @@ class RenderedSet:
         """
         gain = RunDirectory.open(self.folder, RENDERING).amount("gain")
         if gain is None:
-            raise MitsonarError(f"{self.folder} tells no gain: render it anew")
+            raise MitsonarError(f"{self.folder} has no gain: render it again")
         sonar = self.simulated.sonar(self.texture, self.noise)
         path = self.simulated.path(self.frames, sonar.frame_rate_hz)
-        some = path.poses[np.linspace(0, self.frames - 1, poses + 2).astype(int)[1:-1]]
+        sampled_poses = path.poses[np.linspace(0, self.frames - 1, poses + 2).astype(int)[1:-1]]
         noise, law = self._noise, list(laws_of(sonar))[-1]
-        found = []
+        stds = []
         with begin(f"bound of {'-'.join((self.name, self.texture, self.noise))}", poses) as progress:
-            for bounds in bounds_at(self._simulator(sonar), some, noise, gain):
-                one = next(value for (_, kind, of), value in bounds.items() if (kind, of) == ("image", law))
-                found.append(np.zeros(3) if one is None else one.std(2))
+            for bounds in bounds_at(self._simulator(sonar), sampled_poses, noise, gain):
+                bound = next(value for (_, kind, law_name), value in bounds.items() if (kind, law_name) == ("image", law))
+                stds.append(np.zeros(3) if bound is None else bound.std(2))
                 progress(1)
         release_memory()
-        return overall(found)
+        return overall(stds)
 
 
 # ---------------- odometry benchmark
 
 
 METHODS = ("zero", "ecc", "phase", "flow", "direct", "corrnet", "corrnet-coherent", *EXTERNAL)
-"""Rows that are made unasked, but for :data:`OTHER_GRAIN`."""
+"""Default methods, except for those in :data:`UNSUITED_NETWORKS`."""
 
-OTHER_GRAIN = {"still": "corrnet-coherent", "speckle": "corrnet", "recorded": "corrnet"}
+UNSUITED_NETWORKS = {"still": "corrnet-coherent", "speckle": "corrnet", "recorded": "corrnet"}
 """The network that was not trained for frames of a texture."""
 
-SET_WORDS = (DIVE, *(name for name, one in SETS.items() if one.flight is None))
+SET_NAMES = (DIVE, *(name for name, one in SETS.items() if one.flight is None))
 
 LARGEST_JOURNAL = 2**28
 
@@ -513,7 +513,7 @@ BENCHMARK = RunKind(
 
 @dataclass(frozen=True)
 class Wanted:
-    """Rows that are asked for: every method on every set, texture and level of noise.
+    """The requested rows: every method on every set, texture and level of noise.
 
     Attributes:
         sets: names of :data:`~mitsonar.reproduction.odometry_benchmark.SETS`, or paths of recordings and runs. The beginning
@@ -523,11 +523,11 @@ class Wanted:
         methods: as :func:`~mitsonar.estimation.named.create_estimator` takes them; none: :data:`METHODS`, without
             those whose packages are not installed.
         frames: of each set at most; None: 40 of a dive, 260 of another simulated set, all of a recording.
-        geometry: file that tells how the pictures of recordings are laid out.
+        geometry: file that describes the layout of the recordings' pictures.
         bound: poses of the Cramer-Rao bound of a simulated set; 0: none.
     """
 
-    sets: Sequence[str] = SET_WORDS
+    sets: Sequence[str] = SET_NAMES
     textures: Sequence[str] = tuple(TEXTURES)
     noises: Sequence[str] = ("none",)
     methods: Sequence[str] = ()
@@ -537,114 +537,125 @@ class Wanted:
 
 
 def benchmark_odometry(
-    wanted: Wanted,
+    request: Wanted,
     out: str | Path,
     *,
     resume: bool = False,
     overwrite: bool = False,
     workers: int = 1,
-    begin: Begin = lambda what, length: nullcontext(lambda done: None),
+    begin: Begin = lambda stage, total: nullcontext(lambda done: None),
 ) -> PlainTable:
     """Make the rows that are missing, and write the table of all rows in the folder.
 
     Args:
-        wanted: the rows.
-        out: folder: ``rows.jsonl`` with a line a row; ``table.md`` and ``table.json``; rendered sets, and the path of each
-            row.
-        resume: add rows to a folder that is there. Rows in it are kept, and an interrupted one goes on.
-        overwrite: replace what is there.
-        workers: processes that estimate.
+        request: the rows.
+        out: folder: ``rows.jsonl`` with one line per row; ``table.md`` and ``table.json``; rendered sets, and the path of
+            each row.
+        resume: add rows to an existing folder. Its rows are kept, and an interrupted one is resumed.
+        overwrite: replace an existing folder.
+        workers: number of processes that estimate.
         begin: called with each stage, for progress.
 
     Returns:
-        The content of ``table.json``: ``rows``, and ``notes`` that the reader needs.
+        The content of ``table.json``: ``rows``, and ``notes`` for the reader.
 
     Raises:
         MitsonarError: unknown names, no frames, or another benchmark in the folder.
     """
-    cells = list(_cells(wanted))
-    methods, notes = _methods(wanted)
-    cases = [case for cell in cells for case in _cases(cell, methods, wanted)]
-    settings = {"limit": wanted.frames, "seed": SEED, "lengths_m": LENGTHS_M}
-    bench = _Bench(RunDirectory.begin(out, BENCHMARK, settings, resume=resume, overwrite=overwrite), wanted)
+    cells = list(_cells(request))
+    methods, notes = _methods(request)
+    cases = [case for cell in cells for case in _cases(cell, methods, request)]
+    settings = {"limit": request.frames, "seed": SEED, "lengths_m": LENGTHS_M}
+    bench = _Bench(RunDirectory.begin(out, BENCHMARK, settings, resume=resume, overwrite=overwrite), request)
     bench.run.start()
-    known = bench.rows()
+    rows = bench.rows()
     for case in cases:
-        if case.words in known:
+        if case.key in rows:
             continue
         try:
             row = bench.measure(case, methods[case.method], workers, begin)
         except MitsonarError as error:
-            notes.append(f"{' '.join(case.words)}: {error}")
+            notes.append(f"{' '.join(case.key)}: {error}")
             continue
-        bench.keep(row)
-        known[case.words] = row
-    return bench.finish(sorted(known.values(), key=_order), notes)
+        bench.append(row)
+        rows[case.key] = row
+    return bench.finish(sorted(rows.values(), key=_order), notes)
 
 
-# ---------------------------------------------------------------- what is asked
+# ---------------------------------------------------------------- the requested rows
 
 
-def _methods(wanted: Wanted) -> tuple[dict[str, AnyEstimator], list[str]]:
-    """Create the estimators by name. Of those that were not asked for, leave out those that cannot be, with a note."""
-    if wanted.methods:
-        asked = {name: create_estimator(name) for name in dict.fromkeys(wanted.methods)}
-        other = [name for name, estimator in asked.items() if estimator.consumes not in (SonarFrames, object)]
-        if other:
-            raise MitsonarError(f"{other[0]} does not read frames of one view: the benchmark takes {', '.join(METHODS)}")
-        return asked, []
-    made, notes = {}, []
+def _methods(request: Wanted) -> tuple[dict[str, AnyEstimator], list[str]]:
+    """Create the estimators by name. Leave out default ones that cannot be created, with a note."""
+    if request.methods:
+        chosen = {name: create_estimator(name) for name in dict.fromkeys(request.methods)}
+        unsuited = [name for name, estimator in chosen.items() if estimator.consumes not in (SonarFrames, object)]
+        if unsuited:
+            raise MitsonarError(f"{unsuited[0]} does not read frames of one view: the benchmark takes {', '.join(METHODS)}")
+        return chosen, []
+    estimators, notes = {}, []
     for name in METHODS:
         try:
-            made[name] = create_estimator(name)
+            estimators[name] = create_estimator(name)
         except MitsonarError as error:
             notes.append(f"no row of {name}: {error}")
-    return made, notes
+    return estimators, notes
 
 
-def _cells(wanted: Wanted) -> Iterator[Case]:
+def _cells(request: Wanted) -> Iterator[Case]:
     """List sets with texture and noise, as cases without a method.
 
     Raises:
         MitsonarError: unknown names, or no such file.
     """
-    for what, words, known in (("texture", wanted.textures, TEXTURES), ("noise", wanted.noises, NOISES)):
-        for word in words:
-            if word not in known:
-                raise MitsonarError(f"unknown {what} {word!r}: {nearest_names(word, known)}")
-    if wanted.frames is not None and wanted.frames < 3:
-        raise MitsonarError(f"{argument('frames')} must be at least 3: got {wanted.frames}")
-    for name in dict.fromkeys(wanted.sets):
-        sets = [one for one in SETS if f"{one}-".startswith(f"{name}-")]
+    for kind, names, known in (("texture", request.textures, TEXTURES), ("noise", request.noises, NOISES)):
+        for choice in names:
+            if choice not in known:
+                raise MitsonarError(f"unknown {kind} {choice!r}: {nearest_names(choice, known)}")
+    if request.frames is not None and request.frames < 3:
+        raise MitsonarError(f"{argument('frames')} must be at least 3: got {request.frames}")
+    for name in dict.fromkeys(request.sets):
+        sets = [set_name for set_name in SETS if f"{set_name}-".startswith(f"{name}-")]
         if sets:
             yield from (
-                Case(one, texture, noise, "")
-                for one in sets
-                for texture in wanted.textures
-                for noise in (wanted.noises if SETS[one].flight is None else (PRESET,))
+                Case(set_name, texture, noise, "")
+                for set_name in sets
+                for texture in request.textures
+                for noise in (request.noises if SETS[set_name].flight is None else (PRESET,))
             )
         elif not Path(name).exists():
             raise MitsonarError(
-                f"unknown set {name!r}: {nearest_names(name, SET_WORDS)}; or give the path of a recording or a run"
+                f"unknown set {name!r}: {nearest_names(name, SET_NAMES)}; or give the path of a recording or a run"
             )
         else:
             if record_at(name) is not SonarFrames:
-                raise MitsonarError(f"{name} holds impulse responses, and the benchmark is of frames: give frames")
-            yield Case(name, "recorded", "none", "", wanted.geometry)
+                raise MitsonarError(
+                    f"{name} holds impulse responses, but the benchmark needs frames: give a recording or a run of frames"
+                )
+            yield Case(name, "recorded", "none", "", request.geometry)
 
 
-def _cases(cell: Case, methods: dict[str, AnyEstimator], wanted: Wanted) -> Iterator[Case]:
+def _cases(cell: Case, methods: dict[str, AnyEstimator], request: Wanted) -> Iterator[Case]:
     """List the rows of a cell."""
-    unwanted = "" if wanted.methods else OTHER_GRAIN[cell.texture]
-    yield from (replace(cell, method=name) for name in methods if name != unwanted)
+    excluded = "" if request.methods else UNSUITED_NETWORKS[cell.texture]
+    yield from (replace(cell, method=name) for name in methods if name != excluded)
 
 
 def _order(row: PlainTable) -> tuple[int, str, str, int, int, str]:
-    """Return where a row stands in the table: sets, textures, noises and methods in their own order, others after them."""
-    places = [[*SETS], [*NOISES], [*METHODS]]
-    words = row["set"], row["noise"], row["method"]
-    at = [known.index(word) if word in known else len(known) for known, word in zip(places, words, strict=True)]
-    return at[0], row["set"], "" if row["texture"] == "still" else row["texture"], at[1], at[2], row["method"]
+    """Return the sort key of a row: sets, textures, noises and methods in their listed order, others after them."""
+    orders = [[*SETS], [*NOISES], [*METHODS]]
+    choices = row["set"], row["noise"], row["method"]
+    positions = [
+        known.index(choice) if choice in known else len(known) for known, choice in zip(orders, choices, strict=True)
+    ]
+    return (
+        positions[0],
+        row["set"],
+        "" if row["texture"] == "still" else row["texture"],
+        positions[1],
+        positions[2],
+        row["method"],
+    )
 
 
 # ---------------------------------------------------------------- the folder
@@ -654,16 +665,16 @@ class _Bench:
     """The folder of a benchmark.
 
     Attributes:
-        told: sentences that opening recordings gave, each once; they are the same for every method.
+        opening_notes: warnings from opening recordings, each once, since every method gives the same.
     """
 
-    def __init__(self, run: RunDirectory, wanted: Wanted) -> None:
-        self.run, self.out, self.wanted = run, run.path, wanted
-        self.told: dict[str, None] = {}
+    def __init__(self, run: RunDirectory, request: Wanted) -> None:
+        self.run, self.out, self.request = run, run.path, request
+        self.opening_notes: dict[str, None] = {}
         self.journal = run.path / "rows.jsonl"
 
     def rows(self) -> dict[tuple[str, str, str, str], PlainTable]:
-        """Return the rows of earlier runs. Cut off a line that a kill left half written.
+        """Return the rows of earlier runs. Cut off a half-written last line.
 
         Raises:
             MitsonarError: the journal is damaged.
@@ -677,7 +688,7 @@ class _Bench:
                 raise MitsonarError(f"{self.journal}, line {number} is damaged: start over with --overwrite") from None
         return rows
 
-    def keep(self, row: PlainTable) -> None:
+    def append(self, row: PlainTable) -> None:
         """Add a row to the journal."""
         with self.journal.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
@@ -687,27 +698,29 @@ class _Bench:
         rendered = None
         if case.name in SETS:
             rendered = RenderedSet(
-                case.name, case.texture, case.noise, self.wanted.frames or SETS[case.name].frames, self.out
+                case.name, case.texture, case.noise, self.request.frames or SETS[case.name].frames, self.out
             )
             source = rendered.source(begin)
         else:
-            with warnings.catch_warnings(record=True) as told:
+            with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", MitsonarWarning)
-                source = _recorded(case, estimator, self.wanted.frames)
-            self.told |= dict.fromkeys(str(one.message) for one in told if one.category is MitsonarWarning)
-        bound = None if rendered is None or not self.wanted.bound else self._bound(case, rendered, begin)
+                source = _recorded(case, estimator, self.request.frames)
+            self.opening_notes |= dict.fromkeys(
+                str(warning.message) for warning in caught if warning.category is MitsonarWarning
+            )
+        bound = None if rendered is None or not self.request.bound else self._bound(case, rendered, begin)
         loops = 0 if source.true is not None else max(0, len(source) - 1 - LOOP)
-        with begin(" ".join(case.words), len(source) - 1 + loops) as progress:
+        with begin(" ".join(case.key), len(source) - 1 + loops) as progress:
             folder = self.out / "paths" / _folder_name(case)
             return measured_row(case, source, estimator, folder, bound=bound, workers=workers, progress=progress)
 
     def _bound(self, case: Case, rendered: RenderedSet, begin: Begin) -> NDArray[np.float64] | None:
-        """Return the bound of a set, computed once; None where it cannot be."""
-        path = self.out / "bounds" / f"{case.name}-{case.texture}-{case.noise}-{self.wanted.bound}.json"
+        """Return the bound of a set, computed once; None if it cannot be computed."""
+        path = self.out / "bounds" / f"{case.name}-{case.texture}-{case.noise}-{self.request.bound}.json"
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
             try:
-                std = rendered.bound(self.wanted.bound, begin).tolist()
+                std = rendered.bound(self.request.bound, begin).tolist()
             except MitsonarError as error:
                 write_json(path, {"std": None, "reason": str(error)})
             else:
@@ -717,7 +730,7 @@ class _Bench:
 
     def finish(self, rows: list[PlainTable], notes: list[str]) -> PlainTable:
         """Write the table of all rows."""
-        report: PlainTable = {**self.run.asked, "loop": LOOP, "notes": [*self.told, *notes], "rows": rows}
+        report: PlainTable = {**self.run.asked, "loop": LOOP, "notes": [*self.opening_notes, *notes], "rows": rows}
         report |= versions(BENCHMARK.packages)
         write_whole(self.out / "table.md", ("\n".join(benchmark_lines(rows)) + "\n").encode())
         write_json(self.out / "table.json", report)
@@ -734,7 +747,7 @@ def _recorded(case: Case, estimator: AnyEstimator, frames: int | None) -> FrameS
     source = cast(FrameSource, open_source(case.name, estimator, Reading(geometry=case.geometry)))
     source = source if frames is None else _first(source, frames)
     if len(source) < 2:
-        raise MitsonarError(f"a row of the benchmark needs two frames or more: got {len(source)} from {case.name}")
+        raise MitsonarError(f"a row of the benchmark needs at least two frames: got {len(source)} from {case.name}")
     return source
 
 
@@ -751,7 +764,7 @@ def _first(source: FrameSource, count: int) -> FrameSource:
 
 
 def _folder_name(case: Case) -> str:
-    """Return the name of the folder of a row's path; that of a file tells its whole path by a digest."""
+    """Return the name of the folder of a row's path; for a file it contains a digest of the file's path."""
     name = case.name if case.name in SETS else f"{Path(case.name).stem}-{digest(str(Path(case.name).resolve()))[:8]}"
     plain = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in case.method)
     return "-".join((name, case.texture, case.noise, plain))
@@ -775,19 +788,19 @@ def benchmark_lines(rows: Sequence[PlainTable]) -> list[str]:
 
 
 def _dives(rows: Sequence[PlainTable]) -> Iterator[str]:
-    """Yield a table a method: a line a sonar, texture and flight, over the worlds of these."""
+    """Yield one table per method, with one line per sonar, texture and flight, over all their worlds."""
     for method in dict.fromkeys(row["method"] for row in rows):
-        flown: dict[tuple[str, str, str], list[PlainTable]] = {}
+        groups: dict[tuple[str, str, str], list[PlainTable]] = {}
         for row in rows:
             if row["method"] == method:
-                preset, flight = _flown(row["set"])
-                flown.setdefault((preset, row["texture"], flight), []).append(row)
-        worlds = max(len(of) for of in flown.values())
+                preset, flight = _parse_dive(row["set"])
+                groups.setdefault((preset, row["texture"], flight), []).append(row)
+        worlds = max(len(group) for group in groups.values())
         yield from ("", f"**Dives, {method}**: RMSE and bound: {UNITS}; of {worlds} worlds, drift is the median", "")
-        yield from markdown([_dive(*key, of) for key, of in flown.items()], tuple(DIVE_CELLS), DIVE_CELLS)
+        yield from markdown([_dive(*key, group) for key, group in groups.items()], tuple(DIVE_CELLS), DIVE_CELLS)
 
 
-def _flown(name: str) -> tuple[str, str]:
+def _parse_dive(name: str) -> tuple[str, str]:
     """Return preset and flight of a dive's name."""
     preset, flight, _ = name.removeprefix(f"{DIVE}-").rsplit("-", 2)
     return preset, flight
@@ -803,29 +816,31 @@ def _dive(preset: str, texture: str, flight: str, rows: Sequence[PlainTable]) ->
     for name in ("rmse", "bound"):
         if all(row.get(name) is not None for row in known):
             line[name] = np.sqrt(np.mean([np.square(row[name]) for row in known], axis=0)).tolist()
-    tried = [(row["nees"], row["pairs"] - row["failures"]) for row in known if row.get("nees") is not None]
-    if tried:
-        line["nees"] = float(np.average([nees for nees, _ in tried], weights=[count for _, count in tried]))
+    weighted_nees = [(row["nees"], row["pairs"] - row["failures"]) for row in known if row.get("nees") is not None]
+    if weighted_nees:
+        line["nees"] = float(np.average([nees for nees, _ in weighted_nees], weights=[count for _, count in weighted_nees]))
     drifts = [row["end_percent"] for row in known if row["end_percent"] is not None]
     line["end_percent"] = float(np.median(drifts)) if drifts else None
     return line
 
 
 def _overview(parts: list[list[PlainTable]]) -> Iterator[str]:
-    """Yield a table of drift in percent: a line a method, a column a set; nothing for a single set."""
-    measured = [part for part in parts if any("path_m" in row for row in part)]
-    drifts = {", ".join(_cell(part[0])): {row["method"]: row for row in part} for part in measured}
+    """Yield a table of drift in percent: one line per method, one column per set; nothing for a single set."""
+    with_truth = [part for part in parts if any("path_m" in row for row in part)]
+    drifts = {", ".join(_cell(part[0])): {row["method"]: row for row in part} for part in with_truth}
     if len(drifts) < 2:
         return
-    methods = dict.fromkeys(name for of in drifts.values() for name in of)
+    methods = dict.fromkeys(name for by_method in drifts.values() for name in by_method)
     texts: Cells = {name: _drift_in(name) for name in drifts}
-    lines: list[PlainTable] = [{"method": m, **{name: of.get(m, {}) for name, of in drifts.items()}} for m in methods]
+    lines: list[PlainTable] = [
+        {"method": method, **{name: by_method.get(method, {}) for name, by_method in drifts.items()}} for method in methods
+    ]
     yield from ("", "Drift over segments, % of their length; after a comma the motions that failed, %", "")
     yield from markdown(lines, ("method", *drifts), {"method": CELLS["method"], **texts})
 
 
 def _drift_in(name: str) -> Callable[[PlainTable], str]:
-    """Return what writes the drift and the failures of a method in a set."""
+    """Return a function that formats the drift and the failures of a method in a set."""
 
     def text(line: PlainTable) -> str:
         row = line[name]
@@ -844,38 +859,38 @@ def _cell(row: PlainTable) -> tuple[str, str, str]:
 def _part(rows: list[PlainTable]) -> Iterator[str]:
     """Yield heading, facts and table of one set."""
     first = rows[0]
-    true = [row for row in rows if "path_m" in row]
+    with_truth = [row for row in rows if "path_m" in row]
     noise = "" if first["texture"] == "recorded" else f", noise {first['noise']}"
-    yield from ("", f"**{first['set']}, {first['texture']}{noise}**: {'; '.join(_facts(first, true))}", "")
-    yield from markdown(rows, COLUMNS if true else CLOSURE_COLUMNS, CELLS)
+    yield from ("", f"**{first['set']}, {first['texture']}{noise}**: {'; '.join(_facts(first, with_truth))}", "")
+    yield from markdown(rows, COLUMNS if with_truth else CLOSURE_COLUMNS, CELLS)
     yield from (f"- {row['method']}: {row['note']}" for row in rows if row["note"])
 
 
-def _facts(first: PlainTable, true: list[PlainTable]) -> Iterator[str]:
-    """Yield what holds for all rows."""
+def _facts(first: PlainTable, with_truth: list[PlainTable]) -> Iterator[str]:
+    """Yield the facts that are common to all rows."""
     yield f"{first['frames']} frames"
-    if not true:
+    if not with_truth:
         yield f"no truth; net motion and closure: {UNITS}"
         return
-    one = true[0]
-    yield f"path {one['path_m']:.2f} m; RMSE: {UNITS}"
-    if one.get("bound") is not None:
-        yield f"bound {_three(one['bound'])}"
-    if "segments" in one:
-        lengths = ", ".join(f"{length:g}" for length in one["lengths_m"])
-        few = f", so few that intervals are too narrow (95 %, over {one['blocks']} blocks)"
-        blocks = few if one["blocks"] < FEWEST_BLOCKS else f", 95 % intervals over {one['blocks']} blocks"
-        yield f"{one['segments']} segments of {lengths} m{blocks}"
+    row = with_truth[0]
+    yield f"path {row['path_m']:.2f} m; RMSE: {UNITS}"
+    if row.get("bound") is not None:
+        yield f"bound {_format_three(row['bound'])}"
+    if "segments" in row:
+        lengths = ", ".join(f"{length:g}" for length in row["lengths_m"])
+        caveat = f", so few that intervals are too narrow (95 %, over {row['blocks']} blocks)"
+        blocks = caveat if row["blocks"] < FEWEST_BLOCKS else f", 95 % intervals over {row['blocks']} blocks"
+        yield f"{row['segments']} segments of {lengths} m{blocks}"
 
 
 DIGITS = (2, 2, 3)
 
 
-def _three(values: Sequence[float | None], digits: Sequence[int] = DIGITS) -> str:
+def _format_three(values: Sequence[float | None], digits: Sequence[int] = DIGITS) -> str:
     return " / ".join("-" if value is None else f"{value:.{d}f}" for value, d in zip(values, digits, strict=True))
 
 
-def _spanned(row: PlainTable, name: str, digits: int) -> str:
+def _with_interval(row: PlainTable, name: str, digits: int) -> str:
     """Return a value with its interval."""
     if row.get(name) is None:
         return "-"
@@ -885,14 +900,14 @@ def _spanned(row: PlainTable, name: str, digits: int) -> str:
 
 CELLS: Cells = {
     "method": lambda row: str(row["method"]),
-    "drift %": lambda row: _spanned(row, "drift_percent", 1),
-    "drift deg / 100 m": lambda row: _spanned(row, "drift_deg_per_100m", 0),
+    "drift %": lambda row: _with_interval(row, "drift_percent", 1),
+    "drift deg / 100 m": lambda row: _with_interval(row, "drift_deg_per_100m", 0),
     "end %": lambda row: "-" if row.get("end_percent") is None else f"{row['end_percent']:.1f}",
-    "RMSE": lambda row: _three(row["rmse"]) if "rmse" in row else "-",
-    "/ bound": lambda row: _three(row["over_bound"], (0, 0, 0)) if "over_bound" in row else "-",
+    "RMSE": lambda row: _format_three(row["rmse"]) if "rmse" in row else "-",
+    "/ bound": lambda row: _format_three(row["over_bound"], (0, 0, 0)) if "over_bound" in row else "-",
     "nees": lambda row: "-" if row.get("nees") is None else f"{row['nees']:.1f}",
-    "net motion": lambda row: _three(row["sums"]) if "sums" in row else "-",
-    "closure": lambda row: _three(row["closure"]) if "closure" in row else "-",
+    "net motion": lambda row: _format_three(row["sums"]) if "sums" in row else "-",
+    "closure": lambda row: _format_three(row["closure"]) if "closure" in row else "-",
     "fail": lambda row: f"{row['failures']} of {row['pairs']}",
     "ms": lambda row: f"{row['ms']:.0f}",
 }
@@ -903,7 +918,7 @@ DIVE_CELLS: Cells = {
     "flight": lambda row: str(row["flight"]),
     "rejected": lambda row: f"{row['failures']} of {row['pairs']}",
     "RMSE": CELLS["RMSE"],
-    "bound": lambda row: _three(row["bound"]) if "bound" in row else "-",
+    "bound": lambda row: _format_three(row["bound"]) if "bound" in row else "-",
     "NEES": lambda row: "-" if row.get("nees") is None else f"{row['nees']:.2f}",
     "drift %": lambda row: "-" if row.get("end_percent") is None else f"{row['end_percent']:.2f}",
     "ms": CELLS["ms"],

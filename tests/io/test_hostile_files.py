@@ -927,9 +927,9 @@ def test_a_run_that_cannot_go_on(name: str, tmp_path: Path) -> None:
     assert "--overwrite" in said
 
 
-def test_a_run_that_tells_no_gain_cannot_go_on(tmp_path: Path) -> None:
+def test_a_run_without_gain_cannot_be_resumed(tmp_path: Path) -> None:
     make_run(tmp_path)
-    for name, words in (("gain", "tells no gain"), ("tally", "tally must hold")):
+    for name, words in (("gain", "has no gain"), ("tally", "tally must hold")):
         before = (tmp_path / "run.json").read_bytes()
         changed_metadata(tmp_path / "run.json", lambda value, name=name: value.pop(name))  # type: ignore[misc]
         assert words in refusal(lambda: read_run(tmp_path))
