@@ -1,4 +1,4 @@
-"""Reproduction of a table of Almanza-Medina: make its data at a scale, train and evaluate its rows, keep all on disk."""
+"""Reproduction of a table of Almanza-Medina: make its data at a scale, train and evaluate its rows, save all on disk."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ __all__ = [
     "TableRow",
     "Watch",
     "contents",
-    "errors_said",
+    "format_errors",
     "load_scripted",
     "load_tables",
     "plain_table",
@@ -106,13 +106,12 @@ class Effort:
     """What is spent on each row. All rows in one folder have the same effort.
 
     Attributes:
-        scale: part of the recipe's sequences that are made, 0..1.
-        minutes: of training at most [min]; None: until the epochs of the recipe are done.
-        batch: samples of a step in place of the recipe's; the learning rate is scaled by the square root. None: the
-            recipe's.
+        scale: share of the recipe's sequences that are made, 0..1.
+        minutes: largest duration of training [min]; None: until the epochs of the recipe are done.
+        batch: samples per step; the learning rate is scaled by the square root. None: those of the recipe.
         changes: keys of the training recipes to change, with dots between the levels. Keys that a table or a row sets are
             not changed.
-        data: keys of the data set recipes to change, beside those that a training recipe changes.
+        data: keys of the data set recipes to change, in addition to those that a training recipe changes.
         quick: a few coarse frames of small worlds and two steps of narrow networks, to see that a row can be trained.
 
     Raises:
@@ -128,22 +127,22 @@ class Effort:
 
     def __post_init__(self) -> None:
         if not 0 < self.scale <= 1:
-            raise MitsonarError(f"scale is a part of the data of Almanza-Medina, above 0 and at most 1: got {self.scale:g}")
+            raise MitsonarError(f"scale, the share of data that is made, must be above 0 and at most 1: got {self.scale:g}")
         if self.minutes is not None and not (self.minutes > 0 and math.isfinite(self.minutes)):
             raise MitsonarError(f"{argument('minutes')} of training of a row must be above 0: got {self.minutes:g}")
         if self.batch is not None and self.batch < 1:
-            raise MitsonarError(f"a batch has 1 sample or more: got {self.batch}")
+            raise MitsonarError(f"batch must be at least 1: got {self.batch}")
 
-    def recipe(self, name: str, own: JsonObject | None = None) -> TrainingRecipe:
+    def recipe(self, name: str, row_set: JsonObject | None = None) -> TrainingRecipe:
         """Load the training recipe of that name, with the changes of this effort and then those of a table and its row.
 
         Raises:
             MitsonarError: an unknown key, or a value outside its limits.
         """
-        recipe = load_training_recipe(name, {**self.changes, **(own or {}), **(QUICK_TRAINING if self.quick else {})})
-        few = quick_data(load_recipe(recipe.data)) if self.quick else {}
-        if few or self.data:
-            recipe = recipe.replace(data_changes={**recipe.data_changes, **self.data, **few})
+        recipe = load_training_recipe(name, {**self.changes, **(row_set or {}), **(QUICK_TRAINING if self.quick else {})})
+        quick_changes = quick_data(load_recipe(recipe.data)) if self.quick else {}
+        if quick_changes or self.data:
+            recipe = recipe.replace(data_changes={**recipe.data_changes, **self.data, **quick_changes})
         if self.batch is None or self.batch == recipe.batch:
             return recipe
         rate = recipe.optimiser.rate * math.sqrt(self.batch / recipe.batch)
@@ -152,14 +151,14 @@ class Effort:
     def sentence(self) -> str:
         """Describe the effort for people."""
         if self.quick:
-            return "two steps on a few coarse frames: these errors say nothing"
+            return "two steps on a few coarse frames: these errors are meaningless"
         parts = [f"scale {self.scale:g} of the recipes' data"]
         parts.append("all epochs" if self.minutes is None else f"at most {self.minutes:g} minutes of training a row")
         if self.batch is not None:
             parts.append(f"batches of {self.batch}, the rate scaled by the square root")
         if self.changes:
             keys = ", ".join(f"{key} {json.dumps(value)}" for key, value in self.changes.items())
-            parts.append(f"recipes changed, where a row has no value of its own: {keys}")
+            parts.append(f"recipes changed, except for keys that a row sets: {keys}")
         if self.data:
             keys = ", ".join(f"{key} {json.dumps(value)}" for key, value in self.data.items())
             parts.append(f"data changed: {keys}")
@@ -167,17 +166,17 @@ class Effort:
 
 
 Advance = Callable[[int], None]
-"""Reports progress: is called with how many more parts are done."""
+"""Reports progress; called with the number of parts newly done."""
 
 TrainingCallbacks = tuple[Callable[[TrainingReport], None], Callable[[], bool]]
-"""What is called after each step of a training: the progress report, and the question whether to stop."""
+"""Functions called after each step of a training: one takes the progress report, the other returns whether to stop."""
 
 
 class Watch(Protocol):
     """Shows the progress of a reproduction."""
 
     def begin(self, what: str, total: int, unit: str) -> Advance:
-        """Show that work of ``total`` parts begins, and return what reports its progress."""
+        """Show that work of ``total`` parts begins, and return the function that reports its progress."""
 
     def training(self, what: str) -> AbstractContextManager[TrainingCallbacks]:
         """Return the context of the training of one network."""
@@ -192,7 +191,7 @@ class SilentWatch:
 
     @contextmanager
     def training(self, what: str) -> Iterator[TrainingCallbacks]:
-        """Yield a report that does nothing, and a question that never stops training."""
+        """Yield a report that does nothing, and a function that never stops training."""
         yield lambda report: None, lambda: False
 
 
@@ -210,9 +209,9 @@ def reproduce(
     """Make the data of the rows of a table, train and evaluate each row, and write the table; or resume this.
 
     ``out`` holds ``table.md`` and ``table.json``, which are replaced after each row, and ``table-NUMBER.png`` of the tables
-    with that row. ``data/`` holds
-    one training data set for all rows with the same data, and one of unseen scenes. ``runs/`` holds one training a row.
-    ``rows/`` holds the result of each row. Several tables may share a folder: a row of both is trained once.
+    with that row. ``data/`` holds one training data set for all rows with the same data, and one of unseen scenes.
+    ``runs/`` holds one training per row, and ``rows/`` the result of each row. Several tables may share a folder: a row of
+    both is trained once.
 
     Args:
         table: number of the table.
@@ -228,26 +227,28 @@ def reproduce(
         The content of ``table.json``.
 
     Raises:
-        MitsonarError: an unknown name; or the folder holds other things, or was begun with another effort or recipe.
+        MitsonarError: a name is unknown, or the folder has other files or was begun with another effort or recipe.
     """
-    known = table_named(table)
-    recipes = {row.name: effort.recipe(row.recipe, {**known.set, **row.set}) for row in rows_named(known, rows)}
+    document_table = table_named(table)
+    recipes = {
+        row.name: effort.recipe(row.recipe, {**document_table.set, **row.set}) for row in rows_named(document_table, rows)
+    }
     data = {name: load_recipe(recipe.data, recipe.data_changes) for name, recipe in recipes.items()}
     crew = Crew(workers, accelerator, devices, watch or SilentWatch())
     with Storage(out).locked():
-        bench = TableBuilder(RunDirectory.begin(out, TABLES, asdict(effort), resume=True), effort)
-        bench.ask(table, recipes)
-        report = bench.report([table])
+        builder = TableBuilder(RunDirectory.begin(out, TABLES, asdict(effort), resume=True), effort)
+        builder.add_table(table, recipes)
+        report = builder.report([table])
         for name, recipe in recipes.items():
-            if name not in bench.found():
-                bench.work(name, recipe, data[name], crew)
-                report = report if effort.quick else bench.report(tables_with(name))
-        return bench.report([table]) if effort.quick else report
+            if name not in builder.results():
+                builder.make_row(name, recipe, data[name], crew)
+                report = report if effort.quick else builder.report(tables_with(name))
+        return builder.report([table]) if effort.quick else report
 
 
 @dataclass(frozen=True)
 class Crew:
-    """How the work is done, which has no effect on the results: see :func:`reproduce`."""
+    """Means of the work, which have no effect on the results: see :func:`reproduce`."""
 
     workers: int
     accelerator: str
@@ -260,7 +261,7 @@ class TableBuilder:
     """The folder of a reproduction.
 
     Attributes:
-        run: the tables asked for, and the recipes of their rows.
+        run: the requested tables, and the recipes of their rows.
         effort: what is spent on each row.
     """
 
@@ -274,70 +275,72 @@ class TableBuilder:
 
     @property
     def tables(self) -> list[str]:
-        """Return the numbers of the tables asked for."""
+        """Return the numbers of the requested tables."""
         return self.run.notes.get("tables") or []
 
     @property
     def recipes(self) -> JsonObject:
-        """Return the recipes of the rows asked for, by the names of the rows."""
+        """Return the recipes of the requested rows, keyed by the names of the rows."""
         return self.run.notes.get("recipes") or {}
 
-    def ask(self, table: str, recipes: dict[str, TrainingRecipe]) -> None:
+    def add_table(self, table: str, recipes: dict[str, TrainingRecipe]) -> None:
         """Store a table and the recipes of its rows.
 
         Raises:
             MitsonarError: a row was begun with another recipe.
         """
         self.run.start(tables=[], recipes={})
-        had, asked = self.recipes, plain_json({name: recipe.plain() for name, recipe in recipes.items()})
-        begun = {name: recipe for name, recipe in asked.items() if name in had}
-        refuse_other(self.folder, {"row": {name: had[name] for name in begun}}, {"row": begun})
+        stored, requested = self.recipes, plain_json({name: recipe.plain() for name, recipe in recipes.items()})
+        shared = {name: recipe for name, recipe in requested.items() if name in stored}
+        refuse_other(self.folder, {"row": {name: stored[name] for name in shared}}, {"row": shared})
         tables = [name for name in load_tables() if name == table or name in self.tables]
-        self.run.note(tables=tables, recipes=had | asked)
+        self.run.note(tables=tables, recipes=stored | requested)
 
-    def work(self, name: str, recipe: TrainingRecipe, data: Recipe, crew: Crew) -> None:
-        """Make the data of one row, train and evaluate it. What is on disk already is not repeated."""
-        table = table_named(tables_with(name)[0])
+    def make_row(self, name: str, recipe: TrainingRecipe, data: Recipe, crew: Crew) -> None:
+        """Make the data of one row, train and evaluate it. Results that are already on disk are reused."""
+        document_table = table_named(tables_with(name)[0])
         scale = 1.0 if self.effort.quick else self.effort.scale
         sequences = max(1, round(scale * data.sequences))
-        wanted = None if self.effort.quick else table.unseen
-        other, fresh = unseen_recipe(data, sequences, wanted, recipe.input.frames)
-        if wanted is not None:
-            fresh = max(min(fresh, UNSEEN_SEQUENCES[0]), round(self.effort.scale * fresh))
-        seen = self._made(data, sequences, crew)
+        unseen_sequences = None if self.effort.quick else document_table.unseen
+        unseen_data, unseen_count = unseen_recipe(data, sequences, unseen_sequences, recipe.input.frames)
+        if unseen_sequences is not None:
+            unseen_count = max(min(unseen_count, UNSEEN_SEQUENCES[0]), round(self.effort.scale * unseen_count))
+        seen = self._make_data(data, sequences, crew)
         gain = DataStore.open(seen).about.get("gain")  # both data sets are of one sonar
-        unseen = self._made(other if gain is None else other.model_copy(update={"gain": gain}), fresh, crew)
-        checkpoint = self._trained(name, recipe, seen, crew)
-        noises = list(table.noises)[: 1 if self.effort.quick else None]
+        unseen = self._make_data(
+            unseen_data if gain is None else unseen_data.model_copy(update={"gain": gain}), unseen_count, crew
+        )
+        checkpoint = self._train(name, recipe, seen, crew)
+        noises = list(document_table.noises)[: 1 if self.effort.quick else None]
         parts = {"validation": (seen, "validation"), "unseen": (unseen, "all")}
         if split_for(recipe.split_of, data).test:
             parts["test"] = seen, "test"
         scores = {
-            what: _scores(evaluate(checkpoint, url, noise=noises, part=part, begin=_progress(crew.watch, f"{name}, {what}")))
-            for what, (url, part) in parts.items()
+            key: _scores(evaluate(checkpoint, url, noise=noises, part=part, begin=_progress(crew.watch, f"{name}, {key}")))
+            for key, (url, part) in parts.items()
         }
-        found = Found(recipe=name, **scores, reached=_reached(checkpoint, recipe, self._run(name)))
+        row_result = Found(recipe=name, **scores, reached=_reached(checkpoint, recipe, self._run(name)))
         (self.folder / "rows").mkdir(exist_ok=True)
-        write_json(self.folder / "rows" / f"{name}.json", found.model_dump(mode="json"))
+        write_json(self.folder / "rows" / f"{name}.json", row_result.model_dump(mode="json"))
 
-    def _made(self, data: Recipe, sequences: int, crew: Crew) -> Path:
+    def _make_data(self, data: Recipe, sequences: int, crew: Crew) -> Path:
         """Make a data set, or complete it. Rows with the same data recipe share it."""
         path = self.folder / "data" / f"{data.name}-{data.digest()[:8]}.zarr"
         advance: list[Advance] = []
 
-        def begun(frames: int, done: int) -> None:
+        def begin(frames: int, done: int) -> None:
             advance.append(crew.watch.begin(f"rendering {path.stem}", frames, "frames"))
             advance[0](done)
 
         make_dataset(
-            data, str(path), sequences=sequences, workers=crew.workers, begun=begun, progress=lambda more: advance[0](more)
+            data, str(path), sequences=sequences, workers=crew.workers, begun=begin, progress=lambda more: advance[0](more)
         )
         return path
 
     def _run(self, name: str) -> Path:
         return self.folder / "runs" / name
 
-    def _trained(self, name: str, recipe: TrainingRecipe, data: Path, crew: Crew) -> Checkpoint:
+    def _train(self, name: str, recipe: TrainingRecipe, data: Path, crew: Crew) -> Checkpoint:
         """Train the network of a row, or resume its training."""
         run = self._run(name)
         options = TrainOptions(
@@ -352,7 +355,7 @@ class TableBuilder:
         with crew.watch.training(name) as (progress, stop):
             return train(options, progress=progress, stop=stop)
 
-    def found(self) -> dict[str, Found]:
+    def results(self) -> dict[str, Found]:
         """Load the results of the rows that are done.
 
         Raises:
@@ -369,19 +372,21 @@ class TableBuilder:
 
     def report(self, drawn: Collection[str]) -> JsonObject:
         """Write all tables, and figures of the tables ``drawn``, of the rows that are done; return ``table.json``."""
-        found, version = self.found(), versions(("mitsonar",))["mitsonar"]
+        results, version = self.results(), versions(("mitsonar",))["mitsonar"]
         tables = [table_named(name) for name in self.tables]
         lines = [f"`mitsonar reproduce`, mitsonar {version}: {self.effort.sentence()}."]
         for table in tables:
-            lines += ["", *table_lines(table, found)]
+            lines += ["", *table_lines(table, results)]
             if table.name not in drawn:
                 continue
-            figure = table_figure(table, found, title=f"{table.kind} {table.name}, {table.title}; {self.effort.sentence()}")
+            figure = table_figure(
+                table, results, title=f"{table.kind} {table.name}, {table.title}; {self.effort.sentence()}"
+            )
             buffer = io.BytesIO()
             figure.savefig(buffer, format="png", dpi=80)
             write_whole(self.folder / f"table-{table.name}.png", buffer.getvalue())
         report = {"version": version, **self.run.asked, "recipes": self.recipes}
-        report["tables"] = {table.name: plain_table(table, found) for table in tables}
+        report["tables"] = {table.name: plain_table(table, results) for table in tables}
         write_whole(self.folder / "table.md", ("\n".join(lines) + "\n").encode())
         write_json(self.folder / "table.json", report)
         return report
@@ -394,23 +399,23 @@ def quick_data(data: Recipe) -> JsonObject:
     return {**coarse, "world": QUICK_WORLDS[data.world["family"]], "scenes": [{"count": 2, "sequences": sequences}]}
 
 
-def unseen_recipe(data: Recipe, learnt: int, wanted: int | None, frames: int) -> tuple[Recipe, int]:
-    """Return the recipe of unseen scenes, and how many of its sequences are made.
+def unseen_recipe(data: Recipe, training_sequences: int, sequences: int | None, frames: int) -> tuple[Recipe, int]:
+    """Return the recipe of unseen scenes, and the number of its sequences to make.
 
     Args:
         data: recipe of the training data.
-        learnt: number of training sequences.
-        wanted: number of sequences, each with the frames of one sample; None: a part of ``learnt``.
+        training_sequences: number of training sequences.
+        sequences: number of sequences, each with the frames of one sample; None: a share of ``training_sequences``.
         frames: frames of a sample.
     """
     fields = data.model_dump(mode="json") | {"name": f"{data.name}-unseen", "seed": (data.seed + UNSEEN_SEED) % 2**31}
-    if wanted is None:
-        few, most = UNSEEN_SEQUENCES
-        return recipe_from(fields), min(data.sequences, max(few, min(most, learnt // 20)))
-    many = -(-wanted // data.sequences)
+    if sequences is None:
+        fewest, most = UNSEEN_SEQUENCES
+        return recipe_from(fields), min(data.sequences, max(fewest, min(most, training_sequences // 20)))
+    repeats = -(-sequences // data.sequences)
     fields["flight"] |= {"pings": frames}
-    fields["scenes"] = [group | {"sequences": many * group["sequences"]} for group in fields["scenes"]]
-    return recipe_from(fields), wanted
+    fields["scenes"] = [group | {"sequences": repeats * group["sequences"]} for group in fields["scenes"]]
+    return recipe_from(fields), sequences
 
 
 def _progress(watch: Watch, what: str) -> Callable[[int], Advance]:
@@ -434,7 +439,7 @@ def _scores(report: JsonObject) -> dict[str, RowScore]:
 
 
 def _reached(checkpoint: Checkpoint, recipe: TrainingRecipe, folder: Path) -> Reached:
-    """Return the scale of a finished training, as its folder states it.
+    """Return the scale of a finished training from its folder.
 
     Raises:
         MitsonarError: the folder is damaged.
@@ -497,7 +502,7 @@ Errors = Annotated[tuple[float, ...], Field(min_length=1, max_length=3)]
 
 
 class Strict(BaseModel):
-    """A model that refuses unknown keys and cannot be changed."""
+    """An immutable model that rejects unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -527,7 +532,7 @@ class TableRow(Strict):
 
     @model_validator(mode="before")
     @classmethod
-    def _named(cls, fields: object) -> object:
+    def _default_name(cls, fields: object) -> object:
         return {"name": fields.get("recipe"), **fields} if isinstance(fields, dict) else fields
 
     @property
@@ -545,7 +550,7 @@ class TableRow(Strict):
         if errors is None:
             return "-"
         if self.interval is None:
-            return errors_said(errors)
+            return format_errors(errors)
         return f"{errors[0] / 10:.2f} cm ({errors[0] / 10 / self.interval:.2f} %)"
 
 
@@ -554,7 +559,7 @@ class DocumentTable(Strict):
 
     Attributes:
         name: its number.
-        title: what its rows differ in.
+        title: property in which its rows differ.
         figure: whether Almanza-Medina draws it as a figure.
         section: of Almanza-Medina that describes it.
         note: remark for readers who compare.
@@ -604,11 +609,11 @@ class ScriptedTable(Strict):
 
     Attributes:
         name: its number, of a figure with ``figure-`` before it.
-        title: what it shows.
+        title: its content.
         section: of Almanza-Medina that describes it.
         command: that makes it, from the root of the sources.
-        printed: what Almanza-Medina prints, row by row, as text.
-        results: page and heading with ours.
+        printed: values that Almanza-Medina prints, row by row, as text.
+        results: page and heading of our results.
     """
 
     name: str
@@ -636,8 +641,8 @@ def load_scripted() -> dict[str, ScriptedTable]:
 
 def contents() -> list[DocumentTable | ScriptedTable]:
     """List all tables and figures that can be reproduced, in the order of their chapters and numbers."""
-    both: list[DocumentTable | ScriptedTable] = [*load_tables().values(), *load_scripted().values()]
-    return sorted(both, key=lambda one: [int(number) for number in one.name.removeprefix("figure-").split(".")])
+    tables: list[DocumentTable | ScriptedTable] = [*load_tables().values(), *load_scripted().values()]
+    return sorted(tables, key=lambda table: [int(number) for number in table.name.removeprefix("figure-").split(".")])
 
 
 def table_named(name: str) -> DocumentTable:
@@ -672,18 +677,18 @@ def tables_with(name: str) -> list[str]:
     return [table.name for table in load_tables().values() if any(row.name == name for row in table.rows)]
 
 
-def errors_said(errors: tuple[float, ...]) -> str:
+def format_errors(errors: tuple[float, ...]) -> str:
     """Format the RMSE of each axis for people."""
     named = zip(errors, AXES, strict=False)
     return " / ".join(f"{value:.3f}" if axis.unit == "deg" else f"{value:.2f}" for value, axis in named)
 
 
 def split_name(split: str | JsonObject) -> str:
-    """Return what a split deals out: ``sample``, ``sequence`` or ``scene``."""
+    """Return the unit of a split: ``sample``, ``sequence`` or ``scene``."""
     return split if isinstance(split, str) else str(split["by"])
 
 
-# ---------------- What a row of a table reached here: its errors, and the scale of its training
+# ---------------- Our result of a row: its errors, and the scale of its training
 
 
 Part = Literal["validation", "test", "unseen"]
@@ -722,7 +727,7 @@ class Reached(Strict):
         pairs_seen: samples seen in training; a sample counts each time that it is seen.
         pairs_best: samples seen when the evaluated network was saved, the best by validation.
         epochs: pairs_seen over training_pairs.
-        epochs_asked: epochs of the recipe.
+        epochs_asked: number of epochs in the recipe.
         minutes: duration of training [min].
         device: device of training.
         machine: processor of that machine.
@@ -756,7 +761,7 @@ class Found(Strict):
     Attributes:
         recipe: name of the row.
         validation: errors by noise, on the part of the data set that is not used for training.
-        test: errors by noise, on the sequences that are kept from training and validation; empty where there are none.
+        test: errors by noise, on the sequences excluded from training and validation; empty if there are none.
         unseen: errors by noise, on the scenes of a data set with another seed.
         reached: scale of the training.
     """
@@ -773,7 +778,7 @@ class Found(Strict):
         return scores.get(noise)
 
 
-# ---------------- Tables of Almanza-Medina beside what was reached here: as Markdown, for programs, and as a figure
+# ---------------- Tables of Almanza-Medina with our results: as Markdown, for programs, and as a figure
 
 
 NOT_YET = "not trained yet"
@@ -803,89 +808,93 @@ OF_PARTS: dict[Part, str] = {
 """Note on each."""
 
 REACHED: dict[str, Callable[[Found], str]] = {
-    "pairs to learn from": lambda found: f"{found.reached.training_pairs:,}",
-    "pairs seen (best after)": lambda found: f"{found.reached.pairs_seen:,} ({found.reached.pairs_best:,})",
-    "epochs": lambda found: f"{found.reached.epochs:.2f} of {found.reached.epochs_asked:.3g}",
-    "minutes": lambda found: f"{found.reached.minutes:.1f}",
-    "batch, rate, precision": lambda found: f"{found.reached.batch}, {found.reached.rate:.3g}, {found.reached.precision}",
-    "scored pairs: validation, unseen (scenes)": lambda found: (
-        f"{found.validation['none'].pairs:,}, {found.unseen['none'].pairs:,} ({found.unseen['none'].scenes})"
+    "pairs to learn from": lambda result: f"{result.reached.training_pairs:,}",
+    "pairs seen (best after)": lambda result: f"{result.reached.pairs_seen:,} ({result.reached.pairs_best:,})",
+    "epochs": lambda result: f"{result.reached.epochs:.2f} of {result.reached.epochs_asked:.3g}",
+    "minutes": lambda result: f"{result.reached.minutes:.1f}",
+    "batch, rate, precision": lambda result: (
+        f"{result.reached.batch}, {result.reached.rate:.3g}, {result.reached.precision}"
     ),
-    "scored pairs: other sequences": lambda found: f"{found.test['none'].pairs:,}" if found.test else "-",
-    "on": lambda found: f"{found.reached.device}; {found.reached.machine}, threads: {found.reached.threads}",
-    "date": lambda found: found.reached.date,
+    "scored pairs: validation, unseen (scenes)": lambda result: (
+        f"{result.validation['none'].pairs:,}, {result.unseen['none'].pairs:,} ({result.unseen['none'].scenes})"
+    ),
+    "scored pairs: other sequences": lambda result: f"{result.test['none'].pairs:,}" if result.test else "-",
+    "on": lambda result: f"{result.reached.device}; {result.reached.machine}, threads: {result.reached.threads}",
+    "date": lambda result: result.reached.date,
 }
 """Columns that show the scale at which a row was reached."""
 
 
-def table_lines(table: DocumentTable, found: Mapping[str, Found]) -> list[str]:
-    """Format a table as Markdown. Rows that are not in ``found`` are shown as not trained yet."""
-    first = next((found[row.name] for row in table.rows if row.name in found), None)
+def table_lines(table: DocumentTable, results: Mapping[str, Found]) -> list[str]:
+    """Format a table as Markdown. Rows that are not in ``results`` are shown as not trained yet."""
+    first = next((results[row.name] for row in table.rows if row.name in results), None)
     split = first.reached.split if first else split_name(table.set.get("split", "sequence"))
     return [
         f"## {table.kind} {table.name}: {table.title} (Almanza-Medina, {table.section})",
         "",
-        *_framed(_error_cells(table, found, first)),
+        *_framed(_error_cells(table, results, first)),
         "",
         *([f"Note: {table.note}.", ""] if table.note else []),
-        f"*validation* (split: {split}): {SPLITS[split]}; {' '.join(OF_PARTS[part] for part in _parts(table, found))} "
+        f"*validation* (split: {split}): {SPLITS[split]}; {' '.join(OF_PARTS[part] for part in _parts(table, results))} "
         f"{table.differs}{GAIN if 'high' in table.noises else ''}",
         "",
         "The scale at which each figure was reached:",
         "",
-        *_framed(_reached_cells(table, found)),
+        *_framed(_reached_cells(table, results)),
     ]
 
 
-def _parts(table: DocumentTable, found: Mapping[str, Found]) -> dict[Part, str]:
-    """Return the parts that rows are scored on, with their headings: all but other sequences where no split has any."""
-    tested = any(row.name in found and found[row.name].test for row in table.rows)
+def _parts(table: DocumentTable, results: Mapping[str, Found]) -> dict[Part, str]:
+    """Return the parts that rows are scored on, with their headings; other sequences only if a split has any."""
+    tested = any(row.name in results and results[row.name].test for row in table.rows)
     return {part: heading for part, heading in PARTS.items() if part != "test" or tested}
 
 
-def _noises(table: DocumentTable, found: Mapping[str, Found]) -> list[str]:
-    """Return the noises that rows are scored with: none that is not printed and that no row has."""
-    return [noise for noise in table.noises if noise != LOUD or any(noise in one.validation for one in found.values())]
+def _noises(table: DocumentTable, results: Mapping[str, Found]) -> list[str]:
+    """Return the noises that rows are scored with; one that is not printed only if a row has it."""
+    return [
+        noise for noise in table.noises if noise != LOUD or any(noise in result.validation for result in results.values())
+    ]
 
 
-def _error_cells(table: DocumentTable, found: Mapping[str, Found], first: Found | None) -> list[list[str]]:
-    """Return the cells of errors and times: those of Almanza-Medina beside ours."""
+def _error_cells(table: DocumentTable, results: Mapping[str, Found], first: Found | None) -> list[list[str]]:
+    """Return the cells of errors and times, Almanza-Medina's and ours."""
     units = " / ".join(f"{axis.unit} {axis.name}" for axis in table.axes)
-    parts = _parts(table, found)
+    parts = _parts(table, results)
     heights, timed = table.axes == (HEIGHT,), any(row.ms for row in table.rows)
     head, zero = ["RMSE of heights" if heights else f"RMSE, {units}"], ["*always answering no motion*"]
-    for noise in _noises(table, found):
+    for noise in _noises(table, results):
         printed = noise != LOUD
         head += [f"Almanza-Medina, {NOISES[noise]}"] * printed + [f"{part}, {NOISES[noise]}" for part in parts.values()]
         scores = [first.score(part, noise) if first else None for part in parts]
-        zero += [errors_said(table.no_motion)] * printed
-        zero += ["-" if score is None else errors_said(score.zero) for score in scores]
+        zero += [format_errors(table.no_motion)] * printed
+        zero += ["-" if score is None else format_errors(score.zero) for score in scores]
     cells = [head] if heights else [head, zero]
     for row in table.rows:
-        ours = found.get(row.name)
+        result = results.get(row.name)
         cells.append([row.approach])
-        for noise in _noises(table, found):
-            scores = [ours.score(part, noise) if ours else None for part in parts]
-            mine = [row.said(score.rmse) if score is not None else "-" if ours else NOT_YET for score in scores]
-            cells[-1] += [row.said(row.printed.get(noise))] * (noise != LOUD) + mine
+        for noise in _noises(table, results):
+            scores = [result.score(part, noise) if result else None for part in parts]
+            our_cells = [row.said(score.rmse) if score is not None else "-" if result else NOT_YET for score in scores]
+            cells[-1] += [row.said(row.printed.get(noise))] * (noise != LOUD) + our_cells
     if timed:
         head += ["Almanza-Medina, ms", "here, ms"]
         for row, line in zip(table.rows, cells[-len(table.rows) :], strict=True):
-            score = found[row.name].score("unseen", table.noises[0]) if row.name in found else None
+            score = results[row.name].score("unseen", table.noises[0]) if row.name in results else None
             ms = None if score is None else score.ms
-            line += ["-" if one is None else f"{one:.3g}" for one in (row.ms, ms)]
+            line += ["-" if value is None else f"{value:.3g}" for value in (row.ms, ms)]
         zero += ["0", "0"]
     return cells
 
 
-def _reached_cells(table: DocumentTable, found: Mapping[str, Found]) -> list[list[str]]:
+def _reached_cells(table: DocumentTable, results: Mapping[str, Found]) -> list[list[str]]:
     """Return the cells of the scale at which each row was reached."""
     cells = [["row", "recipe", "also in", *REACHED]]
     for row in table.rows:
-        ours = found.get(row.name)
+        result = results.get(row.name)
         others = ", ".join(name for name in tables_with(row.name) if name != table.name) or "-"
         recipe = row.recipe + "".join(f", {key}: {_short(value)}" for key, value in row.set.items())
-        scale = [text(ours) for text in REACHED.values()] if ours else [NOT_YET, *["-"] * (len(REACHED) - 1)]
+        scale = [text(result) for text in REACHED.values()] if result else [NOT_YET, *["-"] * (len(REACHED) - 1)]
         cells.append([row.approach, recipe, others, *scale])
     return cells
 
@@ -894,11 +903,11 @@ def _short(value: object) -> str:
     return json.dumps(value).replace('"', "")
 
 
-def plain_table(table: DocumentTable, found: Mapping[str, Found]) -> JsonObject:
+def plain_table(table: DocumentTable, results: Mapping[str, Found]) -> JsonObject:
     """Return a table for programs."""
     rows = []
     for row in table.rows:
-        ours = found.get(row.name)
+        result = results.get(row.name)
         rows.append(
             {
                 "approach": row.approach,
@@ -909,12 +918,12 @@ def plain_table(table: DocumentTable, found: Mapping[str, Found]) -> JsonObject:
                 "thesis": {noise: list(errors) for noise, errors in row.printed.items()},
                 "thesis_ms": row.ms,
                 "interval_m": row.interval,
-                "status": "done" if ours else NOT_YET,
-                "ours": ours.model_dump(mode="json", exclude={"recipe"}) if ours else None,
+                "status": "done" if result else NOT_YET,
+                "ours": result.model_dump(mode="json", exclude={"recipe"}) if result else None,
             }
         )
-    about = {"title": table.title, "section": table.section, "note": table.note, "units": [axis.unit for axis in table.axes]}
-    return {**about, "no_motion": list(table.no_motion), "rows": rows}
+    facts = {"title": table.title, "section": table.section, "note": table.note, "units": [axis.unit for axis in table.axes]}
+    return {**facts, "no_motion": list(table.no_motion), "rows": rows}
 
 
 def _framed(rows: list[list[str]]) -> list[str]:
@@ -924,7 +933,7 @@ def _framed(rows: list[list[str]]) -> list[str]:
     return [lines[0], "|" + "|".join("-" * (size + 2) for size in width) + "|", *lines[1:]]
 
 
-def table_figure(table: DocumentTable, found: Mapping[str, Found], *, title: str = "") -> Figure:
+def table_figure(table: DocumentTable, results: Mapping[str, Found], *, title: str = "") -> Figure:
     """Draw bars of Almanza-Medina, validation, other sequences and unseen scenes.
 
     Whiskers are 95 % intervals. The dotted line is the RMSE of always estimating no motion.
@@ -933,37 +942,38 @@ def table_figure(table: DocumentTable, found: Mapping[str, Found], *, title: str
 
     figure = Figure(figsize=(13, 2.6 + 1.1 * len(table.rows)), layout="constrained")
     figure.suptitle("\n".join(wrap(title or f"{table.kind} {table.name}: {table.title}", 150)), fontsize="medium")
-    noises = _noises(table, found)
+    noises = _noises(table, results)
     grid = figure.subplots(len(noises), len(table.axes), sharey=True, squeeze=False)
-    position = {row.name: k for k, row in enumerate(table.rows) if row.name in found}
+    position = {row.name: k for k, row in enumerate(table.rows) if row.name in results}
     handles: dict[str, Any] = {}
-    shown = _parts(table, found)
-    places: dict[Part, tuple[float, str]] = {"validation": (-0.08, "C0"), "test": (0.12, "C2"), "unseen": (0.32, "C1")}
+    shown = _parts(table, results)
+    bars: dict[Part, tuple[float, str]] = {"validation": (-0.08, "C0"), "test": (0.12, "C2"), "unseen": (0.32, "C1")}
     for panels, noise in zip(grid, noises, strict=True):
         for k, (panel, axis) in enumerate(zip(panels, table.axes, strict=True)):
             printed = [row.drawn(row.printed[noise])[k] if noise in row.printed else np.nan for row in table.rows]
             handles["Almanza-Medina"] = panel.barh(np.arange(len(printed)) - 0.28, printed, 0.18, color="0.6")
-            for part, said in shown.items():
-                offset, colour = places[part]
-                known = [(row, found[row.name].score(part, noise)) for row in table.rows if row.name in found]
-                scores = [(row, score) for row, score in known if score is not None]
+            for part, heading in shown.items():
+                offset, colour = bars[part]
+                row_scores = [(row, results[row.name].score(part, noise)) for row in table.rows if row.name in results]
+                scores = [(row, score) for row, score in row_scores if score is not None]
                 ends = np.array([[row.drawn(e)[k] for e in (s.low, s.rmse, s.high)] for row, s in scores]).reshape(-1, 3)
                 low, rmse, high = ends.T
                 whiskers = {"xerr": np.maximum([rmse - low, high - rmse], 0), "error_kw": {"linewidth": 0.8}}
                 positions = [position[row.name] + offset for row, _ in scores]
-                handles[said] = panel.barh(positions, rmse, 0.18, color=colour, **(whiskers if scores else {}))
+                handles[heading] = panel.barh(positions, rmse, 0.18, color=colour, **(whiskers if scores else {}))
             handles["no motion"] = panel.axvline(table.no_motion[k], color="black", linestyle=":")
             panel.set(title=f"{NOISES[noise]}: {axis.name}", xlabel=f"RMSE ({axis.unit})")
-            panel.set_yticks(range(len(printed)), [_label(row, found.get(row.name)) for row in table.rows])
+            panel.set_yticks(range(len(printed)), [_label(row, results.get(row.name)) for row in table.rows])
     grid[0, 0].invert_yaxis()
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
     return figure
 
 
-def _label(row: TableRow, ours: Found | None) -> str:
+def _label(row: TableRow, result: Found | None) -> str:
     """Return the name of a row and the scale at which it was reached."""
-    if ours is None:
+    if result is None:
         return f"{row.approach}\n{NOT_YET}"
     return (
-        f"{row.approach}\n{ours.reached.training_pairs:,} pairs x {ours.reached.epochs:.2g}, {ours.reached.minutes:.3g} min"
+        f"{row.approach}\n{result.reached.training_pairs:,} pairs x {result.reached.epochs:.2g}, "
+        f"{result.reached.minutes:.3g} min"
     )

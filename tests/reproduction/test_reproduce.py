@@ -400,7 +400,7 @@ def test_a_table_from_nothing(whole: Path) -> None:
         assert kept.options["width"] == 1 / 16
         assert kept.recipe["loss"]["penalty"] == (100 if name == "posenet-penalty" else 0)
     text = (whole / "table.md").read_text()
-    said = "scale 1 of the recipes' data; all epochs; recipes changed, where a row has no value of its own: network.width "
+    said = "scale 1 of the recipes' data; all epochs; recipes changed, except for keys that a row sets: network.width "
     assert said + "0.0625" in text
     assert "not trained yet" not in text
     assert (whole / "table-3.6.png").stat().st_size > 10_000
@@ -409,7 +409,7 @@ def test_a_table_from_nothing(whole: Path) -> None:
 def test_only_the_requested_table_is_drawn(tmp_path: Path) -> None:
     bench = TableBuilder(RunDirectory.begin(tmp_path / "both", tables.TABLES, {}), Effort(quick=True))
     for name in ("3.2", "3.6"):
-        bench.ask(name, {})
+        bench.add_table(name, {})
     assert set(bench.report(["3.6"])["tables"]) == {"3.2", "3.6"}
     assert [path.name for path in (tmp_path / "both").glob("*.png")] == ["table-3.6.png"]
 
@@ -507,7 +507,7 @@ def test_names_and_numbers_that_are_wrong() -> None:
     for minutes in (0, -1, float("nan"), float("inf")):
         with pytest.raises(MitsonarError, match="minutes of training of a row must be above 0"):
             Effort(minutes=minutes)
-    with pytest.raises(MitsonarError, match="1 sample or more: got 0"):
+    with pytest.raises(MitsonarError, match="batch must be at least 1: got 0"):
         Effort(batch=0)
     with pytest.raises(MitsonarError, match="unknown training recipe key lables"):
         reproduce("3.1", "nowhere", Effort(changes={"lables": "raw"}))
