@@ -47,19 +47,19 @@ __all__ = [
 BLOCK = (16, 2)
 """Number of bins and beams in a block."""
 
-FEWEST = (128, 16)
+MIN_SIZE = (128, 16)
 """Smallest number of bins and beams in an image; a smaller image has too few blocks for the first iteration."""
 
 RANGE_M = 4.4
 """Mean range at which the unit of length is 1 mm [m]. The unit is proportional to range, as images do not show scale."""
 
-TURN = 2.5e-4
+YAW_UNIT = 2.5e-4
 """Unit of yaw [rad]."""
 
-JUDGED = 2
-"""Number of finer iterations that compute weights; later iterations reuse the last ones."""
+WEIGHTED_ITERATIONS = 2
+"""Number of fine iterations that compute weights; later iterations reuse the last ones."""
 
-TALLEST = 0.2
+MAX_RELIEF = 0.2
 """Largest relief, as a fraction of the sonar's height."""
 
 
@@ -82,8 +82,8 @@ class CorrNet(nn.Module):
 
     def __init__(self, *, width: float = 1.0, looks: int = 2, finer: int = 3, relief: bool = True) -> None:
         super().__init__()
-        counts = all(isinstance(count, int) and count >= 1 for count in (looks, finer))
-        if not isinstance(width, int | float) or not 0 < width < math.inf or not counts:
+        valid_counts = all(isinstance(count, int) and count >= 1 for count in (looks, finer))
+        if not isinstance(width, int | float) or not 0 < width < math.inf or not valid_counts:
             raise MitsonarError(
                 f"corrnet takes a width above 0, looks and finer of at least 1: got {shortened(width)}, {shortened(looks)} "
                 f"and {shortened(finer)}"
@@ -118,16 +118,16 @@ class CorrNet(nn.Module):
         Raises:
             MitsonarError: the images are too small, or not pairs.
         """
-        if images.dim() != 4 or images.shape[1] != 2 or images.shape[2] < FEWEST[0] or images.shape[3] < FEWEST[1]:
+        if images.dim() != 4 or images.shape[1] != 2 or images.shape[2] < MIN_SIZE[0] or images.shape[3] < MIN_SIZE[1]:
             raise MitsonarError(
-                f"corrnet takes (batch, 2, bins, beams) of {FEWEST[0]} bins and {FEWEST[1]} beams or more: got "
+                f"corrnet takes (batch, 2, bins, beams) of {MIN_SIZE[0]} bins and {MIN_SIZE[1]} beams or more: got "
                 f"{tuple(images.shape)}"
             )
         # 1. Compute descriptors of blocks, and filtered frames with their slopes for the finer iterations.
         batch, size = images.shape[0], (images.shape[2], images.shape[3])
-        frames = _even(images).reshape(2 * batch, 1, *size)
-        blocks = tuple(cells.contiguous() for cells in _pair(self.encoder(frames)))
-        cells = self.slopes.prepared(*_pair(self.slopes.filter(frames)))
+        frames = _normalised(images).reshape(2 * batch, 1, *size)
+        blocks = tuple(cells.contiguous() for cells in _split_pairs(self.encoder(frames)))
+        cells = self.slopes.prepared(*_split_pairs(self.slopes.filter(frames)))
         # 2. Work in units of motion in which all three components are of similar size.
         unit, estimates = _units(ground), []
         relief = None if self.relief is None else self.relief(*blocks)
@@ -140,7 +140,7 @@ class CorrNet(nn.Module):
         # 4. Fine iterations: Gauss-Newton steps on small cells, which are accurate close to the result.
         warp_grid = WarpGrid(ground, unit, (STEP, 1), size, cells[0].shape[-2:], _resized(relief, cells[0]))
         for k in range(self.options["finer"]):
-            motion, normal, judged = self.slopes(cells, warp_grid, motion, judged if k >= JUDGED else None)
+            motion, normal, judged = self.slopes(cells, warp_grid, motion, judged if k >= WEIGHTED_ITERATIONS else None)
             estimates.append((motion, normal))
         # 5. In training the likelihood sees every iteration, so that each one learns.
         if not self.training:
@@ -155,9 +155,9 @@ class CorrNet(nn.Module):
         grows with the square of the motion, for scale errors, are added.
         """
         inverse = torch.linalg.inv(normal)
-        far = motion.detach()
+        detached = motion.detach()
         covariance = torch.exp(2 * self.scale) * (inverse + inverse.mT) / 2 + torch.diag_embed(
-            torch.exp(2 * self.floor) + torch.exp(2 * self.share) * far.square()
+            torch.exp(2 * self.floor) + torch.exp(2 * self.share) * detached.square()
         )
         return GaussianHead(motion * unit, covariance * unit[:, :, None] * unit[:, None, :])
 
@@ -177,22 +177,22 @@ class Relief(nn.Module):
 
     def forward(self, first: Tensor, second: Tensor) -> Tensor:
         """Estimate the relief ``(batch, 1, rows, columns)`` from the descriptors of both frames."""
-        return TALLEST * torch.tanh(self.layers(torch.cat([first, second], dim=1)))
+        return MAX_RELIEF * torch.tanh(self.layers(torch.cat([first, second], dim=1)))
 
 
 def _units(ground: Ground) -> Tensor:
     """Compute the units of motion ``(batch, 3)`` [m, m, rad]."""
     length = 1e-3 * ground["place"][:, 0].mean(dim=(1, 2)) / RANGE_M
-    return torch.stack([length, length, torch.full_like(length, TURN)], dim=1)
+    return torch.stack([length, length, torch.full_like(length, YAW_UNIT)], dim=1)
 
 
-def _even(images: Tensor) -> Tensor:
+def _normalised(images: Tensor) -> Tensor:
     """Normalise pairs of frames to mean 0 and standard deviation 1, as their levels carry no information on motion."""
     mean, std = images.mean(dim=(1, 2, 3), keepdim=True), images.std(dim=(1, 2, 3), keepdim=True)
     return (images - mean) / (std + 1e-6)
 
 
-def _pair(frames: Tensor) -> tuple[Tensor, ...]:
+def _split_pairs(frames: Tensor) -> tuple[Tensor, ...]:
     """Split alternating frames ``(2 * batch, ...)`` into first and second frames ``(batch, ...)``."""
     return frames.reshape(-1, 2, *frames.shape[1:]).unbind(dim=1)
 
@@ -213,7 +213,7 @@ Pair = tuple[Tensor, ...]
 Context: TypeAlias = Any
 """Context object that torch passes from a function to its derivative; torch gives it no type."""
 
-FAINT = 1e-2
+MIN_POWER = 1e-2
 """Mean square of a descriptor below which the cell is treated as empty."""
 
 
@@ -260,14 +260,14 @@ class Matching(nn.Module):
         """
         # 1. Sample the second frame at the predicted positions, and measure the remaining displacements.
         second, inside = warp_grid.draw(cells[1], motion)
-        displaced, sure = self.displaced(cells[0], second)
+        displaced, factor = self.displaced(cells[0], second)
         # 2. Form the information matrix L L' of each cell; cells outside the frame get none.
-        l11, l22, l21 = (sure * inside[:, None]).unbind(dim=1)
-        along, across, both = l11 * l11, l21 * l21 + l22 * l22, l11 * l21
+        l11, l22, l21 = (factor * inside[:, None]).unbind(dim=1)
+        along, across, mixed = l11 * l11, l21 * l21 + l22 * l22, l11 * l21
         # 3. Solve the weighted least-squares problem for the step of the motion.
         down, aside = displaced.unbind(dim=1)
-        pull = torch.stack([along * down + both * aside, both * down + across * aside], dim=1)
-        step, normal = warp_grid.solved(torch.stack([along, across, both], dim=1), pull)
+        gradient = torch.stack([along * down + mixed * aside, mixed * down + across * aside], dim=1)
+        step, normal = warp_grid.solved(torch.stack([along, across, mixed], dim=1), gradient)
         return motion + step, normal
 
     def displaced(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
@@ -278,26 +278,26 @@ class Matching(nn.Module):
             their information matrix L L' ``(batch, 3, rows, columns)``.
         """
         # 1. Correlate normalised descriptors, so that brightness does not bias the match.
-        one, one_size = _unit_descriptions(first)
-        other, other_size = _unit_descriptions(second)
-        volume = self._volume(one, other)
+        first_unit, first_power = _unit_descriptions(first)
+        second_unit, second_power = _unit_descriptions(second)
+        volume = self._volume(first_unit, second_unit)
         # 2. Judge each cell by its correlations and by the power of its descriptors: faint cells carry little information.
-        judged = self.judge(torch.cat([volume, one_size, other_size], dim=1))
+        judged = self.judge(torch.cat([volume, first_power, second_power], dim=1))
         count = volume.shape[1]
         # 3. Displacement by soft-argmax over the smoothed correlations, which is differentiable and finer than a cell.
         share = torch.softmax(torch.exp(self.sharpness) * self.smooth(volume) + judged[:, :count], dim=1)
-        moved_by = torch.stack([(share * place).sum(dim=1) for place in self.places], dim=1)
+        shift = torch.stack([(share * place).sum(dim=1) for place in self.places], dim=1)
         # 4. Cholesky factor of the information, whose diagonal must be positive.
-        sure = functional.softplus(judged[:, count : count + 2] - 1)
-        return moved_by, torch.cat([sure, 0.3 * judged[:, count + 2 :]], dim=1)
+        diagonal = functional.softplus(judged[:, count : count + 2] - 1)
+        return shift, torch.cat([diagonal, 0.3 * judged[:, count + 2 :]], dim=1)
 
-    def _volume(self, one: Tensor, other: Tensor) -> Tensor:
+    def _volume(self, first: Tensor, second: Tensor) -> Tensor:
         """Correlate each cell with the cells around its predicted position ``(batch, places, rows, columns)``."""
         down, across = self.reach
-        wide = functional.pad(other, (across, across, down, down))
-        if torch.is_grad_enabled() and (one.requires_grad or other.requires_grad):
-            return _Correlations.apply(one, wide)  # type: ignore[no-any-return, no-untyped-call]
-        return _correlations(one, wide)
+        padded = functional.pad(second, (across, across, down, down))
+        if torch.is_grad_enabled() and (first.requires_grad or second.requires_grad):
+            return _Correlations.apply(first, padded)  # type: ignore[no-any-return, no-untyped-call]
+        return _correlations(first, padded)
 
 
 def quiet(layer: nn.Conv2d) -> nn.Conv2d:
@@ -314,41 +314,41 @@ def channels_last(*layers: nn.Module) -> nn.Sequential:
 
 def _unit_descriptions(cells: Tensor) -> tuple[Tensor, Tensor]:
     """Scale descriptors to mean square 1, and return them with the logarithm of their original mean square."""
-    power = (cells * cells).mean(dim=1, keepdim=True) + FAINT
+    power = (cells * cells).mean(dim=1, keepdim=True) + MIN_POWER
     return cells * torch.rsqrt(power), torch.log(power)
 
 
-def _shifted(one: Tensor, wide: Tensor) -> list[Tensor]:
+def _shifted(first: Tensor, padded: Tensor) -> list[Tensor]:
     """Return all views of the padded frame that have the size of the other one, with range as the outer loop."""
-    rows, columns = one.shape[-2:]
-    down, across = (large - small + 1 for large, small in zip(wide.shape[-2:], (rows, columns), strict=True))
-    return [wide[:, :, r : r + rows, c : c + columns] for r in range(down) for c in range(across)]
+    rows, columns = first.shape[-2:]
+    down, across = (large - small + 1 for large, small in zip(padded.shape[-2:], (rows, columns), strict=True))
+    return [padded[:, :, r : r + rows, c : c + columns] for r in range(down) for c in range(across)]
 
 
-def _correlations(one: Tensor, wide: Tensor) -> Tensor:
+def _correlations(first: Tensor, padded: Tensor) -> Tensor:
     """Correlate each cell with all shifts of the padded frame, as means over the channels."""
-    rows, columns = one.shape[-2:]
-    shifted = wide.unfold(2, rows, 1).unfold(3, columns, 1)
-    return (one[:, :, None, None] * shifted).mean(dim=1).flatten(1, 2)
+    rows, columns = first.shape[-2:]
+    shifted = padded.unfold(2, rows, 1).unfold(3, columns, 1)
+    return (first[:, :, None, None] * shifted).mean(dim=1).flatten(1, 2)
 
 
 class _Correlations(torch.autograd.Function):
     """:func:`_correlations` with a derivative that needs a third of the memory accesses of torch's derivative."""
 
     @staticmethod
-    def forward(context: Context, one: Tensor, wide: Tensor) -> Tensor:
-        context.save_for_backward(one, wide)
-        return _correlations(one, wide)
+    def forward(context: Context, first: Tensor, padded: Tensor) -> Tensor:
+        context.save_for_backward(first, padded)
+        return _correlations(first, padded)
 
     @staticmethod
     def backward(context: Context, *gradients: Tensor) -> tuple[Tensor, Tensor]:
-        one, wide = context.saved_tensors
-        by_volume = gradients[0] / one.shape[1]
-        by_one, by_wide = torch.zeros_like(one), torch.zeros_like(wide)
-        for k, (part, by_part) in enumerate(zip(_shifted(one, wide), _shifted(one, by_wide), strict=True)):
-            by_one.addcmul_(by_volume[:, k : k + 1], part)
-            by_part.addcmul_(by_volume[:, k : k + 1], one)
-        return by_one, by_wide
+        first, padded = context.saved_tensors
+        by_volume = gradients[0] / first.shape[1]
+        by_first, by_padded = torch.zeros_like(first), torch.zeros_like(padded)
+        for k, (part, by_part) in enumerate(zip(_shifted(first, padded), _shifted(first, by_padded), strict=True)):
+            by_first.addcmul_(by_volume[:, k : k + 1], part)
+            by_part.addcmul_(by_volume[:, k : k + 1], first)
+        return by_first, by_padded
 
 
 # ---------------- Fine iterations: differences and slopes
@@ -357,16 +357,16 @@ class _Correlations(torch.autograd.Function):
 STEP = 2
 """Number of bins in a cell; a cell is one beam wide."""
 
-TOGETHER = (4, 2)
+POOL = (4, 2)
 """Numbers of cells along range and beams that share one weight."""
 
 HALFWAY = (0.0243, -0.1351, 0.6079, 0.6079, -0.1351, 0.0243)
 """Lanczos weights (three lobes) of six cells for the value midway between them. Training changes them."""
 
-LONGEST = 8.0
+MAX_STEP = 8.0
 """Largest step, in units; fine iterations start close to the result."""
 
-LEAST_TRUE = 0.2
+MIN_SIGNAL_SHARE = 0.2
 """Smallest share of the squared slopes that is taken as signal; steps are lengthened by a factor of at most five."""
 
 
@@ -377,13 +377,13 @@ class SlopeStep(NamedTuple):
         down: slopes along range times their weight ``(batch, filters, rows, columns)``.
         aside: slopes across beams times their weight ``(batch, filters, rows, columns)``.
         information: about the displacement of each cell ``(batch, 3, rows, columns)``.
-        true: share of the squared slopes that is not noise ``(batch, 1)``.
+        signal_share: share of the squared slopes that is not noise ``(batch, 1)``.
     """
 
     down: Tensor
     aside: Tensor
     information: Tensor
-    true: Tensor
+    signal_share: Tensor
 
 
 class Slopes(nn.Module):
@@ -450,30 +450,30 @@ class Slopes(nn.Module):
         residual = second - first
         if judged is None:
             judged = self._judged(frames, second, residual, inside)
-        pull = -torch.stack([(judged.down * residual).sum(dim=1), (judged.aside * residual).sum(dim=1)], dim=1)
-        step, normal = warp_grid.solved(judged.information, pull)
-        step = (step / judged.true).clamp(-LONGEST, LONGEST)
-        return motion + step, normal * judged.true[..., None] * torch.exp(self.scale), judged
+        gradient = -torch.stack([(judged.down * residual).sum(dim=1), (judged.aside * residual).sum(dim=1)], dim=1)
+        step, normal = warp_grid.solved(judged.information, gradient)
+        step = (step / judged.signal_share).clamp(-MAX_STEP, MAX_STEP)
+        return motion + step, normal * judged.signal_share[..., None] * torch.exp(self.scale), judged
 
     def _judged(self, frames: Pair, second: Tensor, residual: Tensor, inside: Tensor) -> SlopeStep:
         """Compute slopes and weights from both frames at the current motion."""
         # 1. Average the slopes of both frames, whose noise is independent.
-        first, own = frames[0], frames[2:]
-        others = _slope(second, 2), _slope(second, 3)
+        first, first_slopes = frames[0], frames[2:]
+        second_slopes = _slope(second, 2), _slope(second, 3)
         weight = self._weight(first, second, residual) * inside[:, None]
-        down, aside = ((a + b) / 2 for a, b in zip(own, others, strict=True))
+        down, aside = ((a + b) / 2 for a, b in zip(first_slopes, second_slopes, strict=True))
         # 2. Information about the displacement: weighted products of slopes, summed over filters.
         by_down, by_aside = weight * down, weight * aside
         along, across = (by_down * down).sum(dim=1), (by_aside * aside).sum(dim=1)
         # 3. Noise cancels in products of slopes of different frames, so their share of the information is the signal.
-        common = (weight * (own[0] * others[0] + own[1] * others[1])).sum(dim=(1, 2, 3))
-        true = common / (along + across).sum(dim=(1, 2)).clamp(min=1e-12)
+        common = (weight * (first_slopes[0] * second_slopes[0] + first_slopes[1] * second_slopes[1])).sum(dim=(1, 2, 3))
+        signal_share = common / (along + across).sum(dim=(1, 2)).clamp(min=1e-12)
         information = torch.stack([along, across, (by_down * aside).sum(dim=1)], dim=1)
-        return SlopeStep(by_down, by_aside, information, true.clamp(LEAST_TRUE, 1.0)[:, None])
+        return SlopeStep(by_down, by_aside, information, signal_share.clamp(MIN_SIGNAL_SHARE, 1.0)[:, None])
 
     def _weight(self, first: Tensor, second: Tensor, residual: Tensor) -> Tensor:
         """Compute the weight of each cell and filter from the local power of difference, mean and product of both frames."""
-        apart, mean = _together(residual.square()), _together((first + second).square()) / 4
+        apart, mean = _pooled(residual.square()), _pooled((first + second).square()) / 4
         powers = torch.cat([apart, mean, (mean - apart / 4).abs()], dim=1)  # the last one: of first times second
         weight = functional.softplus(self.judge(torch.log(powers + 1e-3)))
         return functional.interpolate(weight, size=first.shape[-2:], mode="nearest")
@@ -482,29 +482,29 @@ class Slopes(nn.Module):
 def _doubled(frame: Tensor, weights: Tensor, axis: int) -> Tensor:
     """Interpolate between the cells along an axis, 2 (range) or 3 (beams): ``n`` cells become ``2 n - 1``."""
     last = frame.shape[axis] - 1
-    between = functional.conv2d(_wide(frame, axis), weights, groups=frame.shape[1])
+    between = functional.conv2d(_padded(frame, axis), weights, groups=frame.shape[1])
     pairs = torch.stack([frame.narrow(axis, 0, last), between], dim=axis + 1).flatten(axis, axis + 1)
     return torch.cat([pairs, frame.narrow(axis, last, 1)], dim=axis)
 
 
 def _slope(frame: Tensor, axis: int) -> Tensor:
     """Compute the slope per cell along an axis, to fourth order."""
-    count, wide = frame.shape[axis], _wide(frame, axis)
-    near, far = (wide.narrow(axis, 2 + k, count) - wide.narrow(axis, 2 - k, count) for k in (1, 2))
+    count, padded = frame.shape[axis], _padded(frame, axis)
+    near, far = (padded.narrow(axis, 2 + k, count) - padded.narrow(axis, 2 - k, count) for k in (1, 2))
     return (2 / 3) * near - (1 / 12) * far
 
 
-def _wide(frame: Tensor, axis: int) -> Tensor:
+def _padded(frame: Tensor, axis: int) -> Tensor:
     """Pad an axis by two replicated cells at both ends."""
     return functional.pad(frame, (2, 2, 0, 0) if axis == 3 else (0, 0, 2, 2), mode="replicate")
 
 
-def _together(values: Tensor) -> Tensor:
+def _pooled(values: Tensor) -> Tensor:
     """Average over the cells that share one weight."""
-    rows, columns = (length // count for length, count in zip(values.shape[-2:], TOGETHER, strict=True))
-    values = values[:, :, : rows * TOGETHER[0], : columns * TOGETHER[1]]
-    by_row = values.unflatten(2, (rows, TOGETHER[0])).sum(dim=3)  # type: ignore[no-untyped-call]  # torch gives no types
-    return sum(by_row[..., k :: TOGETHER[1]] for k in range(TOGETHER[1])) / math.prod(TOGETHER)  # type: ignore[no-any-return]
+    rows, columns = (length // count for length, count in zip(values.shape[-2:], POOL, strict=True))
+    values = values[:, :, : rows * POOL[0], : columns * POOL[1]]
+    by_row = values.unflatten(2, (rows, POOL[0])).sum(dim=3)  # type: ignore[no-untyped-call]  # torch gives no types
+    return sum(by_row[..., k :: POOL[1]] for k in range(POOL[1])) / math.prod(POOL)  # type: ignore[no-any-return]
 
 
 # ---------------- Geometry of a grid of cells
@@ -571,21 +571,22 @@ class WarpGrid:
         grid = torch.stack([place[:, 1], place[:, 0]], dim=-1)
         return functional.grid_sample(second, grid, align_corners=True, padding_mode="border"), inside
 
-    def solved(self, information: Tensor, pull: Tensor) -> tuple[Tensor, Tensor]:
+    def solved(self, information: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """Solve the least-squares problem for the step of the motion.
 
         Args:
             information: about the displacement of each cell: along range, across beams, and the off-diagonal element
                 ``(batch, 3, rows, columns)``.
-            pull: information times displacement, along range and across beams ``(batch, 2, rows, columns)``.
+            gradient: of the squared error, negated: information times displacement, along range and across beams
+                ``(batch, 2, rows, columns)``.
 
         Returns:
             The step ``(batch, 3)`` in units, and its normal matrix ``(batch, 3, 3)``.
         """
         weighed = self.derivative * information[:, None, :2] + self.crosswise * information[:, None, 2:]
         flat = self.derivative.flatten(2)
-        normal = weighed.flatten(2) @ flat.mT + PRIOR * torch.eye(3, dtype=pull.dtype, device=pull.device)
-        return torch.linalg.solve(normal, flat @ pull.flatten(1)[..., None])[..., 0], normal
+        normal = weighed.flatten(2) @ flat.mT + PRIOR * torch.eye(3, dtype=gradient.dtype, device=gradient.device)
+        return torch.linalg.solve(normal, flat @ gradient.flatten(1)[..., None])[..., 0], normal
 
     def _shift(self, motion: Tensor) -> Tensor:
         """Compute how far a motion moves the ground of each cell ``(batch, 2, rows, columns)`` [cells]."""
@@ -611,8 +612,8 @@ def displacement(ground: Ground, motion: Tensor) -> Tensor:
     sonar = points.flatten(1, 2) @ turn[:, :2] - height * turn[:, 2:]
     s, f, u = sonar.unflatten(1, points.shape[1:3]).unbind(dim=-1)
     # the two definitions of bearing may occur in one batch
-    beside = torch.where(ground["cone"][:, None, None] > 0, torch.sqrt(f * f + u * u), f)
-    radius, bearing = torch.sqrt(s * s + f * f + u * u), torch.atan2(s, beside)
+    ahead = torch.where(ground["cone"][:, None, None] > 0, torch.sqrt(f * f + u * u), f)
+    radius, bearing = torch.sqrt(s * s + f * f + u * u), torch.atan2(s, ahead)
     return (torch.stack([radius, bearing], dim=1) - ground["place"]) / ground["cell"]
 
 
