@@ -114,14 +114,14 @@ class Checkpoint:
         Raises:
             MitsonarError: the module is not one of these networks, or a value cannot be saved.
         """
-        names = [name for name, made in NETWORKS.items() if type(network) is made]
+        names = [name for name, network_class in NETWORKS.items() if type(network) is network_class]
         if not names:
             raise MitsonarError(
                 f"a checkpoint holds one of our networks: got {type(network).__name__}; make it with create_network, or "
                 "keep its state_dict yourself"
             )
         recipe, coder, described = samples.recipe, samples.labels, samples.described()
-        table: Fields = {
+        contents: Fields = {
             "data": recipe.name,
             **described,
             "network": names[0],
@@ -132,7 +132,7 @@ class Checkpoint:
             "data_recipe": recipe.model_dump(mode="json"),
             **about,
         }
-        plain: Fields = {key: value if key == "weights" else _plain(value, key) for key, value in table.items()}
+        plain: Fields = {key: value if key == "weights" else _plain(value, key) for key, value in contents.items()}
         return cls(**plain)
 
     def halved(self) -> Self:
@@ -147,7 +147,7 @@ class Checkpoint:
         return replace(self, weights=weights)
 
     def build(self) -> nn.Module:
-        """Build the network with its weights, in evaluation mode, without a change to the state of torch's random generator.
+        """Build the network with its weights, in evaluation mode, without changing the state of torch's random generator.
 
         Raises:
             MitsonarError: the network or an option is unknown, or the weights do not fit.
@@ -185,15 +185,15 @@ class Checkpoint:
             )
         try:
             with torch.device("meta"), torch.random.fork_rng(devices=[]):
-                promised = create_network(self.network, **self.options).state_dict()
+                expected = create_network(self.network, **self.options).state_dict()
         except Exception:  # ``build`` raises it again, with a message
             return
-        there = sum(values.numel() for values in self.weights.values())
-        wanted = sum(values.numel() for values in promised.values())
-        if wanted > 2 * there + FEW_WEIGHTS:
+        stored = sum(values.numel() for values in self.weights.values())
+        required = sum(values.numel() for values in expected.values())
+        if required > 2 * stored + FEW_WEIGHTS:
             raise MitsonarError(
-                f"the weights do not fit a {self.network} with options {shortened(self.options)}: they are {there:,}, "
-                f"it has {wanted:,} ({written})"
+                f"the weights do not fit a {self.network} with options {shortened(self.options)}: the file has "
+                f"{stored:,}, the network {required:,} ({written})"
             )
 
     # ---------------------------------------------------------------- description
@@ -237,7 +237,7 @@ class Checkpoint:
 
         It is that at the noise of training if this level was validated, otherwise that over all levels.
         """
-        known = {level: found.get("rmse") for level, found in self.metrics.items() if isinstance(found, dict)}
+        known = {level: scores.get("rmse") for level, scores in self.metrics.items() if isinstance(scores, dict)}
         chosen = [known[self.noise]] if self.noise in known else list(known.values())
         if not chosen or not all(_are_numbers(rmse, len(self.labels["names"])) for rmse in chosen):
             return None
@@ -263,18 +263,18 @@ class Checkpoint:
         if split is None:
             return np.zeros(len(samples), dtype=bool)
         # 1. First frames of the samples of training: its part of the split, cut to the share of the data that it used.
-        part, length = self.recipe.get("part_of_data"), self.arrangement["frames"]
+        fraction, length = self.recipe.get("part_of_data"), self.arrangement["frames"]
         seen = Part.of(samples.store, "train", split, length)
-        share = part if isinstance(part, int | float) else 1.0
+        share = fraction if isinstance(fraction, int | float) else 1.0
         first = seen.first[seen.first + length <= share * len(samples.store)]
-        given = np.zeros(len(samples.store) + length, dtype=bool)  # motions from each frame to the next
+        used = np.zeros(len(samples.store) + length, dtype=bool)  # motions from each frame to the next
         for step in range(max(length - 1, 1)):
-            given[first + step] = True
+            used[first + step] = True
         # 2. A sample counts as seen if training has seen every motion between its frames.
         steps = range(max(samples.frames - 1, 1))
-        return np.asarray(np.all([given[samples.first + step] for step in steps], axis=0))
+        return np.asarray(np.all([used[samples.first + step] for step in steps], axis=0))
 
-    def decode(self, answer: Tensor | GaussianHead) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    def decode(self, output: Tensor | GaussianHead) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Decode the output of the network.
 
         Returns:
@@ -283,14 +283,14 @@ class Checkpoint:
         Raises:
             MitsonarError: the shape of the output differs from that of the labels.
         """
-        if isinstance(answer, GaussianHead):
-            mean, covariance = (values.detach().cpu().double().numpy() for values in answer)
+        if isinstance(output, GaussianHead):
+            mean, covariance = (values.detach().cpu().double().numpy() for values in output)
             return mean, (covariance + covariance.swapaxes(-1, -2)) / 2  # single precision leaves an asymmetry of 1e-8
         names = self.labels["names"]
-        if not isinstance(answer, Tensor) or answer.ndim != 2 or answer.shape[1] != len(names):
-            got = tuple(answer.shape) if isinstance(answer, Tensor) else type(answer).__name__
-            raise MitsonarError(f"the {self.network} answers {got}, its labels are {', '.join(names)}: the file is damaged")
-        return self.coder.decode(answer.detach().cpu().numpy()), None
+        if not isinstance(output, Tensor) or output.ndim != 2 or output.shape[1] != len(names):
+            got = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
+            raise MitsonarError(f"the {self.network} returns {got}, its labels are {', '.join(names)}: the file is damaged")
+        return self.coder.decode(output.detach().cpu().numpy()), None
 
     @property
     def digest(self) -> str:
@@ -303,13 +303,13 @@ class Checkpoint:
 
     def rows(self) -> list[tuple[str, str]]:
         """Return a summary as pairs of names and values, for a console."""
-        words = self.arrangement
-        shape = [words[word] for word in ("kind", "layout", "coordinates")] + ["ground"] * words["ground"]
+        arrangement = self.arrangement
+        shape = [arrangement[entry] for entry in ("kind", "layout", "coordinates")] + ["ground"] * arrangement["ground"]
         count = sum(values.numel() for values in self.weights.values())
         options = "".join(f", {key} {value}" for key, value in self.options.items())
         sonars = [
-            f"{one.name}, {one.beams} beams, {one.range_bins} bins, {one.range_min:g}..{one.range_max:g} m"
-            for one in self.sonars.values()
+            f"{sonar.name}, {sonar.beams} beams, {sonar.range_bins} bins, {sonar.range_min:g}..{sonar.range_max:g} m"
+            for sonar in self.sonars.values()
         ]
         if self.channel is not None:
             received = self.channel
@@ -320,14 +320,14 @@ class Checkpoint:
         rows = [
             ("network", f"{self.network}{options}"),
             ("weights", f"{count:,}"),
-            ("input", f"{words['frames']} frames of {', '.join(words['views'])}: {', '.join(shape)}"),
+            ("input", f"{arrangement['frames']} frames of {', '.join(arrangement['views'])}: {', '.join(shape)}"),
             ("labels", f"{self.labels['kind']}: " + ", ".join(f"{name} {low:.4g}..{high:.4g}" for name, low, high in spans)),
             ("sonar", "; ".join(dict.fromkeys(sonars)) or "any"),
             ("trained on", f"{self.data}, {self.model} model, noise {self.noise}; {self.fixed}"),
             ("trained for", ", ".join(f"{name} {_number(value)}" for name, value in self.trained.items()) or "not recorded"),
         ]
-        for level, found in self.metrics.items():
-            rmse = found.get("rmse") if isinstance(found, dict) else None
+        for level, scores in self.metrics.items():
+            rmse = scores.get("rmse") if isinstance(scores, dict) else None
             if isinstance(rmse, list) and len(rmse) <= len(AXES) and _are_numbers(rmse, len(rmse)):
                 units = [axis.unit for axis in AXES[: len(rmse)]]
                 values = " / ".join(f"{value:.3g} {unit}" for value, unit in zip(rmse, units, strict=True))
@@ -379,11 +379,11 @@ class Checkpoint:
         Raises:
             MitsonarError: the bytes are not a checkpoint, are damaged, or have another format.
         """
-        table = _unpacked(content, source)
+        table = _unpack(content, source)
         if table.get("kind") != KIND:
             lightning = any(str(key).startswith("pytorch-lightning") for key in table)
-            held = "Lightning's state, from which `mitsonar train --resume` continues" if lightning else "something else"
-            raise MitsonarError(f"{source} is not a checkpoint of mitsonar, it holds {held}: give a {FILE}")
+            actual = "Lightning's state, from which `mitsonar train --resume` continues" if lightning else "something else"
+            raise MitsonarError(f"{source} is not a checkpoint of mitsonar, but {actual}: give a {FILE}")
         if table.get("format") != FORMAT:
             raise MitsonarError(
                 f"{source} is a checkpoint of format {shortened(table.get('format'))}, written by mitsonar "
@@ -399,7 +399,7 @@ class Checkpoint:
             reason = complaint(error, _Contents, "checkpoint")
         else:
             return cls(**{one.name: table[one.name] for one in fields(cls)})
-        raise MitsonarError(f"{source} is damaged: {reason}; train again, or take a copy that is whole")
+        raise MitsonarError(f"{source} is damaged: {reason}; train again, or use an intact copy")
 
 
 def _numbers_in(options: Fields) -> list[tuple[str, float]]:
@@ -425,7 +425,7 @@ def _plain(value: object, name: str) -> Plain:
         return [_plain(one, name) for one in value]
     if isinstance(value, dict):
         return {str(key): _plain(one, name) for key, one in value.items()}
-    raise MitsonarError(f"{name} of a checkpoint holds numbers, texts, lists and tables only: got {value!r}")
+    raise MitsonarError(f"{name} of a checkpoint may hold only numbers, strings, lists and dictionaries: got {value!r}")
 
 
 def _mismatch(error: RuntimeError) -> str:
@@ -449,7 +449,7 @@ LARGEST = 8 * 2**30
 """Largest accepted size of a checkpoint when unpacked [bytes]."""
 
 
-def _unpacked(content: bytes, source: str) -> dict[Any, Any]:
+def _unpack(content: bytes, source: str) -> dict[Any, Any]:
     """Unpack the dictionary in a torch file, after checks of sizes and checksums that torch does not make.
 
     Args:
@@ -467,7 +467,7 @@ def _unpacked(content: bytes, source: str) -> dict[Any, Any]:
             packed = [part for part in parts.infolist() if part.compress_type != zipfile.ZIP_STORED]
             if packed or sum(part.file_size for part in parts.infolist()) > min(LARGEST, len(content)):
                 raise MitsonarError(
-                    f"{source} would unpack to more than its own size, or than {LARGEST >> 30} GiB: it is none of mitsonar"
+                    f"{source} would unpack to more than its size, or than {LARGEST >> 30} GiB: it is not of mitsonar"
                 )
             wrong = parts.testzip()
         if wrong is not None:
@@ -517,7 +517,7 @@ class _Labels(_Part):
     @model_validator(mode="after")
     def _fit(self) -> Self:
         if not len(self.low) == len(self.high) == len(self.names):
-            raise ValueError("low and high must have one number a name")
+            raise ValueError("low and high must have one number per name")
         return self
 
 
@@ -529,11 +529,11 @@ class _TrainedAt(_Part):
     roll_deg: Finite
 
 
-def _stored_whole(values: Tensor) -> Tensor:
+def _check_stored(values: Tensor) -> Tensor:
     """Check that the file holds every number of a tensor, all finite; an expanded tensor would need more memory."""
     plain = values.layout == torch.strided and values.device.type == "cpu" and not values.is_quantized
     if not plain or values.numel() * values.element_size() > values.untyped_storage().nbytes():
-        raise ValueError("more numbers are promised than the file holds")
+        raise ValueError("the file has fewer numbers than the shape of the tensor")
     if not torch.isfinite(values).all():
         raise ValueError("numbers must be finite: got nan or inf")
     return values
@@ -545,7 +545,7 @@ class _Contents(_Part, extra="forbid"):
     kind: str
     network: str
     options: Fields
-    weights: dict[str, Annotated[Tensor, AfterValidator(_stored_whole)]]
+    weights: dict[str, Annotated[Tensor, AfterValidator(_check_stored)]]
     arrangement: _Arrangement
     labels: _Labels
     sonar: dict[str, Fields]
@@ -562,12 +562,12 @@ class _Contents(_Part, extra="forbid"):
 
     @model_validator(mode="after")
     def _has_sonars(self) -> Self:
-        receives = self.arrangement.kind == "response"
-        if receives and list(self.sonar) != ["channel"]:
+        is_response = self.arrangement.kind == "response"
+        if is_response and list(self.sonar) != ["channel"]:
             raise ValueError("sonar has no channel")
-        for view, own in self.sonar.items():
+        for view, settings in self.sonar.items():
             try:
-                (ChannelSonar if receives else Sonar).create(**own)
+                (ChannelSonar if is_response else Sonar).create(**settings)
             except (MitsonarError, TypeError) as error:
                 raise ValueError(f"sonar {view[:80]}: {error}") from None
         return self
@@ -620,7 +620,7 @@ def onnx_of(checkpoint: Checkpoint, batch: int | None = None) -> bytes:
         with _quiet(), torch.no_grad():
             network(inputs)  # fill the caches of the network before the tracer passes empty tensors
             traced = torch.export.export(network, (), {"inputs": inputs}, dynamic_shapes=shapes)
-            traced = traced.run_decompositions({**torch.export.default_decompositions(), **WITHOUT})
+            traced = traced.run_decompositions({**torch.export.default_decompositions(), **REPLACEMENTS})
             program = torch.onnx.export(
                 traced,
                 dynamo=True,
@@ -636,7 +636,7 @@ def onnx_of(checkpoint: Checkpoint, batch: int | None = None) -> bytes:
     # 3. Describe inputs and outputs in the metadata.
     assert program is not None
     model = program.model_proto
-    onnx.helper.set_model_props(model, _about(checkpoint))
+    onnx.helper.set_model_props(model, _metadata(checkpoint))
     return bytes(model.SerializeToString())
 
 
@@ -651,53 +651,55 @@ class _Named(nn.Module):
         """Return the labels, or a motion and its covariance."""
         rest = dict(inputs)
         image = rest.pop("image")
-        answer = self.network(image, rest) if self.ground else self.network(image, *rest.values())
-        return tuple(answer) if isinstance(answer, GaussianHead) else answer  # type: ignore[return-value]
+        output = self.network(image, rest) if self.ground else self.network(image, *rest.values())
+        return tuple(output) if isinstance(output, GaussianHead) else output  # type: ignore[return-value]
 
 
 def _inputs(checkpoint: Checkpoint, batch: int) -> dict[str, Tensor]:
     """Make a batch of network inputs, keyed by name, with noise instead of frames."""
-    made = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(0)
     if not checkpoint.arrangement["ground"]:
         options = checkpoint.options
         names = {"image": "size", "cartesian": "cartesian_size"}
         sizes = {name: options[size] for name, size in names.items() if size in options}
         if checkpoint.arrangement["coordinates"] == "cartesian":
             sizes = {"image": options["size"]}
-        return {name: torch.rand((batch, options.get("channels", 1), *size), generator=made) for name, size in sizes.items()}
+        return {
+            name: torch.rand((batch, options.get("channels", 1), *size), generator=generator) for name, size in sizes.items()
+        }
     sonar = sonar_from(dict(checkpoint.data_recipe["sonar"]))
     height, pitch = sum(checkpoint.trained_at["height_m"]) / 2, checkpoint.trained_at["pitch_deg"]
     ground = ground_at(sonar.range_m, sonar.bearing_rad, sonar.bearing, height, math.radians(pitch))
-    image = torch.rand((batch, 2, sonar.range_bins, sonar.beams), generator=made)
+    image = torch.rand((batch, 2, sonar.range_bins, sonar.beams), generator=generator)
     tables = {name: torch.from_numpy(values) for name, values in ground.items()}
     return {"image": image} | {name: values.expand(batch, *values.shape).contiguous() for name, values in tables.items()}
 
 
-def _about(checkpoint: Checkpoint) -> dict[str, str]:
+def _metadata(checkpoint: Checkpoint) -> dict[str, str]:
     """Return the metadata of the ONNX file; dictionaries are JSON."""
     texts = ("network", "model", "noise", "data", "digest")
     tables = ("options", "arrangement", "labels", "sonar", "trained_at", "metrics", "trained")
-    about: dict[str, str] = {name: getattr(checkpoint, name) for name in texts}
-    about |= {name: json.dumps(getattr(checkpoint, name)) for name in tables}
-    return about | {"mitsonar_version": checkpoint.version}
+    metadata: dict[str, str] = {name: getattr(checkpoint, name) for name in texts}
+    metadata |= {name: json.dumps(getattr(checkpoint, name)) for name in tables}
+    return metadata | {"mitsonar_version": checkpoint.version}
 
 
-def _solved(matrix: Tensor, wanted: Tensor, **options: object) -> Tensor:
+def _solve(matrix: Tensor, right_sides: Tensor, **options: object) -> Tensor:
     """Solve systems with positive definite matrices ``(..., 3, 3)`` by elimination."""
     size = matrix.shape[-1]
-    rows = [torch.cat([matrix[..., k, :], wanted[..., k, :]], dim=-1) for k in range(size)]
+    rows = [torch.cat([matrix[..., k, :], right_sides[..., k, :]], dim=-1) for k in range(size)]
     for k in range(size):
         rows[k] = rows[k] / rows[k][..., k : k + 1]
         rows = [row if j == k else row - row[..., k : k + 1] * rows[k] for j, row in enumerate(rows)]
     return torch.stack(rows, dim=-2)[..., size:]
 
 
-def _inverted(matrix: Tensor) -> Tensor:
+def _invert(matrix: Tensor) -> Tensor:
     """Invert positive definite matrices ``(..., 3, 3)`` by elimination."""
-    return _solved(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand(matrix.shape))
+    return _solve(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand(matrix.shape))
 
 
-WITHOUT = {torch.ops.aten.linalg_solve.default: _solved, torch.ops.aten.linalg_inv.default: _inverted}
+REPLACEMENTS = {torch.ops.aten.linalg_solve.default: _solve, torch.ops.aten.linalg_inv.default: _invert}
 """Replacements of operations that ONNX lacks."""
 
 
@@ -705,13 +707,13 @@ WITHOUT = {torch.ops.aten.linalg_solve.default: _solved, torch.ops.aten.linalg_i
 def _quiet() -> Iterator[None]:
     """Suppress torch's messages about packages that are not needed and about its own deprecations."""
     logs = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir", "onnxscript")]
-    had = [log.level for log in logs]
-    for log in logs:
-        log.setLevel(logging.ERROR)
+    levels = [logger.level for logger in logs]
+    for logger in logs:
+        logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        for log, level in zip(logs, had, strict=True):
-            log.setLevel(level)
+        for logger, level in zip(logs, levels, strict=True):
+            logger.setLevel(level)

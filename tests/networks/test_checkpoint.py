@@ -108,7 +108,7 @@ def test_answers_become_motions(checkpoint: Checkpoint) -> None:
 def test_only_our_networks_and_plain_values(checkpoint: Checkpoint) -> None:
     with pytest.raises(MitsonarError, match="one of our networks: got Linear"):
         Checkpoint.of(torch.nn.Linear(2, 3), tiny_samples())
-    with pytest.raises(MitsonarError, match="numbers, texts, lists and tables only"):
+    with pytest.raises(MitsonarError, match="only numbers, strings, lists and dictionaries"):
         Checkpoint.of(tiny_network(), tiny_samples(), trained={"when": object()})
     held = Checkpoint.of(
         tiny_network(), tiny_samples(), trained={"rate": np.float32(0.5), "folder": Path("a") / "b", "steps": (1, 2)}
