@@ -105,25 +105,25 @@ class Journal(Callback):
         self.options, self.progress, self.stop = options, progress, stop
         self.recipe, self.axes = module.recipe, axes_of(material.samples.labels)
         self.scales = np.array([axis.scale for axis in self.axes])
-        self.kept = _Kept()
-        self.had_minutes = 0.0
+        self.state = _JournalState()
+        self.earlier_minutes = 0.0
         self.stopped = False
         self.on_sigterm = signal.getsignal(signal.SIGTERM)
         self.validation: dict[str, list[float]] = {}
 
     def state_dict(self) -> JsonObject:
         """Return the state of the journal for ``last.ckpt``."""
-        return {**vars(self.kept), "minutes": self.spent}
+        return {**vars(self.state), "minutes": self.spent}
 
     def load_state_dict(self, state_dict: JsonObject) -> None:
         """Restore the state of the journal from ``last.ckpt``."""
-        self.had_minutes = float(state_dict["minutes"])
-        self.kept = _Kept(**{name: value for name, value in state_dict.items() if name != "minutes"})
+        self.earlier_minutes = float(state_dict["minutes"])
+        self.state = _JournalState(**{name: value for name, value in state_dict.items() if name != "minutes"})
 
     @property
     def spent(self) -> float:
         """Return the duration of training, including earlier parts of a resumed run [min]."""
-        return self.had_minutes + (time.monotonic() - self.begun) / 60
+        return self.earlier_minutes + (time.monotonic() - self.begun) / 60
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Start the clock, and restore the handler of SIGTERM.
@@ -148,7 +148,7 @@ class Journal(Callback):
         assert isinstance(outputs, Mapping)
         step = trainer.global_step
         loss = float(outputs["loss"].detach())
-        self.kept.add(loss, self.module.squares)
+        self.state.add(loss, self.module.squares)
         end, validate, save = self._due(trainer, step)
         stopped = end and self.stopped
         if stopped and self._finite():  # save first: whatever sent the signal may not wait
@@ -170,16 +170,16 @@ class Journal(Callback):
 
     def _due(self, trainer: lightning.Trainer, step: int) -> tuple[bool, bool, bool]:
         """Return whether training ends, validates, and saves its state; the first process decides for all."""
-        now, wanted = time.monotonic(), self.recipe.validation
+        time_s, schedule = time.monotonic(), self.recipe.validation
         stopped = self.stopped or (self.stop is not None and self.stop())
-        over = self.options.minutes is not None and self.spent >= self.options.minutes
-        end = step >= self.module.steps or over or stopped
-        if wanted.every_steps is not None:
-            validate = step % wanted.every_steps == 0
+        out_of_time = self.options.minutes is not None and self.spent >= self.options.minutes
+        end = step >= self.module.steps or out_of_time or stopped
+        if schedule.every_steps is not None:
+            validate = step % schedule.every_steps == 0
         else:
-            validate = now - self.validated >= wanted.every_minutes * 60
+            validate = time_s - self.validated >= schedule.every_minutes * 60
         validate = validate or (end and not stopped)
-        due = end, stopped, validate, end or validate or now - self.saved >= self.options.state_minutes * 60
+        due = end, stopped, validate, end or validate or time_s - self.saved >= self.options.state_minutes * 60
         end, self.stopped, validate, save = due if trainer.world_size == 1 else trainer.strategy.broadcast(due)
         return end, validate, save
 
@@ -195,32 +195,32 @@ class Journal(Callback):
             "pairs": step * self.recipe.batch,
             "minutes": self.spent,
             "learning_rate": self.recipe.optimiser.rate_at(step - 1, self.module.epoch_steps, self.module.steps),
-            "loss": self.kept.loss_sum / self.kept.loss_count,
+            "loss": self.state.loss_sum / self.state.loss_count,
         }
         row |= self._columns(TRAINED, self._training_rmse())
-        self.kept.loss_sum, self.kept.loss_count = 0.0, 0
+        self.state.loss_sum, self.state.loss_count = 0.0, 0
         score = self._validate(trainer) if validate or stopped else math.inf
         for level in self.material.validation.arrangements:
             row |= self._columns(level, self.validation[level] if validate or stopped else None)
-        self.kept.rows.append(row)
-        better = validate and not score >= self.kept.best
+        self.state.rows.append(row)
+        better = validate and not score >= self.state.best
         if (better or (stopped and not self.folder.network.is_file())) and self._finite():
-            self.kept.best = score if validate else self.kept.best
+            self.state.best = score if validate else self.state.best
             self._checkpoint(row).save(self.folder.network)
-        self.folder.log(self.kept.rows, self.kept.zero, self.axes, drawn=validate or stopped)
+        self.folder.log(self.state.rows, self.state.zero, self.axes, drawn=validate or stopped)
         for logger in trainer.loggers:
             logger.log_metrics({name: value for name, value in row.items() if name != "step" and value is not None}, step)
             logger.save()
         self.logged = time.monotonic()
 
-    def _columns(self, what: str, rmse: list[float] | None) -> JsonObject:
+    def _columns(self, source: str, rmse: list[float] | None) -> JsonObject:
         """Return the columns of an RMSE, keyed by name; None if there is no RMSE."""
         values = [None] * len(self.axes) if rmse is None else rmse
-        return {column(what, axis): value for axis, value in zip(self.axes, values, strict=True)}
+        return {column(source, axis): value for axis, value in zip(self.axes, values, strict=True)}
 
     def _training_rmse(self) -> list[float]:
         """Return the running RMSE on the training samples, in the units of the axes."""
-        return [float(value) for value in np.sqrt(self.kept.squares) * self.scales]
+        return [float(value) for value in np.sqrt(self.state.squares) * self.scales]
 
     def _validate(self, trainer: lightning.Trainer) -> float:
         """Validate the network, and return its score."""
@@ -231,7 +231,7 @@ class Journal(Callback):
             self.module.network, self.material.validation, labels, size, device=device, context=context
         )
         self.validation = {level: (values * self.scales).tolist() for level, values in rmse.items()}
-        self.kept.zero = (zero * self.scales).tolist()
+        self.state.zero = (zero * self.scales).tolist()
         self.validated = time.monotonic()
         return _score([rmse[level] for level in self.recipe.noises], zero)
 
@@ -264,7 +264,7 @@ class Journal(Callback):
             pairs=step * self.recipe.batch,
             minutes=self.spent,
             per_second=(step - self.first) * self.recipe.batch / max(seconds, 1e-6),
-            loss=self.kept.loss,
+            loss=self.state.loss,
             rmse=self._training_rmse(),
             validation=self.validation,
             validated=validated,
@@ -274,7 +274,7 @@ class Journal(Callback):
 
 
 @dataclass
-class _Kept:
+class _JournalState:
     """State of the journal that a resumed run needs.
 
     Attributes:
@@ -302,8 +302,8 @@ class _Kept:
         self.loss_sum, self.loss_count = self.loss_sum + loss, self.loss_count + 1
         self.weight = SMOOTH * self.weight + 1
         self.loss += (loss - self.loss) / self.weight
-        had = np.array(self.squares or [0.0] * len(squares))
-        self.squares = (had + (squares - had) / self.weight).tolist()
+        means = np.array(self.squares or [0.0] * len(squares))
+        self.squares = (means + (squares - means) / self.weight).tolist()
 
 
 def _score(rmse: list[Array], zero: Array) -> float:
@@ -336,7 +336,7 @@ TRAINING = RunKind(
     packages=("mitsonar", "torch", "lightning", "numpy"),
 )
 
-WIDE = 30
+LOG_AXIS_RATIO = 30
 """Ratio of the last to the first number of samples seen from which their axis is logarithmic."""
 
 
@@ -360,7 +360,7 @@ class StateFile(TorchCheckpointIO):
         try:
             state = torch.load(path, map_location=map_location or "cpu", weights_only=True)
             if not isinstance(state["state_dict"], dict):
-                raise ValueError("it holds something else")
+                raise ValueError("it is not a state")
             whole_number(state["global_step"], "global_step")
         except Exception as error:  # a damaged zip or pickle raises whatever its bytes lead to
             raise MitsonarError(
@@ -394,7 +394,7 @@ class RunFolder:
         """Return the path of the best network."""
         return self.path / "network.ckpt"
 
-    def known(self) -> RunDirectory | None:
+    def earlier_run(self) -> RunDirectory | None:
         """Return the earlier run in the folder, if there is one; its arguments may differ.
 
         Raises:
@@ -403,13 +403,13 @@ class RunFolder:
         return RunDirectory.open(self.path, TRAINING) if (self.path / RUN_FILE).is_file() else None
 
     def begin(
-        self, recipe: TrainingRecipe, asked: JsonObject, notes: JsonObject, *, resume: bool, overwrite: bool
+        self, recipe: TrainingRecipe, arguments: JsonObject, notes: JsonObject, *, resume: bool, overwrite: bool
     ) -> RunDirectory | None:
         """Create the folder, or resume the run in it, and return the resumed run.
 
         Args:
             recipe: of the training.
-            asked: further arguments that a resumed run must repeat to reach the same weights.
+            arguments: further arguments that a resumed run must repeat to reach the same weights.
             notes: other facts about the run.
             resume: resume a run in the folder.
             overwrite: replace a run in the folder.
@@ -419,8 +419,8 @@ class RunFolder:
         """
         if not self.writes:
             return None
-        asked = {**asked, "recipe": recipe.plain()}
-        self.run = RunDirectory.begin(self.path, TRAINING, asked, resume=resume, overwrite=overwrite)
+        arguments = {**arguments, "recipe": recipe.plain()}
+        self.run = RunDirectory.begin(self.path, TRAINING, arguments, resume=resume, overwrite=overwrite)
         self.run.start(**notes, machine=machine())
         if not (self.path / "recipe.yaml").is_file():
             text = yaml.safe_dump(recipe.plain(), sort_keys=False, allow_unicode=True)
@@ -477,25 +477,27 @@ def curve_figure(rows: list[JsonObject], zero: list[float], axes: tuple[Axis, ..
     panels[0].plot(pairs, [row["loss"] for row in rows], color="0.2", marker=".")
     panels[0].set(title="training loss", ylabel="loss")
     suffix = f" {axes[0].name} ({axes[0].unit})"
-    shown = [key.removesuffix(suffix) for key in rows[0] if key.endswith(suffix)]
-    for panel, axis, still in zip(panels[1:], axes, zero, strict=True):
+    sources = [key.removesuffix(suffix) for key in rows[0] if key.endswith(suffix)]
+    for panel, axis, no_motion in zip(panels[1:], axes, zero, strict=True):
         curves = []
-        for what in shown:
-            points = [(row["pairs"], row[column(what, axis)]) for row in rows if row.get(column(what, axis)) is not None]
+        for source in sources:
+            points = [(row["pairs"], row[column(source, axis)]) for row in rows if row.get(column(source, axis)) is not None]
             curves.append([value for _, value in points])
-            style = {"color": "0.6"} if what == TRAINED else {"marker": "."}
-            panel.plot(*zip(*points, strict=True), label=what if what == TRAINED else f"validation, noise {what}", **style)
-        panel.axhline(still, color="0.6", linestyle=":", label="no motion" if len(axes) > 1 else "zero")
+            style = {"color": "0.6"} if source == TRAINED else {"marker": "."}
+            panel.plot(
+                *zip(*points, strict=True), label=source if source == TRAINED else f"validation, noise {source}", **style
+            )
+        panel.axhline(no_motion, color="0.6", linestyle=":", label="no motion" if len(axes) > 1 else "zero")
         panel.set(title=axis.name, ylabel=f"RMSE ({axis.unit})", yscale="log")
         lowest, highest = min(map(min, curves)), max(map(max, curves))
-        if min(lowest, still) > 0:
-            panel.set_ylim(min(lowest, still / 5) / 1.2, max(highest, still) * 1.2)
+        if min(lowest, no_motion) > 0:
+            panel.set_ylim(min(lowest, no_motion / 5) / 1.2, max(highest, no_motion) * 1.2)
         panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         panel.yaxis.set_major_formatter(FormatStrFormatter("%g"))
         panel.yaxis.set_minor_formatter(NullFormatter())
     for panel in panels:
         panel.set(xlabel="training samples seen")
-        if pairs[-1] >= WIDE * pairs[0]:
+        if pairs[-1] >= LOG_AXIS_RATIO * pairs[0]:
             panel.set_xscale("log")
             panel.xaxis.set_minor_formatter(NullFormatter())
         panel.xaxis.set_major_formatter(EngFormatter(sep=""))

@@ -29,7 +29,7 @@ from mitsonar.training.step import NetworkTraining, network_for
 
 __all__ = ["leads", "train"]
 
-MOST_AT_ONCE = 1024
+MAX_COUNT = 1024
 """Largest valid number of threads or processes in the record of a run."""
 
 
@@ -50,9 +50,9 @@ def train(
         MitsonarError: options contradict each other, which is checked before training begins, or the loss is not finite.
     """
     recipe, folder = options.changed_recipe(), RunFolder(Path(options.out), writes=leads())
-    known = folder.known() if options.resume else None
-    gain = None if known is None else known.amount("gain")
-    threads = options.threads or (known.count("threads", MOST_AT_ONCE) if known is not None else None)
+    earlier = folder.earlier_run() if options.resume else None
+    gain = None if earlier is None else earlier.amount("gain")
+    threads = options.threads or (earlier.count("threads", MAX_COUNT) if earlier is not None else None)
     material = material_of(recipe, options.data, render=options.render, gain=gain)
     network = network_for(recipe, material)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster convolutions
@@ -60,7 +60,7 @@ def train(
         module = NetworkTraining(network, recipe, material)
         journal = Journal(folder, module, material, options, progress, stop)
         trainer = _trainer(journal, options)
-        module.workers = _workers(options, known, trainer)
+        module.workers = _workers(options, earlier, trainer)
         _begin(journal, trainer, options)
         _fit(journal, trainer, options)
     if journal.stopped:
@@ -71,7 +71,7 @@ def train(
 def _begin(journal: Journal, trainer: lightning.Trainer, options: TrainOptions) -> None:
     """Create the folder of the run, or check that it contains the same run."""
     material, module = journal.material, journal.module
-    asked = {
+    arguments = {
         "data": material.about["name"],
         "digest": material.about["digest"],
         "render": options.render,
@@ -85,8 +85,8 @@ def _begin(journal: Journal, trainer: lightning.Trainer, options: TrainOptions) 
         "epoch_samples": material.epoch,
         "steps": module.steps,
     }
-    earlier = journal.folder.begin(module.recipe, asked, notes, resume=options.resume, overwrite=options.overwrite)
-    _warn_of_other_bits(earlier, notes)
+    earlier = journal.folder.begin(module.recipe, arguments, notes, resume=options.resume, overwrite=options.overwrite)
+    _warn_of_changes(earlier, notes)
 
 
 def _fit(journal: Journal, trainer: lightning.Trainer, options: TrainOptions) -> None:
@@ -111,8 +111,8 @@ def _position(state: Path | None, journal: Journal) -> tuple[int, float]:
     """Return the steps done and minutes used in a state; zeros without a state."""
     if state is None:
         return 0, 0.0
-    begun = StateFile().load_checkpoint(state)
-    return begun["global_step"], float(begun["callbacks"][journal.state_key]["minutes"])
+    state_dict = StateFile().load_checkpoint(state)
+    return state_dict["global_step"], float(state_dict["callbacks"][journal.state_key]["minutes"])
 
 
 def leads() -> bool:
@@ -168,31 +168,33 @@ def _tensorboard(folder: RunFolder) -> TensorBoardLogger | bool:
     return TensorBoardLogger(folder.path, name="", version=EVENTS)
 
 
-def _workers(options: TrainOptions, known: RunDirectory | None, trainer: lightning.Trainer) -> int:
+def _workers(options: TrainOptions, earlier: RunDirectory | None, trainer: lightning.Trainer) -> int:
     """Return the number of processes that read or render: that of the earlier run, or one that suits the machine."""
     if options.workers is not None:
         return options.workers
     cores = len(os.sched_getaffinity(0)) // max(1, trainer.world_size)
     on_cpu = trainer.strategy.root_device.type == "cpu"
     if options.render:
-        had = None if known is None else known.asked.get("workers")
-        usual = max(1, cores // 2 if on_cpu else cores - 1)
-        return had if isinstance(had, int) and 0 <= had <= MOST_AT_ONCE else usual
+        workers = None if earlier is None else earlier.asked.get("workers")
+        default = max(1, cores // 2 if on_cpu else cores - 1)
+        return workers if isinstance(workers, int) and 0 <= workers <= MAX_COUNT else default
     return (1 if cores > 2 else 0) if on_cpu else max(1, min(8, cores - 1))
 
 
-def _warn_of_other_bits(had: RunDirectory | None, notes: JsonObject) -> None:
+def _warn_of_changes(earlier: RunDirectory | None, notes: JsonObject) -> None:
     """Warn of differences because of which a resumed run ends with other bits than an uninterrupted one."""
-    if had is None:
+    if earlier is None:
         return
-    other = [
-        f"{key} {had.notes.get(key)} (now {notes[key]})"
+    changes = [
+        f"{key} {earlier.notes.get(key)} (now {notes[key]})"
         for key in ("threads", "accelerator")
-        if had.notes.get(key) != notes[key]
+        if earlier.notes.get(key) != notes[key]
     ]
-    for change in other + other_versions(had.versions, ("mitsonar", "torch")):
+    for change in changes + other_versions(earlier.versions, ("mitsonar", "torch")):
         warnings.warn(
-            f"the run was begun with {change}: it goes on, but not to the same bits", MitsonarWarning, stacklevel=4
+            f"the run was begun with {change}: it is resumed, but will not end with the same bits",
+            MitsonarWarning,
+            stacklevel=4,
         )
 
 
@@ -200,23 +202,23 @@ def _warn_of_other_bits(had: RunDirectory | None, notes: JsonObject) -> None:
 def _quiet() -> Iterator[None]:
     """Silence Lightning; everything important is raised as an error or part of a report."""
     logs = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric", "lightning_utilities")]
-    levels = [log.level for log in logs]
+    levels = [logger.level for logger in logs]
     with warnings.catch_warnings():
         for origin in ("lightning", "torch"):
             warnings.filterwarnings("ignore", module=origin)
-        for log in logs:
-            log.setLevel(logging.ERROR)
+        for logger in logs:
+            logger.setLevel(logging.ERROR)
         try:
             yield
         finally:
-            for log, level in zip(logs, levels, strict=True):
-                log.setLevel(level)
+            for logger, level in zip(logs, levels, strict=True):
+                logger.setLevel(level)
 
 
 @contextmanager
 def _settings(threads: int | None) -> Iterator[None]:
     """Set torch's number of threads for this training, and restore threads and algorithms afterwards."""
-    had, exact = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    thread_count, deterministic_algorithms = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
     filled = deterministic.fill_uninitialized_memory  # type: ignore[attr-defined]
     if threads:
@@ -224,6 +226,6 @@ def _settings(threads: int | None) -> Iterator[None]:
     try:
         yield
     finally:
-        torch.set_num_threads(had)
-        torch.use_deterministic_algorithms(exact, warn_only=warn_only)
+        torch.set_num_threads(thread_count)
+        torch.use_deterministic_algorithms(deterministic_algorithms, warn_only=warn_only)
         deterministic.fill_uninitialized_memory = filled  # type: ignore[attr-defined]
