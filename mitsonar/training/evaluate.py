@@ -37,7 +37,7 @@ NOISES = ("none", "low", "high")
 SAME_INSTRUMENT = ("name", "model", "seed", "rays", "points_per_m2", "scatterer_spacing_m")
 """Keys in which two channel sonars may differ and still count as the same instrument."""
 
-TIMED = 20
+TIMED_PAIRS = 20
 """Number of pairs over which the time of one estimate is measured."""
 
 
@@ -66,15 +66,15 @@ def predictions(
     """
     torch_device = _device(device)
     network = checkpoint.build().to(torch_device)
-    wanted = range(len(pairs)) if numbers is None else numbers
-    found = []
+    indices = range(len(pairs)) if numbers is None else numbers
+    decoded = []
     with torch.inference_mode():
-        for start in range(0, len(wanted), batch):
-            raw = default_collate([pairs.raw(number) for number in wanted[start : start + batch]])
-            found.append(checkpoint.decode(answer_of(network, pairs.finished(raw, torch_device)[0])))
-            progress(len(found[-1][0]))
-    targets = np.concatenate([targets for targets, _ in found])
-    covariances = [covariance for _, covariance in found if covariance is not None]
+        for start in range(0, len(indices), batch):
+            raw = default_collate([pairs.raw(index) for index in indices[start : start + batch]])
+            decoded.append(checkpoint.decode(answer_of(network, pairs.finished(raw, torch_device)[0])))
+            progress(len(decoded[-1][0]))
+    targets = np.concatenate([targets for targets, _ in decoded])
+    covariances = [covariance for _, covariance in decoded if covariance is not None]
     return targets, np.concatenate(covariances) if covariances else None
 
 
@@ -117,20 +117,22 @@ def evaluate(
     Raises:
         MitsonarError: the sonar differs from that of training, views or arrays are missing, or there are no samples.
     """
-    others = _other_sonars(checkpoint, DataStore.open(data).recipe)
-    if others and not force:
-        raise MitsonarError(f"{'; '.join(others)}: evaluate on that sonar, or force it with --force")
+    sonar_differences = _sonar_differences(checkpoint, DataStore.open(data).recipe)
+    if sonar_differences and not force:
+        raise MitsonarError(f"{'; '.join(sonar_differences)}: evaluate on the sonar of training, or use --force")
     split = checkpoint.recipe.get("split") if split is None else split
-    usual = NOISES[:1] if checkpoint.channel is not None else NOISES
-    levels = list(dict.fromkeys(usual if noise is None else noise))
+    default_levels = NOISES[:1] if checkpoint.channel is not None else NOISES
+    levels = list(dict.fromkeys(default_levels if noise is None else noise))
     samples = {level: samples_for(checkpoint, data, part=part, split=split, noise=level, seed=seed) for level in levels}
     subject = _Subject.of(samples[levels[0]], pairs, seed)
-    ms = _milliseconds(checkpoint, samples_for(checkpoint, data, part=part, split=split, seed=seed), subject.numbers[:TIMED])
+    ms = _milliseconds(
+        checkpoint, samples_for(checkpoint, data, part=part, split=split, seed=seed), subject.numbers[:TIMED_PAIRS]
+    )
     progress, tables = begin(len(levels) * len(subject.numbers)), []
     for level in levels:
-        found = predictions(checkpoint, samples[level], batch, numbers=subject.numbers, device=device, progress=progress)
-        tables.append({"noise": level, "variation": "as told", **_table(checkpoint, subject, ms, *found)})
-    return _report(checkpoint, data, part, samples[levels[0]], subject, others, tables)
+        predicted = predictions(checkpoint, samples[level], batch, numbers=subject.numbers, device=device, progress=progress)
+        tables.append({"noise": level, "variation": "as told", **_table(checkpoint, subject, ms, *predicted)})
+    return _report(checkpoint, data, part, samples[levels[0]], subject, sonar_differences, tables)
 
 
 @dataclass(frozen=True)
@@ -166,7 +168,7 @@ def _report(
     part: str | None,
     samples: SonarPairs | ImpulsePairs,
     subject: _Subject,
-    others: list[str],
+    sonar_differences: list[str],
     tables: list[JsonObject],
 ) -> JsonObject:
     """Return the report of an evaluation; see :func:`evaluate`."""
@@ -184,7 +186,7 @@ def _report(
         "scenes": subject.scenes,
         "names": list(checkpoint.labels["names"]),
         "seed": subject.seed,
-        "notes": [*others, *_learnt_of(checkpoint, samples, subject), *_notes(checkpoint, recipe)],
+        "notes": [*sonar_differences, *_seen_note(checkpoint, samples, subject), *_notes(checkpoint, recipe)],
         "tables": tables,
     }
 
@@ -204,12 +206,12 @@ def samples_for(
         MitsonarError: the data set lacks an input of the network, or has no samples in that part.
     """
     recipe = DataStore.open(data).recipe
-    words = {"noise": noise, "labels": checkpoint.labels["kind"], "seed": seed, "one_a_sequence": recipe.recorded is None}
+    options = {"noise": noise, "labels": checkpoint.labels["kind"], "seed": seed, "one_a_sequence": recipe.recorded is None}
     if part is None:
         part = split_for(split, recipe).unseen
     if checkpoint.channel is not None:
-        return ImpulsePairs(data, part=part, split=split, frames=checkpoint.arrangement["frames"], **words)
-    return SonarPairs(data, part=part, split=split, **checkpoint.arrangement, **words)
+        return ImpulsePairs(data, part=part, split=split, frames=checkpoint.arrangement["frames"], **options)
+    return SonarPairs(data, part=part, split=split, **checkpoint.arrangement, **options)
 
 
 def _device(device: torch.device | str | None) -> torch.device:
@@ -219,14 +221,14 @@ def _device(device: torch.device | str | None) -> torch.device:
 def _milliseconds(checkpoint: Checkpoint, pairs: SonarPairs | ImpulsePairs, numbers: Sequence[int]) -> float:
     """Measure the median CPU time per sample on one core [ms], from the frames (and their geometry) to the estimate."""
     network = checkpoint.build()
-    spent = []
+    times_ms = []
     with torch.inference_mode(), one_thread():
         for number in [numbers[0], *numbers]:
             raw = default_collate([pairs.raw(number)])
-            begun = time.process_time()
+            started = time.process_time()
             answer_of(network, pairs.finished(raw)[0])
-            spent.append(1e3 * (time.process_time() - begun))
-    return float(np.median(spent[1:]))  # the first sample warms up
+            times_ms.append(1e3 * (time.process_time() - started))
+    return float(np.median(times_ms[1:]))  # the first sample warms up
 
 
 # ---------------- Error tables
@@ -245,16 +247,16 @@ def _table(checkpoint: Checkpoint, subject: _Subject, ms: float, estimates: Arra
             checkpoint.network: Answers(estimates, valid, covariances, np.full(len(truth), ms)),
             "zero": Answers(np.zeros_like(truth), valid, nan, np.zeros(len(truth))),
         }
-        rows = [_of_axes(row.plain(), axes) for row in rows_of(answers, inputs, truth, resamples, reference="zero")]
+        rows = [_first_axes(row.plain(), axes) for row in rows_of(answers, inputs, truth, resamples, reference="zero")]
         scale = np.array([1, 1, 100])[:axes]
     # Heights: the baseline is the middle of the training heights, since zero is no height.
     else:
         middle = np.full_like(truth, checkpoint.coder.low.mean() / 2 + checkpoint.coder.high.mean() / 2)
-        found = {checkpoint.network: estimates, "zero": middle}
+        by_method = {checkpoint.network: estimates, "zero": middle}
         times = {checkpoint.network: ms, "zero": 0.0}
         rows = [
             {"method": name, "inputs": inputs[name], "ms": times[name], **_height_errors(values, truth, middle, resamples)}
-            for name, values in found.items()
+            for name, values in by_method.items()
         ]
         scale = np.ones(1)
     for row in rows:
@@ -270,8 +272,8 @@ def _correlations(error: Array, axes: int) -> dict[str, float | None]:
         with np.errstate(invalid="ignore"):
             table = np.atleast_2d(np.corrcoef(error[:, :axes], rowvar=False))
     return {
-        f"{AXES[one].name}-{AXES[other].name}": float(table[one, other]) if np.isfinite(table[one, other]) else None
-        for one, other in combinations(range(axes), 2)
+        f"{AXES[first].name}-{AXES[second].name}": float(table[first, second]) if np.isfinite(table[first, second]) else None
+        for first, second in combinations(range(axes), 2)
     }
 
 
@@ -280,7 +282,7 @@ def _with_yaw(motion: Array) -> Array:
     return np.hstack([motion, np.zeros((len(motion), len(AXES) - motion.shape[1]))])
 
 
-def _of_axes(row: JsonObject, axes: int) -> JsonObject:
+def _first_axes(row: JsonObject, axes: int) -> JsonObject:
     """Return a row with the values of its first axes only."""
     return {name: value[:axes] if isinstance(value, list) else value for name, value in row.items()}
 
@@ -291,12 +293,12 @@ def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArr
     Errors are in mm. ``zero`` is the RMSE of a constant estimate, the middle of the training heights. The slope is that of
     estimated against true differences from this middle.
     """
-    error, side = 1e3 * (heights - truth), 1e3 * (truth - middle)
-    rmse, zero = (float(np.sqrt((values**2).mean())) for values in (error, side))
+    error, offset = 1e3 * (heights - truth), 1e3 * (truth - middle)
+    rmse, zero = (float(np.sqrt((values**2).mean())) for values in (error, offset))
     low, high = np.percentile(np.sqrt((error[resamples, 0] ** 2).mean(axis=1)), [2.5, 97.5])
-    far = np.abs(side) > 0.5 * np.abs(side).max()
-    power = float((side**2).sum())
-    slope = float(((1e3 * (heights - middle)) * side).sum()) / power if power else None
+    large = np.abs(offset) > 0.5 * np.abs(offset).max()
+    power = float((offset**2).sum())
+    slope = float(((1e3 * (heights - middle)) * offset).sum()) / power if power else None
     return {
         "pairs": len(truth),
         "failures": 0,
@@ -307,7 +309,7 @@ def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArr
         "p95": [float(np.percentile(np.abs(error), 95))],
         "bias": [float(error.mean())],
         "slope": [slope],
-        "large": [float(np.sqrt((error[far] ** 2).mean())) if far.any() else None],
+        "large": [float(np.sqrt((error[large] ** 2).mean())) if large.any() else None],
         "zero": [zero],
         "skill": [1 - rmse / zero if zero else None],
         "nees": None,
@@ -326,55 +328,55 @@ def _beyond(checkpoint: Checkpoint, truth: Array, estimates: Array) -> dict[str,
 # ---------------- Differences from training
 
 
-def _other_sonars(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
+def _sonar_differences(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
     """Describe the sonars of a data set that differ from those of training."""
     if checkpoint.channel is not None:
-        return _other_channel(checkpoint.channel, recipe.channel_sonar, recipe.name)
-    found = []
+        return _channel_differences(checkpoint.channel, recipe.channel_sonar, recipe.name)
+    differences = []
     for view in recipe.views:
         trained = checkpoint.sonars.get(view.name)
         if trained is None:
             continue
-        unlike = TrainedInstrument.of(trained).unlike(TrainedInstrument.of(view.sonar))
-        if unlike:
-            found.append(
+        difference = TrainedInstrument.of(trained).unlike(TrainedInstrument.of(view.sonar))
+        if difference:
+            differences.append(
                 f"the {checkpoint.network} was trained on the sonar {trained.name}, the data set {recipe.name} is of "
-                f"{view.sonar.name}: {unlike}"
+                f"{view.sonar.name}: {difference}"
             )
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(differences))
 
 
-def _other_channel(trained: ChannelSonar, other: ChannelSonar, name: str) -> list[str]:
+def _channel_differences(trained: ChannelSonar, evaluated: ChannelSonar, name: str) -> list[str]:
     """Describe the differences between two channel sonars that change responses."""
-    mine, its = trained.model_dump(mode="json"), other.model_dump(mode="json")
-    changed = [key for key in mine if mine[key] != its[key] and key not in SAME_INSTRUMENT]
+    trained_fields, evaluated_fields = trained.model_dump(mode="json"), evaluated.model_dump(mode="json")
+    changed = [key for key in trained_fields if trained_fields[key] != evaluated_fields[key] and key not in SAME_INSTRUMENT]
     return [f"trained with another channel sonar than that of {name}: {', '.join(changed)} differ"] if changed else []
 
 
-def _learnt_of(checkpoint: Checkpoint, samples: SonarPairs | ImpulsePairs, subject: _Subject) -> list[str]:
+def _seen_note(checkpoint: Checkpoint, samples: SonarPairs | ImpulsePairs, subject: _Subject) -> list[str]:
     """Return a note on the number of pairs that training has seen, if any."""
     seen = int(checkpoint.learnt(samples)[subject.numbers].sum())
     count = counted(len(subject.numbers), "pair")
-    return [f"training has seen {seen} of these {count}: their errors do not show how it does on others"] if seen else []
+    return [f"training has seen {seen} of these {count}: errors on unseen pairs may be larger"] if seen else []
 
 
 def _notes(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
     """Describe other differences from training."""
-    found = []
+    notes = []
     model = modality_of(recipe).sonar.model
     if model not in checkpoint.model.split(" and "):
-        found.append(f"trained on the {checkpoint.model} model, evaluated on the {model} model")
+        notes.append(f"trained on the {checkpoint.model} model, evaluated on the {model} model")
     if not checkpoint.arrangement["ground"]:
         low, high = (height + recipe.mount.up_m for height in recipe.flight.heights)
         trained = checkpoint.trained_at
         heights = low < trained["height_m"][0] * (1 - HEIGHT_OFF) or high > trained["height_m"][1] * (1 + HEIGHT_OFF)
         angles = [abs(getattr(recipe.mount, key) - trained[key]) > ANGLE_OFF_DEG for key in ("pitch_deg", "roll_deg")]
         if heights or any(angles):
-            found.append(
+            notes.append(
                 f"{checkpoint.fixed} are fixed by training; here the sonar is at {low:g}..{high:g} m, pitch "
                 f"{recipe.mount.pitch_deg:g} deg, roll {recipe.mount.roll_deg:g} deg"
             )
-    return found
+    return notes
 
 
 # ---------------- Output of the tables
@@ -413,7 +415,7 @@ def refuse_tables(out: Path, *, overwrite: bool) -> None:
         MitsonarError: the folder contains tables, or the path is a file.
     """
     if out.exists() and not out.is_dir():
-        raise MitsonarError(f"-o is a folder: got the file {out}")
+        raise MitsonarError(f"-o must be a folder: got the file {out}")
     refuse_to_replace(out / "table.md", out / "table.json", overwrite=overwrite)
 
 
