@@ -151,15 +151,15 @@ def material_of(
     """
     sets = [] if data is None else [data] if isinstance(data, str | Path) else list(data)
     if not sets and not render:
-        raise MitsonarError("a training needs samples: give --data DATA.zarr, or --render to have them rendered")
+        raise MitsonarError("training needs samples: give --data DATA.zarr, or --render to render them")
     if not render:
         return _stored(recipe, sets)
     if len(sets) > 1:
         raise MitsonarError(
-            f"with --render one data set is for validation: got {len(sets)}; leave out --render, or all but one"
+            f"with --render at most one data set, for validation: got {len(sets)}; omit --render, or give one"
         )
     if recipe.input.kind == "response":
-        raise MitsonarError("impulse responses are not rendered in training: make a data set, and leave out --render")
+        raise MitsonarError("impulse responses are not rendered in training: make a data set, and omit --render")
     stored = _part(recipe, sets[0], "validation", labels="raw") if sets else None
     assert not isinstance(stored, ImpulsePairs)
     world = load_recipe(recipe.data, recipe.data_changes) if stored is None else stored.recipe
@@ -168,15 +168,17 @@ def material_of(
         gain = calibrate(world) if stored is None else float(stored.store.about["gain"])
     samples = RenderedPairs(world, gain=gain, **recipe.arrangement())
     share = world.split.train if recipe.split == world.split.by else 1.0
-    each = world.flight.pings - samples.frames + 1
+    per_sequence = world.flight.pings - samples.frames + 1
     validation = _rendered_validation(recipe, world, gain) if stored is None else _validation(recipe, stored)
     about = {"name": world.name, "digest": world.digest("rendered"), "gain": gain}
-    return Material(samples, None, max(1, round(world.sequences * share * recipe.part_of_data)) * each, validation, about)
+    return Material(
+        samples, None, max(1, round(world.sequences * share * recipe.part_of_data)) * per_sequence, validation, about
+    )
 
 
 def _stored(recipe: TrainingRecipe, sets: list[str | Path]) -> Material:
     pairs = _joined(recipe, sets, "train")
-    numbers = np.flatnonzero(_within(recipe, pairs))
+    numbers = np.flatnonzero(_in_used_part(recipe, pairs))
     if len(numbers) < recipe.batch:
         raise MitsonarError(
             f"{' and '.join(map(str, sets))}: {len(numbers)} samples for training, fewer than a batch of {recipe.batch}: "
@@ -186,50 +188,49 @@ def _stored(recipe: TrainingRecipe, sets: list[str | Path]) -> Material:
     return Material(pairs, numbers, len(numbers), validation, _about(pairs))
 
 
-def _joined(recipe: TrainingRecipe, sets: list[str | Path], part: str, **words: str) -> Stored:
+def _joined(recipe: TrainingRecipe, sets: list[str | Path], part: str, **options: str) -> Stored:
     """Open a part of one data set, or of several as one.
 
     Raises:
         MitsonarError: several data sets hold impulse responses, or do not fit each other.
     """
     if len(sets) == 1:
-        return _part(recipe, sets[0], part, **words)
-    opened = [_part(recipe, one, part, **words) for one in sets]
-    pairs = [one for one in opened if isinstance(one, SonarPairs)]
+        return _part(recipe, sets[0], part, **options)
+    opened = [_part(recipe, data, part, **options) for data in sets]
+    pairs = [samples for samples in opened if isinstance(samples, SonarPairs)]
     if len(pairs) < len(opened):
-        raise MitsonarError(f"impulse responses are learnt from one data set: got {len(sets)}; give --data once")
+        raise MitsonarError(f"training on impulse responses takes one data set: got {len(sets)}; give --data once")
     return JoinedPairs(pairs)
 
 
 def _about(pairs: Stored) -> JsonObject:
     """Return name, digest and gain of the data, which must be the same in a resumed run; joined data sets have no gain."""
     if not isinstance(pairs, JoinedPairs):
-        own, gain = pairs.recipe.digest(len(pairs.store)), pairs.store.about.get("gain")
-        return {"name": pairs.recipe.name, "digest": own, "gain": gain}
+        data_digest, gain = pairs.recipe.digest(len(pairs.store)), pairs.store.about.get("gain")
+        return {"name": pairs.recipe.name, "digest": data_digest, "gain": gain}
     digests = [part.recipe.digest(len(part.store)) for part in pairs.parts]
     return {"name": pairs.described()["data"], "digest": digest(" ".join(digests))[:16], "gain": None}
 
 
-def _part(recipe: TrainingRecipe, data: str | Path, part: str, **words: str) -> SonarPairs | ImpulsePairs:
+def _part(recipe: TrainingRecipe, data: str | Path, part: str, **options: str) -> SonarPairs | ImpulsePairs:
     kind = ImpulsePairs if recipe.input.kind == "response" else SonarPairs
-    return kind(data, part=part, split=recipe.split_of, **{**recipe.arrangement(), **words})
+    return kind(data, part=part, split=recipe.split_of, **{**recipe.arrangement(), **options})
 
 
-def _within(recipe: TrainingRecipe, pairs: Stored) -> NDArray[np.bool_]:
+def _in_used_part(recipe: TrainingRecipe, pairs: Stored) -> NDArray[np.bool_]:
     """Mark the samples ``(samples,)`` that lie in the used part of the data, which is the first frames of each data set."""
     if isinstance(pairs, JoinedPairs):
-        return np.concatenate([_within(recipe, part) for part in pairs.parts])
+        return np.concatenate([_in_used_part(recipe, part) for part in pairs.parts])
     return np.asarray(pairs.first + pairs.frames <= recipe.part_of_data * len(pairs.store))
 
 
 def _validation(recipe: TrainingRecipe, pairs: Stored) -> Validation:
     """Choose stored validation samples from as many sequences as possible."""
-    wanted = recipe.validation
-    numbers = np.flatnonzero(_within(recipe, pairs))
+    settings = recipe.validation
+    numbers = np.flatnonzero(_in_used_part(recipe, pairs))
     if not len(numbers):
         raise MitsonarError(
-            f"the part of the data that is used, {recipe.part_of_data:g}, holds no validation sample: raise "
-            "part_of_data, or make more"
+            f"the used part of the data, {recipe.part_of_data:g}, has no validation sample: raise part_of_data, or make more"
         )
     numbers = np.random.default_rng([recipe.seed, CHOICE]).permutation(numbers)
     # Rank the samples within their sequence: take the first sample of each sequence, then the second ...
@@ -238,19 +239,19 @@ def _validation(recipe: TrainingRecipe, pairs: Stored) -> Validation:
     starts = np.flatnonzero(np.diff(sequence[order], prepend=-1))
     rank = np.empty(len(numbers), dtype=np.int64)
     rank[order] = np.arange(len(numbers)) - np.repeat(starts, np.diff(starts, append=len(numbers)))
-    chosen = numbers[np.argsort(rank, kind="stable")][: wanted.pairs]
-    return Validation(pairs, sorted(int(number) for number in chosen), [*wanted.noise, *recipe.noises])
+    chosen = numbers[np.argsort(rank, kind="stable")][: settings.pairs]
+    return Validation(pairs, sorted(int(number) for number in chosen), [*settings.noise, *recipe.noises])
 
 
 def _rendered_validation(recipe: TrainingRecipe, world: Recipe, gain: float) -> Validation:
     """Render validation samples of a few worlds that training does not use."""
-    wanted = recipe.validation
-    count = wanted.pairs or 500
-    words = {**recipe.arrangement(), "labels": "raw", "seed": seed_of(recipe.seed, WORLDS) >> 33}
-    each = world.flight.pings - recipe.input.frames + 1
-    length = -(-count // (max(each, 1) * VALIDATION_WORLDS))
-    samples = RenderedPairs(world, gain=gain, length=count, buffer=1, sequences_a_world=length, **words)
-    return Validation(samples, list(samples.raw()), [*wanted.noise, *recipe.noises])
+    settings = recipe.validation
+    count = settings.pairs or 500
+    options = {**recipe.arrangement(), "labels": "raw", "seed": seed_of(recipe.seed, WORLDS) >> 33}
+    per_sequence = world.flight.pings - recipe.input.frames + 1
+    length = -(-count // (max(per_sequence, 1) * VALIDATION_WORLDS))
+    samples = RenderedPairs(world, gain=gain, length=count, buffer=1, sequences_a_world=length, **options)
+    return Validation(samples, list(samples.raw()), [*settings.noise, *recipe.noises])
 
 
 # ---------------- Batches
@@ -280,20 +281,20 @@ def batches(
         workers: number of processes that read or render.
         share: index of this device, and number of devices.
     """
-    together = _Together(material.samples, finish=device.type == "cpu")
-    words: JsonObject = {
+    collation = _Collation(material.samples, finish=device.type == "cpu")
+    options: JsonObject = {
         "num_workers": workers,
-        "collate_fn": together,
+        "collate_fn": collation,
         "pin_memory": device.type == "cuda",
         "multiprocessing_context": "spawn" if workers else None,  # a fork is unsafe once the ray tracer runs
         "worker_init_fn": _leave_signals,
     }
     size = recipe.batch // share[1]
     if isinstance(material.samples, RenderedPairs):
-        return DataLoader(RawStream(material.samples, size, start, share), batch_size=size, **words)
+        return DataLoader(RawStream(material.samples, size, start, share), batch_size=size, **options)
     assert material.numbers is not None
     order = Order(material.numbers, recipe.batch, recipe.seed, start, stop, share)
-    return DataLoader(_Stored(material.samples), batch_sampler=order, **words)
+    return DataLoader(_Stored(material.samples), batch_sampler=order, **options)
 
 
 def _leave_signals(worker: int) -> None:
@@ -315,13 +316,15 @@ class Order(Sampler[list[tuple[int, int]]]):
         self.numbers, self.batch, self.seed, self.start, self.stop, self.share = numbers, batch, seed, start, stop, share
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        one, of = self.share
-        known, order = -1, self.numbers
+        rank, size = self.share
+        current_epoch, order = -1, self.numbers
         for step in range(self.start, self.stop):
             epoch, position = divmod(step, len(self.numbers) // self.batch)
-            if epoch != known:
-                known, order = epoch, np.random.default_rng([self.seed, ORDER, epoch]).permutation(self.numbers)
-            yield [(epoch, int(number)) for number in order[position * self.batch : (position + 1) * self.batch][one::of]]
+            if epoch != current_epoch:
+                current_epoch, order = epoch, np.random.default_rng([self.seed, ORDER, epoch]).permutation(self.numbers)
+            yield [
+                (epoch, int(number)) for number in order[position * self.batch : (position + 1) * self.batch][rank::size]
+            ]
 
 
 @dataclass(frozen=True)
@@ -336,7 +339,7 @@ class _Stored(Dataset[RawSample]):
 
 
 @dataclass(frozen=True)
-class _Together:
+class _Collation:
     """Collation of raw samples to a batch: ``epoch``, ``frames``, and ``raw``, or finished ``inputs`` and ``label``."""
 
     samples: Kind

@@ -69,8 +69,8 @@ def network_for(recipe: TrainingRecipe, material: Material) -> nn.Module:
         receivers = len(material.samples.described()["arrangement"]["views"])
         network = create_network(name, **{**options_for(name, inputs, labels, receivers), **options})
     if recipe.start is not None:
-        _begin_with(network, name, Checkpoint.load(recipe.start))
-    _try(network, name, inputs, labels, material)
+        _load_weights(network, name, Checkpoint.load(recipe.start))
+    _check_shapes(network, name, inputs, labels, material)
     return network.train()
 
 
@@ -80,20 +80,22 @@ def _check_recipe(name: str, recipe: TrainingRecipe) -> None:
     Raises:
         MitsonarError: they do not.
     """
-    words = recipe.input.model_dump()
-    for word, needed in getattr(NETWORKS.get(name), "needs", {}).items():
-        if words[word] != needed:
+    input_options = recipe.input.model_dump()
+    for key, needed in getattr(NETWORKS.get(name), "needs", {}).items():
+        if input_options[key] != needed:
             raise MitsonarError(
-                f"network {name} needs input {word} {needed}: got {words[word]}; set input.{word}={str(needed).lower()}"
+                f"network {name} needs input {key} {needed}: got {input_options[key]}; set input.{key}={str(needed).lower()}"
             )
     if getattr(NETWORKS.get(name), "has_covariance", False) != (recipe.loss.kind == "likelihood"):
-        right = "likelihood, it estimates a covariance" if recipe.loss.kind == "mse" else "mse, it estimates no covariance"
-        raise MitsonarError(f"network {name} is trained with loss.kind {right}: got {recipe.loss.kind}")
+        expected = (
+            "likelihood, it estimates a covariance" if recipe.loss.kind == "mse" else "mse, it estimates no covariance"
+        )
+        raise MitsonarError(f"network {name} is trained with loss.kind {expected}: got {recipe.loss.kind}")
     if recipe.loss.kind == "likelihood" and recipe.labels != "raw":
-        raise MitsonarError(f"loss.kind likelihood is of motions in metres: set labels: raw, got {recipe.labels}")
+        raise MitsonarError(f"loss.kind likelihood needs motions in metres: set labels: raw, got {recipe.labels}")
 
 
-def _try(network: nn.Module, name: str, inputs: NetworkInput, labels: Tensor, material: Material) -> None:
+def _check_shapes(network: nn.Module, name: str, inputs: NetworkInput, labels: Tensor, material: Material) -> None:
     """Check that a network accepts the input and returns as many values as there are labels.
 
     Raises:
@@ -112,12 +114,12 @@ def _try(network: nn.Module, name: str, inputs: NetworkInput, labels: Tensor, ma
         shape = (0, 0)  # a different number of labels cannot be decoded
     if shape != labels.shape:
         raise MitsonarError(
-            f"network {name} gives another number of values than the {labels.shape[1]} of the labels "
-            f"({', '.join(material.samples.labels.names)}): leave out its outputs, or set it to {labels.shape[1]}"
+            f"network {name} returns another number of values than the {labels.shape[1]} of the labels "
+            f"({', '.join(material.samples.labels.names)}): omit its option outputs, or set it to {labels.shape[1]}"
         )
 
 
-def _begin_with(network: nn.Module, name: str, checkpoint: Checkpoint) -> None:
+def _load_weights(network: nn.Module, name: str, checkpoint: Checkpoint) -> None:
     """Load the weights of a trained network from a checkpoint.
 
     Raises:
@@ -126,7 +128,7 @@ def _begin_with(network: nn.Module, name: str, checkpoint: Checkpoint) -> None:
     options = network.options
     if checkpoint.network != name or checkpoint.options != options:
         raise MitsonarError(
-            f"start holds the weights of {checkpoint.network} {checkpoint.options}, the recipe is of {name} {options}: give "
+            f"start holds the weights of {checkpoint.network} {checkpoint.options}, the recipe has {name} {options}: give "
             "a checkpoint of the same network"
         )
     network.load_state_dict(checkpoint.build().state_dict())
@@ -165,9 +167,9 @@ class NetworkTraining(lightning.LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Create the optimiser, Adam or AdamW; its learning rate is set before each step."""
-        wanted = self.recipe.optimiser
-        kind: type[torch.optim.Adam] = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[wanted.kind]
-        return kind(self.network.parameters(), lr=wanted.rate, weight_decay=wanted.weight_decay, fused=True)
+        settings = self.recipe.optimiser
+        kind: type[torch.optim.Adam] = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[settings.kind]
+        return kind(self.network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay, fused=True)
 
     @property
     def rate(self) -> float:
@@ -232,7 +234,7 @@ def rmse_by_level(
     """
     squares: dict[str, list[Array]] = {level: [] for level in validation.arrangements}
     truths: list[Array] = []
-    was = network.training
+    was_training = network.training
     network.eval()
     try:
         with torch.no_grad(), context or nullcontext():
@@ -240,7 +242,7 @@ def rmse_by_level(
                 squares[level].append((estimates(called(network, inputs), labels) - truth) ** 2)
                 truths.append(truth**2)
     finally:
-        network.train(was)
+        network.train(was_training)
     means = {level: np.sqrt(np.concatenate(parts).mean(axis=0)) for level, parts in squares.items()}
     return means, np.asarray(np.sqrt(np.concatenate(truths).mean(axis=0)))
 
@@ -327,7 +329,7 @@ def mirrored(batch: Augmented) -> Augmented:
     This is valid for sonars without roll whose beams are symmetric about the axis.
     """
     images, ground, labels = batch
-    chosen = _some(labels, 0.5)
+    chosen = _random_mask(labels, 0.5)
     images = torch.where(chosen[:, None, None, None], images.flip(-1), images)
     return images, ground, torch.where(chosen[:, None], labels * labels.new_tensor([-1.0, 1.0, -1.0]), labels)
 
@@ -335,7 +337,7 @@ def mirrored(batch: Augmented) -> Augmented:
 def reversed_(batch: Augmented) -> Augmented:
     """Reverse the order of the frames in half of the pairs."""
     images, ground, labels = batch
-    chosen = _some(labels, 0.5)
+    chosen = _random_mask(labels, 0.5)
     images = torch.where(chosen[:, None, None, None], images.flip(1), images)
     return images, ground, torch.where(chosen[:, None], inverse(labels), labels)
 
@@ -343,7 +345,7 @@ def reversed_(batch: Augmented) -> Augmented:
 def strange(batch: Augmented) -> Augmented:
     """Replace the second frame by that of another pair in a share :data:`STRANGERS` of the pairs."""
     images, ground, labels = batch
-    chosen = _some(labels, STRANGERS)
+    chosen = _random_mask(labels, STRANGERS)
     second = torch.where(chosen[:, None, None], images[:, 1].roll(1, dims=0), images[:, 1])
     return torch.stack([images[:, 0], second], dim=1), ground, labels
 
@@ -356,6 +358,6 @@ AUGMENTATIONS: dict[str, Callable[[Augmented], Augmented]] = {
 """Augmentations of a batch, keyed by name."""
 
 
-def _some(labels: Tensor, part: float) -> Tensor:
+def _random_mask(labels: Tensor, part: float) -> Tensor:
     """Draw a mask ``(batch,)`` of the pairs to change."""
     return torch.rand(len(labels), device=labels.device) < part

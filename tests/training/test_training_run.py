@@ -50,7 +50,7 @@ from mitsonar.datasets.samples import (  # noqa: E402
 )
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.corrnet import GaussianHead  # noqa: E402
-from mitsonar.training.data import Order, Validation, _Together, finished, material_of  # noqa: E402
+from mitsonar.training.data import Order, Validation, _Collation, finished, material_of  # noqa: E402
 from mitsonar.training.evaluate import evaluate  # noqa: E402
 from mitsonar.training.journal import TrainingReport, _score  # noqa: E402
 from mitsonar.training.run import train  # noqa: E402
@@ -253,8 +253,8 @@ def test_batches_are_the_same_wherever_they_are_finished(made: Path) -> None:
     samples = material.samples
     assert isinstance(samples, SonarPairs)
     rows = [[{"epoch": epoch, **samples.raw(number)} for epoch, number in batch] for batch in order]
-    read = [_Together(samples, finish=True)(batch) for batch in rows]
-    moved = [_Together(samples, finish=False)(batch) for batch in rows]
+    read = [_Collation(samples, finish=True)(batch) for batch in rows]
+    moved = [_Collation(samples, finish=False)(batch) for batch in rows]
     assert [batch["epoch"] for batch in read] == [1, 1, 1]
     samples.set_epoch(7)
     for one, other, planned in zip(read, moved, order, strict=True):
