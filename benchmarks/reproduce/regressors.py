@@ -4,7 +4,7 @@ They read flattened matrices of 5.2.5. Details that Almanza-Medina does not give
 standardised for support vector machines and Gaussian processes, box constraint and half width of the insensitive tube from
 the targets' interquartile range, kernel scale the root of the number of features (ours, MATLAB samples the data); boosting
 by least squares with a learning rate of 0.1 and trees of at most ten splits; bagged trees see all features. The Gaussian
-process finds its numbers by maximum likelihood.
+process is fitted by maximum likelihood.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ NORMAL_IQR = 1.349
 
 
 class Regression(Protocol):
-    """What scikit-learn's regressors do."""
+    """Interface of scikit-learn's regressors."""
 
     def fit(self, X: Array, y: Array) -> object:
         """Learn from features ``(n, features)`` and targets ``(n,)``."""
 
     def predict(self, X: Array) -> Array:
-        """Targets of features."""
+        """Predict the targets ``(n,)`` of features ``(n, features)``."""
 
 
 def _linear(targets: Array) -> Regression:
@@ -51,16 +51,16 @@ def _linear(targets: Array) -> Regression:
 
 
 def _tree(leaf: int) -> Callable[[Array], Regression]:
-    def made(targets: Array) -> Regression:
+    def build(targets: Array) -> Regression:
         from sklearn.tree import DecisionTreeRegressor
 
         return DecisionTreeRegressor(min_samples_leaf=leaf, random_state=0)  # type: ignore[no-any-return]
 
-    return made
+    return build
 
 
 def _svm(degree: int) -> Callable[[Array], Regression]:
-    def made(targets: Array) -> Regression:
+    def build(targets: Array) -> Regression:
         from sklearn.pipeline import make_pipeline
         from sklearn.preprocessing import StandardScaler
         from sklearn.svm import SVR
@@ -70,7 +70,7 @@ def _svm(degree: int) -> Callable[[Array], Regression]:
         machine = SVR(kernel="poly", degree=degree, coef0=constant, gamma="auto", C=spread, epsilon=spread / 10)
         return make_pipeline(StandardScaler(), machine)  # type: ignore[no-any-return]
 
-    return made
+    return build
 
 
 def _boosted(targets: Array) -> Regression:
@@ -106,20 +106,22 @@ def _rational_quadratic(targets: Array) -> Regression:
 
 
 class Turned:
-    """Features in as many directions as there are samples of training, and what another sample has beside these, as one
-    number more: distances to samples of training stay what they are, and cost less where features are many."""
+    """Projection on the span of the training samples, with the norm of the residual as one further feature.
+
+    Distances to training samples are preserved, at less cost if there are many features.
+    """
 
     def fit(self, X: Array, y: Array | None = None) -> Turned:
-        """Find the directions that samples ``(n, f)`` span."""
+        """Compute an orthonormal basis of the span of samples ``(n, f)``."""
         self.mean = X.mean(axis=0)
         self.axes = np.linalg.qr((X - self.mean).T)[0]
         return self
 
     def transform(self, X: Array) -> Array:
-        """Project samples ``(n, f)`` on these directions ``(n, min(n, f) + 1)``."""
-        turned = (X - self.mean) @ self.axes
-        rest = ((X - self.mean) ** 2).sum(axis=1) - (turned**2).sum(axis=1)
-        return np.column_stack([turned, np.sqrt(np.maximum(rest, 0))])
+        """Project samples ``(n, f)`` on this basis, and append the norm of the residual ``(n, min(n, f) + 1)``."""
+        projected = (X - self.mean) @ self.axes
+        rest = ((X - self.mean) ** 2).sum(axis=1) - (projected**2).sum(axis=1)
+        return np.column_stack([projected, np.sqrt(np.maximum(rest, 0))])
 
 
 REGRESSORS: dict[str, Callable[[Array], Regression]] = {
@@ -134,19 +136,19 @@ REGRESSORS: dict[str, Callable[[Array], Regression]] = {
     "Ensemble (Bagged trees)": _bagged,
     "Rational Quadratic GPR": _rational_quadratic,
 }
-"""By the names of table 5.4: from the targets of training ``(n,)`` [mm] to a regressor."""
+"""Functions that make a regressor for training targets ``(n,)`` [mm], keyed by the names of table 5.4."""
 
 
 @dataclass(frozen=True)
 class RegressionScore:
-    """How one regressor did.
+    """Accuracy and time of one regressor.
 
     Attributes:
         name: of :data:`REGRESSORS`, or ``zero``.
-        rmse_mm: on the samples for validation.
-        zero_mm: of always answering no motion.
-        fit_s, answer_s: seconds for all samples of training, and for all of validation.
-        features: that it was given.
+        rmse_mm: on the validation samples.
+        zero_mm: RMSE of always estimating no motion.
+        fit_s, answer_s: seconds for all training samples, and for all validation samples.
+        features: number of features.
     """
 
     name: str
@@ -158,15 +160,15 @@ class RegressionScore:
 
 
 def flattened(samples: ImpulseSamples, numbers: Iterable[int] | None = None) -> tuple[NDArray[np.float32], Array]:
-    """Packed matrices as rows ``(n, taps 2 M Q)``, and the displacements ``(n, 2 or 3)`` [m, m, rad].
+    """Return packed matrices as rows ``(n, taps 2 M Q)``, and the displacements ``(n, 2 or 3)`` [m, m, rad].
 
     Args:
         samples: of a data set.
         numbers: of the samples; default: all.
     """
-    wanted = range(len(samples)) if numbers is None else list(numbers)
-    rows = np.stack([samples.matrix(number) for number in wanted])
-    return rows.reshape(len(rows), -1), np.array([samples.target(number) for number in wanted])
+    indices = range(len(samples)) if numbers is None else list(numbers)
+    rows = np.stack([samples.matrix(index) for index in indices])
+    return rows.reshape(len(rows), -1), np.array([samples.target(index) for index in indices])
 
 
 def score_all(
@@ -178,67 +180,69 @@ def score_all(
     components: int | None = None,
     progress: Callable[[RegressionScore], object] = lambda score: None,
 ) -> list[RegressionScore]:
-    """Fit regressors and score them, in one direction; default: forward, as Almanza-Medina.
+    """Fit regressors and score them on one axis; default: forward, as Almanza-Medina.
 
     Args:
         train: features ``(n, f)`` and displacements ``(n, 2 or 3)`` [m, m, rad] of :func:`flattened`.
-        test: the same, of samples that are not learnt from.
+        test: the same, of samples that are not used for training.
         axis: 0 sideways, 1 forward.
         names: of :data:`REGRESSORS`; default: all.
-        components: so many principal components of the training's features in place of all features, for speed;
-            standardised, the small ones count as much as the large ones, and answers get worse.
+        components: number of principal components of the training features that replace all features, for speed. Since
+            they are standardised, small ones get the same weight as large ones, and estimates get worse.
         progress: called with each score.
 
     Raises:
         MitsonarError: unknown name, no scikit-learn, samples that do not fit.
     """
-    wanted = list(REGRESSORS) if names is None else list(names)
-    for name in wanted:
+    chosen = list(REGRESSORS) if names is None else list(names)
+    for name in chosen:
         if name not in REGRESSORS:
             raise MitsonarError(f"unknown regressor {name!r}: {nearest_names(name, REGRESSORS)}")
     if axis not in (0, 1):
         raise MitsonarError(f"axis must be 0 (sideways) or 1 (forward): got {axis}")
-    features, others = (np.asarray(part[0], dtype=np.float64) for part in (train, test))
-    learnt, truth = (1e3 * np.asarray(part[1], dtype=np.float64)[:, axis] for part in (train, test))
-    if len(features) < 2 or not len(others) or features.shape[1:] != others.shape[1:]:
+    features, test_features = (np.asarray(part[0], dtype=np.float64) for part in (train, test))
+    train_targets, test_targets = (1e3 * np.asarray(part[1], dtype=np.float64)[:, axis] for part in (train, test))
+    if len(features) < 2 or not len(test_features) or features.shape[1:] != test_features.shape[1:]:
         raise MitsonarError(
-            f"regressors need two samples to learn from and one to answer, with the same features: got {features.shape} and "
-            f"{others.shape}"
+            f"regressors need two training samples and one test sample, with the same features: got {features.shape} and "
+            f"{test_features.shape}"
         )
-    features, others = _fewer(features, others, components)
-    zero = float(np.sqrt((truth**2).mean()))
+    features, test_features = _reduced(features, test_features, components)
+    zero = float(np.sqrt((test_targets**2).mean()))
     scores = []
-    for name in wanted:
-        scores.append(_score(name, features, learnt, others, truth, zero))
+    for name in chosen:
+        scores.append(_score(name, features, train_targets, test_features, test_targets, zero))
         progress(scores[-1])
     return scores
 
 
-def _score(name: str, features: Array, learnt: Array, others: Array, truth: Array, zero: float) -> RegressionScore:
-    """One regressor."""
+def _score(
+    name: str, features: Array, train_targets: Array, test_features: Array, test_targets: Array, zero: float
+) -> RegressionScore:
+    """Fit one regressor and score it."""
     try:
-        regressor = REGRESSORS[name](learnt)
+        regressor = REGRESSORS[name](train_targets)
     except ModuleNotFoundError:
-        raise MitsonarError("classical regressors are scikit-learn's: pip install 'mitsonar[learn]'") from None
-    begun = time.perf_counter()
+        raise MitsonarError("classical regressors need scikit-learn: pip install 'mitsonar[learn]'") from None
+    started = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numbers at the ends of their intervals, iterations that ended
-        regressor.fit(features, learnt)
+        regressor.fit(features, train_targets)
     fitted = time.perf_counter()
-    error = regressor.predict(others) - truth
+    error = regressor.predict(test_features) - test_targets
     answered = time.perf_counter()
     rmse = float(np.sqrt((error**2).mean()))
-    return RegressionScore(name, rmse, zero, fitted - begun, answered - fitted, features.shape[1])
+    return RegressionScore(name, rmse, zero, fitted - started, answered - fitted, features.shape[1])
 
 
-def _fewer(features: Array, others: Array, components: int | None) -> tuple[Array, Array]:
-    """Features that are the same in all samples of training left out; then principal components, if so many are asked."""
-    kept = np.ptp(features, axis=0) > 0
-    features, others = features[:, kept], others[:, kept]
+def _reduced(features: Array, test_features: Array, components: int | None) -> tuple[Array, Array]:
+    """Drop features that are constant in training; then project on principal components, if a number is given."""
+    varying = np.ptp(features, axis=0) > 0
+    features, test_features = features[:, varying], test_features[:, varying]
     if components is None:
-        return features, others
+        return features, test_features
     if not 1 <= components <= min(features.shape):
-        raise MitsonarError(f"components must be 1 to {min(features.shape)} of these samples: got {components}")
+        raise MitsonarError(f"components must be 1 to {min(features.shape)} for these samples: got {components}")
     mean = features.mean(axis=0)
-    _, _, axes = np.linalg.svd(features - mean, full_matrices=False)
-    return (features - mean) @ axes[:components].T, (others - mean) @ axes[:components].T
+    _, _, directions = np.linalg.svd(features - mean, full_matrices=False)
+    return (features - mean) @ directions[:components].T, (test_features - mean) @ directions[:components].T

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 __all__ = ["create_network"]
 
 AnyNetwork: TypeAlias = Any
-"""A module of one of the classes of :mod:`mitsonar.networks.create`, each with attributes of its own."""
+"""A module of one of the classes of :mod:`mitsonar.networks.create`, whose attributes differ."""
 
 
 def create_network(name: str, **options: object) -> AnyNetwork:

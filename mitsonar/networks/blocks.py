@@ -86,11 +86,11 @@ class Network(nn.Module):
         Raises:
             MitsonarError: the number of channels, rows or columns differs.
         """
-        made_for = (self.options.get("channels", 1), *self.options[name])
-        if image.dim() != 4 or tuple(image.shape[1:]) != made_for:
+        expected = (self.options.get("channels", 1), *self.options[name])
+        if image.dim() != 4 or tuple(image.shape[1:]) != expected:
             raise MitsonarError(
-                f"this network reads (batch, {', '.join(map(str, made_for))}): got {tuple(image.shape)}; arrange the frames "
-                f"as in its training, or make it with {name}={list(image.shape[-2:])} and as many channels"
+                f"this network reads (batch, {', '.join(map(str, expected))}): got {tuple(image.shape)}; arrange the frames "
+                f"as in its training, or create it with {name}={list(image.shape[-2:])} and the same channels"
             )
 
 
@@ -170,16 +170,16 @@ def convolutions(table: Table, channels: int, width: float, *, bare_end: bool = 
         bare_end: whether the last convolution has a bias instead of normalisation and ReLU.
     """
     layers: OrderedDict[str, nn.Module] = OrderedDict()
-    for number, (kernel, full, stride) in enumerate(table, start=1):
+    for number, (kernel, full_channels, stride) in enumerate(table, start=1):
         bare = bare_end and number == len(table)
         kind = SameConv2d if bare else convolution
-        layers[f"conv{number}"] = kind(channels, scaled(full, width), kernel, stride)
-        channels = scaled(full, width)
+        layers[f"conv{number}"] = kind(channels, scaled(full_channels, width), kernel, stride)
+        channels = scaled(full_channels, width)
     return layers
 
 
 def column_convolutions(
-    kernels: Sequence[int], table: Sequence[int], across: int, width: float, channels: int = 1
+    kernels: Sequence[int], table: Sequence[int], kernel_columns: int, width: float, channels: int = 1
 ) -> list[nn.Module]:
     """Build convolutions with stride 2 along rows and 1 across columns, which preserve the number of columns.
 
@@ -188,14 +188,14 @@ def column_convolutions(
     Args:
         kernels: number of rows of each kernel.
         table: channels of each convolution.
-        across: number of columns of every kernel.
+        kernel_columns: number of columns of every kernel.
         width: factor on the table's channels.
         channels: of the input.
     """
     layers: list[nn.Module] = []
-    for number, (kernel, full) in enumerate(zip(kernels, table, strict=True), start=1):
-        outputs, bare = scaled(full, width), number == len(kernels)
-        layers.append(SameConv2d(channels, outputs, (kernel, across), (2, 1), bias=bare))
+    for number, (kernel, full_channels) in enumerate(zip(kernels, table, strict=True), start=1):
+        outputs, bare = scaled(full_channels, width), number == len(kernels)
+        layers.append(SameConv2d(channels, outputs, (kernel, kernel_columns), (2, 1), bias=bare))
         layers += [] if bare else [nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
         channels = outputs
     return layers

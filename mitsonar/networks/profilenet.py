@@ -93,11 +93,11 @@ class ProfileNet(Network):
             raise MitsonarError(f"windows must be at most the {levels} levels: got {windows}")
         self.options |= {"filters": filters, "taps": taps, "lags": lags, "windows": windows}
         self.portions, self.lags, self.windows = columns // 2, lags, windows
-        made, shifts, hidden = (max(1, round(n * width)) for n in (filters, 48, 128))
+        filter_count, shifts, hidden = (max(1, round(n * width)) for n in (filters, 48, 128))
         self.level = nn.BatchNorm1d(levels, eps=FAINT, affine=False)
-        self.filter = nn.Conv1d(1, made, taps, padding=taps // 2, bias=False)
-        self.shift = nn.Linear(made * (2 * lags + 1) * windows, shifts)
-        self.change = nn.Linear(made * windows, max(1, shifts // 3))
+        self.filter = nn.Conv1d(1, filter_count, taps, padding=taps // 2, bias=False)
+        self.shift = nn.Linear(filter_count * (2 * lags + 1) * windows, shifts)
+        self.change = nn.Linear(filter_count * windows, max(1, shifts // 3))
         values = self.portions * (shifts + max(1, shifts // 3))
         self.layers = nn.Sequential(
             *(nn.Dropout(dropout), nn.Linear(values, hidden), nn.GELU()),

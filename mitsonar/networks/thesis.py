@@ -76,7 +76,7 @@ class PoseNet(ConvolutionNetwork):
 
 
 DUAL_VALUES = 1024
-"""Number of values of the fully connected layer that joins both branches (ours: as many as a branch has)."""
+"""Number of values of the fully connected layer that joins both branches (ours: the number of each branch)."""
 
 
 class PoseNetDual(Network):

@@ -322,9 +322,7 @@ class Order(Sampler[list[tuple[int, int]]]):
             epoch, position = divmod(step, len(self.numbers) // self.batch)
             if epoch != current_epoch:
                 current_epoch, order = epoch, np.random.default_rng([self.seed, ORDER, epoch]).permutation(self.numbers)
-            yield [
-                (epoch, int(number)) for number in order[position * self.batch : (position + 1) * self.batch][rank::size]
-            ]
+            yield [(epoch, int(number)) for number in order[position * self.batch : (position + 1) * self.batch][rank::size]]
 
 
 @dataclass(frozen=True)
