@@ -95,25 +95,25 @@ def handedness_of(part: Part, heading_rad: ArrayLike | None = None) -> Handednes
     if pairs is None:
         return _unknown(f"no pairs of frames turn by {np.degrees(LEAST_TURN * spacing):.2g} deg and show the same ground")
     # 2. Measure the rotation that the pictures show, and drop pairs for which there is none.
-    told = _turns(heading, pairs)
-    seen = _seen_turns(part, pairs, REACH * float(np.abs(told).max()))
-    kept = np.isfinite(seen)
-    told, seen = told[kept], seen[kept]
+    given_turns = _given_turns(heading, pairs)
+    observed_turns = _observed_turns(part, pairs, REACH * float(np.abs(given_turns).max()))
+    measured = np.isfinite(observed_turns)
+    given_turns, observed_turns = given_turns[measured], observed_turns[measured]
     # 3. Correlate both about zero rather than about their means, which keeps the information of a turn to one side.
-    energy = float(np.sum(told**2)), float(np.sum(seen**2))
-    if len(told) < FEWEST_PAIRS or min(energy) <= 0:
-        return _unknown("the pictures show no contrast that moves", len(told))
-    both = float(np.sum(told * seen))
-    correlation, slope = both / math.sqrt(energy[0] * energy[1]), both / energy[0]
+    energy = float(np.sum(given_turns**2)), float(np.sum(observed_turns**2))
+    if len(given_turns) < FEWEST_PAIRS or min(energy) <= 0:
+        return _unknown("the pictures show no contrast that moves", len(given_turns))
+    product = float(np.sum(given_turns * observed_turns))
+    correlation, slope = product / math.sqrt(energy[0] * energy[1]), product / energy[0]
     # 4. Decide by the sign of the correlation, if it is significant: for unrelated rotations, its standard deviation is
     #    1 / sqrt(pairs).
-    clear = abs(correlation) >= max(CLEAR, SIGMAS / math.sqrt(len(told))) and abs(slope) >= LEAST_SLOPE
-    rms = float(np.degrees(np.sqrt(np.mean(told**2))))
-    if not clear:
-        few = abs(correlation) >= CLEAR and abs(slope) >= LEAST_SLOPE
-        reason = "there are too few pairs of frames to be sure" if few else "the pictures do not turn as it is told"
-        return Handedness("unknown", correlation, slope, len(told), rms, reason)
-    return Handedness("agree" if correlation > 0 else "mirrored", correlation, slope, len(told), rms)
+    significant = abs(correlation) >= max(CLEAR, SIGMAS / math.sqrt(len(given_turns))) and abs(slope) >= LEAST_SLOPE
+    rms = float(np.degrees(np.sqrt(np.mean(given_turns**2))))
+    if not significant:
+        too_few = abs(correlation) >= CLEAR and abs(slope) >= LEAST_SLOPE
+        reason = "there are too few pairs of frames to be sure" if too_few else "the pictures do not turn as it is told"
+        return Handedness("unknown", correlation, slope, len(given_turns), rms, reason)
+    return Handedness("agree" if correlation > 0 else "mirrored", correlation, slope, len(given_turns), rms)
 
 
 def _unknown(reason: str, pairs: int = 0) -> Handedness:
@@ -136,72 +136,72 @@ def _headings(part: Part, given: ArrayLike | None) -> Array | None:
     return known if known is not None and np.isfinite(known).sum() > FEWEST_PAIRS else None
 
 
-def _turns(heading: Array, pairs: tuple[Index, Index]) -> Array:
+def _given_turns(heading: Array, pairs: tuple[Index, Index]) -> Array:
     """Return the given rotation of each pair ``(pairs,)`` [rad], in -pi..pi."""
     turn = heading[pairs[1]] - heading[pairs[0]]
     return np.asarray((turn + np.pi) % (2 * np.pi) - np.pi, dtype=float)
 
 
-def _pairs(heading: Array, spacing: float, most: float) -> tuple[Index, Index] | None:
+def _pairs(heading: Array, spacing: float, max_turn: float) -> tuple[Index, Index] | None:
     """Return the first and second frames of pairs whose rotation is suitable; None if there are too few.
 
     Args:
         heading: heading of each frame ``(frames,)`` [rad].
         spacing: beam spacing, which determines the minimum rotation [rad].
-        most: maximum rotation [rad].
+        max_turn: maximum rotation [rad].
     """
-    found: list[tuple[Index, Index]] = []
+    candidates: list[tuple[Index, Index]] = []
     for step in STEPS:
         first = np.arange(0, len(heading) - step)
-        turn = _turns(heading, (first, first + step))
-        first = first[np.isfinite(turn) & (np.abs(turn) <= most)]
-        size = np.abs(_turns(heading, (first, first + step)))
-        chosen = first[size >= LEAST_TURN * spacing]
+        turn = _given_turns(heading, (first, first + step))
+        first = first[np.isfinite(turn) & (np.abs(turn) <= max_turn)]
+        turn_size = np.abs(_given_turns(heading, (first, first + step)))
+        chosen = first[turn_size >= LEAST_TURN * spacing]
         if len(chosen) >= FEWEST_PAIRS:
-            spread = np.unique(np.linspace(0, len(chosen) - 1, min(MOST_PAIRS, len(chosen))).astype(np.intp))
-            found.append((chosen[spread], chosen[spread] + step))
+            subset = np.unique(np.linspace(0, len(chosen) - 1, min(MOST_PAIRS, len(chosen))).astype(np.intp))
+            candidates.append((chosen[subset], chosen[subset] + step))
         if len(chosen) >= ENOUGH_PAIRS:
             break
-    return max(found, key=lambda one: len(one[0])) if found else None
+    return max(candidates, key=lambda one: len(one[0])) if candidates else None
 
 
-def _seen_turns(part: Part, pairs: tuple[Index, Index], most: float) -> Array:
+def _observed_turns(part: Part, pairs: tuple[Index, Index], max_turn: float) -> Array:
     """Return the rotation that the pictures of each pair show ``(pairs,)`` [rad], to starboard; nan if there is none.
 
     Args:
         part: part of a recording.
         pairs: first and second frames.
-        most: largest rotation that is searched [rad].
+        max_turn: largest rotation that is searched [rad].
     """
     # 1. Average some pictures. What does not move with the scene, such as the beam pattern, would suggest no rotation.
     bearing = part.like.bearing_rad
-    some = np.unique(np.concatenate(pairs))
-    shown = some[np.unique(np.linspace(0, len(some) - 1, min(MOST_PAIRS // 4, len(some))).astype(np.intp))]
-    still = np.mean([part.read([number]).matching_values()[0] for number in shown], axis=0)
-    still = still if len(shown) >= FEWEST_PAIRS else np.zeros_like(still)
+    frames = np.unique(np.concatenate(pairs))
+    sampled = frames[np.unique(np.linspace(0, len(frames) - 1, min(MOST_PAIRS // 4, len(frames))).astype(np.intp))]
+    stationary = np.mean([part.read([number]).matching_values()[0] for number in sampled], axis=0)
+    stationary = stationary if len(sampled) >= FEWEST_PAIRS else np.zeros_like(stationary)
     # 2. Register each pair on evenly spaced bearings. The scene moves against the rotation of the sonar: negate the shift.
     even = np.linspace(bearing[0], bearing[-1], len(bearing))
     step = float(even[1] - even[0])
     turns = []
     for first, second in zip(*pairs, strict=True):
-        a, b = (_contrast(one, still, bearing, even) for one in part.read([first, second]).matching_values())
-        turns.append(-_shift(a, b, max(3, round(most / step))) * step)
+        a, b = (_moving_content(one, stationary, bearing, even) for one in part.read([first, second]).matching_values())
+        turns.append(-_shift(a, b, max(3, round(max_turn / step))) * step)
     return np.array(turns)
 
 
-def _contrast(image: NDArray[np.floating], still: NDArray[np.floating], bearing: Array, even: Array) -> Array:
+def _moving_content(image: NDArray[np.floating], stationary: NDArray[np.floating], bearing: Array, even: Array) -> Array:
     """Return the moving content of a picture ``(rows, beams)`` on even bearings, prepared for correlation.
 
     Args:
         image: picture ``(bins, beams)``.
-        still: mean picture ``(bins, beams)``, which is subtracted.
+        stationary: mean picture ``(bins, beams)``, which is subtracted.
         bearing: bearings of the picture ``(beams,)`` [rad].
         even: evenly spaced bearings of the result ``(beams,)`` [rad].
     """
     # 1. Subtract the stationary content, and average bins to at most MOST_ROWS rows.
-    moving = np.asarray(image - still, dtype=float)
-    together = -(-len(moving) // MOST_ROWS)
-    moving = moving[: len(moving) // together * together].reshape(-1, together, moving.shape[1]).mean(axis=1)
+    moving = np.asarray(image - stationary, dtype=float)
+    bins_per_row = -(-len(moving) // MOST_ROWS)
+    moving = moving[: len(moving) // bins_per_row * bins_per_row].reshape(-1, bins_per_row, moving.shape[1]).mean(axis=1)
     # 2. Interpolate to even bearings, on which a rotation is the same shift in all columns.
     place = np.interp(even, bearing, np.arange(len(bearing)))
     left = np.minimum(place.astype(np.intp), len(bearing) - 2)
@@ -227,17 +227,19 @@ def _shift(a: Array, b: Array, reach: int) -> float:
     # 1. Cross-correlate by FFT, padded with zeros to twice the size to avoid wrap-around.
     rows, beams = a.shape
     size = (2 * rows, 2 * beams)
-    found = np.fft.irfft2(np.conj(np.fft.rfft2(a, size)) * np.fft.rfft2(b, size), size)
+    correlation = np.fft.irfft2(np.conj(np.fft.rfft2(a, size)) * np.fft.rfft2(b, size), size)
     # 2. Divide by the autocorrelation of the tapers: the overlap shrinks with the shift, which would favour small shifts.
-    over = [np.fft.irfft(np.abs(np.fft.rfft(_taper(count), 2 * count)) ** 2, 2 * count) for count in (rows, beams)]
+    taper_correlations = [
+        np.fft.irfft(np.abs(np.fft.rfft(_taper(count), 2 * count)) ** 2, 2 * count) for count in (rows, beams)
+    ]
     down, across = max(2, int(REACH_RANGE * rows)), min(reach, beams - 2)
     lags = np.arange(-down, down + 1), np.arange(-across, across + 1)
-    score = found[np.ix_(*lags)] / (over[0][lags[0]][:, None] * over[1][lags[1]])
+    score = correlation[np.ix_(*lags)] / (taper_correlations[0][lags[0]][:, None] * taper_correlations[1][lags[1]])
     # 3. Find the peak. One at the end of the search interval is no maximum.
-    row, best = np.unravel_index(int(score.argmax()), score.shape)
-    if not score[row, best] > 0 or best in (0, len(lags[1]) - 1):
+    row, peak_column = np.unravel_index(int(score.argmax()), score.shape)
+    if not score[row, peak_column] > 0 or peak_column in (0, len(lags[1]) - 1):
         return float("nan")
     # 4. Refine it by the vertex of the parabola through the peak and its neighbours.
-    before, peak, after = score[row, best - 1 : best + 2]
-    bend = before - 2 * peak + after
-    return float(lags[1][best] + (0.5 * (before - after) / bend if bend < 0 else 0.0))
+    before, peak, after = score[row, peak_column - 1 : peak_column + 2]
+    curvature = before - 2 * peak + after
+    return float(lags[1][peak_column] + (0.5 * (before - after) / curvature if curvature < 0 else 0.0))

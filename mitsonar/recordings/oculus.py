@@ -141,12 +141,12 @@ def read_oculus(path: str | Path) -> Recording:
     messages = find_messages(data, name)
     pings, notes = _pings_of(messages)
     log = bool(np.isfinite(messages.time_s).any())
-    time_s, timing = _times(pings, messages.time_s[pings.place])
-    kept, sorting = in_time_order(time_s, pings.head["number"])
-    pings = pings.select(kept)
-    parts = tuple(_part(messages, pings.select(run), time_s[kept][run]) for _, run in runs_of(_windows(pings)))
-    words = "Oculus log (.oculus)" if log or data[:2].tobytes() != b"SO" else "Oculus messages (.raw)"
-    return Recording(name, words, parts, _facts(pings.head), (*notes, *timing, *sorting, *_notes(pings.head)))
+    time_s, time_notes = _times(pings, messages.time_s[pings.place])
+    order, order_notes = in_time_order(time_s, pings.head["number"])
+    pings = pings.select(order)
+    parts = tuple(_part(messages, pings.select(run), time_s[order][run]) for _, run in runs_of(_windows(pings)))
+    format_name = "Oculus log (.oculus)" if log or data[:2].tobytes() != b"SO" else "Oculus messages (.raw)"
+    return Recording(name, format_name, parts, _facts(pings.head), (*notes, *time_notes, *order_notes, *_notes(pings.head)))
 
 
 class _Pings(NamedTuple):
@@ -175,12 +175,12 @@ def _pings_of(messages: Messages) -> tuple[_Pings, list[str]]:
     # Pad every header to the size of the longest version, so that all of them are checked in one array operation.
     blocks = b"".join(messages.head(one, LATER.itemsize).ljust(LATER.itemsize, b"\0") for one in range(len(messages)))
     head = _fields(np.frombuffer(blocks, np.dtype((np.void, LATER.itemsize))))
-    whole = _whole(head, messages.size)
+    plausible = _are_plausible(head, messages.size)
     # Store each distinct bearing table once: pings of the same mode repeat it. -1 marks a table that is not plausible.
     fans: dict[bytes, int] = {}
     tables: list[Array] = []
     fan = np.full(len(messages), -1, dtype=np.intp)
-    for one in np.flatnonzero(whole):
+    for one in np.flatnonzero(plausible):
         start, beams = (LATER if head["version"][one] >= 2 else OLDER).itemsize, int(head["beams"][one])
         content = messages.head(int(one), start + 2 * beams)[start:]
         if content not in fans:
@@ -208,14 +208,14 @@ def _fields(blocks: NDArray[np.void]) -> Header:
     older, later = (np.ndarray((len(blocks),), kind, blocks, 0, (LATER.itemsize,)) for kind in (OLDER, LATER))
     assert LATER.names is not None
     kinds = {name: "<f8" if name == "start" else LATER[name].str for name in LATER.names}
-    made = np.zeros(len(blocks), dtype=list(kinds.items()))
-    newer = later["version"] >= 2
+    fields = np.zeros(len(blocks), dtype=list(kinds.items()))
+    is_later = later["version"] >= 2
     for name in LATER.names:
-        made[name] = np.where(newer, later[name], older[name] if name in (OLDER.names or ()) else np.nan)
-    return made
+        fields[name] = np.where(is_later, later[name], older[name] if name in (OLDER.names or ()) else np.nan)
+    return fields
 
 
-def _whole(head: Header, size: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _are_plausible(head: Header, size: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return which headers ``(n,)`` are plausible for messages of these sizes ``(n,)`` [bytes]."""
     ranges, beams, image = (head[name].astype(np.int64) for name in ("ranges", "beams", "image"))
     rows = ranges * beams * (np.minimum(head["width"], 3) + 1)
@@ -251,28 +251,28 @@ def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
     """Return the times of the pings ``(n,)`` [s], and a sentence if they are assumed."""
     head = pings.head
     start: Array = head["start"].astype(np.float64)
-    steady = (head["version"] >= 2).all() and len(head) > 1 and _rise(start)
+    has_clock = (head["version"] >= 2).all() and len(head) > 1 and _is_clock(start)
     if np.isfinite(logged_s).any():
-        return (_shifted(start, logged_s) if steady else logged_s), []
-    if steady:
+        return (_shifted(start, logged_s) if has_clock else logged_s), []
+    if has_clock:
         return start, []
     number = np.diff(head["number"].astype(np.int64))
     number = np.where((number > 0) & (number < 1_000_000), number, 1)
     codes = np.unique(head["ping_rate"])
     rate = RATES.get(int(codes[0]), 10.0) if len(codes) == 1 else 10.0
-    why = "the greatest ping rate" if len(codes) == 1 and int(codes[0]) in RATES else "assumed"
-    note = f"the file tells no times in a known unit: pings follow each other at {rate:g} Hz ({why}), by their numbers"
+    reason = "the greatest ping rate" if len(codes) == 1 and int(codes[0]) in RATES else "assumed"
+    note = f"the file tells no times in a known unit: pings follow each other at {rate:g} Hz ({reason}), by their numbers"
     return np.concatenate([[0.0], np.cumsum(number)]) / rate, [note]
 
 
 def _shifted(start_s: Array, logged_s: Array) -> Array:
     """Return the sonar's times shifted to the clock of the log ``(n,)`` [s]; those of the log if the clocks diverge."""
-    late = logged_s - start_s
-    shift = np.nanmedian(late)
-    return start_s + shift if bool((np.abs(late - shift) < SAME_CLOCK_S).all()) else logged_s
+    offset_s = logged_s - start_s
+    shift = np.nanmedian(offset_s)
+    return start_s + shift if bool((np.abs(offset_s - shift) < SAME_CLOCK_S).all()) else logged_s
 
 
-def _rise(time_s: Array) -> bool:
+def _is_clock(time_s: Array) -> bool:
     """Return whether times are plausible: strictly increasing, by less than ``LONGEST_S`` at a time."""
     if not (np.abs(time_s) < LATEST_S).all():
         return False
@@ -304,19 +304,19 @@ def _part(messages: Messages, pings: _Pings, time_s: Array) -> Part:
         gained=bool(_gained(head[:1])[0]),
         falling=falling,
     )
-    like = _like(head, bearings[::-1] if falling else bearings, time_s, images)
+    like = _empty_frames(head, bearings[::-1] if falling else bearings, time_s, images)
     return Part(like=like, time_s=time_s, images=images, attitude_rad=_attitude(head))
 
 
-def _like(head: Header, bearings: Array, time_s: Array, images: OculusImages) -> SonarFrames:
+def _empty_frames(head: Header, bearings: Array, time_s: Array, images: OculusImages) -> SonarFrames:
     """Return empty frames with the geometry of a part."""
     first = head[0]
     bins, beams = images.shape
     step = float(np.median(head["resolution"]))
     frequency = float(first["frequency"])
-    known = _known(frequency)
+    known = _preset_name(frequency)
     named = preset(known) if known else None
-    layout_name, fan_deg = _layout(bearings)
+    layout_name, fan_deg = _beam_layout(bearings)
     sonar = Sonar.create(
         name=known or "oculus",
         azimuth_fov_deg=fan_deg,
@@ -344,16 +344,16 @@ def _like(head: Header, bearings: Array, time_s: Array, images: OculusImages) ->
     )
 
 
-def _known(frequency: float) -> str | None:
+def _preset_name(frequency: float) -> str | None:
     """Return the name of the preset for a carrier [Hz]; None if there is none."""
     return next((name for name, (low, high) in BANDS.items() if low < frequency < high), None)
 
 
-def _layout(bearings: Array) -> tuple[str, float]:
+def _beam_layout(bearings: Array) -> tuple[str, float]:
     """Return the beam layout, evenly spaced in the angle or in its sine, and the field of view [deg]."""
-    spread = [float(np.std(steps) / np.mean(steps)) for steps in (np.diff(bearings), np.diff(np.sin(bearings)))]
+    variation = [float(np.std(steps) / np.mean(steps)) for steps in (np.diff(bearings), np.diff(np.sin(bearings)))]
     sides = len(bearings) / (len(bearings) - 1)
-    if spread[0] <= spread[1]:
+    if variation[0] <= variation[1]:
         return "even", min(180.0, float(np.degrees(bearings[-1] - bearings[0])) * sides)
     half = float(np.sin(bearings[-1]) - np.sin(bearings[0])) / 2 * sides
     return "sine", 2 * math.degrees(math.asin(min(1.0, half)))
@@ -412,7 +412,7 @@ def _notes(head: Header) -> list[str]:
         )
     if not ((head["sound_speed"] > 1000) & (head["sound_speed"] < 2000)).any():
         notes.append("the sound speed of the messages cannot be: 1500 m/s is taken; ranges do not depend on it")
-    if not _known(float(head["frequency"][0])):
+    if not _preset_name(float(head["frequency"][0])):
         notes.append(f"no preset has this carrier: an opening over elevation of {ELEVATION_DEG:g} deg is taken")
     return notes
 
@@ -458,7 +458,7 @@ STEP = 4096
 """Number of compressed bytes that are decompressed at a time."""
 
 
-class _Place(NamedTuple):
+class _MessageLocation(NamedTuple):
     """Location of a message in a file: offset, stored bytes, decompressed bytes (0 if not compressed), item time [s]."""
 
     begin: int
@@ -506,7 +506,7 @@ class Messages:
         if not self.unpacked[number]:
             return self.data[begin : begin + min(stored, count)].tobytes()
         try:
-            return _unpacked(self.data.data[begin : begin + stored], min(count, int(self.unpacked[number])))
+            return _decompress(self.data.data[begin : begin + stored], min(count, int(self.unpacked[number])))
         except zlib.error:
             return b""
 
@@ -520,14 +520,14 @@ class Messages:
         if not size:
             return self.data[begin : begin + stored]
         try:
-            made = _unpacked(self.data.data[begin : begin + stored], size)
+            content = _decompress(self.data.data[begin : begin + stored], size)
         except zlib.error as error:
             raise MitsonarError(f"{self.name}: the message at byte {begin:,} cannot be unpacked: {error}") from None
-        if len(made) < size:
+        if len(content) < size:
             raise MitsonarError(
-                f"{self.name}: the message at byte {begin:,} unpacks to {len(made):,} bytes, not to {size:,}"
+                f"{self.name}: the message at byte {begin:,} unpacks to {len(content):,} bytes, not to {size:,}"
             )
-        return np.frombuffer(made, np.uint8)
+        return np.frombuffer(content, np.uint8)
 
 
 def is_oculus(path: Path, first: bytes) -> bool:
@@ -557,87 +557,87 @@ def find_messages(data: Bytes, name: str) -> Messages:
     if first.startswith(DATABASE):
         raise MitsonarError(f"{name} is a log of ViewPoint 2, a database: export it in the format of ViewPoint 1")
     if first.startswith(LOG):
-        return _in_log(data, name)
+        return _find_in_log(data, name)
     if not first.startswith(DUMP):
         raise MitsonarError(
             f"{name} is no recording of an Oculus: it begins with {first[:4]!r}, not with {DUMP!r} (.raw) or {LOG!r} "
             "(.oculus)"
         )
-    return _in_dump(data, name)
+    return _find_in_dump(data, name)
 
 
-class _Found:
+class _MessageCollector:
     """Collector of message locations; compact arrays need only a few bytes per message."""
 
     def __init__(self) -> None:
-        self.places = [array("q"), array("q"), array("q")]
+        self.locations = [array("q"), array("q"), array("q")]
         self.times = array("d")
         self.bytes = 0
         self.skipped = 0
 
-    def add(self, place: _Place) -> None:
-        for column, value in zip(self.places, place[:3], strict=True):
+    def add(self, location: _MessageLocation) -> None:
+        for column, value in zip(self.locations, location[:3], strict=True):
             column.append(value)
-        self.times.append(place.time_s)
+        self.times.append(location.time_s)
 
     def messages(self, data: Bytes, name: str) -> Messages:
-        begin, stored, unpacked = (np.array(column, dtype=np.int64) for column in self.places)
+        begin, stored, unpacked = (np.array(column, dtype=np.int64) for column in self.locations)
         left_over = len(data) - self.bytes
         return Messages(name, data, begin, stored, unpacked, np.array(self.times), left_over, self.skipped)
 
 
-def _in_dump(data: Bytes, name: str) -> Messages:
-    found, view, mark, place = _Found(), data.data, re.compile(re.escape(DUMP)), 0
-    while hit := mark.search(view, place):
-        place = hit.start()
-        if place + HEADER.size > len(view):
+def _find_in_dump(data: Bytes, name: str) -> Messages:
+    collector, view, mark, offset = _MessageCollector(), data.data, re.compile(re.escape(DUMP)), 0
+    while hit := mark.search(view, offset):
+        offset = hit.start()
+        if offset + HEADER.size > len(view):
             break
-        kind, version, follow = HEADER.unpack_from(view, place)[3:6]
-        if kind not in KINDS or version > LATEST or place + HEADER.size + follow > len(view):
-            place += 1  # the mark occurred by chance: search on behind its first byte
+        kind, version, follow = HEADER.unpack_from(view, offset)[3:6]
+        if kind not in KINDS or version > LATEST or offset + HEADER.size + follow > len(view):
+            offset += 1  # the mark occurred by chance: search on behind its first byte
             continue
         size = HEADER.size + follow
-        found.bytes += size
+        collector.bytes += size
         if kind == PING:
-            found.add(_Place(place, size, 0, np.nan))
+            collector.add(_MessageLocation(offset, size, 0, np.nan))
         else:
-            found.skipped += 1
-        place += size
-    return found.messages(data, name)
+            collector.skipped += 1
+        offset += size
+    return collector.messages(data, name)
 
 
-def _in_log(data: Bytes, name: str) -> Messages:
+def _find_in_log(data: Bytes, name: str) -> Messages:
     view = data.data
     if len(view) < LOG_HEADER.size:
         raise MitsonarError(
             f"{name} has {len(view):,} bytes, and the header of a log {LOG_HEADER.size}: the file is cut off"
         )
-    place, encryption = (LOG_HEADER.unpack_from(view)[one] for one in (1, 4))
+    offset, encryption = (LOG_HEADER.unpack_from(view)[one] for one in (1, 4))
     if encryption:
         raise MitsonarError(f"{name} is encrypted (kind {encryption}): export it without encryption")
-    if not LOG_HEADER.size <= place <= LARGEST_HEADER:
-        place = LOG_HEADER.size
-    found, mark = _Found(), re.compile(re.escape(ITEM))
-    found.bytes = place
-    while hit := mark.search(view, place):
-        place = hit.start()
-        if place + ITEM_HEADER.size > len(view):
+    if not LOG_HEADER.size <= offset <= LARGEST_HEADER:
+        offset = LOG_HEADER.size
+    collector, mark = _MessageCollector(), re.compile(re.escape(ITEM))
+    collector.bytes = offset
+    while hit := mark.search(view, offset):
+        offset = hit.start()
+        if offset + ITEM_HEADER.size > len(view):
             break
-        _, head, kind, _, time_s, packing, unpacked, follow = ITEM_HEADER.unpack_from(view, place)
-        if not ITEM_HEADER.size <= head <= LARGEST_HEADER or place + head + follow > len(view):
-            place += 1  # the mark occurred by chance: search on behind its first byte
+        _, head, kind, _, time_s, packing, unpacked, follow = ITEM_HEADER.unpack_from(view, offset)
+        if not ITEM_HEADER.size <= head <= LARGEST_HEADER or offset + head + follow > len(view):
+            offset += 1  # the mark occurred by chance: search on behind its first byte
             continue
-        begin, time_s = place + head, time_s if abs(time_s) < 1e11 else np.nan
-        found.bytes += head + follow
+        begin, time_s = offset + head, time_s if abs(time_s) < 1e11 else np.nan
+        collector.bytes += head + follow
         if kind == MESSAGE_ITEM and follow > HEADER.size and packing in (0, 1):
-            _add_item(found, view, _Place(begin, follow, unpacked if packing else 0, time_s))
+            _add_item(collector, view, _MessageLocation(begin, follow, unpacked if packing else 0, time_s))
         else:
-            found.skipped += 1
-        place = begin + follow
-    return found.messages(data, name)
+            collector.skipped += 1
+        offset = begin + follow
+    return collector.messages(data, name)
 
 
-def _add_item(found: _Found, view: memoryview, item: _Place) -> None:
+def _add_item(collector: _MessageCollector, view: memoryview, item: _MessageLocation) -> None:
     """Add an item if its message holds an image.
 
     The content of a compressed item begins with its decompressed size, most significant byte first.
@@ -646,35 +646,35 @@ def _add_item(found: _Found, view: memoryview, item: _Place) -> None:
         size = int.from_bytes(view[item.begin : item.begin + 4], "big")
         most = min(LARGEST_MESSAGE, INFLATION * item.stored)
         if size != item.unpacked or not HEADER.size < size <= most:
-            found.skipped += 1
+            collector.skipped += 1
             return
         item = item._replace(begin=item.begin + 4, stored=item.stored - 4)
         try:
-            head = _unpacked(view[item.begin : item.begin + item.stored], HEADER.size)
+            head = _decompress(view[item.begin : item.begin + item.stored], HEADER.size)
         except zlib.error:
             head = b""
     else:
         head = bytes(view[item.begin : item.begin + HEADER.size])
     if len(head) == HEADER.size and head[:2] == DUMP and HEADER.unpack(head)[3] == PING:
-        found.add(item)
+        collector.add(item)
     else:
-        found.skipped += 1
+        collector.skipped += 1
 
 
-def _unpacked(packed: memoryview, count: int) -> bytes:
+def _decompress(packed: memoryview, count: int) -> bytes:
     """Decompress the first ``count`` bytes, or all if there are fewer; never allocates more than that.
 
     Raises:
         zlib.error: if the bytes are damaged.
     """
-    made, unpacker = bytearray(), zlib.decompressobj()
+    content, unpacker = bytearray(), zlib.decompressobj()
     for start in range(0, len(packed), STEP):
-        made += unpacker.decompress(packed[start : start + STEP], count - len(made))
-        while unpacker.unconsumed_tail and len(made) < count:
-            made += unpacker.decompress(unpacker.unconsumed_tail, count - len(made))
-        if len(made) >= count or unpacker.eof:
+        content += unpacker.decompress(packed[start : start + STEP], count - len(content))
+        while unpacker.unconsumed_tail and len(content) < count:
+            content += unpacker.decompress(unpacker.unconsumed_tail, count - len(content))
+        if len(content) >= count or unpacker.eof:
             break
-    return bytes(made)
+    return bytes(content)
 
 
 # ---------------- Images
@@ -712,16 +712,16 @@ class OculusImages:
 
         Counts are scaled relative to the smallest gain of the part's first frame.
         """
-        made: Pixels = np.empty((len(index), *self.shape), np.uint8 if self.eight_bit else np.float32)
+        images: Pixels = np.empty((len(index), *self.shape), np.uint8 if self.eight_bit else np.float32)
         reference = self._rows(0)[0].min(initial=np.inf) if self.gained and len(index) else 1.0
         for one, frame in enumerate(index):
             gains, counts = self._rows(int(frame))
             if self.eight_bit:
-                made[one] = counts
+                images[one] = counts
             else:
                 scale = np.sqrt(reference / gains)[:, None] if self.gained else 1.0
-                made[one] = np.minimum(counts * (scale / (256.0**self.width - 1)), 1.0)
-        return made[:, :, ::-1] if self.falling else made
+                images[one] = np.minimum(counts * (scale / (256.0**self.width - 1)), 1.0)
+        return images[:, :, ::-1] if self.falling else images
 
     def _rows(self, frame: int) -> tuple[Array, NDArray[Any]]:
         """Return the row gains ``(bins,)`` and the counts ``(bins, beams)`` of a frame."""
@@ -740,7 +740,7 @@ def _counts(rows: NDArray[np.uint8], width: int) -> NDArray[Any]:
     if width == 1:
         return rows
     parts = rows.reshape(len(rows), -1, width)
-    made = np.zeros(parts.shape[:2], np.uint32)
+    counts = np.zeros(parts.shape[:2], np.uint32)
     for one in range(width):
-        made |= parts[:, :, one].astype(np.uint32) << np.uint32(8 * one)
-    return made
+        counts |= parts[:, :, one].astype(np.uint32) << np.uint32(8 * one)
+    return counts

@@ -48,7 +48,7 @@ class Format(NamedTuple):
     read: Callable[[Path, Path | None, str | None], Recording]
 
 
-def _of_pictures(read: Callable[[Path, Path | None], Recording]) -> Callable[[Path, Path | None, str | None], Recording]:
+def _without_topic(read: Callable[[Path, Path | None], Recording]) -> Callable[[Path, Path | None, str | None], Recording]:
     """Wrap a reader of a format whose files hold a single sonar, so that it rejects a topic."""
 
     def checked(path: Path, geometry: Path | None, topic: str | None) -> Recording:
@@ -59,7 +59,7 @@ def _of_pictures(read: Callable[[Path, Path | None], Recording]) -> Callable[[Pa
     return checked
 
 
-def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path | None, str | None], Recording]:
+def _without_geometry(read: Callable[[Path], Recording]) -> Callable[[Path, Path | None, str | None], Recording]:
     """Wrap a reader of a format whose files hold a single sonar and its geometry, so that it rejects a geometry file."""
 
     def checked(path: Path, geometry: Path | None) -> Recording:
@@ -67,20 +67,20 @@ def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path |
             raise MitsonarError(f"{path} tells its geometry itself: leave {geometry} out")
         return read(path)
 
-    return _of_pictures(checked)
+    return _without_topic(checked)
 
 
 FORMATS: tuple[Format, ...] = (
-    Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _says_it_itself(read_aris)),
-    Format("DIDSON (.ddf)", lambda path, first: first[:4] in SIGNATURES, _says_it_itself(read_didson)),
-    Format("Oculus (.raw, .oculus)", is_oculus, _says_it_itself(read_oculus)),
+    Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _without_geometry(read_aris)),
+    Format("DIDSON (.ddf)", lambda path, first: first[:4] in SIGNATURES, _without_geometry(read_didson)),
+    Format("Oculus (.raw, .oculus)", is_oculus, _without_geometry(read_oculus)),
     Format("ROS bags (.bag, .mcap, .db3, folders)", is_ros_bag, read_ros_bag),
-    Format("folders of UXO (DFKI)", is_uxo, _says_it_itself(read_uxo)),
-    Format("folders of CANOE", is_canoe, _says_it_itself(read_canoe)),
-    Format("folders of views (neusis)", is_neusis, _says_it_itself(read_neusis)),
-    Format("stacks of pictures (.npz)", is_picture_stack, _of_pictures(read_picture_stack)),
-    Format("videos (.avi, .mp4)", is_video, _of_pictures(read_picture_video)),
-    Format("folders of pictures (PNG, JPEG, PGM)", holds_pictures, _of_pictures(read_picture_folder)),
+    Format("folders of UXO (DFKI)", is_uxo, _without_geometry(read_uxo)),
+    Format("folders of CANOE", is_canoe, _without_geometry(read_canoe)),
+    Format("folders of views (neusis)", is_neusis, _without_geometry(read_neusis)),
+    Format("stacks of pictures (.npz)", is_picture_stack, _without_topic(read_picture_stack)),
+    Format("videos (.avi, .mp4)", is_video, _without_topic(read_picture_video)),
+    Format("folders of pictures (PNG, JPEG, PGM)", holds_pictures, _without_topic(read_picture_folder)),
 )
 """All formats, in the order in which they are tried."""
 
@@ -117,12 +117,12 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
         MitsonarError: if the path does not exist, has no known format or is damaged, if there is no such topic, or if a
             geometry is given that is not needed.
     """
-    found = format_of(path)
-    if found is None:
+    recording_format = format_of(path)
+    if recording_format is None:
         if not os.path.exists(path):
             raise MitsonarError(f"no such file: {path}")
         raise MitsonarError(f"{path} is no recording that mitsonar reads: it reads {known_formats()}")
-    return found.read(Path(path), None if geometry is None else Path(geometry), topic)
+    return recording_format.read(Path(path), None if geometry is None else Path(geometry), topic)
 
 
 # ---------------- Summary of a recording
@@ -150,18 +150,18 @@ def summary_of(recording: Recording) -> Summary:
         "name": recording.name,
         "format": recording.format,
         "frames": len(recording),
-        "parts": [_part_of(part) for part in recording.parts],
+        "parts": [_part_summary(part) for part in recording.parts],
         "facts": dict(recording.facts),
         "notes": list(recording.notes),
     }
 
 
-def _part_of(part: Part) -> Summary:
+def _part_summary(part: Part) -> Summary:
     """Return the summary of a part."""
     like, sonar = part.like, part.like.sonar
     bearing = np.degrees(like.bearing_rad)
     steps = np.diff(like.range_m)
-    found: Summary = {
+    summary: Summary = {
         "frames": len(part),
         "sonar": sonar.name,
         "window_m": [sonar.range_min, sonar.range_max],
@@ -174,34 +174,34 @@ def _part_of(part: Part) -> Summary:
         "sound_speed": sonar.sound_speed,
         "level": like.level,
         "samples": str(like.image.dtype),
-        **_times_of(part.time_s),
+        **_time_summary(part.time_s),
     }
     if part.attitude_rad is not None:
         names = ("pitch_deg", "roll_deg", "heading_deg")
-        turned = np.unwrap(part.attitude_rad, axis=0) if np.isfinite(part.attitude_rad).all() else part.attitude_rad
-        found |= {name: _ends(np.degrees(values)) for name, values in zip(names, turned.T, strict=True)}
+        unwrapped = np.unwrap(part.attitude_rad, axis=0) if np.isfinite(part.attitude_rad).all() else part.attitude_rad
+        summary |= {name: _limits(np.degrees(values)) for name, values in zip(names, unwrapped.T, strict=True)}
     if part.poses is not None:
-        found["path_m"] = float(np.linalg.norm(np.diff(part.poses[:, :3], axis=0), axis=1).sum())
+        summary["path_m"] = float(np.linalg.norm(np.diff(part.poses[:, :3], axis=0), axis=1).sum())
     for name in ("height_m", "gain_db"):
         values = getattr(part, name)
         if values is not None:
-            found[name] = _ends(values)
-    return found
+            summary[name] = _limits(values)
+    return summary
 
 
-def _times_of(time_s: Array) -> Summary:
+def _time_summary(time_s: Array) -> Summary:
     """Return first and last time, rate and gaps."""
     time = time_s if time_s.ndim == 1 else time_s.mean(axis=1)
-    found: Summary = {"first_s": float(time[0]), "last_s": float(time[-1])} if len(time) else {}
+    summary: Summary = {"first_s": float(time[0]), "last_s": float(time[-1])} if len(time) else {}
     steps = np.diff(time)
     if len(steps) and np.median(steps) > 0:
         usual = float(np.median(steps))
         wide = steps[steps > GAP * usual]
-        found |= {"rate_hz": 1 / usual, "gaps": len(wide), "longest_step_s": float(steps.max())}
-    return found
+        summary |= {"rate_hz": 1 / usual, "gaps": len(wide), "longest_step_s": float(steps.max())}
+    return summary
 
 
-def _ends(values: Array) -> list[float] | None:
+def _limits(values: Array) -> list[float] | None:
     """Return the minimum and maximum of the known values; None if none is known."""
     known = values[np.isfinite(values)]
     return [float(known.min()), float(known.max())] if len(known) else None
@@ -213,14 +213,14 @@ def summary_lines(summary: Summary) -> list[str]:
     for number, part in enumerate(summary["parts"]):
         if len(summary["parts"]) > 1:
             rows.append((f"part {number}", counted(part["frames"], "frame")))
-        rows += _rows_of(part)
-    rows += [(f"fact {name}", _shown(value)) for name, value in summary["facts"].items()]
+        rows += _part_rows(part)
+    rows += [(f"fact {name}", _format_value(value)) for name, value in summary["facts"].items()]
     rows += [("note", note) for note in summary["notes"]]
     width = max(len(name) for name, _ in rows)
     return [f"{name:<{width}}  {value}" for name, value in rows]
 
 
-def _rows_of(part: Summary) -> list[tuple[str, str]]:
+def _part_rows(part: Summary) -> list[tuple[str, str]]:
     """Return the table rows of a part: name and value."""
     low, high = part["window_m"]
     step = "" if part["bin_m"] is None else f" of {part['bin_m'] * 1e3:.4g} mm"
@@ -236,7 +236,10 @@ def _rows_of(part: Summary) -> list[tuple[str, str]]:
         rows.append(("carrier", f"{part['frequency_hz'] / 1e3:,.6g} kHz"))
     if "first_s" in part:
         rows.append(
-            ("times", f"{_date(part['first_s'])} to {_date(part['last_s'])}, {part['last_s'] - part['first_s']:.6g} s")
+            (
+                "times",
+                f"{_format_time(part['first_s'])} to {_format_time(part['last_s'])}, {part['last_s'] - part['first_s']:.6g} s",
+            )
         )
     if "rate_hz" in part:
         longest = f"; the longest step takes {part['longest_step_s']:.4g} s" if part["gaps"] else ""
@@ -251,18 +254,18 @@ def _rows_of(part: Summary) -> list[tuple[str, str]]:
     return rows
 
 
-def _date(time_s: float) -> str:
+def _format_time(time_s: float) -> str:
     """Format a time: as a date in UTC if it is one, otherwise in seconds."""
     if time_s < SINCE_S:
         return f"{time_s:.6g} s"
     return datetime.fromtimestamp(time_s, UTC).isoformat(sep=" ", timespec="milliseconds").removesuffix("+00:00")
 
 
-def _shown(value: object) -> str:
+def _format_value(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list) and len(value) == 2 and all(isinstance(one, int | float) for one in value):
         return f"{value[0]:.6g}..{value[1]:.6g}"
     if isinstance(value, list):
-        return ", ".join(_shown(one) for one in value)
+        return ", ".join(_format_value(one) for one in value)
     return str(value)

@@ -111,13 +111,13 @@ class PictureGeometry(BaseModel):
         return self
 
     def _check_fan(self) -> None:
-        lacking = [name for name in FAN if getattr(self, name) is None]
-        if lacking:
-            raise ValueError(f"the layout fan needs {', '.join(lacking)}{SEE}")
+        missing = [name for name in FAN if getattr(self, name) is None]
+        if missing:
+            raise ValueError(f"the layout fan needs {', '.join(missing)}{SEE}")
         if not self.far >= self.near + 2:
             raise ValueError(f"far_px must exceed near_px by 2: got {self.far:g} and {self.near:g}")
-        told = (self.pixels_per_m is not None) + (self.range_max is not None)
-        if told == 2 or (told == 0 and self.scale_known):
+        scales = (self.pixels_per_m is not None) + (self.range_max is not None)
+        if scales == 2 or (scales == 0 and self.scale_known):
             raise ValueError("a fan needs its scale: give pixels_per_m or range_max, one of them, or `scale_known: false`")
 
     def _check_polar(self) -> None:
@@ -186,13 +186,13 @@ def load_geometry(path: str | Path) -> PictureGeometry:
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
         raise MitsonarError(f"{path} must hold `key: value` lines of a geometry{SEE}")
     try:
-        found = PictureGeometry.create(**fields)
+        geometry = PictureGeometry.create(**fields)
     except MitsonarError as error:
         raise MitsonarError(f"{path}: {error}") from None
-    numbers = [value for value in found.model_dump().values() if isinstance(value, float)]
-    if not all(map(math.isfinite, [*numbers, *(found.apex_px or ()), *(found.bearings_deg or ())])):
+    numbers = [value for value in geometry.model_dump().values() if isinstance(value, float)]
+    if not all(map(math.isfinite, [*numbers, *(geometry.apex_px or ()), *(geometry.bearings_deg or ())])):
         raise MitsonarError(f"{path} holds a number that is not finite{SEE}")
-    return found
+    return geometry
 
 
 def geometry_beside(path: Path) -> Path | None:
@@ -201,11 +201,11 @@ def geometry_beside(path: Path) -> Path | None:
     It is ``geometry.yaml`` in a folder, or else ``FILE.yaml`` or ``geometry.yaml`` next to the file or folder.
     """
     path = path.absolute()
-    near = [path / "geometry.yaml"] if path.is_dir() else []
+    candidates = [path / "geometry.yaml"] if path.is_dir() else []
     if not path.name:  # the root of the file system
         return None
-    near += [path.with_name(f"{path.name}.yaml"), path.with_suffix(".yaml"), path.with_name("geometry.yaml")]
-    return next((one for one in near if one.is_file() and one != path), None)
+    candidates += [path.with_name(f"{path.name}.yaml"), path.with_suffix(".yaml"), path.with_name("geometry.yaml")]
+    return next((one for one in candidates if one.is_file() and one != path), None)
 
 
 # ---------------- Check of a geometry by the outline of a fan
@@ -274,8 +274,8 @@ def outline_of(brightest: NDArray[np.generic], *, forward: str = "up") -> Outlin
     if left is None or right is None or left[1] + right[1] <= 0.02:
         return None
     # 3. Intersect the edges in the apex.
-    closing = left[1] + right[1]  # the edges approach each other by this many columns per row
-    row = (-right[0] - left[0]) / closing
+    approach = left[1] + right[1]  # the edges approach each other by this many columns per row
+    row = (-right[0] - left[0]) / approach
     column = left[0] + left[1] * row
     # 4. Fit the far arc to the topmost bright pixel of each column, relative to the apex.
     top = mask[:, columns].argmax(axis=0).astype(float)
@@ -284,37 +284,39 @@ def outline_of(brightest: NDArray[np.generic], *, forward: str = "up") -> Outlin
         return None
     # 5. Compute the half angle from the slopes of the edges after the stretch, and undo the flip.
     far, stretch = arc
-    half = math.degrees(math.atan(stretch * closing / 2))
+    half = math.degrees(math.atan(stretch * approach / 2))
     row = row if forward == "up" else mask.shape[0] - 1 - row
     return Outline((float(column), float(row)), far, half, stretch)
 
 
 def doubts(geometry: PictureGeometry, brightest: NDArray[np.generic]) -> list[str]:
     """Compare a geometry with the outline of its pictures, and return sentences on the disagreements."""
-    found = outline_of(brightest, forward=geometry.forward)
-    if found is None:
+    outline = outline_of(brightest, forward=geometry.forward)
+    if outline is None:
         return ["the pictures show no outline of a fan: stretch and half angle could not be checked"]
-    told = geometry.apex_px or (0.0, 0.0)
+    apex_px = geometry.apex_px or (0.0, 0.0)
     notes = []
     half = float(geometry.half_angle_deg or 0.0)
-    if abs(found.stretch / geometry.stretch - 1) > SAME_STRETCH:
+    if abs(outline.stretch / geometry.stretch - 1) > SAME_STRETCH:
         notes.append(
-            f"the far arc is a circle with stretch {found.stretch:.3f}, and the edges then open {found.half_angle_deg:.2f} "
+            f"the far arc is a circle with stretch {outline.stretch:.3f}, and the edges then open {outline.half_angle_deg:.2f} "
             f"deg to each side; the geometry tells stretch {geometry.stretch:g} and {half:g} deg: the pictures are "
             "squeezed, or the geometry is another one"
         )
-    elif abs(found.half_angle_deg - half) > SAME_ANGLE_DEG:
+    elif abs(outline.half_angle_deg - half) > SAME_ANGLE_DEG:
         notes.append(
-            f"the edges of the fan open {found.half_angle_deg:.2f} deg to each side, the geometry tells {half:g} deg"
+            f"the edges of the fan open {outline.half_angle_deg:.2f} deg to each side, the geometry tells {half:g} deg"
         )
-    off = math.hypot((found.apex_px[0] - told[0]) * geometry.stretch, found.apex_px[1] - told[1])
-    if off > SAME_PX * geometry.far:
+    distance_px = math.hypot((outline.apex_px[0] - apex_px[0]) * geometry.stretch, outline.apex_px[1] - apex_px[1])
+    if distance_px > SAME_PX * geometry.far:
         notes.append(
-            f"the edges of the fan meet at ({found.apex_px[0]:.1f}, {found.apex_px[1]:.1f}) px, the geometry tells apex_px "
-            f"({told[0]:g}, {told[1]:g})"
+            f"the edges of the fan meet at ({outline.apex_px[0]:.1f}, {outline.apex_px[1]:.1f}) px, the geometry tells apex_px "
+            f"({apex_px[0]:g}, {apex_px[1]:g})"
         )
-    elif abs(found.far_px - geometry.far) > SAME_PX * geometry.far:
-        notes.append(f"the far arc lies at {found.far_px:.1f} px from the apex, the geometry tells far_px {geometry.far:g}")
+    elif abs(outline.far_px - geometry.far) > SAME_PX * geometry.far:
+        notes.append(
+            f"the far arc lies at {outline.far_px:.1f} px from the apex, the geometry tells far_px {geometry.far:g}"
+        )
     return notes
 
 
@@ -325,18 +327,18 @@ def _edge(row: Doubles, column: Doubles) -> tuple[float, float] | None:
     """
     # Alternate between fitting a line and selecting the pixels near it. The tolerance is wider outside the edge, so that
     # the line moves outwards. While too few pixels are near, the outer half of them is used.
-    kept = np.ones(len(row), dtype=bool)
+    selected = np.ones(len(row), dtype=bool)
     for _ in range(PASSES):
-        slope, start = np.polyfit(row[kept], column[kept], 1)
-        inside = column - (start + slope * row)
-        fresh = (inside < OFF_PX) & (inside > -3 * OFF_PX)
-        fresh = fresh if fresh.sum() >= LEAST_ROWS else inside < np.median(inside)
-        if (fresh == kept).all():
+        slope, start = np.polyfit(row[selected], column[selected], 1)
+        distance_px = column - (start + slope * row)
+        updated = (distance_px < OFF_PX) & (distance_px > -3 * OFF_PX)
+        updated = updated if updated.sum() >= LEAST_ROWS else distance_px < np.median(distance_px)
+        if (updated == selected).all():
             break
-        kept = fresh
-    inside = column - (start + slope * row)
-    good = np.abs(inside) < OFF_PX
-    return (float(start), float(slope)) if good.sum() >= max(LEAST_ROWS, AGREEING * len(row)) else None
+        selected = updated
+    distance_px = column - (start + slope * row)
+    close = np.abs(distance_px) < OFF_PX
+    return (float(start), float(slope)) if close.sum() >= max(LEAST_ROWS, AGREEING * len(row)) else None
 
 
 def _arc(x: Doubles, y: Doubles) -> tuple[float, float] | None:
@@ -346,18 +348,18 @@ def _arc(x: Doubles, y: Doubles) -> tuple[float, float] | None:
     """
     # Alternate between a least-squares fit, which is linear in far^2 and stretch^2, and selecting the pixels near the arc.
     # Start with the upper half of the pixels, most of which belong to the arc.
-    kept = y > np.median(y) - 1e-9
+    selected = y > np.median(y) - 1e-9
     far, squared = 0.0, 0.0
     for _ in range(PASSES):
-        table = np.column_stack([np.ones(int(kept.sum())), -(x[kept] ** 2)])
-        (far_squared, squared), *_ = np.linalg.lstsq(table, y[kept] ** 2, rcond=None)
+        table = np.column_stack([np.ones(int(selected.sum())), -(x[selected] ** 2)])
+        (far_squared, squared), *_ = np.linalg.lstsq(table, y[selected] ** 2, rcond=None)
         if far_squared <= 0 or squared <= 0:
             return None
         far = math.sqrt(far_squared)
-        off = np.sqrt(np.maximum(far_squared - squared * x**2, 0)) - y
-        fresh = (off < OFF_PX) & (off > -3 * OFF_PX)
-        if fresh.sum() < LEAST_ROWS or (fresh == kept).all():
+        distance_px = np.sqrt(np.maximum(far_squared - squared * x**2, 0)) - y
+        updated = (distance_px < OFF_PX) & (distance_px > -3 * OFF_PX)
+        if updated.sum() < LEAST_ROWS or (updated == selected).all():
             break
-        kept = fresh
-    enough = kept.sum() >= max(LEAST_ROWS, AGREEING * len(x))
+        selected = updated
+    enough = selected.sum() >= max(LEAST_ROWS, AGREEING * len(x))
     return (far, math.sqrt(squared)) if enough else None

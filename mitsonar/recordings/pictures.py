@@ -179,7 +179,7 @@ TIMES_IN_NAMES = (
 )
 """Patterns of whole numbers that look like times, and the unit of each [s]."""
 
-PARTED = re.compile(r"(?<!\d)(\d{10})[._](\d{1,9})(?!\d)")
+SPLIT_TIME = re.compile(r"(?<!\d)(\d{10})[._](\d{1,9})(?!\d)")
 """Pattern of seconds and their decimals; after ``_`` come nanoseconds, as ROS writes them."""
 
 MOST_PICTURES = 2_000_000
@@ -208,8 +208,8 @@ def read_picture_folder(path: Path, geometry: Path | None = None) -> Recording:
     Raises:
         MitsonarError: if there is no geometry or no readable picture, or if the geometry does not fit the pictures.
     """
-    told, told_by = geometry_for(path, geometry)
-    files, shape, notes = _of_one_size(picture_paths(path), path)
+    picture_geometry, geometry_path = geometry_for(path, geometry)
+    files, shape, notes = _select_one_size(picture_paths(path), path)
     names = tuple(file.name for file in files)
     first = read_picture(files[0], shape)
     if _has_colours(files[0]):
@@ -230,7 +230,7 @@ def read_picture_folder(path: Path, geometry: Path | None = None) -> Recording:
         facts={"bits": bits},
         notes=tuple(notes),
     )
-    return recording_of(pictures, told, told_by)
+    return recording_of(pictures, picture_geometry, geometry_path)
 
 
 def picture_paths(folder: Path) -> list[Path]:
@@ -240,12 +240,12 @@ def picture_paths(folder: Path) -> list[Path]:
         MitsonarError: if the folder cannot be read, or holds too many pictures.
     """
     try:
-        found = [one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES and not one.name.startswith(".")]
+        pictures = [one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES and not one.name.startswith(".")]
     except OSError as error:
         raise MitsonarError(f"cannot read the folder {folder}: {error.strerror}") from None
-    if len(found) > MOST_PICTURES:
-        raise MitsonarError(f"{folder} holds {len(found):,} pictures, more than {MOST_PICTURES:,}: divide it")
-    return sorted(found, key=lambda one: naturally(one.name))
+    if len(pictures) > MOST_PICTURES:
+        raise MitsonarError(f"{folder} holds {len(pictures):,} pictures, more than {MOST_PICTURES:,}: divide it")
+    return sorted(pictures, key=lambda one: naturally(one.name))
 
 
 def naturally(name: str) -> tuple[tuple[int, int | str], ...]:
@@ -262,42 +262,42 @@ def times_in_names(names: Sequence[str]) -> Array | None:
     """
     if not names:
         return None
-    parted = [PARTED.search(name) for name in names]
-    if all(parted):
-        found = [one.groups() for one in parted if one is not None]
-        decimals = [name[one.end(1)] == "." for name, one in zip(names, parted, strict=True) if one is not None]
+    split_matches = [SPLIT_TIME.search(name) for name in names]
+    if all(split_matches):
+        groups = [one.groups() for one in split_matches if one is not None]
+        decimals = [name[one.end(1)] == "." for name, one in zip(names, split_matches, strict=True) if one is not None]
         times = [
             float(f"{whole}.{rest}") if point else int(whole) + int(rest) * 1e-9
-            for (whole, rest), point in zip(found, decimals, strict=True)
+            for (whole, rest), point in zip(groups, decimals, strict=True)
         ]
-        return _plausible(np.array(times))
+        return _times_if_plausible(np.array(times))
     for pattern, unit in TIMES_IN_NAMES:
-        hits = [pattern.search(name) for name in names]
-        if all(hits):
-            return _plausible(np.array([int(one[1]) for one in hits if one is not None]) * unit)
+        matches = [pattern.search(name) for name in names]
+        if all(matches):
+            return _times_if_plausible(np.array([int(one[1]) for one in matches if one is not None]) * unit)
     return None
 
 
-def _plausible(times: Array) -> Array | None:
+def _times_if_plausible(times: Array) -> Array | None:
     return times if ((times >= EPOCH_S[0]) & (times <= EPOCH_S[1])).all() else None
 
 
 def _numbers(names: Sequence[str]) -> Array | None:
     """Return the last number in each name ``(names,)``, in units of the smallest step; None if they do not increase."""
-    found = [re.findall(r"\d{1,15}", Path(name).stem) for name in names]
-    if not all(found):
+    digits = [re.findall(r"\d{1,15}", Path(name).stem) for name in names]
+    if not all(digits):
         return None
-    numbers = np.array([float(one[-1]) for one in found])
+    numbers = np.array([float(one[-1]) for one in digits])
     steps = np.diff(numbers)
     return numbers / steps.min() if len(steps) and steps.min() > 0 else None
 
 
-def _of_one_size(files: list[Path], folder: Path) -> tuple[list[Path], tuple[int, int], list[str]]:
+def _select_one_size(files: list[Path], folder: Path) -> tuple[list[Path], tuple[int, int], list[str]]:
     """Return the complete pictures of the most frequent size, that size, and sentences on the others."""
-    whole = [file for file in files if is_whole(file)]
+    complete = [file for file in files if is_whole(file)]
     sizes: dict[Path, tuple[int, int]] = {}
     reason = ""
-    for file in whole:
+    for file in complete:
         try:
             sizes[file] = picture_size(file)
         except MitsonarError as error:
@@ -305,14 +305,14 @@ def _of_one_size(files: list[Path], folder: Path) -> tuple[list[Path], tuple[int
     if not sizes:
         raise MitsonarError(reason or f"{folder} holds no whole picture: all are empty or cut off")
     shape = Counter(sizes.values()).most_common(1)[0][0]
-    kept = [file for file, size in sizes.items() if size == shape]
+    same_size = [file for file, size in sizes.items() if size == shape]
     notes = []
     if len(sizes) < len(files):
         notes.append(f"left out: {counted(len(files) - len(sizes), 'picture')} cut off or damaged")
-    if len(kept) < len(sizes):
-        others = len(sizes) - len(kept)
+    if len(same_size) < len(sizes):
+        others = len(sizes) - len(same_size)
         notes.append(f"left out: {counted(others, 'picture')} of another size than {shape[1]:,} x {shape[0]:,} pixels")
-    return kept, shape, notes
+    return same_size, shape, notes
 
 
 def _has_colours(path: Path) -> bool:
@@ -372,7 +372,7 @@ def read_picture_stack(path: Path, geometry: Path | None = None) -> Recording:
         raise MitsonarError(f"cannot read {path}: {' '.join(str(error).split())[:200]}; it is damaged") from None
     name = next(one for one in NAMES if one in table)
     stack = _stack(table[name], f"{name} of {path}")
-    told, told_by = geometry_for(path, geometry, _fan_in(table, path))
+    picture_geometry, geometry_path = geometry_for(path, geometry, _geometry_in_arrays(table, path))
     times = next((table[one] for one in TIME_ARRAYS if one in table and table[one].shape == (len(stack),)), None)
     rate = next((_number(table[one], one, path) for one in RATES if one in table), None)
 
@@ -389,7 +389,7 @@ def read_picture_stack(path: Path, geometry: Path | None = None) -> Recording:
         rate_hz=rate,
         facts={"values": str(stack.dtype)},
     )
-    return recording_of(pictures, told, told_by)
+    return recording_of(pictures, picture_geometry, geometry_path)
 
 
 def _stack(values: FileArray, what: str) -> Grey:
@@ -406,7 +406,7 @@ def _stack(values: FileArray, what: str) -> Grey:
     return values.astype(np.float32)
 
 
-def _fan_in(table: dict[str, FileArray], path: Path) -> PictureGeometry | None:
+def _geometry_in_arrays(table: dict[str, FileArray], path: Path) -> PictureGeometry | None:
     """Return the geometry described by the arrays of the file; None if they do not describe one."""
     if not set(FAN) - {"kx"} <= set(table):
         return None
@@ -444,7 +444,7 @@ def read_picture_video(path: Path, geometry: Path | None = None) -> Recording:
     Raises:
         MitsonarError: if OpenCV is not installed, the video is damaged, or there is no geometry.
     """
-    told, told_by = geometry_for(path, geometry)
+    picture_geometry, geometry_path = geometry_for(path, geometry)
     video = _Video(path)
     count, rate = video.count(), video.rate_hz
     pictures = Pictures(
@@ -456,7 +456,7 @@ def read_picture_video(path: Path, geometry: Path | None = None) -> Recording:
         rate_hz=rate,
         facts={} if rate is None else {"nominal_rate_hz": rate},
     )
-    return recording_of(pictures, told, told_by)
+    return recording_of(pictures, picture_geometry, geometry_path)
 
 
 class _Video:
@@ -469,7 +469,7 @@ class _Video:
             raise explain_missing(error) from None
         self.cv2, self.path = cv2, path
         self.capture: Any = None
-        self.at = 0
+        self.position = 0
         self._begin()
         opened: Any = self.capture
         rows, columns = (int(opened.get(one)) for one in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
@@ -482,17 +482,17 @@ class _Video:
         if self.capture is not None:
             self.capture.release()
         self.capture = self.cv2.VideoCapture(str(self.path))
-        self.at = 0
+        self.position = 0
         if not self.capture.isOpened():
             raise MitsonarError(f"OpenCV cannot open the video {self.path}: it is damaged, or of a codec that is not there")
 
     def count(self) -> int:
         """Return the number of frames that can be decoded; the number in the header is unreliable."""
         while self.capture.grab():
-            self.at += 1
-            if self.at > MOST_PICTURES:
+            self.position += 1
+            if self.position > MOST_PICTURES:
                 raise MitsonarError(f"{self.path} holds more than {MOST_PICTURES:,} frames: cut it")
-        count = self.at
+        count = self.position
         self._begin()
         if not count:
             raise MitsonarError(f"{self.path} holds no frame that can be decoded: it is damaged")
@@ -500,15 +500,15 @@ class _Video:
 
     def read(self, place: int) -> Grey:
         """Decode the frame with this index ``(rows, columns)`` as uint8; colours are converted to luminance."""
-        if place < self.at:
+        if place < self.position:
             self._begin()
-        while self.at < place:
+        while self.position < place:
             if not self.capture.grab():
                 break
-            self.at += 1
-        there, picture = self.capture.read()
-        self.at += 1
-        if not there or picture.shape[:2] != self.shape:
+            self.position += 1
+        decoded, picture = self.capture.read()
+        self.position += 1
+        if not decoded or picture.shape[:2] != self.shape:
             raise MitsonarError(f"frame {place:,} of {self.path} cannot be decoded: the video is damaged")
         grey: Grey = self.cv2.cvtColor(picture, self.cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture
         return np.asarray(grey, dtype=np.uint8)
@@ -525,7 +525,7 @@ MOST_WEIGHTS = 2**25
 MOST_BEAMS = 1024
 """Maximum number of beams if the geometry gives none."""
 
-AT_A_TIME = 2**20
+WEIGHTS_PER_BLOCK = 2**20
 """Number of weights that are computed at a time."""
 
 
@@ -571,12 +571,12 @@ class FanSampler:
         radius = geometry.near + (np.arange(bins * along) + 0.5) * (step / along)
         angle = -half + (np.arange(beams * across) + 0.5) * (2 * half / (beams * across))
         # 3. Compute the weights of some range bins at a time, which limits the memory for intermediate arrays.
-        made = []
-        at_once = max(1, AT_A_TIME // (beams * across * along * 4))
-        for first in range(0, bins, at_once):
-            some = radius[first * along : (first + at_once) * along].astype(float)
-            made.append(_weights(geometry, some, angle.astype(float), (along, across), (rows, columns)))
-        weights = vstack(made, format="csr")
+        blocks = []
+        bins_per_block = max(1, WEIGHTS_PER_BLOCK // (beams * across * along * 4))
+        for first in range(0, bins, bins_per_block):
+            block_radius = radius[first * along : (first + bins_per_block) * along].astype(float)
+            blocks.append(_weights(geometry, block_radius, angle.astype(float), (along, across), (rows, columns)))
+        weights = vstack(blocks, format="csr")
         if not weights.nnz:
             raise MitsonarError(
                 f"the fan of the geometry lies outside the pictures of {columns:,} x {rows:,} pixels: check apex_px, "
@@ -638,12 +638,12 @@ def _weights(
     #    partly outside the picture become the mean of the part inside, and cells fully outside keep an empty row.
     cells = len(radius) // points[0] * (len(angle) // points[1])
     index = np.tile(cell.ravel()[inside], 4)
-    found = csr_array((np.concatenate(parts), (index, np.concatenate(pixels))), shape=(cells, rows * columns))
-    total = found.sum(axis=1)
+    weights = csr_array((np.concatenate(parts), (index, np.concatenate(pixels))), shape=(cells, rows * columns))
+    total = weights.sum(axis=1)
     scale = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
-    found.data *= np.repeat(scale, np.diff(found.indptr))
-    found.eliminate_zeros()
-    return found.astype(np.float32)
+    weights.data *= np.repeat(scale, np.diff(weights.indptr))
+    weights.eliminate_zeros()
+    return weights.astype(np.float32)
 
 
 # ---------------- Recording of a sequence of pictures
@@ -696,9 +696,9 @@ def geometry_for(source: Path, geometry: Path | None, inside: PictureGeometry | 
     Raises:
         MitsonarError: if there is no geometry, or the geometry file is damaged.
     """
-    found = geometry or geometry_beside(source)
-    if found is not None:
-        return load_geometry(found), found
+    geometry_path = geometry or geometry_beside(source)
+    if geometry_path is not None:
+        return load_geometry(geometry_path), geometry_path
     if inside is None:
         raise MitsonarError(
             f"{source} holds pictures, which do not tell their geometry: give a geometry file (--geometry FILE), or lay "
@@ -707,36 +707,36 @@ def geometry_for(source: Path, geometry: Path | None, inside: PictureGeometry | 
     return inside, source
 
 
-def recording_of(pictures: Pictures, geometry: PictureGeometry, told_by: Path) -> Recording:
+def recording_of(pictures: Pictures, geometry: PictureGeometry, geometry_path: Path) -> Recording:
     """Create a recording of pictures; polar pictures are reordered, fans are resampled to beams and bins.
 
     Args:
         pictures: pictures in the order of their source.
         geometry: geometry that they share.
-        told_by: file of the geometry; the path of a file of times is relative to its folder.
+        geometry_path: file of the geometry; the path of a file of times is relative to its folder.
 
     Raises:
         MitsonarError: if the geometry does not fit the pictures, or times cannot be read.
     """
-    times, notes = _times(pictures, geometry, told_by)
-    kept, sorting = in_time_order(times, pictures.numbers)
-    rate = _rate(times[kept], geometry)
+    times, notes = _times(pictures, geometry, geometry_path)
+    order, sorting = in_time_order(times, pictures.numbers)
+    rate = _rate(times[order], geometry)
     notes = [*pictures.notes, *notes, *sorting, *geometry.notes()]
     images: _Polar | _Fan
     if geometry.layout == "polar":
         shape = pictures.shape[::-1] if geometry.transposed else pictures.shape
-        images, like = _Polar(pictures, kept, geometry), polar_frames(geometry, *shape, rate)
+        images, like = _Polar(pictures, order, geometry), polar_frames(geometry, *shape, rate)
     else:
         sampler = FanSampler.of(geometry, *pictures.shape)
-        images = _Fan(pictures, kept, sampler)
+        images = _Fan(pictures, order, sampler)
         like = _fan_frames(geometry, sampler, rate)
-        some = np.unique(np.linspace(0, len(kept) - 1, OUTLINE_PICTURES).astype(np.intp)) if len(kept) else kept
-        if len(some):
-            notes += doubts(geometry, np.max([_bytes(pictures.read(int(place))) for place in kept[some]], axis=0))
-    height_m = None if geometry.height_m is None else np.full(len(kept), geometry.height_m)
-    part = Part(like, times[kept], images, attitude_rad=_attitude(geometry, len(kept)), height_m=height_m)
+        sample = np.unique(np.linspace(0, len(order) - 1, OUTLINE_PICTURES).astype(np.intp)) if len(order) else order
+        if len(sample):
+            notes += doubts(geometry, np.max([_bytes(pictures.read(int(place))) for place in order[sample]], axis=0))
+    height_m = None if geometry.height_m is None else np.full(len(order), geometry.height_m)
+    part = Part(like, times[order], images, attitude_rad=_fixed_attitude(geometry, len(order)), height_m=height_m)
     facts: Facts = {"pictures": len(pictures.names), "rows": pictures.shape[0], "columns": pictures.shape[1]}
-    facts |= {"layout": geometry.layout, "geometry": str(told_by)} | pictures.facts
+    facts |= {"layout": geometry.layout, "geometry": str(geometry_path)} | pictures.facts
     return Recording(str(pictures.source), pictures.format, (part,), facts, tuple(notes))
 
 
@@ -748,7 +748,7 @@ def polar_frames(geometry: PictureGeometry, bins: int, beams: int, rate_hz: floa
     """
     if geometry.bearings_deg is None:
         sonar = _sonar(geometry, bins, beams, float(geometry.azimuth_fov_deg or 0.0), rate_hz)
-        return _like(geometry, sonar, sonar.bearing_rad)
+        return _empty_frames(geometry, sonar, sonar.bearing_rad)
     if len(geometry.bearings_deg) != beams:
         raise MitsonarError(
             f"the geometry has {len(geometry.bearings_deg):,} bearings_deg, and the pictures have {beams:,} beams: give "
@@ -756,13 +756,13 @@ def polar_frames(geometry: PictureGeometry, bins: int, beams: int, rate_hz: floa
         )
     bearings = np.sort(np.radians(geometry.bearings_deg))
     fov = min(360.0, math.degrees(bearings[-1] - bearings[0]) * beams / (beams - 1))
-    return _like(geometry, _sonar(geometry, bins, beams, fov, rate_hz), bearings)
+    return _empty_frames(geometry, _sonar(geometry, bins, beams, fov, rate_hz), bearings)
 
 
 def _fan_frames(geometry: PictureGeometry, sampler: FanSampler, rate_hz: float) -> SonarFrames:
     """Return empty frames with the geometry of resampled fans."""
     sonar = _sonar(geometry, sampler.bins, sampler.beams, 2 * float(geometry.half_angle_deg or 0.0), rate_hz)
-    return _like(geometry, sonar, sonar.bearing_rad)
+    return _empty_frames(geometry, sonar, sonar.bearing_rad)
 
 
 def _sonar(geometry: PictureGeometry, bins: int, beams: int, fov_deg: float, rate_hz: float) -> Sonar:
@@ -786,7 +786,7 @@ def _sonar(geometry: PictureGeometry, bins: int, beams: int, fov_deg: float, rat
     )
 
 
-def _like(geometry: PictureGeometry, sonar: Sonar, bearing_rad: Array) -> SonarFrames:
+def _empty_frames(geometry: PictureGeometry, sonar: Sonar, bearing_rad: Array) -> SonarFrames:
     return SonarFrames(
         image=np.zeros((0, sonar.range_bins, sonar.beams), np.uint8),
         range_m=sonar.range_m,
@@ -807,14 +807,14 @@ class _Polar:
 
     def __call__(self, index: NDArray[np.intp]) -> Pixels:
         """Return images ``(n, bins, beams)``, row 0 nearest, column 0 farthest to port."""
-        turned = self.geometry.transposed
-        shape = self.pictures.shape[::-1] if turned else self.pictures.shape
-        read = [self.pictures.read(int(place)) for place in self.places[index]]
-        stacked = np.stack([one.T if turned else one for one in read]) if read else np.zeros((0, *shape), np.uint8)
+        transposed = self.geometry.transposed
+        shape = self.pictures.shape[::-1] if transposed else self.pictures.shape
+        images = [self.pictures.read(int(place)) for place in self.places[index]]
+        stacked = np.stack([one.T if transposed else one for one in images]) if images else np.zeros((0, *shape), np.uint8)
         rows = slice(None, None, 1 if self.geometry.rows == "near-to-far" else -1)
-        told = self.geometry.bearings_deg
-        falls = self.geometry.mirror if told is None else told[0] > told[-1]
-        return stacked[:, rows, :: -1 if falls else 1]
+        bearings_deg = self.geometry.bearings_deg
+        flipped = self.geometry.mirror if bearings_deg is None else bearings_deg[0] > bearings_deg[-1]
+        return stacked[:, rows, :: -1 if flipped else 1]
 
 
 @dataclass(frozen=True)
@@ -827,10 +827,10 @@ class _Fan:
 
     def __call__(self, index: NDArray[np.intp]) -> Pixels:
         """Return images ``(n, bins, beams)`` float32, row 0 nearest, column 0 farthest to port."""
-        made = np.zeros((len(index), self.sampler.bins, self.sampler.beams), np.float32)
+        images = np.zeros((len(index), self.sampler.bins, self.sampler.beams), np.float32)
         for place, number in enumerate(self.places[index]):
-            made[place] = self.sampler.apply(self.pictures.read(int(number)))
-        return made
+            images[place] = self.sampler.apply(self.pictures.read(int(number)))
+        return images
 
 
 def _bytes(picture: Grey) -> Grey:
@@ -838,10 +838,10 @@ def _bytes(picture: Grey) -> Grey:
     return picture if picture.dtype == np.uint8 else np.asarray(np.clip(picture, 0, 1) * 255, dtype=np.uint8)
 
 
-def _times(pictures: Pictures, geometry: PictureGeometry, told_by: Path) -> tuple[Array, list[str]]:
+def _times(pictures: Pictures, geometry: PictureGeometry, geometry_path: Path) -> tuple[Array, list[str]]:
     """Return the times of the pictures ``(pictures,)`` [s], and sentences on what is assumed."""
     if geometry.times is not None:
-        return _times_in(told_by.parent / geometry.times, pictures.names), []
+        return _read_times(geometry_path.parent / geometry.times, pictures.names), []
     if pictures.time_s is not None:
         return pictures.time_s, []
     rate = geometry.frame_rate_hz or pictures.rate_hz
@@ -852,7 +852,7 @@ def _times(pictures: Pictures, geometry: PictureGeometry, told_by: Path) -> tupl
     return steps / (rate or ANY_RATE_HZ), assumed
 
 
-def _times_in(path: Path, names: tuple[str, ...]) -> Array:
+def _read_times(path: Path, names: tuple[str, ...]) -> Array:
     """Read a file of times: one line ``TIME`` per picture in order, or lines ``NAME, TIME``; ``#`` begins a comment.
 
     Times ``(names,)`` [s] are nan for pictures whose name is missing.
@@ -866,10 +866,10 @@ def _times_in(path: Path, names: tuple[str, ...]) -> Array:
         raise MitsonarError(f"{path} must hold lines `TIME` or `NAME, TIME` with times [s]{SEE}") from None
     if rows and all(len(row) == 2 for row in rows):
         by_name = {row[0]: time for row, time in zip(rows, times, strict=True)}
-        found = np.array([by_name.get(name, np.nan) for name in names])
-        if not np.isfinite(found).any():
+        named_times = np.array([by_name.get(name, np.nan) for name in names])
+        if not np.isfinite(named_times).any():
             raise MitsonarError(f"{path} names none of the pictures, such as {names[0] if names else '-'}")
-        return found
+        return named_times
     if len(times) != len(names) or any(len(row) != 1 for row in rows):
         raise MitsonarError(f"{path} must hold a time for each of {len(names):,} pictures: it holds {len(times):,} lines")
     return np.array(times)
@@ -881,7 +881,7 @@ def _rate(times: Array, geometry: PictureGeometry) -> float:
     return geometry.frame_rate_hz or (min(1e6, 1 / step) if step > 0 else ANY_RATE_HZ)
 
 
-def _attitude(geometry: PictureGeometry, frames: int) -> Array | None:
+def _fixed_attitude(geometry: PictureGeometry, frames: int) -> Array | None:
     """Return pitch, roll, heading ``(frames, 3)`` [rad] if the geometry gives the pitch; the heading is nan."""
     if geometry.pitch_deg is None:
         return None
@@ -924,36 +924,36 @@ def write_frames(
     """
     part = recording.part(number)
     chosen = recording.longest if number is None else number
-    asked = {"of": recording.name, "format": recording.format, "part": chosen, "frames": len(part)}
-    run = RunDirectory.begin(folder, CONVERSION, asked, resume=resume, overwrite=overwrite)
+    request = {"of": recording.name, "format": recording.format, "part": chosen, "frames": len(part)}
+    run = RunDirectory.begin(folder, CONVERSION, request, resume=resume, overwrite=overwrite)
     run.start(frames=len(part), frames_done=0)
-    told = progress or (lambda done: None)
-    packed, path = run.path / "frames.npz", run.path / "frames.zarr"
-    if run.finished and (packed.exists() or path.exists()):
-        told(len(part))
-        return packed if packed.exists() else path
-    store, done = _store(run, recording, part, path)
-    told(done)
+    report_progress = progress or (lambda done: None)
+    npz_path, zarr_path = run.path / "frames.npz", run.path / "frames.zarr"
+    if run.finished and (npz_path.exists() or zarr_path.exists()):
+        report_progress(len(part))
+        return npz_path if npz_path.exists() else zarr_path
+    store, done = _store(run, recording, part, zarr_path)
+    report_progress(done)
     step = max(1, CHUNK_BYTES // (part.like.image.dtype.itemsize * len(part.like.range_m) * len(part.like.bearing_rad)))
     for start in range(done, len(part), step):
         frames = part.read(np.arange(start, min(start + step, len(part))))
         store.write(start, frames)
         run.note(frames_done=start + len(frames))
-        told(len(frames))
+        report_progress(len(frames))
     if len(part) <= LONGEST_NPZ:
-        store.pack(packed)
+        store.pack(npz_path)
     run.finish()
-    return packed if packed.exists() else path
+    return npz_path if npz_path.exists() else zarr_path
 
 
-def _store(run: RunDirectory, recording: Recording, part: Part, path: Path) -> tuple[FrameStore, int]:
+def _store(run: RunDirectory, recording: Recording, part: Part, zarr_path: Path) -> tuple[FrameStore, int]:
     """Return the existing store, or a new one, and the number of frames that it holds."""
-    if run.resumed and path.exists():
-        store = FrameStore.open(path)
+    if run.resumed and zarr_path.exists():
+        store = FrameStore.open(zarr_path)
         done = min(run.count("frames_done", len(part)), store.done)
         store.check(len(part), part.like.sonar, done)
         return store, done
     if run.resumed and run.count("frames_done", len(part)):
-        raise MitsonarError(f"{path} is gone, though run.json says that it was begun: copy again with --overwrite")
+        raise MitsonarError(f"{zarr_path} is gone, though run.json says that it was begun: copy again with --overwrite")
     about = {"recording": recording.name, "format": recording.format, "notes": list(recording.notes)}
-    return FrameStore.create(path, len(part), replace(part.read([]), about=about)), 0
+    return FrameStore.create(zarr_path, len(part), replace(part.read([]), about=about)), 0

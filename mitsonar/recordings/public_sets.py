@@ -63,8 +63,8 @@ POSE_COLUMNS = 16
 SAME_VELOCITY = 0.2
 """Largest median difference between the world velocity and the rotated sensor velocity, as a fraction of the speed."""
 
-UPRIGHT = 0.7
-SAILS = 3.0
+MIN_UPRIGHT = 0.7
+MIN_SAILING_RATIO = 3.0
 """Minimum mean vertical component of the up axis; minimum ratio of mean velocities along and across the sonar."""
 
 
@@ -100,29 +100,33 @@ def read_canoe(path: Path) -> Recording:
         MitsonarError: if no picture can be read, or bearings are not plausible.
     """
     # 1. List the complete pictures and their times.
-    found = sorted((time, one) for one in (path / "sonar").glob("*.png") if (time := _time_us(one)))
-    whole = [(time, one) for time, one in found if is_whole(one)]
-    notes = [f"left out: {counted(len(found) - len(whole), 'picture')} cut off"] if len(whole) < len(found) else []
-    if not whole:
+    pictures = sorted((time, one) for one in (path / "sonar").glob("*.png") if (time := _time_us(one)))
+    complete = [(time, one) for time, one in pictures if is_whole(one)]
+    notes = (
+        [f"left out: {counted(len(pictures) - len(complete), 'picture')} cut off"] if len(complete) < len(pictures) else []
+    )
+    if not complete:
         raise MitsonarError(f"{path / 'sonar'} holds no whole picture")
-    stamps, files = np.array([time for time, _ in whole], dtype=np.int64), [one for _, one in whole]
+    stamps, files = np.array([time for time, _ in complete], dtype=np.int64), [one for _, one in complete]
     # 2. Assign poses, and leave out pictures without one if there are any poses.
-    poses, told = _canoe_poses(path / POSES, stamps)
+    poses, pose_notes = _canoe_poses(path / POSES, stamps)
     if poses is not None and not np.isfinite(poses).all():
         posed = np.flatnonzero(np.isfinite(poses).all(axis=1))
         notes.append(f"left out: {counted(len(files) - len(posed), 'picture')} without a pose")
         stamps, files, poses = stamps[posed], [files[place] for place in posed], poses[posed]
     # 3. Make a part of each run of pictures of the same size.
     times = np.asarray(stamps * 1e-6, dtype=float)
-    kept, sorting = in_time_order(times)
-    sizes = [picture_size(files[place]) for place in kept]
+    order, order_notes = in_time_order(times)
+    sizes = [picture_size(files[place]) for place in order]
     parts = []
     for size, run in runs_of(sizes):
         assert isinstance(size, tuple)  # the keys of runs_of are the sizes
-        parts.append(_canoe_part([files[place] for place in kept[run]], size, times[kept[run]], poses, kept[run]))
+        parts.append(_canoe_part([files[place] for place in order[run]], size, times[order[run]], poses, order[run]))
     facts: Facts = {"pictures": len(files), "rows": sizes[0][0], "columns": sizes[0][1]}
     assumed = f"the window 0..{RANGE_MAX:g} m and the coding amplitude^0.5 are assumed: the files do not tell them"
-    return Recording(str(path), "CANOE data set (Oculus as PNG)", tuple(parts), facts, (*notes, *sorting, *told, assumed))
+    return Recording(
+        str(path), "CANOE data set (Oculus as PNG)", tuple(parts), facts, (*notes, *order_notes, *pose_notes, assumed)
+    )
 
 
 def _time_us(path: Path) -> int:
@@ -207,43 +211,47 @@ def _canoe_poses(path: Path, stamps: NDArray[np.int64]) -> tuple[Array | None, l
     # 1. Match rows and pictures by time, and drop rows with implausible values.
     rows = {int(time): row for row, time in enumerate(table.whole_at(0))}
     values = table.columns_at(range(1, POSE_COLUMNS))
-    fine = np.isfinite(values).all(axis=1) & (np.abs(values).max(axis=1) < 1e9)
-    found = np.array([row if (row := rows.get(int(time), -1)) >= 0 and fine[row] else -1 for time in stamps], dtype=np.intp)
-    if (found >= 0).sum() < max(2, len(stamps) // 2):
-        return None, [f"left out: {POSES}, which has poses of {(found >= 0).sum():,} of {counted(len(stamps), 'picture')}"]
+    valid = np.isfinite(values).all(axis=1) & (np.abs(values).max(axis=1) < 1e9)
+    row_index = np.array(
+        [row if (row := rows.get(int(time), -1)) >= 0 and valid[row] else -1 for time in stamps], dtype=np.intp
+    )
+    if (row_index >= 0).sum() < max(2, len(stamps) // 2):
+        return None, [
+            f"left out: {POSES}, which has poses of {(row_index >= 0).sum():,} of {counted(len(stamps), 'picture')}"
+        ]
     # 2. Determine which rotation the angles describe, and which of its axes are starboard, forward and up.
-    values = values[found[found >= 0]]
-    rotation = _to_world(values)
-    body = None if rotation is None else _body(rotation, values[:, 12:15])
+    values = values[row_index[row_index >= 0]]
+    rotation = _sensor_to_world(values)
+    body = None if rotation is None else _sensor_axes(rotation, values[:, 12:15])
     if rotation is None or body is None:
         why = "angles and velocities disagree" if rotation is None else "the boat does not sail along an axis of the sonar"
         return None, [f"the axes of {POSES} could not be found, since {why}: poses are left out"]
     poses = np.full((len(stamps), 6), np.nan)
-    poses[found >= 0] = poses_from(values[:, :3], rotation * body)
+    poses[row_index >= 0] = poses_from(values[:, :3], rotation * body)
     return poses, []
 
 
-def _to_world(values: Array) -> Rotation | None:
+def _sensor_to_world(values: Array) -> Rotation | None:
     """Return the rotations from sensor to world; None if the velocities in both frames contradict them.
 
     The reference multiplies passive rotations, C1(r) C2(p) C3(y). The velocities decide whether this product or its inverse
     rotates the sensor velocity to the world velocity.
     """
-    world, own = values[:, 6:9], values[:, 12:15]
+    world_velocity, sensor_velocity = values[:, 6:9], values[:, 12:15]
     product = Rotation.from_euler("XYZ", -values[:, 3:6])
-    speed = np.linalg.norm(world, axis=1)
+    speed = np.linalg.norm(world_velocity, axis=1)
     moving = speed > 0.1 * max(float(speed.max()), 1e-9)
     if not speed.max() > 0:
         return None
-    found = []
+    candidates = []
     for rotation in (product, product.inv()):
-        off = np.linalg.norm(rotation.apply(own) - world, axis=1)[moving] / speed[moving]
-        found.append((float(np.median(off)), rotation))
-    least, best = min(found, key=lambda one: one[0])
-    return best if least < SAME_VELOCITY else None
+        error = np.linalg.norm(rotation.apply(sensor_velocity) - world_velocity, axis=1)[moving] / speed[moving]
+        candidates.append((float(np.median(error)), rotation))
+    smallest_error, best = min(candidates, key=lambda one: one[0])
+    return best if smallest_error < SAME_VELOCITY else None
 
 
-def _body(rotation: Rotation, velocity: Array) -> Rotation | None:
+def _sensor_axes(rotation: Rotation, velocity: Array) -> Rotation | None:
     """Return starboard, forward and up in the sensor's axes, as columns; None if they cannot be determined.
 
     Args:
@@ -255,7 +263,7 @@ def _body(rotation: Rotation, velocity: Array) -> Rotation | None:
     level = [axis for axis in range(3) if axis != vertical]
     mean = velocity.mean(axis=0)
     ahead, across = sorted(level, key=lambda axis: -abs(mean[axis]))
-    if abs(upright[vertical]) < UPRIGHT or abs(mean[ahead]) < SAILS * abs(mean[across]):
+    if abs(upright[vertical]) < MIN_UPRIGHT or abs(mean[ahead]) < MIN_SAILING_RATIO * abs(mean[across]):
         return None
     up, forward = np.zeros(3), np.zeros(3)
     up[vertical], forward[ahead] = np.sign(upright[vertical]), np.sign(mean[ahead])
@@ -337,27 +345,27 @@ def read_uxo(path: Path) -> Recording:
     table = CsvTable(path / TABLE)
     headers = _headers(table)
     files = {int(one.stem): one for one in (path / IMAGES).glob("*.pgm") if one.stem.isascii() and one.stem.isdigit()}
-    whole = _whole(headers)
-    there = np.array([int(index) in files and is_whole(files[int(index)]) for index in headers["index"]])
+    plausible = _are_plausible(headers)
+    has_picture = np.array([int(index) in files and is_whole(files[int(index)]) for index in headers["index"]])
     notes = []
-    if not whole.all():
-        notes.append(f"left out: {counted(int((~whole).sum()), 'row')} of {TABLE} with numbers that cannot be")
-    if not there.all():
-        notes.append(f"left out: {counted(int((~there).sum()), 'frame')} of {TABLE} without a picture")
+    if not plausible.all():
+        notes.append(f"left out: {counted(int((~plausible).sum()), 'row')} of {TABLE} with numbers that cannot be")
+    if not has_picture.all():
+        notes.append(f"left out: {counted(int((~has_picture).sum()), 'frame')} of {TABLE} without a picture")
     extra = len(files) - len(set(files) & {int(index) for index in headers["index"]})
     if extra:
         notes.append(f"left out: {counted(extra, 'picture')} without a row in {TABLE}")
     # 2. Sort them by time, assign poses, and make a part of each run of frames with the same geometry.
-    usable = whole & there
-    kept, sorting = in_time_order(np.where(usable, headers["time_us"] * 1e-6, np.nan), headers["index"])
-    sorting = [note for note in sorting if "no valid time" not in note]
-    poses, told = _uxo_poses(path / ROTATOR, headers["index"][kept])
-    modes, samples = headers["ping_mode"][kept].tolist(), headers["samples"][kept].tolist()
-    keys = [(*one, *window) for *one, window in zip(modes, samples, windows_of(headers[kept]), strict=True)]
-    parts = tuple(_uxo_part(headers[kept[run]], files, None if poses is None else poses[run]) for _, run in runs_of(keys))
-    facts: Facts = facts_of(headers[kept], BEAMS[int(headers["ping_mode"][kept[0]])]) if len(kept) else {}
+    usable = plausible & has_picture
+    order, order_notes = in_time_order(np.where(usable, headers["time_us"] * 1e-6, np.nan), headers["index"])
+    order_notes = [note for note in order_notes if "no valid time" not in note]
+    poses, pose_notes = _uxo_poses(path / ROTATOR, headers["index"][order])
+    modes, samples = headers["ping_mode"][order].tolist(), headers["samples"][order].tolist()
+    keys = [(*one, *window) for *one, window in zip(modes, samples, windows_of(headers[order]), strict=True)]
+    parts = tuple(_uxo_part(headers[order[run]], files, None if poses is None else poses[run]) for _, run in runs_of(keys))
+    facts: Facts = facts_of(headers[order], BEAMS[int(headers["ping_mode"][order[0]])]) if len(order) else {}
     return Recording(
-        str(path), "UXO data set (ARIS as PGM)", parts, facts, (*notes, *sorting, *told, *notes_of(headers[kept]))
+        str(path), "UXO data set (ARIS as PGM)", parts, facts, (*notes, *order_notes, *pose_notes, *notes_of(headers[order]))
     )
 
 
@@ -379,25 +387,27 @@ def _headers(table: CsvTable) -> Header:
     return headers
 
 
-def _whole(headers: Header) -> NDArray[np.bool_]:
+def _are_plausible(headers: Header) -> NDArray[np.bool_]:
     """Return which headers ``(frames,)`` are plausible."""
-    whole = np.isin(headers["ping_mode"], list(BEAMS)) & np.isin(headers["system"], list(KINDS)) & (headers["time_us"] > 0)
+    plausible = (
+        np.isin(headers["ping_mode"], list(BEAMS)) & np.isin(headers["system"], list(KINDS)) & (headers["time_us"] > 0)
+    )
     for name, (low, high) in LIMITS.items():
-        whole &= (headers[name] >= low) & (headers[name] <= high)
-    return whole
+        plausible &= (headers[name] >= low) & (headers[name] <= high)
+    return plausible
 
 
-def _uxo_part(mine: Header, files: dict[int, Path], poses: Array | None) -> Part:
-    samples, beams = int(mine["samples"][0]), BEAMS[int(mine["ping_mode"][0])]
-    paths = tuple(files[int(index)] for index in mine["index"])
+def _uxo_part(headers: Header, files: dict[int, Path], poses: Array | None) -> Part:
+    samples, beams = int(headers["samples"][0]), BEAMS[int(headers["ping_mode"][0])]
+    paths = tuple(files[int(index)] for index in headers["index"])
     return Part(
-        like=like_of(mine, samples, beams),
-        time_s=mine["time_us"] * 1e-6,
+        like=like_of(headers, samples, beams),
+        time_s=headers["time_us"] * 1e-6,
         images=_Pgm(paths, (samples, beams)),
         poses=poses,
-        attitude_rad=attitude_of(mine),
-        height_m=height_of(mine),
-        gain_db=mine["gain_db"].astype(float),
+        attitude_rad=attitude_of(headers),
+        height_m=height_of(headers),
+        gain_db=headers["gain_db"].astype(float),
     )
 
 
@@ -426,15 +436,15 @@ def _uxo_poses(path: Path, index: NDArray[np.integer]) -> tuple[Array | None, li
     table = CsvTable(path)
     rows = {int(number): row for row, number in enumerate(table.whole("aris_frame_idx"))}
     position = np.column_stack([table.numbers(f"pos.{axis}") for axis in "xyz"])
-    turn = np.column_stack([table.numbers(f"rot.{axis}") for axis in "xyzw"])
-    fine = np.isfinite(position).all(axis=1) & np.isfinite(turn).all(axis=1) & (np.abs(position).max(axis=1) < 1e6)
-    fine &= np.abs(np.linalg.norm(np.where(np.isfinite(turn), turn, 0), axis=1) - 1) < 0.01
-    found = np.array([rows.get(int(number), -1) for number in index], dtype=np.intp)
-    if (found < 0).any() or not fine[found].all():
-        lacking = int(((found < 0) | ~fine[found]).sum())
-        return None, [f"left out: the poses, for {ROTATOR} has no valid one for {counted(lacking, 'frame')}"]
-    rotation = Rotation.from_quat(turn[found])
-    return poses_from(position[found] + rotation.apply(SONAR_AT), rotation * FORWARD_STARBOARD_DOWN), []
+    quaternion = np.column_stack([table.numbers(f"rot.{axis}") for axis in "xyzw"])
+    valid = np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1) & (np.abs(position).max(axis=1) < 1e6)
+    valid &= np.abs(np.linalg.norm(np.where(np.isfinite(quaternion), quaternion, 0), axis=1) - 1) < 0.01
+    row_index = np.array([rows.get(int(number), -1) for number in index], dtype=np.intp)
+    if (row_index < 0).any() or not valid[row_index].all():
+        missing = int(((row_index < 0) | ~valid[row_index]).sum())
+        return None, [f"left out: the poses, for {ROTATOR} has no valid one for {counted(missing, 'frame')}"]
+    rotation = Rotation.from_quat(quaternion[row_index])
+    return poses_from(position[row_index] + rotation.apply(SONAR_AT), rotation * FORWARD_STARBOARD_DOWN), []
 
 
 # ---------------- Views of neusis
@@ -480,7 +490,7 @@ def read_neusis(path: Path) -> Recording:
     Raises:
         MitsonarError: if there is no configuration or no readable view, views differ in size, or a pose is invalid.
     """
-    setting = _setting(path / "Config.json")
+    settings = _sonar_settings(path / "Config.json")
     files = sorted((path / "Data").glob("*.pkl"), key=lambda one: naturally(one.name))
     if not files:
         raise MitsonarError(f"{path / 'Data'} holds no .pkl file")
@@ -497,10 +507,10 @@ def read_neusis(path: Path) -> Recording:
     rotation = Rotation.from_matrix(poses[:, :3, :3])
     sonar = Sonar.create(
         name="imaging-sonar",
-        azimuth_fov_deg=setting["Azimuth"],
-        elevation_fov_deg=setting["Elevation"],
-        range_min=setting["RangeMin"],
-        range_max=setting["RangeMax"],
+        azimuth_fov_deg=settings["Azimuth"],
+        elevation_fov_deg=settings["Elevation"],
+        range_min=settings["RangeMin"],
+        range_max=settings["RangeMax"],
         beams=shape[1],
         range_bins=shape[0],
         frame_rate_hz=RATE_HZ,
@@ -554,13 +564,13 @@ def _view(path: Path) -> tuple[FileArray, Array]:
         raise MitsonarError(f"{IMAGE} of {path} must be an image (bins, beams) of finite values from 0: got {image.shape}")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or np.abs(matrix[:3, 3]).max() > 1e6:
         raise MitsonarError(f"{POSE} of {path} must be a matrix (4, 4) of finite numbers: got shape {matrix.shape}")
-    turn = matrix[:3, :3]
-    if np.abs(turn @ turn.T - np.eye(3)).max() > ORTHOGONAL or np.linalg.det(turn) < 0:
+    rotation = matrix[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ORTHOGONAL or np.linalg.det(rotation) < 0:
         raise MitsonarError(f"{POSE} of {path} holds no rotation: its columns must be unit vectors, at right angles")
     return image, matrix
 
 
-def _setting(path: Path) -> dict[str, float]:
+def _sonar_settings(path: Path) -> dict[str, float]:
     """Return the field of view [deg] and the window [m] of the imaging sonar in a configuration of HoloOcean."""
     table = read_json(path)
     agents = table.get("agents")
@@ -585,62 +595,62 @@ MOST_DIMENSIONS = 8
 NUMBERS = "biuf"
 """Supported kinds of NumPy type."""
 
-Remembered = Any
+PickledValue = Any
 """Content of a pickle: numbers, strings, bytes, tuples, lists, dictionaries, and the recording objects below."""
 
 
-class _Remembers:
+class _StandIn:
     """A stand-in for an object of a pickle, which only records its constructor arguments and its state."""
 
-    def __init__(self, *made_with: Remembered) -> None:
-        self.made_with = made_with
-        self.state: Remembered = None
+    def __init__(self, *arguments: PickledValue) -> None:
+        self.arguments = arguments
+        self.state: PickledValue = None
 
-    def __setstate__(self, state: Remembered) -> None:
+    def __setstate__(self, state: PickledValue) -> None:
         self.state = state
 
 
-class _Array(_Remembers):
+class _ArrayStandIn(_StandIn):
     """An array; its state is version, shape, type, Fortran order, bytes."""
 
 
-class _Kind(_Remembers):
+class _TypeStandIn(_StandIn):
     """A NumPy type, constructed from its name; its state begins with version and byte order."""
 
 
-class _Scalar(_Remembers):
+class _ScalarStandIn(_StandIn):
     """A NumPy scalar, constructed from its type and bytes."""
 
 
-class _Class(_Remembers):
+class _ClassStandIn(_StandIn):
     """A class that is only referred to by name."""
 
 
-def _encode(text: Remembered, coding: Remembered) -> bytes:
+def _encode(text: PickledValue, coding: PickledValue) -> bytes:
     """Return bytes that old pickles store as a Latin 1 string."""
     if not isinstance(text, str) or coding not in ("latin1", "latin-1"):
         raise pickle.UnpicklingError("bytes that are no text of Latin 1")
     return text.encode("latin1")
 
 
-KNOWN: dict[tuple[str, str], Any] = {
+STAND_INS: dict[tuple[str, str], Any] = {
     **{
-        (f"numpy.{core}.{module}", name): made
+        (f"numpy.{core}.{module}", name): stand_in
         for core in ("core", "_core")
-        for module, name, made in (
-            ("multiarray", "_reconstruct", _Array),
-            ("multiarray", "scalar", _Scalar),
-            ("numeric", "_frombuffer", _Array),
+        for module, name, stand_in in (
+            ("multiarray", "_reconstruct", _ArrayStandIn),
+            ("multiarray", "scalar", _ScalarStandIn),
+            ("numeric", "_frombuffer", _ArrayStandIn),
         )
     },
-    ("numpy", "ndarray"): _Class,
-    ("numpy", "dtype"): _Kind,
+    ("numpy", "ndarray"): _ClassStandIn,
+    ("numpy", "dtype"): _TypeStandIn,
     ("_codecs", "encode"): _encode,
 }
 """Names that a pickle may contain, and the stand-ins for them."""
 
 
-class _Reader(pickle._Unpickler):  # the Python implementation, whose memory use is bounded by the file size
+class _ArrayUnpickler(pickle._Unpickler):  # the Python implementation, whose memory use is bounded by the file size
     """Unpickler that accepts known names only, and sets the state of stand-ins only."""
 
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
@@ -652,9 +662,9 @@ class _Reader(pickle._Unpickler):  # the Python implementation, whose memory use
         Raises:
             UnpicklingError: if the name is not known.
         """
-        if (module, name) not in KNOWN:
+        if (module, name) not in STAND_INS:
             raise pickle.UnpicklingError(f"it names {module[:60]}.{name[:60]}, which is no part of an array")
-        return KNOWN[module, name]
+        return STAND_INS[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
         """Reject references to objects outside the file."""
@@ -662,7 +672,7 @@ class _Reader(pickle._Unpickler):  # the Python implementation, whose memory use
 
     def load_build(self) -> None:
         """Set the state of the object on the stack, which must be a stand-in."""
-        if not isinstance(self.stack[-2], _Remembers):
+        if not isinstance(self.stack[-2], _StandIn):
             raise pickle.UnpicklingError("it changes something that is no array")
         state = self.stack.pop()
         self.stack[-1].__setstate__(state)
@@ -682,26 +692,26 @@ def read_pickled_arrays(path: Path) -> dict[str, FileArray]:
     """
     content = read_bytes(path, "pickle", LARGEST)
     try:
-        found = _Reader(io.BytesIO(content)).load()
-        if not isinstance(found, dict):
+        table = _ArrayUnpickler(io.BytesIO(content)).load()
+        if not isinstance(table, dict):
             raise pickle.UnpicklingError("it holds no table")
-        return {str(name): array for name, value in found.items() if (array := _array(value)) is not None}
+        return {str(name): array for name, value in table.items() if (array := _array(value)) is not None}
     except Exception as error:  # damaged bytes raise errors of many kinds
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MitsonarError(f"cannot read the pickle {path}: {reason}; only arrays of NumPy are read from pickles") from None
 
 
-def _array(value: Remembered) -> FileArray | None:
+def _array(value: PickledValue) -> FileArray | None:
     """Return the array that a value of a pickle represents; None if it represents none."""
     if isinstance(value, bool | int | float):
         return np.asarray(value, dtype=float) if abs(value) < 1e300 or value != value else None
-    if isinstance(value, _Scalar):
-        kind, content = (*value.made_with, None, None)[:2]
+    if isinstance(value, _ScalarStandIn):
+        kind, content = (*value.arguments, None, None)[:2]
         return _from_bytes(content, kind, (), "C")
-    if not isinstance(value, _Array):
+    if not isinstance(value, _ArrayStandIn):
         return None
     if value.state is None:  # constructed by _frombuffer: bytes, type, shape, order
-        content, kind, shape, order = (*value.made_with, None, None, None, None)[:4]
+        content, kind, shape, order = (*value.arguments, None, None, None, None)[:4]
         return _from_bytes(content, kind, shape, order)
     if not isinstance(value.state, tuple) or len(value.state) != 5:
         raise ValueError("an array has a state that cannot be")
@@ -709,19 +719,19 @@ def _array(value: Remembered) -> FileArray | None:
     return _from_bytes(content, kind, shape, "F" if fortran else "C")
 
 
-def _from_bytes(content: Remembered, kind: Remembered, shape: Remembered, order: Remembered) -> FileArray:
+def _from_bytes(content: PickledValue, kind: PickledValue, shape: PickledValue, order: PickledValue) -> FileArray:
     """Build an array from bytes, after its type and shape have been checked against their number."""
-    if not isinstance(kind, _Kind) or not kind.made_with or not isinstance(kind.made_with[0], str):
+    if not isinstance(kind, _TypeStandIn) or not kind.arguments or not isinstance(kind.arguments[0], str):
         raise ValueError("an array has a type that cannot be")
-    name = kind.made_with[0]
-    swapped = isinstance(kind.state, tuple) and len(kind.state) > 1 and kind.state[1] == ">"
+    name = kind.arguments[0]
+    big_endian = isinstance(kind.state, tuple) and len(kind.state) > 1 and kind.state[1] == ">"
     if name[:1] not in NUMBERS or not name[1:].isdigit() or len(name) > 3:
         raise ValueError(f"an array of type {name[:20]} holds no numbers")
-    made = np.dtype(name).newbyteorder(">" if swapped else "<")
+    dtype = np.dtype(name).newbyteorder(">" if big_endian else "<")
     if not isinstance(shape, tuple) or len(shape) > MOST_DIMENSIONS or order not in ("C", "F"):
         raise ValueError("an array has a shape that cannot be")
     if not all(type(length) is int and 0 <= length < 2**40 for length in shape):
         raise ValueError("an array has a shape that cannot be")
-    if not isinstance(content, bytes | bytearray) or math.prod(shape) * made.itemsize != len(content):
+    if not isinstance(content, bytes | bytearray) or math.prod(shape) * dtype.itemsize != len(content):
         raise ValueError("an array has another number of bytes than its shape says")
-    return np.frombuffer(bytes(content), made).reshape(shape, order=order).astype(made.newbyteorder("="))
+    return np.frombuffer(bytes(content), dtype).reshape(shape, order=order).astype(dtype.newbyteorder("="))

@@ -95,7 +95,7 @@ class Part:
             MitsonarError: if an interval holds fewer than two bins or beams, or exceeds those of the part.
         """
         rows, columns = (
-            _within(what, span, len(axis))
+            _crop_slice(what, span, len(axis))
             for what, span, axis in (("bins", bins, self.like.range_m), ("beams", beams, self.like.bearing_rad))
         )
         range_m, bearing_rad = self.like.range_m[rows], self.like.bearing_rad[columns]
@@ -123,7 +123,7 @@ class Part:
             yield self.read(np.arange(start, min(start + count, len(self))))
 
 
-def _within(what: str, span: tuple[int, int] | None, count: int) -> slice:
+def _crop_slice(what: str, span: tuple[int, int] | None, count: int) -> slice:
     """Return a half-open interval of bins or beams as a slice.
 
     Raises:
@@ -196,15 +196,15 @@ def in_time_order(time_s: ArrayLike, number: ArrayLike | None = None) -> tuple[I
     notes = [] if known.all() else [f"left out: {counted(int((~known).sum()), 'frame')} without a valid time"]
     if (np.diff(order) < 0).any():
         notes.append("frames are not in the order of time: they were sorted")
-    kept = order[np.diff(time[order], prepend=-np.inf) > 0]
-    if len(kept) < len(order):
-        notes.append(f"left out: {counted(len(order) - len(kept), 'frame')} at the time of the one before")
-    if number is not None and len(kept) > 1:
-        steps = np.diff(np.asarray(number, dtype=float)[kept])
+    increasing = order[np.diff(time[order], prepend=-np.inf) > 0]
+    if len(increasing) < len(order):
+        notes.append(f"left out: {counted(len(order) - len(increasing), 'frame')} at the time of the one before")
+    if number is not None and len(increasing) > 1:
+        steps = np.diff(np.asarray(number, dtype=float)[increasing])
         missing = float((steps[steps > 1] - 1).sum())
         if missing:
             notes.append(f"missing: {counted(round(missing), 'frame')}, by the numbers that the sonar gave them")
-    return kept, notes
+    return increasing, notes
 
 
 def runs_of(keys: Sequence[Hashable]) -> list[tuple[Hashable, Index]]:
@@ -259,8 +259,8 @@ def layout(fields: Mapping[str, tuple[int, str]], size: int) -> np.dtype[np.void
     offsets = [offset for offset, _ in fields.values()]
     formats = [kind for _, kind in fields.values()]
     table: Any = {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": size}
-    made: np.dtype[np.void] = np.dtype(table)
-    return made
+    header_type: np.dtype[np.void] = np.dtype(table)
+    return header_type
 
 
 @dataclass(frozen=True)
@@ -306,7 +306,7 @@ class EqualFrames:
         """Return a copy of the samples of the given frames ``(n, *shape)``."""
         begin = self.start + self.header.itemsize + index.astype(np.int64) * self.stride
         return (
-            np.stack([self.data[at : at + self.samples].reshape(shape) for at in begin])
+            np.stack([self.data[offset : offset + self.samples].reshape(shape) for offset in begin])
             if len(index)
             else np.zeros((0, *shape), np.uint8)
         )

@@ -99,8 +99,8 @@ class BagFile:
     def topics(self) -> list[Topic]:
         """Return all topics, sorted by name."""
         with self._readable():
-            found = self._open().topics
-            return [Topic(name, one.msgtype or "several types", one.msgcount) for name, one in sorted(found.items())]
+            topics = self._open().topics
+            return [Topic(name, one.msgtype or "several types", one.msgcount) for name, one in sorted(topics.items())]
 
     def messages(self, topic: str, start: int | None = None, stop: int | None = None) -> Iterator[tuple[int, bytes]]:
         """Read the raw messages of a topic in the order in which they were received.
@@ -320,13 +320,13 @@ def metadata_of(frames: SonarFrames, span_db: float | None = None) -> dict[str, 
         "level_scale": frames.level_scale,
         "range_m": frames.range_m.tolist(),
         "bearing_rad": frames.bearing_rad.tolist(),
-        "samples": _in_words(frames, span_db),
+        "samples": _describe_coding(frames, span_db),
     }
     table |= {} if span_db is None else {"span_db": span_db}
     return {name: json.dumps(value) for name, value in table.items()}
 
 
-def _in_words(frames: SonarFrames, span_db: float | None) -> str:
+def _describe_coding(frames: SonarFrames, span_db: float | None) -> str:
     """Describe in words how samples are converted to levels relative to full scale."""
     value, sonar = "sample / 255" if frames.image.dtype == np.uint8 else "sample", frames.sonar
     zero = "0 is no echo; "
@@ -365,14 +365,14 @@ def frames_like(path: Path, images: np.dtype[np.generic]) -> tuple[SonarFrames, 
     try:
         axes = {name: np.array(value[name], dtype=np.float64).reshape(-1) for name in ("range_m", "bearing_rad")}
         table = {name: np.array(value[name]) for name in ("level", "level_scale")} | {"sonar": np.array(record["sonar"])}
-        nothing = {"image": np.zeros((0, *(len(one) for one in axes.values())), images), "time_s": np.zeros(0)}
+        empty = {"image": np.zeros((0, *(len(one) for one in axes.values())), images), "time_s": np.zeros(0)}
     except (TypeError, ValueError) as error:
         raise MitsonarError(f"{source} are damaged: {error}") from None
     span_db = None
     if "span_db" in record:
         span_db = finite_number(parse_json(record["span_db"], f"span_db in {source}"), f"span_db in {source}", above=0)
-        nothing["image"] = nothing["image"].astype(np.float32)
-    return SonarFrames.from_arrays({**axes, **table, **nothing}, source), span_db
+        empty["image"] = empty["image"].astype(np.float32)
+    return SonarFrames.from_arrays({**axes, **table, **empty}, source), span_db
 
 
 def _record_in(path: Path) -> dict[str, str] | None:

@@ -32,10 +32,10 @@ CHANNELS = {
 }
 """Channel weights of the supported encodings of ``sensor_msgs/Image``."""
 
-SAME_RANGE = 0.002
+RANGE_RTOL = 0.002
 """Relative tolerance for equal ranges; drift of the sound speed changes them slightly."""
 
-SAME_BEARING = 1e-4
+BEARING_ATOL_RAD = 1e-4
 """Absolute tolerance for equal bearings [rad]."""
 
 CENTIDEGREE = math.pi / 18_000
@@ -44,10 +44,10 @@ CENTIDEGREE = math.pi / 18_000
 FORWARD_LEFT_UP: Array = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 """Unit vectors to starboard, forward and up as columns, in the axes forward, left, up (REP 103)."""
 
-LONGEST = 1e6
+MAX_DIRECTION = 1e6
 """Largest plausible component of a beam direction; drivers write unit vectors."""
 
-CLEARLY = 0.05
+MIN_CORRELATION_MARGIN = 0.05
 """Difference between two correlations above which they decide the order of the samples."""
 
 
@@ -93,8 +93,8 @@ class PingLayout:
             and self.bearing_rad.shape == other.bearing_rad.shape
             and (self.dtype, self.frame_id, self.gamma) == (other.dtype, other.frame_id, other.gamma)
             and bool((self.order == other.order).all())
-            and bool(np.allclose(self.range_m, other.range_m, rtol=SAME_RANGE, atol=0))
-            and bool(np.allclose(self.bearing_rad, other.bearing_rad, rtol=0, atol=SAME_BEARING))
+            and bool(np.allclose(self.range_m, other.range_m, rtol=RANGE_RTOL, atol=0))
+            and bool(np.allclose(self.bearing_rad, other.bearing_rad, rtol=0, atol=BEARING_ATOL_RAD))
         )
 
 
@@ -159,7 +159,7 @@ def is_beam_major(flat: Sequence[Samples], bins: int, beams: int) -> bool:
         return False
     by_range = np.mean([_correlation(one, beams) for one in flat])
     by_beam = np.mean([_correlation(one, bins) for one in flat])
-    return bool(by_beam > by_range + CLEARLY)
+    return bool(by_beam > by_range + MIN_CORRELATION_MARGIN)
 
 
 def _correlation(values: Samples, lag: int) -> float:
@@ -186,10 +186,10 @@ def _projected(message: Message) -> PingLayout:
         dtype=(">" if image.is_bigendian else "<") + DTYPES[int(image.dtype)],
         axes=axes,
         frame_id=str(message.header.frame_id),
-        frequency_hz=_amount(info.frequency),
-        sound_speed=_amount(info.sound_speed),
-        elevation_rad=_middle(info.tx_beamwidths),
-        beam_width_rad=_middle(info.rx_beamwidths),
+        frequency_hz=_positive_or_zero(info.frequency),
+        sound_speed=_positive_or_zero(info.sound_speed),
+        elevation_rad=_median_angle(info.tx_beamwidths),
+        beam_width_rad=_median_angle(info.rx_beamwidths),
     )
 
 
@@ -199,7 +199,7 @@ def _bearings(vectors: Array) -> tuple[Array, Array]:
     Forward is the z axis, as the message definition states, or the x axis, as in Gazebo. The y axis points to port in both
     cases: this is what the Oculus driver (y = -sin) and Gazebo (REP 103) write, and what ``sonar_image_proc`` draws.
     """
-    if not len(vectors) or not (np.abs(vectors) < LONGEST).all() or not (np.abs(vectors).max(axis=1) > 0).all():
+    if not len(vectors) or not (np.abs(vectors) < MAX_DIRECTION).all() or not (np.abs(vectors).max(axis=1) > 0).all():
         raise ValueError("directions of beams are none, or not finite")
     forward = 0 if np.abs(vectors[:, 0]).mean() > np.abs(vectors[:, 2]).mean() else 2
     axis = np.eye(3)
@@ -226,8 +226,8 @@ def _oculus(message: Message) -> PingLayout:
         dtype="|u1",
         axes=FORWARD_LEFT_UP,
         frame_id=str(message.header.frame_id),
-        frequency_hz=_amount(getattr(message, "frequency", 0.0)),
-        sound_speed=_amount(getattr(message, "speed_of_sound", 0.0)) or _amount(fire.speed_of_sound),
+        frequency_hz=_positive_or_zero(getattr(message, "frequency", 0.0)),
+        sound_speed=_positive_or_zero(getattr(message, "speed_of_sound", 0.0)) or _positive_or_zero(fire.speed_of_sound),
         gamma=gamma / 255 if 0 < gamma < 255 else 1.0,
     )
 
@@ -260,13 +260,13 @@ def picture_of(picture: Message) -> NDArray[np.uint8]:
     return np.asarray(np.rint(values @ np.array(CHANNELS[picture.encoding])), dtype=np.uint8)
 
 
-def _amount(value: object) -> float:
+def _positive_or_zero(value: object) -> float:
     """Return a value as a float if it is finite and positive, otherwise 0."""
     number = float(value)  # type: ignore[arg-type]
     return number if math.isfinite(number) and number > 0 else 0.0
 
 
-def _middle(values: object) -> float:
+def _median_angle(values: object) -> float:
     """Return the median of the angles between 0 and 2 pi [rad]; 0 if there are none."""
     known = np.asarray(values, dtype=float)
     known = known[np.isfinite(known) & (known > 0) & (known < 2 * math.pi)]

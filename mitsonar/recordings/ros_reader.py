@@ -28,10 +28,10 @@ Samples = NDArray[np.generic]
 ELEVATION_DEG = 20.0
 """Elevation aperture if the bag holds none [deg]; that of an Oculus M750d, and of an M1200d at its low frequency."""
 
-TRIED = 8
+ORDER_FRAMES = 8
 """Maximum number of frames from which the order of samples is determined."""
 
-LATER_S = 86_400.0
+LARGEST_DELAY_S = 86_400.0
 """Largest difference between the times of header and reception that is reported as a delay [s]."""
 
 
@@ -65,19 +65,19 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     if not scan.layouts:
         raise MitsonarError(f"{path}: no message of {chosen.name} can be read: {scan.reason or 'there is none'}")
     # 2. Determine what all parts share: order of time, coding, poses, and the metadata of a file written by mitsonar.
-    kept, notes = in_time_order(scan.frame_times())
+    order, notes = in_time_order(scan.frame_times())
     notes = [*scan.notes(), *notes]
-    coding = _coding(scan, kept, notes)
-    numbers = np.array(scan.numbers)[kept]
+    coding = _coding(scan, order, notes)
+    numbers = np.array(scan.numbers)[order]
     layout = scan.layouts[numbers[0]]
-    times = scan.frame_times()[kept]
+    times = scan.frame_times()[order]
     motion = motion_in(bag, layout.frame_id, layout.axes, times)
-    written = _as_written(scan, layout, coding)
+    written = _written_frames(scan, layout, coding)
     # 3. Make a part of each run of frames with the same layout.
     parts = []
     for number, run in runs_of(numbers.tolist()):
         layout = scan.layouts[int(str(number))]
-        like, images = _like(layout, times[run], scan.topic.name), _Frames(scan, kept[run], layout, coding)
+        like, images = _empty_frames(layout, times[run], scan.topic.name), _Frames(scan, order[run], layout, coding)
         part = with_motion(Part(like, times[run], images), motion, run)
         if written is not None:
             like, span_db = written
@@ -85,9 +85,9 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
         parts.append(part)
     if not all(one.elevation_rad for one in scan.layouts):
         notes.append(f"the bag does not tell the opening over elevation: {ELEVATION_DEG:g} deg are assumed")
-    facts = _facts(scan, kept) | ({"poses": motion.origin} if motion.origin else {})
-    words = f"ROS {1 if bag.is_ros1 else 2} bag, {short(chosen.kind)}"
-    return Recording(str(path), words, tuple(parts), facts, (*notes, *motion.notes))
+    facts = _facts(scan, order) | ({"poses": motion.origin} if motion.origin else {})
+    format_name = f"ROS {1 if bag.is_ros1 else 2} bag, {short(chosen.kind)}"
+    return Recording(str(path), format_name, tuple(parts), facts, (*notes, *motion.notes))
 
 
 def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (*PROJECTED, *OCULUS)) -> Topic:
@@ -101,32 +101,32 @@ def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (
     Raises:
         MitsonarError: if there is no such topic or there are several, or the type of the named one is not supported.
     """
-    there = bag.topics()
-    readable = [one for one in there if one.kind in (*PROJECTED, *OCULUS, *FANS) and one.messages]
+    topics = bag.topics()
+    readable = [one for one in topics if one.kind in (*PROJECTED, *OCULUS, *FANS) and one.messages]
     if topic is not None:
-        named = next((one for one in there if one.name == topic), None)
+        named = next((one for one in topics if one.name == topic), None)
         if named is None:
-            raise MitsonarError(f"{bag.path} has no topic {topic!r}: {nearest_names(topic, [one.name for one in there])}")
+            raise MitsonarError(f"{bag.path} has no topic {topic!r}: {nearest_names(topic, [one.name for one in topics])}")
         if named not in readable:
             raise MitsonarError(
                 f"{bag.path}: {topic} holds {counted(named.messages, 'message')} {short(named.kind)}; a sonar's "
-                f"are {_words(*kinds)}"
+                f"are {_type_names(*kinds)}"
             )
         return named
-    found = [one for one in readable if one.kind in kinds]
-    if len(found) > 1:
+    candidates = [one for one in readable if one.kind in kinds]
+    if len(candidates) > 1:
         raise MitsonarError(
-            f"{bag.path} holds several sonars: choose one of the topics {', '.join(one.name for one in found)} "
+            f"{bag.path} holds several sonars: choose one of the topics {', '.join(one.name for one in candidates)} "
             "(topic= in Python, --topic or --view on the command line)"
         )
-    if not found:
-        others = ", ".join(f"{one.name} ({short(one.kind)})" for one in there[:8]) or "none"
+    if not candidates:
+        others = ", ".join(f"{one.name} ({short(one.kind)})" for one in topics[:8]) or "none"
         more = "; pictures need a geometry file (--geometry)" if readable and not set(FANS) & set(kinds) else ""
-        raise MitsonarError(f"{bag.path} holds no messages {_words(*kinds)}: its topics are {others}{more}")
-    return found[0]
+        raise MitsonarError(f"{bag.path} holds no messages {_type_names(*kinds)}: its topics are {others}{more}")
+    return candidates[0]
 
 
-def _words(*kinds: str) -> str:
+def _type_names(*kinds: str) -> str:
     """Return the names of types as part of a sentence."""
     return " or ".join(short(one) for one in kinds if not one.startswith("acoustic_msgs"))
 
@@ -138,7 +138,7 @@ class Coding(NamedTuple):
     scale: float
 
 
-def _coding(scan: TopicScan, kept: Index, notes: list[str]) -> Coding:
+def _coding(scan: TopicScan, order: Index, notes: list[str]) -> Coding:
     """Return how samples are converted to pixels, and append sentences on it to ``notes``.
 
     Raises:
@@ -152,16 +152,16 @@ def _coding(scan: TopicScan, kept: Index, notes: list[str]) -> Coding:
     scale = scan.high if scan.high > 1 else 1.0
     if scale > 1:
         notes.append(f"samples are floats up to {scale:.6g}: they are divided by that")
-    layout = scan.layouts[scan.numbers[int(kept[0])]]
+    layout = scan.layouts[scan.numbers[int(order[0])]]
     if scan.topic.kind not in PROJECTED:
         return Coding(False, scale)
-    same = kept[np.array(scan.numbers)[kept] == scan.numbers[int(kept[0])]]
-    some = same[np.unique(np.linspace(0, len(same) - 1, TRIED).astype(int))]
-    flat = [np.frombuffer(np.asarray(one.image.data, np.uint8).tobytes(), layout.dtype) for _, one in scan.frames(some)]
-    major = is_beam_major(flat, len(layout.range_m), len(layout.bearing_rad))
-    if major:
+    same_layout = order[np.array(scan.numbers)[order] == scan.numbers[int(order[0])]]
+    sample = same_layout[np.unique(np.linspace(0, len(same_layout) - 1, ORDER_FRAMES).astype(int))]
+    flat = [np.frombuffer(np.asarray(one.image.data, np.uint8).tobytes(), layout.dtype) for _, one in scan.frames(sample)]
+    beam_major = is_beam_major(flat, len(layout.range_m), len(layout.bearing_rad))
+    if beam_major:
         notes.append("samples are in the order of beams, unlike those of drivers, by how they correlate")
-    return Coding(major, scale)
+    return Coding(beam_major, scale)
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class _Levels:
         return np.asarray(level.astype(np.float32)[self.samples(index)], dtype=np.float32)
 
 
-def _as_written(scan: TopicScan, layout: PingLayout, coding: Coding) -> tuple[SonarFrames, float | None] | None:
+def _written_frames(scan: TopicScan, layout: PingLayout, coding: Coding) -> tuple[SonarFrames, float | None] | None:
     """Return empty frames with the geometry and coding that mitsonar wrote, and the dynamic range of samples [dB].
 
     The dynamic range is None if samples are the values of the images. The result is None if mitsonar did not write the bag,
@@ -187,12 +187,12 @@ def _as_written(scan: TopicScan, layout: PingLayout, coding: Coding) -> tuple[So
     path = scan.bag.path
     if path.suffix != ".mcap" or scan.topic.name != WRITTEN or len(scan.layouts) > 1 or coding != Coding(False, 1.0):
         return None
-    found = frames_like(path, np.dtype(np.uint8 if _is_uint8(layout) else np.float32))
-    if found is None or found[0].image.shape[1:] != (len(layout.range_m), len(layout.bearing_rad)):
+    record = frames_like(path, np.dtype(np.uint8 if _is_uint8(layout) else np.float32))
+    if record is None or record[0].image.shape[1:] != (len(layout.range_m), len(layout.bearing_rad)):
         return None
-    like, span_db = found
-    near = np.allclose(like.range_m, layout.range_m, rtol=1e-6)
-    fits = near and np.allclose(like.bearing_rad, layout.bearing_rad, atol=1e-6)
+    like, span_db = record
+    same_ranges = np.allclose(like.range_m, layout.range_m, rtol=1e-6)
+    fits = same_ranges and np.allclose(like.bearing_rad, layout.bearing_rad, atol=1e-6)
     return (like, span_db if _is_uint8(layout) else None) if fits else None
 
 
@@ -208,17 +208,17 @@ class _Frames:
     @np.errstate(over="ignore", invalid="ignore")
     def __call__(self, index: Index) -> Pixels:
         """Return images ``(n, bins, beams)``, uint8 or float32, column 0 farthest to port."""
-        wanted = self.places[index]
+        message_index = self.places[index]
         shape = (len(index), len(self.layout.range_m), len(self.layout.bearing_rad))
         image = np.zeros(shape, np.uint8 if _is_uint8(self.layout) else np.float32)
-        for place, message in self.scan.frames(wanted):
+        for place, message in self.scan.frames(message_index):
             try:
                 raw = samples_of(message, self.scan.topic.kind, self.layout, beam_major=self.coding.beam_major)
             except ValueError as error:
                 raise MitsonarError(
                     f"{self.scan.bag.path}: a message of {self.scan.topic.name} is damaged: {error}"
                 ) from None
-            image[wanted == place] = _values(raw, self.coding.scale)
+            image[message_index == place] = _to_pixels(raw, self.coding.scale)
         return image
 
 
@@ -226,7 +226,7 @@ def _is_uint8(layout: PingLayout) -> bool:
     return np.dtype(layout.dtype) == np.uint8
 
 
-def _values(raw: Samples, scale: float) -> Pixels:
+def _to_pixels(raw: Samples, scale: float) -> Pixels:
     """Convert samples to float32 in 0..1; uint8 samples are returned unchanged."""
     if raw.dtype == np.uint8:
         return raw
@@ -237,7 +237,7 @@ def _values(raw: Samples, scale: float) -> Pixels:
     return np.asarray(np.maximum(raw, 0) / most, dtype=np.float32)
 
 
-def _like(layout: PingLayout, time_s: Array, name: str) -> SonarFrames:
+def _empty_frames(layout: PingLayout, time_s: Array, name: str) -> SonarFrames:
     """Return empty frames with the geometry of a part."""
     bins, beams = len(layout.range_m), len(layout.bearing_rad)
     steps = np.diff(layout.range_m) if bins > 1 else np.array([min(0.01, layout.range_m[0])])
@@ -273,9 +273,9 @@ def _rate(time_s: Array) -> float:
     return float(np.clip(1 / np.median(steps), 1e-3, 1e6)) if len(steps) else 10.0
 
 
-def _facts(scan: TopicScan, kept: Index) -> Facts:
+def _facts(scan: TopicScan, order: Index) -> Facts:
     """Return values that the bag holds, keyed by name."""
-    first = scan.layouts[scan.numbers[int(kept[0])]]
+    first = scan.layouts[scan.numbers[int(order[0])]]
     facts: Facts = {
         "topic": scan.topic.name,
         "type": short(scan.topic.kind),
@@ -286,7 +286,7 @@ def _facts(scan: TopicScan, kept: Index) -> Facts:
         facts["sound_speed"] = first.sound_speed
     if first.frequency_hz:
         facts["frequency_hz"] = first.frequency_hz
-    delay = np.array(scan.received, dtype=float)[kept] * 1e-9 - scan.frame_times()[kept]
-    if np.abs(delay).max() < LATER_S:
+    delay = np.array(scan.received, dtype=float)[order] * 1e-9 - scan.frame_times()[order]
+    if np.abs(delay).max() < LARGEST_DELAY_S:
         facts["received_after_s"] = [round(float(delay.min()), 6), round(float(delay.max()), 6)]
     return facts

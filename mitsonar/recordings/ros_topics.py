@@ -86,7 +86,7 @@ class Link:
     fixed: bool = False
     numbers: array[float] = field(default_factory=lambda: array("d"))
 
-    def at(self, time_s: Array) -> tuple[Array, Rotation] | None:
+    def interpolated(self, time_s: Array) -> tuple[Array, Rotation] | None:
         """Return positions ``(n, 3)`` [m] and rotations at the given times; None if the transforms do not cover them."""
         # 1. Drop implausible transforms, and sort the others by time without duplicates.
         table = np.array(self.numbers).reshape(-1, 8)
@@ -102,14 +102,14 @@ class Link:
             return (last[:, 1:4], Rotation.from_quat(last[:, 4:])) if self.fixed else None
         # 3. Reject times that are too far outside the covered interval, or too far from a transform within it.
         known = table[:, 0]
-        held = np.clip(time_s, known[0], known[-1])
-        after = np.clip(np.searchsorted(known, held), 1, len(known) - 1)
-        near = np.minimum(held - known[after - 1], known[after] - held)
-        if np.abs(held - time_s).max() > BEYOND_S or (near > LARGEST_GAP_S / 2).any():
+        clamped_s = np.clip(time_s, known[0], known[-1])
+        after = np.clip(np.searchsorted(known, clamped_s), 1, len(known) - 1)
+        distance_s = np.minimum(clamped_s - known[after - 1], known[after] - clamped_s)
+        if np.abs(clamped_s - time_s).max() > BEYOND_S or (distance_s > LARGEST_GAP_S / 2).any():
             return None
         # 4. Interpolate positions linearly, and rotations on the sphere.
-        place = np.column_stack([np.interp(held, known, axis) for axis in table[:, 1:4].T])
-        return place, Slerp(known, Rotation.from_quat(table[:, 4:]))(held)
+        place = np.column_stack([np.interp(clamped_s, known, axis) for axis in table[:, 1:4].T])
+        return place, Slerp(known, Rotation.from_quat(table[:, 4:]))(clamped_s)
 
 
 def motion_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion:
@@ -122,7 +122,7 @@ def motion_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion
         time_s: frame times ``(frames,)`` [s].
     """
     topics = [one for one in bag.topics() if one.messages]
-    others = _Others(bag, topics, _transforms(bag, topics), _plain(frame_id), axes, time_s)
+    others = _MotionSources(bag, topics, _transforms(bag, topics), _frame_name(frame_id), axes, time_s)
     return replace(others.poses(), attitude_rad=others.attitude(), height_m=others.heights())
 
 
@@ -137,7 +137,7 @@ def with_motion(part: Part, motion: Motion, places: Index) -> Part:
 
 
 @dataclass(frozen=True)
-class _Others:
+class _MotionSources:
     """The topics of a bag and the request of :func:`motion_in`."""
 
     bag: BagFile
@@ -157,16 +157,16 @@ class _Others:
         """
         chain = _chain(self.links, self.frame)
         if chain and any(not one.fixed for one in chain):
-            return _along(chain, self.axes, self.time_s, "the transforms")
-        found, notes = _only(self.bag, self.topics)
-        if found is None:
+            return _compose(chain, self.axes, self.time_s, "the transforms")
+        source, notes = _only_pose_topic(self.bag, self.topics)
+        if source is None:
             return Motion(notes=notes)
-        child, link = found
-        mount = _between(self.links, self.frame, child) if child else None
+        child, link = source
+        mount = _fixed_links(self.links, self.frame, child) if child else None
         if mount is None:
-            told = f"poses of {link.topic} count as those of the sonar: no transform leads from them to {self.frame!r}"
-            notes = (*notes, told)
-        moved = _along([*(mount or []), link], self.axes, self.time_s, link.topic)
+            note = f"poses of {link.topic} count as those of the sonar: no transform leads from them to {self.frame!r}"
+            notes = (*notes, note)
+        moved = _compose([*(mount or []), link], self.axes, self.time_s, link.topic)
         return replace(moved, notes=notes if moved.poses is not None else moved.notes)
 
     def attitude(self) -> Array | None:
@@ -175,31 +175,31 @@ class _Others:
         Fixed transforms must connect the sonar's frame with that of the IMU. Its orientation is relative to east, north, up
         (REP 145).
         """
-        these = [one for one in self.topics if one.kind == IMU]
-        if len(these) != 1:
+        imus = [one for one in self.topics if one.kind == IMU]
+        if len(imus) != 1:
             return None
-        child, link = "", Link("", these[0].name)
-        for _, raw in self.bag.messages(these[0].name):
+        child, link = "", Link("", imus[0].name)
+        for _, raw in self.bag.messages(imus[0].name):
             message = self.bag.decode(raw, IMU)
-            child = _plain(message.header.frame_id)
+            child = _frame_name(message.header.frame_id)
             if float(message.orientation_covariance[0]) != -1:
                 link.numbers.extend((_seconds(message), 0.0, 0.0, 0.0, *_numbers(message.orientation)))
-        mount = _between(self.links, self.frame, child)
+        mount = _fixed_links(self.links, self.frame, child)
         if mount is None:
             return None
-        found = _along([*mount, link], self.axes, self.time_s, link.topic).poses
-        return None if found is None else found[:, 3:]
+        poses = _compose([*mount, link], self.axes, self.time_s, link.topic).poses
+        return None if poses is None else poses[:, 3:]
 
     def heights(self) -> Array | None:
         """Return heights above the ground ``(frames,)`` [m] by the only altimeter; nan where unknown, None without one.
 
         A topic belongs to an altimeter if its type is ``sensor_msgs/Range`` and its name contains ``alti``.
         """
-        these = [one for one in self.topics if one.kind == RANGE and "alti" in one.name.lower()]
-        if len(these) != 1:
+        altimeters = [one for one in self.topics if one.kind == RANGE and "alti" in one.name.lower()]
+        if len(altimeters) != 1:
             return None
         numbers = array("d")
-        for _, raw in self.bag.messages(these[0].name):
+        for _, raw in self.bag.messages(altimeters[0].name):
             message = self.bag.decode(raw, RANGE)
             numbers.extend((_seconds(message), float(message.range)))
         # Interpolate linearly, but only near a measurement. Implausible measurements become nan, and so do heights that
@@ -214,17 +214,17 @@ class _Others:
         return height if np.isfinite(height).any() else None
 
 
-def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> Motion:
+def _compose(chain: Sequence[Link], axes: Array, times: Array, source: str) -> Motion:
     """Return the poses that result from a chain of links from the sonar to the world.
 
     A world frame whose name ends with ``ned`` is converted from north, east, down.
     """
     place, turn = np.zeros((len(times), 3)), Rotation.from_matrix(np.repeat(axes[None], len(times), axis=0))
     for link in chain:
-        here = link.at(times)
-        if here is None:
+        link_pose = link.interpolated(times)
+        if link_pose is None:
             return Motion(notes=(f"poses are not used: {link.topic} does not cover the times of all frames",))
-        place, turn = here[0] + here[1].apply(place), here[1] * turn
+        place, turn = link_pose[0] + link_pose[1].apply(place), link_pose[1] * turn
     world = chain[-1].parent
     if world.lower().endswith("ned"):
         down = Rotation.from_matrix(CONVENTIONS["ned"].world)
@@ -232,26 +232,26 @@ def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> Mot
     return Motion(poses_from(place, turn), origin=f"{source}, in the frame {world!r}")
 
 
-def _only(bag: BagFile, topics: Sequence[Topic]) -> tuple[tuple[str, Link] | None, tuple[str, ...]]:
+def _only_pose_topic(bag: BagFile, topics: Sequence[Topic]) -> tuple[tuple[str, Link] | None, tuple[str, ...]]:
     """Return child frame and transforms of the only topic of odometry, or else of poses; or None and notes on why."""
     for kinds, what in (((ODOMETRY,), "odometry"), (POSES, "poses")):
-        these = [one for one in topics if one.kind in kinds]
-        if len(these) > 1:
-            names = ", ".join(one.name for one in these)
+        candidates = [one for one in topics if one.kind in kinds]
+        if len(candidates) > 1:
+            names = ", ".join(one.name for one in candidates)
             return None, (f"poses are not used: the bag holds several topics of {what} ({names})",)
-        if these:
-            return _stamped(bag, these[0]), ()
+        if candidates:
+            return _read_poses(bag, candidates[0]), ()
     return None, ()
 
 
-def _stamped(bag: BagFile, topic: Topic) -> tuple[str, Link]:
+def _read_poses(bag: BagFile, topic: Topic) -> tuple[str, Link]:
     """Return the child frame (empty for poses) and the transforms of a topic of odometry or poses."""
     child, link = "", Link("", topic.name)
     for _, raw in bag.messages(topic.name):
         message = bag.decode(raw, topic.kind)
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-        link.parent = _plain(message.header.frame_id)
-        child = _plain(getattr(message, "child_frame_id", ""))
+        link.parent = _frame_name(message.header.frame_id)
+        child = _frame_name(getattr(message, "child_frame_id", ""))
         link.numbers.extend((_seconds(message), *_numbers(pose.position), *_numbers(pose.orientation)))
     return child, link
 
@@ -265,7 +265,7 @@ def _transforms(bag: BagFile, topics: Sequence[Topic]) -> dict[str, Link]:
         fixed = topic.name.endswith("tf_static")
         for _, raw in bag.messages(topic.name):
             for one in bag.decode(raw, topic.kind).transforms:
-                child, parent = _plain(one.child_frame_id), _plain(one.header.frame_id)
+                child, parent = _frame_name(one.child_frame_id), _frame_name(one.header.frame_id)
                 link = links.setdefault(child, Link(parent, topic.name, fixed))
                 if link.parent == parent:
                     where = one.transform
@@ -284,14 +284,14 @@ def _chain(links: dict[str, Link], frame: str) -> list[Link]:
     return chain
 
 
-def _between(links: dict[str, Link], frame: str, wanted: str) -> list[Link] | None:
+def _fixed_links(links: dict[str, Link], frame: str, target: str) -> list[Link] | None:
     """Return the fixed links from a frame up to another frame; None if these do not connect the two."""
-    if frame == wanted:
+    if frame == target:
         return []
     names = list(_parents(links, frame))
-    if wanted not in names:
+    if target not in names:
         return None
-    chain = _chain(links, frame)[: names.index(wanted) + 1]
+    chain = _chain(links, frame)[: names.index(target) + 1]
     return chain if all(link.fixed for link in chain) else None
 
 
@@ -301,7 +301,7 @@ def _parents(links: dict[str, Link], frame: str) -> Iterator[str]:
         yield link.parent
 
 
-def _plain(name: object) -> str:
+def _frame_name(name: object) -> str:
     """Return the name of a frame without the leading slash that it may have in ROS 1."""
     return str(name).lstrip("/")
 
@@ -398,14 +398,14 @@ class TopicScan:
         # 2. Decode the message, and find a layout that resembles its own.
         message = self.bag.decode(raw, self.topic.kind)
         layout = layout_of(message, self.topic.kind)
-        number = next((at for at, one in enumerate(self.layouts) if one.resembles(layout)), len(self.layouts))
+        number = next((index for index, one in enumerate(self.layouts) if one.resembles(layout)), len(self.layouts))
         if number == len(self.layouts):
             self.layouts.append(layout)
         # 3. Remember the bytes ahead of the samples for the messages that follow.
         if self.topic.kind in PROJECTED:
             samples = np.asarray(message.image.data, np.uint8).tobytes()
             self._measure(samples, number)
-            head = _head_of(raw, samples)
+            head = _offset_of_samples(raw, samples)
             if head is not None:
                 heads[len(raw)] = head
                 known[_digest(raw[STAMP:head])] = number
@@ -444,18 +444,18 @@ class TopicScan:
 
     def frames(self, places: Index) -> Iterator[tuple[int, Message]]:
         """Read and decode the messages with the given indices; yield index and message in increasing order."""
-        wanted = np.unique(places)
-        if not len(wanted):
+        indices = np.unique(places)
+        if not len(indices):
             return
-        for run in np.split(wanted, np.flatnonzero(np.diff(wanted) > NEAR) + 1):
-            at = {(self.received[place], self.nth[place]): int(place) for place in run}
-            times = [time for time, _ in at]
+        for run in np.split(indices, np.flatnonzero(np.diff(indices) > NEAR) + 1):
+            index_by_message = {(self.received[place], self.nth[place]): int(place) for place in run}
+            times = [time for time, _ in index_by_message]
             last, count = -1, 0
             for time, raw in self.bag.messages(self.topic.name, min(times), max(times) + 1):
                 count = count + 1 if time == last else 0
                 last = time
-                if (time, count) in at:
-                    yield at[time, count], self.bag.decode(raw, self.topic.kind)
+                if (time, count) in index_by_message:
+                    yield index_by_message[time, count], self.bag.decode(raw, self.topic.kind)
 
 
 def _stamp(raw: bytes, ros1: bool) -> float:
@@ -467,7 +467,7 @@ def _stamp(raw: bytes, ros1: bool) -> float:
     return float((seconds * 10**9 + nanoseconds) / 10**9)  # a single rounding, so that written times are restored exactly
 
 
-def _head_of(raw: bytes, samples: bytes) -> int | None:
+def _offset_of_samples(raw: bytes, samples: bytes) -> int | None:
     """Return the offset of the samples at the end of a message; None if they are not there.
 
     Up to three bytes of padding may follow the samples.
@@ -503,16 +503,16 @@ def read_ros_pictures(bag: BagFile, topic: Topic, geometry: Path | None) -> Reco
     Raises:
         MitsonarError: if there is no geometry or no readable picture, or the geometry does not fit the pictures.
     """
-    told, told_by = geometry_for(bag.path, geometry)
+    picture_geometry, geometry_path = geometry_for(bag.path, geometry)
     scan = TopicScan(bag, topic)
     scan.read()
     if not scan.received:
         raise MitsonarError(f"{bag.path}: no message of {topic.name} can be read: {scan.reason or 'there is none'}")
 
     def read(place: int) -> Grey:
-        (found,) = (message for _, message in scan.frames(np.array([place])))
+        (picture_message,) = (message for _, message in scan.frames(np.array([place])))
         try:
-            picture = picture_of(found)
+            picture = picture_of(picture_message)
         except ValueError as error:
             raise MitsonarError(f"{bag.path}: message {place:,} of {topic.name}: {error}") from None
         if picture.shape != shape:
@@ -539,7 +539,7 @@ def read_ros_pictures(bag: BagFile, topic: Topic, geometry: Path | None) -> Reco
         facts={"topic": topic.name, "type": short(topic.kind), "frame_id": str(message.header.frame_id)},
         notes=tuple(scan.notes()),
     )
-    return _with_poses(recording_of(pictures, told, told_by), bag, str(message.header.frame_id))
+    return _with_poses(recording_of(pictures, picture_geometry, geometry_path), bag, str(message.header.frame_id))
 
 
 def _with_poses(recording: Recording, bag: BagFile, frame_id: str) -> Recording:

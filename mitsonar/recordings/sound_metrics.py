@@ -200,11 +200,11 @@ def read_aris(path: str | Path) -> Recording:
         raise MitsonarError(f"{name} is no ARIS file: it begins with {bytes(data[:4])!r}, not with {SIGNATURE!r}")
     frames, beams = _aris_frames(data, name)
     headers = frames.table()
-    whole, notes = _whole(headers, frames)
-    kept, sorting = in_time_order(np.where(whole, headers["time_us"] * 1e-6, np.nan), headers["index"])
-    parts = tuple(_aris_part(frames, headers, kept[run], beams) for _, run in runs_of(windows_of(headers[kept])))
+    valid, notes = _valid_frames(headers, frames)
+    order, order_notes = in_time_order(np.where(valid, headers["time_us"] * 1e-6, np.nan), headers["index"])
+    parts = tuple(_aris_part(frames, headers, order[run], beams) for _, run in runs_of(windows_of(headers[order])))
     return Recording(
-        name, "ARIS 5 (.aris)", parts, facts_of(headers[kept], beams), (*notes, *sorting, *notes_of(headers[kept]))
+        name, "ARIS 5 (.aris)", parts, facts_of(headers[order], beams), (*notes, *order_notes, *notes_of(headers[order]))
     )
 
 
@@ -223,32 +223,32 @@ def _aris_frames(data: Bytes, name: str) -> tuple[EqualFrames, int]:
     return frames, BEAMS[mode]
 
 
-def _whole(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], list[str]]:
+def _valid_frames(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which frames have a plausible header, and sentences on the others."""
-    first, told = headers[0], headers["sound_speed"].astype(float)
-    speed = np.where((told > ARIS_LEAST_SPEED) & (told < ARIS_MOST_SPEED), told, np.nan)
-    whole = (headers["signature"] == SIGNATURE) & (headers["ping_mode"] == first["ping_mode"])
-    whole &= headers["samples"] == first["samples"]
+    first, stated_speed = headers[0], headers["sound_speed"].astype(float)
+    speed = np.where((stated_speed > ARIS_LEAST_SPEED) & (stated_speed < ARIS_MOST_SPEED), stated_speed, np.nan)
+    valid = (headers["signature"] == SIGNATURE) & (headers["ping_mode"] == first["ping_mode"])
+    valid &= headers["samples"] == first["samples"]
     end_us = headers["start_delay_us"] + headers["sample_period_us"] * headers["samples"].astype(float)
-    whole &= (
+    valid &= (
         (headers["sample_period_us"] > 0) & (end_us * 1e-6 * speed / 2 < LONGEST_M) & np.isin(headers["system"], list(KINDS))
     )
-    tabled = whole & _tabled(headers)
-    whole = tabled if tabled.any() else whole  # if all frames lack a table, a later error names the missing one
+    has_table = valid & _has_beam_table(headers)
+    valid = has_table if has_table.any() else valid  # if all frames lack a table, a later error names the missing one
     notes = []
-    if not whole.all():
-        notes.append(f"left out: {counted(int((~whole).sum()), 'frame')} with a damaged header")
+    if not valid.all():
+        notes.append(f"left out: {counted(int((~valid).sum()), 'frame')} with a damaged header")
     if frames.left_over:
         notes.append(f"the last {frames.left_over:,} bytes are no whole frame and are left out")
-    return whole, notes
+    return valid, notes
 
 
-def _tabled(headers: Header) -> NDArray[np.bool_]:
+def _has_beam_table(headers: Header) -> NDArray[np.bool_]:
     """Return which frames ``(frames,)`` have a table of beam angles."""
-    beams, lens = BEAMS[int(headers["ping_mode"][0])], headers["large_lens"] != 0
-    known = lens & (("telephoto", beams) in TABLES)
+    beams, large_lens = BEAMS[int(headers["ping_mode"][0])], headers["large_lens"] != 0
+    known = large_lens & (("telephoto", beams) in TABLES)
     for system, kind in KINDS.items():
-        known |= ~lens & (headers["system"] == system) & ((kind.name, beams) in TABLES)
+        known |= ~large_lens & (headers["system"] == system) & ((kind.name, beams) in TABLES)
     return np.asarray(known, dtype=bool)
 
 
@@ -264,18 +264,20 @@ def windows_of(headers: Header) -> list[tuple[float, ...]]:
 
 
 def _aris_part(frames: EqualFrames, headers: Header, places: NDArray[np.intp], beams: int) -> Part:
-    mine = headers[places]
-    samples = int(mine["samples"][0])
-    raw = _ArisSamples(frames, places, samples, beams, int(mine["ping_mode"][0]), bool(mine["reordered"].all()))
-    attitude = attitude_of(mine)
+    part_headers = headers[places]
+    samples = int(part_headers["samples"][0])
+    raw = _ArisSamples(
+        frames, places, samples, beams, int(part_headers["ping_mode"][0]), bool(part_headers["reordered"].all())
+    )
+    attitude = attitude_of(part_headers)
     return Part(
-        like=like_of(mine, samples, beams),
-        time_s=mine["time_us"] * 1e-6,
+        like=like_of(part_headers, samples, beams),
+        time_s=part_headers["time_us"] * 1e-6,
         images=raw,
-        poses=poses_of(mine, attitude),
+        poses=poses_of(part_headers, attitude),
         attitude_rad=attitude,
-        height_m=height_of(mine),
-        gain_db=mine["gain_db"].astype(float),
+        height_m=height_of(part_headers),
+        gain_db=part_headers["gain_db"].astype(float),
     )
 
 
@@ -498,20 +500,20 @@ def read_didson(path: str | Path) -> Recording:
     head = np.frombuffer(data[: FILE.itemsize].tobytes(), FILE)[0]
     frames = _didson_frames(data, head, version, name)
     headers = frames.table()
-    whole = (
+    valid = (
         (headers["signature"] == data[:4].tobytes()) & (headers["start_code"] <= MOST_START) & (headers["length_code"] < 4)
     )
-    notes = [f"left out: {counted(int((~whole).sum()), 'frame')} with a damaged header"] if not whole.all() else []
+    notes = [f"left out: {counted(int((~valid).sum()), 'frame')} with a damaged header"] if not valid.all() else []
     notes += [f"the last {frames.left_over:,} bytes are no whole frame and are left out"] if frames.left_over else []
-    time_s, timing = _times(headers, head)
-    kept, sorting = in_time_order(np.where(whole, time_s, np.nan), headers["index"])
+    time_s, time_notes = _times(headers, head)
+    order, order_notes = in_time_order(np.where(valid, time_s, np.nan), headers["index"])
     windows = _Windows(head)
     parts = tuple(
-        _didson_part(frames, headers[kept[run]], kept[run], time_s[kept[run]], windows)
-        for _, run in runs_of([windows.key(one) for one in headers[kept]])
+        _didson_part(frames, headers[order[run]], order[run], time_s[order[run]], windows)
+        for _, run in runs_of([windows.key(one) for one in headers[order]])
     )
-    notes = [*notes, *timing, *sorting, *windows.notes(headers[kept])]
-    return Recording(name, f"DIDSON {version} (.ddf)", parts, _facts(head, headers[kept], windows), tuple(notes))
+    notes = [*notes, *time_notes, *order_notes, *windows.notes(headers[order])]
+    return Recording(name, f"DIDSON {version} (.ddf)", parts, _facts(head, headers[order], windows), tuple(notes))
 
 
 def _didson_frames(data: Bytes, head: np.void, version: int, name: str) -> EqualFrames:
@@ -593,9 +595,9 @@ class _Windows:
 
     def config(self, header: np.void) -> int:
         """Return the configuration of a frame; for old sonars, which do not record it, it follows from the serial number."""
-        told = int(header["config"]) & (CLASSIC | LONG_RANGE)
-        told |= CLASSIC if self.old else 0
-        return told | LONG_RANGE if int(self.head["serial"]) == LONG_RANGE_SERIAL else told
+        config = int(header["config"]) & (CLASSIC | LONG_RANGE)
+        config |= CLASSIC if self.old else 0
+        return config | LONG_RANGE if int(self.head["serial"]) == LONG_RANGE_SERIAL else config
 
     def key(self, header: np.void) -> tuple[int, int, int]:
         """Return the values that determine the geometry of a frame: start code, length code and configuration."""

@@ -121,12 +121,12 @@ def interpolated(values: NDArray[Any], have: Array, want: Array, *, axis: int) -
     shape = [1, 1, 1]
     shape[axis] = len(want)
     part = (place - low).astype(np.float32).reshape(shape)
-    made = (
+    result = (
         np.take(values, low, axis=axis) * (1 - part) + np.take(values, np.minimum(low + 1, len(have) - 1), axis=axis) * part
     )
     first, last = (have[1] - have[0]) / 2, (have[-1] - have[-2]) / 2
     inside = (want >= have[0] - first) & (want <= have[-1] + last)
-    return np.asarray(made * inside.reshape(shape), dtype=np.float32)
+    return np.asarray(result * inside.reshape(shape), dtype=np.float32)
 
 
 def half_spacing(bearings: Array) -> float:
@@ -152,34 +152,39 @@ def table_of(bearings: Array, sonar: Sonar, beams: int | None) -> tuple[ArisTabl
     if count not in numbers:
         known = ", ".join(str(one) for one in numbers)
         raise MitsonarError(f"an ARIS file holds {known} beams: got {fan}; give {argument('beams')} 128 to interpolate them")
-    tables = [_named(kind, count, sonar) for kind, number in TABLES if number == count]
+    tables = [_table_for(kind, count, sonar) for kind, number in TABLES if number == count]
     edge = max(abs(bearings[0]), abs(bearings[-1]))
 
-    def differs(table: ArisTable) -> float:
+    def deviation(table: ArisTable) -> float:
         if len(bearings) == count:
             return float(np.abs(table.bearings - bearings).max())
         return float(abs(table.bearings[-1] - edge))
 
-    moved = min(differs(table) for table in tables)
-    near = [table for table in tables if differs(table) <= moved + 1e-9]
-    table = min(near, key=lambda one: (sonar.name != f"aris{KINDS[one.system].name}", _apart(one.system, one.high, sonar)))
-    if beams is None and moved > half_spacing(bearings):
+    smallest = min(deviation(table) for table in tables)
+    nearest = [table for table in tables if deviation(table) <= smallest + 1e-9]
+    table = min(
+        nearest,
+        key=lambda one: (sonar.name != f"aris{KINDS[one.system].name}", _carrier_difference(one.system, one.high, sonar)),
+    )
+    if beams is None and smallest > half_spacing(bearings):
         raise MitsonarError(
             f"no ARIS has {fan}: the nearest table has {count} up to {np.degrees(table.bearings[-1]):.4g} deg; give "
             f"{argument('beams')} {count} to interpolate them"
         )
-    return table, moved
+    return table, smallest
 
 
-def _named(kind: str, beams: int, sonar: Sonar) -> ArisTable:
+def _table_for(kind: str, beams: int, sonar: Sonar) -> ArisTable:
     """Return a table with the ARIS model and frequency, among those that use it, that are nearest to the given sonar."""
     systems = [one for one in KINDS if kind in ("telephoto", KINDS[one].name)]
     choices = [(system, high) for system in systems for high in (1, 0)]
-    chosen = min(choices, key=lambda one: (sonar.name != f"aris{KINDS[one[0]].name}", _apart(one[0], one[1], sonar)))
+    chosen = min(
+        choices, key=lambda one: (sonar.name != f"aris{KINDS[one[0]].name}", _carrier_difference(one[0], one[1], sonar))
+    )
     return ArisTable(beams, aris_bearings(kind, beams), chosen[0], int(kind == "telephoto"), chosen[1])
 
 
-def _apart(system: int, high: int, sonar: Sonar) -> float:
+def _carrier_difference(system: int, high: int, sonar: Sonar) -> float:
     """Return the distance between the carriers of an ARIS model and a sonar [Hz]; 0 if that of the sonar is unknown."""
     carrier = KINDS[system].high_hz if high else KINDS[system].low_hz
     return abs(carrier - sonar.frequency_hz) if sonar.frequency_hz else 0.0
@@ -207,18 +212,18 @@ def window_of(range_m: Array, sound_speed: float) -> ArisWindow:
     whole = max(1, round(period))
     axis = (round(delay) + np.arange(bins) * whole) * speed * 5e-7
     if np.abs(axis - range_m).max() < EXACT * step:
-        made = ArisWindow(round(delay), whole, bins, speed, exact=True)
+        window = ArisWindow(round(delay), whole, bins, speed, exact=True)
     else:
         # 2. If they differ, shorten the period, so that interpolation loses no resolution, and cover the same window.
         finer = max(1, int(period + 1e-6))
         samples = int((range_m[-1] * 2e6 / speed - round(delay)) / finer + 1e-6) + 1
-        made = ArisWindow(round(delay), finer, samples, speed, exact=False)
-    if not 0 < made.samples <= MOST_SAMPLES or made.delay_us >= 1e8 or made.period_us >= 1e6:
+        window = ArisWindow(round(delay), finer, samples, speed, exact=False)
+    if not 0 < window.samples <= MOST_SAMPLES or window.delay_us >= 1e8 or window.period_us >= 1e6:
         raise MitsonarError(
             f"an ARIS file holds up to {MOST_SAMPLES:,} samples a beam: the frames' {bins:,} bins from {range_m[0]:.4g} to "
-            f"{range_m[-1]:.4g} m take {made.samples:,}; write a shorter window"
+            f"{range_m[-1]:.4g} m take {window.samples:,}; write a shorter window"
         )
-    return made
+    return window
 
 
 # ---------------- Writer
@@ -287,7 +292,7 @@ def write_aris(
     if not path.parent.is_dir():
         raise MitsonarError(f"there is no folder {path.parent}: make it first")
     part = path.with_name(f".{path.name}.part")
-    chunks = _pieces(frames) if isinstance(frames, SonarFrames) else frames
+    chunks = _chunks(frames) if isinstance(frames, SonarFrames) else frames
     try:
         with part.open("wb") as file:
             writer = _Writer(file, beams, origin_deg)
@@ -304,7 +309,7 @@ def write_aris(
     return WrittenAris(path, writer.count, tuple(writer.notes()))
 
 
-def _pieces(frames: SonarFrames) -> Iterator[SonarFrames]:
+def _chunks(frames: SonarFrames) -> Iterator[SonarFrames]:
     """Yield frames in chunks of about ``CHUNK_BYTES``."""
     count = max(1, CHUNK_BYTES // max(1, 4 * frames.image[:1].size))
     for start in range(0, len(frames), count):
@@ -334,7 +339,7 @@ class _Writer:
         time_us = self._times(frames)
         codes = self.form.image(self._codes(frames))
         heads = self.form.headers(frames, time_us, self.count)
-        self._place(heads, frames)
+        self._fill_positions(heads, frames)
         for head, image in zip(heads, codes, strict=True):
             self.file.write(head.tobytes())
             self.file.write(image[:, ::-1].tobytes())  # beam 0 is the one farthest to starboard
@@ -346,12 +351,12 @@ class _Writer:
             raise MitsonarError("there are no frames to write")
         head = np.zeros(1, FILE)
         window, table = self.form.window, self.form.table
-        told = {
+        fields = {
             "signature": SIGNATURE, "frames": self.count, "high_frequency": table.high, "beams": table.beams,
             "samples": window.samples, "window_start_m": window.start_m, "size": self.file.tell(),
             "window_length_m": window.samples * window.step_m, "large_lens": table.lens,
         }  # fmt: skip
-        for name, value in told.items():
+        for name, value in fields.items():
             head[name] = value
         self.file.seek(0)
         self.file.write(head.tobytes())
@@ -382,12 +387,12 @@ class _Writer:
         level = frames.to_linear().image
         with np.errstate(divide="ignore"):
             codes = (1 + np.log10(level) * np.float32(10 / CODING_DB)) * np.float32(255)
-        there = frames.image > 0
-        self.echoes += int(np.count_nonzero(there))
-        self.lost += int(np.count_nonzero(there & (codes < 0.5)))
-        return np.where(there, np.clip(codes, 0, 255), np.float32(0))
+        has_echo = frames.image > 0
+        self.echoes += int(np.count_nonzero(has_echo))
+        self.lost += int(np.count_nonzero(has_echo & (codes < 0.5)))
+        return np.where(has_echo, np.clip(codes, 0, 255), np.float32(0))
 
-    def _place(self, heads: Header, frames: SonarFrames) -> None:
+    def _fill_positions(self, heads: Header, frames: SonarFrames) -> None:
         """Fill in latitude, longitude and depth if poses are known."""
         if frames.poses is None:
             return
@@ -434,8 +439,8 @@ class _Form:
     def image(self, codes: Values) -> Bytes:
         """Return values ``(n, samples, beams)`` on the axes of the file, interpolated only along axes that differ."""
         if not self.window.exact:
-            wanted = self.window.start_m + np.arange(self.window.samples, dtype=np.float64) * self.window.step_m
-            codes = interpolated(codes, self.like.range_m, wanted, axis=1)
+            ranges_m = self.window.start_m + np.arange(self.window.samples, dtype=np.float64) * self.window.step_m
+            codes = interpolated(codes, self.like.range_m, ranges_m, axis=1)
         if self.turned:
             codes = interpolated(codes, self.like.bearing_rad, self.table.bearings, axis=2)
         return np.rint(codes).astype(np.uint8)
@@ -444,7 +449,7 @@ class _Form:
         """Return the headers of frames ``(n,)``."""
         sonar, window, table = frames.sonar, self.window, self.table
         heads = np.zeros(len(frames), FRAME)
-        told = {
+        fields = {
             "index": first + np.arange(len(frames)), "time_us": time_us, "sonar_time_us": time_us, "signature": SIGNATURE,
             "window_start_m": window.start_m, "window_length_m": window.samples * window.step_m,
             "temperature_c": sonar.temperature_c, "ping_mode": MODES[table.beams], "high_frequency": table.high,
@@ -456,10 +461,10 @@ class _Form:
         attitude = frames.attitude_rad if frames.attitude_rad is not None else frames.poses
         if attitude is not None:
             pitch, roll, heading = np.degrees(attitude[:, -3:]).T
-            told |= {"pitch_deg": -pitch, "roll_deg": roll, "heading_deg": heading % 360}
+            fields |= {"pitch_deg": -pitch, "roll_deg": roll, "heading_deg": heading % 360}
         if frames.height_m is not None:
-            told["altitude_m"] = np.nan_to_num(frames.height_m)
-        for name, values in told.items():
+            fields["altitude_m"] = np.nan_to_num(frames.height_m)
+        for name, values in fields.items():
             heads[name] = values
         return heads
 
@@ -472,18 +477,18 @@ def _form_of(frames: SonarFrames, beams: int | None) -> _Form:
     """
     if min(len(frames.range_m), len(frames.bearing_rad)) < 2:
         raise MitsonarError("frames of an ARIS file have 2 bins and 2 beams at least: give an image, not a profile")
-    table, moved = table_of(frames.bearing_rad, frames.sonar, beams)
+    table, deviation = table_of(frames.bearing_rad, frames.sonar, beams)
     window = window_of(frames.range_m, frames.sonar.sound_speed)
-    turned = moved > half_spacing(frames.bearing_rad) or table.beams != len(frames.bearing_rad)
+    turned = deviation > half_spacing(frames.bearing_rad) or table.beams != len(frames.bearing_rad)
     notes = []
     if turned:
         low, high = np.degrees(table.bearings[[0, -1]])
         notes.append(
             f"{counted(len(frames.bearing_rad), 'beam')} interpolated to {table.beams}, from {low:.4g} to {high:.4g} deg"
         )
-    elif moved > np.radians(1e-3):
+    elif deviation > np.radians(1e-3):
         notes.append(
-            f"the beams are those of the vendor's table: they differ from the frames' by {np.degrees(moved):.2g} deg"
+            f"the beams are those of the vendor's table: they differ from the frames' by {np.degrees(deviation):.2g} deg"
         )
     if not window.exact:
         step = float(np.diff(frames.range_m).mean()) if len(frames.range_m) > 1 else window.step_m

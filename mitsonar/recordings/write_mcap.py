@@ -372,8 +372,8 @@ class FrameEncoder:
         assert frames.elevation_rad is not None
         image, elevation = frames.image[index], frames.elevation_rad[index]
         rows, columns = np.nonzero(np.isfinite(elevation) & (image > 0))
-        ways = directions(frames.sonar.bearing, frames.bearing_rad[columns], elevation[rows, columns])
-        starboard, forward, up = (ways * frames.range_m[rows, None]).T
+        unit_vectors = directions(frames.sonar.bearing, frames.bearing_rad[columns], elevation[rows, columns])
+        starboard, forward, up = (unit_vectors * frames.range_m[rows, None]).T
         value = to_float32(image[rows, columns])
         table: dict[str, NDArray[Any]] = {"x": forward, "y": -starboard, "z": up, "intensity": value}
         table = {name: one.astype(np.float32) for name, one in table.items()}
@@ -388,8 +388,8 @@ class FrameEncoder:
         for name, one in table.items():
             points[name] = one
         fields = [
-            self._make("sensor_msgs/PointField", name=name, offset=4 * at, datatype=POINT_TYPES[one.dtype], count=1)
-            for at, (name, one) in enumerate(table.items())
+            self._make("sensor_msgs/PointField", name=name, offset=4 * index, datatype=POINT_TYPES[one.dtype], count=1)
+            for index, (name, one) in enumerate(table.items())
         ]
         return self._make(
             "sensor_msgs/PointCloud2",

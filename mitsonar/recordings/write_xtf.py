@@ -133,14 +133,14 @@ def _ping_headers(echogram: Echogram) -> Header:
     pitch, roll, heading = np.degrees(poses[:, 3:]).T
     header["pitch_deg"], header["roll_deg"] = -pitch, roll  # XTF: bow up is positive
     header["heading_deg"] = header["gyro_deg"] = heading % 360
-    flown = Trajectory(poses, echogram.time_s)
-    header["speed_knots"] = np.linalg.norm(velocities(flown)[:, :3], axis=1) * KNOTS
+    trajectory = Trajectory(poses, echogram.time_s)
+    header["speed_knots"] = np.linalg.norm(velocities(trajectory)[:, :3], axis=1) * KNOTS
     header["time_ms"] = np.rint(1000 * (echogram.time_s - echogram.time_s[0]))
     for row, time_s in zip(header, echogram.time_s, strict=True):
-        at = datetime.fromtimestamp(round(float(time_s), 2), UTC)
-        row["year"], row["month"], row["day"], row["day_of_year"] = at.year, at.month, at.day, at.timetuple().tm_yday
-        row["hour"], row["minute"], row["second"] = at.hour, at.minute, at.second
-        row["hundredths"] = round(at.microsecond / 1e4) % 100
+        date = datetime.fromtimestamp(round(float(time_s), 2), UTC)
+        row["year"], row["month"], row["day"], row["day_of_year"] = date.year, date.month, date.day, date.timetuple().tm_yday
+        row["hour"], row["minute"], row["second"] = date.hour, date.minute, date.second
+        row["hundredths"] = round(date.microsecond / 1e4) % 100
     return header
 
 

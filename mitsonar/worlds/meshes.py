@@ -137,8 +137,8 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
         _check_file(path)
         scene = trimesh.load_scene(path, process=False)
         _check_copies(scene)
-        found = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]
-        for geometry in found:
+        geometries = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]
+        for geometry in geometries:
             if np.shape(geometry.vertices)[1:] != (3,) or np.shape(geometry.faces)[1:] != (3,):
                 raise ValueError("a vertex or a triangle has not three numbers")
             if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
@@ -146,9 +146,9 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
     except Exception as error:  # readers of damaged files raise errors of any type
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MitsonarError(f"cannot read {path}: {reason}; export the model again") from None
-    if not found:
+    if not geometries:
         raise MitsonarError(f"{path} holds no triangles: export a mesh, not points or lines")
-    return found
+    return geometries
 
 
 def _check_file(path: Path) -> None:
@@ -182,10 +182,10 @@ def _check_gltf(path: Path, size: int) -> None:
         if count > whole_number(view["byteLength"], "byteLength", 0, 2**40):
             raise ValueError(f"an accessor promises {count:,} values in {view['byteLength']:,} bytes")
     for buffer in tree.get("buffers", []):
-        there = [size] if "uri" not in buffer or str(buffer["uri"]).startswith("data:") else []
-        there += [(path.parent / str(buffer["uri"])).stat().st_size] if not there else []
-        if whole_number(buffer["byteLength"], "byteLength", 0, 2**40) > there[0]:
-            raise ValueError(f"a buffer promises {buffer['byteLength']:,} bytes, {there[0]:,} are there")
+        available = [size] if "uri" not in buffer or str(buffer["uri"]).startswith("data:") else []
+        available += [(path.parent / str(buffer["uri"])).stat().st_size] if not available else []
+        if whole_number(buffer["byteLength"], "byteLength", 0, 2**40) > available[0]:
+            raise ValueError(f"a buffer promises {buffer['byteLength']:,} bytes, {available[0]:,} are there")
 
 
 def _check_copies(scene: trimesh.Scene) -> None:
@@ -292,8 +292,8 @@ def merged(
             file = f"{textured}_{len(content)}"
             uv = np.concatenate([piece.uv for _, piece in members if piece.uv is not None])
             content[f"textures/{file}.png"] = picture
-            own = None if shape_id is None else f"{shape_id}/{file}"
-            meshes.append(Mesh(file, vertices, faces, None, ids, uv, f"textures/{file}.png", shape_id=own))
+            mesh_id = None if shape_id is None else f"{shape_id}/{file}"
+            meshes.append(Mesh(file, vertices, faces, None, ids, uv, f"textures/{file}.png", shape_id=mesh_id))
     return meshes, content
 
 

@@ -46,7 +46,7 @@ __all__ = [
 DEEPEST = 100
 """Largest depth of objects that contain or refer to each other."""
 
-MOST_WAYS = 10**8
+MAX_PATHS = 10**8
 """Largest number of paths along references from object to object; Mitsuba follows every one."""
 
 MOST_PIXELS = 2**28
@@ -126,22 +126,22 @@ def _check_file(node: mi.parser.SceneNode, name: str) -> int:
     if node.props.type(name) != mi.Properties.Type.String:
         return 0
     plugin, value = node.props.plugin_name(), str(node.props[name])
-    for found in _files(value, name):
+    for path in _named_files(value, name):
         if name != "filename":
-            if not found.is_dir():
-                refuse_irregular(found, "file")
+            if not path.is_dir():
+                refuse_irregular(path, "file")
         elif plugin in CHECKS:
-            check_mesh(found, plugin)
+            check_mesh(path, plugin)
         elif plugin in PICTURES:
-            return pixels_of(found)
+            return pixels_of(path)
         elif plugin in ("gridvolume", "sdfgrid"):
-            check_grid(found)
+            check_grid(path)
         elif plugin in ("measured", "measured_polarized"):
-            check_tensors(found)
+            check_tensors(path)
         else:
-            refuse_irregular(found, "file")
+            refuse_irregular(path, "file")
             if plugin.startswith("ellipsoids"):
-                _check_ellipsoids(found)
+                _check_ellipsoids(path)
     return 0
 
 
@@ -152,16 +152,16 @@ def _check_ellipsoids(path: Path) -> None:
         raise MitsonarError(f"{path} is damaged: {error}; export it again") from None
 
 
-def _files(value: str, name: str) -> Iterator[Path]:
+def _named_files(value: str, name: str) -> Iterator[Path]:
     """Yield the files that Mitsuba finds for the value of a property."""
     if "\0" in value:
         raise MitsonarError("a value holds a zero byte: remove it")
     values = [f"data/ior/{value}.{part}.spd" for part in ("eta", "k")] if name in REFRACTING else [value]
     for one in values:
-        found = Path(str(file_resolver().resolve(one)))
+        path = Path(str(file_resolver().resolve(one)))
         try:
-            if one and found.exists():
-                yield found
+            if one and path.exists():
+                yield path
         except OSError:  # for example a name that is too long
             if name == "filename":
                 raise MitsonarError(f"there cannot be a file of the name {shortened(value)}") from None
@@ -173,11 +173,11 @@ def _refuse_incomplete(state: mi.parser.ParserState) -> None:
 
     kinds = mi.Properties.Type
     for node in state.nodes:
-        plugin, held = node.props.plugin_name(), {name: node.props.type(name) for name in node.props}
+        plugin, types = node.props.plugin_name(), {name: node.props.type(name) for name in node.props}
         where = f"{plugin} {node.props.id()}".strip()[:100]
-        if plugin == "bitmap" and held.get("filename") != kinds.String:
+        if plugin == "bitmap" and types.get("filename") != kinds.String:
             raise MitsonarError(f'{where} names no file: give <string name="filename" value="..."/>')
-        if plugin in CONTAINERS and kinds.ResolvedReference not in held.values():
+        if plugin in CONTAINERS and kinds.ResolvedReference not in types.values():
             raise MitsonarError(f"{where} is empty: put a {CONTAINERS[plugin]} in it, or leave it out")
 
 
@@ -193,37 +193,37 @@ def _check_references(state: mi.parser.ParserState) -> None:
     ids = state.id_to_index
     children: list[list[int]] = []
     for node in state.nodes:
-        held = []
+        references = []
         for name in list(node.props):
             kind = node.props.type(name)
             if kind == kinds.ResolvedReference:
-                held.append(int(node.props[name].index()))
+                references.append(int(node.props[name].index()))
             elif kind == kinds.Reference and node.props[name].id() in ids:
-                held.append(int(ids[node.props[name].id()]))
-        children.append(held)
+                references.append(int(ids[node.props[name].id()]))
+        children.append(references)
     # 2. Count paths and depth of each object after those of its children: a depth-first search without recursion. An object
     #    that is met again while it is `waiting` closes a circle.
-    ways, depths = [0] * len(children), [0] * len(children)
+    path_counts, depths = [0] * len(children), [0] * len(children)
     for root in range(len(children)):
-        path = [] if ways[root] else [(root, iter(children[root]))]
+        path = [] if path_counts[root] else [(root, iter(children[root]))]
         waiting = {root}
         while path:
-            number, rest = path[-1]
-            child = next(rest, None)
+            number, remaining = path[-1]
+            child = next(remaining, None)
             if child is None:
-                ways[number] = min(1 + sum(ways[one] for one in children[number]), MOST_WAYS + 1)
+                path_counts[number] = min(1 + sum(path_counts[one] for one in children[number]), MAX_PATHS + 1)
                 depths[number] = 1 + max((depths[one] for one in children[number]), default=0)
                 waiting.discard(number)
                 path.pop()
             elif child in waiting:
                 raise MitsonarError("its objects refer to each other in a circle: take one of the references out")
-            elif not ways[child]:
+            elif not path_counts[child]:
                 path.append((child, iter(children[child])))
                 waiting.add(child)
     if max(depths, default=0) > DEEPEST:
         raise MitsonarError(f"its objects refer to each other more than {DEEPEST} deep: it is no scene")
-    if sum(ways) > MOST_WAYS:
-        raise MitsonarError(f"its objects refer to each other in more than {MOST_WAYS:,} ways: it is no scene")
+    if sum(path_counts) > MAX_PATHS:
+        raise MitsonarError(f"its objects refer to each other in more than {MAX_PATHS:,} ways: it is no scene")
 
 
 # ---------------- World ``scene``: a file of the user
@@ -388,16 +388,16 @@ class _Text:
                     self._add(given.get("name", ""), given.get("value", ""))
                 case b"include":
                     inner = [path.parent, *folders]
-                    found = _found(given.get("filename", ""), inner)
-                    if found is not None:
-                        self.check(found, inner, depth + 1)
+                    target = _find_file(given.get("filename", ""), inner)
+                    if target is not None:
+                        self.check(target, inner, depth + 1)
                 case b"path":
-                    found = _found(given.get("value", ""), [path.parent, *folders])
-                    folders[:0] = [found] if found is not None else []
+                    target = _find_file(given.get("value", ""), [path.parent, *folders])
+                    folders[:0] = [target] if target is not None else []
                 case b"spectrum":
-                    found = _found(given.get("filename", ""), folders)
-                    if found is not None:
-                        refuse_irregular(found, "spectrum", LARGEST_SPECTRUM)
+                    target = _find_file(given.get("filename", ""), folders)
+                    if target is not None:
+                        refuse_irregular(target, "spectrum", LARGEST_SPECTRUM)
 
     def _elements(self, content: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
         """Yield the name and the attributes of each element."""
@@ -412,8 +412,8 @@ class _Text:
                     raise _malformed(path, content, place, f"a {skipped.decode()} does not end")
                 place = content.find(b"<", end)
                 continue
-            if (found := OPENED.match(content, place)) is not None:
-                name, attributes, closed = found.groups()
+            if (tag := OPENED.match(content, place)) is not None:
+                name, attributes, closed = tag.groups()
                 if not opened and self.elements > before:
                     raise _malformed(path, content, place, "there is a second root element")
                 self.elements += 1
@@ -424,25 +424,25 @@ class _Text:
                 if len(opened) > DEEPEST:
                     raise MitsonarError(f"{path} nests its elements more than {DEEPEST} deep: it is no scene")
                 yield name, attributes
-            elif (found := CLOSED.match(content, place)) is not None:
-                if not opened or opened.pop() != found[1]:
+            elif (tag := CLOSED.match(content, place)) is not None:
+                if not opened or opened.pop() != tag[1]:
                     raise _malformed(path, content, place, "an element is closed that is not open")
-            elif opened or (found := DOCTYPE.match(content, place)) is None:  # a longer document type may define entities
+            elif opened or (tag := DOCTYPE.match(content, place)) is None:  # a longer document type may define entities
                 raise _malformed(path, content, place, "the XML of an element or of one of its attributes is malformed")
-            place = content.find(b"<", found.end())
+            place = content.find(b"<", tag.end())
         if opened:
             raise _malformed(path, content, len(content), f"<{opened[-1].decode('utf-8', 'replace')[:40]}> is not closed")
 
     def _expanded(self, attributes: bytes, path: Path) -> dict[str, str]:
         """Return attributes by name, with their parameters replaced as Mitsuba replaces them."""
-        found: dict[str, str] = {}
+        values: dict[str, str] = {}
         for name, double, single in ATTRIBUTE.findall(attributes):
             raw = (double or single).replace(b"\r\n", b" ").translate(SPACES)
             value = ENTITY.sub(_character, raw.decode("utf-8", "surrogateescape"))
             if "$" in value:
                 value = self._replaced(value, path)
-            found.setdefault(name.decode("utf-8", "surrogateescape"), value)
-        return found
+            values.setdefault(name.decode("utf-8", "surrogateescape"), value)
+        return values
 
     def _replaced(self, value: str, path: Path) -> str:
         for name in self.longest_first:
@@ -499,19 +499,19 @@ def _utf8(content: bytes, path: Path) -> bytes:
     return content
 
 
-def _character(found: re.Match[str]) -> str:
+def _character(entity: re.Match[str]) -> str:
     """Return the character that an entity stands for."""
-    decimal, hexadecimal, name = found.groups()
+    decimal, hexadecimal, name = entity.groups()
     if name:
         return ENTITIES[name]
     digits = (decimal or hexadecimal).lstrip("0")
     number = int(digits or "0", 10 if decimal else 16) if len(digits) < 10 else 0x110000
     if not 0 < number < 0x110000 or 0xD800 <= number < 0xE000:
-        raise MitsonarError(f"the scene has {shortened(found[0])}, which is no character")
+        raise MitsonarError(f"the scene has {shortened(entity[0])}, which is no character")
     return chr(number)
 
 
-def _found(name: str, folders: list[Path]) -> Path | None:
+def _find_file(name: str, folders: list[Path]) -> Path | None:
     """Return the file that Mitsuba finds for a name, or None."""
     if not name or "\0" in name:
         return None
@@ -868,8 +868,8 @@ def _check_serialized(content: bytes) -> None:
 
 def _check_one_serialized(content: bytes) -> None:
     """Check one serialized mesh: a version, then deflated flags, name, counts, columns of numbers and triangles."""
-    ours, number = struct.unpack_from("<HH", content)
-    if ours != 0x041C or number not in (3, 4):
+    signature, number = struct.unpack_from("<HH", content)
+    if signature != 0x041C or number not in (3, 4):
         raise _FaultError("it is no serialized mesh of version 3 or 4")
     # 1. Inflate the data, up to the largest possible size.
     unpack = zlib.decompressobj()
@@ -952,10 +952,10 @@ def _shape(head: bytes, tail: bytes) -> tuple[int, int, int]:
         words = re.findall(rb"[^\s#]+", re.sub(rb"#[^\n]*", b"", head[2:2000]))
         return int(words[0]), int(words[1]), 3
     if head.startswith(b"#?"):
-        found = re.search(rb"[+-][XY] (\d{1,9}) [+-][XY] (\d{1,9})\n", head[: 2**16])
-        if found is None:
+        size_line = re.search(rb"[+-][XY] (\d{1,9}) [+-][XY] (\d{1,9})\n", head[: 2**16])
+        if size_line is None:
             raise ValueError
-        return int(found[1]), int(found[2]), 3
+        return int(size_line[1]), int(size_line[2]), 3
     if tail != b"TRUEVISION-XFILE.\0":  # TGA is recognised by its footer
         raise ValueError
     wide, high = struct.unpack_from("<HH", head, 12)

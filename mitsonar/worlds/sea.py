@@ -99,8 +99,8 @@ class WaveSpectrum:
             return k
         k = max(k, omega / math.sqrt(GRAVITY * self.depth_m))  # start above the root: the iterates then decrease to it
         for _ in range(50):
-            slope, found = self.group_speed(np.array(k)), self.frequency(np.array(k))
-            k -= float((found - omega) / slope)
+            slope, frequency = self.group_speed(np.array(k)), self.frequency(np.array(k))
+            k -= float((frequency - omega) / slope)
         return k
 
     def group_speed(self, wavenumber: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -299,9 +299,9 @@ class SeaSurface(Family):
         shortest = SHORTEST * self.step_m
         if self.wind_m_s == 0:
             return SeaState(0.0, math.inf, shortest, 0.0, 0.0)
-        held, left = self.waves.variance(shortest), self.waves.variance(0.0, shortest)
+        resolved, unresolved = self.waves.variance(shortest), self.waves.variance(0.0, shortest)
         height, peak = self.waves.significant_height_m, self.waves.peak_wavelength_m
-        return SeaState(height, peak, shortest, math.sqrt(held), math.sqrt(left))
+        return SeaState(height, peak, shortest, math.sqrt(resolved), math.sqrt(unresolved))
 
     def save(self, path: str | Path, seed: int = 0, time_s: float | None = None) -> None:
         """Write the surface for a seed as a PLY file, for use in another scene.
@@ -436,10 +436,10 @@ def wave_heights(sea: Sea, count: int, step_m: float, seed: int, time_s: float) 
         ((np.abs(index)[:, None] > INNER) | (np.abs(index) > INNER))
         & (lattice * np.hypot(index[:, None], index) <= 2 * math.pi / (SHORTEST * step_m))
     )
-    own = _Waves(index[columns] * lattice, index[rows] * lattice, lattice)
+    grid_waves = _Waves(index[columns] * lattice, index[rows] * lattice, lattice)
     # 2. Sum their waves by an inverse FFT, and cut out the grid.
     values = np.zeros((points, points), np.complex128)
-    values[rows, columns] = _amplitudes(sea, own, seed, 0, time_s)
+    values[rows, columns] = _amplitudes(sea, grid_waves, seed, 0, time_s)
     heights = (np.fft.ifft2(values) * points**2).real[:count, :count]
     # 3. Add the long waves one lattice at a time. They are few, so that a product of two matrices is cheap.
     place = np.arange(count) * step_m
@@ -453,16 +453,16 @@ def wave_heights(sea: Sea, count: int, step_m: float, seed: int, time_s: float) 
 def _long_waves(sea: Sea, lattice: float, step_m: float) -> list[_Waves]:
     """Return the wave vectors that replace the innermost ones of a lattice, in successively finer lattices."""
     calm = CALM * sea.spectrum.wavenumber(sea.spectrum.peak_rad_s)
-    found = []
+    lattices = []
     outer = 3 * INNER + 1
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.arange(-outer, outer + 1.0)] * 2))
     ring = np.maximum(np.abs(x), np.abs(y)) > INNER
     shortest = 2 * math.pi / (SHORTEST * step_m)
     while lattice * (INNER + 0.5) > calm:
         lattice /= 3
-        kept = ring & (lattice * np.hypot(x, y) <= shortest)
-        found.append(_Waves(x[kept] * lattice, y[kept] * lattice, lattice))
-    return found
+        selected = ring & (lattice * np.hypot(x, y) <= shortest)
+        lattices.append(_Waves(x[selected] * lattice, y[selected] * lattice, lattice))
+    return lattices
 
 
 def _amplitudes(sea: Sea, waves: _Waves, seed: int, number: int, time_s: float) -> NDArray[np.complex128]:
@@ -561,13 +561,13 @@ def fishing_net_mesh(width_m: float, height_m: float, opening_m: float, twine_m:
     x, z = (a.ravel() for a in np.meshgrid(np.arange(across + 1), np.arange(up + 1), indexing="ij"))
     knots = np.column_stack([x, np.zeros_like(x), z]) * opening_m
     begins = np.concatenate([knots[z < up], knots[x < across]])
-    ways = np.repeat([[0, 0, opening_m], [opening_m, 0, 0]], [(z < up).sum(), (x < across).sum()], axis=0)
+    bars = np.repeat([[0, 0, opening_m], [opening_m, 0, 0]], [(z < up).sum(), (x < across).sum()], axis=0)
     # 2. Put a triangular ring around both ends of each bar, and join the two rings.
     turn = 2 * np.pi * np.arange(3) / 3
-    round_ = 0.5 * twine_m * np.column_stack([np.cos(turn), np.sin(turn)])
-    side = np.cross(ways / opening_m, [0.0, 1.0, 0.0])
-    ring = round_[None, :, :1] * side[:, None] + round_[None, :, 1:] * np.array([0.0, 1.0, 0.0])
-    vertices = np.concatenate([begins[:, None] + ring, (begins + ways)[:, None] + ring], axis=1)
+    cross_section = 0.5 * twine_m * np.column_stack([np.cos(turn), np.sin(turn)])
+    side = np.cross(bars / opening_m, [0.0, 1.0, 0.0])
+    ring = cross_section[None, :, :1] * side[:, None] + cross_section[None, :, 1:] * np.array([0.0, 1.0, 0.0])
+    vertices = np.concatenate([begins[:, None] + ring, (begins + bars)[:, None] + ring], axis=1)
     faces = [[k, 3 + k, (k + 1) % 3] for k in range(3)] + [[(k + 1) % 3, 3 + k, 3 + (k + 1) % 3] for k in range(3)]
     return vertices.reshape(-1, 3), _copied(np.array(faces), 6, len(begins))
 
