@@ -85,7 +85,7 @@ def handedness_of(part: Part, heading_rad: ArrayLike | None = None) -> Handednes
     """
     heading = _headings(part, heading_rad)
     if heading is None:
-        return _unknown("nothing tells the headings: there are no poses, no compass, and none was given")
+        return _unknown("the headings are unknown: the recording has no poses and no compass, and none were given")
     bearing = part.like.bearing_rad
     if len(bearing) < 8 or len(part) < FEWEST_PAIRS + 1:
         return _unknown("there are too few beams or frames")
@@ -111,7 +111,11 @@ def handedness_of(part: Part, heading_rad: ArrayLike | None = None) -> Handednes
     rms = float(np.degrees(np.sqrt(np.mean(given_turns**2))))
     if not significant:
         too_few = abs(correlation) >= CLEAR and abs(slope) >= LEAST_SLOPE
-        reason = "there are too few pairs of frames to be sure" if too_few else "the pictures do not turn as it is told"
+        reason = (
+            "there are too few pairs of frames for a verdict"
+            if too_few
+            else "the rotation of the pictures does not follow the given headings"
+        )
         return Handedness("unknown", correlation, slope, len(given_turns), rms, reason)
     return Handedness("agree" if correlation > 0 else "mirrored", correlation, slope, len(given_turns), rms)
 
@@ -235,7 +239,7 @@ def _shift(a: Array, b: Array, reach: int) -> float:
     down, across = max(2, int(REACH_RANGE * rows)), min(reach, beams - 2)
     lags = np.arange(-down, down + 1), np.arange(-across, across + 1)
     score = correlation[np.ix_(*lags)] / (taper_correlations[0][lags[0]][:, None] * taper_correlations[1][lags[1]])
-    # 3. Find the peak. One at the end of the search interval is no maximum.
+    # 3. Find the peak. One at the end of the search interval is not a maximum.
     row, peak_column = np.unravel_index(int(score.argmax()), score.shape)
     if not score[row, peak_column] > 0 or peak_column in (0, len(lags[1]) - 1):
         return float("nan")

@@ -197,7 +197,7 @@ def _pings_of(messages: Messages) -> tuple[_Pings, list[str]]:
             f"left out: {counted(messages.skipped, 'message or item', 'messages or items')} of other kinds without an image"
         )
     if messages.left_over:
-        notes.append(f"{messages.left_over:,} bytes are no whole message and are left out")
+        notes.append(f"{messages.left_over:,} bytes are not a complete message and are left out")
     if not len(place):
         raise MitsonarError(f"{messages.name} holds no ping of an Oculus that can be read: {'; '.join(notes)}")
     return _Pings(place, head[place], fan[place], tables), notes
@@ -261,7 +261,7 @@ def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
     codes = np.unique(head["ping_rate"])
     rate = RATES.get(int(codes[0]), 10.0) if len(codes) == 1 else 10.0
     reason = "the greatest ping rate" if len(codes) == 1 and int(codes[0]) in RATES else "assumed"
-    note = f"the file tells no times in a known unit: pings follow each other at {rate:g} Hz ({reason}), by their numbers"
+    note = f"the file holds no times in a known unit: they are computed from the ping numbers at {rate:g} Hz ({reason})"
     return np.concatenate([[0.0], np.cumsum(number)]) / rate, [note]
 
 
@@ -403,17 +403,18 @@ def _notes(head: Header) -> list[str]:
         notes.append(f"the gain changes between {gains[0]:.4g} and {gains[-1]:.4g} %")
     if _gained(head).any():
         notes.append(
-            "rows have gains: counts were divided by their roots, relative to the least gain of a part's first frame"
+            "rows have gains: counts were divided by their square roots, relative to the smallest gain of the first frame "
+            "of each part"
         )
     codes = [int(code) for code in np.unique(head["gamma"]) if code not in (0, 127, 255)]
     if codes:
         notes.append(
-            f"the gamma byte {codes[0]} is taken as an exponent of {_gamma(codes[0]):.3g}: only 0, 127 and 255 are known"
+            f"the gamma byte {codes[0]} is interpreted as the exponent {_gamma(codes[0]):.3g}: only 0, 127 and 255 are known"
         )
     if not ((head["sound_speed"] > 1000) & (head["sound_speed"] < 2000)).any():
-        notes.append("the sound speed of the messages cannot be: 1500 m/s is taken; ranges do not depend on it")
+        notes.append("the messages hold no plausible sound speed: 1500 m/s is assumed; ranges do not depend on it")
     if not _preset_name(float(head["frequency"][0])):
-        notes.append(f"no preset has this carrier: an opening over elevation of {ELEVATION_DEG:g} deg is taken")
+        notes.append(f"no preset has this carrier: an elevation aperture of {ELEVATION_DEG:g} deg is assumed")
     return notes
 
 
@@ -560,7 +561,7 @@ def find_messages(data: Bytes, name: str) -> Messages:
         return _find_in_log(data, name)
     if not first.startswith(DUMP):
         raise MitsonarError(
-            f"{name} is no recording of an Oculus: it begins with {first[:4]!r}, not with {DUMP!r} (.raw) or {LOG!r} "
+            f"{name} is not a recording of an Oculus: it begins with {first[:4]!r}, not with {DUMP!r} (.raw) or {LOG!r} "
             "(.oculus)"
         )
     return _find_in_dump(data, name)
@@ -594,7 +595,7 @@ def _find_in_dump(data: Bytes, name: str) -> Messages:
             break
         kind, version, follow = HEADER.unpack_from(view, offset)[3:6]
         if kind not in KINDS or version > LATEST or offset + HEADER.size + follow > len(view):
-            offset += 1  # the mark occurred by chance: search on behind its first byte
+            offset += 1  # the mark occurred by chance: continue the search after its first byte
             continue
         size = HEADER.size + follow
         collector.bytes += size
@@ -610,7 +611,7 @@ def _find_in_log(data: Bytes, name: str) -> Messages:
     view = data.data
     if len(view) < LOG_HEADER.size:
         raise MitsonarError(
-            f"{name} has {len(view):,} bytes, and the header of a log {LOG_HEADER.size}: the file is cut off"
+            f"{name} has {len(view):,} bytes, fewer than the {LOG_HEADER.size} of a log's header: the file is cut off"
         )
     offset, encryption = (LOG_HEADER.unpack_from(view)[one] for one in (1, 4))
     if encryption:
@@ -625,7 +626,7 @@ def _find_in_log(data: Bytes, name: str) -> Messages:
             break
         _, head, kind, _, time_s, packing, unpacked, follow = ITEM_HEADER.unpack_from(view, offset)
         if not ITEM_HEADER.size <= head <= LARGEST_HEADER or offset + head + follow > len(view):
-            offset += 1  # the mark occurred by chance: search on behind its first byte
+            offset += 1  # the mark occurred by chance: continue the search after its first byte
             continue
         begin, time_s = offset + head, time_s if abs(time_s) < 1e11 else np.nan
         collector.bytes += head + follow

@@ -53,7 +53,7 @@ def _without_topic(read: Callable[[Path, Path | None], Recording]) -> Callable[[
 
     def checked(path: Path, geometry: Path | None, topic: str | None) -> Recording:
         if topic is not None:
-            raise MitsonarError(f"{path} is a recording of one sonar, and has no topics or views: leave {topic!r} out")
+            raise MitsonarError(f"{path} is a recording of one sonar without topics or views: omit {topic!r}")
         return read(path, geometry)
 
     return checked
@@ -64,7 +64,7 @@ def _without_geometry(read: Callable[[Path], Recording]) -> Callable[[Path, Path
 
     def checked(path: Path, geometry: Path | None) -> Recording:
         if geometry is not None:
-            raise MitsonarError(f"{path} tells its geometry itself: leave {geometry} out")
+            raise MitsonarError(f"{path} contains its geometry: omit {geometry}")
         return read(path)
 
     return _without_topic(checked)
@@ -121,7 +121,7 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     if recording_format is None:
         if not os.path.exists(path):
             raise MitsonarError(f"no such file: {path}")
-        raise MitsonarError(f"{path} is no recording that mitsonar reads: it reads {known_formats()}")
+        raise MitsonarError(f"{path} is not a recording that mitsonar reads: it reads {known_formats()}")
     return recording_format.read(Path(path), None if geometry is None else Path(geometry), topic)
 
 
@@ -235,12 +235,8 @@ def _part_rows(part: Summary) -> list[tuple[str, str]]:
     if part["frequency_hz"]:
         rows.append(("carrier", f"{part['frequency_hz'] / 1e3:,.6g} kHz"))
     if "first_s" in part:
-        rows.append(
-            (
-                "times",
-                f"{_format_time(part['first_s'])} to {_format_time(part['last_s'])}, {part['last_s'] - part['first_s']:.6g} s",
-            )
-        )
+        duration_s = part["last_s"] - part["first_s"]
+        rows.append(("times", f"{_format_time(part['first_s'])} to {_format_time(part['last_s'])}, {duration_s:.6g} s"))
     if "rate_hz" in part:
         longest = f"; the longest step takes {part['longest_step_s']:.4g} s" if part["gaps"] else ""
         rows.append(("rate", f"{part['rate_hz']:.4g} Hz, {counted(part['gaps'], 'gap')}{longest}"))

@@ -51,7 +51,7 @@ class PictureGeometry(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     layout: Literal["fan", "polar"] = Field(description="fan: scan-converted pictures; polar: beams by bins")
-    name: str = Field("pictures", max_length=200, description="what the sonar is called")
+    name: str = Field("pictures", max_length=200, description="name of the sonar")
     apex_px: Row | None = Field(None, description="fan: column and row of the sonar; may lie outside the picture")
     near_px: float | None = Field(None, ge=0, le=1e6, description="fan: distance of the near arc from the apex [px]")
     far_px: float | None = Field(None, gt=0, le=1e6, description="fan: distance of the far arc from the apex [px]")
@@ -63,7 +63,7 @@ class PictureGeometry(BaseModel):
     beams: int | None = Field(None, ge=2, le=65_536, description="fan: beams to make; default: one a pixel at mid range")
     azimuth_fov_deg: float | None = Field(None, gt=0, le=360, description="polar: field of view over all beams [deg]")
     bearings_deg: tuple[float, ...] | None = Field(
-        None, min_length=2, max_length=65_536, description="polar: of each column, starboard positive [deg]"
+        None, min_length=2, max_length=65_536, description="polar: bearing of each column, starboard positive [deg]"
     )
     beam_layout: Literal["even", "sine"] = Field("even", description="polar: steps of the angle, or of its sine")
     rows: Literal["near-to-far", "far-to-near"] = Field("near-to-far", description="polar: order of the rows")
@@ -72,11 +72,11 @@ class PictureGeometry(BaseModel):
     range_min: float | None = Field(None, ge=0, le=1e5, description="start of the window [m]; fan: default by near_px")
     range_max: float | None = Field(None, gt=0, le=1e5, description="end of the window [m]")
     scale_known: bool = Field(True, description="false: metres are not known, and range_max may be any value")
-    level: Coding | None = Field(None, description="how values stand for levels: linear, dB or gamma; default: linear")
+    level: Coding | None = Field(None, description="how values represent levels: linear, dB or gamma; default: linear")
     coding_db: float = Field(80.0, gt=0, le=300, description="span of the level dB, from value 0 to 255 [dB]")
-    coding_gamma: float = Field(0.5, gt=0, le=4, description="of the level gamma: value = amplitude^gamma")
+    coding_gamma: float = Field(0.5, gt=0, le=4, description="exponent of the level gamma: value = amplitude^gamma")
     sound_speed: float = Field(1500.0, gt=0, le=1e4, description="sound speed [m/s]")
-    frame_rate_hz: float | None = Field(None, gt=0, le=1e6, description="pictures a second, where nothing tells times")
+    frame_rate_hz: float | None = Field(None, gt=0, le=1e6, description="pictures per second, for pictures without times")
     times: str | None = Field(None, description="file of times [s], a line each, `TIME` or `NAME, TIME`")
     pitch_deg: float | None = Field(None, ge=-90, le=90, description="pitch of the sonar [deg], > 0 is down")
     roll_deg: float = Field(0.0, ge=-180, le=180, description="roll of the sonar [deg], > 0 is starboard down")
@@ -84,7 +84,7 @@ class PictureGeometry(BaseModel):
     frequency_hz: float | None = Field(None, gt=0, le=1e8, description="carrier [Hz]")
     elevation_fov_deg: float | None = Field(None, gt=0, le=180, description="field of view within a beam [deg]")
     bearing: Bearing | None = Field(
-        None, description="what a beam's angle is: azimuth, or the cone of a line array; default: cone up to 180 deg"
+        None, description="meaning of a beam's angle: azimuth, or the cone of a line array; default: cone up to 180 deg"
     )
 
     @classmethod
@@ -104,7 +104,7 @@ class PictureGeometry(BaseModel):
         others = POLAR_ONLY if self.layout == "fan" else FAN_ONLY
         wrong = [name for name in others if name in self.model_fields_set]
         if wrong:
-            raise ValueError(f"{', '.join(wrong)} do not belong to the layout {self.layout}: leave them out{SEE}")
+            raise ValueError(f"{', '.join(wrong)} do not apply to the layout {self.layout}: omit them{SEE}")
         self._check_fan() if self.layout == "fan" else self._check_polar()
         if self.range_min is not None and self.range_max is not None and not self.range_max > self.range_min:
             raise ValueError(f"range_max must exceed range_min: got {self.range_max:g} m <= {self.range_min:g} m")
@@ -118,21 +118,21 @@ class PictureGeometry(BaseModel):
             raise ValueError(f"far_px must exceed near_px by 2: got {self.far:g} and {self.near:g}")
         scales = (self.pixels_per_m is not None) + (self.range_max is not None)
         if scales == 2 or (scales == 0 and self.scale_known):
-            raise ValueError("a fan needs its scale: give pixels_per_m or range_max, one of them, or `scale_known: false`")
+            raise ValueError("a fan needs its scale: give either pixels_per_m or range_max, or `scale_known: false`")
 
     def _check_polar(self) -> None:
         if self.range_min is None or self.range_max is None:
             raise ValueError("the layout polar needs range_min and range_max; with `scale_known: false` their ratio counts")
         if (self.azimuth_fov_deg is None) == (self.bearings_deg is None):
-            raise ValueError("the layout polar needs azimuth_fov_deg or bearings_deg, one of them")
+            raise ValueError("the layout polar needs either azimuth_fov_deg or bearings_deg")
         if self.bearings_deg is not None:
             steps = [after - before for before, after in zip(self.bearings_deg, self.bearings_deg[1:], strict=False)]
             if not (all(step > 0 for step in steps) or all(step < 0 for step in steps)):
-                raise ValueError("bearings_deg must rise, or fall, from column to column")
+                raise ValueError("bearings_deg must increase, or decrease, from column to column")
             if not all(abs(one) <= 180 for one in self.bearings_deg):
                 raise ValueError("bearings_deg must lie in -180..180 deg")
             if {"mirror", "beam_layout"} & self.model_fields_set:
-                raise ValueError("bearings_deg tell the order of the columns: leave mirror and beam_layout out")
+                raise ValueError("bearings_deg determine the order of the columns: omit mirror and beam_layout")
 
     @property
     def near(self) -> float:
@@ -170,9 +170,9 @@ class PictureGeometry(BaseModel):
                 "m: the ratios differ, check the apex"
             )
         if self.level is None:
-            notes.append("level is not told: values are taken as linear")
+            notes.append("level is not given: values are assumed to be linear")
         if self.elevation_fov_deg is None:
-            notes.append(f"elevation_fov_deg is not told: {ANY_ELEVATION_DEG:g} deg are assumed")
+            notes.append(f"elevation_fov_deg is not given: {ANY_ELEVATION_DEG:g} deg are assumed")
         return notes
 
 
@@ -299,23 +299,23 @@ def doubts(geometry: PictureGeometry, brightest: NDArray[np.generic]) -> list[st
     half = float(geometry.half_angle_deg or 0.0)
     if abs(outline.stretch / geometry.stretch - 1) > SAME_STRETCH:
         notes.append(
-            f"the far arc is a circle with stretch {outline.stretch:.3f}, and the edges then open {outline.half_angle_deg:.2f} "
-            f"deg to each side; the geometry tells stretch {geometry.stretch:g} and {half:g} deg: the pictures are "
-            "squeezed, or the geometry is another one"
+            f"the far arc is a circle with stretch {outline.stretch:.3f}, and the edges then open "
+            f"{outline.half_angle_deg:.2f} deg to each side; the geometry gives stretch {geometry.stretch:g} and {half:g} "
+            "deg: the pictures are squeezed, or the geometry belongs to other pictures"
         )
     elif abs(outline.half_angle_deg - half) > SAME_ANGLE_DEG:
         notes.append(
-            f"the edges of the fan open {outline.half_angle_deg:.2f} deg to each side, the geometry tells {half:g} deg"
+            f"the edges of the fan open {outline.half_angle_deg:.2f} deg to each side, the geometry gives {half:g} deg"
         )
     distance_px = math.hypot((outline.apex_px[0] - apex_px[0]) * geometry.stretch, outline.apex_px[1] - apex_px[1])
     if distance_px > SAME_PX * geometry.far:
         notes.append(
-            f"the edges of the fan meet at ({outline.apex_px[0]:.1f}, {outline.apex_px[1]:.1f}) px, the geometry tells apex_px "
-            f"({apex_px[0]:g}, {apex_px[1]:g})"
+            f"the edges of the fan meet at ({outline.apex_px[0]:.1f}, {outline.apex_px[1]:.1f}) px, the geometry gives "
+            f"apex_px ({apex_px[0]:g}, {apex_px[1]:g})"
         )
     elif abs(outline.far_px - geometry.far) > SAME_PX * geometry.far:
         notes.append(
-            f"the far arc lies at {outline.far_px:.1f} px from the apex, the geometry tells far_px {geometry.far:g}"
+            f"the far arc lies at {outline.far_px:.1f} px from the apex, the geometry gives far_px {geometry.far:g}"
         )
     return notes
 

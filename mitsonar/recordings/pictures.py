@@ -96,8 +96,8 @@ def refuse_size(rows: int, columns: int, source: str) -> None:
     """
     if rows * columns > MOST_PIXELS or min(rows, columns) < 2:
         raise MitsonarError(
-            f"{source} has {columns:,} x {rows:,} pixels; pictures of sonars have 2 x 2 to {MOST_PIXELS:,} in all: it is "
-            "damaged, or something else"
+            f"{source} has {columns:,} x {rows:,} pixels; pictures of sonars have at least 2 x 2, and at most "
+            f"{MOST_PIXELS:,} in all: it is damaged, or not a sonar picture"
         )
 
 
@@ -156,7 +156,7 @@ def _opened(path: Path) -> Image.Image:
         raise MitsonarError(f"no such file: {path}") from None
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise MitsonarError(
-            f"{path} says that it has more pixels than any picture of a sonar, {MOST_PIXELS:,}: it is damaged"
+            f"{path} has more pixels than any picture of a sonar, {MOST_PIXELS:,}, according to its header: it is damaged"
         ) from None
     except Exception as error:  # damaged bytes raise errors of many kinds
         reason = " ".join(str(error).split())[:160]
@@ -213,7 +213,9 @@ def read_picture_folder(path: Path, geometry: Path | None = None) -> Recording:
     names = tuple(file.name for file in files)
     first = read_picture(files[0], shape)
     if _has_colours(files[0]):
-        notes.append("the pictures have colours: their luminance is read, which is no level where the colours are a scale")
+        notes.append(
+            "the pictures have colours: their luminance is read, which is not a level if the colours are a colour scale"
+        )
     bits = 8 if first.dtype == np.uint8 else 16
 
     def read(place: int) -> Grey:
@@ -244,7 +246,7 @@ def picture_paths(folder: Path) -> list[Path]:
     except OSError as error:
         raise MitsonarError(f"cannot read the folder {folder}: {error.strerror}") from None
     if len(pictures) > MOST_PICTURES:
-        raise MitsonarError(f"{folder} holds {len(pictures):,} pictures, more than {MOST_PICTURES:,}: divide it")
+        raise MitsonarError(f"{folder} holds {len(pictures):,} pictures, more than {MOST_PICTURES:,}: split it")
     return sorted(pictures, key=lambda one: naturally(one.name))
 
 
@@ -303,7 +305,7 @@ def _select_one_size(files: list[Path], folder: Path) -> tuple[list[Path], tuple
         except MitsonarError as error:
             reason = reason or str(error)
     if not sizes:
-        raise MitsonarError(reason or f"{folder} holds no whole picture: all are empty or cut off")
+        raise MitsonarError(reason or f"{folder} holds no complete picture: all are empty or cut off")
     shape = Counter(sizes.values()).most_common(1)[0][0]
     same_size = [file for file, size in sizes.items() if size == shape]
     notes = []
@@ -484,7 +486,7 @@ class _Video:
         self.capture = self.cv2.VideoCapture(str(self.path))
         self.position = 0
         if not self.capture.isOpened():
-            raise MitsonarError(f"OpenCV cannot open the video {self.path}: it is damaged, or of a codec that is not there")
+            raise MitsonarError(f"OpenCV cannot open the video {self.path}: it is damaged, or its codec is not available")
 
     def count(self) -> int:
         """Return the number of frames that can be decoded; the number in the header is unreliable."""
@@ -701,8 +703,8 @@ def geometry_for(source: Path, geometry: Path | None, inside: PictureGeometry | 
         return load_geometry(geometry_path), geometry_path
     if inside is None:
         raise MitsonarError(
-            f"{source} holds pictures, which do not tell their geometry: give a geometry file (--geometry FILE), or lay "
-            f"geometry.yaml beside them{SEE}"
+            f"{source} holds pictures without their geometry: give a geometry file (--geometry FILE), or put geometry.yaml "
+            f"next to them{SEE}"
         )
     return inside, source
 
@@ -752,7 +754,7 @@ def polar_frames(geometry: PictureGeometry, bins: int, beams: int, rate_hz: floa
     if len(geometry.bearings_deg) != beams:
         raise MitsonarError(
             f"the geometry has {len(geometry.bearings_deg):,} bearings_deg, and the pictures have {beams:,} beams: give "
-            "one a beam"
+            "one per beam"
         )
     bearings = np.sort(np.radians(geometry.bearings_deg))
     fov = min(360.0, math.degrees(bearings[-1] - bearings[0]) * beams / (beams - 1))
@@ -845,7 +847,7 @@ def _times(pictures: Pictures, geometry: PictureGeometry, geometry_path: Path) -
     if pictures.time_s is not None:
         return pictures.time_s, []
     rate = geometry.frame_rate_hz or pictures.rate_hz
-    assumed = [] if rate else [f"nothing tells the times of the pictures: {ANY_RATE_HZ:g} a second are assumed"]
+    assumed = [] if rate else [f"the times of the pictures are unknown: {ANY_RATE_HZ:g} per second are assumed"]
     steps = (
         np.arange(len(pictures.names), dtype=float) if pictures.numbers is None else pictures.numbers - pictures.numbers[0]
     )
@@ -868,7 +870,7 @@ def _read_times(path: Path, names: tuple[str, ...]) -> Array:
         by_name = {row[0]: time for row, time in zip(rows, times, strict=True)}
         named_times = np.array([by_name.get(name, np.nan) for name in names])
         if not np.isfinite(named_times).any():
-            raise MitsonarError(f"{path} names none of the pictures, such as {names[0] if names else '-'}")
+            raise MitsonarError(f"{path} lists none of the pictures, such as {names[0] if names else '-'}")
         return named_times
     if len(times) != len(names) or any(len(row) != 1 for row in rows):
         raise MitsonarError(f"{path} must hold a time for each of {len(names):,} pictures: it holds {len(times):,} lines")
@@ -954,6 +956,8 @@ def _store(run: RunDirectory, recording: Recording, part: Part, zarr_path: Path)
         store.check(len(part), part.like.sonar, done)
         return store, done
     if run.resumed and run.count("frames_done", len(part)):
-        raise MitsonarError(f"{zarr_path} is gone, though run.json says that it was begun: copy again with --overwrite")
+        raise MitsonarError(
+            f"{zarr_path} is missing, although run.json states that it was begun: copy again with --overwrite"
+        )
     about = {"recording": recording.name, "format": recording.format, "notes": list(recording.notes)}
     return FrameStore.create(zarr_path, len(part), replace(part.read([]), about=about)), 0

@@ -106,7 +106,7 @@ def read_canoe(path: Path) -> Recording:
         [f"left out: {counted(len(pictures) - len(complete), 'picture')} cut off"] if len(complete) < len(pictures) else []
     )
     if not complete:
-        raise MitsonarError(f"{path / 'sonar'} holds no whole picture")
+        raise MitsonarError(f"{path / 'sonar'} holds no complete picture")
     stamps, files = np.array([time for time, _ in complete], dtype=np.int64), [one for _, one in complete]
     # 2. Assign poses, and leave out pictures without one if there are any poses.
     poses, pose_notes = _canoe_poses(path / POSES, stamps)
@@ -123,7 +123,7 @@ def read_canoe(path: Path) -> Recording:
         assert isinstance(size, tuple)  # the keys of runs_of are the sizes
         parts.append(_canoe_part([files[place] for place in order[run]], size, times[order[run]], poses, order[run]))
     facts: Facts = {"pictures": len(files), "rows": sizes[0][0], "columns": sizes[0][1]}
-    assumed = f"the window 0..{RANGE_MAX:g} m and the coding amplitude^0.5 are assumed: the files do not tell them"
+    assumed = f"the window 0..{RANGE_MAX:g} m and the coding amplitude^0.5 are assumed: the files do not state them"
     return Recording(
         str(path), "CANOE data set (Oculus as PNG)", tuple(parts), facts, (*notes, *order_notes, *pose_notes, assumed)
     )
@@ -137,7 +137,7 @@ def _time_us(path: Path) -> int:
 def _canoe_part(files: list[Path], size: tuple[int, int], times: Array, poses: Array | None, places: Index) -> Part:
     """Return a part of pictures of one size; their bearings are those of the first picture."""
     if size[0] < HEAD_ROWS + 2:
-        raise MitsonarError(f"{files[0]} has {size[0]:,} rows: {HEAD_ROWS} of bearings and range bins are needed")
+        raise MitsonarError(f"{files[0]} has {size[0]:,} rows: it needs {HEAD_ROWS} rows of bearings, and range bins")
     head = read_picture(files[0], size)[:HEAD_ROWS]
     degrees = bearings_in(head, str(files[0]))
     rises = bool(degrees[-1] > degrees[0])
@@ -177,7 +177,9 @@ class _Png:
         for place, number in enumerate(index):
             picture = read_picture(self.files[number], self.size)
             if picture.dtype != np.uint8 or not (picture[:HEAD_ROWS] == self.head).all():
-                raise MitsonarError(f"{self.files[number]} has other bearings than the pictures before it: remove it")
+                raise MitsonarError(
+                    f"{self.files[number]} has different bearings from those of the pictures before it: remove it"
+                )
             images[place] = picture[HEAD_ROWS:, :: 1 if self.rises else -1]
         return images
 
@@ -189,7 +191,7 @@ def bearings_in(head: Grey, source: str) -> Array:
         MitsonarError: if no byte order gives plausible bearings.
     """
     if head.dtype != np.uint8:
-        raise MitsonarError(f"{source} has more than 8 bits a pixel: its bearings are bytes")
+        raise MitsonarError(f"{source} has more than 8 bits per pixel, but bearings are bytes: it is not a picture of CANOE")
     columns = np.ascontiguousarray(head.T).astype(np.uint8)  # the two bytes of a bearing are above one another
     along = np.ascontiguousarray(head).reshape(-1, 2)  # they are side by side; row 0 holds the first half of the columns
     for pairs in (columns, along):
@@ -198,7 +200,9 @@ def bearings_in(head: Grey, source: str) -> Array:
             steps = np.diff(degrees) * np.sign(degrees[-1] - degrees[0])
             if steps.min() >= STEP_DEG[0] - 1e-9 and steps.max() <= STEP_DEG[1] and np.abs(degrees).max() <= WIDEST_DEG:
                 return np.asarray(degrees, dtype=float)
-    raise MitsonarError(f"the first two rows of {source} are no bearings that rise or fall: it is no picture of CANOE")
+    raise MitsonarError(
+        f"the first two rows of {source} are not increasing or decreasing bearings: it is not a picture of CANOE"
+    )
 
 
 def _canoe_poses(path: Path, stamps: NDArray[np.int64]) -> tuple[Array | None, list[str]]:
@@ -349,7 +353,7 @@ def read_uxo(path: Path) -> Recording:
     has_picture = np.array([int(index) in files and is_whole(files[int(index)]) for index in headers["index"]])
     notes = []
     if not plausible.all():
-        notes.append(f"left out: {counted(int((~plausible).sum()), 'row')} of {TABLE} with numbers that cannot be")
+        notes.append(f"left out: {counted(int((~plausible).sum()), 'row')} of {TABLE} with implausible numbers")
     if not has_picture.all():
         notes.append(f"left out: {counted(int((~has_picture).sum()), 'frame')} of {TABLE} without a picture")
     extra = len(files) - len(set(files) & {int(index) for index in headers["index"]})
@@ -424,7 +428,7 @@ class _Pgm:
         for place, number in enumerate(index):
             picture = read_picture(self.paths[number], self.shape)
             if picture.dtype != np.uint8:
-                raise MitsonarError(f"{self.paths[number]} has more than 8 bits a sample: ARIS samples have 8")
+                raise MitsonarError(f"{self.paths[number]} has more than 8 bits per sample: ARIS samples have 8")
             images[place] = picture[:, ::-1]
         return images
 
@@ -442,7 +446,7 @@ def _uxo_poses(path: Path, index: NDArray[np.integer]) -> tuple[Array | None, li
     row_index = np.array([rows.get(int(number), -1) for number in index], dtype=np.intp)
     if (row_index < 0).any() or not valid[row_index].all():
         missing = int(((row_index < 0) | ~valid[row_index]).sum())
-        return None, [f"left out: the poses, for {ROTATOR} has no valid one for {counted(missing, 'frame')}"]
+        return None, [f"left out: the poses, because {ROTATOR} has no valid one for {counted(missing, 'frame')}"]
     rotation = Rotation.from_quat(quaternion[row_index])
     return poses_from(position[row_index] + rotation.apply(SONAR_AT), rotation * FORWARD_STARBOARD_DOWN), []
 
@@ -498,7 +502,7 @@ def read_neusis(path: Path) -> Recording:
     for file in files:
         image, matrix = _view(file)
         if shape is not None and image.shape != shape:
-            raise MitsonarError(f"{file} has {image.shape} cells, the others {shape}: remove it")
+            raise MitsonarError(f"{file} has {image.shape} cells, the others have {shape}: remove it")
         shape = image.shape
         largest = max(largest, float(image.max()))
         matrices.append(matrix)
@@ -522,7 +526,7 @@ def read_neusis(path: Path) -> Recording:
         poses=poses_from(poses[:, :3, 3], rotation * FORWARD_PORT_UP),
     )
     facts: Facts = {"views": len(files), "largest_value": largest}
-    notes = ["views have no times: they follow one another by name, ten a second"]
+    notes = ["views have no times: they are ordered by name, at an assumed {RATE_HZ:g} Hz"]
     if largest > 1:
         notes.append(f"values reach {largest:.4g}: they are divided by it")
     return Recording(str(path), "views (neusis)", (part,), facts, tuple(notes))
@@ -552,7 +556,7 @@ def _view(path: Path) -> tuple[FileArray, Array]:
     table = read_pickled_arrays(path)
     missing = [name for name in (IMAGE, POSE) if name not in table]
     if missing:
-        raise MitsonarError(f"{path} lacks {' and '.join(missing)}: it is no view of a sonar")
+        raise MitsonarError(f"{path} lacks {' and '.join(missing)}: it is not a view of a sonar")
     image, matrix = table[IMAGE], np.asarray(table[POSE], dtype=float)
     if (
         image.ndim != 2
@@ -566,7 +570,7 @@ def _view(path: Path) -> tuple[FileArray, Array]:
         raise MitsonarError(f"{POSE} of {path} must be a matrix (4, 4) of finite numbers: got shape {matrix.shape}")
     rotation = matrix[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > ORTHOGONAL or np.linalg.det(rotation) < 0:
-        raise MitsonarError(f"{POSE} of {path} holds no rotation: its columns must be unit vectors, at right angles")
+        raise MitsonarError(f"{POSE} of {path} holds no rotation: its columns must be orthogonal unit vectors")
     return image, matrix
 
 
@@ -629,7 +633,7 @@ class _ClassStandIn(_StandIn):
 def _encode(text: PickledValue, coding: PickledValue) -> bytes:
     """Return bytes that old pickles store as a Latin 1 string."""
     if not isinstance(text, str) or coding not in ("latin1", "latin-1"):
-        raise pickle.UnpicklingError("bytes that are no text of Latin 1")
+        raise pickle.UnpicklingError("bytes that are not Latin-1 text")
     return text.encode("latin1")
 
 
@@ -663,7 +667,7 @@ class _ArrayUnpickler(pickle._Unpickler):  # the Python implementation, whose me
             UnpicklingError: if the name is not known.
         """
         if (module, name) not in STAND_INS:
-            raise pickle.UnpicklingError(f"it names {module[:60]}.{name[:60]}, which is no part of an array")
+            raise pickle.UnpicklingError(f"it names {module[:60]}.{name[:60]}, which is not part of an array")
         return STAND_INS[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
@@ -673,7 +677,7 @@ class _ArrayUnpickler(pickle._Unpickler):  # the Python implementation, whose me
     def load_build(self) -> None:
         """Set the state of the object on the stack, which must be a stand-in."""
         if not isinstance(self.stack[-2], _StandIn):
-            raise pickle.UnpicklingError("it changes something that is no array")
+            raise pickle.UnpicklingError("it changes something that is not an array")
         state = self.stack.pop()
         self.stack[-1].__setstate__(state)
 
@@ -694,7 +698,7 @@ def read_pickled_arrays(path: Path) -> dict[str, FileArray]:
     try:
         table = _ArrayUnpickler(io.BytesIO(content)).load()
         if not isinstance(table, dict):
-            raise pickle.UnpicklingError("it holds no table")
+            raise pickle.UnpicklingError("it holds no dictionary")
         return {str(name): array for name, value in table.items() if (array := _array(value)) is not None}
     except Exception as error:  # damaged bytes raise errors of many kinds
         reason = " ".join(str(error).split())[:200] or type(error).__name__
@@ -714,7 +718,7 @@ def _array(value: PickledValue) -> FileArray | None:
         content, kind, shape, order = (*value.arguments, None, None, None, None)[:4]
         return _from_bytes(content, kind, shape, order)
     if not isinstance(value.state, tuple) or len(value.state) != 5:
-        raise ValueError("an array has a state that cannot be")
+        raise ValueError("an array has an invalid state")
     _, shape, kind, fortran, content = value.state
     return _from_bytes(content, kind, shape, "F" if fortran else "C")
 
@@ -722,16 +726,16 @@ def _array(value: PickledValue) -> FileArray | None:
 def _from_bytes(content: PickledValue, kind: PickledValue, shape: PickledValue, order: PickledValue) -> FileArray:
     """Build an array from bytes, after its type and shape have been checked against their number."""
     if not isinstance(kind, _TypeStandIn) or not kind.arguments or not isinstance(kind.arguments[0], str):
-        raise ValueError("an array has a type that cannot be")
+        raise ValueError("an array has an invalid type")
     name = kind.arguments[0]
     big_endian = isinstance(kind.state, tuple) and len(kind.state) > 1 and kind.state[1] == ">"
     if name[:1] not in NUMBERS or not name[1:].isdigit() or len(name) > 3:
         raise ValueError(f"an array of type {name[:20]} holds no numbers")
     dtype = np.dtype(name).newbyteorder(">" if big_endian else "<")
     if not isinstance(shape, tuple) or len(shape) > MOST_DIMENSIONS or order not in ("C", "F"):
-        raise ValueError("an array has a shape that cannot be")
+        raise ValueError("an array has an invalid shape")
     if not all(type(length) is int and 0 <= length < 2**40 for length in shape):
-        raise ValueError("an array has a shape that cannot be")
+        raise ValueError("an array has an invalid shape")
     if not isinstance(content, bytes | bytearray) or math.prod(shape) * dtype.itemsize != len(content):
-        raise ValueError("an array has another number of bytes than its shape says")
+        raise ValueError("the number of bytes of an array does not match its shape")
     return np.frombuffer(bytes(content), dtype).reshape(shape, order=order).astype(dtype.newbyteorder("="))

@@ -132,8 +132,8 @@ def _crop_slice(what: str, span: tuple[int, int] | None, count: int) -> slice:
     first, end = (0, count) if span is None else span
     if not (0 <= first < end - 1 and end <= count):
         raise MitsonarError(
-            f"{argument(f'crop_{what}')} is first,end of two {what} or more, numbered from 0, the end not counted, within "
-            f"0,{count}: got {first},{end}"
+            f"{argument(f'crop_{what}')} must be first,end of at least two {what}, numbered from 0, the end excluded, "
+            f"within 0,{count}: got {first},{end}"
         )
     return slice(first, end)
 
@@ -195,7 +195,7 @@ def in_time_order(time_s: ArrayLike, number: ArrayLike | None = None) -> tuple[I
     order = np.flatnonzero(known)[np.argsort(time[known], kind="stable")]
     notes = [] if known.all() else [f"left out: {counted(int((~known).sum()), 'frame')} without a valid time"]
     if (np.diff(order) < 0).any():
-        notes.append("frames are not in the order of time: they were sorted")
+        notes.append("frames are not in order of time: they were sorted")
     increasing = order[np.diff(time[order], prepend=-np.inf) > 0]
     if len(increasing) < len(order):
         notes.append(f"left out: {counted(len(order) - len(increasing), 'frame')} at the time of the one before")
@@ -242,11 +242,11 @@ def mapped(path: str | Path, what: str, least: int = 1) -> Bytes:
     """
     path = Path(path)
     if not os.path.isfile(path):
-        raise MitsonarError(f"no such file: {path}" if not os.path.exists(path) else f"{path} is no file: give {what}")
+        raise MitsonarError(f"no such file: {path}" if not os.path.exists(path) else f"{path} is not a file: give {what}")
     size = path.stat().st_size
     if size < least:
         raise MitsonarError(
-            f"{path} has {size:,} bytes, and {what} has {least:,} at least: the file is cut off or another one"
+            f"{path} has {size:,} bytes, but {what} has at least {least:,}: the file is cut off or has another format"
         )
     try:
         return np.memmap(path, dtype=np.uint8, mode="r")

@@ -158,7 +158,7 @@ class BagFile:
             reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
             repair = REPAIRS.get(self.path.suffix)
             raise MitsonarError(
-                f"cannot read the bag {self.path}: {reason}; the file is cut off, damaged or of another kind"
+                f"cannot read the bag {self.path}: {reason}; the file is cut off, damaged or of another format"
                 + (f": `{repair}` may repair it" if repair else "")
             ) from None
 
@@ -357,17 +357,17 @@ def frames_like(path: Path, images: np.dtype[np.generic]) -> tuple[SonarFrames, 
     record = _record_in(path)
     if record is None:
         return None
-    source = f"the metadata of {path}"
+    source = f"the metadata record of {path}"
     missing = [name for name in FIELDS if name not in record]
     if missing:
-        raise MitsonarError(f"{source} lack {', '.join(missing)}: the file is damaged")
+        raise MitsonarError(f"{source} lacks {', '.join(missing)}: the file is damaged")
     value = {name: parse_json(record[name], f"{name} in {source}") for name in FIELDS}
     try:
         axes = {name: np.array(value[name], dtype=np.float64).reshape(-1) for name in ("range_m", "bearing_rad")}
         table = {name: np.array(value[name]) for name in ("level", "level_scale")} | {"sonar": np.array(record["sonar"])}
         empty = {"image": np.zeros((0, *(len(one) for one in axes.values())), images), "time_s": np.zeros(0)}
     except (TypeError, ValueError) as error:
-        raise MitsonarError(f"{source} are damaged: {error}") from None
+        raise MitsonarError(f"{source} is damaged: {error}") from None
     span_db = None
     if "span_db" in record:
         span_db = finite_number(parse_json(record["span_db"], f"span_db in {source}"), f"span_db in {source}", above=0)

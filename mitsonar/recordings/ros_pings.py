@@ -111,9 +111,9 @@ def layout_of(message: Message, kind: str) -> PingLayout:
     layout = _projected(message) if kind in PROJECTED else _oculus(message)
     rising = np.all(np.diff(layout.range_m) > 0) and np.all(np.diff(layout.bearing_rad) > 0)
     if not (layout.cells and rising and np.isfinite(layout.range_m).all() and layout.range_m[0] >= 0):
-        raise ValueError("ranges or bearings are none, or do not rise")
+        raise ValueError("ranges or bearings are empty or not increasing")
     if kind in PROJECTED and len(message.image.data) != layout.cells * np.dtype(layout.dtype).itemsize:
-        raise ValueError("the samples are not as many as ranges and beams say")
+        raise ValueError("the number of samples does not match ranges and beams")
     return layout
 
 
@@ -133,7 +133,7 @@ def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: b
     if kind in PROJECTED:
         flat = np.frombuffer(np.asarray(message.image.data, np.uint8).tobytes(), layout.dtype)
         if flat.size != layout.cells:
-            raise ValueError("the samples are not as many as ranges and beams say")
+            raise ValueError("the number of samples does not match ranges and beams")
         image = flat.reshape(shape[::-1]).T if beam_major else flat.reshape(shape)
     else:
         image = picture_of(message.ping)
@@ -178,7 +178,7 @@ def _projected(message: Message) -> PingLayout:
     info, image = message.ping_info, message.image
     ranges: Array = np.asarray(message.ranges).astype(np.float64)
     if int(image.dtype) not in DTYPES:
-        raise ValueError(f"unknown type {image.dtype} of samples")
+        raise ValueError(f"unknown sample type {image.dtype}")
     return PingLayout(
         range_m=ranges,
         bearing_rad=bearing[order],
@@ -200,7 +200,7 @@ def _bearings(vectors: Array) -> tuple[Array, Array]:
     cases: this is what the Oculus driver (y = -sin) and Gazebo (REP 103) write, and what ``sonar_image_proc`` draws.
     """
     if not len(vectors) or not (np.abs(vectors) < MAX_DIRECTION).all() or not (np.abs(vectors).max(axis=1) > 0).all():
-        raise ValueError("directions of beams are none, or not finite")
+        raise ValueError("beam directions are missing, zero or not finite")
     forward = 0 if np.abs(vectors[:, 0]).mean() > np.abs(vectors[:, 2]).mean() else 2
     axis = np.eye(3)
     starboard = -axis[1]
@@ -212,11 +212,11 @@ def _oculus(message: Message) -> PingLayout:
     """Return the layout of an ``OculusPing``. The axes of its frame are assumed to be forward, left, up (REP 103)."""
     bearing = np.asarray(message.bearings, dtype=float) * CENTIDEGREE
     if len(bearing) != int(message.num_beams):
-        raise ValueError("bearings are not as many as beams")
+        raise ValueError("the number of bearings does not match that of beams")
     order = np.argsort(bearing, kind="stable")
     step, bins = float(message.range_resolution), int(message.num_ranges)
     if not (0 < step < 100 and 0 < bins < 2**16):
-        raise ValueError("ranges that cannot be")
+        raise ValueError("invalid range resolution or number of ranges")
     fire = message.fire_msg
     gamma = float(fire.gamma)
     return PingLayout(
@@ -250,12 +250,12 @@ def picture_of(picture: Message) -> NDArray[np.uint8]:
             raise ValueError(f"a picture cannot be decoded: {error}") from None
     rows, columns = int(picture.height), int(picture.width)
     if picture.encoding not in CHANNELS:
-        raise ValueError(f"a picture is {picture.encoding}: mitsonar reads {', '.join(CHANNELS)}")
+        raise ValueError(f"unsupported picture encoding {picture.encoding}: mitsonar reads {', '.join(CHANNELS)}")
     channels = len(CHANNELS[picture.encoding])
     width = columns * channels
     stride = int(picture.step) if int(picture.step) * rows == len(data) else width
     if stride < width or stride * rows != len(data):
-        raise ValueError("a picture's samples are not as many as its height and width say")
+        raise ValueError("the number of a picture's samples does not match its height and width")
     values = data.reshape(rows, stride)[:, :width].reshape(rows, columns, channels)
     return np.asarray(np.rint(values @ np.array(CHANNELS[picture.encoding])), dtype=np.uint8)
 

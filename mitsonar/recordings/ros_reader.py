@@ -59,7 +59,7 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     if chosen.kind in FANS:
         return read_ros_pictures(bag, chosen, None if geometry is None else Path(geometry))
     if geometry is not None:
-        raise MitsonarError(f"{path}: {chosen.name} tells its geometry itself: leave {geometry} out")
+        raise MitsonarError(f"{path}: {chosen.name} contains its geometry: omit {geometry}")
     scan = TopicScan(bag, chosen)
     scan.read()
     if not scan.layouts:
@@ -84,7 +84,7 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
             part = replace(part, like=like, images=part.images if span_db is None else _Levels(part.images, span_db))
         parts.append(part)
     if not all(one.elevation_rad for one in scan.layouts):
-        notes.append(f"the bag does not tell the opening over elevation: {ELEVATION_DEG:g} deg are assumed")
+        notes.append(f"the bag does not state the elevation aperture: {ELEVATION_DEG:g} deg are assumed")
     facts = _facts(scan, order) | ({"poses": motion.origin} if motion.origin else {})
     format_name = f"ROS {1 if bag.is_ros1 else 2} bag, {short(chosen.kind)}"
     return Recording(str(path), format_name, tuple(parts), facts, (*notes, *motion.notes))
@@ -146,12 +146,12 @@ def _coding(scan: TopicScan, order: Index, notes: list[str]) -> Coding:
     """
     if scan.low < 0:
         raise MitsonarError(
-            f"{scan.bag.path}: {scan.topic.name} holds floats from {scan.low:.4g} to {scan.high:.4g}; what levels in dB "
-            "stand for the message does not tell: convert them to amplitudes of 0..1"
+            f"{scan.bag.path}: {scan.topic.name} holds floats from {scan.low:.4g} to {scan.high:.4g}; the message "
+            "does not state the reference of levels in dB: convert them to amplitudes of 0..1"
         )
     scale = scan.high if scan.high > 1 else 1.0
     if scale > 1:
-        notes.append(f"samples are floats up to {scale:.6g}: they are divided by that")
+        notes.append(f"samples are floats up to {scale:.6g}: they are divided by it")
     layout = scan.layouts[scan.numbers[int(order[0])]]
     if scan.topic.kind not in PROJECTED:
         return Coding(False, scale)
@@ -160,7 +160,7 @@ def _coding(scan: TopicScan, order: Index, notes: list[str]) -> Coding:
     flat = [np.frombuffer(np.asarray(one.image.data, np.uint8).tobytes(), layout.dtype) for _, one in scan.frames(sample)]
     beam_major = is_beam_major(flat, len(layout.range_m), len(layout.bearing_rad))
     if beam_major:
-        notes.append("samples are in the order of beams, unlike those of drivers, by how they correlate")
+        notes.append("samples are stored beam by beam, unlike those of drivers, according to their correlation")
     return Coding(beam_major, scale)
 
 

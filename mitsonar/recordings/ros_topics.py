@@ -164,7 +164,9 @@ class _MotionSources:
         child, link = source
         mount = _fixed_links(self.links, self.frame, child) if child else None
         if mount is None:
-            note = f"poses of {link.topic} count as those of the sonar: no transform leads from them to {self.frame!r}"
+            note = (
+                f"poses of {link.topic} are assumed to be those of the sonar: no transform leads from them to {self.frame!r}"
+            )
             notes = (*notes, note)
         moved = _compose([*(mount or []), link], self.axes, self.time_s, link.topic)
         return replace(moved, notes=notes if moved.poses is not None else moved.notes)
@@ -518,7 +520,7 @@ def read_ros_pictures(bag: BagFile, topic: Topic, geometry: Path | None) -> Reco
         if picture.shape != shape:
             raise MitsonarError(
                 f"{bag.path}: message {place:,} of {topic.name} has {picture.shape[1]:,} x {picture.shape[0]:,} pixels, the "
-                f"first one {shape[1]:,} x {shape[0]:,}: cut the bag where they change"
+                f"first one {shape[1]:,} x {shape[0]:,}: split the bag where the size changes"
             )
         return picture
 

@@ -197,7 +197,7 @@ def read_aris(path: str | Path) -> Recording:
     data = mapped(path, "an ARIS file", FILE_HEADER + FRAME.itemsize)
     name = str(path)
     if bytes(data[:4]) != SIGNATURE:
-        raise MitsonarError(f"{name} is no ARIS file: it begins with {bytes(data[:4])!r}, not with {SIGNATURE!r}")
+        raise MitsonarError(f"{name} is not an ARIS file: it begins with {bytes(data[:4])!r}, not with {SIGNATURE!r}")
     frames, beams = _aris_frames(data, name)
     headers = frames.table()
     valid, notes = _valid_frames(headers, frames)
@@ -214,12 +214,14 @@ def _aris_frames(data: Bytes, name: str) -> tuple[EqualFrames, int]:
     mode, samples = int(first["ping_mode"]), int(first["samples"])
     if mode not in BEAMS or not 0 < samples <= MOST_SAMPLES:
         raise MitsonarError(
-            f"{name}: the first frame says ping mode {mode} and {samples:,} samples a beam; there are ping modes 1 to 12 "
-            f"and samples 1 to {MOST_SAMPLES:,}: the file is damaged"
+            f"{name}: the first frame states ping mode {mode} and {samples:,} samples per beam; valid are ping modes 1 to "
+            f"12 and 1 to {MOST_SAMPLES:,} samples: the file is damaged"
         )
     frames = EqualFrames(data, FILE_HEADER, FRAME, samples * BEAMS[mode])
     if not len(frames):
-        raise MitsonarError(f"{name} holds no whole frame: {len(data):,} bytes, and a frame takes {frames.stride:,}")
+        raise MitsonarError(
+            f"{name} holds no complete frame: it has {len(data):,} bytes, and a frame takes {frames.stride:,}"
+        )
     return frames, BEAMS[mode]
 
 
@@ -239,7 +241,7 @@ def _valid_frames(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool
     if not valid.all():
         notes.append(f"left out: {counted(int((~valid).sum()), 'frame')} with a damaged header")
     if frames.left_over:
-        notes.append(f"the last {frames.left_over:,} bytes are no whole frame and are left out")
+        notes.append(f"the last {frames.left_over:,} bytes are not a complete frame and are left out")
     return valid, notes
 
 
@@ -312,7 +314,7 @@ def in_beam_order(samples: Bytes, mode: int) -> Bytes:
     if mode not in PINGS:
         known = ", ".join(str(one) for one in PINGS)
         raise MitsonarError(
-            f"the order of ping mode {mode} is not known: known are {known}; record it with the vendor's program"
+            f"the order of ping mode {mode} is not known, only those of {known}: record it with the vendor's program"
         )
     pings = PINGS[mode]
     by_ping = samples.reshape(pings, -1, len(CHANNELS))
@@ -496,7 +498,7 @@ def read_didson(path: str | Path) -> Recording:
     data = mapped(path, "a DIDSON file", FILE.itemsize)
     version = SIGNATURES.get(data[:4].tobytes())
     if version is None:
-        raise MitsonarError(f"{name} is no DIDSON file: it begins with {data[:4].tobytes()!r}, not with DDF and 3 or 4")
+        raise MitsonarError(f"{name} is not a DIDSON file: it begins with {data[:4].tobytes()!r}, not with DDF and 3 or 4")
     head = np.frombuffer(data[: FILE.itemsize].tobytes(), FILE)[0]
     frames = _didson_frames(data, head, version, name)
     headers = frames.table()
@@ -504,7 +506,7 @@ def read_didson(path: str | Path) -> Recording:
         (headers["signature"] == data[:4].tobytes()) & (headers["start_code"] <= MOST_START) & (headers["length_code"] < 4)
     )
     notes = [f"left out: {counted(int((~valid).sum()), 'frame')} with a damaged header"] if not valid.all() else []
-    notes += [f"the last {frames.left_over:,} bytes are no whole frame and are left out"] if frames.left_over else []
+    notes += [f"the last {frames.left_over:,} bytes are not a complete frame and are left out"] if frames.left_over else []
     time_s, time_notes = _times(headers, head)
     order, order_notes = in_time_order(np.where(valid, time_s, np.nan), headers["index"])
     windows = _Windows(head)
@@ -521,17 +523,19 @@ def _didson_frames(data: Bytes, head: np.void, version: int, name: str) -> Equal
     beams, samples = int(head["beams"]), int(head["samples"])
     if beams not in LENS or not 0 < samples <= MOST_SAMPLES:
         raise MitsonarError(
-            f"{name}: the file says {beams:,} beams and {samples:,} samples a beam; a DIDSON has 48 or 96 beams and 1 to "
-            f"{MOST_SAMPLES:,} samples: the file is damaged"
+            f"{name}: the file states {beams:,} beams and {samples:,} samples per beam; a DIDSON has 48 or 96 beams and 1 "
+            f"to {MOST_SAMPLES:,} samples: the file is damaged"
         )
     for size in FILE_HEADERS[version]:
         if data[size + 12 : size + 16].tobytes() == data[:4].tobytes():
             frames = EqualFrames(data, size, FRAME_HEADER[version], beams * samples)
             if not len(frames):
-                raise MitsonarError(f"{name} holds no whole frame: {len(data):,} bytes, and a frame takes {frames.stride:,}")
+                raise MitsonarError(
+                    f"{name} holds no complete frame: it has {len(data):,} bytes, and a frame takes {frames.stride:,}"
+                )
             return frames
     sizes = " or ".join(f"{size:,}" for size in FILE_HEADERS[version])
-    raise MitsonarError(f"{name}: no frame begins behind a header of {sizes} bytes: the file is cut off or damaged")
+    raise MitsonarError(f"{name}: no frame begins after a header of {sizes} bytes: the file is cut off or damaged")
 
 
 def _times(headers: Header, head: np.void) -> tuple[Array, list[str]]:
@@ -551,7 +555,7 @@ def _times(headers: Header, head: np.void) -> tuple[Array, list[str]]:
         seconds = ((days * 24 + parts["hour"]) * 60 + parts["minute"]) * 60 + parts["second"]
         time_s = np.where(known, seconds + parts["hundredth"] / 100, np.nan)
         return _spread(time_s, headers["index"], 1 / rate)
-    note = f"the sonar's clock tells no times: frames follow each other at {rate:g} Hz, by their numbers"
+    note = f"the sonar's clock gives no times: they are computed from the frame numbers at {rate:g} Hz"
     return headers["index"].astype(float) / rate, [note]
 
 
@@ -570,7 +574,7 @@ def _spread(time_s: Array, number: Index, period_s: float) -> tuple[Array, list[
     # 3. Divide that time evenly among the frames of the group.
     group = np.cumsum(new) - 1
     part = (np.arange(len(time_s)) - begin[group]) / count[group]
-    note = f"{counted(int((~new).sum()), 'frame')} with the clock of the one before: spread evenly up to the next"
+    note = f"{counted(int((~new).sum()), 'frame')} with the time of the one before: spread evenly up to the next"
     return time_s + part * gap[group], [note]
 
 
@@ -623,16 +627,16 @@ class _Windows:
         """Return at most ten sentences: on what is assumed, and on windows for which timing and tables disagree."""
         notes = []
         if not DIDSON_LEAST_SPEED <= int(self.head["sound_speed"]) <= DIDSON_MOST_SPEED:
-            notes.append(f"the file tells no sound speed: {NOMINAL_SPEED:g} m/s is taken")
+            notes.append(f"the file holds no sound speed: {NOMINAL_SPEED:g} m/s is assumed")
         rate = float(self.head["sample_rate_hz"])
         if not (math.isfinite(rate) and 1e2 < rate < 1e8):
-            notes.append("the file tells no sample rate: windows have their nominal lengths")
+            notes.append("the file holds no sample rate: windows have their nominal lengths")
         for one in {self.key(header): header for header in headers}.values():
             (start, length), (expected, whole) = self.timed(one), self.nominal(one)
             if abs(start - expected) > DIFFERS * max(expected, 1.0) or abs(length - whole) > DIFFERS * whole:
                 notes.append(
                     f"a window lies at {start:.3g} to {start + length:.3g} m by its timing, and nominally at "
-                    f"{expected:.3g} to {expected + whole:.3g} m: the timing is taken"
+                    f"{expected:.3g} to {expected + whole:.3g} m: the timing is used"
                 )
         return notes[:10]
 

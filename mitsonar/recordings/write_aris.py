@@ -202,7 +202,8 @@ def window_of(range_m: Array, sound_speed: float) -> ArisWindow:
     """
     if not LEAST_SPEED < sound_speed < MOST_SPEED:
         raise MitsonarError(
-            f"an ARIS file holds sound speeds of {LEAST_SPEED:g} to {MOST_SPEED:g} m/s: got {sound_speed:g}; give others"
+            f"an ARIS file holds sound speeds of {LEAST_SPEED:g} to {MOST_SPEED:g} m/s: got {sound_speed:g}; write "
+            "frames with another sound speed"
         )
     speed = float(np.float32(sound_speed))
     bins = len(range_m)
@@ -220,8 +221,8 @@ def window_of(range_m: Array, sound_speed: float) -> ArisWindow:
         window = ArisWindow(round(delay), finer, samples, speed, exact=False)
     if not 0 < window.samples <= MOST_SAMPLES or window.delay_us >= 1e8 or window.period_us >= 1e6:
         raise MitsonarError(
-            f"an ARIS file holds up to {MOST_SAMPLES:,} samples a beam: the frames' {bins:,} bins from {range_m[0]:.4g} to "
-            f"{range_m[-1]:.4g} m take {window.samples:,}; write a shorter window"
+            f"an ARIS file holds up to {MOST_SAMPLES:,} samples per beam: the frames' {bins:,} bins from {range_m[0]:.4g} "
+            f"to {range_m[-1]:.4g} m take {window.samples:,}; write a shorter window"
         )
     return window
 
@@ -290,7 +291,7 @@ def write_aris(
     if path.exists():
         raise MitsonarError(f"{path} exists: give another name, or remove it first")
     if not path.parent.is_dir():
-        raise MitsonarError(f"there is no folder {path.parent}: make it first")
+        raise MitsonarError(f"there is no folder {path.parent}: create it first")
     part = path.with_name(f".{path.name}.part")
     chunks = _chunks(frames) if isinstance(frames, SonarFrames) else frames
     try:
@@ -366,17 +367,17 @@ class _Writer:
         notes = list(self.form.notes) if self.form else []
         if self.lost:
             share = 100 * self.lost / self.echoes
-            notes.append(f"{share:.2g} % of the echoes lie {CODING_DB:g} dB and more below full scale: they are 0")
+            notes.append(f"{share:.2g} % of the echoes lie {CODING_DB:g} dB or more below full scale: they become 0")
         return notes
 
     def _times(self, frames: SonarFrames) -> NDArray[np.int64]:
         """Return the times of frames ``(n,)`` in whole microseconds."""
         time_s = frames.time_s.mean(axis=1) if frames.time_s.ndim == 2 else frames.time_s
         if not (np.isfinite(time_s).all() and (time_s >= 0).all() and (time_s < LATEST_S).all()):
-            raise MitsonarError("times of an ARIS file are seconds since 1970, at least 0: the frames have others")
+            raise MitsonarError("times of an ARIS file must be seconds since 1970, from 0: the frames have other times")
         time_us = np.rint(time_s * 1e6).astype(np.int64)
         if time_us[0] <= self.last_us or (np.diff(time_us) <= 0).any():
-            raise MitsonarError("times of frames must rise, by a microsecond at least: sort the frames by their times")
+            raise MitsonarError("times of frames must increase by at least a microsecond: sort the frames by their times")
         self.last_us = int(time_us[-1])
         return time_us
 
@@ -476,7 +477,7 @@ def _form_of(frames: SonarFrames, beams: int | None) -> _Form:
         MitsonarError: if beams fit no table, or the format cannot hold the sound speed or the window.
     """
     if min(len(frames.range_m), len(frames.bearing_rad)) < 2:
-        raise MitsonarError("frames of an ARIS file have 2 bins and 2 beams at least: give an image, not a profile")
+        raise MitsonarError("frames of an ARIS file have at least 2 bins and 2 beams: give an image, not a profile")
     table, deviation = table_of(frames.bearing_rad, frames.sonar, beams)
     window = window_of(frames.range_m, frames.sonar.sound_speed)
     turned = deviation > half_spacing(frames.bearing_rad) or table.beams != len(frames.bearing_rad)
@@ -488,7 +489,8 @@ def _form_of(frames: SonarFrames, beams: int | None) -> _Form:
         )
     elif deviation > np.radians(1e-3):
         notes.append(
-            f"the beams are those of the vendor's table: they differ from the frames' by {np.degrees(deviation):.2g} deg"
+            "the beams are those of the vendor's table: they differ from those of the frames by "
+            f"{np.degrees(deviation):.2g} deg"
         )
     if not window.exact:
         step = float(np.diff(frames.range_m).mean()) if len(frames.range_m) > 1 else window.step_m

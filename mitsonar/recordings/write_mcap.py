@@ -78,7 +78,7 @@ def write_mcap(
     """
     path = Path(path)
     if path.suffix != ".mcap":
-        raise MitsonarError(f"{path} must end with .mcap: ROS tells bags by their names")
+        raise MitsonarError(f"{path} must end with .mcap: ROS recognises bags by their suffix")
     refuse_to_replace(path, overwrite=overwrite)
     part = path.with_name(f".{path.name}.part")
     try:
@@ -90,7 +90,7 @@ def write_mcap(
             writer.finish()  # type: ignore[no-untyped-call]
         part.replace(path)
     except FileNotFoundError:
-        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; make it first") from None
+        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first") from None
     finally:
         part.unlink(missing_ok=True)
     return count

@@ -140,9 +140,9 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
         geometries = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]
         for geometry in geometries:
             if np.shape(geometry.vertices)[1:] != (3,) or np.shape(geometry.faces)[1:] != (3,):
-                raise ValueError("a vertex or a triangle has not three numbers")
+                raise ValueError("a vertex or a triangle does not have three numbers")
             if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
-                raise ValueError("a triangle names a vertex that is not there")
+                raise ValueError("a triangle refers to a vertex that does not exist")
     except Exception as error:  # readers of damaged files raise errors of any type
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MitsonarError(f"cannot read {path}: {reason}; export the model again") from None
@@ -180,12 +180,12 @@ def _check_gltf(path: Path, size: int) -> None:
         view = tree["bufferViews"][accessor["bufferView"]] if "bufferView" in accessor else {"byteLength": 16 * size}
         count = whole_number(accessor["count"], "count of an accessor", 0, 2**40)
         if count > whole_number(view["byteLength"], "byteLength", 0, 2**40):
-            raise ValueError(f"an accessor promises {count:,} values in {view['byteLength']:,} bytes")
+            raise ValueError(f"an accessor announces {count:,} values in {view['byteLength']:,} bytes")
     for buffer in tree.get("buffers", []):
         available = [size] if "uri" not in buffer or str(buffer["uri"]).startswith("data:") else []
         available += [(path.parent / str(buffer["uri"])).stat().st_size] if not available else []
         if whole_number(buffer["byteLength"], "byteLength", 0, 2**40) > available[0]:
-            raise ValueError(f"a buffer promises {buffer['byteLength']:,} bytes, {available[0]:,} are there")
+            raise ValueError(f"a buffer announces {buffer['byteLength']:,} bytes, but there are {available[0]:,}")
 
 
 def _check_copies(scene: trimesh.Scene) -> None:
@@ -364,7 +364,9 @@ def _check_options(up: str, scale: float, floor_m: float | None) -> None:
     if up not in UP:
         raise MitsonarError(f"{argument('up')} must be x, y or z: got {up!r}{meant(up, UP)}")
     if not (np.isfinite(scale) and scale > 0):
-        raise MitsonarError(f"{argument('scale')} must be a finite number above 0, metres a unit of the file: got {scale:g}")
+        raise MitsonarError(
+            f"{argument('scale')} must be a finite number above 0, metres per unit of the file: got {scale:g}"
+        )
     if floor_m is not None and not 0 < floor_m <= 10_000:
         raise MitsonarError(f"{argument('floor_m')} must lie in 0..10000 m: got {floor_m:g}")
 
@@ -382,7 +384,7 @@ def _check_extent(path: Path, corners: NDArray[np.float64], scale: float) -> Non
     if not (extent <= LARGEST_M and np.abs(corners).max() <= FARTHEST_M):
         raise MitsonarError(
             f"{path} spans {extent:.4g} m with scale {scale:g}: a model spans at most {LARGEST_M:g} m; give the scale in "
-            "metres a unit of the file"
+            "metres per unit of the file"
         )
 
 

@@ -95,7 +95,9 @@ def check_parsed(state: mi.parser.ParserState) -> None:
                 where = f"{node.props.plugin_name()} {node.props.id()}".strip()[:100]
                 raise MitsonarError(f"{where}, {name[:60]}: {error}") from None
     if pixels > MOST_PIXELS:
-        raise MitsonarError(f"its pictures have {pixels:,} pixels, at most {MOST_PIXELS:,} are possible: make them smaller")
+        raise MitsonarError(
+            f"its pictures have {pixels:,} pixels, more than the {MOST_PIXELS:,} that are allowed: make them smaller"
+        )
     refuse_beyond_memory(BYTES_A_PIXEL * pixels, "its pictures")
 
 
@@ -164,7 +166,7 @@ def _named_files(value: str, name: str) -> Iterator[Path]:
                 yield path
         except OSError:  # for example a name that is too long
             if name == "filename":
-                raise MitsonarError(f"there cannot be a file of the name {shortened(value)}") from None
+                raise MitsonarError(f"no file can have the name {shortened(value)}") from None
 
 
 def _refuse_incomplete(state: mi.parser.ParserState) -> None:
@@ -178,7 +180,7 @@ def _refuse_incomplete(state: mi.parser.ParserState) -> None:
         if plugin == "bitmap" and types.get("filename") != kinds.String:
             raise MitsonarError(f'{where} names no file: give <string name="filename" value="..."/>')
         if plugin in CONTAINERS and kinds.ResolvedReference not in types.values():
-            raise MitsonarError(f"{where} is empty: put a {CONTAINERS[plugin]} in it, or leave it out")
+            raise MitsonarError(f"{where} is empty: put a {CONTAINERS[plugin]} in it, or remove it")
 
 
 def _check_references(state: mi.parser.ParserState) -> None:
@@ -216,14 +218,14 @@ def _check_references(state: mi.parser.ParserState) -> None:
                 waiting.discard(number)
                 path.pop()
             elif child in waiting:
-                raise MitsonarError("its objects refer to each other in a circle: take one of the references out")
+                raise MitsonarError("its objects refer to each other in a circle: remove one of the references")
             elif not path_counts[child]:
                 path.append((child, iter(children[child])))
                 waiting.add(child)
     if max(depths, default=0) > DEEPEST:
-        raise MitsonarError(f"its objects refer to each other more than {DEEPEST} deep: it is no scene")
+        raise MitsonarError(f"its objects refer to each other more than {DEEPEST} levels deep: it is not a scene")
     if sum(path_counts) > MAX_PATHS:
-        raise MitsonarError(f"its objects refer to each other in more than {MAX_PATHS:,} ways: it is no scene")
+        raise MitsonarError(f"its objects refer to each other along more than {MAX_PATHS:,} paths: it is not a scene")
 
 
 # ---------------- World ``scene``: a file of the user
@@ -279,7 +281,7 @@ class SceneFile(Family):
             MitsonarError: the file does not exist.
         """
         if not os.path.isfile(self.file):
-            raise MitsonarError(f"no scene file {self.file}: world.file must name a Mitsuba XML file that is there")
+            raise MitsonarError(f"no scene file {self.file}: world.file must name an existing Mitsuba XML file")
         return Path(self.file), self.parameters
 
 
@@ -372,7 +374,7 @@ class _Text:
         """Check a file and its includes, and search ``folders`` for the files that it names; ``<path>`` adds a folder."""
         if depth >= MOST_INCLUDED:
             raise MitsonarError(
-                f"{path} is included {depth} files deep: {MOST_INCLUDED} are the most; does it include itself?"
+                f"{path} is included {depth} files deep, the maximum is {MOST_INCLUDED}: does it include itself?"
             )
         self.files += 1
         if self.files > MOST_FILES:
@@ -422,7 +424,7 @@ class _Text:
                 if not closed:
                     opened.append(name)
                 if len(opened) > DEEPEST:
-                    raise MitsonarError(f"{path} nests its elements more than {DEEPEST} deep: it is no scene")
+                    raise MitsonarError(f"{path} nests its elements more than {DEEPEST} levels deep: it is not a scene")
                 yield name, attributes
             elif (tag := CLOSED.match(content, place)) is not None:
                 if not opened or opened.pop() != tag[1]:
@@ -500,14 +502,14 @@ def _utf8(content: bytes, path: Path) -> bytes:
 
 
 def _character(entity: re.Match[str]) -> str:
-    """Return the character that an entity stands for."""
+    """Return the character that an entity represents."""
     decimal, hexadecimal, name = entity.groups()
     if name:
         return ENTITIES[name]
     digits = (decimal or hexadecimal).lstrip("0")
     number = int(digits or "0", 10 if decimal else 16) if len(digits) < 10 else 0x110000
     if not 0 < number < 0x110000 or 0xD800 <= number < 0xE000:
-        raise MitsonarError(f"the scene has {shortened(entity[0])}, which is no character")
+        raise MitsonarError(f"the scene has {shortened(entity[0])}, which is not a character")
     return chr(number)
 
 
@@ -518,7 +520,7 @@ def _find_file(name: str, folders: list[Path]) -> Path | None:
     try:
         return next((path for path in [*(folder / name for folder in folders), Path(name)] if path.exists()), None)
     except OSError:  # for example a name that is too long
-        raise MitsonarError(f"there cannot be a file of the name {shortened(name)}") from None
+        raise MitsonarError(f"no file can have the name {shortened(name)}") from None
 
 
 def _malformed(path: Path, content: bytes, place: int, reason: str) -> MitsonarError:
@@ -689,7 +691,7 @@ def check_counts(path: Path) -> None:
         start += element.count * (2 * len(kinds) if order is None else sum(np.dtype(kind).itemsize for kind in kinds))
     size = path.stat().st_size
     if start > size + 1:
-        raise _FaultError(f"its header promises {start:,} bytes at least, it has {size:,}")
+        raise _FaultError(f"its header announces at least {start:,} bytes, it has {size:,}")
 
 
 def _check_ply(content: bytes) -> None:
@@ -768,7 +770,7 @@ def _ply_rows(content: bytes, start: int, elements: list[_Element], order: str) 
     for element in elements:
         kind = element.dtype(order)
         if element.count * kind.itemsize > len(content) - start:
-            raise _FaultError(f"{element.count:,} of {element.name} need more bytes than are there")
+            raise _FaultError(f"{element.count:,} of {element.name} need more bytes than there are")
         rows.append(np.frombuffer(content, kind, element.count, start))
         start += element.count * kind.itemsize
         if element.counted and element.name != "face" and (rows[-1][f"count of {next(iter(element.counted))}"] != 3).any():
@@ -776,7 +778,7 @@ def _ply_rows(content: bytes, start: int, elements: list[_Element], order: str) 
         if {"vertex", "face"} <= {one.name for one in elements[: len(rows)]}:
             break  # Mitsuba ignores what follows
     if len(rows) == len(elements) and content[start:].strip(b" \t\r\n\0"):
-        raise _FaultError(f"{len(content) - start:,} bytes are left over after what its header promises")
+        raise _FaultError(f"{len(content) - start:,} bytes are left over after what its header announces")
     return rows
 
 
@@ -786,14 +788,14 @@ def _ply_rows_of_text(text: bytes, elements: list[_Element]) -> list[NDArray[np.
     for element in elements:
         width = len(element.scalars) + 3 * len(element.counted)
         if element.count * width > len(words) - start:
-            raise _FaultError(f"{element.count:,} of {element.name} need more numbers than are there")
+            raise _FaultError(f"{element.count:,} of {element.name} need more numbers than there are")
         numbers = np.array(words[start : start + element.count * width], dtype=np.float64).reshape(element.count, width)
         rows.append(_as_table(numbers, element))
         start += element.count * width
         if {"vertex", "face"} <= {one.name for one in elements[: len(rows)]}:
             break
     if len(rows) == len(elements) and start < len(words):
-        raise _FaultError(f"{len(words) - start:,} numbers are left over after what its header promises")
+        raise _FaultError(f"{len(words) - start:,} numbers are left over after what its header announces")
     return rows
 
 
@@ -840,7 +842,7 @@ def _check_obj(content: bytes) -> None:
     for place, name in enumerate((b"v", b"vt", b"vn")):
         named = [corner[place] for corner in corners if len(corner) > place and (corner[place] or place == 0)]
         if any(len(word) > 12 for word in named):
-            raise _FaultError("an index of a face is not a number that can be")
+            raise _FaultError("an index of a face is too large")
         if named:
             indices = np.array(named, dtype=np.int64) - 1
             _check_triangles(indices, len(lines[name]), f"a face names, of its {name.decode()}, number")
@@ -858,7 +860,7 @@ def _check_serialized(content: bytes) -> None:
     width = 8 if number >= 4 else 4
     table = len(content) - 4 - count * width
     if count < 1 or table < 4:
-        raise _FaultError(f"it promises {count:,} meshes, more than fit in it")
+        raise _FaultError(f"it announces {count:,} meshes, more than fit in it")
     starts = np.frombuffer(content, "<u8" if width == 8 else "<u4", count, table).tolist()
     for start, stop in zip(starts, [*starts[1:], table], strict=True):
         if not start + 4 < stop <= table:
@@ -870,7 +872,7 @@ def _check_one_serialized(content: bytes) -> None:
     """Check one serialized mesh: a version, then deflated flags, name, counts, columns of numbers and triangles."""
     signature, number = struct.unpack_from("<HH", content)
     if signature != 0x041C or number not in (3, 4):
-        raise _FaultError("it is no serialized mesh of version 3 or 4")
+        raise _FaultError("it is not a serialized mesh of version 3 or 4")
     # 1. Inflate the data, up to the largest possible size.
     unpack = zlib.decompressobj()
     data = unpack.decompress(content[4:], max_length=MESH_INFLATION * len(content))
@@ -882,7 +884,7 @@ def _check_one_serialized(content: bytes) -> None:
     size = 8 if flags & 0x2000 else 4
     columns = 3 + 3 * bool(flags & 0x0001) + 2 * bool(flags & 0x0002) + 3 * bool(flags & 0x0008)
     if vertices * columns * size + triangles * 12 > len(data) - start:
-        raise _FaultError(f"{vertices:,} vertices and {triangles:,} triangles need more bytes than are there")
+        raise _FaultError(f"{vertices:,} vertices and {triangles:,} triangles need more bytes than there are")
     # 3. Check the values.
     numbers = np.frombuffer(data, f"<f{size}", vertices * columns, start)
     _check_mesh_numbers(numbers, "its numbers")
@@ -919,7 +921,7 @@ def pixels_of(path: Path) -> int:
         path: picture file.
 
     Raises:
-        MitsonarError: the file is no picture of these formats, has no pixels, or more than its size allows.
+        MitsonarError: the file is not a picture of these formats, has no pixels, or more than its size allows.
     """
     refuse_irregular(path, "picture")
     size = path.stat().st_size
@@ -930,7 +932,7 @@ def pixels_of(path: Path) -> int:
     try:
         wide, high, channels = _shape(head, tail)
     except (struct.error, ValueError, IndexError):
-        raise MitsonarError(f"{path} is no picture that Mitsuba reads: export it again as PNG, JPEG or OpenEXR") from None
+        raise MitsonarError(f"{path} is not a picture that Mitsuba reads: export it again as PNG, JPEG or OpenEXR") from None
     if min(wide, high) < 1 or wide * high > 8 * PICTURE_INFLATION * size:
         raise MitsonarError(f"picture {path} is damaged: {wide:,} x {high:,} pixels in {size:,} bytes; export it again")
     return wide * high * max(1, (channels + 2) // 3)
@@ -1047,4 +1049,4 @@ def check_tensors(path: Path) -> None:
             if start + math.prod(shape) * TENSORS[kind] > size:
                 raise ValueError
     except (struct.error, ValueError, KeyError):
-        raise MitsonarError(f"table {path} is damaged: its header promises what it does not hold; fetch it again") from None
+        raise MitsonarError(f"table {path} is damaged: its header announces more than it holds; fetch it again") from None

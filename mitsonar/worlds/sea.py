@@ -239,8 +239,10 @@ class SeaSurface(Family):
     spectrum: Literal["pierson-moskowitz", "jonswap"] = Field(
         "pierson-moskowitz", description="pierson-moskowitz (fully developed) or jonswap (limited by the fetch)"
     )
-    fetch_km: float = Field(20.0, gt=0, le=10_000, description="way over which the wind blows, of jonswap [km]")
-    towards_deg: float = Field(0.0, ge=-360, le=360, description="where the wind blows to: 0 is +y, 90 is +x [deg]")
+    fetch_km: float = Field(20.0, gt=0, le=10_000, description="fetch: distance over which the wind blows, for jonswap [km]")
+    towards_deg: float = Field(
+        0.0, ge=-360, le=360, description="direction towards which the wind blows: 0 is +y, 90 is +x [deg]"
+    )
     spreading: float = Field(2.0, ge=0, le=100, description="s of cos^2s of half the angle off the wind; 0: all directions")
     size_m: float = Field(40.0, gt=0, le=10_000, description="edge of the square surface, and of the seabed [m]")
     step_m: float = Field(0.25, gt=0, le=25, description="edge of the mesh's squares [m]")
@@ -348,7 +350,7 @@ class SeaSurface(Family):
             "reflection: -1.0\n"
             f"roughness_m: {self.state.roughness_m:.4g}\n"
             "source: >-\n"
-            "  reflection: water against air. roughness_m: the waves that the mesh does not hold. mu (ours): what they\n"
+            "  reflection: water against air. roughness_m: the waves that the mesh does not resolve. mu (ours): what they\n"
             "  take from the mirror is scattered by Lambert's law, all of it.\n"
         )
 

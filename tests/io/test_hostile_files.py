@@ -327,8 +327,8 @@ def test_amphora_mutants_never_end_mitsuba(tmp_path: Path) -> None:
     ("content", "words"),
     [
         (ply(count=4), "lists of vertex_indices must have 3"),
-        (ply(vertices=10**9), "need more bytes than are there"),
-        (ply(faces=10**18), "need more bytes than are there"),
+        (ply(vertices=10**9), "need more bytes than there are"),
+        (ply(faces=10**18), "need more bytes than there are"),
         (ply(faces=0), "no triangles"),
         (ply(vertices=3), "bytes"),
         (ply(x=float("nan")), "finite"),

@@ -107,7 +107,7 @@ def test_damaged_headers_are_left_out_and_a_cut_file_keeps_its_whole_frames(tmp_
     recording = open_recording(path)
     assert len(recording) == 2
     assert any("left out: 2 frames with a damaged header" in note for note in recording.notes)
-    assert any("no whole frame" in note for note in recording.notes)
+    assert any("not a complete frame" in note for note in recording.notes)
 
 
 @pytest.mark.parametrize(
@@ -141,8 +141,8 @@ def test_positions_become_metres_east_and_north(tmp_path: Path) -> None:
     [
         (b"DDF\x05", "the file is cut off"),
         (b"DDF\x05".ljust(3000, b"\0"), "ping mode 0"),
-        (b"PK\x03\x04".ljust(3000, b"\0"), "is no recording that mitsonar reads"),
-        (b"", "is no recording that mitsonar reads"),
+        (b"PK\x03\x04".ljust(3000, b"\0"), "is not a recording that mitsonar reads"),
+        (b"", "is not a recording that mitsonar reads"),
     ],
 )
 def test_other_files_are_refused_in_one_sentence(tmp_path: Path, content: bytes, reason: str) -> None:

@@ -105,7 +105,7 @@ def test_echoes_below_the_span_are_counted(tmp_path: Path) -> None:
     image = open_recording(tmp_path / "a.aris").part().read([0]).image[0]
     assert (image[0] == 255).all()
     assert not image[1:].any()
-    assert written.notes == ("50 % of the echoes lie 80 dB and more below full scale: they are 0",)
+    assert written.notes == ("50 % of the echoes lie 80 dB or more below full scale: they become 0",)
 
 
 def test_attitude_path_height_and_speed_come_back(tmp_path: Path) -> None:
@@ -225,10 +225,10 @@ def test_files_are_whole_or_absent_and_never_overwritten(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
-        ({"time_s": np.array([0.0, 0.2, 0.1])}, "must rise"),
-        ({"time_s": np.array([-1.0, 0.2, 0.3])}, "at least 0"),
-        ({"time_s": np.array([0.0, 1e-7, 1.0])}, "a microsecond at least"),
-        ({"time_s": np.array([0.0, np.nan, 1.0])}, "at least 0"),
+        ({"time_s": np.array([0.0, 0.2, 0.1])}, "must increase"),
+        ({"time_s": np.array([-1.0, 0.2, 0.3])}, "seconds since 1970, from 0"),
+        ({"time_s": np.array([0.0, 1e-7, 1.0])}, "at least a microsecond"),
+        ({"time_s": np.array([0.0, np.nan, 1.0])}, "seconds since 1970, from 0"),
         ({"poses": np.full((3, 6), 5e7)}, "leaves the earth"),
     ],
 )

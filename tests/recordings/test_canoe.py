@@ -144,11 +144,11 @@ def test_sizes_that_change_make_parts_and_cut_pictures_are_left_out(tmp_path: Pa
 
 
 def test_pictures_without_bearings_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(MitsonarError, match="no bearings that rise or fall"):
+    with pytest.raises(MitsonarError, match="not increasing or decreasing bearings"):
         bearings_in(np.random.default_rng(1).integers(0, 256, (2, 40), dtype=np.uint8), "a.png")
     written(tmp_path)
     name = f"sonar/{START + 70_000}.png"
     Image.fromarray(np.full((32, 80), 7, np.uint8)).save(tmp_path / name)
     recording = open_recording(tmp_path)
-    with pytest.raises(MitsonarError, match="other bearings than the pictures before it"):
+    with pytest.raises(MitsonarError, match="different bearings from those of the pictures before it"):
         recording.part().read([0, 1])

@@ -108,7 +108,7 @@ def test_a_sample_rate_that_is_missing_or_strange_is_said(tmp_path: Path) -> Non
     assert any("no sample rate" in note for note in missing.notes)
     assert missing.part().like.sonar.range_max - missing.part().like.sonar.range_min == pytest.approx(10)
     strange = opened(tmp_path, file={"sample_rate_hz": 5000.0})
-    assert any("the timing is taken" in note for note in strange.notes)
+    assert any("the timing is used" in note for note in strange.notes)
 
 
 @pytest.mark.parametrize(("beams", "steps"), [(96, (0.220, 0.368)), (48, (0.449, 0.748))])
@@ -152,7 +152,7 @@ def test_damaged_frames_are_left_out(tmp_path: Path) -> None:
     recording = open_recording(tmp_path / "a.ddf")
     assert len(recording) == 4
     assert any("left out: 1 frame with a damaged header" in note for note in recording.notes)
-    assert any("no whole frame" in note for note in recording.notes)
+    assert any("not a complete frame" in note for note in recording.notes)
     assert any("missing: 1 frame" in note for note in recording.notes)
 
 
@@ -161,7 +161,7 @@ def test_damaged_frames_are_left_out(tmp_path: Path) -> None:
     [
         (b"DDF\x03", "cut off"),
         (b"DDF\x03".ljust(2000, b"\0"), "0 beams"),
-        (didson_file(IMAGES)[:600], "no whole frame"),
+        (didson_file(IMAGES)[:600], "no complete frame"),
         (didson_file(IMAGES, version=4, header=900), "no frame begins"),
         (didson_file(IMAGES, file={"samples": 2**31}), "the file is damaged"),
         (didson_file(IMAGES, file={"beams": 97}), "97 beams"),

@@ -202,7 +202,7 @@ def test_damage_is_passed_over_and_said(tmp_path: Path) -> None:
     (tmp_path / "a.raw").write_bytes(first + second + third + fourth[:-5])
     recording = open_recording(tmp_path / "a.raw")
     assert len(recording) >= 1
-    assert any("no whole message" in note for note in recording.notes)
+    assert any("not a complete message" in note for note in recording.notes)
     (tmp_path / "one.raw").write_bytes(first)
     one = open_recording(tmp_path / "one.raw").part().read([0])
     assert (recording.part().read([0]).image == one.image).all()
@@ -215,7 +215,7 @@ def test_a_log_passes_over_what_is_between_items(tmp_path: Path) -> None:
     (tmp_path / "a.oculus").write_bytes(log[:second] + b"what is this" + log[second:])
     recording = open_recording(tmp_path / "a.oculus")
     assert len(recording) == 2
-    assert recording.notes == ("12 bytes are no whole message and are left out",)
+    assert recording.notes == ("12 bytes are not a complete message and are left out",)
 
 
 def test_packed_bytes_that_are_damaged_are_one_sentence(tmp_path: Path) -> None:
@@ -245,8 +245,8 @@ def test_a_log_of_viewpoint_2_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (b"", "no recording"),
-        (b"SOS", "no recording"),
+        (b"", "is not a recording"),
+        (b"SOS", "is not a recording"),
         (other_message(), "holds no ping"),
         (oculus_ping(np.ones((4, 3)), resolution=np.nan), "left out: 1 damaged ping"),
         (oculus_ping(np.ones((4, 3)), ranges=60_000), "left out: 1 damaged ping"),

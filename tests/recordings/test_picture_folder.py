@@ -119,7 +119,7 @@ def test_times_may_stand_in_a_file(tmp_path: Path) -> None:
     for text, reason in [
         ("1\n2\n", "a time for each of 3 pictures"),
         ("a b\n", "must hold lines"),
-        ("x.png 3", "names none"),
+        ("x.png 3", "lists none"),
     ]:
         (path / "times.csv").write_text(text)
         with pytest.raises(MitsonarError, match=reason):
@@ -216,7 +216,7 @@ def test_what_is_missing_is_told(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match=r"cannot read geometry file .*none\.yaml"):
         open_recording(path, tmp_path / "none.yaml")
     (path / "run.json").write_text("{}")  # a run's folder is no recording
-    with pytest.raises(MitsonarError, match="is no recording that mitsonar reads"):
+    with pytest.raises(MitsonarError, match="is not a recording that mitsonar reads"):
         open_recording(path, tmp_path / "told.yaml")
     with pytest.raises(MitsonarError, match="is no recording of pictures: it tells its geometry itself"):
         open_frames(path, geometry=tmp_path / "told.yaml")

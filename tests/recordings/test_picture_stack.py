@@ -53,7 +53,7 @@ def test_the_static_videos_of_fish_open_with_their_ready_geometries(name: str, r
     expected = {"lamprey2": 0.98, "lamprey4": 0.936}[name]
     assert np.corrcoef(frames.image.reshape(2, -1))[0, 1] == pytest.approx(expected, abs=0.03)
     assert not [note for note in recording.notes if "stretch" in note]
-    with pytest.raises(MitsonarError, match="do not tell their geometry"):
+    with pytest.raises(MitsonarError, match="without their geometry"):
         open_recording(REAL / f"didson-static-video/{name}_first30.npz")
 
 

@@ -71,7 +71,7 @@ def test_poses_without_a_mount_count_as_the_sonars_and_a_note_says_so(tmp_path: 
     path = write_bag(tmp_path / "two", maker, [*pings(maker, smooth(), forward="x"), *sent])
     recording = open_recording(path)
     assert recording.part().poses == pytest.approx(expected(""), abs=1e-4)
-    assert any("count as those of the sonar" in note for note in recording.notes)
+    assert any("are assumed to be those of the sonar" in note for note in recording.notes)
 
 
 def test_a_world_of_north_east_down_is_turned(tmp_path: Path) -> None:

@@ -113,5 +113,5 @@ def test_damaged_tables_are_refused(tmp_path: Path, text: str, reason: str) -> N
 
 def test_a_geometry_is_refused(tmp_path: Path) -> None:
     written(tmp_path)
-    with pytest.raises(MitsonarError, match="tells its geometry itself"):
+    with pytest.raises(MitsonarError, match="contains its geometry"):
         open_recording(tmp_path, tmp_path / "geometry.yaml")

@@ -45,7 +45,7 @@ TEXTS = {
     "quotes": (OPEN + "<a x='\" " * 150_000, "malformed"),
     "attributes": (OPEN + "<a " + "x='' " * 200_000 + "y", "malformed"),
     "data": (OPEN + "<![CDATA[" * 100_000, "does not end"),
-    "depth": (OPEN + "<shape>" * 200, "nests its elements more than 100 deep"),
+    "depth": (OPEN + "<shape>" * 200, "nests its elements more than 100 levels deep"),
     "parameters that grow": (grown(10), "longer than 65,536 letters"),
     "many parameters": (SCENE.format("".join(PARAMETER.format(k) for k in range(60_000))), "1,000 parameters"),
     "used too often": (
