@@ -25,30 +25,30 @@ Index = NDArray[np.intp]
 STEPS = (1, 2, 4, 8, 16, 32, 64)
 """Candidate frame distances within a pair; the smallest that gives enough pairs is used, or else the one that gives most."""
 
-LEAST_TURN = 1.5
+MIN_TURN = 1.5
 """Minimum rotation of a pair, in units of the beam spacing."""
 
-MOST_TURN = 0.25
+MAX_TURN = 0.25
 """Maximum rotation of a pair, as a fraction of the field of view; beyond it, too little is visible in both frames."""
 
-MOST_PAIRS = 120
+MAX_PAIRS = 120
 ENOUGH_PAIRS = 40
-FEWEST_PAIRS = 5
+MIN_PAIRS = 5
 """Maximum number of pairs that are registered; number that is enough; minimum number for a verdict."""
 
-CLEAR, SIGMAS = 0.4, 3.0
+MIN_CORRELATION, SIGMAS = 0.4, 3.0
 """Minimum correlation for a verdict, absolute and in standard deviations of the correlation of unrelated rotations."""
 
-LEAST_SLOPE = 0.25
+MIN_SLOPE = 0.25
 """Minimum ratio of observed to given rotation for a verdict."""
 
-REACH = 2.0
+MAX_TURN_RATIO = 2.0
 """Largest rotation that is searched, as a multiple of the largest given one."""
 
-REACH_RANGE = 0.15
+MAX_RANGE_SHIFT = 0.15
 """Largest shift over range that is searched, as a fraction of the number of bins."""
 
-MOST_ROWS = 192
+MAX_ROWS = 192
 """Maximum number of rows to which pictures are averaged."""
 
 
@@ -87,30 +87,30 @@ def handedness_of(part: Part, heading_rad: ArrayLike | None = None) -> Handednes
     if heading is None:
         return _unknown("the headings are unknown: the recording has no poses and no compass, and none were given")
     bearing = part.like.bearing_rad
-    if len(bearing) < 8 or len(part) < FEWEST_PAIRS + 1:
+    if len(bearing) < 8 or len(part) < MIN_PAIRS + 1:
         return _unknown("there are too few beams or frames")
     # 1. Choose pairs of frames that turn by a measurable angle and still show the same ground.
     spacing, width = float(np.median(np.diff(bearing))), float(bearing[-1] - bearing[0])
-    pairs = _pairs(heading, spacing, MOST_TURN * width)
+    pairs = _pairs(heading, spacing, MAX_TURN * width)
     if pairs is None:
-        return _unknown(f"no pairs of frames turn by {np.degrees(LEAST_TURN * spacing):.2g} deg and show the same ground")
+        return _unknown(f"no pairs of frames turn by {np.degrees(MIN_TURN * spacing):.2g} deg and show the same ground")
     # 2. Measure the rotation that the pictures show, and drop pairs for which there is none.
     given_turns = _given_turns(heading, pairs)
-    observed_turns = _observed_turns(part, pairs, REACH * float(np.abs(given_turns).max()))
+    observed_turns = _observed_turns(part, pairs, MAX_TURN_RATIO * float(np.abs(given_turns).max()))
     measured = np.isfinite(observed_turns)
     given_turns, observed_turns = given_turns[measured], observed_turns[measured]
     # 3. Correlate both about zero rather than about their means, which keeps the information of a turn to one side.
     energy = float(np.sum(given_turns**2)), float(np.sum(observed_turns**2))
-    if len(given_turns) < FEWEST_PAIRS or min(energy) <= 0:
+    if len(given_turns) < MIN_PAIRS or min(energy) <= 0:
         return _unknown("the pictures show no contrast that moves", len(given_turns))
     product = float(np.sum(given_turns * observed_turns))
     correlation, slope = product / math.sqrt(energy[0] * energy[1]), product / energy[0]
     # 4. Decide by the sign of the correlation, if it is significant: for unrelated rotations, its standard deviation is
     #    1 / sqrt(pairs).
-    significant = abs(correlation) >= max(CLEAR, SIGMAS / math.sqrt(len(given_turns))) and abs(slope) >= LEAST_SLOPE
+    significant = abs(correlation) >= max(MIN_CORRELATION, SIGMAS / math.sqrt(len(given_turns))) and abs(slope) >= MIN_SLOPE
     rms = float(np.degrees(np.sqrt(np.mean(given_turns**2))))
     if not significant:
-        too_few = abs(correlation) >= CLEAR and abs(slope) >= LEAST_SLOPE
+        too_few = abs(correlation) >= MIN_CORRELATION and abs(slope) >= MIN_SLOPE
         reason = (
             "there are too few pairs of frames for a verdict"
             if too_few
@@ -137,7 +137,7 @@ def _headings(part: Part, given: ArrayLike | None) -> Array | None:
         return heading
     known = part.poses[:, 5] if part.poses is not None else None
     known = part.attitude_rad[:, 2] if known is None and part.attitude_rad is not None else known
-    return known if known is not None and np.isfinite(known).sum() > FEWEST_PAIRS else None
+    return known if known is not None and np.isfinite(known).sum() > MIN_PAIRS else None
 
 
 def _given_turns(heading: Array, pairs: tuple[Index, Index]) -> Array:
@@ -160,9 +160,9 @@ def _pairs(heading: Array, spacing: float, max_turn: float) -> tuple[Index, Inde
         turn = _given_turns(heading, (first, first + step))
         first = first[np.isfinite(turn) & (np.abs(turn) <= max_turn)]
         turn_size = np.abs(_given_turns(heading, (first, first + step)))
-        chosen = first[turn_size >= LEAST_TURN * spacing]
-        if len(chosen) >= FEWEST_PAIRS:
-            subset = np.unique(np.linspace(0, len(chosen) - 1, min(MOST_PAIRS, len(chosen))).astype(np.intp))
+        chosen = first[turn_size >= MIN_TURN * spacing]
+        if len(chosen) >= MIN_PAIRS:
+            subset = np.unique(np.linspace(0, len(chosen) - 1, min(MAX_PAIRS, len(chosen))).astype(np.intp))
             candidates.append((chosen[subset], chosen[subset] + step))
         if len(chosen) >= ENOUGH_PAIRS:
             break
@@ -180,9 +180,9 @@ def _observed_turns(part: Part, pairs: tuple[Index, Index], max_turn: float) -> 
     # 1. Average some pictures. What does not move with the scene, such as the beam pattern, would suggest no rotation.
     bearing = part.like.bearing_rad
     frames = np.unique(np.concatenate(pairs))
-    sampled = frames[np.unique(np.linspace(0, len(frames) - 1, min(MOST_PAIRS // 4, len(frames))).astype(np.intp))]
+    sampled = frames[np.unique(np.linspace(0, len(frames) - 1, min(MAX_PAIRS // 4, len(frames))).astype(np.intp))]
     stationary = np.mean([part.read([number]).matching_values()[0] for number in sampled], axis=0)
-    stationary = stationary if len(sampled) >= FEWEST_PAIRS else np.zeros_like(stationary)
+    stationary = stationary if len(sampled) >= MIN_PAIRS else np.zeros_like(stationary)
     # 2. Register each pair on evenly spaced bearings. The scene moves against the rotation of the sonar: negate the shift.
     even = np.linspace(bearing[0], bearing[-1], len(bearing))
     step = float(even[1] - even[0])
@@ -202,9 +202,9 @@ def _moving_content(image: NDArray[np.floating], stationary: NDArray[np.floating
         bearing: bearings of the picture ``(beams,)`` [rad].
         even: evenly spaced bearings of the result ``(beams,)`` [rad].
     """
-    # 1. Subtract the stationary content, and average bins to at most MOST_ROWS rows.
+    # 1. Subtract the stationary content, and average bins to at most MAX_ROWS rows.
     moving = np.asarray(image - stationary, dtype=float)
-    bins_per_row = -(-len(moving) // MOST_ROWS)
+    bins_per_row = -(-len(moving) // MAX_ROWS)
     moving = moving[: len(moving) // bins_per_row * bins_per_row].reshape(-1, bins_per_row, moving.shape[1]).mean(axis=1)
     # 2. Interpolate to even bearings, on which a rotation is the same shift in all columns.
     place = np.interp(even, bearing, np.arange(len(bearing)))
@@ -236,7 +236,7 @@ def _shift(a: Array, b: Array, reach: int) -> float:
     taper_correlations = [
         np.fft.irfft(np.abs(np.fft.rfft(_taper(count), 2 * count)) ** 2, 2 * count) for count in (rows, beams)
     ]
-    down, across = max(2, int(REACH_RANGE * rows)), min(reach, beams - 2)
+    down, across = max(2, int(MAX_RANGE_SHIFT * rows)), min(reach, beams - 2)
     lags = np.arange(-down, down + 1), np.arange(-across, across + 1)
     score = correlation[np.ix_(*lags)] / (taper_correlations[0][lags[0]][:, None] * taper_correlations[1][lags[1]])
     # 3. Find the peak. One at the end of the search interval is not a maximum.

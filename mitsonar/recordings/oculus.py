@@ -85,26 +85,26 @@ LATER = layout(
 )  # fmt: skip
 """Fields of a message of version 2."""
 
-GAINED = 4
+ROW_GAINS = 4
 """Bit of the flags: each image row begins with its gain, 4 bytes."""
 
 RATES = {0: 10.0, 1: 15.0, 2: 40.0, 3: 5.0, 4: 2.0}
 """Maximum ping rates by their code [Hz]."""
 
-SAME_STEP = 0.002
+RESOLUTION_TOLERANCE = 0.002
 """Relative change of the range resolution, caused by drift of the sound speed, up to which a window counts as the same."""
 
-WIDEST_DEG = 85.0
+MAX_BEARING_DEG = 85.0
 """Largest plausible bearing [deg]."""
 
-MOST_CELLS = 2**28
-LONGEST_M = 1e4
+MAX_CELLS = 2**28
+MAX_RANGE_M = 1e4
 """Largest plausible number of cells of an image, and largest plausible range [m]."""
 
-LONGEST_S, LATEST_S = 1e4, 1e11
+MAX_STEP_S, MAX_TIME_S = 1e4, 1e11
 """Largest plausible time between two pings, and largest plausible time [s]."""
 
-SAME_CLOCK_S = 1.0
+CLOCK_TOLERANCE_S = 1.0
 """Largest deviation from a constant offset with which the clocks of sonar and log count as synchronous [s]."""
 
 BANDS = {
@@ -220,14 +220,14 @@ def _are_plausible(head: Header, size: NDArray[np.int64]) -> NDArray[np.bool_]:
     ranges, beams, image = (head[name].astype(np.int64) for name in ("ranges", "beams", "image"))
     rows = ranges * beams * (np.minimum(head["width"], 3) + 1)
     start = np.where(head["version"] >= 2, LATER.itemsize, OLDER.itemsize)
-    step = np.where((head["resolution"] > 1e-6) & (head["resolution"] < LONGEST_M), head["resolution"], np.nan)
+    step = np.where((head["resolution"] > 1e-6) & (head["resolution"] < MAX_RANGE_M), head["resolution"], np.nan)
     return np.asarray(
         (head["version"] <= 2)
         & (head["width"] <= 3)
         & (ranges > 0)
         & (beams > 1)
-        & (ranges * beams <= MOST_CELLS)
-        & (step * ranges < LONGEST_M)
+        & (ranges * beams <= MAX_CELLS)
+        & (step * ranges < MAX_RANGE_M)
         & (image >= start + 2 * beams)
         & (head["image_size"] >= rows)
         & (image + head["image_size"] <= size)
@@ -237,14 +237,14 @@ def _are_plausible(head: Header, size: NDArray[np.int64]) -> NDArray[np.bool_]:
 def _is_fan(bearings_deg: Array) -> bool:
     """Return whether bearings are strictly monotonic and lie in front of the sonar."""
     steps = np.diff(bearings_deg)
-    return len(steps) > 0 and bool((steps > 0).all() or (steps < 0).all()) and np.abs(bearings_deg).max() <= WIDEST_DEG
+    return len(steps) > 0 and bool((steps > 0).all() or (steps < 0).all()) and np.abs(bearings_deg).max() <= MAX_BEARING_DEG
 
 
 def _gained(head: Header) -> NDArray[np.bool_]:
     """Return whether the rows of each image begin with a gain: the flag is set and the image is large enough for it."""
     ranges = head["ranges"].astype(np.int64)
     stride = head["beams"].astype(np.int64) * (head["width"] + 1) + 4
-    return np.asarray((head["flags"] & GAINED > 0) & (head["image_size"] >= ranges * stride))
+    return np.asarray((head["flags"] & ROW_GAINS > 0) & (head["image_size"] >= ranges * stride))
 
 
 def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
@@ -269,15 +269,15 @@ def _shifted(start_s: Array, logged_s: Array) -> Array:
     """Return the sonar's times shifted to the clock of the log ``(n,)`` [s]; those of the log if the clocks diverge."""
     offset_s = logged_s - start_s
     shift = np.nanmedian(offset_s)
-    return start_s + shift if bool((np.abs(offset_s - shift) < SAME_CLOCK_S).all()) else logged_s
+    return start_s + shift if bool((np.abs(offset_s - shift) < CLOCK_TOLERANCE_S).all()) else logged_s
 
 
 def _is_clock(time_s: Array) -> bool:
-    """Return whether times are plausible: strictly increasing, by less than ``LONGEST_S`` at a time."""
-    if not (np.abs(time_s) < LATEST_S).all():
+    """Return whether times are plausible: strictly increasing, by less than ``MAX_STEP_S`` at a time."""
+    if not (np.abs(time_s) < MAX_TIME_S).all():
         return False
     steps = time_s[1:] - time_s[:-1]
-    return bool(((steps > 0) & (steps < LONGEST_S)).all())
+    return bool(((steps > 0) & (steps < MAX_STEP_S)).all())
 
 
 def _windows(pings: _Pings) -> list[tuple[float, ...]]:
@@ -285,7 +285,7 @@ def _windows(pings: _Pings) -> list[tuple[float, ...]]:
     keys, step = [], 0.0
     gained = _gained(pings.head)
     for one, ping in enumerate(pings.head):
-        if abs(float(ping["resolution"]) - step) > SAME_STEP * step:
+        if abs(float(ping["resolution"]) - step) > RESOLUTION_TOLERANCE * step:
             step = float(ping["resolution"])
         rest = (ping["ranges"], pings.fan[one], ping["width"], ping["gamma"], ping["mode"], gained[one])
         keys.append((step, *(float(value) for value in rest)))
@@ -445,17 +445,17 @@ PING = 0x23
 KINDS = (0x15, 0x22, PING, 0x55, 0x80, 0xFF)
 """All kinds of message."""
 
-LATEST = 2
+MAX_VERSION = 2
 """Latest supported version of a message."""
 
 MESSAGE_ITEM = 10
 """Kind of item that holds one message."""
 
-LARGEST_HEADER = 4096
-LARGEST_MESSAGE = 2**26
+MAX_HEADER_BYTES = 4096
+MAX_MESSAGE_BYTES = 2**26
 """Largest plausible header in a log, and largest plausible size of a decompressed message [bytes]."""
 
-STEP = 4096
+CHUNK_BYTES = 4096
 """Number of compressed bytes that are decompressed at a time."""
 
 
@@ -538,7 +538,7 @@ def is_oculus(path: Path, first: bytes) -> bool:
     if not first.startswith(DUMP) or len(first) < HEADER.size:
         return False
     kind, version = HEADER.unpack_from(first)[3:5]
-    return kind in KINDS and version <= LATEST
+    return kind in KINDS and version <= MAX_VERSION
 
 
 def find_messages(data: Bytes, name: str) -> Messages:
@@ -594,7 +594,7 @@ def _find_in_dump(data: Bytes, name: str) -> Messages:
         if offset + HEADER.size > len(view):
             break
         kind, version, follow = HEADER.unpack_from(view, offset)[3:6]
-        if kind not in KINDS or version > LATEST or offset + HEADER.size + follow > len(view):
+        if kind not in KINDS or version > MAX_VERSION or offset + HEADER.size + follow > len(view):
             offset += 1  # the mark occurred by chance: continue the search after its first byte
             continue
         size = HEADER.size + follow
@@ -616,7 +616,7 @@ def _find_in_log(data: Bytes, name: str) -> Messages:
     offset, encryption = (LOG_HEADER.unpack_from(view)[one] for one in (1, 4))
     if encryption:
         raise MitsonarError(f"{name} is encrypted (kind {encryption}): export it without encryption")
-    if not LOG_HEADER.size <= offset <= LARGEST_HEADER:
+    if not LOG_HEADER.size <= offset <= MAX_HEADER_BYTES:
         offset = LOG_HEADER.size
     collector, mark = _MessageCollector(), re.compile(re.escape(ITEM))
     collector.bytes = offset
@@ -625,7 +625,7 @@ def _find_in_log(data: Bytes, name: str) -> Messages:
         if offset + ITEM_HEADER.size > len(view):
             break
         _, head, kind, _, time_s, packing, unpacked, follow = ITEM_HEADER.unpack_from(view, offset)
-        if not ITEM_HEADER.size <= head <= LARGEST_HEADER or offset + head + follow > len(view):
+        if not ITEM_HEADER.size <= head <= MAX_HEADER_BYTES or offset + head + follow > len(view):
             offset += 1  # the mark occurred by chance: continue the search after its first byte
             continue
         begin, time_s = offset + head, time_s if abs(time_s) < 1e11 else np.nan
@@ -645,7 +645,7 @@ def _add_item(collector: _MessageCollector, view: memoryview, item: _MessageLoca
     """
     if item.unpacked:
         size = int.from_bytes(view[item.begin : item.begin + 4], "big")
-        most = min(LARGEST_MESSAGE, INFLATION * item.stored)
+        most = min(MAX_MESSAGE_BYTES, INFLATION * item.stored)
         if size != item.unpacked or not HEADER.size < size <= most:
             collector.skipped += 1
             return
@@ -669,8 +669,8 @@ def _decompress(packed: memoryview, count: int) -> bytes:
         zlib.error: if the bytes are damaged.
     """
     content, unpacker = bytearray(), zlib.decompressobj()
-    for start in range(0, len(packed), STEP):
-        content += unpacker.decompress(packed[start : start + STEP], count - len(content))
+    for start in range(0, len(packed), CHUNK_BYTES):
+        content += unpacker.decompress(packed[start : start + CHUNK_BYTES], count - len(content))
         while unpacker.unconsumed_tail and len(content) < count:
             content += unpacker.decompress(unpacker.unconsumed_tail, count - len(content))
         if len(content) >= count or unpacker.eof:

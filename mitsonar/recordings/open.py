@@ -133,10 +133,10 @@ Array = NDArray[np.float64]
 Summary: TypeAlias = dict[str, Any]
 """JSON values, keyed by name: numbers, strings, lists and dictionaries of them."""
 
-GAP = 2.5
+GAP_RATIO = 2.5
 """A time step between frames counts as a gap if it exceeds this multiple of the median step."""
 
-SINCE_S = 946_684_800.0
+DATES_FROM_S = 946_684_800.0
 """Times from this one on are shown as dates: 2000-01-01 [s since 1970]."""
 
 
@@ -196,7 +196,7 @@ def _time_summary(time_s: Array) -> Summary:
     steps = np.diff(time)
     if len(steps) and np.median(steps) > 0:
         usual = float(np.median(steps))
-        wide = steps[steps > GAP * usual]
+        wide = steps[steps > GAP_RATIO * usual]
         summary |= {"rate_hz": 1 / usual, "gaps": len(wide), "longest_step_s": float(steps.max())}
     return summary
 
@@ -252,7 +252,7 @@ def _part_rows(part: Summary) -> list[tuple[str, str]]:
 
 def _format_time(time_s: float) -> str:
     """Format a time: as a date in UTC if it is one, otherwise in seconds."""
-    if time_s < SINCE_S:
+    if time_s < DATES_FROM_S:
         return f"{time_s:.6g} s"
     return datetime.fromtimestamp(time_s, UTC).isoformat(sep=" ", timespec="milliseconds").removesuffix("+00:00")
 

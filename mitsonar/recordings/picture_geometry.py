@@ -14,7 +14,7 @@ from mitsonar.errors import MitsonarError, complaint
 from mitsonar.instruments.sonar import Bearing, Coding
 from mitsonar.io.files import read_yaml
 
-__all__ = ["Outline", "PictureGeometry", "doubts", "geometry_beside", "load_geometry", "outline_of"]
+__all__ = ["Outline", "PictureGeometry", "doubts", "find_geometry_file", "load_geometry", "outline_of"]
 
 
 ANY_RANGE_MAX = 10.0
@@ -23,7 +23,7 @@ ANY_RANGE_MAX = 10.0
 ANY_ELEVATION_DEG, ANY_RATE_HZ = 14.0, 10.0
 """Elevation aperture [deg] and frame rate [Hz] that are assumed if they are not given."""
 
-SAME_SCALE = 0.02
+SCALE_TOLERANCE = 0.02
 """Difference between ``near_px / far_px`` and ``range_min / range_max`` beyond which the apex is questioned."""
 
 FAN = ("apex_px", "near_px", "far_px", "half_angle_deg")
@@ -164,7 +164,7 @@ class PictureGeometry(BaseModel):
         notes = []
         if not self.scale_known:
             notes.append(f"metres are not known: the window counts as {start:.4g}..{end:.4g} m, and lengths are up to scale")
-        if self.layout == "fan" and abs(self.near / self.far - start / end) > SAME_SCALE:
+        if self.layout == "fan" and abs(self.near / self.far - start / end) > SCALE_TOLERANCE:
             notes.append(
                 f"near_px and far_px are {self.near:g} and {self.far:g}, and range_min and range_max {start:g} and {end:g} "
                 "m: the ratios differ, check the apex"
@@ -195,7 +195,7 @@ def load_geometry(path: str | Path) -> PictureGeometry:
     return geometry
 
 
-def geometry_beside(path: Path) -> Path | None:
+def find_geometry_file(path: Path) -> Path | None:
     """Return the geometry file that belongs to a recording; None if there is none.
 
     It is ``geometry.yaml`` in a folder, or else ``FILE.yaml`` or ``geometry.yaml`` next to the file or folder.
@@ -213,21 +213,21 @@ def geometry_beside(path: Path) -> Path | None:
 
 Doubles = NDArray[np.float64]
 
-DARK = 16
+DARK_LEVEL = 16
 """Largest value 0..255 of a pixel that counts as outside the fan, where compressed videos ring."""
 
-LEAST_ROWS = 24
+MIN_ROWS = 24
 """Minimum number of rows of an edge, and of columns of an arc."""
 
-OFF_PX = 1.5
+INLIER_PX = 1.5
 """Distance inside an edge or arc beyond which a pixel does not belong to it [px]."""
 
-AGREEING = 0.5
+MIN_INLIERS = 0.5
 """Minimum fraction of the pixels of an edge or arc that must belong to it."""
 
-PASSES = 30
+MAX_ITERATIONS = 30
 
-SAME_STRETCH, SAME_ANGLE_DEG, SAME_PX = 0.05, 0.75, 0.02
+STRETCH_TOLERANCE, ANGLE_TOLERANCE_DEG, PX_TOLERANCE = 0.05, 0.75, 0.02
 """Tolerated differences between given and measured geometry: relative, in degrees, and as a fraction of ``far_px``."""
 
 
@@ -261,11 +261,11 @@ def outline_of(brightest: NDArray[np.generic], *, forward: str = "up") -> Outlin
         The outline; None if there are no straight edges or no arc, or if the picture cuts the fan off.
     """
     # 1. Separate the fan from its dark surroundings, and flip a fan that opens downwards.
-    mask = np.asarray(brightest) > DARK
+    mask = np.asarray(brightest) > DARK_LEVEL
     mask = mask if forward == "up" else mask[::-1]
     rows = np.flatnonzero(mask.any(axis=1))
     columns = np.flatnonzero(mask.any(axis=0))
-    if len(rows) < LEAST_ROWS or len(columns) < LEAST_ROWS:
+    if len(rows) < MIN_ROWS or len(columns) < MIN_ROWS:
         return None
     # 2. Fit the edges to the first and last bright pixel of each row. Negated columns make the right edge a left one.
     first = mask[rows].argmax(axis=1).astype(float)
@@ -297,23 +297,23 @@ def doubts(geometry: PictureGeometry, brightest: NDArray[np.generic]) -> list[st
     apex_px = geometry.apex_px or (0.0, 0.0)
     notes = []
     half = float(geometry.half_angle_deg or 0.0)
-    if abs(outline.stretch / geometry.stretch - 1) > SAME_STRETCH:
+    if abs(outline.stretch / geometry.stretch - 1) > STRETCH_TOLERANCE:
         notes.append(
             f"the far arc is a circle with stretch {outline.stretch:.3f}, and the edges then open "
             f"{outline.half_angle_deg:.2f} deg to each side; the geometry gives stretch {geometry.stretch:g} and {half:g} "
             "deg: the pictures are squeezed, or the geometry belongs to other pictures"
         )
-    elif abs(outline.half_angle_deg - half) > SAME_ANGLE_DEG:
+    elif abs(outline.half_angle_deg - half) > ANGLE_TOLERANCE_DEG:
         notes.append(
             f"the edges of the fan open {outline.half_angle_deg:.2f} deg to each side, the geometry gives {half:g} deg"
         )
     distance_px = math.hypot((outline.apex_px[0] - apex_px[0]) * geometry.stretch, outline.apex_px[1] - apex_px[1])
-    if distance_px > SAME_PX * geometry.far:
+    if distance_px > PX_TOLERANCE * geometry.far:
         notes.append(
             f"the edges of the fan meet at ({outline.apex_px[0]:.1f}, {outline.apex_px[1]:.1f}) px, the geometry gives "
             f"apex_px ({apex_px[0]:g}, {apex_px[1]:g})"
         )
-    elif abs(outline.far_px - geometry.far) > SAME_PX * geometry.far:
+    elif abs(outline.far_px - geometry.far) > PX_TOLERANCE * geometry.far:
         notes.append(
             f"the far arc lies at {outline.far_px:.1f} px from the apex, the geometry gives far_px {geometry.far:g}"
         )
@@ -328,17 +328,17 @@ def _edge(row: Doubles, column: Doubles) -> tuple[float, float] | None:
     # Alternate between fitting a line and selecting the pixels near it. The tolerance is wider outside the edge, so that
     # the line moves outwards. While too few pixels are near, the outer half of them is used.
     selected = np.ones(len(row), dtype=bool)
-    for _ in range(PASSES):
+    for _ in range(MAX_ITERATIONS):
         slope, start = np.polyfit(row[selected], column[selected], 1)
         distance_px = column - (start + slope * row)
-        updated = (distance_px < OFF_PX) & (distance_px > -3 * OFF_PX)
-        updated = updated if updated.sum() >= LEAST_ROWS else distance_px < np.median(distance_px)
+        updated = (distance_px < INLIER_PX) & (distance_px > -3 * INLIER_PX)
+        updated = updated if updated.sum() >= MIN_ROWS else distance_px < np.median(distance_px)
         if (updated == selected).all():
             break
         selected = updated
     distance_px = column - (start + slope * row)
-    close = np.abs(distance_px) < OFF_PX
-    return (float(start), float(slope)) if close.sum() >= max(LEAST_ROWS, AGREEING * len(row)) else None
+    close = np.abs(distance_px) < INLIER_PX
+    return (float(start), float(slope)) if close.sum() >= max(MIN_ROWS, MIN_INLIERS * len(row)) else None
 
 
 def _arc(x: Doubles, y: Doubles) -> tuple[float, float] | None:
@@ -350,16 +350,16 @@ def _arc(x: Doubles, y: Doubles) -> tuple[float, float] | None:
     # Start with the upper half of the pixels, most of which belong to the arc.
     selected = y > np.median(y) - 1e-9
     far, squared = 0.0, 0.0
-    for _ in range(PASSES):
+    for _ in range(MAX_ITERATIONS):
         table = np.column_stack([np.ones(int(selected.sum())), -(x[selected] ** 2)])
         (far_squared, squared), *_ = np.linalg.lstsq(table, y[selected] ** 2, rcond=None)
         if far_squared <= 0 or squared <= 0:
             return None
         far = math.sqrt(far_squared)
         distance_px = np.sqrt(np.maximum(far_squared - squared * x**2, 0)) - y
-        updated = (distance_px < OFF_PX) & (distance_px > -3 * OFF_PX)
-        if updated.sum() < LEAST_ROWS or (updated == selected).all():
+        updated = (distance_px < INLIER_PX) & (distance_px > -3 * INLIER_PX)
+        if updated.sum() < MIN_ROWS or (updated == selected).all():
             break
         selected = updated
-    enough = selected.sum() >= max(LEAST_ROWS, AGREEING * len(x))
+    enough = selected.sum() >= max(MIN_ROWS, MIN_INLIERS * len(x))
     return (far, math.sqrt(squared)) if enough else None

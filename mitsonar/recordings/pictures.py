@@ -28,7 +28,7 @@ from mitsonar.recordings.picture_geometry import (
     SEE,
     PictureGeometry,
     doubts,
-    geometry_beside,
+    find_geometry_file,
     load_geometry,
 )
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order
@@ -42,10 +42,10 @@ __all__ = [
     "Pictures",
     "geometry_for",
     "holds_pictures",
+    "is_complete",
     "is_picture_stack",
     "is_video",
-    "is_whole",
-    "naturally",
+    "natural_key",
     "picture_paths",
     "picture_size",
     "polar_frames",
@@ -69,7 +69,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm")
 FORMATS = ("PNG", "JPEG", "PPM")
 """Formats that Pillow may detect, whatever the suffix of a file."""
 
-MOST_PIXELS = 2**25
+MAX_PIXELS = 2**25
 """Maximum number of pixels of a picture."""
 
 PNG, END_OF_PNG = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
@@ -94,14 +94,14 @@ def refuse_size(rows: int, columns: int, source: str) -> None:
     Raises:
         MitsonarError: if the size is not that of a sonar picture.
     """
-    if rows * columns > MOST_PIXELS or min(rows, columns) < 2:
+    if rows * columns > MAX_PIXELS or min(rows, columns) < 2:
         raise MitsonarError(
             f"{source} has {columns:,} x {rows:,} pixels; pictures of sonars have at least 2 x 2, and at most "
-            f"{MOST_PIXELS:,} in all: it is damaged, or not a sonar picture"
+            f"{MAX_PIXELS:,} in all: it is damaged, or not a sonar picture"
         )
 
 
-def is_whole(path: Path) -> bool:
+def is_complete(path: Path) -> bool:
     """Return whether a path is a file that is not obviously truncated.
 
     A PNG file must have its final chunk; any other file must not be empty.
@@ -156,7 +156,7 @@ def _opened(path: Path) -> Image.Image:
         raise MitsonarError(f"no such file: {path}") from None
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise MitsonarError(
-            f"{path} has more pixels than any picture of a sonar, {MOST_PIXELS:,}, according to its header: it is damaged"
+            f"{path} has more pixels than any picture of a sonar, {MAX_PIXELS:,}, according to its header: it is damaged"
         ) from None
     except Exception as error:  # damaged bytes raise errors of many kinds
         reason = " ".join(str(error).split())[:160]
@@ -182,7 +182,7 @@ TIMES_IN_NAMES = (
 SPLIT_TIME = re.compile(r"(?<!\d)(\d{10})[._](\d{1,9})(?!\d)")
 """Pattern of seconds and their decimals; after ``_`` come nanoseconds, as ROS writes them."""
 
-MOST_PICTURES = 2_000_000
+MAX_PICTURES = 2_000_000
 """Maximum number of pictures in a folder, or of frames in a video."""
 
 
@@ -199,7 +199,7 @@ def holds_pictures(path: Path, first: bytes) -> bool:
 def read_picture_folder(path: Path, geometry: Path | None = None) -> Recording:
     """Open a folder of pictures of one size; they are read on demand.
 
-    Pictures are sorted naturally. Their times are taken from their names if these look like times.
+    Pictures are sorted natural_key. Their times are taken from their names if these look like times.
 
     Args:
         path: path of the folder.
@@ -245,12 +245,12 @@ def picture_paths(folder: Path) -> list[Path]:
         pictures = [one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES and not one.name.startswith(".")]
     except OSError as error:
         raise MitsonarError(f"cannot read the folder {folder}: {error.strerror}") from None
-    if len(pictures) > MOST_PICTURES:
-        raise MitsonarError(f"{folder} holds {len(pictures):,} pictures, more than {MOST_PICTURES:,}: split it")
-    return sorted(pictures, key=lambda one: naturally(one.name))
+    if len(pictures) > MAX_PICTURES:
+        raise MitsonarError(f"{folder} holds {len(pictures):,} pictures, more than {MAX_PICTURES:,}: split it")
+    return sorted(pictures, key=lambda one: natural_key(one.name))
 
 
-def naturally(name: str) -> tuple[tuple[int, int | str], ...]:
+def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
     """Return a sort key that puts names in natural order: ``f2`` before ``f10``."""
     parts = re.split(r"(\d+)", name)
     return tuple((0, int(part)) if place % 2 else (1, part.lower()) for place, part in enumerate(parts))
@@ -296,7 +296,7 @@ def _numbers(names: Sequence[str]) -> Array | None:
 
 def _select_one_size(files: list[Path], folder: Path) -> tuple[list[Path], tuple[int, int], list[str]]:
     """Return the complete pictures of the most frequent size, that size, and sentences on the others."""
-    complete = [file for file in files if is_whole(file)]
+    complete = [file for file in files if is_complete(file)]
     sizes: dict[Path, tuple[int, int]] = {}
     reason = ""
     for file in complete:
@@ -492,8 +492,8 @@ class _Video:
         """Return the number of frames that can be decoded; the number in the header is unreliable."""
         while self.capture.grab():
             self.position += 1
-            if self.position > MOST_PICTURES:
-                raise MitsonarError(f"{self.path} holds more than {MOST_PICTURES:,} frames: cut it")
+            if self.position > MAX_PICTURES:
+                raise MitsonarError(f"{self.path} holds more than {MAX_PICTURES:,} frames: cut it")
         count = self.position
         self._begin()
         if not count:
@@ -521,10 +521,10 @@ class _Video:
 
 Doubles = NDArray[np.float64]
 
-MOST_WEIGHTS = 2**25
+MAX_WEIGHTS = 2**25
 """Maximum number of weights of a sampler: a quarter of a GiB."""
 
-MOST_BEAMS = 1024
+MAX_BEAMS = 1024
 """Maximum number of beams if the geometry gives none."""
 
 WEIGHTS_PER_BLOCK = 2**20
@@ -547,7 +547,7 @@ class FanSampler:
     beams: int
 
     @classmethod
-    def of(cls, geometry: PictureGeometry, rows: int, columns: int) -> FanSampler:
+    def from_geometry(cls, geometry: PictureGeometry, rows: int, columns: int) -> FanSampler:
         """Build the map for pictures ``(rows, columns)``.
 
         Evenly spaced points cover each cell, about one per pixel along range and across. Each point reads the picture by
@@ -564,9 +564,9 @@ class FanSampler:
         width = 2 * half / beams * geometry.far / max(1.0, geometry.stretch)
         across, along = (max(1, math.ceil(size - 1e-6)) for size in (width, step))
         count = bins * beams * across * along * 4
-        if count > MOST_WEIGHTS:
+        if count > MAX_WEIGHTS:
             raise MitsonarError(
-                f"a fan of {bins:,} bins and {beams:,} beams takes {count:,} weights: {MOST_WEIGHTS:,} at most; give "
+                f"a fan of {bins:,} bins and {beams:,} beams takes {count:,} weights: {MAX_WEIGHTS:,} at most; give "
                 "smaller bins and beams in the geometry"
             )
         # 2. Place the points at the centres of equal subdivisions of range and angle.
@@ -603,7 +603,7 @@ def cell_counts(geometry: PictureGeometry) -> tuple[int, int]:
     bins = geometry.bins or max(2, round(geometry.far - geometry.near))
     half = math.radians(float(geometry.half_angle_deg or 0.0))
     arc = (geometry.near + geometry.far) / 2 * 2 * half / max(1.0, geometry.stretch)
-    return bins, geometry.beams or int(np.clip(round(arc), 2, MOST_BEAMS))
+    return bins, geometry.beams or int(np.clip(round(arc), 2, MAX_BEAMS))
 
 
 def _weights(
@@ -654,7 +654,7 @@ def _weights(
 OUTLINE_PICTURES = 16
 """Maximum number of pictures from which the outline of a fan is determined."""
 
-LARGEST_TIMES = 2**26
+MAX_TIMES_BYTES = 2**26
 """Maximum size of a file of times [bytes]."""
 
 
@@ -698,7 +698,7 @@ def geometry_for(source: Path, geometry: Path | None, inside: PictureGeometry | 
     Raises:
         MitsonarError: if there is no geometry, or the geometry file is damaged.
     """
-    geometry_path = geometry or geometry_beside(source)
+    geometry_path = geometry or find_geometry_file(source)
     if geometry_path is not None:
         return load_geometry(geometry_path), geometry_path
     if inside is None:
@@ -729,7 +729,7 @@ def recording_of(pictures: Pictures, geometry: PictureGeometry, geometry_path: P
         shape = pictures.shape[::-1] if geometry.transposed else pictures.shape
         images, like = _Polar(pictures, order, geometry), polar_frames(geometry, *shape, rate)
     else:
-        sampler = FanSampler.of(geometry, *pictures.shape)
+        sampler = FanSampler.from_geometry(geometry, *pictures.shape)
         images = _Fan(pictures, order, sampler)
         like = _fan_frames(geometry, sampler, rate)
         sample = np.unique(np.linspace(0, len(order) - 1, OUTLINE_PICTURES).astype(np.intp)) if len(order) else order
@@ -859,7 +859,7 @@ def _read_times(path: Path, names: tuple[str, ...]) -> Array:
 
     Times ``(names,)`` [s] are nan for pictures whose name is missing.
     """
-    text = read_bytes(path, "file of times", LARGEST_TIMES).decode("utf-8", "replace")
+    text = read_bytes(path, "file of times", MAX_TIMES_BYTES).decode("utf-8", "replace")
     rows = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
     rows = [row for row in rows if row]
     try:

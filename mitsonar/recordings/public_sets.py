@@ -22,7 +22,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.csv_table import CsvTable
 from mitsonar.io.files import FileArray, PlainValue, finite_number, read_bytes, read_json
 from mitsonar.motion.pose import poses_from
-from mitsonar.recordings.pictures import Grey, is_whole, naturally, picture_size, read_picture
+from mitsonar.recordings.pictures import Grey, is_complete, natural_key, picture_size, read_picture
 from mitsonar.recordings.recording import Facts, Header, Part, Pixels, Recording, in_time_order, runs_of
 from mitsonar.recordings.sound_metrics import (
     BEAMS,
@@ -55,12 +55,12 @@ HEAD_ROWS = 2
 STEP_DEG = (0.01, 5.0)
 """Smallest and largest plausible step between beams [deg]."""
 
-WIDEST_DEG = 90.0
+MAX_BEARING_DEG = 90.0
 """Largest plausible bearing [deg]."""
 
 POSE_COLUMNS = 16
 
-SAME_VELOCITY = 0.2
+VELOCITY_TOLERANCE = 0.2
 """Largest median difference between the world velocity and the rotated sensor velocity, as a fraction of the speed."""
 
 MIN_UPRIGHT = 0.7
@@ -101,7 +101,7 @@ def read_canoe(path: Path) -> Recording:
     """
     # 1. List the complete pictures and their times.
     pictures = sorted((time, one) for one in (path / "sonar").glob("*.png") if (time := _time_us(one)))
-    complete = [(time, one) for time, one in pictures if is_whole(one)]
+    complete = [(time, one) for time, one in pictures if is_complete(one)]
     notes = (
         [f"left out: {counted(len(pictures) - len(complete), 'picture')} cut off"] if len(complete) < len(pictures) else []
     )
@@ -198,7 +198,7 @@ def bearings_in(head: Grey, source: str) -> Array:
         for order in ("<i2", ">i2"):
             degrees = np.ascontiguousarray(pairs).view(order).ravel() * 0.01
             steps = np.diff(degrees) * np.sign(degrees[-1] - degrees[0])
-            if steps.min() >= STEP_DEG[0] - 1e-9 and steps.max() <= STEP_DEG[1] and np.abs(degrees).max() <= WIDEST_DEG:
+            if steps.min() >= STEP_DEG[0] - 1e-9 and steps.max() <= STEP_DEG[1] and np.abs(degrees).max() <= MAX_BEARING_DEG:
                 return np.asarray(degrees, dtype=float)
     raise MitsonarError(
         f"the first two rows of {source} are not increasing or decreasing bearings: it is not a picture of CANOE"
@@ -252,7 +252,7 @@ def _sensor_to_world(values: Array) -> Rotation | None:
         error = np.linalg.norm(rotation.apply(sensor_velocity) - world_velocity, axis=1)[moving] / speed[moving]
         candidates.append((float(np.median(error)), rotation))
     smallest_error, best = min(candidates, key=lambda one: one[0])
-    return best if smallest_error < SAME_VELOCITY else None
+    return best if smallest_error < VELOCITY_TOLERANCE else None
 
 
 def _sensor_axes(rotation: Rotation, velocity: Array) -> Rotation | None:
@@ -279,7 +279,7 @@ def _sensor_axes(rotation: Rotation, velocity: Array) -> Rotation | None:
 
 TABLE, IMAGES, ROTATOR = "aris_frame_meta.csv", "aris_raw", "ar3.csv"
 
-NEEDED = {
+REQUIRED_COLUMNS = {
     "index": "FrameIndex",
     "time_us": "FrameTime",
     "ping_mode": "PingMode",
@@ -290,7 +290,7 @@ NEEDED = {
 }
 """Columns of the required fields of a header."""
 
-OPTIONAL = {
+OPTIONAL_COLUMNS = {
     "gain_db": ("ReceiverGain", 0.0),
     "depth_m": ("Depth", 0.0),
     "altitude_m": ("Altitude", 0.0),
@@ -350,7 +350,7 @@ def read_uxo(path: Path) -> Recording:
     headers = _headers(table)
     files = {int(one.stem): one for one in (path / IMAGES).glob("*.pgm") if one.stem.isascii() and one.stem.isdigit()}
     plausible = _are_plausible(headers)
-    has_picture = np.array([int(index) in files and is_whole(files[int(index)]) for index in headers["index"]])
+    has_picture = np.array([int(index) in files and is_complete(files[int(index)]) for index in headers["index"]])
     notes = []
     if not plausible.all():
         notes.append(f"left out: {counted(int((~plausible).sum()), 'row')} of {TABLE} with implausible numbers")
@@ -376,14 +376,14 @@ def read_uxo(path: Path) -> Recording:
 def _headers(table: CsvTable) -> Header:
     """Return the rows of the table as headers of ARIS frames; invalid integers become 0, invalid floats nan."""
     headers: Header = np.zeros(len(table), dtype=[(name, FRAME[name]) for name in FRAME.names or ()])
-    for name, column in NEEDED.items():
+    for name, column in REQUIRED_COLUMNS.items():
         if headers.dtype[name].kind == "f":
             headers[name] = table.numbers(column)
         else:
             values = table.whole(column)
             most = min(int(np.iinfo(headers.dtype[name]).max), 2**62)
             headers[name] = np.where((values >= 0) & (values <= most), values, 0)
-    for name, (column, default) in OPTIONAL.items():
+    for name, (column, default) in OPTIONAL_COLUMNS.items():
         numbers = table.numbers(column, default)
         if headers.dtype[name].kind != "f":
             numbers = np.where((numbers >= 0) & (numbers < 2**31), numbers, 0)
@@ -459,13 +459,13 @@ IMAGE, POSE = "ImagingSonar", "PoseSensor"
 RATE_HZ = 10.0
 """Assumed frame rate of views, which have no times [Hz]."""
 
-SHAPE_LIMIT = 2**25
+MAX_CELLS = 2**25
 """Maximum number of cells of a view."""
 
 FORWARD_PORT_UP = Rotation.from_matrix([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 """Starboard, forward and up in the sensor's axes, as columns."""
 
-ORTHOGONAL = 1e-3
+ORTHOGONALITY_TOLERANCE = 1e-3
 """Largest tolerated error of the orthogonality of a rotation matrix."""
 
 
@@ -495,7 +495,7 @@ def read_neusis(path: Path) -> Recording:
         MitsonarError: if there is no configuration or no readable view, views differ in size, or a pose is invalid.
     """
     settings = _sonar_settings(path / "Config.json")
-    files = sorted((path / "Data").glob("*.pkl"), key=lambda one: naturally(one.name))
+    files = sorted((path / "Data").glob("*.pkl"), key=lambda one: natural_key(one.name))
     if not files:
         raise MitsonarError(f"{path / 'Data'} holds no .pkl file")
     shape, largest, matrices = None, 0.0, []
@@ -558,18 +558,12 @@ def _view(path: Path) -> tuple[FileArray, Array]:
     if missing:
         raise MitsonarError(f"{path} lacks {' and '.join(missing)}: it is not a view of a sonar")
     image, matrix = table[IMAGE], np.asarray(table[POSE], dtype=float)
-    if (
-        image.ndim != 2
-        or min(image.shape) < 2
-        or image.size > SHAPE_LIMIT
-        or not np.isfinite(image).all()
-        or image.min() < 0
-    ):
+    if image.ndim != 2 or min(image.shape) < 2 or image.size > MAX_CELLS or not np.isfinite(image).all() or image.min() < 0:
         raise MitsonarError(f"{IMAGE} of {path} must be an image (bins, beams) of finite values from 0: got {image.shape}")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or np.abs(matrix[:3, 3]).max() > 1e6:
         raise MitsonarError(f"{POSE} of {path} must be a matrix (4, 4) of finite numbers: got shape {matrix.shape}")
     rotation = matrix[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ORTHOGONAL or np.linalg.det(rotation) < 0:
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ORTHOGONALITY_TOLERANCE or np.linalg.det(rotation) < 0:
         raise MitsonarError(f"{POSE} of {path} holds no rotation: its columns must be orthogonal unit vectors")
     return image, matrix
 
@@ -591,12 +585,12 @@ def _sonar_settings(path: Path) -> dict[str, float]:
 # ---------------- Safe reading of pickled arrays
 
 
-LARGEST = 2**30
+MAX_PICKLE_BYTES = 2**30
 """Maximum size of a pickle [bytes]."""
 
-MOST_DIMENSIONS = 8
+MAX_DIMENSIONS = 8
 
-NUMBERS = "biuf"
+NUMBER_KINDS = "biuf"
 """Supported kinds of NumPy type."""
 
 PickledValue = Any
@@ -694,7 +688,7 @@ def read_pickled_arrays(path: Path) -> dict[str, FileArray]:
     Raises:
         MitsonarError: if the file does not exist, holds no dictionary, or refers to anything other than NumPy arrays.
     """
-    content = read_bytes(path, "pickle", LARGEST)
+    content = read_bytes(path, "pickle", MAX_PICKLE_BYTES)
     try:
         table = _ArrayUnpickler(io.BytesIO(content)).load()
         if not isinstance(table, dict):
@@ -729,10 +723,10 @@ def _from_bytes(content: PickledValue, kind: PickledValue, shape: PickledValue, 
         raise ValueError("an array has an invalid type")
     name = kind.arguments[0]
     big_endian = isinstance(kind.state, tuple) and len(kind.state) > 1 and kind.state[1] == ">"
-    if name[:1] not in NUMBERS or not name[1:].isdigit() or len(name) > 3:
+    if name[:1] not in NUMBER_KINDS or not name[1:].isdigit() or len(name) > 3:
         raise ValueError(f"an array of type {name[:20]} holds no numbers")
     dtype = np.dtype(name).newbyteorder(">" if big_endian else "<")
-    if not isinstance(shape, tuple) or len(shape) > MOST_DIMENSIONS or order not in ("C", "F"):
+    if not isinstance(shape, tuple) or len(shape) > MAX_DIMENSIONS or order not in ("C", "F"):
         raise ValueError("an array has an invalid shape")
     if not all(type(length) is int and 0 <= length < 2**40 for length in shape):
         raise ValueError("an array has an invalid shape")

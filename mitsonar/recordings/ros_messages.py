@@ -45,7 +45,7 @@ ROS1 = b"#ROSBAG V"
 MCAP = b"\x89MCAP0\r\n"
 SQLITE = b"SQLite format 3\x00"
 
-ENDS = {ROS1: ".bag", MCAP: ".mcap", SQLITE: ".db3"}
+SUFFIXES = {ROS1: ".bag", MCAP: ".mcap", SQLITE: ".db3"}
 """Required suffixes of single-file bags, keyed by their first bytes."""
 
 
@@ -143,7 +143,7 @@ class BagFile:
             return
         with self.path.open("rb") as file:
             first = file.read(len(SQLITE))
-        for begin, end in ENDS.items():
+        for begin, end in SUFFIXES.items():
             if first.startswith(begin) and self.path.suffix != end:
                 raise MitsonarError(f"{self.path} is a bag whose name must end with {end}: rename it")
 

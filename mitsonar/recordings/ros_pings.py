@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mitsonar.recordings.ros_messages import DTYPES, PROJECTED, Message
 
-__all__ = ["FORWARD_LEFT_UP", "PingLayout", "is_beam_major", "layout_of", "picture_of", "samples_of"]
+__all__ = ["SONAR_AXES_IN_FLU", "PingLayout", "decode_image", "is_beam_major", "parse_layout", "samples_of"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -41,7 +41,7 @@ BEARING_ATOL_RAD = 1e-4
 CENTIDEGREE = math.pi / 18_000
 """Unit of the bearings in Oculus messages [rad]."""
 
-FORWARD_LEFT_UP: Array = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+SONAR_AXES_IN_FLU: Array = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 """Unit vectors to starboard, forward and up as columns, in the axes forward, left, up (REP 103)."""
 
 MAX_DIRECTION = 1e6
@@ -86,7 +86,7 @@ class PingLayout:
         """Return the number of samples."""
         return len(self.range_m) * len(self.bearing_rad)
 
-    def resembles(self, other: PingLayout) -> bool:
+    def is_compatible_with(self, other: PingLayout) -> bool:
         """Return whether frames of both layouts belong to the same part of a recording."""
         return (
             self.range_m.shape == other.range_m.shape
@@ -98,7 +98,7 @@ class PingLayout:
         )
 
 
-def layout_of(message: Message, kind: str) -> PingLayout:
+def parse_layout(message: Message, kind: str) -> PingLayout:
     """Return the layout of a message.
 
     Args:
@@ -123,7 +123,7 @@ def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: b
     Args:
         message: decoded message.
         kind: type of the message.
-        layout: layout of the message, or of one that resembles it.
+        layout: layout of the message, or a compatible one.
         beam_major: whether the samples of each beam are contiguous, instead of those of each range, as drivers write them.
 
     Raises:
@@ -136,7 +136,7 @@ def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: b
             raise ValueError("the number of samples does not match ranges and beams")
         image = flat.reshape(shape[::-1]).T if beam_major else flat.reshape(shape)
     else:
-        image = picture_of(message.ping)
+        image = decode_image(message.ping)
         if image.shape != shape:
             raise ValueError(f"the picture is {image.shape[0]} x {image.shape[1]}, not {shape[0]} x {shape[1]}")
     return image[:, layout.order]
@@ -224,7 +224,7 @@ def _oculus(message: Message) -> PingLayout:
         bearing_rad=bearing[order],
         order=order,
         dtype="|u1",
-        axes=FORWARD_LEFT_UP,
+        axes=SONAR_AXES_IN_FLU,
         frame_id=str(message.header.frame_id),
         frequency_hz=_positive_or_zero(getattr(message, "frequency", 0.0)),
         sound_speed=_positive_or_zero(getattr(message, "speed_of_sound", 0.0)) or _positive_or_zero(fire.speed_of_sound),
@@ -233,7 +233,7 @@ def _oculus(message: Message) -> PingLayout:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def picture_of(picture: Message) -> NDArray[np.uint8]:
+def decode_image(picture: Message) -> NDArray[np.uint8]:
     """Return the grey values ``(rows, columns)`` of a ``sensor_msgs/Image`` or ``CompressedImage``.
 
     Raises:

@@ -31,7 +31,7 @@ ELEVATION_DEG = 20.0
 ORDER_FRAMES = 8
 """Maximum number of frames from which the order of samples is determined."""
 
-LARGEST_DELAY_S = 86_400.0
+MAX_DELAY_S = 86_400.0
 """Largest difference between the times of header and reception that is reported as a delay [s]."""
 
 
@@ -287,6 +287,6 @@ def _facts(scan: TopicScan, order: Index) -> Facts:
     if first.frequency_hz:
         facts["frequency_hz"] = first.frequency_hz
     delay = np.array(scan.received, dtype=float)[order] * 1e-9 - scan.frame_times()[order]
-    if np.abs(delay).max() < LARGEST_DELAY_S:
+    if np.abs(delay).max() < MAX_DELAY_S:
         facts["received_after_s"] = [round(float(delay.min()), 6), round(float(delay.max()), 6)]
     return facts

@@ -20,7 +20,7 @@ from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.recordings.pictures import Grey, Pictures, geometry_for, recording_of, refuse_size
 from mitsonar.recordings.recording import Part, Recording
 from mitsonar.recordings.ros_messages import FANS, PROJECTED, BagFile, Message, Topic, short
-from mitsonar.recordings.ros_pings import FORWARD_LEFT_UP, PingLayout, layout_of, picture_of
+from mitsonar.recordings.ros_pings import SONAR_AXES_IN_FLU, PingLayout, decode_image, parse_layout
 
 __all__ = ["Motion", "TopicScan", "motion_in", "read_ros_pictures", "with_motion"]
 
@@ -35,19 +35,19 @@ IMU = "sensor_msgs/msg/Imu"
 RANGE = "sensor_msgs/msg/Range"
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
-MOST_LINKS = 32
+MAX_LINKS = 32
 """Maximum number of transforms between a sonar and the world."""
 
-BEYOND_S = 0.25
+MAX_EXTRAPOLATION_S = 0.25
 """Time before the first pose and after the last one for which that pose is held constant [s]."""
 
-FARTHEST_M = 1e8
+MAX_COORDINATE_M = 1e8
 """Largest plausible coordinate of a position [m]."""
 
-NOT_UNIT = 0.1
+NORM_TOLERANCE = 0.1
 """Tolerated deviation of the norm of a quaternion from 1."""
 
-LARGEST_GAP_S = 2.0
+MAX_GAP_S = 2.0
 """Longest time between two poses over which poses are interpolated [s]."""
 
 
@@ -90,9 +90,9 @@ class Link:
         """Return positions ``(n, 3)`` [m] and rotations at the given times; None if the transforms do not cover them."""
         # 1. Drop implausible transforms, and sort the others by time without duplicates.
         table = np.array(self.numbers).reshape(-1, 8)
-        table = table[np.isfinite(table).all(axis=1) & (np.abs(table[:, 1:4]) < FARTHEST_M).all(axis=1)]
+        table = table[np.isfinite(table).all(axis=1) & (np.abs(table[:, 1:4]) < MAX_COORDINATE_M).all(axis=1)]
         table = table[(np.abs(table[:, 4:]) < 2).all(axis=1)]
-        table = table[np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) < NOT_UNIT]
+        table = table[np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) < NORM_TOLERANCE]
         table = table[np.unique(table[:, 0], return_index=True)[1]]
         if not len(table):
             return None
@@ -105,7 +105,7 @@ class Link:
         clamped_s = np.clip(time_s, known[0], known[-1])
         after = np.clip(np.searchsorted(known, clamped_s), 1, len(known) - 1)
         distance_s = np.minimum(clamped_s - known[after - 1], known[after] - clamped_s)
-        if np.abs(clamped_s - time_s).max() > BEYOND_S or (distance_s > LARGEST_GAP_S / 2).any():
+        if np.abs(clamped_s - time_s).max() > MAX_EXTRAPOLATION_S or (distance_s > MAX_GAP_S / 2).any():
             return None
         # 4. Interpolate positions linearly, and rotations on the sphere.
         place = np.column_stack([np.interp(clamped_s, known, axis) for axis in table[:, 1:4].T])
@@ -210,8 +210,8 @@ class _MotionSources:
         table = table[np.argsort(table[:, 0], kind="stable")]
         after = np.clip(np.searchsorted(table[:, 0], self.time_s), 1, max(1, len(table) - 1))
         ends = np.stack([table[after - 1], table[np.minimum(after, len(table) - 1)]])
-        near = np.abs(ends[:, :, 0] - self.time_s).min(axis=0) <= LARGEST_GAP_S / 2
-        table[~np.isfinite(table[:, 1]) | (table[:, 1] <= 0) | (table[:, 1] > FARTHEST_M), 1] = np.nan
+        near = np.abs(ends[:, :, 0] - self.time_s).min(axis=0) <= MAX_GAP_S / 2
+        table[~np.isfinite(table[:, 1]) | (table[:, 1] <= 0) | (table[:, 1] > MAX_COORDINATE_M), 1] = np.nan
         height = np.where(near, np.interp(self.time_s, table[:, 0], table[:, 1]), np.nan)
         return height if np.isfinite(height).any() else None
 
@@ -276,12 +276,12 @@ def _transforms(bag: BagFile, topics: Sequence[Topic]) -> dict[str, Link]:
 
 
 def _chain(links: dict[str, Link], frame: str) -> list[Link]:
-    """Return the links from a frame up to its root; an empty list if they are cyclic or more than ``MOST_LINKS``."""
+    """Return the links from a frame up to its root; an empty list if they are cyclic or more than ``MAX_LINKS``."""
     chain: list[Link] = []
     while frame in links:
         chain.append(links[frame])
         frame = links[frame].parent
-        if len(chain) > MOST_LINKS:
+        if len(chain) > MAX_LINKS:
             return []
     return chain
 
@@ -325,7 +325,7 @@ def _numbers(vector: Message) -> tuple[float, ...]:
 STAMP = 12
 """Size of a message up to the end of its time stamp [bytes], which follows a counter (ROS 1) or encoding bytes (ROS 2)."""
 
-NEAR = 8
+MAX_READ_GAP = 8
 """Largest distance between two requested frames up to which those in between are read rather than skipped."""
 
 
@@ -397,10 +397,10 @@ class TopicScan:
                 layout = self.layouts[number]
                 self._measure(raw[head : head + layout.cells * np.dtype(layout.dtype).itemsize], number)
                 return number
-        # 2. Decode the message, and find a layout that resembles its own.
+        # 2. Decode the message, and find a compatible layout.
         message = self.bag.decode(raw, self.topic.kind)
-        layout = layout_of(message, self.topic.kind)
-        number = next((index for index, one in enumerate(self.layouts) if one.resembles(layout)), len(self.layouts))
+        layout = parse_layout(message, self.topic.kind)
+        number = next((index for index, one in enumerate(self.layouts) if one.is_compatible_with(layout)), len(self.layouts))
         if number == len(self.layouts):
             self.layouts.append(layout)
         # 3. Remember the bytes ahead of the samples for the messages that follow.
@@ -449,7 +449,7 @@ class TopicScan:
         indices = np.unique(places)
         if not len(indices):
             return
-        for run in np.split(indices, np.flatnonzero(np.diff(indices) > NEAR) + 1):
+        for run in np.split(indices, np.flatnonzero(np.diff(indices) > MAX_READ_GAP) + 1):
             index_by_message = {(self.received[place], self.nth[place]): int(place) for place in run}
             times = [time for time, _ in index_by_message]
             last, count = -1, 0
@@ -514,7 +514,7 @@ def read_ros_pictures(bag: BagFile, topic: Topic, geometry: Path | None) -> Reco
     def read(place: int) -> Grey:
         (picture_message,) = (message for _, message in scan.frames(np.array([place])))
         try:
-            picture = picture_of(picture_message)
+            picture = decode_image(picture_message)
         except ValueError as error:
             raise MitsonarError(f"{bag.path}: message {place:,} of {topic.name}: {error}") from None
         if picture.shape != shape:
@@ -526,7 +526,7 @@ def read_ros_pictures(bag: BagFile, topic: Topic, geometry: Path | None) -> Reco
 
     (_, message) = next(scan.frames(np.array([0])))
     try:
-        rows, columns = picture_of(message).shape
+        rows, columns = decode_image(message).shape
     except ValueError as error:
         raise MitsonarError(f"{bag.path}: the first message of {topic.name}: {error}") from None
     refuse_size(rows, columns, f"a message of {topic.name}")
@@ -547,7 +547,7 @@ def read_ros_pictures(bag: BagFile, topic: Topic, geometry: Path | None) -> Reco
 def _with_poses(recording: Recording, bag: BagFile, frame_id: str) -> Recording:
     """Return the recording with the motion of the sonar from other topics of the bag."""
     part = recording.parts[0]
-    motion = motion_in(bag, frame_id, FORWARD_LEFT_UP, part.time_s)
+    motion = motion_in(bag, frame_id, SONAR_AXES_IN_FLU, part.time_s)
     part = with_motion(part, motion, np.arange(len(part)))
     facts = recording.facts | ({"poses": motion.origin} if motion.origin else {})
     return replace(recording, parts=(part,), facts=facts, notes=(*recording.notes, *motion.notes))

@@ -79,8 +79,8 @@ MOTION = {
 EARTH_M = 6_371_008.8
 """Mean radius of the earth [m]."""
 
-DEEPEST_M = 1.2e4
-HIGHEST_M = 1e4
+MAX_DEPTH_M = 1.2e4
+MAX_HEIGHT_M = 1e4
 """Largest plausible depth, and largest plausible height above the ground [m]."""
 
 
@@ -97,7 +97,7 @@ def attitude_of(headers: Header) -> Array | None:
 def height_of(headers: Header) -> Array | None:
     """Return the height above the ground ``(frames,)`` [m], nan where unknown; None if the vehicle never filled it in."""
     altitude_m = headers["altitude_m"].astype(float)
-    known = np.isfinite(altitude_m) & (altitude_m > 0) & (altitude_m < HIGHEST_M)
+    known = np.isfinite(altitude_m) & (altitude_m > 0) & (altitude_m < MAX_HEIGHT_M)
     return np.where(known, altitude_m, np.nan) if known.any() else None
 
 
@@ -113,7 +113,7 @@ def poses_of(headers: Header, attitude_rad: Array | None) -> Array | None:
     depth = headers["depth_m"].astype(float)
     east = (longitude - longitude[0]) * np.cos(latitude[0]) * EARTH_M
     north = (latitude - latitude[0]) * EARTH_M
-    return np.column_stack([east, north, -np.where(np.abs(depth) < DEEPEST_M, depth, 0.0), attitude_rad])
+    return np.column_stack([east, north, -np.where(np.abs(depth) < MAX_DEPTH_M, depth, 0.0), attitude_rad])
 
 
 # ---------------- ARIS files
@@ -155,12 +155,12 @@ CHANNELS = (10, 2, 14, 6, 8, 0, 12, 4, 11, 3, 15, 7, 9, 1, 13, 5)
 ARIS_CODING_DB = 80.0
 """Dynamic range of the values 0..255 [dB]."""
 
-MOST_SAMPLES = 65_536
-ARIS_LEAST_SPEED, ARIS_MOST_SPEED = 1000.0, 2000.0
-LONGEST_M = 1e4
+MAX_SAMPLES = 65_536
+ARIS_MIN_SPEED, ARIS_MAX_SPEED = 1000.0, 2000.0
+MAX_RANGE_M = 1e4
 """Plausible values of a header: maximum samples per beam, sound speed [m/s], maximum end of the window [m]."""
 
-SAME_SPEED = 0.002
+SPEED_TOLERANCE = 0.002
 """Relative change of the sound speed up to which a window counts as the same."""
 
 
@@ -212,10 +212,10 @@ def _aris_frames(data: Bytes, name: str) -> tuple[EqualFrames, int]:
     """Return the frames and the number of beams, as given by the first frame header."""
     first = np.frombuffer(data[FILE_HEADER : FILE_HEADER + FRAME.itemsize].tobytes(), FRAME)[0]
     mode, samples = int(first["ping_mode"]), int(first["samples"])
-    if mode not in BEAMS or not 0 < samples <= MOST_SAMPLES:
+    if mode not in BEAMS or not 0 < samples <= MAX_SAMPLES:
         raise MitsonarError(
             f"{name}: the first frame states ping mode {mode} and {samples:,} samples per beam; valid are ping modes 1 to "
-            f"12 and 1 to {MOST_SAMPLES:,} samples: the file is damaged"
+            f"12 and 1 to {MAX_SAMPLES:,} samples: the file is damaged"
         )
     frames = EqualFrames(data, FILE_HEADER, FRAME, samples * BEAMS[mode])
     if not len(frames):
@@ -228,12 +228,14 @@ def _aris_frames(data: Bytes, name: str) -> tuple[EqualFrames, int]:
 def _valid_frames(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which frames have a plausible header, and sentences on the others."""
     first, stated_speed = headers[0], headers["sound_speed"].astype(float)
-    speed = np.where((stated_speed > ARIS_LEAST_SPEED) & (stated_speed < ARIS_MOST_SPEED), stated_speed, np.nan)
+    speed = np.where((stated_speed > ARIS_MIN_SPEED) & (stated_speed < ARIS_MAX_SPEED), stated_speed, np.nan)
     valid = (headers["signature"] == SIGNATURE) & (headers["ping_mode"] == first["ping_mode"])
     valid &= headers["samples"] == first["samples"]
     end_us = headers["start_delay_us"] + headers["sample_period_us"] * headers["samples"].astype(float)
     valid &= (
-        (headers["sample_period_us"] > 0) & (end_us * 1e-6 * speed / 2 < LONGEST_M) & np.isin(headers["system"], list(KINDS))
+        (headers["sample_period_us"] > 0)
+        & (end_us * 1e-6 * speed / 2 < MAX_RANGE_M)
+        & np.isin(headers["system"], list(KINDS))
     )
     has_table = valid & _has_beam_table(headers)
     valid = has_table if has_table.any() else valid  # if all frames lack a table, a later error names the missing one
@@ -259,7 +261,7 @@ def windows_of(headers: Header) -> list[tuple[float, ...]]:
     names = ("start_delay_us", "sample_period_us", "large_lens", "system", "high_frequency")
     keys, speed = [], 0.0
     for header in headers:
-        if abs(float(header["sound_speed"]) - speed) > SAME_SPEED * speed:
+        if abs(float(header["sound_speed"]) - speed) > SPEED_TOLERANCE * speed:
             speed = float(header["sound_speed"])
         keys.append((speed, *(float(header[name]) for name in names)))
     return keys
@@ -444,7 +446,7 @@ LENGTHS_M = {
 STEPS_M = {0: 0.42, CLASSIC: 0.375}
 """Nominal step of the window start [m] at high frequency, extended and classic; twice as much at low frequency."""
 
-MOST_START, MOST_LENGTH = 31, 3
+MAX_START_CODE, MAX_LENGTH_CODE = 31, 3
 """Largest codes of the window start and length."""
 
 DELAY_S = {True: 0.512e-3, False: 0.572e-3}
@@ -456,13 +458,13 @@ FREQUENCIES_HZ = {0: (1.1e6, 1.8e6), LONG_RANGE: (0.7e6, 1.2e6)}
 NOMINAL_SPEED = 1500.0
 """Sound speed if the file holds none [m/s]."""
 
-DIDSON_LEAST_SPEED, DIDSON_MOST_SPEED = 1300, 1700
+DIDSON_MIN_SPEED, DIDSON_MAX_SPEED = 1300, 1700
 """Range of plausible sound speeds [m/s]."""
 
 DIDSON_CODING_DB = 90.0
 """Dynamic range of the values 0..255 [dB]."""
 
-DIFFERS = 0.1
+WINDOW_TOLERANCE = 0.1
 """Relative difference between the window computed from timing and the nominal window beyond which a note is added."""
 
 CLOCK = {
@@ -471,7 +473,7 @@ CLOCK = {
 }  # fmt: skip
 """Fields of the sonar's clock, and their valid ranges."""
 
-LONGEST_TIE = 3.0
+MAX_TIE_PERIODS = 3.0
 """Largest gap, in nominal frame periods per frame, over which frames with equal times are spread."""
 
 LENS = {48: (1.0, 0.0015, 1.3351), 96: (1.012, 0.0030, 2.6829)}
@@ -503,7 +505,9 @@ def read_didson(path: str | Path) -> Recording:
     frames = _didson_frames(data, head, version, name)
     headers = frames.table()
     valid = (
-        (headers["signature"] == data[:4].tobytes()) & (headers["start_code"] <= MOST_START) & (headers["length_code"] < 4)
+        (headers["signature"] == data[:4].tobytes())
+        & (headers["start_code"] <= MAX_START_CODE)
+        & (headers["length_code"] < 4)
     )
     notes = [f"left out: {counted(int((~valid).sum()), 'frame')} with a damaged header"] if not valid.all() else []
     notes += [f"the last {frames.left_over:,} bytes are not a complete frame and are left out"] if frames.left_over else []
@@ -521,10 +525,10 @@ def read_didson(path: str | Path) -> Recording:
 def _didson_frames(data: Bytes, head: np.void, version: int, name: str) -> EqualFrames:
     """Return the frames; the size of the file header is the one after which a frame with the signature begins."""
     beams, samples = int(head["beams"]), int(head["samples"])
-    if beams not in LENS or not 0 < samples <= MOST_SAMPLES:
+    if beams not in LENS or not 0 < samples <= MAX_SAMPLES:
         raise MitsonarError(
             f"{name}: the file states {beams:,} beams and {samples:,} samples per beam; a DIDSON has 48 or 96 beams and 1 "
-            f"to {MOST_SAMPLES:,} samples: the file is damaged"
+            f"to {MAX_SAMPLES:,} samples: the file is damaged"
         )
     for size in FILE_HEADERS[version]:
         if data[size + 12 : size + 16].tobytes() == data[:4].tobytes():
@@ -570,7 +574,7 @@ def _spread(time_s: Array, number: Index, period_s: float) -> tuple[Array, list[
     begin = np.flatnonzero(new)
     count = np.diff(begin, append=len(time_s))
     gap = np.append(np.diff(time_s[begin]), np.nan)
-    gap = np.where((gap > 0) & (gap < LONGEST_TIE * period_s * count), gap, period_s * count)
+    gap = np.where((gap > 0) & (gap < MAX_TIE_PERIODS * period_s * count), gap, period_s * count)
     # 3. Divide that time evenly among the frames of the group.
     group = np.cumsum(new) - 1
     part = (np.arange(len(time_s)) - begin[group]) / count[group]
@@ -595,7 +599,7 @@ class _Windows:
     @property
     def sound_speed(self) -> float:
         stated = int(self.head["sound_speed"])
-        return float(stated) if DIDSON_LEAST_SPEED <= stated <= DIDSON_MOST_SPEED else NOMINAL_SPEED
+        return float(stated) if DIDSON_MIN_SPEED <= stated <= DIDSON_MAX_SPEED else NOMINAL_SPEED
 
     def config(self, header: np.void) -> int:
         """Return the configuration of a frame; for old sonars, which do not record it, it follows from the serial number."""
@@ -620,20 +624,23 @@ class _Windows:
         if not (math.isfinite(rate) and 1e2 < rate < 1e8):
             return begin, length * self.sound_speed / NOMINAL_SPEED
         reference = int(self.head["length_code"])
-        whole = nominal_window(0, reference if reference <= MOST_LENGTH else code, config, high=self.high)[1]
+        whole = nominal_window(0, reference if reference <= MAX_LENGTH_CODE else code, config, high=self.high)[1]
         return begin, samples * self.sound_speed / (2 * rate) * length / whole
 
     def notes(self, headers: Header) -> list[str]:
         """Return at most ten sentences: on what is assumed, and on windows for which timing and tables disagree."""
         notes = []
-        if not DIDSON_LEAST_SPEED <= int(self.head["sound_speed"]) <= DIDSON_MOST_SPEED:
+        if not DIDSON_MIN_SPEED <= int(self.head["sound_speed"]) <= DIDSON_MAX_SPEED:
             notes.append(f"the file holds no sound speed: {NOMINAL_SPEED:g} m/s is assumed")
         rate = float(self.head["sample_rate_hz"])
         if not (math.isfinite(rate) and 1e2 < rate < 1e8):
             notes.append("the file holds no sample rate: windows have their nominal lengths")
         for one in {self.key(header): header for header in headers}.values():
             (start, length), (expected, whole) = self.timed(one), self.nominal(one)
-            if abs(start - expected) > DIFFERS * max(expected, 1.0) or abs(length - whole) > DIFFERS * whole:
+            if (
+                abs(start - expected) > WINDOW_TOLERANCE * max(expected, 1.0)
+                or abs(length - whole) > WINDOW_TOLERANCE * whole
+            ):
                 notes.append(
                     f"a window lies at {start:.3g} to {start + length:.3g} m by its timing, and nominally at "
                     f"{expected:.3g} to {expected + whole:.3g} m: the timing is used"

@@ -16,17 +16,17 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.recordings.recording import CHUNK_BYTES, Bytes, Header, layout
 from mitsonar.recordings.sound_metrics import ARIS_CODING_DB as CODING_DB
 from mitsonar.recordings.sound_metrics import (
-    ARIS_LEAST_SPEED as LEAST_SPEED,
+    ARIS_MAX_SPEED as MAX_SPEED,
 )
 from mitsonar.recordings.sound_metrics import (
-    ARIS_MOST_SPEED as MOST_SPEED,
+    ARIS_MIN_SPEED as MIN_SPEED,
 )
 from mitsonar.recordings.sound_metrics import (
     BEAMS,
     EARTH_M,
     FRAME,
     KINDS,
-    MOST_SAMPLES,
+    MAX_SAMPLES,
     SIGNATURE,
     TABLES,
     aris_bearings,
@@ -55,7 +55,7 @@ Array = NDArray[np.float64]
 Values = NDArray[np.float32] | NDArray[np.uint8]
 """Values 0..255 of images ``(n, bins, beams)``."""
 
-EXACT = 0.05
+MAX_AXIS_ERROR = 0.05
 """Largest deviation of the written range axis from that of the frames, in bins, up to which nothing is interpolated."""
 
 
@@ -200,9 +200,9 @@ def window_of(range_m: Array, sound_speed: float) -> ArisWindow:
     Raises:
         MitsonarError: if the format cannot hold the sound speed or the window.
     """
-    if not LEAST_SPEED < sound_speed < MOST_SPEED:
+    if not MIN_SPEED < sound_speed < MAX_SPEED:
         raise MitsonarError(
-            f"an ARIS file holds sound speeds of {LEAST_SPEED:g} to {MOST_SPEED:g} m/s: got {sound_speed:g}; write "
+            f"an ARIS file holds sound speeds of {MIN_SPEED:g} to {MAX_SPEED:g} m/s: got {sound_speed:g}; write "
             "frames with another sound speed"
         )
     speed = float(np.float32(sound_speed))
@@ -212,16 +212,16 @@ def window_of(range_m: Array, sound_speed: float) -> ArisWindow:
     period, delay = step * 2e6 / speed, range_m[0] * 2e6 / speed
     whole = max(1, round(period))
     axis = (round(delay) + np.arange(bins) * whole) * speed * 5e-7
-    if np.abs(axis - range_m).max() < EXACT * step:
+    if np.abs(axis - range_m).max() < MAX_AXIS_ERROR * step:
         window = ArisWindow(round(delay), whole, bins, speed, exact=True)
     else:
         # 2. If they differ, shorten the period, so that interpolation loses no resolution, and cover the same window.
         finer = max(1, int(period + 1e-6))
         samples = int((range_m[-1] * 2e6 / speed - round(delay)) / finer + 1e-6) + 1
         window = ArisWindow(round(delay), finer, samples, speed, exact=False)
-    if not 0 < window.samples <= MOST_SAMPLES or window.delay_us >= 1e8 or window.period_us >= 1e6:
+    if not 0 < window.samples <= MAX_SAMPLES or window.delay_us >= 1e8 or window.period_us >= 1e6:
         raise MitsonarError(
-            f"an ARIS file holds up to {MOST_SAMPLES:,} samples per beam: the frames' {bins:,} bins from {range_m[0]:.4g} "
+            f"an ARIS file holds up to {MAX_SAMPLES:,} samples per beam: the frames' {bins:,} bins from {range_m[0]:.4g} "
             f"to {range_m[-1]:.4g} m take {window.samples:,}; write a shorter window"
         )
     return window
@@ -249,7 +249,7 @@ SALINITIES = (0, 15, 35)
 ORIGIN_DEG = (0.0, -30.0)
 """Default latitude and longitude of x = y = 0 [deg]: in the open Atlantic, on the equator."""
 
-LATEST_S = 2.0**53 / 1e6
+MAX_TIME_S = 2.0**53 / 1e6
 """Latest time that a float represents exactly in whole microseconds [s]."""
 
 
@@ -373,7 +373,7 @@ class _Writer:
     def _times(self, frames: SonarFrames) -> NDArray[np.int64]:
         """Return the times of frames ``(n,)`` in whole microseconds."""
         time_s = frames.time_s.mean(axis=1) if frames.time_s.ndim == 2 else frames.time_s
-        if not (np.isfinite(time_s).all() and (time_s >= 0).all() and (time_s < LATEST_S).all()):
+        if not (np.isfinite(time_s).all() and (time_s >= 0).all() and (time_s < MAX_TIME_S).all()):
             raise MitsonarError("times of an ARIS file must be seconds since 1970, from 0: the frames have other times")
         time_us = np.rint(time_s * 1e6).astype(np.int64)
         if time_us[0] <= self.last_us or (np.diff(time_us) <= 0).any():

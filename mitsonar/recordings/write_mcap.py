@@ -218,7 +218,7 @@ TOPICS = {
 }
 """Topics that may be written, with their types."""
 
-LARGEST_FAN = 800
+MAX_FAN_ROWS = 800
 """Maximum number of rows of a fan."""
 
 PICTURES = {"png": ("PNG", {"compress_level": 3}), "jpeg": ("JPEG", {"quality": 92})}
@@ -351,7 +351,7 @@ class FrameEncoder:
 
     @cached_property
     def _map(self) -> CartesianMap:
-        rows = min(LARGEST_FAN, max(2, len(self.like.range_m)))
+        rows = min(MAX_FAN_ROWS, max(2, len(self.like.range_m)))
         return cartesian_map(self.like.range_m, self.like.bearing_rad, rows=rows)
 
     def _fan(self, frames: SonarFrames, index: int, time: int) -> RosObject:

@@ -47,10 +47,10 @@ UP = {"x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)), "y": ((1, 0, 0), (0, 0, -1), (0, 1
 MOST_TRIANGLES = 50_000_000
 """Largest number of triangles of a model, including all copies."""
 
-MOST_PIXELS = 2**26
+MAX_PIXELS = 2**26
 """Largest number of pixels of a picture of a model."""
 
-LARGEST_FILE = 2**32
+MAX_FILE_BYTES = 2**32
 """Largest size of a model file [bytes]."""
 
 
@@ -158,8 +158,8 @@ def _check_file(path: Path) -> None:
         ValueError: the file is too large, or its header announces more data than it has.
     """
     size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise ValueError(f"it has {size:,} bytes, more than {LARGEST_FILE:,}")
+    if size > MAX_FILE_BYTES:
+        raise ValueError(f"it has {size:,} bytes, more than {MAX_FILE_BYTES:,}")
     kind = path.suffix.lower()
     if kind == ".ply":
         check_counts(path)
@@ -197,8 +197,8 @@ def _check_copies(scene: trimesh.Scene) -> None:
         material = getattr(geometry.visual, "material", None)
         for name in ("baseColorTexture", "image"):
             picture = getattr(material, name, None)
-            if picture is not None and picture.width * picture.height > MOST_PIXELS:
-                raise ValueError(f"a picture has {picture.width:,} x {picture.height:,} pixels, more than {MOST_PIXELS:,}")
+            if picture is not None and picture.width * picture.height > MAX_PIXELS:
+                raise ValueError(f"a picture has {picture.width:,} x {picture.height:,} pixels, more than {MAX_PIXELS:,}")
     if total > MOST_TRIANGLES:
         raise ValueError(f"it places {total:,} triangles, more than {MOST_TRIANGLES:,}")
 

@@ -43,16 +43,16 @@ __all__ = [
 ]
 
 
-DEEPEST = 100
+MAX_DEPTH = 100
 """Largest depth of objects that contain or refer to each other."""
 
 MAX_PATHS = 10**8
 """Largest number of paths along references from object to object; Mitsuba follows every one."""
 
-MOST_PIXELS = 2**28
+MAX_PIXELS = 2**28
 """Largest number of pixels of all pictures of a scene."""
 
-BYTES_A_PIXEL = 28
+BYTES_PER_PIXEL = 28
 """Memory that Mitsuba needs to read a pixel [bytes]: its stored value, and its value in single precision."""
 
 PICTURES = ("bitmap", "envmap")
@@ -94,11 +94,11 @@ def check_parsed(state: mi.parser.ParserState) -> None:
             except MitsonarError as error:
                 where = f"{node.props.plugin_name()} {node.props.id()}".strip()[:100]
                 raise MitsonarError(f"{where}, {name[:60]}: {error}") from None
-    if pixels > MOST_PIXELS:
+    if pixels > MAX_PIXELS:
         raise MitsonarError(
-            f"its pictures have {pixels:,} pixels, more than the {MOST_PIXELS:,} that are allowed: make them smaller"
+            f"its pictures have {pixels:,} pixels, more than the {MAX_PIXELS:,} that are allowed: make them smaller"
         )
-    refuse_beyond_memory(BYTES_A_PIXEL * pixels, "its pictures")
+    refuse_beyond_memory(BYTES_PER_PIXEL * pixels, "its pictures")
 
 
 def _check_numbers(props: mi.Properties, name: str) -> None:
@@ -222,8 +222,8 @@ def _check_references(state: mi.parser.ParserState) -> None:
             elif not path_counts[child]:
                 path.append((child, iter(children[child])))
                 waiting.add(child)
-    if max(depths, default=0) > DEEPEST:
-        raise MitsonarError(f"its objects refer to each other more than {DEEPEST} levels deep: it is not a scene")
+    if max(depths, default=0) > MAX_DEPTH:
+        raise MitsonarError(f"its objects refer to each other more than {MAX_DEPTH} levels deep: it is not a scene")
     if sum(path_counts) > MAX_PATHS:
         raise MitsonarError(f"its objects refer to each other along more than {MAX_PATHS:,} paths: it is not a scene")
 
@@ -288,31 +288,31 @@ class SceneFile(Family):
 # ---------------- XML text
 
 
-LARGEST = 2**28
+MAX_XML_BYTES = 2**28
 """Largest size of a scene's XML, including all files that it includes [bytes]."""
 
-LARGEST_SPECTRUM = 2**22
+MAX_SPECTRUM_BYTES = 2**22
 """Largest size of a spectrum file [bytes]."""
 
-MOST_ELEMENTS = 2_000_000
+MAX_ELEMENTS = 2_000_000
 """Largest number of elements."""
 
-MOST_FILES = 1_000
+MAX_FILES = 1_000
 """Largest number of files read, counting repeated includes."""
 
-MOST_INCLUDED = 15
+MAX_INCLUDE_DEPTH = 15
 """Largest depth of nested includes, the same as Mitsuba's limit."""
 
-MOST_PARAMETERS = 1_000
+MAX_PARAMETERS = 1_000
 """Largest number of parameters; Mitsuba compares each with each."""
 
-LONGEST_VALUE = 2**16
+MAX_VALUE_LENGTH = 2**16
 """Largest length of an attribute after its parameters are replaced [characters]."""
 
-MOST_WORK = 2**31
+MAX_WORK = 2**31
 """Largest number of characters that Mitsuba may compare and move to replace parameters: about a second."""
 
-SEARCH = 300
+SEARCH_COST = 300
 """Cost of one search for a parameter, as an equivalent number of characters."""
 
 SKIPPED = {b"<!--": b"-->", b"<![CDATA[": b"]]>", b"<?": b"?>"}
@@ -372,18 +372,18 @@ class _Text:
 
     def check(self, path: Path, folders: list[Path], depth: int) -> None:
         """Check a file and its includes, and search ``folders`` for the files that it names; ``<path>`` adds a folder."""
-        if depth >= MOST_INCLUDED:
+        if depth >= MAX_INCLUDE_DEPTH:
             raise MitsonarError(
-                f"{path} is included {depth} files deep, the maximum is {MOST_INCLUDED}: does it include itself?"
+                f"{path} is included {depth} files deep, the maximum is {MAX_INCLUDE_DEPTH}: does it include itself?"
             )
         self.files += 1
-        if self.files > MOST_FILES:
-            raise MitsonarError(f"{path} is one of more than {MOST_FILES:,} files that the scene includes: include fewer")
-        refuse_irregular(path, "scene", LARGEST - self.size)
-        content = _utf8(read_bytes(path, "scene", LARGEST - self.size), path)
+        if self.files > MAX_FILES:
+            raise MitsonarError(f"{path} is one of more than {MAX_FILES:,} files that the scene includes: include fewer")
+        refuse_irregular(path, "scene", MAX_XML_BYTES - self.size)
+        content = _utf8(read_bytes(path, "scene", MAX_XML_BYTES - self.size), path)
         self.size += len(content)
         for name, attributes in self._elements(content, path):
-            plain = b"$" not in attributes and b"&" not in attributes and name not in READ
+            plain = b"$" not in attributes and b"&" not in attributes and name not in EVALUATED
             given = {} if plain else self._expanded(attributes, path)
             match name:
                 case b"default":
@@ -399,7 +399,7 @@ class _Text:
                 case b"spectrum":
                     target = _find_file(given.get("filename", ""), folders)
                     if target is not None:
-                        refuse_irregular(target, "spectrum", LARGEST_SPECTRUM)
+                        refuse_irregular(target, "spectrum", MAX_SPECTRUM_BYTES)
 
     def _elements(self, content: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
         """Yield the name and the attributes of each element."""
@@ -419,12 +419,12 @@ class _Text:
                 if not opened and self.elements > before:
                     raise _malformed(path, content, place, "there is a second root element")
                 self.elements += 1
-                if self.elements > MOST_ELEMENTS:
-                    raise MitsonarError(f"{path} has more than {MOST_ELEMENTS:,} elements: put the shapes into mesh files")
+                if self.elements > MAX_ELEMENTS:
+                    raise MitsonarError(f"{path} has more than {MAX_ELEMENTS:,} elements: put the shapes into mesh files")
                 if not closed:
                     opened.append(name)
-                if len(opened) > DEEPEST:
-                    raise MitsonarError(f"{path} nests its elements more than {DEEPEST} levels deep: it is not a scene")
+                if len(opened) > MAX_DEPTH:
+                    raise MitsonarError(f"{path} nests its elements more than {MAX_DEPTH} levels deep: it is not a scene")
                 yield name, attributes
             elif (tag := CLOSED.match(content, place)) is not None:
                 if not opened or opened.pop() != tag[1]:
@@ -457,18 +457,20 @@ class _Text:
                 value = value[:place] + new + value[place + len(key) :]
                 place += len(new)
                 self._work(len(value), path)
-                if len(value) > LONGEST_VALUE:
-                    raise MitsonarError(f"{path} has a value that its parameters make longer than {LONGEST_VALUE:,} letters")
+                if len(value) > MAX_VALUE_LENGTH:
+                    raise MitsonarError(
+                        f"{path} has a value that its parameters make longer than {MAX_VALUE_LENGTH:,} letters"
+                    )
         return value.replace("\\$", "$")
 
     def _work(self, letters: int, path: Path) -> None:
-        self.work += letters + SEARCH
-        if self.work > MOST_WORK:
+        self.work += letters + SEARCH_COST
+        if self.work > MAX_WORK:
             raise MitsonarError(f"{path} uses its parameters too often: write the values themselves")
 
     def _count(self, parameters: int) -> None:
-        if parameters > MOST_PARAMETERS:
-            raise MitsonarError(f"a scene may have {MOST_PARAMETERS:,} parameters: got more; write the values themselves")
+        if parameters > MAX_PARAMETERS:
+            raise MitsonarError(f"a scene may have {MAX_PARAMETERS:,} parameters: got more; write the values themselves")
 
     def _add(self, name: str, value: str) -> None:
         """Add the default of a parameter, unless the parameter already has a value."""
@@ -483,7 +485,7 @@ class _Text:
 SPACES = bytes.maketrans(b"\t\r\n", b"   ")
 """Translation of white space in an attribute to blanks."""
 
-READ = (b"default", b"include", b"path", b"spectrum")
+EVALUATED = (b"default", b"include", b"path", b"spectrum")
 """Elements whose attributes the check evaluates."""
 
 
@@ -534,7 +536,7 @@ def _malformed(path: Path, content: bytes, place: int, reason: str) -> MitsonarE
 LARGEST_COORDINATE = 1e12
 """Largest magnitude of vertices, normals and texture coordinates; beyond it single precision overflows."""
 
-LONGEST_MESH_HEADER = 2**16
+MAX_PLY_HEADER_BYTES = 2**16
 """Largest size of a PLY header [bytes]."""
 
 MESH_INFLATION = 1032
@@ -685,7 +687,7 @@ def check_counts(path: Path) -> None:
         ValueError: the file is too short.
     """
     with path.open("rb") as file:
-        order, elements, start = _ply_header(file.read(LONGEST_MESH_HEADER), strict=False)
+        order, elements, start = _ply_header(file.read(MAX_PLY_HEADER_BYTES), strict=False)
     for element in elements:
         kinds = [element.counted.get(name, kind) for name, kind in element.scalars.items()]
         start += element.count * (2 * len(kinds) if order is None else sum(np.dtype(kind).itemsize for kind in kinds))
@@ -713,7 +715,7 @@ def _check_ply(content: bytes) -> None:
 
 def _ply_header(content: bytes, strict: bool = True) -> tuple[str | None, list[_Element], int]:
     """Parse a PLY header; return the byte order (None: text), the elements, and the offset of the data."""
-    end = content.find(b"end_header", 0, LONGEST_MESH_HEADER)
+    end = content.find(b"end_header", 0, MAX_PLY_HEADER_BYTES)
     stop = content.find(b"\n", end)
     if not content.startswith(b"ply") or end < 0 or stop < 0 or content[end + 10 : stop].strip():
         raise _FaultError("it has no header of PLY")
@@ -899,7 +901,7 @@ CHECKS = {"ply": _check_ply, "obj": _check_obj, "serialized": _check_serialized}
 # Their headers are checked before Mitsuba allocates what they announce.
 
 
-LONGEST_PICTURE_HEADER = 2**20
+MAX_PICTURE_HEADER_BYTES = 2**20
 """Bytes at the beginning of a picture that are searched for its size."""
 
 PICTURE_INFLATION = 1100
@@ -926,7 +928,7 @@ def pixels_of(path: Path) -> int:
     refuse_irregular(path, "picture")
     size = path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(LONGEST_PICTURE_HEADER)
+        head = file.read(MAX_PICTURE_HEADER_BYTES)
         file.seek(max(0, size - 18))
         tail = file.read(18)
     try:
@@ -1034,7 +1036,7 @@ def check_tensors(path: Path) -> None:
     refuse_irregular(path, "table")
     size = path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(LONGEST_PICTURE_HEADER)
+        head = file.read(MAX_PICTURE_HEADER_BYTES)
     try:
         if not head.startswith(b"tensor_file\0"):
             raise ValueError

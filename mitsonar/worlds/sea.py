@@ -42,13 +42,13 @@ TO_19_5_M = 1.026
 """Ratio of the wind speeds at 19.5 m, which Pierson and Moskowitz use, and at 10 m (Stewart, Introduction to Physical
 Oceanography, 16.4)."""
 
-LOWEST = 0.3
+LOWEST_RATIO = 0.3
 """Lowest frequency of an integral, relative to the peak; waves below it have no energy: exp(-154)."""
 
-HIGHEST = 1000.0
+HIGHEST_RATIO = 1000.0
 """Highest frequency of an integral, relative to the peak; waves above it have 1e-12 of the variance."""
 
-REACH = (100.0, 17_000.0)
+FETCH_LIMITS = (100.0, 17_000.0)
 """Smallest and largest dimensionless fetch g x / U^2; at the largest, the peak is that of a fully developed sea."""
 
 STEPS = 4000
@@ -136,7 +136,7 @@ class WaveSpectrum:
 
     def _band(self, shortest_m: float, longest_m: float) -> NDArray[np.float64]:
         """Return the frequencies of the waves between two lengths, logarithmically spaced."""
-        low, high = LOWEST * self.peak_rad_s, HIGHEST * self.peak_rad_s
+        low, high = LOWEST_RATIO * self.peak_rad_s, HIGHEST_RATIO * self.peak_rad_s
         if longest_m < math.inf:
             low = max(low, float(self.frequency(np.array(2 * math.pi / longest_m))))
         if shortest_m > 0:
@@ -169,7 +169,7 @@ def jonswap(wind_m_s: float, fetch_m: float, depth_m: float = math.inf) -> WaveS
         MitsonarError: the fetch is shorter than those measured, or so long that the peak frequency would lie below that of a
             fully developed sea.
     """
-    least, grown = (reach * wind_m_s**2 / GRAVITY for reach in REACH)
+    least, grown = (reach * wind_m_s**2 / GRAVITY for reach in FETCH_LIMITS)
     if not least <= fetch_m <= grown:
         raise MitsonarError(
             f"jonswap holds for fetches from {least / 1000:.3g} to {grown / 1000:.3g} km at a wind of {wind_m_s:g} m/s: got "
@@ -201,7 +201,7 @@ def spreading(angle: NDArray[np.float64], exponent: float) -> NDArray[np.float64
 MOST_TRIANGLES = 2_000_000
 """Largest number of triangles of a surface, the limit of mirrors in impulse responses."""
 
-FEWEST_STEPS = 8
+MIN_STEPS = 8
 """Smallest number of steps along the edge."""
 
 MATERIAL = "surface.yaml"
@@ -258,9 +258,9 @@ class SeaSurface(Family):
         if self.wind_m_s == 0:
             return self
         steps = self.size_m / self.step_m
-        if steps < FEWEST_STEPS:
+        if steps < MIN_STEPS:
             raise ValueError(
-                f"size_m must be at least {FEWEST_STEPS} step_m, {FEWEST_STEPS * self.step_m:g} m: got {self.size_m:g} m"
+                f"size_m must be at least {MIN_STEPS} step_m, {MIN_STEPS * self.step_m:g} m: got {self.size_m:g} m"
             )
         if 2 * round(steps) ** 2 > MOST_TRIANGLES:
             least = self.size_m / math.isqrt(MOST_TRIANGLES // 2)
@@ -386,7 +386,7 @@ SHORTEST = 4
 INNER = 4
 """Largest index along both axes of the wave vectors that are subdivided."""
 
-CALM = 0.4
+CALM_FRACTION = 0.4
 """Wave vectors below this fraction of the peak's are not subdivided further: they have 1e-20 of the variance."""
 
 
@@ -454,7 +454,7 @@ def wave_heights(sea: Sea, count: int, step_m: float, seed: int, time_s: float) 
 
 def _long_waves(sea: Sea, lattice: float, step_m: float) -> list[_Waves]:
     """Return the wave vectors that replace the innermost ones of a lattice, in successively finer lattices."""
-    calm = CALM * sea.spectrum.wavenumber(sea.spectrum.peak_rad_s)
+    calm = CALM_FRACTION * sea.spectrum.wavenumber(sea.spectrum.peak_rad_s)
     lattices = []
     outer = 3 * INNER + 1
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.arange(-outer, outer + 1.0)] * 2))
@@ -508,7 +508,7 @@ def _smooth(count: int) -> int:
 Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
 """Vertices ``(vertices, 3)`` [m] and outward triangles ``(faces, 3)``."""
 
-MOST = 5_000_000
+MAX_COPIES = 5_000_000
 """Largest number of particles or bars."""
 
 
@@ -527,8 +527,8 @@ def particle_mesh(count: int, size_m: tuple[float, float, float], radius_m: floa
     Raises:
         MitsonarError: there are no particles or too many, or a size is not positive.
     """
-    if not 1 <= count <= MOST or not min(*size_m, radius_m) > 0:
-        raise MitsonarError(f"particles are 1..{MOST:,} of positive size: got {count} of {radius_m:g} m in {size_m} m")
+    if not 1 <= count <= MAX_COPIES or not min(*size_m, radius_m) > 0:
+        raise MitsonarError(f"particles are 1..{MAX_COPIES:,} of positive size: got {count} of {radius_m:g} m in {size_m} m")
     rng = np.random.default_rng(seed)
     corners = np.concatenate([np.eye(3), -np.eye(3)]) * radius_m
     sides = [[x, y, z] for x in (0, 3) for y in (1, 4) for z in (2, 5)]
@@ -557,8 +557,8 @@ def fishing_net_mesh(width_m: float, height_m: float, opening_m: float, twine_m:
             f"a net has twine < opening <= size: got {twine_m:g}, {opening_m:g}, {width_m:g}, {height_m:g} m"
         )
     across, up = (round(size / opening_m) for size in (width_m, height_m))
-    if (across + 1) * up + (up + 1) * across > MOST:
-        raise MitsonarError(f"a net has at most {MOST:,} bars: enlarge opening_m, got {opening_m:g}")
+    if (across + 1) * up + (up + 1) * across > MAX_COPIES:
+        raise MitsonarError(f"a net has at most {MAX_COPIES:,} bars: enlarge opening_m, got {opening_m:g}")
     # 1. Place the knots. From each, one bar rises and one leads east, except at the upper and the eastern edge.
     x, z = (a.ravel() for a in np.meshgrid(np.arange(across + 1), np.arange(up + 1), indexing="ij"))
     knots = np.column_stack([x, np.zeros_like(x), z]) * opening_m

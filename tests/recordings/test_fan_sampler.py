@@ -37,7 +37,7 @@ def test_each_cell_holds_the_value_of_its_place(changed: dict[str, Any]) -> None
     keys = dict(changed)
     apex = (119.5, 210.25 if changed.get("forward") != "down" else 199 - 210.25)
     geometry = PictureGeometry.create(**{**FAN, "apex_px": apex}, range_max=10, **keys)
-    sampler = FanSampler.of(geometry, *picture.shape)
+    sampler = FanSampler.from_geometry(geometry, *picture.shape)
     assert sampler.bins == 140
     found = sampler.apply(picture)
     wanted = smooth(*axes(sampler.bins, sampler.beams))
@@ -50,7 +50,7 @@ def test_a_cell_wider_than_pixels_is_the_mean_of_its_area() -> None:
     rng = np.random.default_rng(2)
     noise = rng.random((200, 240)).astype(np.float32)
     geometry = PictureGeometry.create(**FAN, range_max=10, bins=14, beams=7)
-    found = FanSampler.of(geometry, 200, 240).apply(noise)
+    found = FanSampler.from_geometry(geometry, 200, 240).apply(noise)
     v, u = np.indices((200, 240), dtype=float)
     radius, bearing = np.hypot(u - 119.5, 210.25 - v), np.arctan2(u - 119.5, 210.25 - v)
     row, column = ((radius - 60) / 10).astype(int), ((np.degrees(bearing) + 28) / 8).astype(int)
@@ -78,7 +78,7 @@ def test_there_and_back_through_scan_conversion() -> None:
         bins=200,
         beams=90,
     )
-    found = FanSampler.of(geometry, *fan.image.shape).apply(np.nan_to_num(fan.image))
+    found = FanSampler.from_geometry(geometry, *fan.image.shape).apply(np.nan_to_num(fan.image))
     at_range = 2 + (np.arange(200) + 0.5) * 6 / 200
     at_bearing = np.radians(-25 + (np.arange(90) + 0.5) * 50 / 90)
     wanted = 0.5 + 0.3 * np.sin(at_range * 5)[:, None] * np.cos(at_bearing * 15)[None, :]
@@ -87,21 +87,21 @@ def test_there_and_back_through_scan_conversion() -> None:
 
 def test_bytes_and_floats_agree() -> None:
     picture = drawn(smooth)
-    sampler = FanSampler.of(PictureGeometry.create(**FAN, range_max=10), 200, 240)
+    sampler = FanSampler.from_geometry(PictureGeometry.create(**FAN, range_max=10), 200, 240)
     as_bytes = np.rint(picture * 255).astype(np.uint8)
     assert np.abs(sampler.apply(as_bytes) - sampler.apply(picture)).max() <= 0.5 / 255 + 1e-6
 
 
 def test_nothing_exceeds_full_scale() -> None:
     """Weights that add up to 1 are rounded, and so is 255 of them."""
-    sampler = FanSampler.of(PictureGeometry.create(**FAN, range_max=10), 200, 240)
+    sampler = FanSampler.from_geometry(PictureGeometry.create(**FAN, range_max=10), 200, 240)
     assert sampler.apply(np.full((200, 240), 255, np.uint8)).max() == 1
 
 
 def test_fans_outside_and_too_large_ones_are_refused() -> None:
     away = PictureGeometry.create(**{**FAN, "apex_px": (9000, 9000)}, range_max=10)
     with pytest.raises(MitsonarError, match="lies outside the pictures of 240 x 200"):
-        FanSampler.of(away, 200, 240)
+        FanSampler.from_geometry(away, 200, 240)
     large = PictureGeometry.create(**FAN, range_max=10, bins=60_000, beams=60_000)
     with pytest.raises(MitsonarError, match="give smaller bins and beams"):
-        FanSampler.of(large, 200, 240)
+        FanSampler.from_geometry(large, 200, 240)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from mitsonar import MitsonarError
-from mitsonar.recordings.picture_geometry import PictureGeometry, geometry_beside, load_geometry
+from mitsonar.recordings.picture_geometry import PictureGeometry, find_geometry_file, load_geometry
 
 FAN: dict[str, Any] = {"layout": "fan", "apex_px": [10, 99], "near_px": 20, "far_px": 80, "half_angle_deg": 15}
 POLAR: dict[str, Any] = {"layout": "polar", "range_min": 1, "range_max": 9, "azimuth_fov_deg": 60}
@@ -75,14 +75,14 @@ def test_a_file_is_read_and_its_faults_name_it(tmp_path: Path) -> None:
 def test_the_file_beside_a_recording_is_found(tmp_path: Path) -> None:
     (tmp_path / "pings").mkdir()
     video = tmp_path / "a.avi"
-    assert geometry_beside(video) is None
-    assert geometry_beside(tmp_path / "pings") is None
+    assert find_geometry_file(video) is None
+    assert find_geometry_file(tmp_path / "pings") is None
     order = ["geometry.yaml", "a.yaml", "a.avi.yaml"]
     for name in order:
         (tmp_path / name).write_text("layout: polar")
-        assert geometry_beside(video) == tmp_path / name
+        assert find_geometry_file(video) == tmp_path / name
     (tmp_path / "pings/geometry.yaml").write_text("layout: polar")
-    assert geometry_beside(tmp_path / "pings") == tmp_path / "pings/geometry.yaml"
+    assert find_geometry_file(tmp_path / "pings") == tmp_path / "pings/geometry.yaml"
 
 
 def test_every_key_is_in_the_reference() -> None:

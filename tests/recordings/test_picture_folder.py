@@ -15,7 +15,7 @@ from PIL import Image
 
 from mitsonar import MitsonarError, open_recording
 from mitsonar.mapping.sources import open_frames
-from mitsonar.recordings.pictures import naturally, times_in_names
+from mitsonar.recordings.pictures import natural_key, times_in_names
 
 POLAR = "layout: polar\nrange_min: 1\nrange_max: 9\nazimuth_fov_deg: 60\nlevel: dB\nelevation_fov_deg: 12\n"
 
@@ -75,7 +75,7 @@ def test_other_names_are_none(names: list[str]) -> None:
 
 
 def test_natural_order() -> None:
-    assert sorted(["f10", "F2", "f1", "10", "9"], key=naturally) == ["9", "10", "f1", "F2", "f10"]
+    assert sorted(["f10", "F2", "f1", "10", "9"], key=natural_key) == ["9", "10", "f1", "F2", "f10"]
 
 
 @pytest.mark.parametrize(

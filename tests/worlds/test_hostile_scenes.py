@@ -120,7 +120,7 @@ def test_files_that_include_each_other_are_counted(tmp_path: Path) -> None:
 
 
 def test_elements_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsonar.worlds.scene_check.MOST_ELEMENTS", 100)
+    monkeypatch.setattr("mitsonar.worlds.scene_check.MAX_ELEMENTS", 100)
     (tmp_path / "many.xml").write_text(SCENE.format(DIFFUSE * 99))
     check_text(tmp_path / "many.xml", {}, [tmp_path])
     (tmp_path / "many.xml").write_text(SCENE.format(DIFFUSE * 100))
