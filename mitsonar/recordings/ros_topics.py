@@ -270,8 +270,8 @@ def _transforms(bag: BagFile, topics: Sequence[Topic]) -> dict[str, Link]:
                 child, parent = _frame_name(one.child_frame_id), _frame_name(one.header.frame_id)
                 link = links.setdefault(child, Link(parent, topic.name, fixed))
                 if link.parent == parent:
-                    where = one.transform
-                    link.numbers.extend((_seconds(one), *_numbers(where.translation), *_numbers(where.rotation)))
+                    transform = one.transform
+                    link.numbers.extend((_seconds(one), *_numbers(transform.translation), *_numbers(transform.rotation)))
     return links
 
 

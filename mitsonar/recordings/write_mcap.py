@@ -407,13 +407,13 @@ class FrameEncoder:
     # ------------------------------------------------------------ poses
 
     def _transform(self, parent: str, child: str, time: int, place: Array, turn: Rotation) -> RosObject:
-        where = self._make(
+        transform = self._make(
             "geometry_msgs/Transform",
             translation=self._vector(place),
             rotation=self._vector(turn.as_quat(canonical=True), "geometry_msgs/Quaternion"),
         )
         header = self._header(time, parent)
-        one = self._make("geometry_msgs/TransformStamped", header=header, child_frame_id=child, transform=where)
+        one = self._make("geometry_msgs/TransformStamped", header=header, child_frame_id=child, transform=transform)
         return self._make("tf2_msgs/TFMessage", transforms=[one])
 
     def _odometry(self, time: int, place: Array, turn: Rotation) -> RosObject:

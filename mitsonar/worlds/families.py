@@ -66,7 +66,7 @@ class Pattern(BuiltFamily):
         "gaussian", description="seabed: Gaussian cells, Perlin of high or low correlation, or a picture"
     )
     block_m: tuple[float, float, float] = Field((0.5, 0.5, 0.025), description="a block's width, length, height [m]")
-    block_step_m: float = Field(0.6, gt=0, description="from one block's middle to the next [m] (ours)")
+    block_step_m: float = Field(0.6, gt=0, description="distance between the middles of neighbouring blocks [m] (ours)")
     bar_width_m: float = Field(0.05, gt=0, description="width of a bar [m] (ours)")
     bar_height_m: float = Field(0.025, gt=0, description="height of a bar [m] (ours)")
     bar_step_m: float = Field(0.2, gt=0, description="between the middles of the two bars of a pair [m] (ours)")
@@ -169,7 +169,9 @@ class RockyField(BuiltFamily):
     centre_height_m: Interval = Field((0.0, 0.45), description="height of a rock's centre over the seabed [m]")
     rock_size_m: Interval = Field((0.0, 0.45), description="size of a rock in each of its three directions [m]")
     rotation_deg: Interval = Field((-165.0, 100.0), description="turn of a rock about each axis [deg]")
-    rock_reflectivity: Interval = Field((0.0, 1.0), description="what Perlin's -1..1 becomes on rocks")
+    rock_reflectivity: Interval = Field(
+        (0.0, 1.0), description="reflectivities of rocks, to which Perlin noise of -1..1 is mapped"
+    )
     perlin_cell_m: float = Field(0.15, gt=0, le=100, description="lattice cell of that noise [m] (ours)")
 
     def build(self, seed: int) -> World:
@@ -232,7 +234,9 @@ class ShipHull(BuiltFamily):
     anode_height_m: Interval = Field((0.0, 0.03), description="height of an anode [m]")
     anode_length_m: Interval = Field((0.15, 0.3), description="major axis of an anode [m]")
     anode_width_m: Interval = Field((0.05, 0.1), description="minor axis of an anode [m]")
-    object_reflectivity: Interval = Field((0.0, 1.0), description="what Perlin's -1..1 becomes on tubes and anodes")
+    object_reflectivity: Interval = Field(
+        (0.0, 1.0), description="reflectivities of tubes and anodes, from Perlin noise of -1..1"
+    )
     perlin_cell_m: float = Field(0.15, gt=0, le=100, description="lattice cell of that noise [m] (ours)")
 
     def build(self, seed: int) -> World:
@@ -305,7 +309,7 @@ class FlatObjects(BuiltFamily):
     size_m: float = Field(50.0, gt=0, le=10_000, description="edge of the square field [m]")
     seabed_cells: int = Field(2048, ge=1, le=2**20, description="cells along the seabed's edge")
     seabed_reflectivity: Interval = Field((0.0, 1.0), description="uniform reflectivity of a cell")
-    objects: Counts = Field((2000, 5000), description="number of rectangles, drawn; ellipses likewise")
+    objects: Counts = Field((2000, 5000), description="number of rectangles, drawn, and likewise of ellipses")
     rectangles: int | None = Field(None, ge=0, le=10**6, description="rectangles, instead of a draw")
     ellipses: int | None = Field(None, ge=0, le=10**6, description="ellipses, instead of a draw")
     thickness_m: float = Field(
@@ -364,8 +368,8 @@ def _levels(middle: NDArray[np.float64], side: NDArray[np.float64]) -> NDArray[n
     for first, second in np.sort(near, axis=1):
         earlier[second].append(first)
     for number, others in enumerate(earlier):
-        taken = set(level[others])
-        level[number] = next(free for free in range(len(taken) + 1) if free not in taken)
+        used_levels = set(level[others])
+        level[number] = next(free for free in range(len(used_levels) + 1) if free not in used_levels)
     return level
 
 
@@ -426,9 +430,9 @@ def perlin_reflectivity(
     kinds = (rng.random(PERIOD) * len(GRADIENTS)).astype(np.int16)
     total = np.zeros(len(places))
     for start in range(0, len(places), BLOCK):
-        here = slice(start, start + BLOCK)
+        block = slice(start, start + BLOCK)
         for octave in range(OCTAVES):
-            total[here] += 0.5**octave * _noise(places[here] / cell_m * 2**octave, order, kinds)
+            total[block] += 0.5**octave * _noise(places[block] / cell_m * 2**octave, order, kinds)
     level = np.clip(0.5 + 0.5 * CONTRAST * total / (2 - 0.5 ** (OCTAVES - 1)), 0, 1)
     low, high = span
     return low + (high - low) * level
