@@ -53,10 +53,10 @@ EXTRAS = {
 }
 """Optional packages, with the extras that install each and the tasks that need it."""
 
-LONGEST_KEY = 60
+MAX_KEY_LENGTH = 60
 """Maximum number of characters of a key in a message; keys in input files may be arbitrarily long."""
 
-MARK = "\x1f"
+ARGUMENT_DELIMITER = "\x1f"
 """Control character that delimits argument names in messages; never displayed."""
 
 
@@ -74,10 +74,10 @@ class MitsonarError(ValueError):
                 ``{"height_m": "--height"}``. Other arguments keep their Python names.
         """
 
-        def typed(found: re.Match[str]) -> str:
-            return options.get(found[1].rpartition(" ")[2], found[1])
+        def option_of(match: re.Match[str]) -> str:
+            return options.get(match[1].rpartition(" ")[2], match[1])
 
-        return re.sub(f"{MARK}([^{MARK}]*){MARK}", typed, super().__str__())
+        return re.sub(f"{ARGUMENT_DELIMITER}([^{ARGUMENT_DELIMITER}]*){ARGUMENT_DELIMITER}", option_of, super().__str__())
 
 
 def argument(name: str) -> str:
@@ -89,7 +89,7 @@ def argument(name: str) -> str:
         name: name of the argument, optionally after a word that says what it belongs to, as in ``sonar model``. The option
             replaces both.
     """
-    return f"{MARK}{name}{MARK}"
+    return f"{ARGUMENT_DELIMITER}{name}{ARGUMENT_DELIMITER}"
 
 
 class MitsonarWarning(UserWarning):
@@ -113,9 +113,9 @@ def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
 def nearest_names(wrong: str, names: Iterable[str]) -> str:
     """Format the known names for the end of an error message, after a suggestion of those similar to ``wrong``."""
     known = list(names)
-    near = [name for name in known if wrong and wrong.lower() in name.lower()]
-    near = near or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
-    return f"did you mean {' or '.join(near)}? Known: {', '.join(known)}" if near else f"known: {', '.join(known)}"
+    similar = [name for name in known if wrong and wrong.lower() in name.lower()]
+    similar = similar or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
+    return f"did you mean {' or '.join(similar)}? Known: {', '.join(known)}" if similar else f"known: {', '.join(known)}"
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
@@ -125,8 +125,8 @@ def counted(number: int, noun: str, plural: str = "") -> str:
 
 def meant(wrong: object, names: Iterable[str]) -> str:
     """Format a suggestion of the most similar name, for the end of a message; empty if no name is similar."""
-    near = difflib.get_close_matches(str(wrong).lower(), [str(name) for name in names], n=1, cutoff=0.5)
-    return f"; did you mean {near[0]}?" if near else ""
+    similar = difflib.get_close_matches(str(wrong).lower(), [str(name) for name in names], n=1, cutoff=0.5)
+    return f"; did you mean {similar[0]}?" if similar else ""
 
 
 def refuse_unknown(given: Iterable[str], known: Iterable[str], owner: str) -> None:
@@ -159,7 +159,7 @@ def complaint(error: ValidationError, model: type[BaseModel], what: str, see: st
     """
     first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")  # a misspelt key also makes one missing
     where = [str(part) for part in first["loc"]]
-    key = ".".join(part if len(part) <= LONGEST_KEY else f"{part[:LONGEST_KEY]}..." for part in where)
+    key = ".".join(part if len(part) <= MAX_KEY_LENGTH else f"{part[:MAX_KEY_LENGTH]}..." for part in where)
     if first["type"] == "extra_forbidden":
         known = _fields_of(model, where[:-1]) or model.model_fields
         return f"unknown {what} key {key}: {nearest_names(where[-1], known)}"
@@ -169,10 +169,10 @@ def complaint(error: ValidationError, model: type[BaseModel], what: str, see: st
         reason = str(first["ctx"]["error"])
         return f"{argument(f'{what} {key}')}: {reason}" if where else reason
     message = first["msg"][0].lower() + first["msg"][1:]
-    return f"{argument(f'{what} {key}')}: {message}, got {shortened(first['input'])}{_meant(first)}{see}"
+    return f"{argument(f'{what} {key}')}: {message}, got {shortened(first['input'])}{_suggest_literal(first)}{see}"
 
 
-def _meant(error: ErrorDetails) -> str:
+def _suggest_literal(error: ErrorDetails) -> str:
     """Suggest the most similar allowed value if the given one is not allowed."""
     if error["type"] != "literal_error":
         return ""
@@ -196,18 +196,18 @@ def _fields_of(model: type[BaseModel], where: list[str]) -> dict[str, object]:
         if name.isdigit():  # an index in a list
             continue
         field = model.model_fields.get(name)
-        nested = [kind for kind in _kinds(field.annotation if field else None) if issubclass(kind, BaseModel)]
+        nested = [member for member in _classes_in(field.annotation if field else None) if issubclass(member, BaseModel)]
         if len(nested) != 1:
             return {}
         model = nested[0]
     return dict(model.model_fields)
 
 
-def _kinds(annotation: object) -> list[type]:
+def _classes_in(annotation: object) -> list[type]:
     """List the classes in an annotation: ``list[A] | None`` contains A and NoneType."""
     from typing import get_args
 
     parts = get_args(annotation)
     if parts:
-        return [kind for part in parts for kind in _kinds(part)]
+        return [member for part in parts for member in _classes_in(part)]
     return [annotation] if isinstance(annotation, type) else []

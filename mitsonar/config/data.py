@@ -116,7 +116,7 @@ def set_key(fields: Keys, key: str, value: object) -> None:
     for level in levels:
         fields = fields.setdefault(level, {})
         if not isinstance(fields, dict):
-            raise MitsonarError(f"cannot set {key}: {level} is not a group of keys; change it in a YAML file of your own")
+            raise MitsonarError(f"cannot set {key}: {level} is not a group of keys; change it in a YAML file")
     fields[last] = value
 
 
@@ -182,36 +182,36 @@ RESERVED = ("frames", "label")
 """Names that samples use for other purposes, so that no view may have them."""
 
 
-def _fits_name(name: str) -> str:
+def _check_view_name(name: str) -> str:
     if not name.isidentifier():
-        raise ValueError(f"a name is letters, digits and _ : got {shortened(name)}")
+        raise ValueError(f"a name must consist of letters, digits and _: got {shortened(name)}")
     if name in RESERVED or name.startswith("nonzero"):
-        raise ValueError(f"{name} means something else in a data set: choose another name")
+        raise ValueError(f"{name} is reserved in a data set: choose another name")
     return name
 
 
 class ReceiverSpec(Mount):
     """A receiver of a bistatic sonar: its pose in the transmitter's axes, and the keys of its sonar that differ."""
 
-    name: Annotated[str, AfterValidator(_fits_name)]
+    name: Annotated[str, AfterValidator(_check_view_name)]
     sonar: Keys = Field(default_factory=dict, description="keys of the receiver's sonar that differ")
 
 
-def _from_0(pair: tuple[float, float]) -> tuple[float, float]:
+def _check_jump(pair: tuple[float, float]) -> tuple[float, float]:
     if pair[0] < 0:
-        raise ValueError(f"a jump goes either way, give its size low,high with 0 <= low: got {pair[0]:g},{pair[1]:g}")
+        raise ValueError(f"a jump must be its size low,high with 0 <= low, in either direction: got {pair[0]:g},{pair[1]:g}")
     return pair
 
 
-def _box(corners: tuple[float, ...]) -> tuple[float, ...]:
+def _check_box(corners: tuple[float, ...]) -> tuple[float, ...]:
     if not all(low < high for low, high in zip(corners[:3], corners[3:], strict=True)):
-        raise ValueError(f"a box is x, y, z of its least corner, then of its largest: got {corners}")
+        raise ValueError(f"a box must be x, y, z of its lowest corner, then of its highest: got {corners}")
     return corners
 
 
-_NotBelow0 = Annotated[Interval, AfterValidator(_from_0)]
+_Jump = Annotated[Interval, AfterValidator(_check_jump)]
 _Angle = Annotated[float, Field(gt=0, le=180)]
-_Box = Annotated[tuple[float, float, float, float, float, float], AfterValidator(_box)]
+_Box = Annotated[tuple[float, float, float, float, float, float], AfterValidator(_check_box)]
 
 
 class Flight(RecipePart):
@@ -225,7 +225,7 @@ class Flight(RecipePart):
     sideways_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion to either side between pings [mm]")
     forward_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion ahead or back between pings [mm]")
     yaw_deg: float = Field(0.45, ge=0, le=180, description="largest turn between pings [deg]")
-    jump_m: _NotBelow0 | None = Field((3.0, 4.0), description="jump between sequences, in x and in y [m]; null: anywhere")
+    jump_m: _Jump | None = Field((3.0, 4.0), description="jump between sequences, in x and in y [m]; null: anywhere")
     footprint_fov_deg: tuple[_Angle, _Angle] | None = Field(
         None, description="field of view whose footprint stays inside the scene [deg]; default: the sonar's"
     )
@@ -245,11 +245,11 @@ class Flight(RecipePart):
         return {key: value for key, value in handler(self).items() if key not in ("pitch_deg", "keep_out") or value}
 
     @model_validator(mode="after")
-    def _pitched(self) -> Self:
+    def _check_random_only(self) -> Self:
         if self.pitch_deg is not None and not (self.pitch_deg[0] >= -90 and self.pitch_deg[1] <= 90):
             raise ValueError(f"pitch_deg must lie in -90..90: got {self.pitch_deg[0]:g},{self.pitch_deg[1]:g}")
         if (self.pitch_deg or self.keep_out) and self.kind != "random":
-            raise ValueError(f"pitch_deg and keep_out are of random flights: got flight.kind {self.kind}")
+            raise ValueError(f"pitch_deg and keep_out apply to random flights only: got flight.kind {self.kind}")
         return self
 
     @property
@@ -274,7 +274,7 @@ class Split(RecipePart):
     seed: int = Field(0, ge=0, lt=2**31, description="of the draw; readers of one data set must agree on it")
 
     @model_validator(mode="after")
-    def _whole(self) -> Self:
+    def _check_shares(self) -> Self:
         if abs(self.train + self.validation + self.test - 1) > 1e-9:
             raise ValueError(
                 f"train, validation and test must add up to 1: got {self.train + self.validation + self.test:g}"
@@ -309,10 +309,10 @@ class Recorded(RecipePart):
     )
 
     @model_validator(mode="after")
-    def _rising(self) -> Self:
+    def _check_bearings(self) -> Self:
         table = np.array(self.bearings or [0.0])
         if not (np.abs(table) <= math.pi).all() or (np.diff(table) <= 0).any():
-            raise ValueError("bearings must rise within -pi..pi")
+            raise ValueError("bearings must increase within -pi..pi")
         return self
 
     @property
@@ -324,9 +324,9 @@ class Recorded(RecipePart):
 # ---------------- The recipe of a data set
 
 
-_Made = TypeVar("_Made", bound=RecipePart)
+_PartT = TypeVar("_Made", bound=RecipePart)
 
-ADDED = ("recorded", "mirrors", "bodies", "noise_db", "visible_labels")
+OPTIONAL_KEYS = ("recorded", "mirrors", "bodies", "noise_db", "visible_labels")
 """Keys that are omitted from a written recipe if they are null or empty."""
 
 
@@ -382,11 +382,11 @@ class Recipe(RecipePart):
     @model_serializer(mode="wrap")
     def _without_absent(self, handler: SerializerFunctionWrapHandler) -> Keys:
         """Omit unused keys that later versions added, so that the digests of stores and checkpoints do not change."""
-        return {key: value for key, value in handler(self).items() if key not in ADDED or value}
+        return {key: value for key, value in handler(self).items() if key not in OPTIONAL_KEYS or value}
 
     @model_validator(mode="before")
     @classmethod
-    def _level(cls, fields: object) -> object:
+    def _level_channel_mount(cls, fields: object) -> object:
         """Make the default mount of a channel sonar level, with the vehicle's own attitude."""
         if isinstance(fields, dict) and fields.get("channel") is not None:
             return {"mount": Mount(), **fields}
@@ -396,7 +396,7 @@ class Recipe(RecipePart):
     def _consistent(self) -> Self:
         if (self.sonar is None) == (self.channel is None):
             got = "neither" if self.sonar is None else "both"
-            raise ValueError(f"a data set is of a sonar (images) or a channel (impulse responses), one of them: got {got}")
+            raise ValueError(f"give either sonar (images) or channel (impulse responses): got {got}")
         try:
             self._check_images() if self.channel is None else self._check_responses()
             self._check_recorded()
@@ -407,11 +407,11 @@ class Recipe(RecipePart):
         if not (low > 0 and math.isfinite(high)):
             raise ValueError(f"flight height_m must be finite and above 0: got {low:g} m")
         if low != high and self.flight.kind == "runs":
-            raise ValueError(f"with flight.kind runs height_m is one number: got {low:g},{high:g}")
+            raise ValueError(f"with flight.kind runs height_m must be one number: got {low:g},{high:g}")
         if self.frames > self.flight.pings and self.flight.kind == "random":
             raise ValueError(f"frames must be at most flight.pings, {self.flight.pings}: got {self.frames}")
         if self.flight.kind == "runs" and any(group.sequences != len(self.flight.runs) for group in self.scenes):
-            raise ValueError(f"with flight.kind runs each scene has {len(self.flight.runs)} sequences, one a run")
+            raise ValueError(f"with flight.kind runs each scene must have {len(self.flight.runs)} sequences, one per run")
         if not all(family.half_m > 0 for family in families):
             raise ValueError("a scene must have a size")
         surfaces = [one.surface_m for one in families if isinstance(one, BuiltFamily) and one.surface_m is not None]
@@ -431,8 +431,10 @@ class Recipe(RecipePart):
             )
         if self.recorded is None:
             return
-        other = self.world or self.channel is not None or self.receivers or self.segments or self.mirrors or self.bodies
-        if other or self.store != "images":
+        has_other_keys = (
+            self.world or self.channel is not None or self.receivers or self.segments or self.mirrors or self.bodies
+        )
+        if has_other_keys or self.store != "images":
             raise MitsonarError(
                 "recorded frames are images of one sonar: leave out world, channel, receivers, segments, mirrors, bodies "
                 "and store"
@@ -450,7 +452,7 @@ class Recipe(RecipePart):
         """
         if len({view.name for view in self.views}) < len(self.views):
             names = shortened([view.name for view in self.views])
-            raise MitsonarError(f"receivers and segments must have names of their own: got {names}")
+            raise MitsonarError(f"receivers and segments must have different names: got {names}")
         if len({(view.sonar.range_min, view.sonar.range_max, view.sonar.range_bins) for view in self.views}) > 1:
             raise MitsonarError("all receivers must have the same window: range_min, range_max and range_bins")
         if self.labels and self.store == "vectors":
@@ -464,10 +466,11 @@ class Recipe(RecipePart):
             )
         if self.visible_labels and self.instrument.model != "coherent":
             raise MitsonarError(
-                f"visible_labels is of the model coherent: got {self.instrument.model}, whose pictures show what is labelled"
+                f"visible_labels applies to the model coherent only: got {self.instrument.model}, whose pictures show "
+                "everything that is labelled"
             )
         if len(set(self.bodies)) < len(self.bodies):
-            raise MitsonarError(f"bodies are named once each: got {shortened(self.bodies)}")
+            raise MitsonarError(f"each body must be named only once: got {shortened(self.bodies)}")
         if self.recorded is None:
             check_image_mirrors(self.instrument, self.views, bool(self.mirrors))
 
@@ -478,7 +481,7 @@ class Recipe(RecipePart):
             MitsonarError: a key of the instrument is not valid, or a key applies to images only.
         """
         check_channel_mirrors(self.channel_sonar, bool(self.mirrors), "give the recipe the key mirrors")
-        plain = {
+        defaults = {
             "mount": Mount(),
             "receivers": [],
             "segments": [],
@@ -490,12 +493,12 @@ class Recipe(RecipePart):
             "noise_db": [],
             "visible_labels": False,
         }
-        other = [name for name, value in plain.items() if getattr(self, name) != value]
-        of_images = {"footprint_fov_deg": None, "pitch_deg": None}
-        other += [f"flight.{name}" for name, value in of_images.items() if getattr(self.flight, name) != value]
-        if other:
+        misplaced = [name for name, value in defaults.items() if getattr(self, name) != value]
+        image_defaults = {"footprint_fov_deg": None, "pitch_deg": None}
+        misplaced += [f"flight.{name}" for name, value in image_defaults.items() if getattr(self.flight, name) != value]
+        if misplaced:
             raise MitsonarError(
-                f"{other[0]} belongs to images: leave it out of a recipe with channel, whose receivers have their own "
+                f"{misplaced[0]} belongs to images: leave it out of a recipe with channel, whose receivers have their own "
                 "positions and fields of view"
             )
 
@@ -508,7 +511,7 @@ class Recipe(RecipePart):
         """
         if self.sonar is None:
             raise MitsonarError(
-                f"the data set {self.name} is of impulse responses, this needs one of images: `mitsonar compare` and "
+                f"the data set {self.name} holds impulse responses, but images are needed: `mitsonar compare` and "
                 "ImpulsePairs read it"
             )
         return sonar_from(dict(self.sonar)).replace(seed=self.seed)
@@ -521,7 +524,7 @@ class Recipe(RecipePart):
             MitsonarError: the data set contains images.
         """
         if self.channel is None:
-            raise MitsonarError(f"the data set {self.name} is of images: read it with SonarPairs, this needs responses")
+            raise MitsonarError(f"the data set {self.name} holds images, but responses are needed: read it with SonarPairs")
         return ChannelSonar.create(**{"name": self.name, "seed": self.seed, **self.channel})
 
     @cached_property
@@ -536,11 +539,13 @@ class Recipe(RecipePart):
             raise MitsonarError("receivers and segments exclude each other: give one")
         if self.segments:
             return [Segment(sonar, name) for name in self.segments]
-        made: list[View] = []
+        receivers: list[View] = []
         for spec in self.receivers:
-            own = {**(self.sonar or {}), "beams": sonar.beams, "jitter": None, **spec.sonar}
-            made.append(Receiver(sonar, sonar_from({k: v for k, v in own.items() if v is not None}), spec.pose, spec.name))
-        return made or [Whole(sonar, None if self.recorded is None else self.recorded.bearing_rad)]
+            keys = {**(self.sonar or {}), "beams": sonar.beams, "jitter": None, **spec.sonar}
+            receivers.append(
+                Receiver(sonar, sonar_from({k: v for k, v in keys.items() if v is not None}), spec.pose, spec.name)
+            )
+        return receivers or [Whole(sonar, None if self.recorded is None else self.recorded.bearing_rad)]
 
     def digest(self, *more: object) -> str:
         """Return a digest of all values that are not defaults, and of the values ``more``: 16 hexadecimal digits.
@@ -567,8 +572,8 @@ class Recipe(RecipePart):
         """
         if self.recorded is not None:
             raise MitsonarError(
-                f"the data set {self.name} holds recorded frames and no worlds, so nothing can be rendered: give one that "
-                "`mitsonar dataset make` made"
+                f"the data set {self.name} holds recorded frames and no worlds, so nothing can be rendered: give the output "
+                "of `mitsonar dataset make`"
             )
         fields = {**self.world, **self.scenes[group].world}
         if "family" not in fields:
@@ -623,7 +628,7 @@ def load_recipe(name_or_file: str | Path, changes: Keys | None = None) -> Recipe
     )
     for key, value in (changes or {}).items():
         set_key(fields, key, value)
-    _find_files(fields, path.parent)
+    _resolve_files(fields, path.parent)
     return recipe_from({"name": path.stem, **fields})
 
 
@@ -633,7 +638,7 @@ def recipe_from(fields: Keys) -> Recipe:
     Raises:
         MitsonarError: a key is unknown, or a value is outside its limits.
     """
-    return _checked(Recipe, "recipe", fields)
+    return _validated(Recipe, "recipe", fields)
 
 
 def split_from(fields: Keys) -> Split:
@@ -642,19 +647,19 @@ def split_from(fields: Keys) -> Split:
     Raises:
         MitsonarError: a key is unknown, or a value is outside its limits.
     """
-    return _checked(Split, "split", fields)
+    return _validated(Split, "split", fields)
 
 
-def _checked(part: type[_Made], what: str, fields: Keys) -> _Made:
+def _validated(part: type[_PartT], what: str, fields: Keys) -> _PartT:
     try:
         return part(**fields)
     except ValidationError as error:
         raise MitsonarError(complaint(error, part, what, " (see docs/guides/data-sets.md)")) from None
     except TypeError as error:
-        raise MitsonarError(f"{what} keys must be words: {error}") from None
+        raise MitsonarError(f"{what} keys must be strings: {error}") from None
 
 
-def _find_files(fields: Keys, folder: Path) -> None:
+def _resolve_files(fields: Keys, folder: Path) -> None:
     """Resolve the scene files in ``fields`` relative to the folder of the recipe, in place."""
     groups = fields.get("scenes")
     for world in [

@@ -40,12 +40,12 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-def _known_noise(text: str) -> str:
+def _check_noise(text: str) -> str:
     (snr_of if text.endswith("dB") else load_noise)(text)
     return text
 
 
-Noise = Annotated[str, AfterValidator(_known_noise)]
+Noise = Annotated[str, AfterValidator(_check_noise)]
 
 
 class Input(_Part):
@@ -71,24 +71,24 @@ class Input(_Part):
     )
 
     @model_validator(mode="after")
-    def _of_one_kind(self) -> Self:
-        plain = Input.model_construct(kind=self.kind, frames=self.frames)
+    def _check_kind(self) -> Self:
+        defaults = Input.model_construct(kind=self.kind, frames=self.frames)
         images = ("views", "layout", "coordinates", "cartesian_rows", "range_levels", "halves", "ground")
         names = images if self.kind == "response" else ("leak",)
-        other = [name for name in names if getattr(self, name) != getattr(plain, name)]
-        if other:
-            raise ValueError(f"input.{other[0]} is not for kind {self.kind}: leave it out")
+        misplaced = [name for name in names if getattr(self, name) != getattr(defaults, name)]
+        if misplaced:
+            raise ValueError(f"input.{misplaced[0]} does not apply to kind {self.kind}: leave it out")
         return self
 
-    def words(self) -> Keys:
+    def arguments(self) -> Keys:
         """Return the keyword arguments for SonarPairs and RenderedPairs, or for ImpulsePairs."""
-        words = self.model_dump()
+        arguments = self.model_dump()
         if self.kind == "response":
             return {"frames": self.frames, "leak": self.leak}
-        del words["leak"]
-        if not words["ground"]:
-            del words["ground"]
-        return words
+        del arguments["leak"]
+        if not arguments["ground"]:
+            del arguments["ground"]
+        return arguments
 
 
 class Loss(_Part):
@@ -127,13 +127,13 @@ class Optimiser(_Part):
     clip: float | None = Field(None, gt=0, description="largest norm of the gradient; null: any")
 
     @model_validator(mode="after")
-    def _steps_follow(self) -> Self:
+    def _check_steps(self) -> Self:
         epochs, rates = [epoch for epoch, _ in self.steps], [rate for _, rate in self.steps]
         follow = epochs == sorted(set(epochs)) and all(0 < rate <= 10 for rate in rates)
         if (self.schedule == "steps") != bool(self.steps) or not follow:
             raise ValueError(
-                "optimiser steps are [epoch, rate] of schedule steps, epochs rising, rates above 0 to 10: got "
-                f"{self.steps} with schedule {self.schedule}"
+                "optimiser steps must be [epoch, rate] with increasing epochs and rates above 0 up to 10, for "
+                f"schedule steps only: got {self.steps} with schedule {self.schedule}"
             )
         return self
 
@@ -147,18 +147,18 @@ class Optimiser(_Part):
             epoch_steps: number of steps in an epoch.
             steps: planned number of steps of the whole training.
         """
-        rise = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
+        warmup_factor = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
         match self.schedule:
             case "halve":
-                return self.rate * rise * self.fall_to ** math.floor(step / (self.halve_every * epoch_steps))
+                return self.rate * warmup_factor * self.fall_to ** math.floor(step / (self.halve_every * epoch_steps))
             case "steps":
-                begun = [rate for epoch, rate in self.steps if step >= epoch * epoch_steps]
-                return rise * (begun[-1] if begun else self.rate)
+                passed_rates = [rate for epoch, rate in self.steps if step >= epoch * epoch_steps]
+                return warmup_factor * (passed_rates[-1] if passed_rates else self.rate)
             case "cosine":
                 done = max(0, step - self.warmup) / max(1, steps - self.warmup)
-                return self.rate * rise * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+                return self.rate * warmup_factor * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
             case _:
-                return self.rate * rise
+                return self.rate * warmup_factor
 
 
 class Validate(_Part):
@@ -201,7 +201,7 @@ class TrainingRecipe(_Part):
 
     @model_validator(mode="before")
     @classmethod
-    def _spelled_out(cls, fields: object) -> object:
+    def _expand(cls, fields: object) -> object:
         if not isinstance(fields, dict):
             return fields
         named = {"network": {"name": fields["network"]}} if isinstance(fields.get("network"), str) else {}
@@ -213,7 +213,7 @@ class TrainingRecipe(_Part):
 
     @field_validator("network")
     @classmethod
-    def _has_a_name(cls, network: Keys) -> Keys:
+    def _check_network(cls, network: Keys) -> Keys:
         if not isinstance(network.get("name"), str):
             raise ValueError("give the name of a network, such as posenet, or name and options")
         return network
@@ -221,16 +221,16 @@ class TrainingRecipe(_Part):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if (self.epochs is None) == (self.steps is None):
-            raise ValueError(f"the length is epochs or steps, one of them: got epochs {self.epochs}, steps {self.steps}")
+            raise ValueError(f"give either epochs or steps: got epochs {self.epochs}, steps {self.steps}")
         if isinstance(self.noise, list) and not self.noise:
-            raise ValueError("noise is a level or a list of levels: got an empty list; give none for no noise")
+            raise ValueError("noise must be a level or a list of levels, not an empty list: give 'none' for no noise")
         decibels = self.input.kind == "response"
         for level in {*self.noises, *self.validate_.noise} - {"none"}:
             if level.endswith("dB") != decibels:
                 allowed = "a signal to noise ratio such as '20 dB'" if decibels else "low, high, chapter2 or mean,std,scale"
-                raise ValueError(f"noise of input.kind {self.input.kind} is {allowed}, or none: got {shortened(level)}")
+                raise ValueError(f"noise of input.kind {self.input.kind} must be {allowed}, or none: got {shortened(level)}")
         if self.augment and not self.input.ground:
-            raise ValueError("augment is for inputs with ground: set input.ground: true, or leave augment out")
+            raise ValueError("augment needs inputs with ground: set input.ground: true, or leave augment out")
         if isinstance(self.split, dict):
             split_from(self.split)
         elif self.split not in SPLITS:
@@ -261,7 +261,7 @@ class TrainingRecipe(_Part):
         """Return the keyword arguments for SonarPairs and RenderedPairs in training."""
         noise = self.noises
         return {
-            **self.input.words(),
+            **self.input.arguments(),
             "labels": self.labels,
             "noise": noise[0] if len(noise) == 1 else noise,
             "seed": self.seed,
@@ -323,7 +323,7 @@ def training_recipe_from(fields: Keys) -> TrainingRecipe:
         message = complaint(error, TrainingRecipe, "training recipe")
         raise MitsonarError(message.replace("validate_", "validate")) from None
     except TypeError as error:
-        raise MitsonarError(f"training recipe keys must be words: {error}") from None
+        raise MitsonarError(f"training recipe keys must be strings: {error}") from None
 
 
 # ---------------- Options of a training

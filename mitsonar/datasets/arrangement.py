@@ -76,20 +76,20 @@ class Labels:
         values = np.asarray(targets, dtype=float)
         if self.kind == "raw":
             return values.astype(np.float32)
-        part = self._part(values)
+        fraction = self._fraction(values)
         if self.kind == "quantised":
-            return np.rint(np.clip(part, 0, 1) * (LEVELS - 1)).astype(np.float32)
-        return ((2 * part - 1) * SCALE).astype(np.float32)
+            return np.rint(np.clip(fraction, 0, 1) * (LEVELS - 1)).astype(np.float32)
+        return ((2 * fraction - 1) * SCALE).astype(np.float32)
 
     def decode(self, labels: ArrayLike) -> NDArray[np.float64]:
         """Compute the targets [m, rad] of labels ``(..., targets)``, or of estimates of labels."""
         values = np.asarray(labels, dtype=float)
         if self.kind == "raw":
             return values
-        part = values / (LEVELS - 1) if self.kind == "quantised" else (values / SCALE + 1) / 2
-        return np.asarray(self.low + part * (self.high - self.low), dtype=np.float64)
+        fraction = values / (LEVELS - 1) if self.kind == "quantised" else (values / SCALE + 1) / 2
+        return np.asarray(self.low + fraction * (self.high - self.low), dtype=np.float64)
 
-    def _part(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _fraction(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map the lower limit to 0 and the upper limit to 1; return 1/2 if the limits are equal."""
         span = self.high - self.low
         return np.where(span > 0, (values - self.low) / np.where(span > 0, span, 1), 0.5)
@@ -143,12 +143,12 @@ class Arrangement:
         if self.kind == "vector":
             axis = 1 if self.layout == "channels" else 3
             parts = [part[..., side] for part in parts for side in (0, 1)] if self.halves else parts
-            columns = [self._coarser(part[:, q, :]) for part in parts for q in range(part.shape[1])]
+            columns = [self._rebin(part[:, q, :]) for part in parts for q in range(part.shape[1])]
             return xp.stack(columns, axis=1) if axis == 1 else xp.expand_dims(xp.stack(columns, axis=2), axis=1)
-        polar = self._laid_out(parts) if self.coordinates != "cartesian" else None
+        polar = self._lay_out(parts) if self.coordinates != "cartesian" else None
         if self.coordinates == "polar":
             return polar
-        fan = self._laid_out([self.maps[view].apply(part) for view, part in zip(self.views, parts, strict=True)])
+        fan = self._lay_out([self.maps[view].apply(part) for view, part in zip(self.views, parts, strict=True)])
         return fan if polar is None else (polar, fan)
 
     def _with_drawn_levels(
@@ -160,22 +160,22 @@ class Arrangement:
         drawn, _ = uniform((numbers.shape[0], 1, 1), seed=seed + WHICH_LEVEL, frames=numbers[:, 0], like=numbers)
         level = xp.floor(drawn[:, 0, 0] * len(self.levels))
         groups = [(model, xp.nonzero(level == k)[0]) for k, model in enumerate(self.levels)]
-        mine = {name: values for name, values in frames.items() if name.removeprefix("nonzero_") in self.views}
+        view_frames = {name: values for name, values in frames.items() if name.removeprefix("nonzero_") in self.views}
         # 2. Arrange each group with a single noise model.
         parts = [
             replace(self, noise=model, levels=())(
-                {name: xp.take(values, chosen, axis=0) for name, values in mine.items()},
-                xp.take(numbers, chosen, axis=0),
+                {name: xp.take(values, rows, axis=0) for name, values in view_frames.items()},
+                xp.take(numbers, rows, axis=0),
                 seed,
             )
-            for model, chosen in groups
-            if chosen.shape[0]
+            for model, rows in groups
+            if rows.shape[0]
         ]
         # 3. Join the groups and restore the order of the batch.
-        back = xp.argsort(xp.concat([chosen for _, chosen in groups]))
+        order = xp.argsort(xp.concat([rows for _, rows in groups]))
 
         def joined(pieces: Iterable[ArrayOfAnyLibrary]) -> ArrayOfAnyLibrary:
-            return xp.take(xp.concat(list(pieces), axis=0), back, axis=0)
+            return xp.take(xp.concat(list(pieces), axis=0), order, axis=0)
 
         return tuple(map(joined, zip(*parts, strict=True))) if isinstance(parts[0], tuple) else joined(parts)
 
@@ -216,7 +216,7 @@ class Arrangement:
         both = [xp.sum(side, axis=-1) for side in (flat[..., :half], flat[..., flat.shape[-1] - half :])]
         return xp.reshape(xp.stack(both, axis=-1), (*values.shape[:-1], 2))
 
-    def _coarser(self, vectors: ArrayOfAnyLibrary) -> ArrayOfAnyLibrary:
+    def _rebin(self, vectors: ArrayOfAnyLibrary) -> ArrayOfAnyLibrary:
         """Sum neighbouring bins of vectors ``(batch, bins)`` into ``range_levels`` levels."""
         if self.range_levels is None:
             return vectors
@@ -224,7 +224,7 @@ class Arrangement:
         split = array_namespace(vectors).reshape(vectors, (batch, self.range_levels, bins // self.range_levels))
         return array_namespace(vectors).sum(split, axis=-1)
 
-    def _laid_out(self, parts: list[ArrayOfAnyLibrary]) -> ArrayOfAnyLibrary:
+    def _lay_out(self, parts: list[ArrayOfAnyLibrary]) -> ArrayOfAnyLibrary:
         """Join the frames of all views into one array ``(batch, channels, rows, columns)``."""
         xp = array_namespace(parts[0])
         pictures = [part[:, q, ...] for part in parts for q in range(part.shape[1])]
@@ -254,23 +254,23 @@ def arrangement_of(
     Raises:
         MitsonarError: an option is unknown, or does not fit the others.
     """
-    known = {view.name: view for view in recipe.views}
-    chosen = (views,) if isinstance(views, str) else tuple(known if views is None else views)
+    views_by_name = {view.name: view for view in recipe.views}
+    names = (views,) if isinstance(views, str) else tuple(views_by_name if views is None else views)
     models = _noise_models(noise)
     kind = kind or recipe.kinds[0]
-    _check_names(recipe, chosen, kind, layout, coordinates)
+    _check_names(recipe, names, kind, layout, coordinates)
     _check_vectors(recipe, kind, range_levels, halves)
-    beams = {name: len(known[name].bearing_rad) for name in chosen}
+    beams = {name: len(views_by_name[name].bearing_rad) for name in names}
     if kind == "image" and len(set(beams.values())) > 1 and layout != "side":
         raise MitsonarError(f"views of different widths can only be side by side: {beams}; give layout='side'")
     maps = {}
     if coordinates != "polar":
-        for name in chosen:
-            maps[name] = cartesian_map(known[name].sonar.range_m, known[name].bearing_rad, cartesian_rows)
+        for name in names:
+            maps[name] = cartesian_map(views_by_name[name].sonar.range_m, views_by_name[name].bearing_rad, cartesian_rows)
         if len({conversion.index.shape for conversion in maps.values()}) > 1 and layout != "side":
             raise MitsonarError("fans of different sizes can only be side by side: give layout='side'")
     return Arrangement(
-        views=chosen,
+        views=names,
         kind=kind,
         layout=cast(Layout, layout),
         coordinates=cast(Coordinates, coordinates),
@@ -301,18 +301,18 @@ def _check_names(recipe: Recipe, views: tuple[str, ...], kind: str, layout: str,
     Raises:
         MitsonarError: a name is unknown or does not fit.
     """
-    for word, name, allowed in (
+    for value, name, allowed in (
         (kind, "kind", ("image", "vector")),
         (layout, "layout", get_args(Layout)),
         (coordinates, "coordinates", get_args(Coordinates)),
     ):
-        if word not in allowed:
-            raise MitsonarError(f"{name} must be one of {', '.join(allowed)}: got {word!r}")
+        if value not in allowed:
+            raise MitsonarError(f"{name} must be one of {', '.join(allowed)}: got {value!r}")
     known = [view.name for view in recipe.views]
-    wrong = [name for name in views if name not in known]
-    if wrong or not views:
+    unknown = [name for name in views if name not in known]
+    if unknown or not views:
         raise MitsonarError(
-            f"unknown view {wrong[0] if wrong else 'none'}: {nearest_names(wrong[0] if wrong else '', known)}"
+            f"unknown view {unknown[0] if unknown else 'none'}: {nearest_names(unknown[0] if unknown else '', known)}"
         )
     if kind == "image" and "image" not in recipe.kinds:
         raise MitsonarError("the data set holds vectors only: read kind='vector', or make one with store: images or both")
@@ -332,5 +332,7 @@ def _check_vectors(recipe: Recipe, kind: str, range_levels: int | None, halves: 
         raise MitsonarError("halves are cut from images: this data set holds vectors only; make one with store: images")
     bins = recipe.instrument.range_bins
     if range_levels is not None and not (1 <= range_levels <= bins and bins % range_levels == 0):
-        fit = [str(count) for count in range(1, bins + 1) if bins % count == 0]
-        raise MitsonarError(f"range_levels must divide the {bins} of the data set ({', '.join(fit)}): got {range_levels}")
+        divisors = [str(count) for count in range(1, bins + 1) if bins % count == 0]
+        raise MitsonarError(
+            f"range_levels must divide the {bins} of the data set ({', '.join(divisors)}): got {range_levels}"
+        )

@@ -69,7 +69,7 @@ __all__ = [
 ]
 
 
-HALF_A_GROUP = re.compile(r"zarr\.[0-9a-f]{32}\.partial")
+PARTIAL_GROUP = re.compile(r"zarr\.[0-9a-f]{32}\.partial")
 """Partial file that a killed writer may leave in an otherwise empty folder. Any other file belongs to the user."""
 
 ROUNDS = 3
@@ -128,15 +128,17 @@ def make_dataset(
         MitsonarError: the store holds another data set, another process writes to it, or it was begun with other versions.
     """
     if recipe.recorded is not None:
-        raise MitsonarError(f"the recipe {recipe.name} is of recorded frames: `mitsonar dataset from-frames` copies them")
+        raise MitsonarError(
+            f"the recipe {recipe.name} describes recorded frames: `mitsonar dataset from-frames` copies them"
+        )
     storage = Storage(url)
     _refuse_other_files(storage)
-    with storage.locked() as still_ours:
+    with storage.locked() as check_lock:
         variant = ensure_variant()
         store = _open_or_create(storage, recipe, sequences, variant, verify)
         _clear_parts(storage)
         todo = store.missing(verify=verify)
-        begun(len(store), len(store) - _frames(store, todo))
+        begun(len(store), len(store) - _frame_count(store, todo))
         written = 0
         for _ in range(ROUNDS):  # later passes replace shards that were damaged meanwhile
             if not todo:
@@ -144,8 +146,8 @@ def make_dataset(
             _check_versions(store)
             store.unfinish()
             for shard in made_by(store, todo, workers=workers, scheduler=scheduler):
-                still_ours()
-                progress(_frames(store, [shard]))
+                check_lock()
+                progress(_frame_count(store, [shard]))
             written += len(todo)
             todo = store.missing()
         if todo:
@@ -160,9 +162,9 @@ def _refuse_other_files(storage: Storage) -> None:
     Raises:
         MitsonarError: there are other files.
     """
-    there = [name for name in storage.sizes() if not HALF_A_GROUP.fullmatch(name)]
-    if there and "zarr.json" not in there:
-        raise MitsonarError(f"{storage.url} holds other things ({min(there)}) and is kept as it is: choose another -o")
+    names = [name for name in storage.sizes() if not PARTIAL_GROUP.fullmatch(name)]
+    if names and "zarr.json" not in names:
+        raise MitsonarError(f"{storage.url} contains other files ({min(names)}) and is kept as it is: choose another -o")
 
 
 def _open_or_create(storage: Storage, recipe: Recipe, sequences: int | None, variant: str, verify: bool) -> DataStore:
@@ -187,9 +189,9 @@ def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) 
         MitsonarError: it was not; the message names the differences.
     """
     about = store.about
-    asked = {**recipe.model_dump(mode="json"), "sequences": sequences}
-    had = {**about["recipe"], "sequences": about["sequences"]}
-    refuse_other(store.place.url, had, asked, " (`mitsonar dataset info --recipe` prints the recipe)")
+    requested = {**recipe.model_dump(mode="json"), "sequences": sequences}
+    stored = {**about["recipe"], "sequences": about["sequences"]}
+    refuse_other(store.place.url, stored, requested, " (`mitsonar dataset info --recipe` prints the recipe)")
     if about["variant"] != variant:
         raise MitsonarError(
             f"{store.place.url} was begun with {about['variant']}, this is {variant}, which differs in the last bits: set "
@@ -219,7 +221,7 @@ def _clear_parts(storage: Storage) -> None:
                 storage.remove(name)
 
 
-def _too_few(store: DataStore) -> list[str]:
+def _split_warnings(store: DataStore) -> list[str]:
     """Return a warning if there are too few scenes or sequences for the recipe's split."""
     split = store.recipe.split
     worlds = world_of(store.recipe, store.scenes)[store.read("scene")]
@@ -230,23 +232,22 @@ def _too_few(store: DataStore) -> list[str]:
     return []
 
 
-def _frames(store: DataStore, shards: list[int]) -> int:
+def _frame_count(store: DataStore, shards: list[int]) -> int:
     return sum(store.frames_of(shard).stop - store.frames_of(shard).start for shard in shards)
 
 
 def _warnings(store: DataStore) -> list[str]:
     """Return all warnings for the user about a finished data set, one sentence each."""
-    sentences = [*_too_few(store)]
-    over_nothing = int(np.isnan(store.read("height_m")).sum())
-    if over_nothing:
+    sentences = [*_split_warnings(store)]
+    groundless = int(np.isnan(store.read("height_m")).sum())
+    if groundless:
         sentences.append(
-            f"nothing is below the sonar in {over_nothing:,} of {len(store):,} frames: world.size_m is larger than what the "
-            "scene holds"
+            f"nothing is below the sonar in {groundless:,} of {len(store):,} frames: world.size_m is larger than the scene"
         )
-    return [*sentences, *_empty(store), *store.modality.warnings(store.read)]
+    return [*sentences, *_empty_frame_warnings(store), *store.modality.warnings(store.read)]
 
 
-def _empty(store: DataStore) -> list[str]:
+def _empty_frame_warnings(store: DataStore) -> list[str]:
     """Return a warning if frames have no echo, searching shards that are spread evenly over the data set."""
     shards = np.unique(np.linspace(0, store.shards - 1, min(SHARDS_TO_CHECK, store.shards)).round().astype(int))
     empty, frames = [], 0
@@ -264,19 +265,19 @@ def _empty(store: DataStore) -> list[str]:
 # ---------------- Workers: this process, local processes or dask
 
 
-AHEAD = 2
+SHARDS_PER_WORKER = 2
 """Number of shards assigned to a worker at a time: one in progress, one waiting."""
 
-ASK_S = 1.0
-"""Seconds between two requests for the list of workers."""
+REFRESH_S = 1.0
+"""Seconds between two updates of the list of workers."""
 
-LOSSES = 3
+MAX_LOSSES = 3
 """Number of workers that may be lost on the same shard."""
 
-SILENCE_S = 90.0
+WORKER_TIMEOUT_S = 90.0
 """Seconds that the scheduler may be without any worker."""
 
-ANSWERS_WITHIN = "10s"
+CONNECT_TIMEOUT = "10s"
 """Time limit for the scheduler's first answer, in dask's notation."""
 
 
@@ -329,7 +330,7 @@ def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: s
             forget()
     else:
         with _client(workers, scheduler) as client:
-            yield from _hand_out(client, store, Queue(todo))
+            yield from _distribute(client, store, Queue(todo))
 
 
 @contextlib.contextmanager
@@ -345,7 +346,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
 
     if scheduler is not None:
         try:
-            connected = connect(scheduler, timeout=ANSWERS_WITHIN, set_as_default=False)
+            connected = connect(scheduler, timeout=CONNECT_TIMEOUT, set_as_default=False)
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())[:160]
             raise MitsonarError(
@@ -386,21 +387,21 @@ class Queue:
 
     def __init__(self, todo: list[int]) -> None:
         self.waiting = set(todo)
-        self.at: dict[str, int] = {}
-        self.lost: Counter[int] = Counter()
+        self.last_shard: dict[str, int] = {}
+        self.losses: Counter[int] = Counter()
 
     def __bool__(self) -> bool:
         return bool(self.waiting)
 
     def next(self, worker: str) -> int:
         """Choose the next shard for a worker."""
-        shard = self.at.get(worker, -2) + 1
+        shard = self.last_shard.get(worker, -2) + 1
         if shard not in self.waiting:
             first, end = self._longest()
-            taken = first - 1 in self.at.values()  # another worker will continue there: start in the middle
+            taken = first - 1 in self.last_shard.values()  # another worker will continue there: start in the middle
             shard = (first + end) // 2 if taken else first
         self.waiting.remove(shard)
-        self.at[worker] = shard
+        self.last_shard[worker] = shard
         return shard
 
     def _longest(self) -> tuple[int, int]:
@@ -418,47 +419,47 @@ class Queue:
         Raises:
             MitsonarError: too many workers were lost on this shard.
         """
-        self.lost[shard] += 1
-        if self.lost[shard] > LOSSES:
+        self.losses[shard] += 1
+        if self.losses[shard] > MAX_LOSSES:
             raise MitsonarError(
-                f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; whole shards "
-                "stay, the same command continues"
+                f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; complete "
+                "shards are kept, and the same command continues"
             )
         self.waiting.add(shard)
 
     def forget(self, alive: list[str]) -> None:
         """Forget the workers that are no longer alive."""
-        self.at = {worker: shard for worker, shard in self.at.items() if worker in alive}
+        self.last_shard = {worker: shard for worker, shard in self.last_shard.items() if worker in alive}
 
 
-def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
+def _distribute(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
     """Supply every worker with shards until all are made, and yield the number of each when it is done."""
     url = store.place.root if store.place.local else store.place.url
-    given: dict[Future, tuple[str, int]] = {}
-    asked, received, alive = 0.0, time.monotonic(), list[str]()
+    assigned: dict[Future, tuple[str, int]] = {}
+    refreshed_s, last_worker_s, alive = 0.0, time.monotonic(), list[str]()
     try:
-        while queue or given:
+        while queue or assigned:
             # 1. Refresh the list of workers, and take back the shards of lost ones.
-            if time.monotonic() - asked > ASK_S:
-                alive, asked = list(client.ncores()), time.monotonic()
+            if time.monotonic() - refreshed_s > REFRESH_S:
+                alive, refreshed_s = list(client.ncores()), time.monotonic()
                 queue.forget(alive)
                 # dask would wait for ever for a worker that is gone
-                for future in [future for future, (worker, _) in given.items() if worker not in alive]:
-                    queue.give_back(given.pop(future)[1])
+                for future in [future for future, (worker, _) in assigned.items() if worker not in alive]:
+                    queue.give_back(assigned.pop(future)[1])
                     future.cancel()
             if alive:
-                received = time.monotonic()
-            elif time.monotonic() - received > SILENCE_S:
+                last_worker_s = time.monotonic()
+            elif time.monotonic() - last_worker_s > WORKER_TIMEOUT_S:
                 raise _no_worker(queue)
-            # 2. Keep AHEAD shards assigned to every worker, so that none idles between two shards.
+            # 2. Keep SHARDS_PER_WORKER shards assigned to every worker, so that none idles between two shards.
             for worker in alive:
-                while queue and sum(owner == worker for owner, _ in given.values()) < AHEAD:
+                while queue and sum(owner == worker for owner, _ in assigned.values()) < SHARDS_PER_WORKER:
                     shard = queue.next(worker)
-                    given[client.submit(_work, url, shard, workers=[worker], pure=False)] = worker, shard
+                    assigned[client.submit(_work, url, shard, workers=[worker], pure=False)] = worker, shard
             # 3. Yield finished shards, raise the error of a task, and put back the shards of workers that died.
-            done = [future for future in given if future.done()]
+            done = [future for future in assigned if future.done()]
             for future in done:
-                shard = given.pop(future)[1]
+                shard = assigned.pop(future)[1]
                 if future.status == "finished":
                     yield shard
                 elif future.status == "error" and not _is_lost(future):
@@ -469,19 +470,19 @@ def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
                 time.sleep(0.1)
     finally:
         with contextlib.suppress(Exception):
-            client.cancel(list(given))
+            client.cancel(list(assigned))
 
 
 def _no_worker(queue: Queue) -> MitsonarError:
     """Return the error for a scheduler without workers."""
-    lost = ", ".join(map(str, queue.lost))
+    shards = ", ".join(map(str, queue.losses))
     cause = (
-        f"workers were lost at shards {lost} and none has come back for {SILENCE_S:.0f} s "
+        f"workers were lost at shards {shards} and none has come back for {WORKER_TIMEOUT_S:.0f} s "
         "(out of memory?): use fewer workers"
-        if lost
-        else f"the scheduler has had no worker for {SILENCE_S:.0f} s: start some with `dask worker ADDRESS`"
+        if shards
+        else f"the scheduler has had no worker for {WORKER_TIMEOUT_S:.0f} s: start some with `dask worker ADDRESS`"
     )
-    return MitsonarError(f"{cause}; whole shards stay, the same command continues")
+    return MitsonarError(f"{cause}; complete shards are kept, and the same command continues")
 
 
 def _is_lost(future: Future) -> bool:
@@ -501,10 +502,10 @@ def _work(url: str, shard: int) -> int:
 
     use_threads(get_worker().state.nthreads)
     store = DataStore.open(url, write=True, unfinished=True)
-    other = store.other_versions()
-    if other:
+    changed = store.other_versions()
+    if changed:
         raise MitsonarError(
-            f"the store was begun with {', '.join(other)} on {socket.gethostname()}: install the same everywhere"
+            f"the store was begun with {', '.join(changed)} on {socket.gethostname()}: install the same everywhere"
         )
     return make_shard(store, shard)
 
@@ -515,13 +516,13 @@ def _work(url: str, shard: int) -> int:
 _RENDERER: dict[tuple[str, Scene], Renderer] = {}
 """Renderer of the last scene, keyed by everything that it depends on: the recipe and the scene's plan."""
 
-_ONE_AT_A_TIME = threading.Lock()
+_RENDER_LOCK = threading.Lock()
 """Lock that lets a process render one shard at a time, because the threads of a dask worker share one ray tracer."""
 
 
 def make_shard(store: DataStore, shard: int) -> int:
     """Render and write one shard, and return its number; the last scene stays loaded for the next call."""
-    with _ONE_AT_A_TIME:
+    with _RENDER_LOCK:
         ensure_variant(store.about["variant"])
         store.write_shard(shard, _shard_values(store, shard))
     return shard
@@ -538,13 +539,13 @@ def _shard_values(store: DataStore, shard: int) -> dict[str, Values]:
     here = store.frames_of(shard)
     scene_of = store.read("scene")[here]
     planned = {name: store.read(name, here) for name in ("pose", *store.modality.planned)}
-    firsts = _first_frames(store)
+    first_frames = _first_frames(store)
     parts: dict[str, list[Values]] = {}
     for number in np.unique(scene_of):
-        mine = np.flatnonzero(scene_of == number)
-        first = here.start + int(mine[0]) - firsts[int(number)]
-        known = {name: values[mine] for name, values in planned.items()}
-        for name, values in _renderer(store, int(number)).recorded(known, first, store.about).items():
+        rows = np.flatnonzero(scene_of == number)
+        first = here.start + int(rows[0]) - first_frames[int(number)]
+        scene_planned = {name: values[rows] for name, values in planned.items()}
+        for name, values in _renderer(store, int(number)).recorded(scene_planned, first, store.about).items():
             parts.setdefault(name, []).append(values)
     return {name: values[0] if len(values) == 1 else np.concatenate(values) for name, values in parts.items()}
 
@@ -582,139 +583,143 @@ def check(store: DataStore, progress: Callable[[int], None] = lambda frames: Non
     Returns:
         One sentence per fault.
     """
-    wrong = _files(store, progress)
-    for check_part in (_plan, _counts, _labels, _flight):
+    faults = _file_faults(store, progress)
+    for check_part in (_plan_faults, _count_faults, _label_faults, _flight_faults):
         try:
-            wrong += check_part(store)
+            faults += check_part(store)
         except MitsonarError as error:
-            wrong.append(str(error))
-    return wrong
+            faults.append(str(error))
+    return faults
 
 
-def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
+def _file_faults(store: DataStore, progress: Callable[[int], None]) -> list[str]:
     """Check every file against its seal, and the values against their limits."""
-    wrong: list[str] = []
+    faults: list[str] = []
     unwritten: list[int] = []
     empty: list[int] = []
     sizes, seals = store.place.sizes(), store.seals()
     for shard in range(store.shards):
         here = store.frames_of(shard)
         keys = [store.key(name, shard) for name in store.rendered]
-        lacking = [key for key in keys if key not in sizes]
+        missing = [key for key in keys if key not in sizes]
         # Values are only checked in shards that are complete and undamaged.
-        if lacking or not seals[shard].any():
+        if missing or not seals[shard].any():
             unwritten.append(shard)
         else:
             damaged = store.damaged(shard, seals[shard])
             for key in damaged:
                 size = int(seals[shard][keys.index(key), 0])
-                wrong.append(
+                faults.append(
                     f"{key} is damaged (frames {here.start}..{here.stop - 1}): "
-                    + (f"{sizes[key]} bytes, sealed with {size}" if sizes[key] != size else "other bytes than were sealed")
+                    + (
+                        f"{sizes[key]} bytes, sealed with {size}"
+                        if sizes[key] != size
+                        else "its content differs from the seal"
+                    )
                 )
             if not damaged:
-                wrong += store.modality.faults(store.read, here)
+                faults += store.modality.faults(store.read, here)
                 empty += (here.start + np.flatnonzero(store.modality.empty(store.read, here))).tolist()
         progress(here.stop - here.start)
     if empty:
-        wrong.append(empty_sentence(empty, len(store)))
+        faults.append(empty_sentence(empty, len(store)))
     if unwritten:
         which = ", ".join(map(str, unwritten[:10])) + (" ..." if len(unwritten) > 10 else "")
         state = "is damaged" if store.finished else "is not finished"
-        wrong.append(
+        faults.append(
             f"{store.place.url} {state}: {len(unwritten)} of {store.shards} shards are not written ({which}); the same "
             "`mitsonar dataset make` makes them"
         )
-    return wrong
+    return faults
 
 
-def _plan(store: DataStore) -> list[str]:
+def _plan_faults(store: DataStore) -> list[str]:
     """Check the planned arrays against a new plan from recipe and seed."""
     if store.recipe.recorded is not None:  # recorded frames come with their poses, there is no plan
         return []
     plan = Plan.of(store.recipe, int(store.about["sequences"]))
-    return [f"{name} is not what recipe and seed give" for name in store.unplanned(plan)]
+    return [f"{name} differs from the plan of recipe and seed" for name in store.unplanned(plan)]
 
 
-def _counts(store: DataStore) -> list[str]:
+def _count_faults(store: DataStore) -> list[str]:
     """Check the numbers of frames, sequences and scenes."""
-    about, wrong = store.about, []
+    about, faults = store.about, []
     scene, sequence = store.read("scene"), store.read("sequence")
     lengths = np.bincount(sequence)
     if len(scene) != about["frames"] or len(lengths) != about["sequences"]:
-        wrong.append(f"{len(scene)} frames in {len(lengths)} sequences, {about['frames']} in {about['sequences']} promised")
+        faults.append(f"{len(scene)} frames in {len(lengths)} sequences, {about['frames']} in {about['sequences']} expected")
     if (np.diff(sequence) < 0).any() or (np.diff(sequence) > 1).any():
-        wrong.append("sequences are not numbered one after the other")
+        faults.append("sequences are not numbered one after the other")
     if store.recipe.flight.kind == "random" and (lengths != store.recipe.flight.pings).any():
-        wrong.append(f"sequences of {sorted(set(lengths.tolist()))} frames, the recipe says {store.recipe.flight.pings}")
+        faults.append(f"sequences of {sorted(set(lengths.tolist()))} frames, the recipe has {store.recipe.flight.pings}")
     _, first = np.unique(sequence, return_index=True)
-    for number, wanted in store.scenes.items():
-        found = int((scene[first] == number).sum())
-        if found != wanted.sequences:
-            wrong.append(f"scene {number} has {found} sequences, {wanted.sequences} promised")
+    for number, planned in store.scenes.items():
+        count = int((scene[first] == number).sum())
+        if count != planned.sequences:
+            faults.append(f"scene {number} has {count} sequences, {planned.sequences} expected")
     for name, axis in store.modality.axes.items():
         if not np.array_equal(store.read(name), axis.values):
-            wrong.append(f"{name} is not what the recipe's sonar has")
-    return wrong
+            faults.append(f"{name} differs from that of the recipe's sonar")
+    return faults
 
 
-def _vehicle(store: DataStore) -> NDArray[np.float64]:
+def _vehicle_poses(store: DataStore) -> NDArray[np.float64]:
     return store.read("vehicle_pose" if "vehicle_pose" in store.group else "pose")
 
 
-def _labels(store: DataStore) -> list[str]:
+def _label_faults(store: DataStore) -> list[str]:
     """Check the motions against the poses."""
-    sequence, motion, vehicle = store.read("sequence"), store.read("motion"), _vehicle(store)
+    sequence, motion, vehicle = store.read("sequence"), store.read("motion"), _vehicle_poses(store)
     inner = np.append(sequence[1:] == sequence[:-1], False)
-    wrong = []
+    faults = []
     if not np.isnan(motion[~inner]).all():
-        wrong.append("the last frame of a sequence has a motion")
+        faults.append("the last frame of a sequence has a motion")
     error = np.abs(motions(vehicle) - motion[:-1])[inner[:-1]]
     if error.size and not error.max() <= LABEL_TOLERANCE:
-        wrong.append(f"labels differ from poses by up to {error.max():.1e} (m, rad), allowed {LABEL_TOLERANCE:g}")
-    return wrong
+        faults.append(f"labels differ from poses by up to {error.max():.1e} (m, rad), allowed {LABEL_TOLERANCE:g}")
+    return faults
 
 
-def _flight(store: DataStore) -> list[str]:
+def _flight_faults(store: DataStore) -> list[str]:
     """Check that motions and jumps are within their limits, and that footprints lie inside their scenes."""
     recipe = store.recipe
     flight = recipe.flight
     if flight.kind != "random":
         return []
-    wrong = []
+    faults = []
     sequence, motion, scene = (store.read(name) for name in ("sequence", "motion", "scene"))
-    vehicle = _vehicle(store)
+    vehicle = _vehicle_poses(store)
     limit = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
     if motion.size and np.nanmax(np.abs(np.nan_to_num(motion)) - limit) > LABEL_TOLERANCE:
-        wrong.append("motions exceed the recipe's limits")
+        faults.append("motions exceed the recipe's limits")
     border = np.flatnonzero((sequence[1:] != sequence[:-1]) & (scene[1:] == scene[:-1]))
     if flight.jump_m is not None and border.size:
         jump = np.abs(vehicle[border + 1, :2] - vehicle[border, :2])
         low, high = flight.jump_m
         if jump.min() < low - LABEL_TOLERANCE or jump.max() > high + LABEL_TOLERANCE:
-            wrong.append(f"jumps of {jump.min():.4f}..{jump.max():.4f} m, the recipe says {low:g}..{high:g}")
-    outside = _outside(store, vehicle, scene)
-    if outside > LABEL_TOLERANCE:
-        wrong.append(f"a footprint leaves its scene by {outside:.3g} m")
-    return wrong
+            faults.append(f"jumps of {jump.min():.4f}..{jump.max():.4f} m, the recipe has {low:g}..{high:g}")
+    excess_m = _footprint_excess_m(store, vehicle, scene)
+    if excess_m > LABEL_TOLERANCE:
+        faults.append(f"a footprint leaves its scene by {excess_m:.3g} m")
+    return faults
 
 
-def _outside(store: DataStore, vehicle: NDArray[np.float64], scene: NDArray[np.int32]) -> float:
+def _footprint_excess_m(store: DataStore, vehicle: NDArray[np.float64], scene: NDArray[np.int32]) -> float:
     """Compute the largest distance by which a footprint leaves its scene [m]; negative if all lie inside."""
     recipe = store.recipe
     # Half the side of each frame's scene.
-    half = {number: recipe.family(one.group).half_m for number, one in store.scenes.items()}
-    limit = np.array([half[int(number)] for number in scene])
-    farthest = -np.inf
+    half_m = {number: recipe.family(one.group).half_m for number, one in store.scenes.items()}
+    limit_m = np.array([half_m[int(number)] for number in scene])
+    excess_m = -np.inf
     # If no vehicle poses are stored, they differ from those of the sonar by the pitch of the mount only.
-    lean = 0.0 if "vehicle_pose" in store.group else recipe.mount.pose.pitch
-    flown = np.column_stack([vehicle[:, 2], np.round(vehicle[:, 3] - lean, 9)])
+    mount_pitch = 0.0 if "vehicle_pose" in store.group else recipe.mount.pose.pitch
+    attitudes = np.column_stack([vehicle[:, 2], np.round(vehicle[:, 3] - mount_pitch, 9)])
     # Frames at the same height and pitch share one footprint.
-    for height, pitch in np.unique(flown, axis=0):
-        mine = (flown == (height, pitch)).all(axis=1)
-        corners = np.abs(footprints_at(vehicle[mine], store.modality.reach(float(height), float(pitch))))
-        farthest = max(farthest, float((corners.max(axis=(1, 2)) - limit[mine]).max()))
-    return farthest
+    for height, pitch in np.unique(attitudes, axis=0):
+        rows = (attitudes == (height, pitch)).all(axis=1)
+        corners = np.abs(footprints_at(vehicle[rows], store.modality.reach(float(height), float(pitch))))
+        excess_m = max(excess_m, float((corners.max(axis=(1, 2)) - limit_m[rows]).max()))
+    return excess_m
 
 
 # ---------------- Rendering images, for stores and for training
@@ -754,18 +759,18 @@ class SceneRenderer:
         """
         refuse_worlds(recipe)
         gain = calibrate(recipe)
-        found: Fields = {"gain": gain, "level_scale": 1 / gain}
+        attributes: Fields = {"gain": gain, "level_scale": 1 / gain}
         groups = range(len(recipe.scenes))
         if "shape_id" in recipe.labels and any(recipe.family(group).called == "scene" for group in groups):
-            known: dict[str, list[str]] = {}
+            names_by_family: dict[str, list[str]] = {}
             for group in groups:
                 family = recipe.family(group)
-                if repr(family) not in known:
+                if repr(family) not in names_by_family:
                     world = Scene(0, group, world_seed(recipe.seed, 0), 1)
-                    named = family.called == "scene"
-                    known[repr(family)] = list(shape_names_in(loaded_world(recipe, world))) if named else []
-            found["shape_names"] = [known[repr(recipe.family(group))] for group in groups]
-        return found
+                    is_file = family.called == "scene"
+                    names_by_family[repr(family)] = list(shape_names_in(loaded_world(recipe, world))) if is_file else []
+            attributes["shape_names"] = [names_by_family[repr(recipe.family(group))] for group in groups]
+        return attributes
 
     def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[RenderedPings]]:
         """Render the levels of frames ``first``, ``first + 1`` ... of the scene, and yield batches with one part per view.
@@ -815,7 +820,7 @@ class SceneRenderer:
         """Render frames at the planned poses; see :class:`~mitsonar.datasets.modality.Renderer`."""
         return self.frames(planned["pose"], first, float(about["gain"]))
 
-    def _empty(self, frames: int) -> dict[str, Values]:
+    def _empty_frame_warnings(self, frames: int) -> dict[str, Values]:
         """Allocate the arrays to fill, with zeros."""
         stored = ImageModality(self.recipe).stored
         return {name: np.zeros((frames, *one.shape), dtype=one.kind) for name, one in stored.items()}
@@ -860,12 +865,12 @@ def body_places(recipe: Recipe, motion: SceneMotion | None) -> list[int]:
     Raises:
         MitsonarError: one of the recipe's bodies does not move in the scene.
     """
-    known = () if motion is None else motion.bodies.names
+    moving = () if motion is None else motion.bodies.names
     for name in recipe.bodies:
-        if name not in known:
-            there = nearest_names(name, known) if known else "nothing moves there"
-            raise MitsonarError(f"bodies: no body {shortened(name)} moves in the scene: {there}")
-    return [known.index(name) for name in recipe.bodies]
+        if name not in moving:
+            hint = nearest_names(name, moving) if moving else "nothing moves there"
+            raise MitsonarError(f"bodies: no body {shortened(name)} moves in the scene: {hint}")
+    return [moving.index(name) for name in recipe.bodies]
 
 
 def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
@@ -895,9 +900,9 @@ def refuse_worlds(recipe: Recipe) -> None:
     from mitsonar.simulation.moving import motion_in
 
     families = [recipe.family(group) for group in range(len(recipe.scenes))]
-    every = bool(recipe.mirrors or recipe.bodies)
-    looked_at = {repr(family): group for group, family in enumerate(families) if every or not family.seeded}
-    for group in looked_at.values():
+    check_all = bool(recipe.mirrors or recipe.bodies)
+    groups = {repr(family): group for group, family in enumerate(families) if check_all or not family.seeded}
+    for group in groups.values():
         world = loaded_world(recipe, Scene(0, group, world_seed(recipe.seed, 0), 1))
         body_places(recipe, motion_in(world, None) if recipe.bodies else None)
         if mirror_of(world, recipe.mirrors) is None and recipe.mirrors:
@@ -935,10 +940,10 @@ def calibrate(recipe: Recipe) -> float:
             "the first frames are empty: no ray met anything within the window; check height_m, mount, range_min and "
             "range_max"
         )
-    return constant_gain([_joined(batches)])[0]
+    return constant_gain([_join_views(batches)])[0]
 
 
-def _joined(batches: list[list[RenderedPings]]) -> RenderedPings:
+def _join_views(batches: list[list[RenderedPings]]) -> RenderedPings:
     """Join all views of all frames into frames of one column, because one gain applies to all views."""
     first = batches[0][0]
     frames = []

@@ -198,8 +198,8 @@ class Modality(Protocol):
 
 def renderer_of(modality: Modality) -> type[Renderer]:
     """Import the class that renders scenes; importing it late means that reading a store loads no simulator."""
-    found: type[Renderer] = resolve_name(modality.renderer_class)
-    return found
+    renderer: type[Renderer] = resolve_name(modality.renderer_class)
+    return renderer
 
 
 def samples_of(modality: Modality, url: str | Path, **options: Any) -> OpenedSamples:
@@ -229,18 +229,18 @@ def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:
     Raises:
         MitsonarError: the ground is out of range.
     """
-    above = float(eye[2])
-    if above <= 0 or above >= range_max:
+    height = float(eye[2])
+    if height <= 0 or height >= range_max:
         raise MitsonarError(
-            f"the sonar sees no ground: it is {above:g} m over it, range_max is {range_max:g} m; lower height_m or "
+            f"the sonar sees no ground: it is {height:g} m over it, range_max is {range_max:g} m; lower height_m or "
             "raise range_max"
         )
-    across = math.sqrt(range_max**2 - above**2)
-    level = np.hypot(directions[:, 0], directions[:, 1])
+    max_distance = math.sqrt(range_max**2 - height**2)
+    horizontal = np.hypot(directions[:, 0], directions[:, 1])
     with np.errstate(divide="ignore", invalid="ignore"):
-        ground = np.where(directions[:, 2] < 0, above * level / -directions[:, 2], np.inf)
-    distance = np.minimum(ground, across)
-    unit = directions[:, :2] / np.maximum(level, 1e-12)[:, None]
+        ground = np.where(directions[:, 2] < 0, height * horizontal / -directions[:, 2], np.inf)
+    distance = np.minimum(ground, max_distance)
+    unit = directions[:, :2] / np.maximum(horizontal, 1e-12)[:, None]
     points = eye[:2] + unit * distance[:, None]
     return np.asarray(points[ConvexHull(points).vertices])
 

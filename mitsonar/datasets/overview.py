@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["info", "sheet_figure"]
 
 
-SAMPLED = 200
+SAMPLED_FRAMES = 200
 """Approximate number of frames or pings that a mean is taken over."""
 
 Table: TypeAlias = dict[str, Any]
@@ -55,7 +55,7 @@ def info(store: DataStore) -> Table:
         **{name: about[name] for name in ("gain",) if name in store.modality.settled},
         "bytes": sum(sizes.values()),
         "arrays": arrays,
-        **({"levels": _levels_of(store)} if store.recipe.channel is None else {}),
+        **({"levels": _level_table(store)} if store.recipe.channel is None else {}),
         "variant": about["variant"],
         "versions": about["versions"],
     }
@@ -83,19 +83,19 @@ def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None,
     if view not in names:
         raise MitsonarError(f"unknown view {view}: {nearest_names(view, names)}")
     frames, name = store.recipe.frames, names[view]
-    shown = _chosen(store, samples, seed)
+    starts = _sample_starts(store, samples, seed)
     columns = max(frames + 2, 4)
-    figure = Figure(figsize=(3.1 * columns, 2.8 * (len(shown) + 1)), layout="constrained")
-    axes = figure.subplots(len(shown) + 1, columns, squeeze=False)
-    for row, start in enumerate(shown):
-        for place in range(columns):
-            _sample(axes[row, place], store, name, view, start, place, frames)
+    figure = Figure(figsize=(3.1 * columns, 2.8 * (len(starts) + 1)), layout="constrained")
+    axes = figure.subplots(len(starts) + 1, columns, squeeze=False)
+    for row, start in enumerate(starts):
+        for column in range(columns):
+            _sample(axes[row, column], store, name, view, start, column, frames)
     _summary(axes[-1], store, name, view)
     figure.suptitle(_title(store, f"view {view}"))
     return figure
 
 
-def _chosen(store: DataStore, samples: int, seed: int) -> list[int]:
+def _sample_starts(store: DataStore, samples: int, seed: int) -> list[int]:
     """Return the first frames of samples drawn at random, in storage order."""
     frames, sequence = store.recipe.frames, store.read("sequence")
     first = np.arange(max(0, len(sequence) - frames + 1))
@@ -103,8 +103,8 @@ def _chosen(store: DataStore, samples: int, seed: int) -> list[int]:
     first = first[sequence[first] == sequence[first + frames - 1]]
     if not len(first):
         raise MitsonarError(f"{store.place.url} has no {frames} {store.modality.what}s in one sequence: nothing to show")
-    chosen: list[int] = np.sort(np.random.default_rng(seed).choice(first, min(samples, len(first)), replace=False)).tolist()
-    return chosen
+    starts: list[int] = np.sort(np.random.default_rng(seed).choice(first, min(samples, len(first)), replace=False)).tolist()
+    return starts
 
 
 def _title(store: DataStore, part: str) -> str:
@@ -118,9 +118,9 @@ def _title(store: DataStore, part: str) -> str:
 
 def _extent(store: DataStore, view: str) -> tuple[float, float, float, float]:
     """Return the limits of an image, bearing [deg] and range [m], as Matplotlib's extent with the nearest range below."""
-    shown = next(v for v in store.recipe.views if v.name == view)
-    port, starboard = np.degrees(shown.bearing_rad[[0, -1]])
-    return float(port), float(starboard), shown.sonar.range_min, shown.sonar.range_max
+    selected = next(v for v in store.recipe.views if v.name == view)
+    port, starboard = np.degrees(selected.bearing_rad[[0, -1]])
+    return float(port), float(starboard), selected.sonar.range_min, selected.sonar.range_max
 
 
 def _draw(axes: Axes, store: DataStore, values: NDArray[np.float64], view: str, title: str, *, top: float = 1.0) -> None:
@@ -140,12 +140,12 @@ def _levels(values: Stored) -> NDArray[np.float64]:
     return np.asarray(values, dtype=float) / (255 if values.dtype == np.uint8 else 1)
 
 
-def _sample(axes: Axes, store: DataStore, name: str, view: str, start: int, place: int, frames: int) -> None:
+def _sample(axes: Axes, store: DataStore, name: str, view: str, start: int, column: int, frames: int) -> None:
     """Draw one panel of a sample: a frame, then the difference of the last and the first, then the label."""
-    if place < frames:
-        title = f"frame {start + place}, scene {store.read('scene')[start + place]}"
-        _draw(axes, store, _levels(store.read(name, start + place)), view, title)
-    elif place == frames and frames > 1:
+    if column < frames:
+        title = f"frame {start + column}, scene {store.read('scene')[start + column]}"
+        _draw(axes, store, _levels(store.read(name, start + column)), view, title)
+    elif column == frames and frames > 1:
         first, last = (_levels(store.read(name, frame)) for frame in (start, start + frames - 1))
         if first.ndim == 1:
             axes.plot(store.read("range_m"), last - first, lw=0.7)
@@ -156,7 +156,7 @@ def _sample(axes: Axes, store: DataStore, name: str, view: str, start: int, plac
         axes.set_title("last minus first" + (" (+-0.3)" if first.ndim == 2 else ""), fontsize=8)
     else:
         axes.axis("off")
-        if place == min(frames + 1, 2 * frames):
+        if column == min(frames + 1, 2 * frames):
             axes.text(
                 0, 0.5, _label(store, start, frames), fontsize=9, va="center", family="monospace", transform=axes.transAxes
             )
@@ -184,10 +184,10 @@ def _summary(axes: NDArray[np.object_], store: DataStore, name: str, view: str) 
         names = ["sideways (mm)", "forward (mm)", "yaw (deg)"]
     else:
         columns, names = [store.read("pose")[:, 2]], ["height (m)"]
-    for place, axis in enumerate(axes[1:]):
-        if place < len(columns):
-            axis.hist(columns[place], bins=40, color="0.4")
-            axis.set(xlabel=names[place], ylabel="frames")
+    for column, axis in enumerate(axes[1:]):
+        if column < len(columns):
+            axis.hist(columns[column], bins=40, color="0.4")
+            axis.set(xlabel=names[column], ylabel="frames")
         else:
             axis.axis("off")
 
@@ -196,27 +196,27 @@ def _sampled(store: DataStore, name: str) -> Stored:
     """Read a sample of the frames: whole chunks, evenly spread over the data set."""
     chunk = int(store.about["chunk_frames"])
     starts = np.arange(0, len(store), chunk)
-    some = starts[np.unique(np.linspace(0, len(starts) - 1, max(1, SAMPLED // chunk)).astype(int))]
-    return np.concatenate([store.read(name, slice(start, start + chunk)) for start in some])
+    selected = starts[np.unique(np.linspace(0, len(starts) - 1, max(1, SAMPLED_FRAMES // chunk)).astype(int))]
+    return np.concatenate([store.read(name, slice(start, start + chunk)) for start in selected])
 
 
-def _level(store: DataStore, name: str, view: str) -> Table:
+def _view_levels(store: DataStore, name: str, view: str) -> Table:
     """Measure the fraction of pixels with an echo, their mean level, and its ratio to the scale of each noise model."""
-    some = _levels(_sampled(store, name))
-    if some.ndim == 2:  # sums over the beams
+    levels = _levels(_sampled(store, name))
+    if levels.ndim == 2:  # sums over the beams
         beams = next(len(v.bearing_rad) for v in store.recipe.views if v.name == view)
-        echoes, pixels = int(_sampled(store, name.replace("vector", "nonzero", 1)).sum()), some.size * beams
+        echoes, pixels = int(_sampled(store, name.replace("vector", "nonzero", 1)).sum()), levels.size * beams
     else:
-        echoes, pixels = int(np.count_nonzero(some)), some.size
-    mean = float(some.sum()) / max(echoes, 1)
+        echoes, pixels = int(np.count_nonzero(levels)), levels.size
+    mean = float(levels.sum()) / max(echoes, 1)
     noise = {model: mean / NOISE_MODELS[model].scale for model in ("low", "high", "chapter2")}
     return {"filled": echoes / pixels, "signal_mean": mean, "signal_over_noise": noise}
 
 
-def _levels_of(store: DataStore) -> Table:
+def _level_table(store: DataStore) -> Table:
     """Measure the levels of each view of a data set, keyed by view; empty while the data set is unfinished."""
     names = array_names(store.recipe).items() if store.finished else ()
-    return {view: _level(store, name, view) for name, (kind, view) in names if kind == store.recipe.kinds[0]}
+    return {view: _view_levels(store, name, view) for name, (kind, view) in names if kind == store.recipe.kinds[0]}
 
 
 # ---------------- Impulse responses
@@ -228,10 +228,10 @@ def _response_sheet(store: DataStore, *, samples: int, receiver: str | None, see
     receiver = receiver or names[0]
     if receiver not in names:
         raise MitsonarError(f"unknown receiver {receiver}: {nearest_names(receiver, names)}")
-    shown = _chosen(store, samples, seed)
-    figure = Figure(figsize=(13, 2.6 * (len(shown) + 1)), layout="constrained")
-    axes = figure.subplots(len(shown) + 1, 3, squeeze=False)
-    for row, start in zip(axes, shown, strict=False):
+    starts = _sample_starts(store, samples, seed)
+    figure = Figure(figsize=(13, 2.6 * (len(starts) + 1)), layout="constrained")
+    axes = figure.subplots(len(starts) + 1, 3, squeeze=False)
+    for row, start in zip(axes, starts, strict=False):
         _response_sample(row, store, names.index(receiver), start, store.recipe.frames)
     _response_summary(axes[-1], store, names)
     figure.suptitle(_title(store, f"receiver {receiver}"))
@@ -242,13 +242,13 @@ def _response_sample(axes: NDArray[np.object_], store: DataStore, receiver: int,
     """Draw the magnitudes, the phase from the first to the last ping where the response is strong, and the label."""
     delay_ms = 1e3 * store.read("delay_s")
     response = store.read("response", slice(start, start + pings))[:, receiver]
-    for place, style in ((0, "-"), (pings - 1, ":")):
-        axes[0].plot(delay_ms, np.abs(response[place]), style, lw=0.8, label=f"ping {start + place}")
+    for ping, style in ((0, "-"), (pings - 1, ":")):
+        axes[0].plot(delay_ms, np.abs(response[ping]), style, lw=0.8, label=f"ping {start + ping}")
     axes[0].set(xlabel="delay (ms)", ylabel="magnitude", title=f"scene {store.read('scene')[start]}")
     axes[0].legend(fontsize=7)
-    loud = np.abs(response[0]) > 0.1 * np.abs(response[0]).max(initial=0)
-    turned = np.degrees(np.angle(response[-1] * response[0].conj()))
-    axes[1].plot(delay_ms[loud], turned[loud], ".", ms=3)
+    strong = np.abs(response[0]) > 0.1 * np.abs(response[0]).max(initial=0)
+    phase_deg = np.degrees(np.angle(response[-1] * response[0].conj()))
+    axes[1].plot(delay_ms[strong], phase_deg[strong], ".", ms=3)
     axes[1].set(xlabel="delay (ms)", ylabel="phase, first to last (deg)", ylim=(-180, 180))
     axes[2].axis("off")
     motion, pose = store.read("motion")[start], store.read("pose")[start]
@@ -261,10 +261,10 @@ def _response_sample(axes: NDArray[np.object_], store: DataStore, receiver: int,
 
 def _response_summary(axes: NDArray[np.object_], store: DataStore, names: list[str]) -> None:
     """Draw the mean energy of the taps of each receiver, and the distribution of the motions."""
-    every = max(1, len(store) // SAMPLED)
-    some = store.read("response", slice(None, None, every))
+    step = max(1, len(store) // SAMPLED_FRAMES)
+    responses = store.read("response", slice(None, None, step))
     for receiver, name in enumerate(names):
-        energy = _decibels((np.abs(some[:, receiver]) ** 2).mean(axis=0))
+        energy = _decibels((np.abs(responses[:, receiver]) ** 2).mean(axis=0))
         axes[0].plot(1e3 * store.read("delay_s"), energy, lw=0.8, label=name)
     axes[0].set(xlabel="delay (ms)", ylabel="mean energy (dB)", ylim=(-80, 3))
     axes[0].legend(fontsize=7)

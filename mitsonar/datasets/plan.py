@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 
-FEWEST_SEQUENCES = 10
+MIN_SEQUENCES_PER_SCENE = 10
 """Sequences per scene before a small data set adds another scene: building a world costs more than rendering frames."""
 
 CANDIDATES = 64
@@ -107,9 +107,9 @@ class Plan:
             MitsonarError: fewer than one sequence, more than the recipe has, or a footprint that does not fit its scene.
         """
         scenes = scenes_of(recipe, recipe.sequences if sequences is None else sequences)
-        flown = [(scene, one) for scene in scenes for one in islice(sequences_of(recipe, scene), scene.sequences)]
-        lengths = [len(one.vehicle) for _, one in flown]
-        vehicle = np.concatenate([one.vehicle for _, one in flown])
+        planned = [(scene, one) for scene in scenes for one in islice(sequences_of(recipe, scene), scene.sequences)]
+        lengths = [len(one.vehicle) for _, one in planned]
+        vehicle = np.concatenate([one.vehicle for _, one in planned])
         # the last frame of a sequence has no motion: the next one belongs to another sequence
         motion = np.full((len(vehicle), 3), np.nan)
         last = np.cumsum(lengths) - 1
@@ -119,13 +119,13 @@ class Plan:
         step = np.concatenate([np.arange(length) for length in lengths])
         return cls(
             scenes=scenes,
-            scene=np.repeat([scene.number for scene, _ in flown], lengths).astype(np.int32),
-            sequence=np.repeat(np.arange(len(flown)), lengths).astype(np.int32),
+            scene=np.repeat([scene.number for scene, _ in planned], lengths).astype(np.int32),
+            sequence=np.repeat(np.arange(len(planned)), lengths).astype(np.int32),
             time_s=step / rate,
             vehicle=vehicle,
             poses=mounted(vehicle, recipe.mount.pose),
             motion=motion,
-            velocity=np.concatenate([velocities(one.at_rate(rate)) for _, one in flown]),
+            velocity=np.concatenate([velocities(one.at_rate(rate)) for _, one in planned]),
         )
 
 
@@ -137,16 +137,20 @@ def scenes_of(recipe: Recipe, sequences: int) -> list[Scene]:
     """
     if not 1 <= sequences <= recipe.sequences:
         raise MitsonarError(
-            f"the recipe {recipe.name} has {recipe.sequences:,} sequences: got {sequences:,}; give 1 to as many, or raise "
-            "scenes.sequences in a recipe of your own"
+            f"the recipe {recipe.name} has {recipe.sequences:,} sequences: got {sequences:,}; give 1 to "
+            f"{recipe.sequences:,}, or raise scenes.sequences in a recipe file"
         )
     groups = [group for group, part in enumerate(recipe.scenes) for _ in range(part.count)]
-    own = np.array([recipe.scenes[group].sequences for group in groups])
-    opened = len(own) if sequences == own.sum() else int(np.clip(sequences // FEWEST_SEQUENCES, 1, len(own)))
-    while own[:opened].sum() < sequences:  # small scenes may have fewer than FEWEST_SEQUENCES
-        opened += 1
+    sequence_counts = np.array([recipe.scenes[group].sequences for group in groups])
+    scene_count = (
+        len(sequence_counts)
+        if sequences == sequence_counts.sum()
+        else int(np.clip(sequences // MIN_SEQUENCES_PER_SCENE, 1, len(sequence_counts)))
+    )
+    while sequence_counts[:scene_count].sum() < sequences:  # small scenes may have fewer than FEWEST_SEQUENCES
+        scene_count += 1
     # Rounding the cumulative sum, not each share, keeps the total exact.
-    exact = sequences * np.cumsum(own[:opened]) / own[:opened].sum()
+    exact = sequences * np.cumsum(sequence_counts[:scene_count]) / sequence_counts[:scene_count].sum()
     counts = np.diff(np.floor(exact + 1e-9).astype(int), prepend=0)
     return [
         Scene(number, groups[number], world_seed(recipe.seed, number), int(count))
@@ -216,23 +220,23 @@ def _sequence(
         outermost = np.maximum(np.abs(x + position[:, :1]), np.abs(y + position[:, 1:])).max(axis=1)
         fits = outermost <= half
         here = slice(-flight.pings, None)  # the last corners are the positions of the pings
-        fits &= ~_kept_out(flight, x[:, here] + position[:, :1], y[:, here] + position[:, 1:], height)
+        fits &= ~_in_excluded_box(flight, x[:, here] + position[:, :1], y[:, here] + position[:, 1:], height)
         # 5. Take the first accepted candidate.
-        found = int(fits.argmax())
-        if fits[found]:
+        candidate = int(fits.argmax())
+        if fits[candidate]:
             start = Pose.from_row(
-                (float(position[found, 0]), float(position[found, 1]), height, pitch, 0, float(heading[found]))
+                (float(position[candidate, 0]), float(position[candidate, 1]), height, pitch, 0, float(heading[candidate]))
             )
             return _drive(start, motion, flight.pings)
     raise MitsonarError(
         f"no place for a sequence found in {TRIES * CANDIDATES:,} tries: its footprint reaches "
         f"{np.hypot(*corners.T).max():.3g} m from the vehicle, the scene {half:g} m from its middle, jumps "
-        f"{flight.jump_m or 'anywhere'}{', boxes are kept out' if flight.keep_out else ''}; use a larger scene, smaller "
+        f"{flight.jump_m or 'anywhere'}{', boxes are excluded' if flight.keep_out else ''}; use a larger scene, smaller "
         "jumps, a nearer range_max or a lower height"
     )
 
 
-def _kept_out(flight: Flight, x: NDArray[np.float64], y: NDArray[np.float64], height: float) -> NDArray[np.bool_]:
+def _in_excluded_box(flight: Flight, x: NDArray[np.float64], y: NDArray[np.float64], height: float) -> NDArray[np.bool_]:
     """Mark the candidates ``(candidates,)`` with at least one ping in an excluded box.
 
     Args:
@@ -293,7 +297,7 @@ def run_poses(name: str, height_m: float) -> NDArray[np.float64]:
     - ``diagonal``: 300 frames, 5 m to starboard and 2.3 m forward.
     - ``turn``: 300 frames over 120 deg on the spot; the T is straight ahead half-way.
     - ``sideways_50``, ``sideways_54``: 50 and 54 steps from the middle of a scene, almost all to starboard, some back near
-      the end. Figures 4.16 and 4.17 show these two without numbers, so the numbers are our own choice.
+      the end. Figures 4.16 and 4.17 show these two without numbers, so the numbers are our choice.
     """
     x, y = -2.5, -4.85
     match name:
@@ -342,7 +346,7 @@ TEXTS = {
     "shadow": "{}: 0 not in shadow, 1 dark with sound or echoes beyond, 2 dark with all sound intercepted before",
 }
 
-OF_BODIES = {
+BODY_TEXTS = {
     "body_pose": "of the recipe's bodies, in its order: x, y, z [m], pitch, roll, heading [rad]",
     "body_velocity": "of the recipe's bodies in the world's axes: of the origin [m/s], rotation vector a second [rad/s]",
 }
@@ -356,7 +360,7 @@ PER_FRAME = {
 }
 
 
-MOST_DROPPED = 0.5
+MAX_DROPPED_SHARE = 0.5
 """Share of a ping's rays that may be dropped without a warning if the recipe sets the range window explicitly."""
 
 
@@ -390,7 +394,7 @@ class ImageModality:
             table[name] = self._stored(kind, view_name, shape, dims)
         if self.recipe.bodies:
             shape, dims = (len(self.recipe.bodies), 6), ("body", "six")
-            table |= {name: StoredArray(np.dtype(np.float64), about, shape, dims) for name, about in OF_BODIES.items()}
+            table |= {name: StoredArray(np.dtype(np.float64), about, shape, dims) for name, about in BODY_TEXTS.items()}
         return table | PER_FRAME
 
     @property
@@ -462,24 +466,24 @@ class ImageModality:
 
     def faults(self, read: Read, here: slice) -> list[str]:
         """Check pixels, sums and labels against their limits, and return one sentence per fault."""
-        wrong = []
+        faults = []
         beams = {view.name: len(view.bearing_rad) for view in self.recipe.views}
         for name, (kind, view) in array_names(self.recipe).items():
             values = read(name, here)
             low, high = _limits(kind, values, beams[view])
-            known = values[~np.isnan(values)] if kind == "elevation_rad" else values
-            if known.size and not (known.min() >= low and known.max() <= high):
-                wrong.append(
-                    f"{name}, frames {here.start}..{here.stop - 1}: values {known.min():g}..{known.max():g}, allowed "
+            valid = values[~np.isnan(values)] if kind == "elevation_rad" else values
+            if valid.size and not (valid.min() >= low and valid.max() <= high):
+                faults.append(
+                    f"{name}, frames {here.start}..{here.stop - 1}: values {valid.min():g}..{valid.max():g}, allowed "
                     f"{low:g}..{high:g}"
                 )
             if kind == "nonzero":
                 vector = read(name.replace("nonzero", "vector", 1), here)
                 if ((vector > 0) != (values > 0)).any() or (vector > values * (1 + 1e-6)).any():
-                    wrong.append(
+                    faults.append(
                         f"{name}, frames {here.start}..{here.stop - 1}: sums and numbers of echoes contradict each other"
                     )
-        return wrong
+        return faults
 
     def warnings(self, read: Read) -> list[str]:
         """Return warnings about motions far below a range bin, returns outside the window, and too high a gain."""
@@ -495,7 +499,7 @@ class ImageModality:
             )
         dropped, saturated = (read(name).astype(np.int64) for name in ("dropped", "saturated"))
         rays, stated = self.sonar.rays, {"range_min", "range_max"} <= set(self.recipe.sonar or {})
-        if dropped.mean() > (MOST_DROPPED if stated else NEGLIGIBLE) * rays:
+        if dropped.mean() > (MAX_DROPPED_SHARE if stated else NEGLIGIBLE) * rays:
             sentences.append(
                 f"{dropped.mean():,.0f} returns a ping ({100 * dropped.mean() / rays:.2g} % of {rays:,} rays) lie outside "
                 f"the window {self.sonar.range_min:g}..{self.sonar.range_max:g} m and were dropped: set sonar.range_min "
@@ -629,14 +633,14 @@ class ResponseModality:
 
     def faults(self, read: Read, here: slice) -> list[str]:
         """Check that responses are finite and counts not negative, and return one sentence per fault."""
-        wrong = [
+        faults = [
             f"response, pings {here.start}..{here.stop - 1}: values that are not finite"
             for _ in range(not np.isfinite(read("response", here)).all())
         ]
         for name in ("echoes", "dropped"):
             if (read(name, here) < 0).any():
-                wrong.append(f"{name}, pings {here.start}..{here.stop - 1}: numbers below 0")
-        return wrong
+                faults.append(f"{name}, pings {here.start}..{here.stop - 1}: numbers below 0")
+        return faults
 
     def warnings(self, read: Read) -> list[str]:
         """Return warnings about receivers without echoes, dropped echoes, and motions far below a wavelength."""

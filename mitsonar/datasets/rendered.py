@@ -65,21 +65,23 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         gain: float | None = None,
         **arrangement: Unpack[ArrangementOptions],
     ) -> None:
-        own = ("seed", "length", "sequences_a_world", "buffer", "gain")
-        refuse_unknown(arrangement, (*own, *ArrangementOptions.__annotations__), type(self).__name__)
+        option_names = ("seed", "length", "sequences_a_world", "buffer", "gain")
+        refuse_unknown(arrangement, (*option_names, *ArrangementOptions.__annotations__), type(self).__name__)
         recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
         Samples.__init__(self, recipe, seed=seed, **arrangement)
         if recipe.flight.kind != "random":
-            raise MitsonarError("frames are rendered in training for random flights only: runs have an end, make a data set")
+            raise MitsonarError(
+                f"samples can be rendered for random flights only: got flight.kind {recipe.flight.kind}; make a data set"
+            )
         if self.frames > recipe.flight.pings:
             raise MitsonarError(f"frames must be at most flight.pings, {recipe.flight.pings}: got {self.frames}")
-        own_seed = int(np.random.SeedSequence([self.seed, 9]).generate_state(1)[0] // 2)
-        self.worlds = recipe_from({**recipe.model_dump(), "seed": own_seed})  # rebuilt, since a copy keeps cached values
+        stream_seed = int(np.random.SeedSequence([self.seed, 9]).generate_state(1)[0] // 2)
+        self.worlds = recipe_from({**recipe.model_dump(), "seed": stream_seed})  # rebuilt, since a copy keeps cached values
         self.length, self.sequences_a_world, self.buffer, self.gain = length, sequences_a_world, buffer, gain
 
     def __repr__(self) -> str:
         length = "endless" if self.length is None else f"{self.length:,}"
-        return f"RenderedPairs({length} samples of {self.frames} frames, rendered of {self.recipe.name}, seed {self.seed})"
+        return f"RenderedPairs({length} samples of {self.frames} frames, rendered from {self.recipe.name}, seed {self.seed})"
 
     def __iter__(self) -> Iterator[Batch]:
         for sample in self.raw():
@@ -93,12 +95,12 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             share: index of this worker and number of workers; default: those of torch.
         """
         # 1. Divide the samples of the epoch among the workers.
-        known = self._ready()
-        worker, workers = share or known
+        this_worker = self._set_up()
+        worker, workers = share or this_worker
         self._calibrate()
-        mine = None if self.length is None else self.length // workers + (worker < self.length % workers)
+        count = None if self.length is None else self.length // workers + (worker < self.length % workers)
         # 2. Replay the shuffled order up to ``skip``. Rendering starts at the first sample that is not skipped.
-        order = self._order(worker, mine)
+        order = self._order(worker, count)
         skipped: set[int] = set()
         first = 0
         for number in itertools.islice(order, skip):
@@ -107,14 +109,14 @@ class RenderedPairs(IterableDataset[Batch], Samples):
                 skipped.remove(first)
                 first += 1
         # 3. Render in sequence, and buffer samples until their turn in the shuffled order.
-        rendered = self._rendered(worker, workers, first)
-        waiting: dict[int, RawSample] = {}
+        stream = self._rendered(worker, workers, first)
+        buffered: dict[int, RawSample] = {}
         for number in order:
-            while number not in waiting:
-                made, sample = next(rendered)
-                if made >= first and made not in skipped:
-                    waiting[made] = sample
-            yield waiting.pop(number)
+            while number not in buffered:
+                rendered_number, sample = next(stream)
+                if rendered_number >= first and rendered_number not in skipped:
+                    buffered[rendered_number] = sample
+            yield buffered.pop(number)
 
     def _order(self, worker: int, length: int | None) -> Iterator[int]:
         """Yield sample numbers in shuffled order; each is drawn from a buffer of ``buffer`` numbers."""
@@ -150,7 +152,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         if self.gain is None:
             self.gain = calibrate(self.recipe)
 
-    def _ready(self) -> tuple[int, int]:
+    def _set_up(self) -> tuple[int, int]:
         """Set up the renderer, and return the index of this worker and the number of workers."""
         info = get_worker_info()
         if info is None:
@@ -171,34 +173,34 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         The stream starts with the first sample of the sequence that contains sample ``first``.
         """
         weights = np.array([group.count * group.sequences for group in self.worlds.scenes], dtype=float)
-        of_sequence = self.worlds.flight.pings - self.frames + 1
-        turn, sequence = divmod(first // of_sequence, self.sequences_a_world)
-        number = worker + (turn + self.epoch * 10**6) * workers
-        count = (first // of_sequence) * of_sequence
+        samples_per_sequence = self.worlds.flight.pings - self.frames + 1
+        world, sequence = divmod(first // samples_per_sequence, self.sequences_a_world)
+        number = worker + (world + self.epoch * 10**6) * workers
+        count = (first // samples_per_sequence) * samples_per_sequence
         while True:
             rng = np.random.default_rng([self.seed, 8, number])
             group = int(rng.choice(len(weights), p=weights / weights.sum()))
             scene = Scene(number, group, world_seed(self.worlds.seed, number), self.sequences_a_world)
             release_memory()
-            for sample in self._of_world(SceneRenderer(self.worlds, scene), sequence):
+            for sample in self._samples_of_world(SceneRenderer(self.worlds, scene), sequence):
                 yield count, sample
                 count += 1
             number, sequence = number + workers, 0
 
-    def _of_world(self, renderer: SceneRenderer, begin: int = 0) -> Iterator[RawSample]:
+    def _samples_of_world(self, renderer: SceneRenderer, begin: int = 0) -> Iterator[RawSample]:
         """Render samples of one world, starting at sequence ``begin``, with as many sequences per launch as fit."""
         assert self.gain is not None
         recipe, pings = renderer.recipe, renderer.recipe.flight.pings
-        together = max(1, renderer.simulator.model.pings_per_launch // pings)
+        sequences_per_launch = max(1, renderer.simulator.model.pings_per_launch // pings)
         sequences = itertools.islice(sequences_of(recipe, renderer.scene), begin, None)
-        before = renderer.scene.number * self.sequences_a_world * pings
-        for start in range(begin, self.sequences_a_world, together):
-            flown = [next(sequences).vehicle for _ in range(min(together, self.sequences_a_world - start))]
-            poses = mounted(np.concatenate(flown), recipe.mount.pose)
+        first_number = renderer.scene.number * self.sequences_a_world * pings
+        for start in range(begin, self.sequences_a_world, sequences_per_launch):
+            vehicles = [next(sequences).vehicle for _ in range(min(sequences_per_launch, self.sequences_a_world - start))]
+            poses = mounted(np.concatenate(vehicles), recipe.mount.pose)
             values = renderer.frames(poses, start * pings, self.gain)
-            for k, vehicle in enumerate(flown):
+            for k, vehicle in enumerate(vehicles):
                 for first in range(pings - self.frames + 1):
-                    yield self._sample(values, vehicle, poses, k * pings, first, before + start * pings)
+                    yield self._sample(values, vehicle, poses, k * pings, first, first_number + start * pings)
 
     def _sample(
         self,
@@ -257,9 +259,9 @@ class RawStream(IterableDataset[RawSample]):
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
         worker = (worker + self.skip) % workers  # torch always starts with worker 0
-        had = len(range(worker, self.skip, workers))  # batches come from the workers in rotation
+        batches_read = len(range(worker, self.skip, workers))  # batches come from the workers in rotation
         loader, loaders = self.share
-        return self.pairs.raw(self.batch_size * had, (loader * workers + worker, loaders * workers))
+        return self.pairs.raw(self.batch_size * batches_read, (loader * workers + worker, loaders * workers))
 
 
 # ---------------- Rendering stored samples again
@@ -292,15 +294,15 @@ def re_rendered(
     fields = pairs.recipe.model_dump()
     recipe = pairs.recipe if jitter is None else recipe_from({**fields, "sonar": {**fields["sonar"], "jitter": jitter}})
     gain = float(pairs.store.about["gain"])
-    wanted = np.asarray(numbers, dtype=np.int64)
-    scene_of = pairs.scene[pairs.first[wanted]]
+    selected = np.asarray(numbers, dtype=np.int64)
+    scene_of = pairs.scene[pairs.first[selected]]
     for scene in scenes_of(pairs.recipe, pairs.recipe.sequences):
-        mine = wanted[scene_of == scene.number]
-        if not len(mine):
+        indices = selected[scene_of == scene.number]
+        if not len(indices):
             continue
         renderer = SceneRenderer(recipe, scene)
         start = int(np.argmax(pairs.scene == scene.number))
-        for index in mine.tolist():
+        for index in indices.tolist():
             here = pairs.frame_numbers(index)
             poses = pairs.pose[here] if shift is None else shift(index, pairs.pose[here])
             values = renderer.frames(poses, here.start - start, gain)

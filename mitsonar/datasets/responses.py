@@ -68,10 +68,10 @@ def with_noise(
     """
     if snr_db is None:
         return response
-    each = np.sqrt(noise_power(response, snr_db) / 2)
+    std = np.sqrt(noise_power(response, snr_db) / 2)
     draws = [np.random.default_rng([seed, int(number)]) for number in np.asarray(numbers)]
     parts = np.stack([rng.standard_normal((*response.shape[1:], 2)) for rng in draws])
-    noisy = response + each * (parts[..., 0] + 1j * parts[..., 1])
+    noisy = response + std * (parts[..., 0] + 1j * parts[..., 1])
     return np.asarray(noisy, dtype=response.dtype)
 
 
@@ -104,7 +104,7 @@ class Packing:
             seed: seed of the noise.
         """
         rows = zip(response, np.asarray(numbers), strict=True)
-        return packed(np.stack([self.received(one, mine, seed) for one, mine in rows]))[:, None]
+        return packed(np.stack([self.received(sample, pings, seed) for sample, pings in rows]))[:, None]
 
 
 # ---------------- Samples for estimators, without torch
@@ -167,12 +167,12 @@ class ImpulseSamples:
         self.sonar = self.recipe.channel_sonar
         self.frames = self.recipe.frames if frames is None else frames
         if self.frames < 2:
-            raise MitsonarError(f"a sample has two pings or more, first and last: got frames {self.frames}")
+            raise MitsonarError(f"frames must be at least 2, for a first and a last ping: got {self.frames}")
         if leak not in LEAKS:
             raise MitsonarError(f"leak must be one of {', '.join(LEAKS)}: got {leak!r}")
         levels = [noise] if isinstance(noise, str) else list(noise)
         if not levels:
-            raise MitsonarError("noise is a ratio or a list of them: got an empty list; give none for no noise")
+            raise MitsonarError("noise must be a ratio or a list of ratios, not an empty list: give 'none' for no noise")
         self.arrange = Packing(tuple(one.name for one in self.sonar.receivers), tuple(map(snr_of, levels)))
         self.labels = displacement_labels(labels, self.recipe, self.frames)
         self.seed, self.epoch, self.leak = seed, 0, leak
@@ -180,7 +180,7 @@ class ImpulseSamples:
         self.split, self.first = self.chosen.split, self.chosen.first
         self.scene, self.sequence = self.chosen.scene, self.chosen.sequence
         if leak == "strangers" and len(np.unique(self.scene[self.first])) < 2:
-            raise MitsonarError(f"strangers are of two scenes, part {part!r} has one: read another part, or make more")
+            raise MitsonarError(f"leak='strangers' needs two scenes, part {part!r} has one: read another part, or make more")
 
     def __len__(self) -> int:
         return len(self.first)
@@ -211,14 +211,14 @@ class ImpulseSamples:
 
     def response(self, index: int) -> NDArray[np.complex64]:
         """Read the responses of a sample ``(Q, M, taps)`` without noise; ``leak`` selects responses to replace."""
-        mine = self.store.read("response", self.frame_numbers(index))
+        responses = self.store.read("response", self.frame_numbers(index))
         if self.leak == "one_ping":
-            return np.repeat(mine[:1], self.frames, axis=0)
+            return np.repeat(responses[:1], self.frames, axis=0)
         if self.leak == "strangers":
-            others = np.flatnonzero(self.scene[self.first] != self.scene[self.first[index]])
-            other = int(np.random.default_rng([self.seed, 11, int(self.first[index])]).choice(others))
-            return np.concatenate([mine[:1], self.store.read("response", self.frame_numbers(other))[1:]])
-        return mine
+            strangers = np.flatnonzero(self.scene[self.first] != self.scene[self.first[index]])
+            stranger = int(np.random.default_rng([self.seed, 11, int(self.first[index])]).choice(strangers))
+            return np.concatenate([responses[:1], self.store.read("response", self.frame_numbers(stranger))[1:]])
+        return responses
 
     @property
     def noise_seed(self) -> int:
@@ -237,14 +237,14 @@ class ImpulseSamples:
     def responses(self, index: int) -> ImpulseResponses:
         """Read a sample with noise as :class:`ImpulseResponses`, the input of estimators."""
         here = self.frame_numbers(index)
-        known = self._per_ping
+        per_ping = self._per_ping
         return ImpulseResponses(
             response=self.received(index),
             sonar=self.sonar,
             poses=self.chosen.pose[here],
-            time_s=known["time_s"][here],
-            velocity=known["velocity"][here],
-            height_m=known["height_m"][here],
+            time_s=per_ping["time_s"][here],
+            velocity=per_ping["velocity"][here],
+            height_m=per_ping["height_m"][here],
         )
 
     @cached_property

@@ -64,24 +64,24 @@ class Part:
         Raises:
             MitsonarError: the part or split is unknown, or the part has no samples.
         """
-        dealt = split_for(split, store.recipe)
+        resolved = split_for(split, store.recipe)
         scene, sequence, pose, motion = (store.read(name) for name in ("scene", "sequence", "pose", "motion"))
         first = np.arange(max(0, len(sequence) - frames + 1))
         first = first[sequence[first] == sequence[first + frames - 1]]
-        if dealt.by == "sample":
-            first = first[deal_samples(sequence[first], dealt, part)]
+        if resolved.by == "sample":
+            first = first[deal_samples(sequence[first], resolved, part)]
         else:
-            first = first[deal(world_of(store.recipe, store.scenes)[scene], sequence, dealt, part)[first]]
+            first = first[deal(world_of(store.recipe, store.scenes)[scene], sequence, resolved, part)[first]]
         if not len(first):
             raise MitsonarError(
                 f"{store.place.url} has no sample of {frames} frames in part {part!r}: its sequences have "
-                f"{np.bincount(sequence).max()} frames; ask for fewer frames, or another part"
+                f"{np.bincount(sequence).max()} frames; request fewer frames, or another part"
             )
         if one_a_sequence:
             rank = np.random.default_rng([seed, 5]).permutation(len(first))
             order = np.lexsort((rank, sequence[first]))
             first = np.sort(first[order][np.unique(sequence[first][order], return_index=True)[1]])
-        return cls(dealt, frames, first, scene, sequence, pose, motion)
+        return cls(resolved, frames, first, scene, sequence, pose, motion)
 
     def frame_numbers(self, index: int) -> slice:
         """Return the slice of the store's frames that a sample holds."""

@@ -77,8 +77,8 @@ def ground_at(
     # 1. Place the nodes evenly in index, and measure the local size of a bin and of a beam there.
     axes = [np.asarray(values, dtype=float) for values in (range_m, bearing_rad)]
     index = [np.linspace(0, len(axis) - 1, count) for axis, count in zip(axes, NODES, strict=True)]
-    nodes = [np.interp(at, np.arange(len(axis)), axis) for at, axis in zip(index, axes, strict=True)]
-    cell = [np.interp(at, np.arange(len(axis)), np.gradient(axis)) for at, axis in zip(index, axes, strict=True)]
+    nodes = [np.interp(position, np.arange(len(axis)), axis) for position, axis in zip(index, axes, strict=True)]
+    cell = [np.interp(position, np.arange(len(axis)), np.gradient(axis)) for position, axis in zip(index, axes, strict=True)]
     geometry = GroundGeometry(nodes[0], nodes[1], bearing, height_m, pitch_rad, roll_rad)
     # 2. Where a node does not meet the ground, take the nearest node that does.
     row, column = nearest_known(np.asarray(np.isfinite(geometry.points).all(axis=-1)))
@@ -87,8 +87,8 @@ def ground_at(
 
     def derivative(part: float) -> NDArray[np.float64]:
         """Compute the derivative with respect to motion, for a sonar at this fraction of the height."""
-        own = GroundGeometry(nodes[0], nodes[1], bearing, part * height_m, pitch_rad, roll_rad)
-        values = np.nan_to_num(own.derivative[row, column]) / np.moveaxis(cells, 0, -1)[..., None]
+        shifted = GroundGeometry(nodes[0], nodes[1], bearing, part * height_m, pitch_rad, roll_rad)
+        values = np.nan_to_num(shifted.derivative[row, column]) / np.moveaxis(cells, 0, -1)[..., None]
         return np.moveaxis(values, (2, 3), (0, 1))
 
     # 3. Differentiate with respect to relief by central differences: higher ground is the same as a lower sonar.
@@ -259,7 +259,7 @@ class StoredBatches(Batches):
         """Yield the batches of one epoch on a device; their order depends on seed and epoch only."""
         order = torch.Generator().manual_seed(self.epoch_seed)
         yield from self.batches(
-            _Raw(self), batch_size, device, workers, shuffle=shuffle, generator=order, drop_last=drop_last
+            _RawSamples(self), batch_size, device, workers, shuffle=shuffle, generator=order, drop_last=drop_last
         )
 
 
@@ -271,7 +271,7 @@ def _first(inputs: Inputs) -> Inputs:
 
 
 @dataclass(frozen=True)
-class _Raw(Dataset[RawSample]):
+class _RawSamples(Dataset[RawSample]):
     """Raw samples for worker processes, which only read."""
 
     samples: StoredBatches
@@ -364,7 +364,7 @@ class Samples(Batches):
         self.seed, self.epoch, self.ground = seed, 0, ground
         if ground and (self.frames != 2 or len(self.arrange.views) != 1 or self.arrange.kind != "image"):
             raise MitsonarError(
-                "the ground is that of pairs of images of one view: give frames=2, views='NAME' of "
+                "ground=True needs pairs of images of one view: give frames=2, views='NAME' of "
                 f"{', '.join(self.arrange.views)}, kind='image'"
             )
 
@@ -503,8 +503,8 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         one_a_sequence: bool = False,
         **arrangement: Unpack[SampleOptions],
     ) -> None:
-        own = ("part", "split", "one_a_sequence")
-        refuse_unknown(arrangement, (*own, *SampleOptions.__annotations__), type(self).__name__)
+        names = ("part", "split", "one_a_sequence")
+        refuse_unknown(arrangement, (*names, *SampleOptions.__annotations__), type(self).__name__)
         self.store, self._part = DataStore.open(url), part
         Samples.__init__(self, self.store.recipe, **arrangement)
         self.chosen = Part.of(self.store, part, split, self.frames, seed=self.seed, one_a_sequence=one_a_sequence)
@@ -512,7 +512,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         self.scene, self.sequence = self.chosen.scene, self.chosen.sequence
         self.pose, self.motion = self.chosen.pose, self.chosen.motion
         self._grounds: dict[int, RawSample] = {}
-        self._whole: dict[str, Values] = {}
+        self._vectors: dict[str, Values] = {}
 
     def __repr__(self) -> str:
         return (
@@ -563,13 +563,13 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         levels = int(np.prod(self.store.modality.stored[name].shape))
         if self.stored_kind != "vector" or 4 * levels * len(self.sequence) > KEPT_BYTES:
             return self.store.read(name, here)
-        if name not in self._whole:
-            self._whole[name] = self.store.read(name)
-        return self._whole[name][here]
+        if name not in self._vectors:
+            self._vectors[name] = self.store.read(name)
+        return self._vectors[name][here]
 
     def __getstate__(self) -> Fields:
         """Return the state without cached arrays, because other processes read them themselves."""
-        return {**vars(self), "_whole": {}}
+        return {**vars(self), "_vectors": {}}
 
     def sonar_frames(self, index: int, image: Values | None = None) -> SonarFrames:
         """Read a sample of one view as :class:`SonarFrames` with noise, poses and heights, the input of estimators.
@@ -629,14 +629,14 @@ class JoinedPairs(StoredBatches, Dataset[Any]):
         self.parts = tuple(parts)
         leader = self.parts[0]
         for part in self.parts[1:]:
-            _refuse_others(leader, part)
+            _check_agreement(leader, part)
         self.recipe, self.labels, self.frames = leader.recipe, leader.labels, leader.frames
         self.seed, self.epoch = leader.seed, leader.epoch
         self._samples = np.cumsum([0, *map(len, self.parts)])
         self._frames = np.cumsum([0, *(len(part.sequence) for part in self.parts)])
-        before = np.cumsum([0, *(int(part.sequence.max()) + 1 for part in self.parts)])
+        sequence_offsets = np.cumsum([0, *(int(part.sequence.max()) + 1 for part in self.parts)])
         self.first = np.concatenate([part.first + n for part, n in zip(self.parts, self._frames, strict=False)])
-        self.sequence = np.concatenate([part.sequence + n for part, n in zip(self.parts, before, strict=False)])
+        self.sequence = np.concatenate([part.sequence + n for part, n in zip(self.parts, sequence_offsets, strict=False)])
 
     def __len__(self) -> int:
         return int(self._samples[-1])
@@ -665,9 +665,9 @@ class JoinedPairs(StoredBatches, Dataset[Any]):
 
     def raw(self, index: int) -> RawSample:
         """Read a sample as stored."""
-        place = int(np.searchsorted(self._samples, index, side="right")) - 1
-        sample = self.parts[place].raw(index - int(self._samples[place]))
-        return {**sample, "frames": sample["frames"] + self._frames[place]}  # so that no two sets share noise
+        part = int(np.searchsorted(self._samples, index, side="right")) - 1
+        sample = self.parts[part].raw(index - int(self._samples[part]))
+        return {**sample, "frames": sample["frames"] + self._frames[part]}  # so that no two sets share noise
 
     def finished(self, batch: dict[str, Tensor], device: Device = None) -> Batch:
         """Compute the inputs and labels of a batch of raw samples from any of the sets on a device."""
@@ -675,41 +675,41 @@ class JoinedPairs(StoredBatches, Dataset[Any]):
 
     def described(self) -> Fields:
         """Return the description for a checkpoint: that of the first set, with the models and names of all sets."""
-        told = [part.described() for part in self.parts]
+        descriptions = [part.described() for part in self.parts]
         names = [part.recipe.name for part in self.parts]
-        return {**told[0], "model": _listed([one["model"] for one in told]), "data": _listed(names)}
+        return {**descriptions[0], "model": _join_names([one["model"] for one in descriptions]), "data": _join_names(names)}
 
 
-def _listed(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     return " and ".join(dict.fromkeys(names))
 
 
-def _refuse_others(leader: SonarPairs, part: SonarPairs) -> None:
+def _check_agreement(leader: SonarPairs, part: SonarPairs) -> None:
     """Refuse a data set whose inputs or labels have another form than those of the first.
 
     Raises:
-        MitsonarError: they have.
+        MitsonarError: its inputs or labels differ.
     """
-    mine, its = (_what_must_agree(pairs) for pairs in (leader, part))
-    other = [name for name in mine if mine[name] != its[name]]
-    if other:
-        name = other[0]
+    expected, actual = (_common_properties(pairs) for pairs in (leader, part))
+    differing = [name for name in expected if expected[name] != actual[name]]
+    if differing:
+        name = differing[0]
         raise MitsonarError(
-            f"data sets of one training agree in {', '.join(mine)}: {leader.store.place.url} has {name} {mine[name]}, "
-            f"{part.store.place.url} has {its[name]}; train on one of them, or make the other anew"
+            f"data sets of one training must agree in {', '.join(expected)}: {leader.store.place.url} has {name} "
+            f"{expected[name]}, {part.store.place.url} has {actual[name]}; train on one of them, or make the other again"
         )
 
 
-def _what_must_agree(pairs: SonarPairs) -> Fields:
+def _common_properties(pairs: SonarPairs) -> Fields:
     """Return the properties that determine the form of inputs and labels, keyed by name."""
     views = [view for view in pairs.recipe.views if view.name in pairs.arrange.views]
-    told = pairs.described()
+    description = pairs.described()
     return {
         "views": pairs.arrange.views,
         "window": [(one.sonar.range_min, one.sonar.range_max, one.sonar.range_bins) for one in views],
         "beams": [(len(one.bearing_rad), *np.degrees(one.bearing_rad[[0, -1]]).round(6).tolist()) for one in views],
         "pixels": (pairs.stored_kind, pairs.recipe.pixel),
-        "heights and mount": told["trained_at"],
+        "heights and mount": description["trained_at"],
         "largest motions": (pairs.labels.names, pairs.labels.high.tolist()),
     }
 

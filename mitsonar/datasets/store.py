@@ -57,7 +57,7 @@ PACKAGES = ("mitsonar", "mitsuba", "drjit", "numpy", "finufft", "zarr")
 DECIDING = PACKAGES[:3]
 """Packages whose versions affect the recorded values."""
 
-Kind: TypeAlias = np.dtype[Any]
+DType: TypeAlias = np.dtype[Any]
 """NumPy data type of an array."""
 
 
@@ -130,24 +130,26 @@ class DataStore:
         try:
             group = zarr.open_group(storage.store(write=write), mode="r+" if write else "r", zarr_format=3)
             attributes: Fields = dict(group.attrs)
-            ours = attributes.get("kind") == "mitsonar data set"
-            known = attributes.get("format")
+            is_data_set = attributes.get("kind") == "mitsonar data set"
+            stored_format = attributes.get("format")
             check_plain(attributes, "its zarr.json")
         except Exception as error:  # a damaged file, or a storage that does not answer, may raise anything
-            nothing = isinstance(error, zarr.errors.GroupNotFoundError)
-            reason = "it is no Zarr group" if nothing else " ".join(str(error).split())[:200] or type(error).__name__
+            no_group = isinstance(error, zarr.errors.GroupNotFoundError)
+            reason = "it is not a Zarr group" if no_group else " ".join(str(error).split())[:200] or type(error).__name__
             raise MitsonarError(
-                f"no data set at {storage.url}: {reason}; give what `mitsonar dataset make` or `dataset from-frames` wrote"
+                f"no data set at {storage.url}: {reason}; give the output of `mitsonar dataset make` or of `dataset "
+                "from-frames`"
             ) from None
-        if not ours:
+        if not is_data_set:
             kind = shortened(attributes.get("kind"))
             raise MitsonarError(
-                f"{storage.url} is no data set of mitsonar, but a Zarr group of the kind {kind}: give what `mitsonar "
-                "dataset make` or `dataset from-frames` wrote"
+                f"{storage.url} is not a mitsonar data set, but a Zarr group of the kind {kind}: give the output of "
+                "`mitsonar dataset make` or `dataset from-frames`"
             )
-        if known != FORMAT:
+        if stored_format != FORMAT:
             raise MitsonarError(
-                f"{storage.url} has format {shortened(known)}, this mitsonar reads {FORMAT}: use the version that made it"
+                f"{storage.url} has format {shortened(stored_format)}, but this version of mitsonar reads format {FORMAT}: "
+                "use the version that wrote it"
             )
         try:
             store = cls(storage, group)
@@ -161,8 +163,7 @@ class DataStore:
             ) from None
         if not unfinished and not store.finished:
             raise MitsonarError(
-                f"{storage.url} is not finished, and only a whole data set is read: run the same `mitsonar dataset make` "
-                "again, it continues where it stopped"
+                f"{storage.url} is not finished: run the same `mitsonar dataset make` again, which resumes it"
             )
         return store
 
@@ -204,18 +205,18 @@ class DataStore:
         if name not in self._arrays:  # cached, because the group reads the metadata at every access
             try:
                 with zarr.config.set({"array.write_empty_chunks": True}):  # so that a missing file is a missing shard
-                    found = self.group[name]
-                if isinstance(found, zarr.Array):
-                    refuse_codecs(found)
+                    array = self.group[name]
+                if isinstance(array, zarr.Array):
+                    refuse_codecs(array)
             except Exception as error:  # metadata missing or damaged
                 raise MitsonarError(
-                    f"{self.place.url}/{name}/zarr.json is damaged or gone ({type(error).__name__}): remove the data set "
+                    f"{self.place.url}/{name}/zarr.json is damaged or missing ({type(error).__name__}): remove the data set "
                     "and make it again"
                 ) from None
-            if not isinstance(found, zarr.Array):
-                raise MitsonarError(f"{self.place.url}/{name} is no array: remove the data set and make it again")
-            self._check_array(name, found)
-            self._arrays[name] = found
+            if not isinstance(array, zarr.Array):
+                raise MitsonarError(f"{self.place.url}/{name} is not an array: remove the data set and make it again")
+            self._check_array(name, array)
+            self._arrays[name] = array
         return self._arrays[name]
 
     def read(self, name: str, index: int | slice | EllipsisType = ...) -> Values:
@@ -230,18 +231,18 @@ class DataStore:
         except Exception as error:  # damaged bytes may raise anything
             reason = " ".join(str(error).split())[:160] or type(error).__name__
             raise MitsonarError(
-                f"{self.place.url}: {name} is damaged ({reason}); `mitsonar dataset check` tells where, "
-                "`mitsonar dataset make --verify` mends it"
+                f"{self.place.url}: {name} is damaged ({reason}); `mitsonar dataset check` lists the damaged files, "
+                "`mitsonar dataset make --verify` repairs them"
             ) from None
-        most = {"sequence": int(self.about["sequences"]) - 1, "scene": max(self.scenes)}.get(name)
-        if values.size and most is not None and not (values.min() >= 0 and values.max() <= most):
+        highest = {"sequence": int(self.about["sequences"]) - 1, "scene": max(self.scenes)}.get(name)
+        if values.size and highest is not None and not (values.min() >= 0 and values.max() <= highest):
             raise MitsonarError(
-                f"{self.place.url}: {name} is damaged (numbers are 0..{most}, got {values.min()}..{values.max()}); "
-                "`mitsonar dataset make --verify` mends it"
+                f"{self.place.url}: {name} is damaged (numbers are 0..{highest}, got {values.min()}..{values.max()}); "
+                "`mitsonar dataset make --verify` repairs it"
             )
         if name in ("pose", "vehicle_pose", "time_s") and not np.isfinite(values).all():
             raise MitsonarError(
-                f"{self.place.url}: {name} is damaged (nan or inf); `mitsonar dataset make --verify` mends it"
+                f"{self.place.url}: {name} is damaged (nan or inf); `mitsonar dataset make --verify` repairs it"
             )
         return values
 
@@ -253,37 +254,39 @@ class DataStore:
         """
         if len(self) <= FEW_ROWS:
             return
-        stored = 0
+        stored_bytes = 0
         for key in ("pose/c/0/0", "motion/c/0/0", "time_s/c/0"):
             with contextlib.suppress(OSError):
-                stored = max(stored, int(self.place.fs.size(f"{self.place.root}/{key}") or 0))
-        if len(self) > rows_that_fit(stored):
-            raise ValueError(f"{len(self):,} frames are more than the {stored:,} bytes of their poses can hold")
+                stored_bytes = max(stored_bytes, int(self.place.fs.size(f"{self.place.root}/{key}") or 0))
+        if len(self) > rows_that_fit(stored_bytes):
+            raise ValueError(f"{len(self):,} frames are more than the {stored_bytes:,} bytes of their poses can hold")
 
-    def _check_array(self, name: str, found: zarr.Array[Any]) -> None:
+    def _check_array(self, name: str, array: zarr.Array[Any]) -> None:
         """Check that type, shape and chunks of an array match the recipe.
 
         Raises:
             MitsonarError: they do not.
         """
-        wanted = self._wanted.get(name)
-        if wanted is None:
+        expected = self._expected_arrays.get(name)
+        if expected is None:
             return
-        shape, kind = wanted
-        pieces = found.shards or found.chunks
-        whole = (self.shard_frames, *shape[1:]) if name in self.rendered else (1, *shape[1:]) if name == SEAL else shape
-        fits = all(piece > 0 for piece in found.chunks) and tuple(pieces) == whole
-        if found.shape != shape or found.dtype.kind != np.dtype(kind).kind or not fits:
+        shape, dtype = expected
+        chunks = array.shards or array.chunks
+        expected_chunks = (
+            (self.shard_frames, *shape[1:]) if name in self.rendered else (1, *shape[1:]) if name == SEAL else shape
+        )
+        fits = all(piece > 0 for piece in array.chunks) and tuple(chunks) == expected_chunks
+        if array.shape != shape or array.dtype.kind != np.dtype(dtype).kind or not fits:
             raise MitsonarError(
-                f"{self.place.url}/{name} is {found.dtype} {str(found.shape)[:60]} in pieces of {str(pieces)[:60]}, not "
-                f"{kind} {shape} in pieces of {whole}: it is damaged; remove the data set and make it again"
+                f"{self.place.url}/{name} is {array.dtype} {str(array.shape)[:60]} in chunks of {str(chunks)[:60]}, not "
+                f"{dtype} {shape} in chunks of {expected_chunks}: it is damaged; remove the data set and make it again"
             )
 
     @cached_property
-    def _wanted(self) -> dict[str, tuple[tuple[int, ...], Kind]]:
+    def _expected_arrays(self) -> dict[str, tuple[tuple[int, ...], DType]]:
         """Return the expected shape and type of each array, keyed by name."""
         frames = len(self)
-        table: dict[str, tuple[tuple[int, ...], Kind]] = {}
+        table: dict[str, tuple[tuple[int, ...], DType]] = {}
         table |= {name: ((frames, *one.shape), one.kind) for name, one in self.modality.stored.items()}
         table |= {name: (axis.values.shape, axis.values.dtype) for name, axis in self.modality.axes.items()}
         widths = {"pose": 6, "vehicle_pose": 6, "motion": 3, "velocity": 4}
@@ -344,34 +347,34 @@ class DataStore:
             verify: whether to compare digests as well as sizes, which reads all files.
         """
         sizes, seals = self.place.sizes(), self.seals()
-        lacking = []
+        missing = []
         for shard in range(self.shards):
             keys = [self.key(name, shard) for name in self.rendered]
-            found = np.array([sizes.get(key, -1) for key in keys])
-            if (found < 0).any():
-                lacking.append(shard)
+            file_sizes = np.array([sizes.get(key, -1) for key in keys])
+            if (file_sizes < 0).any():
+                missing.append(shard)
             elif not seals[shard].any():  # the writer stopped between the last file and the seal
-                if not self.group.read_only and self._reads_whole(shard):
+                if not self.group.read_only and self._checksums_match(shard):
                     self.seal(shard)
                 else:
-                    lacking.append(shard)
-            elif (found != seals[shard, :, 0]).any() or (verify and self.damaged(shard, seals[shard])):
-                lacking.append(shard)
-        return lacking
+                    missing.append(shard)
+            elif (file_sizes != seals[shard, :, 0]).any() or (verify and self.damaged(shard, seals[shard])):
+                missing.append(shard)
+        return missing
 
     def damaged(self, shard: int, seal: NDArray[np.uint64]) -> list[str]:
         """Return the files of a shard whose digest differs from the sealed one."""
-        wrong = []
-        for name, (_, wanted) in zip(self.rendered, seal, strict=True):
+        damaged = []
+        for name, (_, sealed_digest) in zip(self.rendered, seal, strict=True):
             try:
                 content = self.place.read(self.key(name, shard))
             except OSError:
                 content = b""
-            if digest(content) != int(wanted):
-                wrong.append(self.key(name, shard))
-        return wrong
+            if digest(content) != int(sealed_digest):
+                damaged.append(self.key(name, shard))
+        return damaged
 
-    def _reads_whole(self, shard: int) -> bool:
+    def _checksums_match(self, shard: int) -> bool:
         """Return whether all checksums inside the files of a shard are correct."""
         try:
             for name in self.rendered:
@@ -398,16 +401,16 @@ class DataStore:
 
         The tolerance allows for processors that differ in the last bits.
         """
-        wrong = []
+        deviating = []
         for name, values in planned_arrays(plan, self.modality).items():
             try:
-                there = self.read(name)
-                same = there.shape == values.shape and np.allclose(there, values, rtol=0, atol=1e-9, equal_nan=True)
+                stored = self.read(name)
+                same = stored.shape == values.shape and np.allclose(stored, values, rtol=0, atol=1e-9, equal_nan=True)
             except MitsonarError:
                 same = False
             if not same:
-                wrong.append(name)
-        return wrong
+                deviating.append(name)
+        return deviating
 
     def mend_known(self, plan: Plan) -> None:
         """Rewrite the planned arrays that are damaged or deviate from the plan."""
@@ -430,7 +433,7 @@ SHARD_BYTES = 32 * 2**20
 SEAL = "seal"
 """Name of the array with the sizes and digests of all files."""
 
-ABOUT = {
+DESCRIPTIONS = {
     "pose": "sonar: x, y, z [m], pitch, roll, heading [rad]",
     "vehicle_pose": "vehicle: x, y, z [m], pitch, roll, heading [rad]; motion is the vehicle's",
     "motion": "to the next frame of the sequence: sideways, forward [m], yaw [rad]; nan for its last",
@@ -459,14 +462,14 @@ class ShardLayout:
         """Choose chunks of one sequence if sequences are short, and shards of about 32 MiB, of one scene if possible."""
         pings = recipe.flight.pings if recipe.flight.kind == "random" else 10
         chunk = pings if pings <= 10 else 10
-        each = modality_of(recipe).ping_bytes
+        ping_bytes = modality_of(recipe).ping_bytes
         scenes = np.bincount(plan.scene)
-        wanted = max(1, min(SHARD_BYTES // each, int(scenes.max())) // chunk)
+        target = max(1, min(SHARD_BYTES // ping_bytes, int(scenes.max())) // chunk)
         # Shards end where scenes end if the sizes allow it, because rendering a shard of two scenes loads both. The
-        # aligned size is used unless it is less than a third of the wanted size.
-        whole = int(np.gcd.reduce(scenes[scenes > 0])) // chunk
-        aligned = max((n for n in range(1, wanted + 1) if whole % n == 0), default=1) if whole else 1
-        return cls(chunk, chunk * (aligned if 3 * aligned >= wanted else wanted))
+        # aligned size is used unless it is less than a third of the target.
+        scene_chunks = int(np.gcd.reduce(scenes[scenes > 0])) // chunk
+        aligned = max((n for n in range(1, target + 1) if scene_chunks % n == 0), default=1) if scene_chunks else 1
+        return cls(chunk, chunk * (aligned if 3 * aligned >= target else target))
 
 
 def create_arrays(group: zarr.Group, plan: Plan, modality: Modality, layout: ShardLayout) -> None:
@@ -497,7 +500,7 @@ def create_arrays(group: zarr.Group, plan: Plan, modality: Modality, layout: Sha
         overwrite=True,
         dimension_names=("shard", "stored", "two"),
     )
-    seal.attrs.put({"about": ABOUT[SEAL], "arrays": recorded})
+    seal.attrs.put({"about": DESCRIPTIONS[SEAL], "arrays": recorded})
 
 
 def planned_arrays(plan: Plan, modality: Modality) -> dict[str, Values]:
@@ -505,17 +508,17 @@ def planned_arrays(plan: Plan, modality: Modality) -> dict[str, Values]:
 
     The vehicle's poses are included if x, y, z or heading of the sonar differ from the vehicle's.
     """
-    known: dict[str, Values] = {"pose": plan.poses, "motion": plan.motion, "time_s": plan.time_s}
-    known |= {"scene": plan.scene, "sequence": plan.sequence}
+    arrays: dict[str, Values] = {"pose": plan.poses, "motion": plan.motion, "time_s": plan.time_s}
+    arrays |= {"scene": plan.scene, "sequence": plan.sequence}
     if not np.array_equal(plan.poses[:, [0, 1, 2, 5]], plan.vehicle[:, [0, 1, 2, 5]]):
-        known["vehicle_pose"] = plan.vehicle
-    return known | {name: getattr(plan, name) for name in modality.planned}
+        arrays["vehicle_pose"] = plan.vehicle
+    return arrays | {name: getattr(plan, name) for name in modality.planned}
 
 
 def write_planned(group: zarr.Group, name: str, values: Values) -> None:
     """Write an array of :func:`planned_arrays` as a single chunk."""
-    inner = {"pose": ("six",), "vehicle_pose": ("six",), "motion": ("three",), "velocity": ("four",)}
-    _write_known(group, name, values, ("frame", *inner.get(name, ())), ABOUT[name])
+    dims = {"pose": ("six",), "vehicle_pose": ("six",), "motion": ("three",), "velocity": ("four",)}
+    _write_known(group, name, values, ("frame", *dims.get(name, ())), DESCRIPTIONS[name])
 
 
 def _create_recorded(group: zarr.Group, name: str, frames: int, stored: StoredArray, layout: ShardLayout) -> None:
@@ -558,7 +561,7 @@ def _write_known(group: zarr.Group, name: str, values: Values, dims: tuple[str, 
 # ---------------- Validation of a store's attributes
 
 
-MOST_FRAMES = 10**9
+MAX_FRAMES = 10**9
 """Largest number of frames in a data set."""
 
 
@@ -576,14 +579,14 @@ def check_attributes(about: Fields, recipe: Recipe, modality: Modality) -> None:
         MitsonarError, KeyError, ValueError: a number is missing, out of bounds or inconsistent.
     """
     sequences = whole_number(about["sequences"], "sequences", 1, recipe.sequences)
-    most = MOST_FRAMES
+    max_frames = MAX_FRAMES
     if recipe.flight.kind == "random":
-        most = sequences * recipe.flight.pings
-        whole_number(about["frames"], "frames", most, most)
-    frames = whole_number(about["frames"], "frames", 1, min(most, MOST_FRAMES))
-    shard = whole_number(about["shard_frames"], "shard_frames", 1, MOST_FRAMES)
-    if shard % whole_number(about["chunk_frames"], "chunk_frames", 1, shard):
-        raise ValueError("shard_frames is no multiple of chunk_frames")
+        max_frames = sequences * recipe.flight.pings
+        whole_number(about["frames"], "frames", max_frames, max_frames)
+    frames = whole_number(about["frames"], "frames", 1, min(max_frames, MAX_FRAMES))
+    shard_frames = whole_number(about["shard_frames"], "shard_frames", 1, MAX_FRAMES)
+    if shard_frames % whole_number(about["chunk_frames"], "chunk_frames", 1, shard_frames):
+        raise ValueError("shard_frames is not a multiple of chunk_frames")
     total, numbers = 0, set()
     for scene in about["scenes"]:
         numbers.add(whole_number(scene["number"], "number of a scene", 0, 2**31))
@@ -591,12 +594,12 @@ def check_attributes(about: Fields, recipe: Recipe, modality: Modality) -> None:
         whole_number(scene["seed"], "seed of a scene", 0, 2**64)
         total += whole_number(scene["sequences"], "sequences of a scene", 1, sequences)
     if total != sequences or len(numbers) != len(about["scenes"]):
-        raise ValueError(f"scenes have {total:,} sequences, {sequences:,} are promised for {frames:,} frames")
+        raise ValueError(f"scenes have {total:,} sequences, but the attributes state {sequences:,} for {frames:,} frames")
     for name in modality.settled:
         finite_number(about[name], name, above=0)
     versions = about["versions"]
     if not (isinstance(versions, dict) and isinstance(about["variant"], str)):
-        raise ValueError("versions or variant is something else")
+        raise ValueError("versions must be an object, and variant a string")
     if not all(type(about[name]) is bool for name in ("ready", "finished")):
         raise ValueError("ready and finished must be true or false")
 
@@ -640,19 +643,19 @@ def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, pa
         raise MitsonarError(f"part must be {', '.join(PARTS)} or all: got {part!r}{meant(part, (*PARTS, 'all'))}")
     shares = np.array([getattr(split, name) for name in PARTS])
     if shares[PARTS.index(part)] == 0:
-        raise MitsonarError(f"the split by {split.by} has no {part} part: {_shares(split)}; give another split")
-    owner = world if split.by == "scene" else sequence
-    numbers = np.unique(owner)
-    counts = _counts(len(numbers), shares)
+        raise MitsonarError(f"the split by {split.by} has no {part} part: {_format_shares(split)}; give another split")
+    unit = world if split.by == "scene" else sequence
+    numbers = np.unique(unit)
+    counts = _part_sizes(len(numbers), shares)
     if (counts[shares > 0] == 0).any():
         raise MitsonarError(
-            f"the data set has {len(numbers)} different {split.by}{'s' * (len(numbers) > 1)}, too few for {_shares(split)}: "
-            "make more, give another split, or read part 'all'"
+            f"the data set has {len(numbers)} different {split.by}{'s' * (len(numbers) > 1)}, too few for "
+            f"{_format_shares(split)}: make more, give another split, or read part 'all'"
         )
-    dealt = numbers[np.random.default_rng([split.seed, 6]).permutation(len(numbers))]
+    shuffled = numbers[np.random.default_rng([split.seed, 6]).permutation(len(numbers))]
     ends = np.cumsum(counts)
     index = PARTS.index(part)
-    return np.isin(owner, dealt[ends[index] - counts[index] : ends[index]])
+    return np.isin(unit, shuffled[ends[index] - counts[index] : ends[index]])
 
 
 def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
@@ -674,18 +677,20 @@ def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArra
     if part not in PARTS or not split.test:
         return deal(number.astype(np.int64), number, split, part)
     # 2. Otherwise set whole sequences aside for the test, so that it shares no motion with training.
-    whole = Split(by="sequence", train=1 - split.test, validation=0.0, test=split.test, seed=split.seed)
+    sequence_split = Split(by="sequence", train=1 - split.test, validation=0.0, test=split.test, seed=split.seed)
     if part == "test":
-        return deal(sequence.astype(np.int64), sequence, whole, part)
+        return deal(sequence.astype(np.int64), sequence, sequence_split, part)
     # 3. Assign the remaining samples one by one, with the shares that remain.
-    marked = deal(sequence.astype(np.int64), sequence, whole, "train")
-    rest = 1 - split.test
-    shared = split.model_copy(update={"train": split.train / rest, "validation": split.validation / rest, "test": 0.0})
-    marked[marked] = deal(number[marked].astype(np.int64), number[marked], shared, part)
-    return marked
+    mask = deal(sequence.astype(np.int64), sequence, sequence_split, "train")
+    remaining = 1 - split.test
+    sample_split = split.model_copy(
+        update={"train": split.train / remaining, "validation": split.validation / remaining, "test": 0.0}
+    )
+    mask[mask] = deal(number[mask].astype(np.int64), number[mask], sample_split, part)
+    return mask
 
 
-def _counts(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:
+def _part_sizes(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:
     """Divide ``total`` among the parts by their shares; every part with a positive share gets at least one."""
     counts = np.maximum(np.rint(shares * total).astype(np.int64), (shares > 0).astype(np.int64))
     largest = int(shares.argmax())
@@ -693,7 +698,7 @@ def _counts(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.maximum(counts, 0)
 
 
-def _shares(split: Split) -> str:
+def _format_shares(split: Split) -> str:
     """Format the shares of all parts."""
     return ", ".join(f"{name} {getattr(split, name):.0%}" for name in PARTS)
 
@@ -713,22 +718,24 @@ def names_of_scenes(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArra
     """
     if store.recipe.recorded is not None:
         return (), {}
-    stored = store.about.get("shape_names")
-    found: dict[int, tuple[str, ...]] = {}
-    built: dict[tuple[str, int], tuple[str, ...]] = {}
+    file_names = store.about.get("shape_names")
+    scene_names: dict[int, tuple[str, ...]] = {}
+    built_names: dict[tuple[str, int], tuple[str, ...]] = {}
     for number, scene in sorted(store.scenes.items()):
         family = store.recipe.family(scene.group)
         if family.called == "scene":
-            if not isinstance(stored, list) or scene.group >= len(stored):
+            if not isinstance(file_names, list) or scene.group >= len(file_names):
                 return (), {}
-            found[number] = tuple(map(str, stored[scene.group]))
+            scene_names[number] = tuple(map(str, file_names[scene.group]))
         else:
             key = repr(family), scene.seed if family.seeded else 0
-            if key not in built:
-                built[key] = family.build(scene.seed).shape_names
-            found[number] = built[key]
-    names = tuple(dict.fromkeys(name for own in found.values() for name in own))
-    if len(set(map(len, found.values()))) == 1 and len(set(found.values())) == 1:  # all scenes agree
-        return next(iter(found.values())), {}
-    place = {name: at for at, name in enumerate(names)}
-    return names, {number: np.array([*map(place.get, own), -1], dtype=np.int32) for number, own in found.items()}
+            if key not in built_names:
+                built_names[key] = family.build(scene.seed).shape_names
+            scene_names[number] = built_names[key]
+    names = tuple(dict.fromkeys(name for shapes in scene_names.values() for name in shapes))
+    if len(set(map(len, scene_names.values()))) == 1 and len(set(scene_names.values())) == 1:  # all scenes agree
+        return next(iter(scene_names.values())), {}
+    index_of = {name: index for index, name in enumerate(names)}
+    return names, {
+        number: np.array([*map(index_of.get, shapes), -1], dtype=np.int32) for number, shapes in scene_names.items()
+    }

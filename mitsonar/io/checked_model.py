@@ -83,11 +83,11 @@ class Preset(NamedTuple):
 
 def presets_in(package: str, folder: str) -> dict[str, Preset]:
     """Return the presets in a folder of a package, by name: those of a file's ``modes``, or else the file itself."""
-    found = {}
+    presets = {}
     for path in sorted((files(package) / folder).iterdir(), key=lambda path: path.name):
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
         for name, mode in table.get("modes", {path.name.removesuffix(".yaml"): table}).items():
             keys = {**table["keys"], **mode["keys"]}.items()
             values, sources = ({key: one[part] for key, one in keys} for part in ("value", "source"))
-            found[name] = Preset(mode["about"], values, sources)
-    return found
+            presets[name] = Preset(mode["about"], values, sources)
+    return presets

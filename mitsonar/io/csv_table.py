@@ -15,7 +15,7 @@ from mitsonar.io.files import read_bytes
 
 __all__ = ["CsvTable"]
 
-LARGEST = 2**29
+MAX_BYTES = 2**29
 """Largest size of a table [bytes]."""
 
 
@@ -29,20 +29,20 @@ class CsvTable:
             MitsonarError: no such file, not a table, or a row of another length.
         """
         self.path = path
-        text = read_bytes(path, "table", LARGEST).decode("utf-8-sig", "replace")
+        text = read_bytes(path, "table", MAX_BYTES).decode("utf-8-sig", "replace")
         try:
             rows = [row for row in csv.reader(io.StringIO(text)) if any(word.strip() for word in row)]
         except csv.Error as error:
-            reason = "it is no text" if "\0" in text or "new-line" in str(error) else error
+            reason = "it is not text" if "\0" in text or "new-line" in str(error) else error
             raise MitsonarError(f"cannot read the table {path}: {reason}; give a CSV file") from None
         if len(rows) < 2:
-            raise MitsonarError(f"{path} holds no table: a line of names and rows below it are needed")
+            raise MitsonarError(f"{path} holds no table: it needs a line of names and rows below it")
         self.names = [name.strip() for name in rows[0]]
         self.rows = rows[1:]
-        wrong = next((number for number, row in enumerate(self.rows, 2) if len(row) != len(self.names)), None)
-        if wrong is not None:
+        uneven = next((number for number, row in enumerate(self.rows, 2) if len(row) != len(self.names)), None)
+        if uneven is not None:
             raise MitsonarError(
-                f"row {wrong:,} of {path} has {len(self.rows[wrong - 2]):,} words, its first line has {len(self.names):,}"
+                f"row {uneven:,} of {path} has {len(self.rows[uneven - 2]):,} cells, its first line has {len(self.names):,}"
             )
 
     def __len__(self) -> int:
@@ -73,7 +73,7 @@ class CsvTable:
 
     def whole_at(self, column: int) -> NDArray[np.int64]:
         """Return a column of integers ``(rows,)`` by index; invalid cells are -1."""
-        return np.array([_whole(row[column]) for row in self.rows], dtype=np.int64)
+        return np.array([_integer(row[column]) for row in self.rows], dtype=np.int64)
 
     def columns_at(self, columns: Sequence[int]) -> NDArray[np.float64]:
         """Return columns ``(rows, columns)`` by index."""
@@ -87,7 +87,7 @@ def _number(word: str) -> float:
         return float("nan")
 
 
-def _whole(word: str) -> int:
+def _integer(word: str) -> int:
     text = word.strip()
     digits = text.partition(".")[0] if not text.partition(".")[2].strip("0") else ""
     return int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 19 else -1

@@ -40,19 +40,19 @@ __all__ = [
 ]
 
 
-LARGEST_JSON = 2**27
+MAX_JSON_BYTES = 2**27
 """Largest size of a JSON file [bytes]."""
 
-LARGEST_YAML = 2**20
+MAX_YAML_BYTES = 2**20
 """Largest size of a YAML file, which is written by hand [bytes]."""
 
 INFLATION = 1032
 """Largest factor by which deflated data can grow on decompression."""
 
-LAST_LETTER = 0x10FFFF
+MAX_CODE_POINT = 0x10FFFF
 """Largest Unicode code point."""
 
-MOST_PARTS = 10_000
+MAX_PARTS = 10_000
 """Largest number of arrays in an npz file."""
 
 
@@ -63,12 +63,12 @@ FileArray: TypeAlias = NDArray[Any]
 def write_whole(path: str | Path, content: bytes) -> None:
     """Write a file atomically, by renaming a temporary file: a reader finds either the old or the complete new file."""
     path = Path(path)
-    part = path.with_name(f".{path.name}.part")
-    with part.open("wb") as file:
+    temporary = path.with_name(f".{path.name}.part")
+    with temporary.open("wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    part.replace(path)
+    temporary.replace(path)
 
 
 def write_json(path: str | Path, value: dict[str, PlainValue]) -> None:
@@ -101,13 +101,13 @@ def refuse_irregular(path: str | Path, what: str, limit: int | None = None) -> N
         MitsonarError: a folder, a device, a pipe or a socket; or a file larger than the limit.
     """
     try:
-        known = Path(path).stat()
+        status = Path(path).stat()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise MitsonarError(f"cannot read {what} {path}: {reason}; give an existing file") from None
-    if not stat.S_ISREG(known.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise MitsonarError(f"{what} {path} is a folder, a device or a pipe: give a file")
-    if limit is not None and known.st_size > limit:
+    if limit is not None and status.st_size > limit:
         raise MitsonarError(f"{what} {path} is larger than {limit:,} bytes: it is damaged, or something else")
 
 
@@ -148,11 +148,11 @@ def whole_lines(path: Path, what: str, limit: int) -> list[bytes]:
     if not path.exists():
         return []
     content = read_bytes(path, what, limit)
-    whole = content[: content.rfind(b"\n") + 1]
-    if len(whole) < len(content):
+    complete = content[: content.rfind(b"\n") + 1]
+    if len(complete) < len(content):
         with path.open("r+b") as file:
-            file.truncate(len(whole))
-    return whole.splitlines()
+            file.truncate(len(complete))
+    return complete.splitlines()
 
 
 def read_json(path: str | Path, *, check: bool = True) -> dict[str, PlainValue]:
@@ -165,7 +165,7 @@ def read_json(path: str | Path, *, check: bool = True) -> dict[str, PlainValue]:
     Raises:
         MitsonarError: no such file, not JSON, not an object, or beyond the size limits.
     """
-    value = parse_json(read_bytes(path, "file", LARGEST_JSON), str(path), check=check)
+    value = parse_json(read_bytes(path, "file", MAX_JSON_BYTES), str(path), check=check)
     if not isinstance(value, dict):
         raise MitsonarError(f"{path} must hold a JSON object")
     return value
@@ -183,16 +183,16 @@ def read_yaml(path: str | Path, what: str, also: str = "") -> PlainValue:
         MitsonarError: no such file, not YAML, or beyond the size limits.
     """
     try:
-        content = at_most(path, LARGEST_YAML)
+        content = at_most(path, MAX_YAML_BYTES)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise MitsonarError(f"cannot read {what} {path}: {reason}; give a YAML file{also}") from None
-    if len(content) > LARGEST_YAML:
-        raise MitsonarError(f"{path} is larger than {LARGEST_YAML:,} bytes: it is no {what}")
+    if len(content) > MAX_YAML_BYTES:
+        raise MitsonarError(f"{path} is larger than {MAX_YAML_BYTES:,} bytes: it is not a {what}")
     try:
         return parse_yaml(content.decode("utf-8"), str(path))
     except UnicodeDecodeError as error:
-        raise MitsonarError(f"{path} is not YAML: byte {error.start:,} is no text in UTF-8") from None
+        raise MitsonarError(f"{path} is not YAML: byte {error.start:,} is not valid UTF-8") from None
 
 
 def read_npz(path: str | Path) -> dict[str, FileArray]:
@@ -204,26 +204,28 @@ def read_npz(path: str | Path) -> dict[str, FileArray]:
     """
     try:
         with Path(path).open("rb") as raw:
-            begin = raw.read(1)
+            first_byte = raw.read(1)
     except OSError as error:
         raise ValueError(f"{error.strerror or error}") from None
-    if not begin:
+    if not first_byte:
         raise ValueError("it is empty")
     if not zipfile.is_zipfile(path):
-        raise ValueError("it is no npz file, or was cut off")
+        raise ValueError("it is not an npz file, or was cut off")
     with zipfile.ZipFile(path) as file:  # each part is read to its end, since only then its checksum is verified
         parts = file.infolist()
         if any(entry.comment for entry in parts):  # a damaged comment length hides other parts
             raise ValueError("its list of parts is damaged")
-        if len(parts) > MOST_PARTS or len({entry.filename for entry in parts}) < len(parts):
+        if len(parts) > MAX_PARTS or len({entry.filename for entry in parts}) < len(parts):
             raise ValueError("its list of parts holds a name twice, or too many")
         if sum(entry.compress_size for entry in parts) > Path(path).stat().st_size:
             raise ValueError("its parts overlap")
         for entry in parts:
             if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError(f"{entry.filename} is packed in a way that NumPy does not use")
+                raise ValueError(f"{entry.filename} has a compression that NumPy does not use")
             if entry.file_size > INFLATION * entry.compress_size + 64:
-                raise ValueError(f"{entry.filename} says that it unpacks to {entry.file_size:,} bytes, more than can be")
+                raise ValueError(
+                    f"{entry.filename} declares {entry.file_size:,} bytes, more than its compressed bytes can hold"
+                )
         refuse_beyond_memory(sum(entry.file_size for entry in parts), str(path))
         return {entry.filename.removesuffix(".npy"): _array_in(file.read(entry), entry.filename) for entry in parts}
 
@@ -238,33 +240,33 @@ def refuse_beyond_memory(size: int, source: str) -> None:
     Raises:
         MitsonarError: it exceeds half of the machine's memory.
     """
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if size > there // 2:
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if size > memory // 2:
         raise MitsonarError(
-            f"{source} would take {size / 2**30:,.4g} GiB of memory, this machine has {there / 2**30:,.4g}: it is damaged, "
+            f"{source} would take {size / 2**30:,.4g} GiB of memory, this machine has {memory / 2**30:,.4g}: it is damaged, "
             "or must be cut into pieces"
         )
 
 
 def _array_in(content: bytes, name: str) -> FileArray:
     """Read one array of an npz file, after checking its header."""
-    part = io.BytesIO(content)
+    stream = io.BytesIO(content)
     versions = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    found = np.lib.format.read_magic(part)
-    if found not in versions:
-        raise ValueError(f"{name} has the version {found} of NumPy's format")
-    shape, fortran_order, kind = versions[found](part)
-    if kind.hasobject or kind.names is not None or kind.kind not in "biufcU":
-        raise ValueError(f"{name} holds neither numbers nor text but {str(kind)[:60]}")
-    if any(length < 0 for length in shape) or math.prod(shape) * kind.itemsize != len(content) - part.tell():
-        raise ValueError(f"{name} says that its shape is {str(shape)[:60]}, its bytes are {len(content) - part.tell():,}")
-    values = np.frombuffer(content, kind, math.prod(shape), part.tell()) if kind.itemsize and math.prod(shape) else None
-    if values is not None and kind.kind == "U":
-        letters = values.view(np.dtype(np.uint32).newbyteorder(kind.byteorder))
-        if (letters > LAST_LETTER).any():  # NumPy accepts these code points, but they make other readers fail
+    format_version = np.lib.format.read_magic(stream)
+    if format_version not in versions:
+        raise ValueError(f"{name} has the unknown version {format_version} of NumPy's format")
+    shape, fortran_order, dtype = versions[format_version](stream)
+    if dtype.hasobject or dtype.names is not None or dtype.kind not in "biufcU":
+        raise ValueError(f"{name} holds neither numbers nor text but {str(dtype)[:60]}")
+    if any(length < 0 for length in shape) or math.prod(shape) * dtype.itemsize != len(content) - stream.tell():
+        raise ValueError(f"{name} declares the shape {str(shape)[:60]}, but has {len(content) - stream.tell():,} bytes")
+    values = np.frombuffer(content, dtype, math.prod(shape), stream.tell()) if dtype.itemsize and math.prod(shape) else None
+    if values is not None and dtype.kind == "U":
+        code_points = values.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+        if (code_points > MAX_CODE_POINT).any():  # NumPy accepts these code points, but they make other readers fail
             raise ValueError(f"{name} holds text that is not Unicode")
-    made = np.zeros(shape, kind) if values is None else values.reshape(shape, order="F" if fortran_order else "C")
-    return np.array(made)  # writable
+    array = np.zeros(shape, dtype) if values is None else values.reshape(shape, order="F" if fortran_order else "C")
+    return np.array(array)  # writable
 
 
 # ---------------- Validation of JSON and YAML contents
@@ -274,16 +276,16 @@ def _array_in(content: bytes, name: str) -> FileArray:
 PlainValue: TypeAlias = Any
 """A value of a file: a table, list, string, number, date or None. Its reader checks which."""
 
-DEEPEST = 40
+MAX_DEPTH = 40
 """Largest nesting depth of lists and tables."""
 
-MOST_VALUES = 2_000_000
+MAX_VALUES = 2_000_000
 """Largest number of values in a file, counting a referenced value each time."""
 
-MOST_OF_YAML = 100_000
+MAX_YAML_VALUES = 100_000
 """Largest number of values in a YAML file, which is written by hand."""
 
-MOST_BRACKETS = 200
+MAX_BRACKETS = 200
 """Largest number of open brackets in a YAML text, including those in comments."""
 
 LARGEST_INTEGER = 2**64
@@ -307,7 +309,7 @@ def parse_json(text: str | bytes, source: str, *, check: bool = True) -> PlainVa
     try:
         value = json.loads(text)
     except RecursionError:
-        raise MitsonarError(f"{source} nests more than {DEEPEST} deep: it is damaged") from None
+        raise MitsonarError(f"{source} nests more than {MAX_DEPTH} deep: it is damaged") from None
     except ValueError as error:
         raise MitsonarError(f"cannot read {source}: it is not JSON ({' '.join(str(error).split())[:160]})") from None
     if check:
@@ -325,9 +327,11 @@ def parse_yaml(text: str, source: str) -> PlainValue:
     Raises:
         MitsonarError: not YAML, a circular reference, or a depth, size or integer beyond the limits of this module.
     """
-    steps = ((one in "[{") - (one in "]}") for one in text if one in "[]{}")  # those in strings and comments as well
-    if max(itertools.accumulate(steps), default=0) > MOST_BRACKETS:  # PyYAML would need seconds to reject it
-        raise MitsonarError(f"{source} is not YAML: it nests more than {DEEPEST} deep")
+    steps = (
+        (letter in "[{") - (letter in "]}") for letter in text if letter in "[]{}"
+    )  # those in strings and comments as well
+    if max(itertools.accumulate(steps), default=0) > MAX_BRACKETS:  # PyYAML would need seconds to reject it
+        raise MitsonarError(f"{source} is not YAML: it nests more than {MAX_DEPTH} deep")
     loader: yaml.SafeLoader | None = None
     try:
         loader = yaml.SafeLoader(text)
@@ -339,17 +343,17 @@ def parse_yaml(text: str, source: str) -> PlainValue:
     except MitsonarError:
         raise
     except RecursionError:
-        raise MitsonarError(f"{source} is not YAML: it nests more than {DEEPEST} deep") from None
+        raise MitsonarError(f"{source} is not YAML: it nests more than {MAX_DEPTH} deep") from None
     except Exception as error:  # constructors of numbers and dates raise many types of errors
         raise MitsonarError(f"{source} is not YAML: {' '.join(str(error).split())[:300] or type(error).__name__}") from None
     finally:
         if loader is not None:
             loader.dispose()
-    check_plain(value, source, MOST_OF_YAML)
+    check_plain(value, source, MAX_YAML_VALUES)
     return value
 
 
-def check_plain(value: object, source: str, most: int = MOST_VALUES) -> None:
+def check_plain(value: object, source: str, most: int = MAX_VALUES) -> None:
     """Check that a value contains only tables, lists, strings, numbers and dates, within limits of depth and size.
 
     Args:
@@ -360,23 +364,23 @@ def check_plain(value: object, source: str, most: int = MOST_VALUES) -> None:
     Raises:
         MitsonarError: other types, or a value beyond the limits.
     """
-    rest: list[tuple[object, int]] = [(value, 0)]
+    pending: list[tuple[object, int]] = [(value, 0)]
     count = 0
-    while rest:
-        one, depth = rest.pop()
+    while pending:
+        item, depth = pending.pop()
         count += 1
-        if depth > DEEPEST or count > most:
-            too = f"nests more than {DEEPEST} deep" if depth > DEEPEST else f"holds more than {most:,} values"
-            raise MitsonarError(f"{source} {too}, or refers to itself: it is damaged")
-        if isinstance(one, dict):
-            rest += [(inner, depth + 1) for pair in one.items() for inner in pair]
-        elif isinstance(one, list | tuple | set):
-            rest += [(inner, depth + 1) for inner in one]
-        elif type(one) is int:
-            if abs(one) > LARGEST_INTEGER:
-                raise MitsonarError(f"{source} holds an integer of {one.bit_length():,} bits: integers have at most 64")
-        elif not (one is None or isinstance(one, str | bytes | bool | float | datetime.date)):
-            raise MitsonarError(f"{source} holds a {type(one).__name__}: only tables, lists, texts and numbers are known")
+        if depth > MAX_DEPTH or count > most:
+            excess = f"nests more than {MAX_DEPTH} deep" if depth > MAX_DEPTH else f"holds more than {most:,} values"
+            raise MitsonarError(f"{source} {excess}, or refers to itself: it is damaged")
+        if isinstance(item, dict):
+            pending += [(inner, depth + 1) for pair in item.items() for inner in pair]
+        elif isinstance(item, list | tuple | set):
+            pending += [(inner, depth + 1) for inner in item]
+        elif type(item) is int:
+            if abs(item) > LARGEST_INTEGER:
+                raise MitsonarError(f"{source} holds an integer of {item.bit_length():,} bits: integers have at most 64")
+        elif not (item is None or isinstance(item, str | bytes | bool | float | datetime.date)):
+            raise MitsonarError(f"{source} holds a {type(item).__name__}: only tables, lists, texts and numbers are allowed")
 
 
 def whole_number(value: object, name: str, low: int = 0, high: int = LARGEST_COUNT) -> int:
@@ -386,8 +390,8 @@ def whole_number(value: object, name: str, low: int = 0, high: int = LARGEST_COU
         MitsonarError: not an integer, or outside ``low`` .. ``high``.
     """
     if type(value) is not int or not low <= value <= high:
-        top = "2^63" if high == LARGEST_COUNT else f"{high:,}"
-        raise MitsonarError(f"{name} must be a whole number in {low:,}..{top}: got {shortened(value)}")
+        largest = "2^63" if high == LARGEST_COUNT else f"{high:,}"
+        raise MitsonarError(f"{name} must be a whole number in {low:,}..{largest}: got {shortened(value)}")
     return value
 
 
@@ -398,24 +402,24 @@ def finite_number(value: Any, name: str, above: float = -math.inf, below: float 
         MitsonarError: not a number, not finite, or not between ``above`` and ``below``.
     """
     if type(value) not in (int, float) or not above < value < below or abs(value) > sys.float_info.max:
-        over = "" if above == -math.inf else f" above {above:g}"
-        under = "" if below == math.inf else f" below {below:g}"
-        raise MitsonarError(f"{name} must be a finite number{over}{under}: got {shortened(value)}")
+        lower = "" if above == -math.inf else f" above {above:g}"
+        upper = "" if below == math.inf else f" below {below:g}"
+        raise MitsonarError(f"{name} must be a finite number{lower}{upper}: got {shortened(value)}")
     return float(value)
 
 
 def _check_nodes(node: yaml.Node, source: str) -> None:
     """Check the depth and size of a YAML document before its values are constructed, counting aliases in full."""
-    rest, count = [(node, 0)], 0
-    while rest:
-        one, depth = rest.pop()
+    pending, count = [(node, 0)], 0
+    while pending:
+        item, depth = pending.pop()
         count += 1
-        if depth > DEEPEST or count > MOST_OF_YAML:
+        if depth > MAX_DEPTH or count > MAX_YAML_VALUES:
             raise MitsonarError(
-                f"{source} is not YAML that can be read: it nests more than {DEEPEST} deep, refers to itself, or holds more "
-                f"than {MOST_OF_YAML:,} values"
+                f"{source} is not YAML that can be read: it nests more than {MAX_DEPTH} deep, refers to itself, or holds "
+                f"more than {MAX_YAML_VALUES:,} values"
             )
-        if isinstance(one, yaml.MappingNode):
-            rest += [(inner, depth + 1) for pair in one.value for inner in pair]
-        elif isinstance(one, yaml.SequenceNode):
-            rest += [(inner, depth + 1) for inner in one.value]
+        if isinstance(item, yaml.MappingNode):
+            pending += [(inner, depth + 1) for pair in item.value for inner in pair]
+        elif isinstance(item, yaml.SequenceNode):
+            pending += [(inner, depth + 1) for inner in item.value]

@@ -41,10 +41,10 @@ __all__ = [
 # ---------------- Provenance of results
 
 
-MOST_SHOWN = 4
+MAX_DIFFERENCES = 4
 """Largest number of differences listed in one sentence."""
 
-LONGEST_SHOWN = 60
+MAX_VALUE_LENGTH = 60
 """Largest number of characters of a value in a sentence."""
 
 
@@ -63,30 +63,31 @@ def refuse_other(where: str | Path, had: Mapping[str, object], asked: Mapping[st
     Raises:
         MitsonarError: they differ; the message names each difference with both values.
     """
-    other = differences(had, asked)
-    if other:
-        more = f"; and {len(other) - MOST_SHOWN} more" if len(other) > MOST_SHOWN else ""
+    changes = differences(had, asked)
+    if changes:
+        more = f"; and {len(changes) - MAX_DIFFERENCES} more" if len(changes) > MAX_DIFFERENCES else ""
         raise MitsonarError(
-            f"{where} was begun with {'; '.join(other[:MOST_SHOWN])}{more}: ask for the same{hint}, or choose another -o"
+            f"{where} was begun with {'; '.join(changes[:MAX_DIFFERENCES])}{more}: request the same settings"
+            f"{hint}, or choose another -o"
         )
 
 
 def differences(had: Mapping[str, object], asked: Mapping[str, object], within: str = "") -> list[str]:
     """List the keys whose values differ, with dots between levels and both values: ``sonar.seed 0, not 5``."""
-    found: list[str] = []
+    texts: list[str] = []
     for key in [*asked, *(key for key in had if key not in asked)]:
-        one, other = had.get(key), asked.get(key)
-        if isinstance(one, Mapping) and isinstance(other, Mapping):
-            found += differences(one, other, f"{within}{shown(key)}.")
-        elif one != other:
-            found.append(f"{within}{shown(key)} {shown(one)}, not {shown(other)}")
-    return found
+        old, new = had.get(key), asked.get(key)
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            texts += differences(old, new, f"{within}{shown(key)}.")
+        elif old != new:
+            texts.append(f"{within}{shown(key)} {shown(old)}, not {shown(new)}")
+    return texts
 
 
 def shown(value: object) -> str:
     """Format a value for a sentence, in one line, truncated if long."""
     text = " ".join(str(value).split())
-    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
+    return text if len(text) <= MAX_VALUE_LENGTH else f"{text[:MAX_VALUE_LENGTH]}..."
 
 
 def plain_json(value: Mapping[str, object]) -> dict[str, PlainValue]:
@@ -122,18 +123,20 @@ def json_digest(value: Mapping[str, object]) -> str:
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
     """Return the installed versions of packages, by name."""
-    found = {}
+    installed = {}
     for package in packages:
         try:
-            found[package] = version(package)
+            installed[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "not installed as a package"
-    return found
+            installed[package] = "not installed as a package"
+    return installed
 
 
 def other_versions(had: Mapping[str, object], packages: Iterable[str]) -> list[str]:
     """List the packages whose version has changed: ``mitsuba 3.8.0 (now 3.9.0)``."""
-    return [f"{name} {had.get(name)} (now {now})" for name, now in versions(packages).items() if had.get(name) != now]
+    return [
+        f"{name} {had.get(name)} (now {current})" for name, current in versions(packages).items() if had.get(name) != current
+    ]
 
 
 # ---------------- Run directory
@@ -141,7 +144,7 @@ def other_versions(had: Mapping[str, object], packages: Iterable[str]) -> list[s
 
 RUN_FILE = "run.json"
 
-LEFT_BY_A_KILL = (".part", "writer.lock")
+PARTIAL_SUFFIXES = (".part", "writer.lock")
 """File name suffixes that a killed run may leave behind; a folder with only such files counts as empty."""
 
 
@@ -214,21 +217,21 @@ class RunDirectory:
         if resume and overwrite:
             raise MitsonarError("--resume and --overwrite contradict each other: give one")
         new = cls(Path(path), kind, plain_json(asked), versions(kind.packages))
-        if not _holds_a_run(new.path):
+        if not _contains_run(new.path):
             return new
-        had = _read(new.path, kind, only_kind=overwrite)
-        if overwrite or (resume and had._replaces):  # killed while it removed the run that it replaces
+        existing = _read(new.path, kind, only_kind=overwrite)
+        if overwrite or (resume and existing._replaces):  # killed while it removed the run that it replaces
             new._replaces = True
             return new
         if not resume:
             raise MitsonarError(
-                f"{new.path} exists and is kept as it is: --resume goes on with it, --overwrite begins anew, or choose "
+                f"{new.path} exists and is kept as it is: --resume continues it, --overwrite begins anew, or choose "
                 "another -o"
             )
-        deciding = [{name: of.versions.get(name) for name in kind.deciding} for of in (had, new)]
-        refuse_other(new.path, had.asked | deciding[0], new.asked | deciding[1])
-        had.resumed = True
-        return had
+        deciding = [{name: run.versions.get(name) for name in kind.deciding} for run in (existing, new)]
+        refuse_other(new.path, existing.asked | deciding[0], new.asked | deciding[1])
+        existing.resumed = True
+        return existing
 
     @classmethod
     def open(cls, path: str | Path, kind: RunKind) -> RunDirectory:
@@ -239,9 +242,9 @@ class RunDirectory:
         """
         if not (Path(path) / RUN_FILE).is_file():
             raise MitsonarError(f"{path} holds no {kind.name}: there is no {Path(path) / RUN_FILE}")
-        there = kind_of_run(path)
-        if there not in ("", kind.name):
-            raise MitsonarError(f"{path} holds no {kind.name} but a run of another kind, {there}: give another folder")
+        other_kind = kind_of_run(path)
+        if other_kind not in ("", kind.name):
+            raise MitsonarError(f"{path} holds no {kind.name} but a run of another kind, {other_kind}: give another folder")
         return _read(Path(path), kind)
 
     def start(self, **notes: Any) -> None:
@@ -297,8 +300,8 @@ class RunDirectory:
 
     def damage(self, reason: object) -> MitsonarError:
         """Return the error for a damaged run file, with its remedies."""
-        do = "begin anew with --overwrite" if self.kind.replaced else "remove the folder"
-        return MitsonarError(f"{self.path / RUN_FILE} is damaged ({reason}): {do}, or choose another -o")
+        remedy = "begin anew with --overwrite" if self.kind.replaced else "remove the folder"
+        return MitsonarError(f"{self.path / RUN_FILE} is damaged ({reason}): {remedy}, or choose another -o")
 
     def _write(self) -> None:
         unknown = set(self.notes) - set(self.kind.notes)
@@ -330,7 +333,7 @@ def kind_of_run(path: str | Path) -> str:
     return kind if isinstance(kind, str) else ""
 
 
-def _holds_a_run(path: Path) -> bool:
+def _contains_run(path: Path) -> bool:
     """Return whether a folder holds a run; a missing or empty folder does not.
 
     Raises:
@@ -338,17 +341,17 @@ def _holds_a_run(path: Path) -> bool:
     """
     if path.exists() and not path.is_dir():
         raise MitsonarError(f"{path} is a file and is kept as it is: choose a folder as -o")
-    there = [one.name for one in path.iterdir() if not one.name.endswith(LEFT_BY_A_KILL)] if path.exists() else []
-    if there and RUN_FILE not in there:
-        raise MitsonarError(f"{path} holds other things ({min(there)}) and is kept as it is: choose another -o")
-    return bool(there)
+    names = [one.name for one in path.iterdir() if not one.name.endswith(PARTIAL_SUFFIXES)] if path.exists() else []
+    if names and RUN_FILE not in names:
+        raise MitsonarError(f"{path} contains other files ({min(names)}) and is kept as it is: choose another -o")
+    return bool(names)
 
 
 def _read(path: Path, kind: RunKind, *, only_kind: bool = False) -> RunDirectory:
     """Read the run in a folder and check its values; of a run to be replaced, only its type is checked."""
     content = read_json(path / RUN_FILE, check=False)
     if content.get("kind") != kind.name:
-        raise MitsonarError(f"{path} holds no {kind.name} of mitsonar and is kept as it is: choose another -o")
+        raise MitsonarError(f"{path} contains no {kind.name} run of mitsonar and is kept as it is: choose another -o")
     run = RunDirectory(path, kind, {}, {})
     if only_kind:
         return run
@@ -362,7 +365,7 @@ def _read(path: Path, kind: RunKind, *, only_kind: bool = False) -> RunDirectory
     return run
 
 
-COMMON: dict[str, Any] = {"kind": str, "finished": bool, "replaces": bool, "asked": dict, "versions": dict}
+COMMON_KEYS: dict[str, Any] = {"kind": str, "finished": bool, "replaces": bool, "asked": dict, "versions": dict}
 """Keys of every run file."""
 
 
@@ -375,9 +378,9 @@ def _check(content: dict[str, Any], kind: RunKind) -> None:
     from pydantic import ConfigDict, Field, ValidationError, create_model
 
     check_plain(content, "it")
-    narrower: dict[Any, Any] = {int: Annotated[int, Field(ge=0, le=LARGEST_COUNT)], list: list[str | int | float]}
-    fields: dict[str, Any] = {name: (expected, ...) for name, expected in COMMON.items()}
-    fields |= {name: (narrower.get(expected, expected), None) for name, expected in kind.notes.items()}
+    stricter: dict[Any, Any] = {int: Annotated[int, Field(ge=0, le=LARGEST_COUNT)], list: list[str | int | float]}
+    fields: dict[str, Any] = {name: (expected, ...) for name, expected in COMMON_KEYS.items()}
+    fields |= {name: (stricter.get(expected, expected), None) for name, expected in kind.notes.items()}
     model = create_model(
         "RunFile", __config__=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, protected_namespaces=()), **fields
     )

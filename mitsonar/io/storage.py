@@ -51,14 +51,14 @@ def refuse_codecs(array: zarr.Array[Any]) -> None:
     Raises:
         ValueError: the array needs another codec.
     """
-    rest: list[Any] = list(getattr(array.metadata, "codecs", ()))
+    pending: list[Any] = list(getattr(array.metadata, "codecs", ()))
     if array.metadata.zarr_format != 3:
-        raise ValueError("it is of version 2 of Zarr's format, whose pieces may hold pickles")
-    while rest:
-        codec = rest.pop()
-        rest += [*getattr(codec, "codecs", ()), *getattr(codec, "index_codecs", ())]
+        raise ValueError("it has version 2 of Zarr's format, whose chunks may contain pickles")
+    while pending:
+        codec = pending.pop()
+        pending += [*getattr(codec, "codecs", ()), *getattr(codec, "index_codecs", ())]
         if not (type(codec).__module__.startswith("zarr.codecs.") and type(codec).__name__ in CODECS):
-            raise ValueError(f"its pieces need the codec {type(codec).__name__[:40]}, which is not read")
+            raise ValueError(f"its chunks need the codec {type(codec).__name__[:40]}, which is not allowed")
 
 
 class Storage:
@@ -97,7 +97,7 @@ class Storage:
             raise MitsonarError(f"{self.url} is a file: give a folder, or a URL")
         try:
             self.fs.invalidate_cache()
-            found = self.fs.find(self.root, detail=True)
+            entries = self.fs.find(self.root, detail=True)
         except FileNotFoundError:
             return {}
         except Exception as error:  # storage libraries raise many types of errors
@@ -105,7 +105,7 @@ class Storage:
             raise MitsonarError(
                 f"cannot list {self.url}: {reason}; check the address, and for object storage its endpoint and credentials"
             ) from None
-        files = {name[len(self.root) + 1 :]: int(entry["size"] or 0) for name, entry in found.items()}
+        files = {name[len(self.root) + 1 :]: int(entry["size"] or 0) for name, entry in entries.items()}
         return {name: size for name, size in files.items() if name not in (LOCK, LOCK_FILE)}
 
     def read(self, name: str) -> bytes:
@@ -128,8 +128,8 @@ class Storage:
         Raises:
             MitsonarError: another process holds the lock.
         """
-        with self._locked_folder() if self.local else self._locked_objects() as still_ours:
-            yield still_ours
+        with self._locked_folder() if self.local else self._locked_objects() as check_lock:
+            yield check_lock
 
     @contextlib.contextmanager
     def _locked_folder(self) -> Iterator[Callable[[], None]]:
@@ -164,7 +164,7 @@ class Storage:
         self._refuse_if_written()
         self._renew(owner)
         time.sleep(0.5)  # of two processes that start at the same time, the last writer gets the lock
-        self._refuse_if_written(besides=owner)
+        self._refuse_if_written(except_owner=owner)
         done = threading.Event()
         lost = threading.Event()
 
@@ -175,17 +175,17 @@ class Storage:
                         return lost.set()
                     self._renew(owner)
 
-        def still_ours() -> None:
+        def check_lock() -> None:
             if lost.is_set():
                 raise MitsonarError(
-                    f"another process took {self.url} over, since this one had been silent for {STALE_S:.0f} s: it goes on "
-                    "there; what this one wrote is whole"
+                    f"another process has taken over {self.url}, because this one had not renewed its lock for "
+                    f"{STALE_S:.0f} s: the other process continues; the files that this one wrote are complete"
                 )
 
         thread = threading.Thread(target=renew, daemon=True)
         thread.start()
         try:
-            yield still_ours
+            yield check_lock
         finally:
             done.set()
             thread.join()
@@ -201,14 +201,14 @@ class Storage:
         """Write the owner and the current time."""
         self.write(LOCK, json.dumps({"owner": owner, "time": time.time()}).encode())
 
-    def _refuse_if_written(self, besides: str = "") -> None:
+    def _refuse_if_written(self, except_owner: str = "") -> None:
         try:
-            found = parse_json(self.read(LOCK), LOCK)
-            age = time.time() - finite_number(found["time"], "time")
-            owner = str(found["owner"])
+            lock = parse_json(self.read(LOCK), LOCK)
+            age = time.time() - finite_number(lock["time"], "time")
+            owner = str(lock["owner"])
         except (FileNotFoundError, ValueError, KeyError, TypeError):  # no identifiable writer
             return
-        if owner != besides and age < STALE_S:
+        if owner != except_owner and age < STALE_S:
             host, process, *_ = [*owner.split(), "?"]
             raise MitsonarError(
                 f"{self.url} is being written by process {process} on {host} (last sign {age:.0f} s ago): wait for it to "

@@ -316,8 +316,8 @@ def test_nothing_is_rendered_of_recorded_frames(places: dict[str, Path], tmp_pat
         ({"world": {"family": "rocky-field"}}, "leave out world"),
         ({"scenes": [{"sequences": 1}, {"sequences": 1}]}, "one scene"),
         ({"bearings": [0.0, 0.1]}, "2 of 96 beams"),
-        ({"bearings": [0.1, 0.0]}, "must rise"),
-        ({"bearings": [float("nan")] * 96}, "must rise"),
+        ({"bearings": [0.1, 0.0]}, "must increase"),
+        ({"bearings": [float("nan")] * 96}, "must increase"),
         ({"level": "contrast"}, "level"),
     ],
 )

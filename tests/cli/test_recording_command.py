@@ -115,7 +115,7 @@ def test_frames_survive_folder_and_mcap_in_any_order(
     assert back.height_m == pytest.approx(frames.height_m, rel=1e-6)
     assert back.sonar == frames.sonar
     refused(mitsonar("recording", "convert", places[kind], "-o", first), "exists and is kept")
-    refused(mitsonar("recording", "convert", places[kind], "-o", second), "--resume goes on with it")
+    refused(mitsonar("recording", "convert", places[kind], "-o", second), "--resume continues it")
     assert mitsonar("recording", "convert", first, "-o", second, "--resume").returncode == 0
 
 

@@ -184,8 +184,8 @@ def test_an_out_that_exists_is_kept(mitsonar: Command, scene: Path, tmp_path: Pa
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.tex").write_text("years of work")
-    refused(mitsonar("render", scene, "-o", mine), "holds other things (thesis.tex)", "kept", "-o")
-    refused(mitsonar("render", scene, "-o", mine, "--overwrite"), "holds other things")
+    refused(mitsonar("render", scene, "-o", mine), "contains other files (thesis.tex)", "kept", "-o")
+    refused(mitsonar("render", scene, "-o", mine, "--overwrite"), "contains other files")
     assert (mine / "thesis.tex").read_text() == "years of work"
     out = tmp_path / "out"
     assert mitsonar("render", scene, "-o", out).returncode == 0

@@ -81,7 +81,7 @@ def test_bodies_are_where_their_trajectories_say(tmp_path: Path) -> None:
 
 
 def test_a_body_that_does_not_move_is_refused_before_a_store_is_made(tmp_path: Path) -> None:
-    for bodies, words in ((["fisch"], "no body 'fisch' moves .*did you mean fish"), (["fish", "fish"], "once each")):
+    for bodies, words in ((["fisch"], "no body 'fisch' moves .*did you mean fish"), (["fish", "fish"], "only once")):
         with pytest.raises(MitsonarError, match=words):
             make_dataset(moving_recipe(tmp_path / "tank", bodies=bodies, gain=1e3), str(tmp_path / "data.zarr"))
     with pytest.raises(MitsonarError, match="nothing moves there"):

@@ -106,7 +106,7 @@ def test_a_changed_velocity_is_found_and_mended(made: Path, tmp_path: Path) -> N
     url = Path(shutil.copytree(made, tmp_path / "heard.zarr"))
     array = zarr.open_group(url, mode="r+")["velocity"]
     array[3] = np.asarray(array[3]) + 1e-3  # type: ignore[index]
-    assert check(DataStore.open(url)) == ["velocity is not what recipe and seed give"]
+    assert check(DataStore.open(url)) == ["velocity differs from the plan of recipe and seed"]
     make_dataset(impulse_recipe(), str(url), verify=True)
     assert files_of(url) == files_of(made)
 
@@ -239,8 +239,8 @@ def test_recipes_are_the_rows_of_the_table() -> None:
         ({"channel": {"frequency_step_hz": 100}}, "frequency_step_hz must be below"),
         ({"channel": {"bandwidth_hz": 6000}}, "sampling_hz must be at least"),
         ({"channel": {"carier_hz": 1}}, "unknown channel sonar key carier_hz: did you mean carrier_hz"),
-        ({"sonar": {"preset": "didson300"}}, "one of them: got both"),
-        ({"channel": None}, "one of them: got neither"),
+        ({"sonar": {"preset": "didson300"}}, "impulse responses): got both"),
+        ({"channel": None}, "impulse responses): got neither"),
         ({"mount": {"pitch_deg": 35}}, "mount belongs to images"),
         ({"store": "vectors"}, "store belongs to images"),
         ({"segments": ["q1"]}, "segments belongs to images"),
@@ -369,14 +369,16 @@ def test_responses_are_read_without_torch_and_without_a_renderer(made: Path) -> 
 
 
 def test_the_wrong_kind_of_data_set_is_one_sentence(made: Path) -> None:
-    with pytest.raises(MitsonarError, match="the data set tiny is of images: read it with SonarPairs"):
+    with pytest.raises(
+        MitsonarError, match="the data set tiny holds images, but responses are needed: read it with SonarPairs"
+    ):
         tiny_recipe().channel_sonar  # noqa: B018
-    with pytest.raises(MitsonarError, match="two pings or more, first and last: got frames 1"):
+    with pytest.raises(MitsonarError, match="frames must be at least 2, for a first and a last ping: got 1"):
         ImpulseSamples(made, frames=1)
     pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
     from mitsonar.datasets.samples import SonarPairs
 
-    with pytest.raises(MitsonarError, match="the data set received is of impulse responses, this needs one of images"):
+    with pytest.raises(MitsonarError, match="the data set received holds impulse responses, but images are needed"):
         SonarPairs(made)
 
 

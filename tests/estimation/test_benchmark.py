@@ -246,7 +246,7 @@ def test_mistakes_are_said(mitsonar: Command, made: Path, tmp_path: Path) -> Non
     refused(mitsonar("compare", tmp_path / "none.zarr"), "none.zarr")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thing").write_text("mine")
-    refused(mitsonar("compare", made, "--part", "all", "-o", tmp_path / "full"), "holds other things")
+    refused(mitsonar("compare", made, "--part", "all", "-o", tmp_path / "full"), "contains other files")
 
 
 def test_damaged_answers_are_said(mitsonar: Command, made: Path, tmp_path: Path) -> None:

@@ -138,7 +138,7 @@ def test_what_a_kill_leaves_before_a_run_has_begun_is_free(tmp_path: Path) -> No
 def test_other_things_are_kept(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     for resume, overwrite in WAYS:
-        with pytest.raises(MitsonarError, match=r"holds other things \(thesis.tex\) and is kept as it is: choose"):
+        with pytest.raises(MitsonarError, match=r"contains other files \(thesis.tex\) and is kept as it is: choose"):
             begun(tmp_path, resume=resume, overwrite=overwrite)
         with pytest.raises(MitsonarError, match="is a file and is kept as it is"):
             begun(tmp_path / "thesis.tex", resume=resume, overwrite=overwrite)
@@ -161,7 +161,7 @@ def test_runs_of_another_kind_are_kept(tmp_path: Path) -> None:
 
 def test_a_run_is_kept_unless_it_is_resumed_or_replaced_and_not_both(tmp_path: Path) -> None:
     begun(tmp_path)
-    with pytest.raises(MitsonarError, match="exists and is kept as it is: --resume goes on with it, --overwrite begins"):
+    with pytest.raises(MitsonarError, match="exists and is kept as it is: --resume continues it, --overwrite begins"):
         begun(tmp_path)
     with pytest.raises(MitsonarError, match="contradict each other"):
         begun(tmp_path, resume=True, overwrite=True)
@@ -268,7 +268,9 @@ def test_differences_name_both_values() -> None:
     had, asked = {"a": 1, "b": {"c": [1, 2], "d": None}, "old": "x" * 100}, {"a": 1.0, "b": {"c": [1, 3], "d": None}}
     assert differences(had, asked) == ["b.c [1, 2], not [1, 3]", f"old {'x' * 60}..., not None"]
     assert differences(asked, asked) == []
-    with pytest.raises(MitsonarError, match=r"^here was begun with a 0, not 1; .*; and 2 more: ask for the same \(so\), or"):
+    with pytest.raises(
+        MitsonarError, match=r"^here was begun with a 0, not 1; .*; and 2 more: request the same settings \(so\), or"
+    ):
         refuse_other("here", dict.fromkeys("abcdef", 0), dict.fromkeys("abcdef", 1), " (so)")
 
 

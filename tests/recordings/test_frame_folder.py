@@ -69,7 +69,7 @@ def test_a_stopped_copy_goes_on_and_gives_the_same(
     assert len(load_frames_of_unfinished(folder)) == 4
     (folder / "frames.zarr/image/c/4/0").mkdir(parents=True, exist_ok=True)
     (folder / "frames.zarr/image/c/4/0/0.7f.partial").write_bytes(b"half")  # as a kill leaves it
-    with pytest.raises(MitsonarError, match="--resume goes on with it"):
+    with pytest.raises(MitsonarError, match="--resume continues it"):
         write_frames(of(frames), None, folder)
     read: list[int] = []
     made = write_frames(of(frames), None, folder, resume=True, progress=read.append)
@@ -100,5 +100,5 @@ def test_another_recording_is_not_resumed_and_other_things_are_kept(frames: Sona
     same(made, frames.select(slice(3)))
     (tmp_path / "other").mkdir()
     (tmp_path / "other/notes.txt").write_text("mine")
-    with pytest.raises(MitsonarError, match="holds other things"):
+    with pytest.raises(MitsonarError, match="contains other files"):
         write_frames(of(frames), None, tmp_path / "other")

@@ -285,7 +285,7 @@ def test_a_killed_benchmark_goes_on_to_the_same_bits(run_of: Path, tmp_path: Pat
 def test_rows_come_one_by_one_and_are_not_made_again(run_of: Path, tmp_path: Path, monkeypatch: Any) -> None:
     out = tmp_path / "bench"
     benchmark_odometry(Wanted((str(run_of),), methods=("zero",)), out)
-    with pytest.raises(MitsonarError, match="--resume goes on with it"):
+    with pytest.raises(MitsonarError, match="--resume continues it"):
         benchmark_odometry(Wanted((str(run_of),), methods=("flow",)), out)
     first = table_of(out)
     monkeypatch.setattr(Zero, "estimate", None)  # asked again, it would fail

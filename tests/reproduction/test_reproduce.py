@@ -553,7 +553,7 @@ def test_a_folder_keeps_to_what_it_was_begun_with(whole: Path, tmp_path: Path) -
         tiny(whole)
     row.write_text(fine)
     (tmp_path / "thesis.docx").write_text("mine")
-    with pytest.raises(MitsonarError, match=r"holds other things \(thesis\.docx\) and is kept"):
+    with pytest.raises(MitsonarError, match=r"contains other files \(thesis\.docx\) and is kept"):
         tiny(tmp_path)
     assert os.listdir(tmp_path) == ["thesis.docx"]
 

@@ -215,9 +215,12 @@ def test_another_instrument_is_refused(made: Path, run: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"noise": "high"}, "noise of input.kind response is a signal to noise ratio such as '20 dB', or none: got 'high'"),
-        ({"input": {"kind": "response", "layout": "stack"}}, "input.layout is not for kind response"),
-        ({"input": {"kind": "image", "leak": "one_ping"}}, "input.leak is not for kind image"),
+        (
+            {"noise": "high"},
+            "noise of input.kind response must be a signal to noise ratio such as '20 dB', or none: got 'high'",
+        ),
+        ({"input": {"kind": "response", "layout": "stack"}}, "input.layout does not apply to kind response"),
+        ({"input": {"kind": "image", "leak": "one_ping"}}, "input.leak does not apply to kind image"),
     ],
 )
 def test_mistakes_in_recipes_are_answered(changes: dict[str, Any], sentence: str) -> None:
@@ -228,7 +231,7 @@ def test_mistakes_in_recipes_are_answered(changes: dict[str, Any], sentence: str
 def test_what_does_not_go_together_is_answered(made: Path, tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="not rendered in training"):
         train(TrainOptions(recipe_of(FIELDS), None, tmp_path / "run", render=True))
-    with pytest.raises(MitsonarError, match="of impulse responses, this needs one of images"):
+    with pytest.raises(MitsonarError, match="holds impulse responses, but images are needed"):
         train(
             TrainOptions(recipe_of({**FIELDS, "input": {}, "noise": "none", "network": "posenet"}), made, tmp_path / "run")
         )

@@ -180,7 +180,7 @@ def test_recipes_say_what_they_leave_out(tmp_path: Path) -> None:
         ({"validate": {"pairs": 0}}, "validate.pairs"),
         ({"noise": "loud"}, "noise must be none, low, high"),
         ({"noise": []}, "empty list"),
-        ({"epochs": 3}, "epochs or steps, one of them"),
+        ({"epochs": 3}, "either epochs or steps"),
         ({"split": "world"}, "split must be sequence, scene"),
         ({"split": {"trian": 0.9}}, "did you mean train"),
         ({"loss": {"kind": "likelihood", "penalty": 1}}, "penalty belongs to kind mse"),
@@ -522,7 +522,7 @@ def test_runs_that_are_there_are_kept(made: Path, other: Path, tmp_path: Path) -
     out = tmp_path / "run"
     told = recipe(steps=2)
     first = train(TrainOptions(told, made, out, threads=1))
-    with pytest.raises(MitsonarError, match="--resume goes on with it, --overwrite begins anew"):
+    with pytest.raises(MitsonarError, match="--resume continues it, --overwrite begins anew"):
         train(TrainOptions(told, made, out))
     with pytest.raises(MitsonarError, match=r"begun with recipe\.optimiser\.rate 0\.001, not 0\.002"):
         train(TrainOptions(recipe(steps=2, optimiser={"rate": 2e-3}), made, out, resume=True))
@@ -538,7 +538,7 @@ def test_runs_that_are_there_are_kept(made: Path, other: Path, tmp_path: Path) -
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("all of it")
     for resume, overwrite in ((False, False), (True, False), (False, True)):
-        with pytest.raises(MitsonarError, match=r"holds other things \(thesis\.txt\) and is kept"):
+        with pytest.raises(MitsonarError, match=r"contains other files \(thesis\.txt\) and is kept"):
             train(TrainOptions(told, made, tmp_path / "mine", resume=resume, overwrite=overwrite))
 
 

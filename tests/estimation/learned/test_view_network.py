@@ -122,8 +122,8 @@ def test_vectors_are_read_once(portions: Path, monkeypatch: pytest.MonkeyPatch) 
     """And come out of memory as they lie on disk; other processes read for themselves."""
     pairs = SonarPairs(portions, part="all", views=["c3"])
     once = pairs[4][0]
-    assert set(pairs._whole) == {"vector_c3", "nonzero_c3"}
-    assert pickle.loads(pickle.dumps(pairs))._whole == {}
+    assert set(pairs._vectors) == {"vector_c3", "nonzero_c3"}
+    assert pickle.loads(pickle.dumps(pairs))._vectors == {}
     monkeypatch.setattr("mitsonar.datasets.samples.KEPT_BYTES", 0)
     torch.testing.assert_close(SonarPairs(portions, part="all", views=["c3"])[4][0], once, rtol=0, atol=0)
 
@@ -244,7 +244,7 @@ def test_the_schedule_of_the_chapter() -> None:
     rate = Optimiser(rate=1e-4, schedule="steps", steps=[(12, 5e-5), (16, 1e-5)])
     assert [rate.rate_at(10 * epoch, 10, 240) for epoch in (0, 11, 12, 15, 16, 23)] == [1e-4, 1e-4, 5e-5, 5e-5, 1e-5, 1e-5]
     for words in ({"schedule": "steps"}, {"steps": [(2, 1e-4)]}, {"schedule": "steps", "steps": [(2, 1e-4), (1, 1e-5)]}):
-        with pytest.raises(ValueError, match="optimiser steps are"):
+        with pytest.raises(ValueError, match="optimiser steps must be"):
             Optimiser(**words)
 
 
