@@ -324,7 +324,7 @@ class Recorded(RecipePart):
 # ---------------- The recipe of a data set
 
 
-_PartT = TypeVar("_Made", bound=RecipePart)
+_PartT = TypeVar("_PartT", bound=RecipePart)
 
 OPTIONAL_KEYS = ("recorded", "mirrors", "bodies", "noise_db", "visible_labels")
 """Keys that are omitted from a written recipe if they are null or empty."""

@@ -239,10 +239,10 @@ def _frame_count(store: DataStore, shards: list[int]) -> int:
 def _warnings(store: DataStore) -> list[str]:
     """Return all warnings for the user about a finished data set, one sentence each."""
     sentences = [*_split_warnings(store)]
-    groundless = int(np.isnan(store.read("height_m")).sum())
-    if groundless:
+    without_ground = int(np.isnan(store.read("height_m")).sum())
+    if without_ground:
         sentences.append(
-            f"nothing is below the sonar in {groundless:,} of {len(store):,} frames: world.size_m is larger than the scene"
+            f"nothing is below the sonar in {without_ground:,} of {len(store):,} frames: world.size_m exceeds the scene"
         )
     return [*sentences, *_empty_frame_warnings(store), *store.modality.warnings(store.read)]
 
@@ -505,7 +505,7 @@ def _work(url: str, shard: int) -> int:
     changed = store.other_versions()
     if changed:
         raise MitsonarError(
-            f"the store was begun with {', '.join(changed)} on {socket.gethostname()}: install the same everywhere"
+            f"the store was begun with {', '.join(changed)} on {socket.gethostname()}: install the same versions everywhere"
         )
     return make_shard(store, shard)
 
@@ -611,11 +611,7 @@ def _file_faults(store: DataStore, progress: Callable[[int], None]) -> list[str]
                 size = int(seals[shard][keys.index(key), 0])
                 faults.append(
                     f"{key} is damaged (frames {here.start}..{here.stop - 1}): "
-                    + (
-                        f"{sizes[key]} bytes, sealed with {size}"
-                        if sizes[key] != size
-                        else "its content differs from the seal"
-                    )
+                    + (f"{sizes[key]} bytes, sealed with {size}" if sizes[key] != size else "its content was changed")
                 )
             if not damaged:
                 faults += store.modality.faults(store.read, here)
@@ -766,9 +762,9 @@ class SceneRenderer:
             for group in groups:
                 family = recipe.family(group)
                 if repr(family) not in names_by_family:
-                    world = Scene(0, group, world_seed(recipe.seed, 0), 1)
+                    scene = Scene(0, group, world_seed(recipe.seed, 0), 1)
                     is_file = family.called == "scene"
-                    names_by_family[repr(family)] = list(shape_names_in(loaded_world(recipe, world))) if is_file else []
+                    names_by_family[repr(family)] = list(shape_names_in(loaded_world(recipe, scene))) if is_file else []
             attributes["shape_names"] = [names_by_family[repr(recipe.family(group))] for group in groups]
         return attributes
 
@@ -789,7 +785,7 @@ class SceneRenderer:
             first: number of the first frame in the scene.
             gain: of the data set.
         """
-        values = self._empty(len(poses))
+        values = self._allocate(len(poses))
         # 1. Pixels, and labels unless a second simulator makes them.
         for batch in self.render_views(poses, first, labels=bool(self.recipe.labels) and self._labeller is None):
             start = batch[0].first - (self.scene.number * FRAMES_A_SCENE + first)
@@ -820,7 +816,7 @@ class SceneRenderer:
         """Render frames at the planned poses; see :class:`~mitsonar.datasets.modality.Renderer`."""
         return self.frames(planned["pose"], first, float(about["gain"]))
 
-    def _empty_frame_warnings(self, frames: int) -> dict[str, Values]:
+    def _allocate(self, frames: int) -> dict[str, Values]:
         """Allocate the arrays to fill, with zeros."""
         stored = ImageModality(self.recipe).stored
         return {name: np.zeros((frames, *one.shape), dtype=one.kind) for name, one in stored.items()}

@@ -147,7 +147,7 @@ def scenes_of(recipe: Recipe, sequences: int) -> list[Scene]:
         if sequences == sequence_counts.sum()
         else int(np.clip(sequences // MIN_SEQUENCES_PER_SCENE, 1, len(sequence_counts)))
     )
-    while sequence_counts[:scene_count].sum() < sequences:  # small scenes may have fewer than FEWEST_SEQUENCES
+    while sequence_counts[:scene_count].sum() < sequences:  # small scenes may have fewer than MIN_SEQUENCES_PER_SCENE
         scene_count += 1
     # Rounding the cumulative sum, not each share, keeps the total exact.
     exact = sequences * np.cumsum(sequence_counts[:scene_count]) / sequence_counts[:scene_count].sum()

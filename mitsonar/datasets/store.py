@@ -275,7 +275,7 @@ class DataStore:
         expected_chunks = (
             (self.shard_frames, *shape[1:]) if name in self.rendered else (1, *shape[1:]) if name == SEAL else shape
         )
-        fits = all(piece > 0 for piece in array.chunks) and tuple(chunks) == expected_chunks
+        fits = all(length > 0 for length in array.chunks) and tuple(chunks) == expected_chunks
         if array.shape != shape or array.dtype.kind != np.dtype(dtype).kind or not fits:
             raise MitsonarError(
                 f"{self.place.url}/{name} is {array.dtype} {str(array.shape)[:60]} in chunks of {str(chunks)[:60]}, not "

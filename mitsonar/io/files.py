@@ -327,9 +327,7 @@ def parse_yaml(text: str, source: str) -> PlainValue:
     Raises:
         MitsonarError: not YAML, a circular reference, or a depth, size or integer beyond the limits of this module.
     """
-    steps = (
-        (letter in "[{") - (letter in "]}") for letter in text if letter in "[]{}"
-    )  # those in strings and comments as well
+    steps = ((c in "[{") - (c in "]}") for c in text if c in "[]{}")  # those in strings and comments as well
     if max(itertools.accumulate(steps), default=0) > MAX_BRACKETS:  # PyYAML would need seconds to reject it
         raise MitsonarError(f"{source} is not YAML: it nests more than {MAX_DEPTH} deep")
     loader: yaml.SafeLoader | None = None

@@ -351,7 +351,7 @@ def _read(path: Path, kind: RunKind, *, only_kind: bool = False) -> RunDirectory
     """Read the run in a folder and check its values; of a run to be replaced, only its type is checked."""
     content = read_json(path / RUN_FILE, check=False)
     if content.get("kind") != kind.name:
-        raise MitsonarError(f"{path} contains no {kind.name} run of mitsonar and is kept as it is: choose another -o")
+        raise MitsonarError(f"{path} holds no {kind.name} of mitsonar and is kept as it is: choose another -o")
     run = RunDirectory(path, kind, {}, {})
     if only_kind:
         return run
