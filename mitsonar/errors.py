@@ -86,7 +86,7 @@ def argument(name: str) -> str:
     The command line replaces it by the corresponding option, if there is one.
 
     Args:
-        name: name of the argument, optionally after a word that says what it belongs to, as in ``sonar model``. The option
+        name: name of the argument, optionally after the noun for its owner, as in ``sonar model``. The option
             replaces both.
     """
     return f"{ARGUMENT_DELIMITER}{name}{ARGUMENT_DELIMITER}"

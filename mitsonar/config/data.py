@@ -152,9 +152,9 @@ MirrorKeys: TypeAlias = Annotated[dict[str, tuple[float, float]] | Literal["mate
 class Scenes(RecipePart):
     """A group of similar scenes, each with a different seed."""
 
-    count: int = Field(1, ge=1, le=100_000, description="how many scenes")
-    sequences: int = Field(ge=1, le=10**7, description="sequences in each")
-    world: Keys = Field(default_factory=dict, description="numbers of the world that differ in these scenes")
+    count: int = Field(1, ge=1, le=100_000, description="number of scenes")
+    sequences: int = Field(ge=1, le=10**7, description="sequences per scene")
+    world: Keys = Field(default_factory=dict, description="parameters of the world that differ in these scenes")
 
 
 class Mount(RecipePart):
@@ -220,8 +220,8 @@ class Flight(RecipePart):
     kind: Literal["random", "runs", "recorded"] = Field(
         "random", description="random sequences, the runs of chapters 2 and 4, or paths of recorded frames"
     )
-    height_m: Interval | float = Field(2.5, description="over z = 0 [m]; low,high: drawn for each sequence")
-    pings: int = Field(5, ge=1, le=10**6, description="pings of a sequence")
+    height_m: Interval | float = Field(2.5, description="height over z = 0 [m]; low,high: drawn for each sequence")
+    pings: int = Field(5, ge=1, le=10**6, description="pings per sequence")
     sideways_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion to either side between pings [mm]")
     forward_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion ahead or back between pings [mm]")
     yaw_deg: float = Field(0.45, ge=0, le=180, description="largest turn between pings [deg]")
@@ -266,12 +266,12 @@ class Split(RecipePart):
     """Default division of the frames into training, validation and test; a reader may choose another."""
 
     by: Literal["sequence", "scene", "sample"] = Field(
-        "sequence", description="what is dealt out: sequences, whole scenes, or samples, which leaks (but test: sequences)"
+        "sequence", description="what is divided: sequences, scenes, or samples, which leaks (except into the test part)"
     )
     train: float = Field(0.95, ge=0, le=1)
     validation: float = Field(0.05, ge=0, le=1)
     test: float = Field(0.0, ge=0, le=1)
-    seed: int = Field(0, ge=0, lt=2**31, description="of the draw; readers of one data set must agree on it")
+    seed: int = Field(0, ge=0, lt=2**31, description="seed of the division; readers of one data set must use the same")
 
     @model_validator(mode="after")
     def _check_shares(self) -> Self:
@@ -290,22 +290,25 @@ class Split(RecipePart):
 class RecordedSource(RecipePart):
     """A recording or a run whose frames form one scene of a data set."""
 
-    name: str = Field(min_length=1, description="of the file or folder, as it was given")
-    format: str = Field(description="in words: ARIS 5 (.aris), run of mitsonar")
-    poses: str = Field(description="where its poses come from: its own, or the name of a file of poses")
-    frames: int = Field(ge=1, description="that were taken")
+    name: str = Field(min_length=1, description="name of the file or folder, as given")
+    format: str = Field(description="format in words: ARIS 5 (.aris), run of mitsonar")
+    poses: str = Field(description="source of its poses: the recording, or the name of a file of poses")
+    frames: int = Field(ge=1, description="number of frames taken from it")
     left_out: int = Field(0, ge=0, description="frames without a pose, of another geometry, or with no neighbour")
     level_scale: float = Field(1.0, gt=0, allow_inf_nan=False, description="level of a pixel of 1")
-    start_s: float = Field(allow_inf_nan=False, description="time of its first frame [s]; those that are stored begin at 0")
+    start_s: float = Field(allow_inf_nan=False, description="time of its first frame [s]; stored times begin at 0")
 
 
 class Recorded(RecipePart):
     """Frames that the recipe does not render: from runs, and from recordings with known poses."""
 
-    sources: list[RecordedSource] = Field(min_length=1, description="a scene each, in this order")
-    level: Literal["linear", "dB", "gamma"] = Field("linear", description="how pixels stand for levels")
+    sources: list[RecordedSource] = Field(min_length=1, description="sources, one scene each, in this order")
+    level: Literal["linear", "dB", "gamma"] = Field("linear", description="coding of levels in pixels")
     bearings: list[float] | None = Field(
-        None, min_length=1, max_length=65_536, description="axes of the beams [rad], where they are not those of the sonar"
+        None,
+        min_length=1,
+        max_length=65_536,
+        description="bearings of the beams [rad], if they differ from those of the sonar",
     )
 
     @model_validator(mode="after")
@@ -340,43 +343,51 @@ class Recipe(RecipePart):
         MitsonarError: through :func:`load_recipe`, a key is unknown or a value is outside its limits.
     """
 
-    name: str = Field("custom", description="what the data set is called")
-    about: str = Field("", description="a sentence on it")
-    seed: int = Field(0, ge=0, lt=2**31, description="of worlds, flights and jitter")
-    world: Keys = Field(default_factory=dict, description="family of the world, and numbers of it; of recorded frames none")
+    name: str = Field("custom", description="name of the data set")
+    about: str = Field("", description="description in one sentence")
+    seed: int = Field(0, ge=0, lt=2**31, description="seed of worlds, flights and jitter")
+    world: Keys = Field(
+        default_factory=dict, description="family of the world, and its parameters; empty for recorded frames"
+    )
     scenes: list[Scenes] = Field(min_length=1, description="the scenes, each with its sequences")
     sonar: Keys | None = Field(None, description="preset and keys of docs/guides/sonars.md")
     channel: Keys | None = Field(None, description="for responses: keys of docs/guides/impulse-responses.md")
     mount: Mount = Field(
-        default_factory=lambda: Mount(pitch_deg=35.0), description="pose of the sonar on the vehicle; of a channel none"
+        default_factory=lambda: Mount(pitch_deg=35.0), description="pose of the sonar on the vehicle; not with channel"
     )
-    flight: Flight = Field(default_factory=Flight, description="how the vehicle moves")
-    frames: int = Field(2, ge=1, le=16, description="Q: frames that make one sample, unless a reader asks for others")
-    receivers: list[ReceiverSpec] = Field(default_factory=list, description="of a bistatic sonar; the sonar transmits")
-    segments: list[str] = Field(default_factory=list, description="portions of a looking-down sonar's field of view")
+    flight: Flight = Field(default_factory=Flight, description="motion of the vehicle")
+    frames: int = Field(2, ge=1, le=16, description="Q: default number of frames per sample")
+    receivers: list[ReceiverSpec] = Field(
+        default_factory=list, description="receivers of a bistatic sonar; the sonar transmits"
+    )
+    segments: list[str] = Field(default_factory=list, description="segments of a downward-looking sonar's field of view")
     store: Literal["images", "vectors", "both"] = Field("images", description="images, vectors (sums over beams), or both")
     pixel: Literal["uint8", "float32"] = Field("uint8", description="type of stored pixels")
     gain: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="of the pixels, as of another data set; null: set on the first frames"
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="gain of the pixels, such as that of another data set; null: set on the first frames",
     )
     labels: list[Literal["elevation_rad", "shape_id", "object_id", "shadow"]] = Field(
         default_factory=list, description="per-pixel truth to store"
     )
-    split: Split = Field(default_factory=Split, description="which frames are for what")
-    recorded: Recorded | None = Field(None, description="where frames come from that no scene was rendered for")
+    split: Split = Field(default_factory=Split, description="division into training, validation and test")
+    recorded: Recorded | None = Field(None, description="sources of frames that were recorded, not rendered")
     mirrors: MirrorKeys = Field(
         None, description="shapes that reflect as mirrors: [reflection, rms height in m] by their ids, or materials"
     )
     bodies: list[str] = Field(
-        default_factory=list, max_length=10_000, description="bodies that move, whose poses and velocities are stored"
+        default_factory=list, max_length=10_000, description="moving bodies whose poses and velocities are stored"
     )
     visible_labels: bool = Field(
-        False, description="labels of what pictures show: beyond half-power beams too, above noise and -40 dB (coherent)"
+        False,
+        description="labels of all that pictures show, also beyond half-power beams, above noise and -40 dB (coherent)",
     )
     noise_db: list[Annotated[float, Field(ge=-100, le=100)]] = Field(
         default_factory=list,
         max_length=1000,
-        description="what scenes add to the sonar's noise_level_db, in turn [dB] (coherent); default: nothing",
+        description="values that scenes add to the sonar's noise_level_db, in turn [dB] (coherent)",
     )
 
     @model_serializer(mode="wrap")

@@ -55,19 +55,19 @@ class Input(_Part):
     :class:`~mitsonar.datasets.samples.ImpulsePairs`.
     """
 
-    frames: int = Field(2, ge=1, le=16, description="of a sample; 1: heights are learnt")
-    views: list[str] | None = Field(None, description="which views; null: all")
+    frames: int = Field(2, ge=1, le=16, description="frames per sample; 1: learn heights")
+    views: list[str] | None = Field(None, description="names of the views; null: all")
     kind: Literal["image", "vector", "response"] = Field(
         "image", description="images, sums over their beams, or impulse responses"
     )
     layout: Literal["side", "stack", "channels"] = Field("side", description="frames side by side, stacked, or channels")
     coordinates: Literal["polar", "cartesian", "both"] = Field("polar", description="as stored, fans in metres, or both")
     cartesian_rows: int = Field(512, ge=2, le=8192, description="pixels of a fan in the forward direction")
-    range_levels: int | None = Field(None, ge=1, description="of vectors, stored ones added up to so many; null: as stored")
+    range_levels: int | None = Field(None, ge=1, description="bins of vectors, by adding neighbouring bins; null: as stored")
     halves: bool = Field(False, description="vectors of both halves of images (fig. 4.18)")
-    ground: bool = Field(False, description="with the geometry of the ground, for networks that know it")
+    ground: bool = Field(False, description="add the geometry of the ground, for networks that use it")
     leak: Literal["none", "one_ping", "strangers"] = Field(
-        "none", description="of impulse responses: no motion is shown, what is still learnt is a leak"
+        "none", description="impulse responses without motion, as a test: what is still learnt is a leak"
     )
 
     @model_validator(mode="after")
@@ -97,9 +97,11 @@ class Loss(_Part):
     kind: Literal["mse", "likelihood"] = Field(
         "mse", description="eq. 3.1; or the likelihood of the motion, with its covariance"
     )
-    penalty: float = Field(0.0, ge=0, allow_inf_nan=False, description="eta of eq. 3.2 for estimates beyond the bounds")
+    penalty: float = Field(
+        0.0, ge=0, allow_inf_nan=False, description="weight eta of eq. 3.2 for estimates beyond the bounds"
+    )
     bounds: tuple[float, float] | None = Field(
-        None, description="of eq. 3.2, in label units; default: what the largest motions become, +-10 for normx10"
+        None, description="bounds of eq. 3.2, in label units; default: labels of the largest motions, +-10 for normx10"
     )
 
     @model_validator(mode="after")
@@ -116,12 +118,12 @@ class Optimiser(_Part):
 
     kind: Literal["adam", "adamw"] = "adam"
     rate: float = Field(1e-4, gt=0, le=10, description="learning rate at the start")
-    schedule: Literal["halve", "cosine", "constant", "steps"] = Field("halve", description="of the rate")
+    schedule: Literal["halve", "cosine", "constant", "steps"] = Field("halve", description="schedule of the rate")
     steps: list[tuple[float, float]] = Field(
-        default_factory=list, description="of schedule steps: [epoch, rate from then on]"
+        default_factory=list, description="for schedule steps: [epoch, rate from that epoch]"
     )
-    halve_every: float = Field(12.0, gt=0, description="epochs between falls of the rate")
-    fall_to: float = Field(0.5, gt=0, le=1, description="part of the rate that is left then, with schedule halve")
+    halve_every: float = Field(12.0, gt=0, description="epochs between reductions of the rate")
+    fall_to: float = Field(0.5, gt=0, le=1, description="factor of each reduction, with schedule halve")
     warmup: int = Field(0, ge=0, description="steps over which the rate rises from 0 at the beginning")
     weight_decay: float = Field(0.0, ge=0, le=1)
     clip: float | None = Field(None, gt=0, description="largest norm of the gradient; null: any")
@@ -164,10 +166,10 @@ class Optimiser(_Part):
 class Validate(_Part):
     """Validation during training, on which the updates of the weights do not depend."""
 
-    noise: list[Noise] = Field(default=["none", "high"], min_length=1, description="levels of noise")
-    pairs: int | None = Field(500, ge=1, description="samples, always the same; null: all of the part")
+    noise: list[Noise] = Field(default=["none", "high"], min_length=1, description="noise levels")
+    pairs: int | None = Field(500, ge=1, description="number of samples, always the same ones; null: all of the part")
     every_minutes: float = Field(5.0, gt=0)
-    every_steps: int | None = Field(None, ge=1, description="instead of minutes")
+    every_steps: int | None = Field(None, ge=1, description="interval in steps, instead of minutes")
 
 
 class TrainingRecipe(_Part):
@@ -177,27 +179,29 @@ class TrainingRecipe(_Part):
         MitsonarError: from :func:`load_training_recipe`, if a key is unknown or a value is out of bounds.
     """
 
-    about: str = Field("", description="a sentence on it")
+    about: str = Field("", description="description in one sentence")
     network: Keys = Field(description="name of the network, or name and options: {name: posenet, width: 0.25}")
     start: str | None = Field(None, description="checkpoint or run with the initial weights; null: random weights")
     data: str = Field("rocky-field", description="data set recipe, name or file, for --render and reproduce")
-    data_changes: Keys = Field(default_factory=dict, description="keys of it to change: {sonar.range_bins: 256}")
-    part_of_data: float = Field(1.0, gt=0, le=1, description="part of the frames, from the first, whose samples are used")
+    data_changes: Keys = Field(default_factory=dict, description="changed keys of that recipe: {sonar.range_bins: 256}")
+    part_of_data: float = Field(
+        1.0, gt=0, le=1, description="fraction of the frames, from the first, whose samples are used"
+    )
     input: Input = Field(default_factory=Input)
     labels: Literal["raw", "quantised", "normx10"] = Field("normx10", description="form of the network's outputs")
     noise: Noise | list[Noise] = Field("none", description="noise in training; each sample draws one of a list")
     augment: list[Literal["mirror", "reverse", "strangers"]] = Field(
-        default_factory=list, description="changes of samples, for networks that know the ground"
+        default_factory=list, description="changes of samples, for networks that use the ground"
     )
     split: str | Keys = Field("sequence", description="sequence, scene, sample, or keys of a data set recipe's split")
     loss: Loss = Field(default_factory=Loss)
     optimiser: Optimiser = Field(default_factory=Optimiser)
-    batch: int = Field(4, ge=1, le=65_536, description="samples of a step, over all devices")
+    batch: int = Field(4, ge=1, le=65_536, description="samples per step, over all devices")
     epochs: float | None = Field(32.0, gt=0, description="passes over all samples; or steps")
-    steps: int | None = Field(None, ge=1, description="of the optimiser, in place of epochs")
-    precision: Precision = Field("32-true", description="precision, as Lightning names it")
+    steps: int | None = Field(None, ge=1, description="steps of the optimiser, in place of epochs")
+    precision: Precision = Field("32-true", description="precision, as named by Lightning")
     validate_: Validate = Field(default_factory=Validate, alias="validate")
-    seed: int = Field(0, ge=0, lt=2**31, description="of weights, order, noise, dropout")
+    seed: int = Field(0, ge=0, lt=2**31, description="seed of weights, order, noise and dropout")
 
     @model_validator(mode="before")
     @classmethod
