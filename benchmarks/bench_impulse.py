@@ -154,7 +154,7 @@ def shares(simulator: ChannelSimulator, poses: NDArray[np.float64], velocity: ND
     tracer = simulator.tracer
     received = simulator.paths(poses[0], velocity[0])
     parts: dict[str, Callable[[], object]] = {
-        "which points": lambda: tracer.asked(poses[0], 0),
+        "which points": lambda: tracer.candidates(poses[0], 0),
         "these, tracing, delays": lambda: tracer.trace(poses[0], velocity[0], 0, FOR_RESPONSES),
         "transform (one thread)": lambda: impulse_response(received.delay_s, received.amplitude, simulator.sonar),
     }

@@ -111,9 +111,7 @@ class AcousticMaterial(mi.BSDF):
 def _material(name: str) -> Material:
     """Return a material by name, or from a YAML file that Mitsuba resolves relative to the scene's folder."""
     if not name:
-        raise MitsonarError(
-            f"acoustic_material needs a material: {', '.join(named_materials())}, or a YAML file of your own"
-        )
+        raise MitsonarError(f"acoustic_material needs a material: {', '.join(named_materials())}, or a YAML file")
     is_file = name.lower().endswith((".yaml", ".yml"))
     resolver: Any = mi.file_resolver  # an `object` to Mitsuba's stubs
     return material(str(resolver().resolve(name)) if is_file else name)
@@ -126,7 +124,7 @@ def _mean(texture: mi.Texture, given: float) -> float:
             given = float(texture.mean()[0])
         except RuntimeError:
             raise MitsonarError(
-                f"acoustic_material cannot tell the mean of a reflectance of kind {texture.class_name()}: give it as "
+                f"acoustic_material cannot determine the mean of a reflectance of kind {texture.class_name()}: give it as "
                 "reflectance_mean"
             ) from None
     if not 0 < given < float("inf"):

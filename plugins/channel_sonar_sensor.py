@@ -17,8 +17,8 @@ from mitsonar.plugins.native_plugins import load_dict
 
 __all__ = ["ChannelSensor", "is_channel_sonar"]
 
-FIELD = tuple(FieldOfView.model_fields)
-OWN = tuple(name for name in ChannelSonar.model_fields if name not in ("transmitter", "receivers"))
+FIELD_KEYS = tuple(FieldOfView.model_fields)
+SONAR_KEYS = tuple(name for name in ChannelSonar.model_fields if name not in ("transmitter", "receivers"))
 
 
 class ChannelSensor(mi.Sensor):
@@ -107,22 +107,26 @@ def is_channel_sonar(sensor: mi.Sensor) -> bool:
 
 def _read(props: mi.Properties) -> ChannelSonar:
     """Create the instrument from the properties."""
-    fields = _some(props, OWN)
-    shared = _some(props, tuple(name for name in FIELD if name != "heading_deg"))
-    sends = {"shape": "all", **_some(props, FIELD, "transmitter_")}
+    fields = _some(props, SONAR_KEYS)
+    shared = _some(props, tuple(name for name in FIELD_KEYS if name != "heading_deg"))
+    transmitter = {"shape": "all", **_some(props, FIELD_KEYS, "transmitter_")}
     names = [name.strip() for name in str(props.get("receivers", ", ".join(LOOKS))).split(",")]
-    known = {receiver.name: receiver.model_dump() for receiver in four_receivers()}
+    known = {one.name: one.model_dump() for one in four_receivers()}
     receivers = []
     for name in names:
-        own = _some(props, FIELD, f"{name}_")
+        field_keys = _some(props, FIELD_KEYS, f"{name}_")
         if not name.isidentifier():
-            raise MitsonarError(f"receivers are names with commas between them, as 'bow, port': got {props['receivers']!r}")
-        made = known.get(name, {"name": name, "field": {}})
+            raise MitsonarError(
+                f"receivers must be names separated by commas, such as 'bow, port': got {props['receivers']!r}"
+            )
+        receiver = known.get(name, {"name": name, "field": {}})
         if f"{name}_position" in props:
-            made["position"] = _position(f"{name}_position", props[f"{name}_position"])
-        receivers.append({**made, "field": {**made["field"], **shared, **own}})
+            receiver["position"] = _position(f"{name}_position", props[f"{name}_position"])
+        receivers.append({**receiver, "field": {**receiver["field"], **shared, **field_keys}})
         missing = [
-            key for key, there in (("heading_deg", "heading_deg" in own), ("position", "position" in made)) if not there
+            key
+            for key, there in (("heading_deg", "heading_deg" in field_keys), ("position", "position" in receiver))
+            if not there
         ]
         if name not in known and missing:
             _refuse_unknown(props, names)
@@ -132,7 +136,7 @@ def _read(props: mi.Properties) -> ChannelSonar:
                 "up in m; heading: 0 forward, 90 to starboard); front, left, back and right have defaults"
             )
     _refuse_unknown(props, names)
-    return ChannelSonar.create(**fields, transmitter=sends, receivers=receivers)
+    return ChannelSonar.create(**fields, transmitter=transmitter, receivers=receivers)
 
 
 def _position(key: str, value: object) -> tuple[float, ...]:
@@ -144,18 +148,20 @@ def _position(key: str, value: object) -> tuple[float, ...]:
         position = ()
     if len(position) != 3:
         example = f'<point name="{key}" value="0, 0.3, 0"/>'
-        raise MitsonarError(f"{key} is a point, starboard, forward, up in m, {example}: got {value!r}")
+        raise MitsonarError(f"{key} must be a point, starboard, forward, up in m, such as {example}: got {value!r}")
     return position
 
 
 def _refuse_unknown(props: mi.Properties, names: list[str]) -> None:
-    """Check that the sensor has all of the given properties.
+    """Check that the sensor knows all given properties.
 
     Raises:
         MitsonarError: an unknown property.
     """
-    known = {*OWN, *FIELD, "receivers", "to_world", "id", *(f"transmitter_{key}" for key in FIELD)} - {"heading_deg"}
-    known |= {f"{name}_{key}" for name in names for key in (*FIELD, "position")}
+    known = {*SONAR_KEYS, *FIELD_KEYS, "receivers", "to_world", "id", *(f"transmitter_{key}" for key in FIELD_KEYS)} - {
+        "heading_deg"
+    }
+    known |= {f"{name}_{key}" for name in names for key in (*FIELD_KEYS, "position")}
     for key in props:
         if key not in known and props.type(key) not in (mi.Properties.Type.Object, mi.Properties.Type.Reference):
             raise MitsonarError(f"the sensor channel_sonar has no property {key!r}: {nearest_names(key, sorted(known))}")

@@ -38,9 +38,9 @@ def edge_direction(fan: Fan, angle: DeviceArray) -> DeviceArray:
     return dr.normalize(fan.d + fan.side * fan.aside + fan.lift * angle)
 
 
-def flatter(normal: DeviceArray, d: DeviceArray, way: DeviceArray) -> DeviceArray:
+def flatter(normal: DeviceArray, d: DeviceArray, direction: DeviceArray) -> DeviceArray:
     """Return whether a direction meets the tangent plane of the ray ``d`` below :data:`GRAZING`, or misses it."""
-    return dr.dot(normal, way) * dr.select(dr.dot(normal, d) > 0, 1, -1) <= GRAZING
+    return dr.dot(normal, direction) * dr.select(dr.dot(normal, d) > 0, 1, -1) <= GRAZING
 
 
 class Echo(ADIntegrator):
@@ -99,25 +99,25 @@ class Echo(ADIntegrator):
             low, high = _meets(scene, ray, fan, hit, fan.below, low), _meets(scene, ray, fan, hit, fan.above, high)
         point = ray.o + ray.d * hit.t
 
-        def kept(value: DeviceArray) -> DeviceArray:
+        def masked(value: DeviceArray) -> DeviceArray:
             return dr.select(valid, value, 0)
 
         return Echoes(
             hit=dr.select(valid, mi.Float(1), 0),
-            range_m=kept(range_m),
-            near_m=kept(dr.select(low < high, low, high)),
-            far_m=kept(dr.select(low < high, high, low)),
-            reflectivity=kept(hit.reflectivity),
-            cosine=kept(cosine),
-            solid_angle_sr=kept(fan.solid_angle),
-            x=kept(point.x),
-            y=kept(point.y),
-            z=kept(point.z),
-            nx=kept(hit.n.x),
-            ny=kept(hit.n.y),
-            nz=kept(hit.n.z),
+            range_m=masked(range_m),
+            near_m=masked(dr.select(low < high, low, high)),
+            far_m=masked(dr.select(low < high, high, low)),
+            reflectivity=masked(hit.reflectivity),
+            cosine=masked(cosine),
+            solid_angle_sr=masked(fan.solid_angle),
+            x=masked(point.x),
+            y=masked(point.y),
+            z=masked(point.z),
+            nx=masked(hit.n.x),
+            ny=masked(hit.n.y),
+            nz=masked(hit.n.z),
             shape_id=dr.select(valid, mi.Float(hit.shape_id), -1),
-            object_id=kept(hit.object_id),
+            object_id=masked(hit.object_id),
         )
 
     def aov_names(self) -> list[str]:
@@ -158,7 +158,7 @@ class Echo(ADIntegrator):
         """Return values, validity, channels and no state, as ``ADIntegrator`` expects them."""
         surfaces = Surfaces.of(scene)
         if self._sonar is not None:
-            surfaces = surfaces.heard_by(self._sonar)
+            surfaces = surfaces.at_frequency_of(self._sonar)
         for note in surfaces.notes:
             mi.Log(mi.LogLevel.Warn, note)  # type: ignore[operator]  # an `object` to Mitsuba's stubs
         assert self._fan is not None
@@ -192,13 +192,13 @@ def _meets(scene: mi.Scene, ray: mi.Ray3f, fan: Fan, hit: Hit, angle: DeviceArra
     The point on the edge counts if the line to it lies within :data:`LEVEL` of the tangent plane. An edge is the same ray
     for both of its cells, so they join.
     """
-    way = edge_direction(fan, angle)
-    asked = hit.valid & flatter(hit.n, ray.d, way)
+    direction = edge_direction(fan, angle)
+    grazing = hit.valid & flatter(hit.n, ray.d, direction)
     coherent: DeviceArray = True
-    found = scene.ray_intersect_preliminary(mi.Ray3f(ray.o, way, ray.time), coherent=coherent, active=asked)
-    along: DeviceArray = way * found.t - ray.d * hit.t
+    intersection = scene.ray_intersect_preliminary(mi.Ray3f(ray.o, direction, ray.time), coherent=coherent, active=grazing)
+    along: DeviceArray = direction * intersection.t - ray.d * hit.t
     level = dr.abs(dr.dot(hit.n, along)) <= LEVEL * dr.norm(along)
-    return dr.select(asked & found.is_valid() & level, found.t, otherwise)
+    return dr.select(grazing & intersection.is_valid() & level, intersection.t, otherwise)
 
 
 mi.register_integrator("echo", Echo)

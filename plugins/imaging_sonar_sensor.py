@@ -209,11 +209,11 @@ class ImagingSonar(mi.Sensor):
         return cast(mi.Film, film)
 
     def _check_film(self) -> None:
-        film, wanted = self.film(), (self.sonar.columns, self.sonar.rays_per_beam)
+        film, expected = self.film(), (self.sonar.columns, self.sonar.rays_per_beam)
         size, crop = (tuple(int(n) for n in film.size()), tuple(int(n) for n in film.crop_size()))
-        if size != wanted or crop != wanted:
+        if size != expected or crop != expected:
             raise MitsonarError(
-                f"the film must be {wanted[0]} x {wanted[1]} pixels, rays side by side x rays over elevation: got "
+                f"the film must be {expected[0]} x {expected[1]} pixels, rays side by side x rays over elevation: got "
                 f"{crop[0]} x {crop[1]}; remove the film from the sensor, it follows from beams and rays"
             )
         if not film.rfilter().is_box_filter():

@@ -77,12 +77,12 @@ class _Children(mi.TraversalCallback):
 
     def __init__(self) -> None:
         super().__init__()
-        self.found: list[mi.BSDF] = []
+        self.bsdfs: list[mi.BSDF] = []
 
     def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
         """Collect a value if it is a BSDF; Mitsuba calls this for each parameter."""
         if isinstance(value, mi.BSDF):
-            self.found.append(value)
+            self.bsdfs.append(value)
 
 
 def material_of(shape: mi.Shape) -> AcousticMaterial | None:
@@ -91,14 +91,14 @@ def material_of(shape: mi.Shape) -> AcousticMaterial | None:
     Raises:
         MitsonarError: several materials, or a material together with another BSDF.
     """
-    found, others = _leaves(shape.bsdf())
-    names = sorted({one.material.name for one in found})
-    if len(found) > 1 or (found and others):
+    materials, others = _leaves(shape.bsdf())
+    names = sorted({one.material.name for one in materials})
+    if len(materials) > 1 or (materials and others):
         raise MitsonarError(
-            f"shape {shape.id()} must have one material for all of it: got {', '.join(names)} beside another BSDF; "
+            f"shape {shape.id()} must have one material for all of it: got {', '.join(names)} together with another BSDF; "
             "acoustic_material has two sides, give it alone"
         )
-    return found[0] if found else None
+    return materials[0] if materials else None
 
 
 def _leaves(bsdf: mi.BSDF) -> tuple[list[AcousticMaterial], int]:
@@ -107,12 +107,12 @@ def _leaves(bsdf: mi.BSDF) -> tuple[list[AcousticMaterial], int]:
         return [cast(AcousticMaterial, bsdf)], 0
     children = _Children()
     bsdf.traverse(children)
-    if not children.found:
+    if not children.bsdfs:
         return [], 1
-    found: list[AcousticMaterial] = []
+    materials: list[AcousticMaterial] = []
     others = 0
-    for child in children.found:
+    for child in children.bsdfs:
         below = _leaves(child)
-        found += [one for one in below[0] if all(one is not other for other in found)]
+        materials += [one for one in below[0] if all(one is not other for other in materials)]
         others += below[1]
-    return found, others
+    return materials, others

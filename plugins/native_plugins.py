@@ -33,7 +33,7 @@ DECOYS = "mitsonar-plugins-"
 
 
 @cache
-def own_folder() -> Path:
+def mitsuba_folder() -> Path:
     """Return the folder of Mitsuba, which contains its ``plugins`` and ``data``."""
     import mitsuba as mi
 
@@ -41,9 +41,9 @@ def own_folder() -> Path:
 
 
 @cache
-def own_names() -> frozenset[str]:
+def mitsuba_names() -> frozenset[str]:
     """Return the names of Mitsuba's own plugins."""
-    return frozenset(path.stem for path in (own_folder() / "plugins").iterdir() if path.suffix in LIBRARIES) | BUILT_IN
+    return frozenset(path.stem for path in (mitsuba_folder() / "plugins").iterdir() if path.suffix in LIBRARIES) | BUILT_IN
 
 
 def foreign_names(names: Iterable[str]) -> list[str]:
@@ -52,11 +52,11 @@ def foreign_names(names: Iterable[str]) -> list[str]:
     Raises:
         MitsonarError: a path instead of a name.
     """
-    found = sorted(set(names) - own_names())
-    for name in found:
+    foreign = sorted(set(names) - mitsuba_names())
+    for name in foreign:
         if not NAME.fullmatch(name):
             raise MitsonarError(f"a type must be the name of a plugin, of letters, digits and _: got {shortened(name)}")
-    return found
+    return foreign
 
 
 @contextmanager
@@ -75,7 +75,7 @@ def own_code_only(names: Iterable[str]) -> Iterator[None]:
     foreign = foreign_names(names)
     try:
         with ExitStack() as stack:
-            folders = [own_folder()]
+            folders = [mitsuba_folder()]
             if foreign:
                 folders.append(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=DECOYS))))
                 _make_decoys(folders[-1] / "plugins", foreign)
@@ -88,7 +88,7 @@ def own_code_only(names: Iterable[str]) -> Iterator[None]:
         name = next((name for name in foreign if Path(name).stem == unknown[1] or name == unknown[1]), unknown[1])
         raise MitsonarError(
             f"there is no plugin {name}: Mitsuba has none of that name, and none is registered in Python"
-            f"{meant(name, own_names())}"
+            f"{meant(name, mitsuba_names())}"
         ) from None
 
 
@@ -127,8 +127,8 @@ def file_resolver() -> Any:
 
 def search_folders() -> list[Path]:
     """Return the folders that Mitsuba searches for files of a scene, excluding its own."""
-    found = [Path(str(folder)) for folder in file_resolver()]
-    return [folder for folder in found if folder.resolve() != own_folder() and not folder.name.startswith(DECOYS)]
+    folders = [Path(str(folder)) for folder in file_resolver()]
+    return [folder for folder in folders if folder.resolve() != mitsuba_folder() and not folder.name.startswith(DECOYS)]
 
 
 def load_dict(parts: dict[str, Any], **options: bool) -> Any:

@@ -2,7 +2,8 @@
 
 The reflectivity of a surface is one number in 0..1; colours are converted to luminance:
 
-- ``acoustic_material``: a constant of its law, or for a sonar (:meth:`Surfaces.heard_by`) the value of the law at the angle;
+- ``acoustic_material``: a constant of its law, or for a sonar (:meth:`Surfaces.at_frequency_of`) the value of its law at
+  the angle;
 - a BSDF with a diffuse reflectance (``diffuse``, ``plastic``, ``roughplastic``; through ``twosided``, ``mask``,
   ``bumpmap``, ``normalmap``): that reflectance, textured or not;
 - ``principled``, ``principledthin``: the base colour; ``blendbsdf``: the weighted mean of the two;
@@ -75,7 +76,7 @@ class Surfaces:
         constant: by registry index, reflectivity of a shape without a diffuse reflectance; negative: evaluate its BSDF.
         objects: number of the object that a triangle belongs to (the mesh's attribute ``face_id``, 0 without it), one per
             triangle; a single 0 if no mesh has the attribute.
-        laws: scattering laws of the materials, for the sonar of :meth:`heard_by`; a single 0 without a sonar.
+        laws: scattering laws of the materials, for the sonar of :meth:`at_frequency_of`; a single 0 without a sonar.
         mirrors: by material, reflection coefficient at normal incidence and rms height [m]; zeros without a mirror part.
         materials: one BSDF per material, by number.
         lawful: whether the laws are evaluated.
@@ -99,7 +100,7 @@ class Surfaces:
 
     @classmethod
     def of(cls, scene: mi.Scene, shapes: Sequence[mi.Shape] | None = None) -> Surfaces:
-        """Build the tables of a scene, with one reflectivity per material for all angles; see :meth:`heard_by`.
+        """Build the tables of a scene, with one reflectivity per material for all angles; see :meth:`at_frequency_of`.
 
         Args:
             scene: scene to trace.
@@ -155,16 +156,16 @@ class Surfaces:
         dr.eval(tables.arrays())
         return tables
 
-    def adopt(self, now: Surfaces) -> bool:
+    def adopt(self, updated: Surfaces) -> bool:
         """Replace the tables by those of the current state of the same scene.
 
         Returns:
             False, with nothing replaced, if launches recorded with these tables are incompatible with the new ones.
         """
-        if any(getattr(self, name) != getattr(now, name) for name in ("lawful", "textured", "foreign", "notes")):
+        if any(getattr(self, name) != getattr(updated, name) for name in ("lawful", "textured", "foreign", "notes")):
             return False
         for name in ("materials", *self.arrays()):
-            setattr(self, name, getattr(now, name))
+            setattr(self, name, getattr(updated, name))
         return True
 
     def turn_facets(self, mesh: mi.Mesh) -> None:
@@ -185,7 +186,7 @@ class Surfaces:
         names = ("facets", "corners", "shapes", "constant", "objects", "laws", "mirrors")
         return {name: getattr(self, name) for name in names}
 
-    def heard_by(self, sonar: Sonar) -> Surfaces:
+    def at_frequency_of(self, sonar: Sonar) -> Surfaces:
         """Return the tables with the laws of the materials at the frequency of a sonar, and notes on them.
 
         The models ``physical`` and ``coherent`` evaluate the law at each ray's angle. The model ``thesis`` uses mu, or sigma
@@ -208,34 +209,34 @@ class Surfaces:
         coherent: DeviceArray = True
         return self.read(scene.ray_intersect_preliminary(ray, coherent=coherent, active=active), ray, active)
 
-    def read(self, found: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
+    def read(self, intersection: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
         """Return the surface at given intersections; rays and intersections are in the axes of the shape's scene."""
         # 1. Find the shape, and read normal and reflectivity of its facet from the table.
-        valid = found.is_valid() & active
-        index: DeviceArray = dr.reinterpret_array(mi.UInt32, found.shape)
+        valid = intersection.is_valid() & active
+        index: DeviceArray = dr.reinterpret_array(mi.UInt32, intersection.shape)
         known = valid & (index * 4 < dr.width(self.shapes))
         shape = dr.gather(mi.Vector4i, self.shapes, index, known)
         first = dr.select(known, shape.x, -1)
         tabled = first >= 0
-        row = dr.gather(mi.Vector4f, self.facets, mi.UInt32(first) + found.prim_index, tabled)
+        row = dr.gather(mi.Vector4f, self.facets, mi.UInt32(first) + intersection.prim_index, tabled)
         normal: DeviceArray = mi.Normal3f(row.x, row.y, row.z)
         reflectivity: DeviceArray = row.w
         shape_id: DeviceArray = dr.select(known, shape.z, -1)
         # 2. Evaluate textures that vary within a facet, at a uv from the table.
         if self.textured:
             evaluated = tabled & (reflectivity < 0)
-            si = self._on_facet(found, ray, normal, mi.UInt32(shape.y), evaluated)
-            own: DeviceArray = one_number(found.shape.bsdf().eval_diffuse_reflectance(si, evaluated))
-            reflectivity = dr.select(evaluated, unit(own), reflectivity)
+            si = self._on_facet(intersection, ray, normal, mi.UInt32(shape.y), evaluated)
+            reflectance: DeviceArray = one_number(intersection.shape.bsdf().eval_diffuse_reflectance(si, evaluated))
+            reflectivity = dr.select(evaluated, unit(reflectance), reflectivity)
         # 3. Let Mitsuba evaluate shapes that are not in the tables. An instance counts as one shape of the scene.
         if self.foreign:
             evaluated = valid & ~tabled
-            si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, evaluated)
+            si = intersection.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, evaluated)
             fixed = dr.select(known, dr.gather(mi.Float, self.constant, index, known), -1)
-            own = one_number(si.bsdf().eval_diffuse_reflectance(si, evaluated & (fixed < 0)))
+            reflectance = one_number(si.bsdf().eval_diffuse_reflectance(si, evaluated & (fixed < 0)))
             normal = dr.select(tabled, normal, si.n)
-            reflectivity = dr.select(tabled, reflectivity, unit(dr.select(fixed < 0, own, fixed)))
-            top: DeviceArray = dr.reinterpret_array(mi.UInt32, found.instance)
+            reflectivity = dr.select(tabled, reflectivity, unit(dr.select(fixed < 0, reflectance, fixed)))
+            top: DeviceArray = dr.reinterpret_array(mi.UInt32, intersection.instance)
             inside = valid & (top > 0) & (top * 4 < dr.width(self.shapes))
             shape_id = dr.select(inside, dr.gather(mi.Vector4i, self.shapes, top, inside).z, shape_id)
         # 4. Apply the scattering law of the material at the angle of the ray.
@@ -245,33 +246,33 @@ class Surfaces:
             reflectivity = weighed(self.laws, material, reflectivity, dr.select(cosine < 1, cosine, 1))
         # 5. Read the object number of the facet.
         numbered = tabled & (dr.width(self.objects) > 1)
-        object_id = dr.gather(mi.Float, self.objects, mi.UInt32(first) + found.prim_index, numbered)
-        return Hit(valid, found.t, normal, reflectivity, shape_id, object_id, material)
+        object_id = dr.gather(mi.Float, self.objects, mi.UInt32(first) + intersection.prim_index, numbered)
+        return Hit(valid, intersection.t, normal, reflectivity, shape_id, object_id, material)
 
     def _on_facet(
         self,
-        found: mi.PreliminaryIntersection3f,
+        intersection: mi.PreliminaryIntersection3f,
         ray: mi.Ray3f,
         normal: DeviceArray,
         first: mi.UInt32,
         active: DeviceArray,
     ) -> mi.SurfaceInteraction3f:
         """Return the inputs of a texture or BSDF at a point: uv, position, triangle, and the side that is hit."""
-        corner = (first + found.prim_index) * 2
+        corner = (first + intersection.prim_index) * 2
         uv = dr.gather(mi.Vector4f, self.corners, corner, active)
         change = dr.gather(mi.Vector4f, self.corners, corner + 1, active)
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(found.t))
-        offset: DeviceArray = ray.d * found.t
-        si.t, si.p, si.n = found.t, ray.o + offset, normal
-        si.uv = mi.Point2f(uv.x, uv.y) + mi.Point2f(uv.z, uv.w) * found.prim_uv.x
-        si.uv += mi.Point2f(change.x, change.y) * found.prim_uv.y
-        si.shape, si.prim_index = found.shape, found.prim_index
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(intersection.t))
+        offset: DeviceArray = ray.d * intersection.t
+        si.t, si.p, si.n = intersection.t, ray.o + offset, normal
+        si.uv = mi.Point2f(uv.x, uv.y) + mi.Point2f(uv.z, uv.w) * intersection.prim_uv.x
+        si.uv += mi.Point2f(change.x, change.y) * intersection.prim_uv.y
+        si.shape, si.prim_index = intersection.shape, intersection.prim_index
         si.wi = mi.Vector3f(0, 0, -dr.dot(normal, ray.d))
         return si
 
 
 def registry_index(shape: mi.Shape) -> int:
-    """Return the number by which kernels identify a shape, which is that of ``found.shape``."""
+    """Return the number by which kernels identify a shape, which is that of ``intersection.shape``."""
     index: DeviceArray = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
     return int(index[0])
 
@@ -288,22 +289,22 @@ def _fixed_reflectivity(shape: mi.Shape, kinds: set[str], named: dict[str, list[
 
 def _number_of_material(shape: mi.Shape, materials: list[AcousticMaterial]) -> int:
     """Return the number of a shape's material, which is appended to ``materials`` unless an equal one is present."""
-    own = material_of(shape)
-    assert own is not None
-    for number, other in enumerate(materials):
-        if own.material == other.material:
+    shape_material = material_of(shape)
+    assert shape_material is not None
+    for number, known in enumerate(materials):
+        if shape_material.material == known.material:
             return number
-    materials.append(own)
+    materials.append(shape_material)
     return len(materials) - 1
 
 
 def _facet_rows(mesh: mi.Mesh, constant: float, flat: bool) -> DeviceArray:
     """Return the normal and reflectivity of each triangle, as computed by Mitsuba."""
     si = facet_points(mesh, dr.arange(mi.UInt32, mesh.face_count()), mi.Point2f(1 / 3))
-    own: DeviceArray = mi.Float(-1)
+    reflectivity: DeviceArray = mi.Float(-1)
     if flat:
-        own = reflectivity_at(mesh.bsdf(), si) if constant < 0 else mi.Float(constant)
-    rows: DeviceArray = dr.ravel(mi.Vector4f(si.n.x, si.n.y, si.n.z, own))
+        reflectivity = reflectivity_at(mesh.bsdf(), si) if constant < 0 else mi.Float(constant)
+    rows: DeviceArray = dr.ravel(mi.Vector4f(si.n.x, si.n.y, si.n.z, reflectivity))
     return rows
 
 
@@ -340,15 +341,17 @@ def facet_points(mesh: mi.Mesh, facet: DeviceArray, uv: mi.Point2f) -> mi.Surfac
         uv: second and third barycentric coordinates of the points.
     """
     count = dr.width(facet)
-    found: DeviceArray = dr.zeros(mi.PreliminaryIntersection3f, count)
-    found.valid = dr.full(mi.Bool, True, count)
-    found.t = mi.Float(1)
-    found.prim_index = facet
-    found.prim_uv = uv
-    found.shape = mi.ShapePtr(mesh)
+    intersection: DeviceArray = dr.zeros(mi.PreliminaryIntersection3f, count)
+    intersection.valid = dr.full(mi.Bool, True, count)
+    intersection.t = mi.Float(1)
+    intersection.prim_index = facet
+    intersection.prim_uv = uv
+    intersection.shape = mi.ShapePtr(mesh)
     ray = dr.zeros(mi.Ray3f, count)
     ray.d = mi.Vector3f(0, 0, 1)
-    return cast(mi.SurfaceInteraction3f, found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame))
+    return cast(
+        mi.SurfaceInteraction3f, intersection.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame)
+    )
 
 
 def _notes(named: dict[str, list[str]]) -> list[str]:

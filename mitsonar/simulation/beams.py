@@ -143,8 +143,8 @@ class BeamFormer:
         inside = (column >= 0) & (column < self.ranges)
         away = sonar.range_m[:, None] - (self.first_range + column * self.range_step)
         # 2. Pulse shape at these columns, scaled to the energy of a bin and corrected for the linear deposit.
-        kept = _kept_power(pulse.shape, self.range_step, 20 * pulse.resolution_m)
-        value = pulse.shape(away) * math.sqrt(sonar.bin_m / (pulse.equivalent_m * kept))
+        preserved = _preserved_power(pulse.shape, self.range_step, 20 * pulse.resolution_m)
+        value = pulse.shape(away) * math.sqrt(sonar.bin_m / (pulse.equivalent_m * preserved))
         row = np.broadcast_to(np.arange(sonar.range_bins)[:, None], column.shape)
         entries = (value[inside].astype(np.float32), (row[inside], column[inside]))
         return csr_array(entries, shape=(sonar.range_bins, self.ranges))
@@ -152,14 +152,14 @@ class BeamFormer:
     @cached_property
     def _gain(self) -> float:
         """Return the factor that gives a beam the level of a box of the same width."""
-        kept = _kept_power(self.aperture.pattern, self.sine_step, 40 / self.aperture.length)
-        return math.sqrt(self.sonar.beam_width_rad / (self.aperture.equivalent_width * kept))
+        preserved = _preserved_power(self.aperture.pattern, self.sine_step, 40 / self.aperture.length)
+        return math.sqrt(self.sonar.beam_width_rad / (self.aperture.equivalent_width * preserved))
 
     @cached_property
-    def kept(self) -> float:
+    def preserved_power(self) -> float:
         """Return the fraction of power that linear deposit on the grid preserves, over sine and range."""
-        over_range = _kept_power(self.pulse.shape, self.range_step, 20 * self.pulse.resolution_m)
-        return over_range * _kept_power(self.aperture.pattern, self.sine_step, 40 / self.aperture.length)
+        over_range = _preserved_power(self.pulse.shape, self.range_step, 20 * self.pulse.resolution_m)
+        return over_range * _preserved_power(self.aperture.pattern, self.sine_step, 40 / self.aperture.length)
 
     @cached_property
     def _away(self) -> NDArray[np.float64]:
@@ -179,12 +179,12 @@ class BeamFormer:
         assert sonar.focus_m is not None
         assert sonar.frequency_hz is not None
         wavelength = sonar.sound_speed / sonar.frequency_hz
-        found = []
+        blocks = []
         for part in np.array_split(np.arange(sonar.range_bins), min(FOCUS_BLOCKS, sonar.range_bins)):
             curvature = float(np.mean(1 / sonar.range_m[part])) - 1 / sonar.focus_m
             matrix = np.stack([self.aperture.defocused(row, curvature, wavelength) for row in self._away]) * self._gain
-            found.append((slice(int(part[0]), int(part[-1]) + 1), matrix.astype(np.complex64)))
-        return found
+            blocks.append((slice(int(part[0]), int(part[-1]) + 1), matrix.astype(np.complex64)))
+        return blocks
 
     def beams(self, field: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Compute the complex image ``(bins, beams)`` of a field ``(sines, ranges)``."""
@@ -199,7 +199,7 @@ class BeamFormer:
         return np.concatenate([sums[bins] @ matrix.T for bins, matrix in self.focused])
 
 
-def _kept_power(shape: Any, step: float, reach: float) -> float:
+def _preserved_power(shape: Any, step: float, reach: float) -> float:
     """Return the fraction of power that linear deposit on a grid preserves, averaged over positions between lines."""
     x = np.linspace(-reach, reach, 40_001)
     places = (np.arange(32) + 0.5) / 32
@@ -279,7 +279,7 @@ def phasor_sums(turn: NDArray[np.float64], strength: NDArray[np.complex128], mod
     if not len(turn):
         return np.zeros(modes, np.complex128)
     if current_variant().startswith("cuda") and _has_cufinufft():
-        return _on_the_device(turn, strength, modes)
+        return _sums_on_device(turn, strength, modes)
     return np.asarray(finufft.nufft1d1(turn, strength, modes, eps=TOLERANCE, isign=-1, nthreads=1))
 
 
@@ -295,12 +295,12 @@ def _has_cufinufft() -> bool:
     return True
 
 
-def _on_the_device(turn: NDArray[np.float64], strength: NDArray[np.complex128], modes: int) -> NDArray[np.complex128]:
+def _sums_on_device(turn: NDArray[np.float64], strength: NDArray[np.complex128], modes: int) -> NDArray[np.complex128]:
     import cufinufft
     import torch
 
-    there = [torch.from_numpy(np.ascontiguousarray(values)).cuda() for values in (turn, strength)]
-    return np.asarray(cufinufft.nufft1d1(*there, modes, eps=TOLERANCE, isign=-1).cpu().numpy())
+    arrays = [torch.from_numpy(np.ascontiguousarray(values)).cuda() for values in (turn, strength)]
+    return np.asarray(cufinufft.nufft1d1(*arrays, modes, eps=TOLERANCE, isign=-1).cpu().numpy())
 
 
 def phasors(

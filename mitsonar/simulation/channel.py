@@ -36,14 +36,14 @@ FOR_PATHS = ("counts", "beyond", "delay", "amplitude", "phase", "doppler")
 FOR_RESPONSES = ("counts", "beyond", "turn", "real", "imag")
 """Fields of :class:`~mitsonar.simulation.scatterers.EchoBatch` that a launch returns."""
 
-LACKING = (
-    'give reflection and rms height by the ids of shapes, mirrors={"surface": (-1.0, 0.0)}, or "materials" (--mirrors) with '
+MIRROR_ADVICE = (
+    'give reflection and rms height keyed by shape id, mirrors={"surface": (-1.0, 0.0)}, or "materials" (--mirrors) with '
     "a material that has both"
 )
 """Advice in the error of an instrument that needs mirrors."""
 
 NO_MIRRORS = (
-    "the scene has no mirrors: no shape has an acoustic_material with reflection and roughness_m; all is as without mirrors"
+    "the scene has no mirrors: no shape has an acoustic_material with reflection and roughness_m; mirrors have no effect"
 )
 
 PINGS_AT_A_TIME = 16
@@ -103,10 +103,12 @@ class Paths:
             MitsonarError: there is no such kind of path.
         """
         if name not in self.ways:
-            raise MitsonarError(f"no path goes by {name!r}: {nearest_names(name, self.ways)}")
+            raise MitsonarError(f"no kind of path is named {name!r}: {nearest_names(name, self.ways)}")
         way = np.zeros(len(self.delay_s), np.int64) if self.way is None else self.way
-        own = way == self.ways.index(name)
-        return Paths(self.delay_s[own], self.amplitude[own], self.doppler_hz[own], 0, way[own], self.ways)
+        selected = way == self.ways.index(name)
+        return Paths(
+            self.delay_s[selected], self.amplitude[selected], self.doppler_hz[selected], 0, way[selected], self.ways
+        )
 
 
 class ChannelSimulator:
@@ -154,8 +156,8 @@ class ChannelSimulator:
         self.reset()
 
     def __repr__(self) -> str:
-        shapes, ways = len(self._given[0].shapes()), ", ".join(self.ways[:4])
-        return f"ChannelSimulator({self.sonar} in a scene of {shapes} shapes; ways {ways})"
+        shapes, paths = len(self._given[0].shapes()), ", ".join(self.ways[:4])
+        return f"ChannelSimulator({self.sonar} in a scene of {shapes} shapes; paths {paths})"
 
     def _build(self, like: ChannelTracer | None = None) -> None:
         """Build everything that depends on the current scene: scatterers or surface tables, and mirrors."""
@@ -166,11 +168,11 @@ class ChannelSimulator:
         from mitsonar.simulation.scatterers import ChannelTracer
 
         parts = mirror_of(scene, mirrors) if mirrors else None
-        check_channel_mirrors(sonar, parts is not None, LACKING)
+        check_channel_mirrors(sonar, parts is not None, MIRROR_ADVICE)
         self._without_mirrors = mirrors == "materials" and parts is None
         self.tracer: ChannelTracer = ChannelTracer(scene, sonar, like, parts)
         self.without_scatterer: MirrorPaths = MirrorPaths(self.tracer)
-        self.ways = tuple([way.name for way in self.tracer.ways] + self.without_scatterer.names)
+        self.ways = tuple([path.name for path in self.tracer.paths] + self.without_scatterer.names)
 
     def _follow_scene(self) -> None:
         """Rebuild everything that depends on the scene if its parameters have changed."""
@@ -235,9 +237,9 @@ class ChannelSimulator:
         if table.shape != (1, 6):
             raise MitsonarError(f"a step takes one pose x, y, z [m], pitch, roll, heading [rad]: got {table.shape}")
         time = self._stepped / self.sonar.frame_rate_hz if time_s is None else time_s
-        made = self.responses(Trajectory(table, np.array([time])), velocity)
+        responses = self.responses(Trajectory(table, np.array([time])), velocity)
         self._stepped += 1
-        return made
+        return responses
 
     def reset(self) -> None:
         """Begin a new loop: the next :meth:`step` is ping 0."""
@@ -285,7 +287,7 @@ class ChannelSimulator:
         speeds = _checked(velocity, 1, self.sonar.sound_speed)
         self._follow_scene()
         parts = [
-            *(self.tracer.trace(table[0], speeds[0], receiver, FOR_PATHS, way=way) for way in self.tracer.ways),
+            *(self.tracer.trace(table[0], speeds[0], receiver, FOR_PATHS, path=path) for path in self.tracer.paths),
             *self.without_scatterer.trace(table[0], speeds[0], receiver, FOR_PATHS),
         ]
         received = joined(parts)
@@ -301,20 +303,20 @@ class ChannelSimulator:
     ) -> Channels:
         """Simulate a batch of pings; threads select points and transform echoes while the device traces."""
         shape = (len(poses), len(self.sonar.receivers))
-        ways = self.tracer.ways
-        each = [(k, receiver, way) for k, receiver in np.ndindex(shape) for way in ways]
+        paths = self.tracer.paths
+        each = [(k, receiver, path) for k, receiver in np.ndindex(shape) for path in paths]
         # select the points of all launches ahead, in threads
-        asked = [threads.submit(self.tracer.asked, poses[k], receiver, way) for k, receiver, way in each]
-        made = []
+        candidates = [threads.submit(self.tracer.candidates, poses[k], receiver, path) for k, receiver, path in each]
+        transforms = []
         parts: list[EchoValues] = []
         # trace one kind of path after another; a response is transformed once all its kinds have arrived
-        for (k, receiver, way), ready in zip(each, asked, strict=True):
-            parts.append(self.tracer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES, ready.result(), way))
-            if len(parts) == len(ways):
+        for (k, receiver, path), ready in zip(each, candidates, strict=True):
+            parts.append(self.tracer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES, ready.result(), path))
+            if len(parts) == len(paths):
                 parts += self.without_scatterer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES)
-                made.append(threads.submit(_one_response, self.sonar, parts))
+                transforms.append(threads.submit(_one_response, self.sonar, parts))
                 parts = []
-        response, echoes, dropped = zip(*(future.result() for future in made), strict=True)
+        response, echoes, dropped = zip(*(future.result() for future in transforms), strict=True)
         return Channels(
             first=first,
             response=np.reshape(np.asarray(response, np.complex64), (*shape, self.sonar.taps)),

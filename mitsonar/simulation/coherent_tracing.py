@@ -147,7 +147,7 @@ class CoherentTracer:
             if mirrors is not None:
                 hit = without_mirror_part(mirrors, hit, rays.d, 2 * math.pi / self.wavelength)
             if isinstance(surfaces, MovingSurfaces):  # last: mirrors are looked up by shape
-                hit = replace(hit, shape_id=surfaces.own_lattice(scene, hit, body))
+                hit = replace(hit, shape_id=surfaces.scatterer_lattice(scene, hit, body))
             return self._sums(rays, hit, patches)
 
         return launch
@@ -185,11 +185,11 @@ class CoherentTracer:
     def _count(self, counts: mi.UInt32, rays: FanRays, hit: Hit, points: HashedPoints) -> None:
         """Count the outcomes of the rays in the field of view; rays beside it only carry side lobes and skirts."""
         near, far = hit.valid & (hit.t < self.sonar.range_min), hit.valid & (hit.t >= self.sonar.range_max)
-        for place, found in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
-            kept = found & rays.inside
-            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(place), kept, mode=ADD)
+        for place, outcome in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
+            counted = outcome & rays.inside
+            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(place), counted, mode=ADD)
         widest = mi.UInt32(COUNTED.index("widest"))
-        dr.scatter_reduce(dr.ReduceOp.Max, counts, mi.UInt32(points.wanted), widest, points.cut & rays.inside, mode=ADD)
+        dr.scatter_reduce(dr.ReduceOp.Max, counts, mi.UInt32(points.covered), widest, points.cut & rays.inside, mode=ADD)
 
     def _deposit(
         self,
@@ -212,8 +212,8 @@ class CoherentTracer:
         level = level * elevation_gain(self.sonar, seen.tangent)
         # 4. Deposit, if the point lies in the cell of this ray.
         wave = seen.sine, seen.range_m, level, cos, sin
-        kept = add_waves(self.former, self.bits, sums, wave, seen.mine & (number < points.count))
-        dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(COUNTED.index("points")), kept, mode=ADD)
+        deposited = add_waves(self.former, self.bits, sums, wave, seen.mine & (number < points.count))
+        dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(COUNTED.index("points")), deposited, mode=ADD)
 
 
 def add_waves(
@@ -233,9 +233,9 @@ def add_waves(
     at_sine = (sine - former.first_sine) * (1 / former.sine_step)
     at_range = mi.Float(range_m - former.first_range) * (1 / former.range_step)
     line, cell = dr.floor(at_sine), dr.floor(at_range)
-    kept = active & (cell >= 0) & (cell < former.ranges - 1)
-    kept &= (line >= 0) & (line < former.sines - 1)
-    begin = mi.UInt32(dr.select(kept, line, 0)) * former.ranges + mi.UInt32(dr.select(kept, cell, 0))
+    inside = active & (cell >= 0) & (cell < former.ranges - 1)
+    inside &= (line >= 0) & (line < former.sines - 1)
+    begin = mi.UInt32(dr.select(inside, line, 0)) * former.ranges + mi.UInt32(dr.select(inside, cell, 0))
     # 2. Bilinear deposit; integer additions do not depend on the order of the rays.
     part = at_sine - line, at_range - cell
     for over_sine in (0, 1):
@@ -244,8 +244,8 @@ def add_waves(
             for total, turned in zip(sums, (cos, sin), strict=True):
                 value = mi.UInt64(mi.Int64(mi.Float64(level * share * turned) * 2.0**bits))
                 where = begin + over_sine * former.ranges + over_range
-                dr.scatter_reduce(dr.ReduceOp.Add, total, value, where, kept, mode=ADD)
-    return kept
+                dr.scatter_reduce(dr.ReduceOp.Add, total, value, where, inside, mode=ADD)
+    return inside
 
 
 @dataclass
@@ -362,7 +362,9 @@ class FanRays:
         """Return range, direction and cosine of points, and whether their direction lies in the cell of the ray."""
         # 1. Line of sight and range, in double precision because the phase needs fractions of a wavelength.
         origin = pick(points.axis, mi.Vector3d(*(line[3] for line in self.lines)))
-        exact = [mi.Float64(own) - begin for own, begin in zip((point.p, point.q, point.a), origin, strict=True)]
+        exact = [
+            mi.Float64(coordinate) - begin for coordinate, begin in zip((point.p, point.q, point.a), origin, strict=True)
+        ]
         range_m = dr.sqrt(sum(value * value for value in exact))
         way = [mi.Float(value) for value in exact]
         # 2. Direction in the axes of the sonar.
@@ -383,7 +385,7 @@ class FanRays:
     def _along(self, points: HashedPoints, way: list[DeviceArray], column: int) -> DeviceArray:
         """Return the component of vectors along one axis of the sensor."""
         axis = pick(points.axis, mi.Vector3f(*(mi.Float(line[column]) for line in self.lines)))
-        return sum(own * part for own, part in zip(axis, way, strict=True))
+        return sum(component * part for component, part in zip(axis, way, strict=True))
 
 
 def point_pitch(sonar: Sonar) -> float:

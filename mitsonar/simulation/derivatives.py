@@ -96,7 +96,9 @@ def differentiate(
         raise MitsonarError(f"a derivative needs at least 1 ping in each half: got {pings}")
     source = jittered(simulator)
     for number, pose in enumerate(table):
-        yield _at(source, Pose.from_row(pose), gain, pings, step or step_for(source.sonar), first + 2 * pings * number)
+        yield _derivatives_at(
+            source, Pose.from_row(pose), gain, pings, step or step_for(source.sonar), first + 2 * pings * number
+        )
 
 
 def jittered(simulator: Simulator) -> Simulator:
@@ -113,7 +115,7 @@ def step_for(sonar: Sonar, part: float = STEP) -> Motion:
     return Motion(part * sonar.beam_width_rad * middle, part * sonar.bin_m, part * sonar.beam_width_rad)
 
 
-def _at(source: Simulator, pose: Pose, gain: float, pings: int, step: Motion, first: int) -> list[Derivative]:
+def _derivatives_at(source: Simulator, pose: Pose, gain: float, pings: int, step: Motion, first: int) -> list[Derivative]:
     """Render both sides of each step, in two halves, and return one derivative for each view."""
     # both sides of a step render the same ping numbers, hence the same jitter, at motions that differ along one axis only
     sums: list[_Sums] = []
@@ -124,10 +126,10 @@ def _at(source: Simulator, pose: Pose, gain: float, pings: int, step: Motion, fi
             motions[:, axis] = (2 * side - 1) * step[axis]
             moved = np.array([compose(pose, Motion(*motion)) for motion in motions])
             for views in source.render_views(moved, first=first):
-                sums = sums or [_Sums.empty(*seen.levels.shape[1:]) for seen in views]
-                for own, seen in zip(sums, views, strict=True):
-                    own.add(seen.levels, np.arange(len(seen)) + seen.first - first >= pings, gain, axis, side)
-    return [own.derivative(pings, step) for own in sums]
+                sums = sums or [_Sums.empty(*batch.levels.shape[1:]) for batch in views]
+                for total, batch in zip(sums, views, strict=True):
+                    total.add(batch.levels, np.arange(len(batch)) + batch.first - first >= pings, gain, axis, side)
+    return [total.derivative(pings, step) for total in sums]
 
 
 def evenly(count: int) -> NDArray[np.float64]:
@@ -144,11 +146,11 @@ class _Sums:
     """Sums over pings.
 
     Attributes:
-        of: sums of level and filled, by half, axis and side ``(2, 3, 2, 2, bins, beams)``.
+        totals: sums of level and filled, by half, axis and side ``(2, 3, 2, 2, bins, beams)``.
         squares: sums of squared levels over all pings ``(bins, beams)``.
     """
 
-    of: NDArray[np.float64]
+    totals: NDArray[np.float64]
     squares: NDArray[np.float64]
 
     @classmethod
@@ -159,13 +161,13 @@ class _Sums:
         """Add pings of one side; ``second`` marks those of the second half."""
         for half in (0, 1):
             image = np.minimum(levels[second == half] * np.float32(gain), np.float32(1))
-            self.of[half, axis, side, 0] += image.sum(axis=0, dtype=np.float64)
-            self.of[half, axis, side, 1] += (image > 0).sum(axis=0)
+            self.totals[half, axis, side, 0] += image.sum(axis=0, dtype=np.float64)
+            self.totals[half, axis, side, 1] += (image > 0).sum(axis=0)
             self.squares += np.einsum("pij,pij->ij", image, image, dtype=np.float64)
 
     def derivative(self, pings: int, step: Motion) -> Derivative:
         """Compute differences over twice the steps, and means over all sides."""
-        level, filled = self.of.mean(axis=(0, 1, 2)) / pings
-        jacobian = (self.of[:, :, 1] - self.of[:, :, 0]) / pings / (2 * np.array(step))[:, None, None, None]
+        level, filled = self.totals.mean(axis=(0, 1, 2)) / pings
+        jacobian = (self.totals[:, :, 1] - self.totals[:, :, 0]) / pings / (2 * np.array(step))[:, None, None, None]
         variance = np.maximum(self.squares / (12 * pings) - level**2, 0.0)
         return Derivative(level, filled, variance, np.moveaxis(jacobian, (1, 2), (4, 3)).astype(np.float32), pings)

@@ -59,25 +59,25 @@ def ensure_variant(name: str | None = None) -> str:
     cuda, llvm = _backends()
     import mitsuba as mi
 
-    wanted = name or os.environ.get("MITSONAR_VARIANT")
-    if wanted is None:
+    variant = name or os.environ.get("MITSONAR_VARIANT")
+    if variant is None:
         if mi.variant() in VARIANTS:
             return str(mi.variant())
-        wanted = "cuda_ad_mono" if cuda else "llvm_ad_mono"
+        variant = "cuda_ad_mono" if cuda else "llvm_ad_mono"
         if mi.variant() is not None:  # chosen by the user, whose objects would be invalid in another variant
             raise MitsonarError(
                 f"the Mitsuba variant {mi.variant()} is set, and mitsonar works with {', '.join(VARIANTS)}: call "
-                f'mi.set_variant("{wanted}") first, or leave set_variant out'
+                f'mi.set_variant("{variant}") first, or leave set_variant out'
             )
-    if wanted not in VARIANTS:
-        raise MitsonarError(f"unknown variant {wanted!r}: {nearest_names(wanted, VARIANTS)}")
-    if not (cuda if wanted.startswith("cuda") else llvm):
-        if wanted.startswith("cuda"):
-            raise MitsonarError(f"{wanted} needs an NVIDIA driver, and none was found: use llvm_ad_mono")
+    if variant not in VARIANTS:
+        raise MitsonarError(f"unknown variant {variant!r}: {nearest_names(variant, VARIANTS)}")
+    if not (cuda if variant.startswith("cuda") else llvm):
+        if variant.startswith("cuda"):
+            raise MitsonarError(f"{variant} needs an NVIDIA driver, and none was found: use llvm_ad_mono")
         raise MitsonarError(f"the library libLLVM was not found, which the renderer needs: {INSTALL}")
-    if mi.variant() != wanted:
-        mi.set_variant(wanted)
-    return wanted
+    if mi.variant() != variant:
+        mi.set_variant(variant)
+    return variant
 
 
 def backend() -> Backend:
@@ -132,12 +132,12 @@ class Frozen:
         import mitsuba as mi
 
         self._launch = launch
-        own = weakref.ref(self)
+        reference = weakref.ref(self)
 
         def run(*inputs: object) -> Any:
-            found = own()
-            assert found is not None, "called by its owner"
-            return found._launch(*inputs)
+            frozen = reference()
+            assert frozen is not None, "called by its owner"
+            return frozen._launch(*inputs)
 
         self._recorded: Any = dr.freeze(run, state_fn=lambda *_: mi.BSDFPtr(None))
 
@@ -218,6 +218,6 @@ def padded(values: NDArray[Any]) -> NDArray[Any]:
     """
     room = np.zeros(len(values) + MOST_LANES + ALIGNED_BYTES // values.itemsize, dtype=values.dtype)
     first = -room.ctypes.data % ALIGNED_BYTES // values.itemsize
-    kept = room[first : first + len(values)]
-    kept[:] = values
-    return kept
+    aligned = room[first : first + len(values)]
+    aligned[:] = values
+    return aligned

@@ -37,7 +37,7 @@ from mitsonar.simulation.device import current_variant
 from mitsonar.simulation.runs import SIMULATORS, Destination, RenderOptions, Steps, path_digest, run, write_run
 from mitsonar.simulation.simulator import Simulator
 from mitsonar.simulation.sounding import SoundedPings, SounderSimulator, dvl_readings, dvl_sensors
-from mitsonar.simulation.vehicle import CameraSimulator, Mounted, VehicleSimulator, refuse_path, told_of
+from mitsonar.simulation.vehicle import CameraSimulator, Mounted, VehicleSimulator, camera_settings, refuse_path
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -139,8 +139,8 @@ def run_impulse(
         write_whole(run.path / "waterfall.png", figures.waterfall_png(responses))
         responses.save(run.path / "responses.npz")
 
-    made = write_run(CHANNEL_MEASUREMENT, settings, destination, steps, frames_done=0)
-    return ImpulseReport(spread, made.notes.get("warnings") or [])
+    directory = write_run(CHANNEL_MEASUREMENT, settings, destination, steps, frames_done=0)
+    return ImpulseReport(spread, directory.notes.get("warnings") or [])
 
 
 def _write_responses(
@@ -188,7 +188,7 @@ def _check_store(group: zarr.Group, pings: int, sonar: ChannelSonar) -> None:
         refuse_codecs(array)
         check_column(array, name, column, sizes, str(group.store_path))
         if array.chunks != ((1, *array.shape[1:]) if array.ndim > 2 else array.shape):
-            raise ValueError(f"{name} is cut into pieces of {array.chunks}")
+            raise ValueError(f"{name} has chunks of {array.chunks}")
 
 
 def _refuse_silence(simulator: ChannelSimulator, flown: Trajectory, paths: list[Paths]) -> None:
@@ -320,7 +320,7 @@ def run_camera(simulator: CameraSimulator, flown: Trajectory, destination: Desti
     """
     settings = {
         "variant": current_variant(),
-        "camera": told_of(simulator.camera),
+        "camera": camera_settings(simulator.camera),
         "frames": len(flown),
         "samples": simulator.samples,
         "frame": frame,
@@ -429,11 +429,11 @@ def run_sounder(
         soundings = Soundings(flown.time_s, flown.poses, sounder, *(parts[name] for name in DETECTED))
         yield 0, {"warnings": [*simulator.notes, *_write_soundings(run.path, soundings, parts)]}
 
-    made = write_run(SOUNDINGS, settings, destination, steps, pings_done=0)
-    shutil.rmtree(made.path / "parts", ignore_errors=True)
-    soundings = Soundings.load(made.path / "soundings.npz")
-    files = [name for name in SOUNDINGS.outputs if (made.path / name).is_file()]
-    warnings = [str(one) for one in made.notes.get("warnings") or []]
+    directory = write_run(SOUNDINGS, settings, destination, steps, pings_done=0)
+    shutil.rmtree(directory.path / "parts", ignore_errors=True)
+    soundings = Soundings.load(directory.path / "soundings.npz")
+    files = [name for name in SOUNDINGS.outputs if (directory.path / name).is_file()]
+    warnings = [str(one) for one in directory.notes.get("warnings") or []]
     return SoundingReport(files, int(soundings.found.sum()), soundings.found.size, warnings)
 
 
@@ -556,12 +556,12 @@ def run_vehicle(
                 begun.append(name)
                 yield 0, {"begun": begun}  # noted first: only a sensor that was begun is resumed in its folder
             inner = replace(destination, folder=run.path / name, resume=again, overwrite=not again)
-            found = _run_sensor(simulator.scene, one, vehicle, bodies, options, inner)
-            warnings += [line for line in (f"{name}: {sentence}" for sentence in found) if line not in warnings]
+            sentences = _run_sensor(simulator.scene, one, vehicle, bodies, options, inner)
+            warnings += [line for line in (f"{name}: {sentence}" for sentence in sentences) if line not in warnings]
             yield 0, {"warnings": warnings}
 
-    made = write_run(VEHICLE_RUN, settings, destination, steps, begun=[], warnings=[])
-    return VehicleReport(tuple(sensors), made.notes["warnings"])
+    directory = write_run(VEHICLE_RUN, settings, destination, steps, begun=[], warnings=[])
+    return VehicleReport(tuple(sensors), directory.notes["warnings"])
 
 
 def _run_sensor(
@@ -589,5 +589,5 @@ def _run_sensor(
 def _sensor_settings(sensor: Mounted) -> dict[str, Any]:
     """Return the keys and the mount that describe a sensor."""
     one = sensor.instrument
-    keys = one.model_dump(mode="json") if isinstance(one, Sonar | Sounder | ChannelSonar) else told_of(one)
+    keys = one.model_dump(mode="json") if isinstance(one, Sonar | Sounder | ChannelSonar) else camera_settings(one)
     return {"keys": keys, "mount": list(sensor.mount)}

@@ -15,7 +15,15 @@ from mitsonar.acoustics.water import delay_exact
 from mitsonar.instruments.hydrophones import PADDING, ChannelSonar
 from mitsonar.simulation.beams import phasors
 from mitsonar.simulation.device import DeviceArray, Frozen, padded, replayed
-from mitsonar.simulation.mirrors import ROW, MirrorFacets, MirrorWay, PlaneRow, ScatteringPoints, mirror_ways, unfolded
+from mitsonar.simulation.mirrors import (
+    ROW,
+    MirrorFacets,
+    MirrorSequence,
+    PlaneRow,
+    ScatteringPoints,
+    mirror_sequences,
+    unfolded,
+)
 from mitsonar.simulation.scatterers import ChannelTracer, EchoValues, link_table
 from mitsonar.simulation.tracing import hidden
 
@@ -45,8 +53,8 @@ class MirrorPaths:
         self.facets = tracer.flat.facets
         lengths = range(0 if self.sonar.direct else 1, self.sonar.bounces + 1)
         planes = tracer.flat.reflecting
-        self.ways = {length: ways for length in lengths if (ways := mirror_ways(planes(length), length))}
-        self.names = [way.name or "direct" for ways in self.ways.values() for way in ways]
+        self.sequences = {length: sequences for length in lengths if (sequences := mirror_sequences(planes(length), length))}
+        self.names = [sequence.name or "direct" for sequences in self.sequences.values() for sequence in sequences]
         self.names += [mirror.name for mirror in self.facets]
         self.wavenumber = 2 * math.pi / self.sonar.wavelength_m
         self.launches: dict[int, Callable[..., list[DeviceArray]]] = {}
@@ -54,7 +62,7 @@ class MirrorPaths:
         self.notes: list[str] = []
 
     def trace(
-        self, pose: NDArray[np.float64], velocity: NDArray[np.float64], receiver: int, wanted: Sequence[str]
+        self, pose: NDArray[np.float64], velocity: NDArray[np.float64], receiver: int, fields: Sequence[str]
     ) -> list[EchoValues]:
         """Return the paths of one ping at one receiver: a list of echo values, one entry for each of :attr:`names`.
 
@@ -62,54 +70,62 @@ class MirrorPaths:
             pose: pose of the transmitter ``(6,)`` [m, rad].
             velocity: velocity of the vehicle in its own axes ``(4,)`` [m/s, rad/s].
             receiver: index of the receiver.
-            wanted: names of the values to return.
+            fields: names of the values to return.
         """
         table = link_table(self.sonar, receiver, pose, velocity)
-        found = [part for length, ways in self.ways.items() for part in self._by_planes(table, receiver, length, ways)]
-        found += [self._by_facets(table, receiver, mirror) for mirror in self.facets]
-        return [{name: part[name] for name in wanted} for part in found]
+        echoes = [
+            part
+            for length, sequences in self.sequences.items()
+            for part in self._by_planes(table, receiver, length, sequences)
+        ]
+        echoes += [self._by_facets(table, receiver, mirror) for mirror in self.facets]
+        return [{name: part[name] for name in fields} for part in echoes]
 
-    def _by_planes(self, table: NDArray[np.float64], receiver: int, length: int, ways: list[MirrorWay]) -> list[EchoValues]:
+    def _by_planes(
+        self, table: NDArray[np.float64], receiver: int, length: int, sequences: list[MirrorSequence]
+    ) -> list[EchoValues]:
         """Return the paths via sequences of ``length`` planes, one entry for each sequence."""
         # 1. image sources, and which of them the receiver sees through its mirrors
-        sent_from, heard_at = table[0:3], table[3:6]
-        image = np.array([way.images(sent_from)[-1] for way in ways])
-        rows = np.array([way.rows(sent_from, self.registry) for way in ways])
-        is_open, factor = self._open(image, heard_at, rows, length)
+        sent_from, received_at = table[0:3], table[3:6]
+        image = np.array([sequence.images(sent_from)[-1] for sequence in sequences])
+        rows = np.array([sequence.rows(sent_from, self.registry) for sequence in sequences])
+        is_open, factor = self._open(image, received_at, rows, length)
         # 2. direction and distance from the receiver to the image
-        way = image - heard_at
-        distance = np.linalg.norm(way, axis=1)
+        to_image = image - received_at
+        distance = np.linalg.norm(to_image, axis=1)
         apart = distance > APART_M
-        u = way / np.where(apart, distance, 1)[:, None]
+        u = to_image / np.where(apart, distance, 1)[:, None]
         # 3. the direction in which sound departs from the transmitter itself, mirrored back from that of its image
-        departed = np.einsum("nij,ni->nj", np.array([one.turn for one in ways]), -u)
+        departed = np.einsum("nij,ni->nj", np.array([sequence.turn for sequence in sequences]), -u)
         # 4. delay, amplitude and Doppler shift
         valid = is_open & apart
-        delay = delay_exact(np.zeros(way.T.shape), way.T, table[9:12, None], self.sonar.sound_speed)
+        delay = delay_exact(np.zeros(to_image.T.shape), to_image.T, table[9:12, None], self.sonar.sound_speed)
         amplitude = factor * self._sensitivity(table, receiver, departed, u)
         if self.sonar.spreads:
             amplitude = amplitude / np.where(apart, distance, 1)
         doppler = (departed @ table[6:9] + u @ table[9:12]) / self.sonar.wavelength_m
         return [
             echo_values(self.sonar, delay[k : k + 1], amplitude[k : k + 1], doppler[k : k + 1], valid[k : k + 1])
-            for k in range(len(ways))
+            for k in range(len(sequences))
         ]
 
     def _sensitivity(
         self, table: NDArray[np.float64], receiver: int, departed: NDArray[np.float64], u: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the combined sensitivity of transmitter and receiver ``(n,)``, given unit directions from each."""
-        listens, sends = self.sonar.receivers[receiver].field, self.sonar.transmitter
-        heard = listens.sensitivity(*(table[12:21].reshape(3, 3) @ u.T))
-        return np.asarray(heard * sends.sensitivity(*(table[21:30].reshape(3, 3) @ departed.T)), dtype=float)
+        receiver_field, transmitter_field = self.sonar.receivers[receiver].field, self.sonar.transmitter
+        receiver_gain = receiver_field.sensitivity(*(table[12:21].reshape(3, 3) @ u.T))
+        return np.asarray(
+            receiver_gain * transmitter_field.sensitivity(*(table[21:30].reshape(3, 3) @ departed.T)), dtype=float
+        )
 
     def _open(
-        self, image: NDArray[np.float64], heard_at: NDArray[np.float64], rows: NDArray[np.float64], length: int
+        self, image: NDArray[np.float64], received_at: NDArray[np.float64], rows: NDArray[np.float64], length: int
     ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """Return which paths are unobstructed ``(n,)``, and the products of their reflection coefficients ``(n,)``."""
         if length not in self.launches:
             self.launches[length] = _compile_open(length, self.wavenumber)
-        inputs = [np.broadcast_to(heard_at, image.shape), image, rows.reshape(len(image), -1)]
+        inputs = [np.broadcast_to(received_at, image.shape), image, rows.reshape(len(image), -1)]
         table = np.concatenate(inputs, axis=1)
         columns = mi.UInt32(padded(np.arange(len(image), dtype=np.uint32))), mi.Float64(padded(table.ravel()))
         seen, factor = replayed(self.launches[length], *columns, self.scene)
@@ -117,14 +133,14 @@ class MirrorPaths:
 
     def _by_facets(self, table: NDArray[np.float64], receiver: int, mirror: MirrorFacets) -> EchoValues:
         """Return the echoes of one reflection from the facets of a mirror that is not flat."""
-        found = facet_echoes(mirror, table[0:3], table[3:6], table[9:12], self.sonar.carrier_hz, self.sonar.sound_speed)
-        self._tell(mirror, table)
-        valid = found.lit & self._lit(mirror, table)
-        amplitude = found.amplitude * self._sensitivity(table, receiver, found.sent, found.received)
+        echoes = facet_echoes(mirror, table[0:3], table[3:6], table[9:12], self.sonar.carrier_hz, self.sonar.sound_speed)
+        self._note_large_facets(mirror, table)
+        valid = echoes.lit & self._lit(mirror, table)
+        amplitude = echoes.amplitude * self._sensitivity(table, receiver, echoes.sent, echoes.received)
         if not self.sonar.spreads:
-            amplitude = amplitude * found.length
-        doppler = (found.sent @ table[6:9] + found.received @ table[9:12]) / self.sonar.wavelength_m
-        return echo_values(self.sonar, found.delay, amplitude, doppler, valid)
+            amplitude = amplitude * echoes.length
+        doppler = (echoes.sent @ table[6:9] + echoes.received @ table[9:12]) / self.sonar.wavelength_m
+        return echo_values(self.sonar, echoes.delay, amplitude, doppler, valid)
 
     def _lit(self, mirror: MirrorFacets, table: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which facets both transmitter and receiver see ``(facets,)``."""
@@ -137,7 +153,7 @@ class MirrorPaths:
         numbers = mi.Float(padded(np.concatenate(inputs, axis=1, dtype=np.float32).ravel()))
         return np.broadcast_to(np.array(replayed(self.shadows, number, numbers, self.scene)), len(middle))
 
-    def _tell(self, mirror: MirrorFacets, table: NDArray[np.float64]) -> None:
+    def _note_large_facets(self, mirror: MirrorFacets, table: NDArray[np.float64]) -> None:
         """Add a note, once, if facets are too large for the integral."""
         largest, allowed = half_fresnel_m(mirror, table[0:3], table[3:6], self.sonar.wavelength_m)
         if largest > allowed and not self.notes:
@@ -153,8 +169,8 @@ def _compile_open(length: int, wavenumber: float) -> Callable[..., list[DeviceAr
     @Frozen
     def launch(number: mi.UInt32, table: mi.Float64, scene: mi.Scene) -> list[DeviceArray]:
         columns = _columns(mi.Float64, table, number, 6 + (ROW + 1) * length)
-        at = columns[:3]
-        point = ScatteringPoints(mi.Point3f(*at), at, mi.Normal3f(0, 0, 0))
+        position = columns[:3]
+        point = ScatteringPoints(mi.Point3f(*position), position, mi.Normal3f(0, 0, 0))
         rows = [PlaneRow.of(columns[6 + (ROW + 1) * k : 6 + (ROW + 1) * (k + 1)]) for k in range(length)]
         seen, factor = unfolded(scene, point, columns[3:6], rows, wavenumber, mi.Bool(True))
         dr.eval(seen, factor)
@@ -177,13 +193,13 @@ def _compile_shadows() -> Callable[..., DeviceArray]:
     @Frozen
     def launch(number: mi.UInt32, table: mi.Float, scene: mi.Scene) -> DeviceArray:
         columns = _columns(mi.Float, table, number, 12)
-        at, normal = mi.Point3f(*columns[:3]), mi.Normal3f(*columns[3:6])
+        point, normal = mi.Point3f(*columns[:3]), mi.Normal3f(*columns[3:6])
         seen = mi.Bool(True)
         for start in (6, 9):
             place = mi.Point3f(*columns[start : start + 3])
-            way = at - place
-            distance = dr.norm(way)
-            seen = seen & ~hidden(scene, at, normal, way / distance, distance, seen)
+            line = point - place
+            distance = dr.norm(line)
+            seen = seen & ~hidden(scene, point, normal, line / distance, distance, seen)
         dr.eval(seen)
         return seen
 
@@ -252,7 +268,7 @@ class FacetEchoes(NamedTuple):
 def facet_echoes(
     mirror: MirrorFacets,
     sent_from: NDArray[np.float64],
-    heard_at: NDArray[np.float64],
+    received_at: NDArray[np.float64],
     velocity: NDArray[np.float64],
     carrier_hz: float,
     sound_speed: float,
@@ -271,7 +287,7 @@ def facet_echoes(
     Args:
         mirror: the facets.
         sent_from: position of the transmitter ``(3,)`` [m].
-        heard_at: position of the receiver when sound is sent ``(3,)`` [m].
+        received_at: position of the receiver when sound is sent ``(3,)`` [m].
         velocity: velocity of the receiver ``(3,)`` [m/s].
         carrier_hz: frequency of the carrier [Hz].
         sound_speed: [m/s].
@@ -283,7 +299,7 @@ def facet_echoes(
     twice = np.linalg.norm(across, axis=1)
     normal = across / np.maximum(twice, 1e-30)[:, None]
     # 2. directions from both ends, and the sum of the cosines to the normal
-    legs = [middle - place for place in (sent_from, heard_at)]
+    legs = [middle - place for place in (sent_from, received_at)]
     sent, received = (np.linalg.norm(leg, axis=1) for leg in legs)
     u = [leg / np.maximum(length, 1e-9)[:, None] for leg, length in zip(legs, (sent, received), strict=True)]
     cosines = [np.einsum("ni,ni->n", normal, one) for one in u]
@@ -291,9 +307,9 @@ def facet_echoes(
 
     # 3. delay via the centre, and phase at the corners relative to it
     def delay(places: NDArray[np.float64]) -> NDArray[np.float64]:
-        ways = [np.moveaxis(places - place, -1, 0) for place in (sent_from, heard_at)]
-        moving = velocity.reshape(3, *[1] * (ways[0].ndim - 1))
-        return np.asarray(delay_exact(ways[0], ways[1], moving, sound_speed))
+        vectors = [np.moveaxis(places - place, -1, 0) for place in (sent_from, received_at)]
+        moving = velocity.reshape(3, *[1] * (vectors[0].ndim - 1))
+        return np.asarray(delay_exact(vectors[0], vectors[1], moving, sound_speed))
 
     arrival, wavenumber = delay(middle), 2 * np.pi * carrier_hz / sound_speed
     phase = 2 * np.pi * carrier_hz * (delay(mirror.corners) - arrival[:, None])
@@ -329,18 +345,18 @@ def phase_mean(phase: NDArray[np.float64]) -> NDArray[np.complex128]:
 
 
 def half_fresnel_m(
-    mirror: MirrorFacets, sent_from: NDArray[np.float64], heard_at: NDArray[np.float64], wavelength_m: float
+    mirror: MirrorFacets, sent_from: NDArray[np.float64], received_at: NDArray[np.float64], wavelength_m: float
 ) -> tuple[float, float]:
     """Return the longest edge of the facet on the shortest path, and half the Fresnel radius there [m].
 
     Args:
         mirror: the facets.
         sent_from: position of the transmitter ``(3,)`` [m].
-        heard_at: position of the receiver ``(3,)`` [m].
+        received_at: position of the receiver ``(3,)`` [m].
         wavelength_m: wavelength of the carrier [m].
     """
     middle = mirror.corners.mean(axis=1)
-    sent, received = (np.linalg.norm(middle - place, axis=1) for place in (sent_from, heard_at))
+    sent, received = (np.linalg.norm(middle - place, axis=1) for place in (sent_from, received_at))
     near = int(np.argmin(sent + received))
     edges = mirror.corners[near] - np.roll(mirror.corners[near], 1, axis=0)
     radius = np.sqrt(wavelength_m * sent[near] * received[near] / (sent[near] + received[near]))

@@ -33,18 +33,18 @@ __all__ = [
     "MirrorFacets",
     "MirrorPart",
     "MirrorPlane",
-    "MirrorWay",
+    "MirrorSequence",
     "Mirroring",
     "Mirrors",
     "PlaneRow",
+    "ReturnPath",
     "ScatteringPoints",
     "SecondMirror",
     "SecondMirrors",
-    "WayBack",
     "bright_notes",
     "flat_mirrors",
     "mirror_of",
-    "mirror_ways",
+    "mirror_sequences",
     "second_notes",
     "unfolded",
 ]
@@ -90,11 +90,11 @@ def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
         MitsonarError: a shape is not in the scene, or a number is out of limits.
     """
     if isinstance(mirrors, str):
-        mirrors = _of_materials(scene, mirrors)
+        mirrors = _material_parts(scene, mirrors)
     if not isinstance(mirrors, Mapping | None):
-        raise MitsonarError(f"mirrors are parts by the ids of the shapes, or `materials`: got {shortened(mirrors)}")
+        raise MitsonarError(f"mirrors must be mirror parts keyed by shape id, or `materials`: got {shortened(mirrors)}")
     names = [shape.id() for shape in scene.shapes()]
-    found = Mirrors(np.zeros(len(names)), np.zeros(len(names)))
+    parts = Mirrors(np.zeros(len(names)), np.zeros(len(names)))
     for name, part in (mirrors or {}).items():
         if name not in names:
             raise MitsonarError(f"mirrors: the scene has no shape {name}: {nearest_names(name, names)}")
@@ -104,9 +104,9 @@ def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
                 f"mirrors: the reflection of {name} lies in -1..1 and its rms height in 0..{ROUGHEST_M:g} m: "
                 f"got {reflection:g} and {roughness_m:g}"
             )
-        for place in (place for place, own in enumerate(names) if own == name):
-            found.reflection[place], found.roughness_m[place] = reflection, roughness_m
-    return found if found.reflection.any() else None
+        for place in (place for place, shape_name in enumerate(names) if shape_name == name):
+            parts.reflection[place], parts.roughness_m[place] = reflection, roughness_m
+    return parts if parts.reflection.any() else None
 
 
 def _numbers_of(name: str, part: MirrorPart) -> tuple[float, float]:
@@ -122,16 +122,16 @@ def _numbers_of(name: str, part: MirrorPart) -> tuple[float, float]:
     return reflection, roughness_m
 
 
-def _of_materials(scene: mi.Scene, asked: str) -> dict[str, MirrorPart]:
+def _material_parts(scene: mi.Scene, source: str) -> dict[str, MirrorPart]:
     """Return the materials of a scene's shapes, keyed by shape id."""
-    if asked != "materials":
-        raise MitsonarError(f"mirrors are parts by the ids of the shapes, or `materials`: got {asked!r}")
-    found: dict[str, MirrorPart] = {}
+    if source != "materials":
+        raise MitsonarError(f"mirrors must be mirror parts keyed by shape id, or `materials`: got {source!r}")
+    parts: dict[str, MirrorPart] = {}
     for shape in scene.shapes():
-        own = material_of(shape) if shape.bsdf() is not None else None
-        if own is not None:
-            found[shape.id()] = own.material
-    return found
+        acoustic_material = material_of(shape) if shape.bsdf() is not None else None
+        if acoustic_material is not None:
+            parts[shape.id()] = acoustic_material.material
+    return parts
 
 
 def refuse_moving_mirrors(scene: mi.Scene, mirrors: Mirroring, moving: Collection[str]) -> None:
@@ -145,12 +145,12 @@ def refuse_moving_mirrors(scene: mi.Scene, mirrors: Mirroring, moving: Collectio
     Raises:
         MitsonarError: a mirror moves.
     """
-    found = mirror_of(scene, mirrors)
-    for shape, reflection in zip(scene.shapes(), [] if found is None else found.reflection, strict=found is not None):
+    parts = mirror_of(scene, mirrors)
+    for shape, reflection in zip(scene.shapes(), [] if parts is None else parts.reflection, strict=parts is not None):
         if reflection != 0 and shape.id() in moving:
             raise MitsonarError(
-                f"mirrors stand still: got {shape.id()}, which moves; name the mirrors by the ids of still shapes, or leave "
-                "its trajectory out"
+                f"mirrors must not move: got {shape.id()}, which moves; name the mirrors by the ids of still shapes, or "
+                "remove its trajectory"
             )
 
 
@@ -258,18 +258,18 @@ class FlatMirrors:
 
     def notes_on(self, bounces: int) -> list[str]:
         """Return notes to the user, given the largest number of reflections."""
-        found = list(self.notes)
+        notes = list(self.notes)
         for mirror in self.facets if bounces > 1 else []:
             mean = next((plane for plane in self.means if plane.name == mirror.name), None)
             if mean is None:
-                found.append(f"the mirror {mirror.name} is no plane with waves: it reflects once and makes no ghosts")
+                notes.append(f"the mirror {mirror.name} is not a plane with waves: it reflects once and makes no ghosts")
             else:
-                found.append(
-                    f"the mirror {mirror.name} is not flat: ways of several reflections have the coherent part of its "
+                notes.append(
+                    f"the mirror {mirror.name} is not flat: paths of several reflections have the coherent part of its "
                     f"mean plane, with the loss of its waves' rms height, {mean.roughness_m:.2g} m; "
                     "what waves scatter is left out"
                 )
-        return found
+        return notes
 
 
 def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
@@ -284,7 +284,7 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
     Raises:
         MitsonarError: a curved mirror has more than :data:`MOST_FACETS` triangles.
     """
-    found = FlatMirrors()
+    flat = FlatMirrors()
     for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
         assert mirrors is not None
         part = float(mirrors.reflection[place]), float(mirrors.roughness_m[place])
@@ -293,36 +293,36 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
         name = shape.id()
         kind = shape.class_name()
         if not isinstance(shape, mi.Mesh) and kind not in FLAT:
-            found.notes.append(
+            flat.notes.append(
                 f"shape {name} ({kind.lower()}) is curved and mirrors nothing in impulse responses: give it as a mesh"
             )
             continue
         corners = _triangles(shape)
         planes = _planes(corners)
         if planes is not None:
-            found.planes.extend(MirrorPlane(name, place, normal, offset, *part) for normal, offset in planes)
+            flat.planes.extend(MirrorPlane(name, place, normal, offset, *part) for normal, offset in planes)
         elif len(corners) > MOST_FACETS:
             raise MitsonarError(
                 f"the mirror {name} has {len(corners):,} triangles: at most {MOST_FACETS:,} are possible; give it fewer, or "
                 "make it flat"
             )
         else:
-            found.facets.append(MirrorFacets(name, corners, *part))
+            flat.facets.append(MirrorFacets(name, corners, *part))
             mean = _mean_plane(name, place, corners, *part)
-            found.means.extend([] if mean is None else [mean])
-    return found
+            flat.means.extend([] if mean is None else [mean])
+    return flat
 
 
 def mirror_planes(scene: mi.Scene, mirrors: Mirrors | None) -> list[MirrorPlane]:
     """Return the planes of a scene's flat mirrors."""
-    found = []
+    flat_planes = []
     for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
         assert mirrors is not None
         part = float(mirrors.reflection[place]), float(mirrors.roughness_m[place])
         if part[0] != 0 and (isinstance(shape, mi.Mesh) or shape.class_name() in FLAT):
             planes = _planes(_triangles(shape)) or []
-            found += [MirrorPlane(shape.id(), place, normal, offset, *part) for normal, offset in planes]
-    return found
+            flat_planes += [MirrorPlane(shape.id(), place, normal, offset, *part) for normal, offset in planes]
+    return flat_planes
 
 
 def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
@@ -381,15 +381,15 @@ def _planes(corners: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], flo
 
 
 ROW = 10
-"""Number of values of a plane in :meth:`MirrorWay.rows`, not counting the registry index of its shape."""
+"""Number of values of a plane in :meth:`MirrorSequence.rows`, not counting the registry index of its shape."""
 
 
-MOST_WAYS = 20_000
+MOST_SEQUENCES = 20_000
 """Largest number of sequences with a given number of planes; each costs about 1 ms per ping and receiver."""
 
 
 @dataclass(frozen=True)
-class MirrorWay:
+class MirrorSequence:
     """Sequence of planes that sound meets on its path from (or, backwards, to) a transducer; empty for the direct path."""
 
     planes: tuple[MirrorPlane, ...] = ()
@@ -437,22 +437,24 @@ class MirrorWay:
         ).reshape(-1, ROW + 1)
 
 
-def mirror_ways(planes: Sequence[MirrorPlane], length: int) -> list[MirrorWay]:
+def mirror_sequences(planes: Sequence[MirrorPlane], length: int) -> list[MirrorSequence]:
     """Return all sequences of ``length`` planes in which no plane follows itself.
 
     Raises:
-        MitsonarError: there are more than :data:`MOST_WAYS`.
+        MitsonarError: there are more than :data:`MOST_SEQUENCES`.
     """
     count = len(planes) * (len(planes) - 1) ** (length - 1) if length else 1
-    if count > MOST_WAYS:
+    if count > MOST_SEQUENCES:
         raise MitsonarError(
-            f"sound may meet the {len(planes)} planes of the mirrors in {count:,} orders of {length}: at most {MOST_WAYS:,} "
-            "are traced; give fewer mirrors, or fewer bounces"
+            f"sound may meet the {len(planes)} planes of the mirrors in {count:,} orders of {length}: at most "
+            f"{MOST_SEQUENCES:,} are traced; give fewer mirrors, or fewer bounces"
         )
-    ways: list[tuple[MirrorPlane, ...]] = [()]
+    sequences: list[tuple[MirrorPlane, ...]] = [()]
     for _ in range(length):
-        ways = [(*way, plane) for way in ways for plane in planes if not way or way[-1] is not plane]
-    return [MirrorWay(way) for way in ways]
+        sequences = [
+            (*sequence, plane) for sequence in sequences for plane in planes if not sequence or sequence[-1] is not plane
+        ]
+    return [MirrorSequence(sequence) for sequence in sequences]
 
 
 # ---------------- Unfolded paths: visibility and loss
@@ -462,18 +464,18 @@ class ScatteringPoints(NamedTuple):
     """Points on surfaces.
 
     Attributes:
-        at: position [m].
+        position: position [m].
         exact: position in double precision, three arrays [m].
         normal: unit normal of the surface.
     """
 
-    at: DeviceArray
+    position: DeviceArray
     exact: list[DeviceArray]
     normal: DeviceArray
 
 
 class PlaneRow(NamedTuple):
-    """One mirror of a path on the device; see :meth:`~mitsonar.simulation.mirrors.MirrorWay.rows`.
+    """One mirror of a path on the device; see :meth:`~mitsonar.simulation.mirrors.MirrorSequence.rows`.
 
     Attributes:
         image: image of the transducer in the mirrors before this one, three arrays [m].
@@ -526,39 +528,39 @@ def unfolded(
         Which paths are open (each leg meets its mirror first, and the last leg the transducer), and the product of the
         mirrors' reflection coefficients.
     """
-    at, normal, far, factor = point.exact, point.normal, image, mi.Float(1)
+    position, normal, far, factor = point.exact, point.normal, image, mi.Float(1)
     slab: DeviceArray = mi.Float(0)  # of the mirror that a leg leaves; its waves hide nothing
     for row in reversed(rows):
         # 1. the point and the image must be on opposite sides of the plane, and outside its waves
-        above, below = (dot(row.normal, place) - row.offset for place in (at, far))
-        size = dr.abs(at[0]) + dr.abs(at[1]) + dr.abs(at[2]) + 1
+        above, below = (dot(row.normal, place) - row.offset for place in (position, far))
+        size = dr.abs(position[0]) + dr.abs(position[1]) + dr.abs(position[2]) + 1
         # a point on the mirror itself has no path via it
         active = active & (above * below < 0) & (dr.abs(above) > size * OFF_SURFACE + row.slab_m)
         active = active & (dr.abs(below) > row.slab_m)
         # 2. the leg to the foot, where the line to the image crosses the plane, must not be obstructed
         part = above / (above - below)
-        foot = [a + (b - a) * part for a, b in zip(at, far, strict=True)]
-        way = [b - a for a, b in zip(at, foot, strict=True)]
-        u = mi.Vector3f(*(axis / length(way) for axis in way))
-        active = active & _meets(scene, mi.Point3f(*at) + u * slab, normal, u, row, active, moment)
+        foot = [a + (b - a) * part for a, b in zip(position, far, strict=True)]
+        leg = [b - a for a, b in zip(position, foot, strict=True)]
+        u = mi.Vector3f(*(axis / length(leg) for axis in leg))
+        active = active & _meets(scene, mi.Point3f(*position) + u * slab, normal, u, row, active, moment)
         # 3. loss at the mirror; the next leg begins at the foot and points to the image before this mirror
         normal = mi.Normal3f(*row.normal)
         facing: DeviceArray = mi.Vector3f(*row.normal)
         cosine = dr.abs(dr.dot(facing, u))
         factor = factor * mi.Float(row.reflection) * smooth_share(mi.Float(row.roughness_m), cosine, wavenumber)
-        at, far = foot, row.image
+        position, far = foot, row.image
         slab = mi.Float(row.slab_m) / cosine
     # 4. the last leg, to the transducer itself
-    last = [a - b for a, b in zip(at, far, strict=True)]
+    last = [a - b for a, b in zip(position, far, strict=True)]
     distance = length(last)
     u = mi.Vector3f(*(axis / distance for axis in last))
-    start = mi.Point3f(*at) - u * slab
+    start = mi.Point3f(*position) - u * slab
     return active & ~hidden(scene, start, normal, u, mi.Float(distance) - slab, active, moment), factor
 
 
 def _meets(
     scene: mi.Scene,
-    at: DeviceArray,
+    start: DeviceArray,
     normal: DeviceArray,
     u: DeviceArray,
     row: PlaneRow,
@@ -566,18 +568,18 @@ def _meets(
     moment: DeviceArray = None,
 ) -> DeviceArray:
     """Test whether rays from points meet a mirror's plane before anything else."""
-    off = (1 + dr.abs(at.x) + dr.abs(at.y) + dr.abs(at.z)) * OFF_SURFACE
-    ray = mi.Ray3f(at + normal * dr.select(dr.dot(normal, u) > 0, off, -off), u)
+    off = (1 + dr.abs(start.x) + dr.abs(start.y) + dr.abs(start.z)) * OFF_SURFACE
+    ray = mi.Ray3f(start + normal * dr.select(dr.dot(normal, u) > 0, off, -off), u)
     if moment is not None:
         ray.time = moment
-    found = scene.ray_intersect_preliminary(ray, coherent=True, active=active)  # type: ignore[call-overload]
-    index: DeviceArray = dr.reinterpret_array(mi.UInt32, found.shape)
-    met = ray.o + u * found.t
+    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)  # type: ignore[call-overload]
+    index: DeviceArray = dr.reinterpret_array(mi.UInt32, hit.shape)
+    met = ray.o + u * hit.t
     size = 1 + dr.abs(met.x) + dr.abs(met.y) + dr.abs(met.z)
     # the shape alone does not suffice, since a mesh may have several planes
     aside = dr.abs(dr.dot(mi.Vector3f(*row.normal), met) - mi.Float(row.offset))
     near = 4 * size * OFF_SURFACE + mi.Float(row.slab_m)
-    return found.is_valid() & (index == mi.UInt32(row.registry)) & (aside < near)
+    return hit.is_valid() & (index == mi.UInt32(row.registry)) & (aside < near)
 
 
 # ---------------- Return paths via a second mirror
@@ -609,7 +611,7 @@ class SecondMirror:
 
 
 @dataclass(frozen=True)
-class WayBack:
+class ReturnPath:
     """Return path from points to the sonar via one plane.
 
     Attributes:
@@ -650,7 +652,7 @@ class SecondMirrors:
         shapes = scene.shapes()
         return cls(tuple(SecondMirror(plane, registry_index(shapes[plane.shape])) for plane in planes), wavenumber)
 
-    def ways(
+    def return_paths(
         self,
         scene: DeviceArray,
         origin: DeviceArray,
@@ -658,7 +660,7 @@ class SecondMirrors:
         first: tuple[DeviceArray, DeviceArray],
         active: DeviceArray,
         moment: DeviceArray = None,
-    ) -> Iterator[WayBack]:
+    ) -> Iterator[ReturnPath]:
         """Yield the return path via each plane.
 
         Args:
@@ -677,8 +679,8 @@ class SecondMirrors:
             # image of the sonar, and the direct line from it to the points
             plane, facing = mirror.plane, mirror.normal
             image = sonar - facing * (2 * (dr.dot(facing, sonar) - plane.offset))
-            way: DeviceArray = mi.Vector3d(*exact) - image
-            distance = dr.norm(way)
+            from_image: DeviceArray = mi.Vector3d(*exact) - image
+            distance = dr.norm(from_image)
             row = PlaneRow(
                 image=list(sonar),
                 normal=[mi.Float64(value) for value in plane.normal.tolist()],
@@ -689,9 +691,9 @@ class SecondMirrors:
                 registry=mi.UInt32(mirror.registry),
             )
             # the plane of the outward path is left out: callers sum that return path separately
-            other = active & ~_on(plane, *first)
-            is_open, factor = unfolded(scene, scattering, list(image), [row], self.wavenumber, other, moment)
-            yield WayBack(mirror, mi.Vector3f(way / distance), mi.Float(distance), factor, is_open)
+            eligible = active & ~_on(plane, *first)
+            is_open, factor = unfolded(scene, scattering, list(image), [row], self.wavenumber, eligible, moment)
+            yield ReturnPath(mirror, mi.Vector3f(from_image / distance), mi.Float(distance), factor, is_open)
 
 
 def _on(plane: MirrorPlane, place: DeviceArray, normal: DeviceArray) -> DeviceArray:
@@ -709,8 +711,8 @@ def second_notes(scene: mi.Scene, mirrors: Mirroring) -> list[str]:
     if count <= MOST_SECOND:
         return []
     return [
-        f"the mirrors have {count} planes: ghosts by way of one there and another back are for {MOST_SECOND} at most, and "
-        "are left out"
+        f"the mirrors have {count} planes: ghosts out via one plane and back via another need {MOST_SECOND} at most, "
+        "and are left out"
     ]
 
 
@@ -727,18 +729,18 @@ def bright_notes(scene: mi.Scene, surfaces: Surfaces) -> list[str]:
         surfaces: surface tables of the scene.
     """
     rows = np.array(surfaces.facets).reshape(-1, 4)[:, 3]
-    found, largest = [], 1 / math.pi + 1e-3
+    bright, largest = [], 1 / math.pi + 1e-3
     for first, _, number, material in np.array(surfaces.shapes).reshape(-1, 4):
         if first < 0 or number < 0 or material >= 0:
             continue
         shape = scene.shapes()[number]
         assert isinstance(shape, mi.Mesh)
         if (rows[first : first + shape.face_count()] > largest).any():
-            found.append(shape.id() or f"shape number {number}")  # Mitsuba merges meshes into one without a name
-    if not found:
+            bright.append(shape.id() or f"shape number {number}")  # Mitsuba merges meshes into one without a name
+    if not bright:
         return []
-    names = ", ".join(sorted(found)[:3]) + (" ..." if len(found) > 3 else "")
+    names = ", ".join(sorted(bright)[:3]) + (" ..." if len(bright) > 3 else "")
     return [
-        f"reflectivities above 1/pi = 0.318 send on more than arrives: paths of several reflections by way of {names} are "
+        f"reflectivities above 1/pi = 0.318 reflect more than arrives: paths of several reflections via {names} are "
         "too loud; give a reflectance of 0.318 at most, or a material"
     ]

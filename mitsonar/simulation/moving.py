@@ -29,7 +29,7 @@ __all__ = ["DeformingMesh", "MovingScene", "SceneMotion", "SceneWatch", "carried
 
 @dataclass
 class MovingScene:
-    """Scene with moving bodies as the input of a launch; created by :meth:`SceneMotion.at`.
+    """Scene with moving bodies as the input of a launch; created by :meth:`SceneMotion.scene_at`.
 
     It is traced like a Mitsuba scene.
 
@@ -55,8 +55,8 @@ class MovingScene:
 
     def ray_test(self, ray: mi.Ray3f, coherent: DeviceArray = True, active: DeviceArray = True) -> DeviceArray:
         """Test whether rays hit anything before their ``maxt``."""
-        found, _ = self.find(ray, active)
-        return found.is_valid() & (found.t < ray.maxt)
+        intersection, _ = self.find(ray, active)
+        return intersection.is_valid() & (intersection.t < ray.maxt)
 
     def find(self, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[mi.PreliminaryIntersection3f, DeviceArray]:
         """Trace rays to the nearest surface; return the hit and the number of the body, 0 for still shapes."""
@@ -90,8 +90,8 @@ class MovingScene:
             best, body = self._nearer(scene, sphere, ray, number, best, body, active)
             return number + 1, best, body
 
-        found = dr.while_loop((number, best, body), lambda number, best, body: number < first + copies, step)
-        return found[1], found[2]
+        nearest = dr.while_loop((number, best, body), lambda number, best, body: number < first + copies, step)
+        return nearest[1], nearest[2]
 
     def _nearer(
         self,
@@ -104,17 +104,17 @@ class MovingScene:
         active: DeviceArray,
     ) -> tuple[DeviceArray, DeviceArray]:
         """Return the nearer of the best hit so far and the hit of a body; rays that miss its sphere are not traced."""
-        own = self.carried(ray, number)
-        way: DeviceArray = mi.Point3f(sphere.x, sphere.y, sphere.z) - own.o
-        along = dr.dot(way, own.d)
-        reach = dr.squared_norm(way - own.d * along) < dr.square(sphere.w)
-        own.maxt = best.t
+        local = self.carried(ray, number)
+        way: DeviceArray = mi.Point3f(sphere.x, sphere.y, sphere.z) - local.o
+        along = dr.dot(way, local.d)
+        reach = dr.squared_norm(way - local.d * along) < dr.square(sphere.w)
+        local.maxt = best.t
         coherent: DeviceArray = True
-        found: DeviceArray = scene.ray_intersect_preliminary(
-            own, coherent=coherent, active=active & reach & (along > -sphere.w)
+        intersection: DeviceArray = scene.ray_intersect_preliminary(
+            local, coherent=coherent, active=active & reach & (along > -sphere.w)
         )
-        nearer = found.is_valid() & (found.t < best.t)
-        return dr.select(nearer, found, best), dr.select(nearer, number, body)
+        nearer = intersection.is_valid() & (intersection.t < best.t)
+        return dr.select(nearer, intersection, best), dr.select(nearer, number, body)
 
     def lines(self, moment: DeviceArray, body: DeviceArray) -> list[mi.Vector4f]:
         """Return the three rows of the transforms from world to bodies."""
@@ -182,7 +182,7 @@ class SceneMotion:
             one.scene = self._movers[list(moved).index(one.mesh.id())]
         dr.make_opaque(self._spheres)
 
-    def at(self, time_s: ArrayLike) -> MovingScene:
+    def scene_at(self, time_s: ArrayLike) -> MovingScene:
         """Return the scene at the given moments ``(moments,)`` [s]; a ray's time is the index of its moment.
 
         Deforming bodies have one shape at all moments: that at the mean time.
@@ -199,9 +199,9 @@ class SceneMotion:
 
     def sonar_lines(self, pose: NDArray[np.float64], time_s: float) -> NDArray[np.float64]:
         """Return three rows of the sonar's ``to_world``, in the world and in each body's axes ``(1 + bodies, 3, 4)``."""
-        own = to_world_matrices(pose.reshape(1, 6))[0]
+        sonar = to_world_matrices(pose.reshape(1, 6))[0]
         rows = self.bodies.from_world(time_s)[0]
-        return np.concatenate([own[None, :3], rows @ own])
+        return np.concatenate([sonar[None, :3], rows @ sonar])
 
     def body_lines(self, time_s: float) -> NDArray[np.float64]:
         """Return three rows of the transforms from world to world (identity) and to each body ``(1 + bodies, 3, 4)``."""
@@ -232,7 +232,7 @@ def motion_in(scene: mi.Scene, moving: Moving | MovingBodies | None) -> SceneMot
 
 def scene_at(scene: mi.Scene, motion: SceneMotion | None, time_s: float) -> mi.Scene | MovingScene:
     """Return a scene at a time [s]; the scene itself if nothing moves."""
-    return scene if motion is None else motion.at(time_s)
+    return scene if motion is None else motion.scene_at(time_s)
 
 
 def scene_of(shapes: list[mi.Shape]) -> mi.Scene:
@@ -289,13 +289,13 @@ class DeformingMesh:
         Raises:
             MitsonarError: the number of vertices differs from the mesh's, or some are not finite.
         """
-        found = np.asarray(self.law(time_s), dtype=np.float32)
+        vertices = np.asarray(self.law(time_s), dtype=np.float32)
         count = self.mesh.vertex_count()
-        if found.shape != (count, 3) or not np.isfinite(found).all():
+        if vertices.shape != (count, 3) or not np.isfinite(vertices).all():
             raise MitsonarError(
-                f"moving: {self.mesh.id()} has {count} vertices, finite ({count}, 3): got {found.shape} at {time_s:g} s"
+                f"moving: {self.mesh.id()} has {count} vertices, finite ({count}, 3): got {vertices.shape} at {time_s:g} s"
             )
-        return found
+        return vertices
 
     def deform(self, time_s: float) -> None:
         """Move the vertices to their positions at a time [s].
@@ -319,16 +319,16 @@ def _copied(mesh: mi.Mesh) -> mi.Mesh:
     props = mi.Properties()
     props["bsdf"] = mesh.bsdf()
     uv = mesh.has_vertex_texcoords()
-    made = mi.Mesh(mesh.id(), mesh.vertex_count(), mesh.face_count(), props, False, uv)
-    old, new = mi.traverse(mesh), mi.traverse(made)
+    copied = mi.Mesh(mesh.id(), mesh.vertex_count(), mesh.face_count(), props, False, uv)
+    old, new = mi.traverse(mesh), mi.traverse(copied)
     for name in ("vertex_positions", "faces", *(("vertex_texcoords",) if uv else ())):
         new[name] = type(new[name])(old[name])
     new.update()
     if mesh.has_attribute("face_id")[0]:
         numbers = mesh.attribute_buffer("face_id")
-        made.add_attribute("face_id", dr.width(numbers) // mesh.face_count(), np.array(numbers).tolist())
-    made.set_id(mesh.id())
-    return made
+        copied.add_attribute("face_id", dr.width(numbers) // mesh.face_count(), np.array(numbers).tolist())
+    copied.set_id(mesh.id())
+    return copied
 
 
 # ---------------- Detection of changed scene parameters
@@ -357,11 +357,11 @@ class SceneWatch:
 
     def _begin(self) -> None:
         """Collect references to the parameters, and record their current state."""
-        found: Any = mi.traverse(self._scene)  # the type stubs lack keys()
+        traversal: Any = mi.traverse(self._scene)  # the type stubs lack keys()
         self._arrays: dict[str, Any] = {}  # references, which follow the scene's current values
         self._others: dict[str, Any] = {}
         self._owners: dict[str, mi.Object] = {}
-        for name, (place, kind, owner, _) in found.properties.items():
+        for name, (place, kind, owner, _) in traversal.properties.items():
             if not isinstance(owner, mi.Shape | mi.BSDF | mi.Texture) or name.endswith(WITHOUT_ECHO):
                 continue
             looked_up = name.endswith("to_world") and isinstance(owner, mi.Shape) and not isinstance(owner, mi.Mesh)
@@ -374,22 +374,22 @@ class SceneWatch:
             else:
                 self._others[name] = place, kind
         self._live = list(self._arrays.values())
-        self._keep()
+        self._record()
 
     def changed(self) -> dict[str, mi.Object] | None:
         """Return the owners of the parameters that changed since the last call, keyed by name; None if none did."""
         materials = self._materials()
-        if materials != self._kept_materials:  # a shape has another BSDF, with other parameters
-            found: dict[str, mi.Object] = {"bsdf": self._scene}
+        if materials != self._recorded_materials:  # a shape has another BSDF, with other parameters
+            owners: dict[str, mi.Object] = {"bsdf": self._scene}
             self._begin()
-            return found
+            return owners
         others = self._fingerprints()
-        if [one.index for one in self._live] == self._numbers and others == self._kept_others:
+        if [one.index for one in self._live] == self._numbers and others == self._recorded_others:
             return None
         numbered = zip(self._arrays.items(), self._numbers, strict=True)
         names = [name for (name, value), number in numbered if value.index != number]
-        names += [name for name, before in self._kept_others.items() if others[name] != before]
-        self._keep()
+        names += [name for name, before in self._recorded_others.items() if others[name] != before]
+        self._record()
         return {name: self._owners[name] for name in names}
 
     def _materials(self) -> list[mi.BSDF | None]:
@@ -407,11 +407,11 @@ class SceneWatch:
         """Return a fingerprint of each of these parameters, which differs after a change."""
         return {name: tuple(dr.detail.collect_indices([value])) or str(value) for name, value in self._values().items()}
 
-    def _keep(self) -> None:
+    def _record(self) -> None:
         """Record the current state of the parameters."""
-        self._kept = [[dr.copy(value) for value in self._live], [_shared(value) for value in self._values().values()]]
-        self._numbers, self._kept_others = [one.index for one in self._live], self._fingerprints()
-        self._kept_materials = self._materials()
+        self._references = [[dr.copy(value) for value in self._live], [_shared(value) for value in self._values().values()]]
+        self._numbers, self._recorded_others = [one.index for one in self._live], self._fingerprints()
+        self._recorded_materials = self._materials()
 
 
 def _shared(value: Any) -> Any:

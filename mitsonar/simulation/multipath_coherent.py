@@ -124,7 +124,7 @@ class MirrorTracer:
         dr.make_opaque(self.index)
         dr.eval(self.table)
         self.survey, self.launch = self._compile_survey(), self._compile_sum()
-        self.told = False
+        self.warned = False
 
     def field(self, pose: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad]; see :meth:`add`."""
@@ -145,36 +145,36 @@ class MirrorTracer:
         """
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
         scene = scene_at(self.scene, self.motion, time_s)
-        wanted = np.array(replayed(self.survey, self.index, scene, rows, self.surfaces.arrays(), self.table))
-        cell = np.flatnonzero(wanted)
+        desired = np.array(replayed(self.survey, self.index, scene, rows, self.surfaces.arrays(), self.table))
+        cell = np.flatnonzero(desired)
         if not len(cell):
             return
-        parts = self._parts(np.abs(wanted[cell]))
-        self._tell(wanted[cell], parts)
+        parts = self._parts(np.abs(desired[cell]))
+        self._warn_if_coarse(desired[cell], parts)
         inputs = tuple(mi.UInt32(padded(part)) for part in _expanded(cell, parts))
         real, imag = replayed(self.launch, inputs, scene, rows, self.surfaces.arrays(), self.table)
         field.real += np.array(real, copy=False).reshape(field.shape)
         field.imag += np.array(imag, copy=False).reshape(field.shape)
 
-    def _parts(self, wanted: NDArray[np.float32]) -> NDArray[np.int64]:
+    def _parts(self, desired: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return the number of parts of cells in each direction: powers of two, reduced if there are too many rays."""
-        parts = 2 ** np.ceil(np.log2(np.clip(wanted, 1, self.finest)) - 1e-6).astype(np.int64)
+        parts = 2 ** np.ceil(np.log2(np.clip(desired, 1, self.finest)) - 1e-6).astype(np.int64)
         parts = np.minimum(parts, self.finest)
         while (parts * parts).sum() > MOST_RAYS and parts.max() > 1:
             parts = np.minimum(parts, parts.max() // 2)
         return parts
 
-    def _tell(self, wanted: NDArray[np.float32], parts: NDArray[np.int64]) -> None:
+    def _warn_if_coarse(self, desired: NDArray[np.float32], parts: NDArray[np.int64]) -> None:
         """Warn, once, if cells of a curved mirror remain larger than half the Fresnel radius."""
-        excess = np.where(wanted > 0, wanted, 0) / parts * (2 / FRESNEL_PARTS)
-        if self.told or not (excess > 1).any():
+        excess = np.where(desired > 0, desired, 0) / parts * (2 / FRESNEL_PARTS)
+        if self.warned or not (excess > 1).any():
             return
-        self.told = True
+        self.warned = True
         rays = self.fan.rays * float(excess.max()) ** 2
         warnings.warn(
             f"cells of rays on mirrors are up to {excess.max():.2g} times half the Fresnel radius: their echoes are "
-            f"wrong by decibels; {rays:,.0f} rays would do, of {self.fan.rays:,} now: choose a finer quality or a lower "
-            "frequency",
+            f"wrong by decibels; {rays:,.0f} rays are needed, and the fan has {self.fan.rays:,}: choose a finer "
+            "quality or a lower frequency",
             MitsonarWarning,
             stacklevel=2,
         )
@@ -194,18 +194,18 @@ class MirrorTracer:
             # 2. comparison with neighbours, which are gathered from evaluated arrays
             seen = kind, place, mi.Vector3f(hit.n), dr.dot(hit.n, rays.d)
             dr.eval(*seen, hit.t)
-            facing, needed, mixed = self._around(rays, hit, seen)
+            facing, needed, mixed = self._compare_neighbours(rays, hit, seen)
             dr.eval(facing)
             near = facing
             for over, down in NEIGHBOURS:
-                near |= dr.gather(mi.Bool, facing, self._beside(rays, over, down))
+                near |= dr.gather(mi.Bool, facing, self._neighbour(rays, over, down))
             # 3. parts for the curvature; the most, marked by a negative sign, at edges near a mirror that faces the sonar
             smooth = dr.select(mirror & (dr.abs(seen[-1]) > LAST), dr.select(needed > 1, needed, 1), 0)
             return dr.select(mixed & near & (smooth <= self.finest), -float(self.finest), smooth)
 
         return survey
 
-    def _around(self, rays: FanRays, hit: Hit, seen: tuple[Any, ...]) -> tuple[DeviceArray, ...]:
+    def _compare_neighbours(self, rays: FanRays, hit: Hit, seen: tuple[Any, ...]) -> tuple[DeviceArray, ...]:
         """Compare each hit with its neighbours.
 
         Returns:
@@ -216,35 +216,35 @@ class MirrorTracer:
         steps = [dr.norm(step) for step in rays.steps_on(hit)]
         mixed, turned, needed = mi.Bool(False), mi.Float(0), mi.Float(0)
         same: dict[tuple[int, int], DeviceArray] = {}
-        for beside in NEIGHBOURS:
+        for offset in NEIGHBOURS:
             # 1. is the neighbour on the same surface: the same kind, and close to the tangent plane?
-            other = self._beside(rays, *beside)
-            chord: DeviceArray = dr.gather(mi.Vector3f, place, other) - place
+            neighbour = self._neighbour(rays, *offset)
+            chord: DeviceArray = dr.gather(mi.Vector3f, place, neighbour) - place
             length = dr.norm(chord)
-            alike = dr.gather(mi.Int32, kind, other) == kind
-            same[beside] = alike & ((kind < 0) | (dr.abs(dr.dot(normal, chord)) <= LEVEL_PART * length))
-            mixed |= ~same[beside]
+            same_kind = dr.gather(mi.Int32, kind, neighbour) == kind
+            same[offset] = same_kind & ((kind < 0) | (dr.abs(dr.dot(normal, chord)) <= LEVEL_PART * length))
+            mixed |= ~same[offset]
             # 2. turn of the normal; along columns and rows it gives the curvature, and that the size of a cell
-            turn = dr.select(alike, dr.norm(dr.gather(mi.Vector3f, normal, other) - normal), 0)
+            turn = dr.select(same_kind, dr.norm(dr.gather(mi.Vector3f, normal, neighbour) - normal), 0)
             turned = dr.select(turn > turned, turn, turned)
-            if 0 in beside:
-                bent = dr.select(same[beside] & (length > 0), turn / length, 0)
-                wanted = self._cells(steps[beside.index(0) ^ 1], bent, hit.t)
-                needed = dr.select(wanted > needed, wanted, needed)
+            if 0 in offset:
+                curvature = dr.select(same[offset] & (length > 0), turn / length, 0)
+                parts = self._cells(steps[offset.index(0) ^ 1], curvature, hit.t)
+                needed = dr.select(parts > needed, parts, needed)
         # 3. a body without a neighbour on its surface on either side is not resolved: assume a radius of one step
         thin = ~(same[1, 0] | same[-1, 0]) | ~(same[0, 1] | same[0, -1])
-        least = dr.select(steps[0] < steps[1], steps[0], steps[1])
-        unresolved = dr.select(thin, self._cells(least, 1 / least, hit.t), 0)
+        shorter_step = dr.select(steps[0] < steps[1], steps[0], steps[1])
+        unresolved = dr.select(thin, self._cells(shorter_step, 1 / shorter_step, hit.t), 0)
         # 4. a mirror faces the sonar if its normal does here, or may do between this hit and the next
         steep = dr.sqrt(dr.select(along * along < 1, 1 - along * along, 0))
         facing = (kind >= 0) & ((dr.abs(along) > FACING) | thin | (turned * TURN_PART > steep))
         return facing, dr.select(unresolved > needed, unresolved, needed), mixed
 
-    def _cells(self, step: DeviceArray, bent: DeviceArray, range_m: DeviceArray) -> DeviceArray:
+    def _cells(self, step: DeviceArray, curvature: DeviceArray, range_m: DeviceArray) -> DeviceArray:
         """Return the ratio of a step to the desired size of a cell on a surface of the given curvature [1/m]."""
-        return step * FRESNEL_PARTS * dr.sqrt((bent + 1 / range_m) * (2 / self.wavelength))
+        return step * FRESNEL_PARTS * dr.sqrt((curvature + 1 / range_m) * (2 / self.wavelength))
 
-    def _beside(self, rays: FanRays, over: int, down: int) -> mi.UInt32:
+    def _neighbour(self, rays: FanRays, over: int, down: int) -> mi.UInt32:
         """Return the index of each ray's neighbour; the ray itself at the border of the fan."""
         column, row = rays.column + over, rays.row + down
         column = dr.select((column >= 0) & (column < self.fan.columns), column, rays.column)
@@ -425,15 +425,15 @@ class GhostTracer:
             rays = FanRays(self.direct.fan, self.sonar, index, lines)
             surfaces = replace(self.direct.surfaces, **tables)
             hit = surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d))
-            now = MirroredRays(rays, hit, mi.Float(1), mi.UInt32(0))
+            mirrored = MirroredRays(rays, hit, mi.Float(1), mi.UInt32(0))
             sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))
             # 2. follow them from mirror to mirror, and sum the points that they meet
             for number in range(2, self.sonar.bounces + 1):
-                first = rays.origin + rays.d * now.hit.t, now.hit.n
-                now = mirrored_on(scene, surfaces, now, mirrors, self.wavenumber)
+                first = rays.origin + rays.d * mirrored.hit.t, mirrored.hit.n
+                mirrored = mirrored_on(scene, surfaces, mirrored, mirrors, self.wavenumber)
                 retro = number == 2 and self.sonar.bounces > 2
-                own = first if retro else None
-                self._sum(scene, rays, now, mirrors, patches, (sums[0], sums[1]), first=own, bodies=bodies)
+                only_mirror = first if retro else None
+                self._sum(scene, rays, mirrored, mirrors, patches, (sums[0], sums[1]), first=only_mirror, bodies=bodies)
             dr.eval(sums)
             return tuple(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in sums)
 
@@ -443,7 +443,7 @@ class GhostTracer:
         self,
         scene: DeviceArray,
         rays: FanRays,
-        now: MirroredRays,
+        mirrored: MirroredRays,
         mirrors: mi.Float,
         patches: mi.Float,
         sums: tuple[mi.UInt64, mi.UInt64],
@@ -456,38 +456,43 @@ class GhostTracer:
         ``first`` is position and normal of the only mirror so far, given if the return path may also be via mirrors.
         """
         # 1. return paths: directly to the sonar, if the point is visible from it and the path lies in the window ...
-        hit = without_mirror_part(mirrors, now.hit, now.rays.d, self.wavenumber)
-        place: DeviceArray = now.rays.origin + now.rays.d * hit.t
-        way: DeviceArray = place - rays.origin
-        distance = dr.norm(way)
-        u = way / distance
+        hit = without_mirror_part(mirrors, mirrored.hit, mirrored.rays.d, self.wavenumber)
+        place: DeviceArray = mirrored.rays.origin + mirrored.rays.d * hit.t
+        to_point: DeviceArray = place - rays.origin
+        distance = dr.norm(to_point)
+        u = to_point / distance
         matt = hit.valid & (hit.reflectivity > 0)
-        straight = matt & (dr.dot(hit.n, u) * dr.dot(hit.n, now.rays.d) > 0)
-        straight &= self._within((hit.t + distance) * 0.5, now)
+        straight = matt & (dr.dot(hit.n, u) * dr.dot(hit.n, mirrored.rays.d) > 0)
+        straight &= self._within((hit.t + distance) * 0.5, mirrored)
         straight &= ~hidden(scene, mi.Point3f(place), hit.n, u, distance, straight)
         # ... via the same mirror ...
-        back = matt & self._within(hit.t, now) if first is not None else mi.Bool(False)
+        back = matt & self._within(hit.t, mirrored) if first is not None else mi.Bool(False)
         # ... and via each other mirror
-        ways: list[tuple[FanRays, DeviceArray, DeviceArray]] = []
+        returns: list[tuple[FanRays, DeviceArray, DeviceArray]] = []
         if first is not None and self.second is not None:
-            for way in self.second.ways(scene, rays.origin, (place, hit.n), first, matt):
-                beyond = rays.from_lines(mirrored_lines(rays.lines, way.mirror.normal, way.mirror.place))
-                facing = dr.dot(hit.n, way.u) * dr.dot(hit.n, now.rays.d) > 0
-                ways.append((beyond, way.factor, way.is_open & facing & self._within((hit.t + way.distance) * 0.5, now)))
+            for path in self.second.return_paths(scene, rays.origin, (place, hit.n), first, matt):
+                beyond = rays.from_lines(mirrored_lines(rays.lines, path.mirror.normal, path.mirror.place))
+                facing = dr.dot(hit.n, path.u) * dr.dot(hit.n, mirrored.rays.d) > 0
+                returns.append(
+                    (beyond, path.factor, path.is_open & facing & self._within((hit.t + path.distance) * 0.5, mirrored))
+                )
         # 2. points are anchored to bodies: everything below is in the axes of the body that is hit
         if bodies is not None:
             assert isinstance(self.direct.surfaces, MovingSurfaces)
-            turn = [[dr.gather(mi.Float64, bodies, now.body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
-            rays, now = in_body(turn, rays), replace(now, rays=in_body(turn, now.rays))
-            ways = [(in_body(turn, beyond), factor, is_open) for beyond, factor, is_open in ways]
+            turn = [[dr.gather(mi.Float64, bodies, mirrored.body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
+            rays, mirrored = in_body(turn, rays), replace(mirrored, rays=in_body(turn, mirrored.rays))
+            returns = [(in_body(turn, beyond), factor, is_open) for beyond, factor, is_open in returns]
             normal = [mi.Float(row[0]) * hit.n.x + mi.Float(row[1]) * hit.n.y + mi.Float(row[2]) * hit.n.z for row in turn]
-            lattice = self.direct.surfaces.own_lattice(scene, hit, now.body)
-            hit, place = replace(hit, n=mi.Normal3f(*normal), shape_id=lattice), now.rays.origin + now.rays.d * hit.t
+            lattice = self.direct.surfaces.scatterer_lattice(scene, hit, mirrored.body)
+            hit, place = (
+                replace(hit, n=mi.Normal3f(*normal), shape_id=lattice),
+                mirrored.rays.origin + mirrored.rays.d * hit.t,
+            )
         # 3. add the waves of all points in each ray's cell
         points = HashedPoints(
-            replace(hit, valid=straight | back | _any_of(ways)),
+            replace(hit, valid=straight | back | _any_of(returns)),
             place,
-            *now.rays.steps_on(hit),
+            *mirrored.rays.steps_on(hit),
             pitch=self.direct.pitch,
             patch=self.sonar.speckle_patch_m,
             seed=self.sonar.seed,
@@ -495,24 +500,26 @@ class GhostTracer:
 
         def step(number: mi.Int32) -> tuple[mi.Int32]:
             point = points.point(number, patches, self.direct.patch_entries)
-            held = number < points.count
-            self._deposit((rays, now), points, point, sums, (held & straight, held & back if first is not None else None))
-            for beyond, factor, is_open in ways:
-                self._deposit_by((now, beyond, factor), points, point, sums, held & is_open)
+            exists = number < points.count
+            self._deposit(
+                (rays, mirrored), points, point, sums, (exists & straight, exists & back if first is not None else None)
+            )
+            for beyond, factor, is_open in returns:
+                self._deposit_return((mirrored, beyond, factor), points, point, sums, exists & is_open)
             return (number + 1,)
 
         begin = mi.Int32(0) + dr.zeros(mi.Int32, self.direct.fan.rays)
         dr.while_loop((begin,), lambda number: number < points.count, step)
 
-    def _within(self, range_m: DeviceArray, now: MirroredRays) -> DeviceArray:
+    def _within(self, range_m: DeviceArray, mirrored: MirroredRays) -> DeviceArray:
         """Test whether paths via a ray's cell may lie in the window."""
-        across, down = now.rays.steps_on(now.hit)
+        across, down = mirrored.rays.steps_on(mirrored.hit)
         wide = dr.norm(across) + dr.norm(down)
         return (range_m + wide > self.former.first_range) & (range_m - wide < self.last)
 
     def _deposit(
         self,
-        ways: tuple[FanRays, MirroredRays],
+        views: tuple[FanRays, MirroredRays],
         points: HashedPoints,
         point: Point,
         sums: tuple[mi.UInt64, mi.UInt64],
@@ -520,10 +527,10 @@ class GhostTracer:
     ) -> None:
         """Add the paths of one point of each ray to the grid."""
         # 1. the point as seen via the mirrors (there) and directly (here)
-        rays, now = ways
-        there, here = now.rays.seen(points, point), rays.seen(points, point)
+        rays, mirrored = views
+        there, here = mirrored.rays.seen(points, point), rays.seen(points, point)
         far, near = (self._clear(seen.range_m) for seen in (there, here))
-        level = points.strength * point.amplitude * now.gain
+        level = points.strength * point.amplitude * mirrored.gain
         both = level * dr.sqrt(there.cosine * here.cosine) / (far * near)
         # 2. the path and its reverse: one length, with both ends' patterns exchanged
         half = (there.range_m + here.range_m) * 0.5
@@ -535,37 +542,40 @@ class GhostTracer:
             )
             self._add(sums, (there.sine + here.sine) * 0.5, both * gain * 2, wave, seen)
         else:
-            for one, other in ((there, here), (here, there)):
-                gain = elevation_gain_of_ends(self.sonar, one.tangent, other.tangent)
-                self._add(sums, one.sine, both * gain, wave, seen)
+            for arrival, departure in ((there, here), (here, there)):
+                gain = elevation_gain_of_ends(self.sonar, arrival.tangent, departure.tangent)
+                self._add(sums, arrival.sine, both * gain, wave, seen)
         # 3. out and back via the same mirrors
         if active[1] is not None:
             gain = (
-                now.gain * there.cosine / dr.square(far) * elevation_gain_of_ends(self.sonar, there.tangent, there.tangent)
+                mirrored.gain
+                * there.cosine
+                / dr.square(far)
+                * elevation_gain_of_ends(self.sonar, there.tangent, there.tangent)
             )
             wave = (there.range_m, *self._turned(there.range_m, point))
             self._add(sums, there.sine, level * gain, wave, active[1] & there.mine)
 
-    def _deposit_by(
+    def _deposit_return(
         self,
-        way: tuple[MirroredRays, FanRays, DeviceArray],
+        path: tuple[MirroredRays, FanRays, DeviceArray],
         points: HashedPoints,
         point: Point,
         sums: tuple[mi.UInt64, mi.UInt64],
         active: DeviceArray,
     ) -> None:
         """Add the path of one point of each ray that returns via another mirror; its reverse belongs to another ray."""
-        now, beyond, factor = way
-        there, other = now.rays.seen(points, point), beyond.seen(points, point)
-        half = (there.range_m + other.range_m) * 0.5
-        level = points.strength * point.amplitude * now.gain * factor * dr.sqrt(there.cosine * other.cosine)
-        level /= self._clear(there.range_m) * self._clear(other.range_m)
-        level *= elevation_gain_of_ends(self.sonar, there.tangent, other.tangent)
+        mirrored, beyond, factor = path
+        there, back = mirrored.rays.seen(points, point), beyond.seen(points, point)
+        half = (there.range_m + back.range_m) * 0.5
+        level = points.strength * point.amplitude * mirrored.gain * factor * dr.sqrt(there.cosine * back.cosine)
+        level /= self._clear(there.range_m) * self._clear(back.range_m)
+        level *= elevation_gain_of_ends(self.sonar, there.tangent, back.tangent)
         sine = there.sine
         if self.sonar.beam_pattern == "two_way":
-            level *= overlap(self.sonar, there.sine - other.sine)
-            sine = (there.sine + other.sine) * 0.5
-        self._add(sums, sine, level, (half, *self._turned(half, point)), active & there.mine & other.ahead)
+            level *= overlap(self.sonar, there.sine - back.sine)
+            sine = (there.sine + back.sine) * 0.5
+        self._add(sums, sine, level, (half, *self._turned(half, point)), active & there.mine & back.ahead)
 
     def _clear(self, range_m: DeviceArray) -> DeviceArray:
         """Return ranges for spreading, which is constant closer than the window or one bin."""
@@ -591,27 +601,27 @@ class GhostTracer:
         add_waves(self.former, self.bits, sums, (sine, half, level, cos, sin), active)
 
 
-def _any_of(ways: list[tuple[FanRays, DeviceArray, DeviceArray]]) -> DeviceArray:
+def _any_of(returns: list[tuple[FanRays, DeviceArray, DeviceArray]]) -> DeviceArray:
     """Return which rays have an open path via another mirror."""
-    found = mi.Bool(False)
-    for _, _, is_open in ways:
-        found |= is_open
-    return found
+    any_open = mi.Bool(False)
+    for _, _, is_open in returns:
+        any_open |= is_open
+    return any_open
 
 
 def mirrored_on(
-    scene: DeviceArray, surfaces: Surfaces, now: MirroredRays, mirrors: mi.Float, wavenumber: float
+    scene: DeviceArray, surfaces: Surfaces, mirrored: MirroredRays, mirrors: mi.Float, wavenumber: float
 ) -> MirroredRays:
     """Follow rays that meet mirrors to the next surface; other rays end.
 
     Args:
         scene: scene to trace.
         surfaces: surface tables of the scene.
-        now: rays and their current hits.
+        mirrored: rays and their current hits.
         mirrors: table of mirror parts.
         wavenumber: wavenumber of the carrier [1/m].
     """
-    rays, hit = now.rays, now.hit
+    rays, hit = mirrored.rays, mirrored.hit
     reflection, roughness_m = parts_at(mirrors, hit)
     active = hit.valid & (reflection != 0)
     place: DeviceArray = rays.origin + rays.d * hit.t
@@ -619,12 +629,12 @@ def mirrored_on(
     begin = going_on(place, beyond.d, hit.n)
     onward, body = mi.Ray3f(mi.Point3f(place + beyond.d * begin), beyond.d), mi.UInt32(0)
     if isinstance(surfaces, MovingSurfaces):
-        found, body = surfaces.hit_and_body(scene, onward, active)
+        next_hit, body = surfaces.hit_and_body(scene, onward, active)
     else:
-        found = surfaces.hit(scene, onward, active)
-    length = dr.norm(place - beyond.origin) + begin + found.t
-    gain = now.gain * reflection * smooth_share(roughness_m, dr.dot(hit.n, rays.d), wavenumber)
-    return MirroredRays(beyond, replace(found, t=length, valid=found.valid & active), gain, body)
+        next_hit = surfaces.hit(scene, onward, active)
+    length = dr.norm(place - beyond.origin) + begin + next_hit.t
+    gain = mirrored.gain * reflection * smooth_share(roughness_m, dr.dot(hit.n, rays.d), wavenumber)
+    return MirroredRays(beyond, replace(next_hit, t=length, valid=next_hit.valid & active), gain, body)
 
 
 def in_body(turn: list[list[DeviceArray]], rays: FanRays) -> FanRays:
@@ -662,7 +672,7 @@ class LastMirror:
         u: unit direction from the sonar to the point.
         reflection: factor of all mirrors on the amplitude.
         share: weight of Kirchhoff's integral, given the direction in which the ray leaves the mirror.
-        heard: whether the mirror sends anything back.
+        reflects_back: whether the mirror sends anything back.
     """
 
     way: DeviceArray
@@ -671,7 +681,7 @@ class LastMirror:
     u: DeviceArray
     reflection: DeviceArray
     share: DeviceArray
-    heard: DeviceArray
+    reflects_back: DeviceArray
 
 
 class CornerTracer(MirrorTracer):
@@ -696,17 +706,17 @@ class CornerTracer(MirrorTracer):
     ) -> Iterator[tuple[MirroredRays, LastMirror]]:
         """Yield rays at their second mirror, then at their third, each with what that mirror sends back."""
         surfaces = replace(self.surfaces, **tables)
-        now = MirroredRays(rays, surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d)), mi.Float(1), mi.UInt32(0))
+        mirrored = MirroredRays(rays, surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d)), mi.Float(1), mi.UInt32(0))
         for _ in range(2, self.sonar.bounces + 1):
-            now = mirrored_on(scene, surfaces, now, table, self.wavenumber)
-            yield now, self._last(scene, rays, now, table)
+            mirrored = mirrored_on(scene, surfaces, mirrored, table, self.wavenumber)
+            yield mirrored, self._last(scene, rays, mirrored, table)
 
-    def _last(self, scene: mi.Scene, rays: FanRays, now: MirroredRays, table: mi.Float) -> LastMirror:
-        """Return what the surface that rays meet sends back as a mirror."""
+    def _last(self, scene: mi.Scene, rays: FanRays, mirrored: MirroredRays, table: mi.Float) -> LastMirror:
+        """Return the surface that rays meet as a mirror, and whether it sends anything back."""
         # 1. distances from the sonar and from its image, in float64 for the phase
-        hit, d = now.hit, now.rays.d
+        hit, d = mirrored.hit, mirrored.rays.d
         reflection, roughness_m = parts_at(table, hit)
-        image, origin = (mi.Point3d(*(line[3] for line in one.lines)) for one in (now.rays, rays))
+        image, origin = (mi.Point3d(*(line[3] for line in one.lines)) for one in (mirrored.rays, rays))
         ray: DeviceArray = mi.Vector3d(d)
         place: DeviceArray = image + ray * mi.Float64(hit.t)
         way = place - origin
@@ -714,13 +724,13 @@ class CornerTracer(MirrorTracer):
         u: DeviceArray = mi.Vector3f(way / distance)
         # 2. what counts: a mirror that faces the sonar from the side that the ray meets, within the window, and visible
         share = facing_share(dr.dot(reflected(d, hit.n), -u))
-        heard = hit.valid & (reflection != 0) & (share > 0) & (length < distance * MOST_STRETCH)
-        heard &= dr.dot(hit.n, u) * dr.dot(hit.n, d) > 0
+        reflects_back = hit.valid & (reflection != 0) & (share > 0) & (length < distance * MOST_STRETCH)
+        reflects_back &= dr.dot(hit.n, u) * dr.dot(hit.n, d) > 0
         half = mi.Float(length + distance) * 0.5
-        heard &= (half > self.former.first_range) & (half < self.last)
-        heard &= ~hidden(scene, mi.Point3f(place), hit.n, u, mi.Float(distance), heard)
+        reflects_back &= (half > self.former.first_range) & (half < self.last)
+        reflects_back &= ~hidden(scene, mi.Point3f(place), hit.n, u, mi.Float(distance), reflects_back)
         left = smooth_share(roughness_m, dr.dot(hit.n, d), self.wavenumber)
-        return LastMirror(way, distance, length, u, now.gain * reflection * left, share, heard)
+        return LastMirror(way, distance, length, u, mirrored.gain * reflection * left, share, reflects_back)
 
     # ---------------- First launch: which cells to divide
 
@@ -728,35 +738,37 @@ class CornerTracer(MirrorTracer):
         @Frozen
         def survey(index: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
             rays = FanRays(self.fan, self.sonar, index, rows_of(rows))
-            wanted: DeviceArray = mi.Float(0)
-            for now, last in self._chains(scene, tables, rays, table):
-                own: DeviceArray = self._parts_of(rays, now, last)
-                wanted = dr.select(dr.square(own) > dr.square(wanted), own, wanted)
-            return wanted
+            parts: DeviceArray = mi.Float(0)
+            for mirrored, last in self._chains(scene, tables, rays, table):
+                chain_parts: DeviceArray = self._parts_of(rays, mirrored, last)
+                parts = dr.select(dr.square(chain_parts) > dr.square(parts), chain_parts, parts)
+            return parts
 
         return survey
 
-    def _parts_of(self, rays: FanRays, now: MirroredRays, last: LastMirror) -> DeviceArray:
+    def _parts_of(self, rays: FanRays, mirrored: MirroredRays, last: LastMirror) -> DeviceArray:
         """Return the number of parts of cells in each direction: 0 if nothing is sent back, negative at edges."""
-        heard, image, normal = last.heard, mi.Vector3f(now.rays.origin), mi.Vector3f(now.hit.n)
-        place: DeviceArray = mi.Vector3f(image + now.rays.d * now.hit.t)
-        dr.eval(heard, image, normal, place)
-        near, mixed = heard, mi.Bool(False)
+        reflects_back, image, normal = last.reflects_back, mi.Vector3f(mirrored.rays.origin), mi.Vector3f(mirrored.hit.n)
+        place: DeviceArray = mi.Vector3f(image + mirrored.rays.d * mirrored.hit.t)
+        dr.eval(reflects_back, image, normal, place)
+        near, mixed = reflects_back, mi.Bool(False)
         # 1. edges: a neighbour sends nothing back, or belongs to another chain of planes or another surface
-        for beside in NEIGHBOURS:
-            other = self._beside(rays, *beside)
-            also = dr.gather(mi.Bool, heard, other)
-            chord: DeviceArray = dr.gather(mi.Vector3f, place, other) - place
-            apart: DeviceArray = dr.norm(dr.gather(mi.Vector3f, image, other) - image)
-            alike = (apart <= ONE_PLANE * (1 + now.hit.t)) & (dr.abs(dr.dot(normal, chord)) <= LEVEL_PART * dr.norm(chord))
-            mixed |= (also != heard) | (also & heard & ~alike)
-            near |= also
+        for offset in NEIGHBOURS:
+            neighbour = self._neighbour(rays, *offset)
+            neighbour_reflects = dr.gather(mi.Bool, reflects_back, neighbour)
+            chord: DeviceArray = dr.gather(mi.Vector3f, place, neighbour) - place
+            apart: DeviceArray = dr.norm(dr.gather(mi.Vector3f, image, neighbour) - image)
+            same_plane = (apart <= ONE_PLANE * (1 + mirrored.hit.t)) & (
+                dr.abs(dr.dot(normal, chord)) <= LEVEL_PART * dr.norm(chord)
+            )
+            mixed |= (neighbour_reflects != reflects_back) | (neighbour_reflects & reflects_back & ~same_plane)
+            near |= neighbour_reflects
         # 2. parts for the width of the cell across the ray
-        d = now.rays.d
-        steps = [dr.norm(step - d * dr.dot(d, step)) for step in now.rays.steps_on(now.hit)]
+        d = mirrored.rays.d
+        steps = [dr.norm(step - d * dr.dot(d, step)) for step in mirrored.rays.steps_on(mirrored.hit)]
         longest = dr.select(steps[0] > steps[1], steps[0], steps[1])
         needed = self._cells(longest, mi.Float(0), mi.Float(last.distance))
-        smooth = dr.select(heard, dr.select(needed > 1, needed, 1), 0)
+        smooth = dr.select(reflects_back, dr.select(needed > 1, needed, 1), 0)
         return dr.select(mixed & near, -float(self.finest), smooth)
 
     # ---------------- Second launch: sum over the finer rays
@@ -765,14 +777,16 @@ class CornerTracer(MirrorTracer):
         self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]
     ) -> None:
         """Add the echo of each ray's cell to the grid."""
-        for now, last in self._chains(scene, tables, rays, table):
-            self._add_last(rays, now, last, sums)
+        for mirrored, last in self._chains(scene, tables, rays, table):
+            self._add_last(rays, mirrored, last, sums)
 
-    def _add_last(self, rays: FinerRays, now: MirroredRays, last: LastMirror, sums: tuple[mi.UInt64, mi.UInt64]) -> None:
+    def _add_last(
+        self, rays: FinerRays, mirrored: MirroredRays, last: LastMirror, sums: tuple[mi.UInt64, mi.UInt64]
+    ) -> None:
         """Add what the last mirror sends back to the grid."""
         # 1. magnitude of the integral over the cell, see the class's docstring
-        hit, d = now.hit, now.rays.d
-        across, down = now.rays.steps_on(hit)
+        hit, d = mirrored.hit, mirrored.rays.d
+        across, down = mirrored.rays.steps_on(hit)
         steep, back = dr.abs(dr.dot(hit.n, d)), dr.abs(dr.dot(hit.n, last.u))
         length, distance = mi.Float(last.length), mi.Float(last.distance)
         level = last.reflection * last.share * (self.wavenumber / (4 * math.pi)) * (steep + back)
@@ -789,5 +803,5 @@ class CornerTracer(MirrorTracer):
         half = (last.length + last.distance) * 0.5
         turns = half * (2 / self.wavelength)
         sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + 0.25) * (2 * math.pi))
-        kept = last.heard & ahead & (steep + back < 2 * MOST_STRETCH * steep)
-        add_waves(self.former, self.bits, sums, (sine, half, level, cos, sin), kept)
+        valid = last.reflects_back & ahead & (steep + back < 2 * MOST_STRETCH * steep)
+        add_waves(self.former, self.bits, sums, (sine, half, level, cos, sin), valid)

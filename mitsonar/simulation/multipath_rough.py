@@ -149,24 +149,24 @@ class Walk:
             ray: number of each ray.
             key: 32-bit key of the random numbers.
         """
-        now = begin
+        vertex = begin
         for number in range(2, self.bounces + 1):
-            now = self._next(now, ray, key + (DRAWS + number))
+            vertex = self._next(vertex, ray, key + (DRAWS + number))
             if number == 2 and self.bounces > 2 and self.mirrors is not None:
-                yield self._back_again(now)
-                yield from self._by_others(begin, now)
-            yield self._straight(now)
+                yield self._same_mirror_return(vertex)
+                yield from self._other_mirror_returns(begin, vertex)
+            yield self._direct_return(vertex)
 
-    def _next(self, now: Vertex, ray: DeviceArray, key: DeviceArray) -> Vertex:
+    def _next(self, vertex: Vertex, ray: DeviceArray, key: DeviceArray) -> Vertex:
         """Follow paths to the next surface."""
         # 1. new direction and gain: specular at mirrors, drawn from Lambert's law at rough surfaces
-        mirror = now.reflection != 0
-        d = dr.select(mirror, reflected(now.d, now.n), lambert_direction(now.n, now.d, ray, key))
-        gain = now.gain * dr.select(mirror, dr.square(now.reflection), now.reflectivity * dr.pi)
+        mirror = vertex.reflection != 0
+        d = dr.select(mirror, reflected(vertex.d, vertex.n), lambert_direction(vertex.n, vertex.d, ray, key))
+        gain = vertex.gain * dr.select(mirror, dr.square(vertex.reflection), vertex.reflectivity * dr.pi)
         # 2. trace on from just off the surface
-        begin = going_on(now.place, d, now.n)
-        active = now.valid & (gain > 0)
-        onward = mi.Ray3f(now.place + d * begin, d)
+        begin = going_on(vertex.place, d, vertex.n)
+        active = vertex.valid & (gain > 0)
+        onward = mi.Ray3f(vertex.place + d * begin, d)
         if self.moment is not None:
             onward.time = self.moment
         hit = self.surfaces.hit(self.scene, onward, active)
@@ -180,94 +180,94 @@ class Walk:
         along: DeviceArray = begin + hit.t
         return Vertex(
             valid=active & hit.valid,
-            place=now.place + d * along,
+            place=vertex.place + d * along,
             n=hit.n,
             d=d,
-            lift=reflected(now.lift, now.n),
-            side=reflected(now.side, now.n),
+            lift=reflected(vertex.lift, vertex.n),
+            side=reflected(vertex.side, vertex.n),
             reflectivity=at_most_one(hit.reflectivity),
             reflection=reflection,
-            length=now.length + along,
+            length=vertex.length + along,
             gain=gain,
-            pure=now.pure & mirror,
-            first=now.first,
+            pure=vertex.pure & mirror,
+            first=vertex.first,
         )
 
-    def _straight(self, now: Vertex) -> Arrival:
+    def _direct_return(self, vertex: Vertex) -> Arrival:
         """Return what arrives from a surface that the sonar insonifies directly."""
         # 1. visible from the sonar, on the side that the path meets
-        way: DeviceArray = now.place - self.origin
+        way: DeviceArray = vertex.place - self.origin
         distance = dr.norm(way)
         u = way / distance
-        toward = dr.dot(now.n, u)
-        lit = now.valid & (now.reflectivity > 0) & (toward * dr.dot(now.n, now.d) > 0)
-        lit &= ~hidden(self.scene, mi.Point3f(now.place), now.n, u, distance, lit, self.moment)
+        toward = dr.dot(vertex.n, u)
+        lit = vertex.valid & (vertex.reflectivity > 0) & (toward * dr.dot(vertex.n, vertex.d) > 0)
+        lit &= ~hidden(self.scene, mi.Point3f(vertex.place), vertex.n, u, distance, lit, self.moment)
         # 2. range interval: from the cell's edges after mirrors only, of constant width otherwise
-        half = (now.length + distance) * 0.5
-        low, high = self._edges(now, u, half)
+        half = (vertex.length + distance) * 0.5
+        low, high = self._edges(vertex, u, half)
         cosine = dr.abs(toward)
         return Arrival(
             active=lit,
-            reflectivity=now.reflectivity * now.gain,
+            reflectivity=vertex.reflectivity * vertex.gain,
             cosine=dr.select(cosine < 1, cosine, 1),
             distance=distance,
             range_m=half,
-            low_m=dr.select(now.pure, low, half - self.width),
-            high_m=dr.select(now.pure, high, half + self.width),
+            low_m=dr.select(vertex.pure, low, half - self.width),
+            high_m=dr.select(vertex.pure, high, half + self.width),
             toward=u,
-            reverse=now.first,
-            pure=now.pure,
+            reverse=vertex.first,
+            pure=vertex.pure,
         )
 
-    def _back_again(self, now: Vertex) -> Arrival:
+    def _same_mirror_return(self, vertex: Vertex) -> Arrival:
         """Return what leaves and arrives via the same mirror."""
-        low, high = self._edges(now, now.d, now.length)
-        cosine = dr.abs(dr.dot(now.n, now.d))
+        low, high = self._edges(vertex, vertex.d, vertex.length)
+        cosine = dr.abs(dr.dot(vertex.n, vertex.d))
         return Arrival(
-            active=now.valid & now.pure & (now.reflectivity > 0),
-            reflectivity=now.reflectivity * dr.square(now.gain),
+            active=vertex.valid & vertex.pure & (vertex.reflectivity > 0),
+            reflectivity=vertex.reflectivity * dr.square(vertex.gain),
             cosine=dr.select(cosine < 1, cosine, 1),
-            distance=now.length,
-            range_m=now.length,
+            distance=vertex.length,
+            range_m=vertex.length,
             low_m=low,
             high_m=high,
-            toward=now.d,
+            toward=vertex.d,
             reverse=mi.Bool(False),
-            pure=now.pure,
+            pure=vertex.pure,
             same=True,
         )
 
-    def _by_others(self, first: Vertex, now: Vertex) -> Iterator[Arrival]:
+    def _other_mirror_returns(self, first: Vertex, vertex: Vertex) -> Iterator[Arrival]:
         """Yield what leaves via one mirror and arrives via another; the reverse belongs to the ray to the other mirror."""
         if self.second is None:
             return
-        met = now.valid & now.pure & (now.reflectivity > 0)
-        point, mirror = (now.place, now.n), (first.place, first.n)
-        for way in self.second.ways(self.scene, self.origin, point, mirror, met, self.moment):
-            half = (now.length + way.distance) * 0.5
-            toward = dr.dot(now.n, way.u)
+        valid = vertex.valid & vertex.pure & (vertex.reflectivity > 0)
+        point, mirror = (vertex.place, vertex.n), (first.place, first.n)
+        for path in self.second.return_paths(self.scene, self.origin, point, mirror, valid, self.moment):
+            half = (vertex.length + path.distance) * 0.5
+            toward = dr.dot(vertex.n, path.u)
             cosine = dr.abs(toward)
-            low, high = self._edges(now, way.u, half)
+            low, high = self._edges(vertex, path.u, half)
             yield Arrival(
-                active=met & way.is_open & (toward * dr.dot(now.n, now.d) > 0),
-                reflectivity=now.reflectivity * now.gain * dr.square(way.factor),
+                active=valid & path.is_open & (toward * dr.dot(vertex.n, vertex.d) > 0),
+                reflectivity=vertex.reflectivity * vertex.gain * dr.square(path.factor),
                 cosine=dr.select(cosine < 1, cosine, 1),
-                distance=way.distance,
+                distance=path.distance,
                 range_m=half,
                 low_m=low,
                 high_m=high,
-                toward=reflected(way.u, mi.Vector3f(way.mirror.normal)),
+                toward=reflected(path.u, mi.Vector3f(path.mirror.normal)),
                 reverse=mi.Bool(False),
                 pure=mi.Bool(True),
             )
 
-    def _edges(self, now: Vertex, u: DeviceArray, half: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
+    def _edges(self, vertex: Vertex, u: DeviceArray, half: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Return the sorted half lengths of paths via a cell's lower and upper edge, on the tangent plane.
 
         ``u`` is the direction from the other end.
         """
-        lift = half_path_rate(now.length, now.d, now.lift, u, now.n)
-        middle = half + half_path_rate(now.length, now.d, now.side, u, now.n) * self.aside
+        lift = half_path_rate(vertex.length, vertex.d, vertex.lift, u, vertex.n)
+        middle = half + half_path_rate(vertex.length, vertex.d, vertex.side, u, vertex.n) * self.aside
         low, high = middle + lift * self.below, middle + lift * self.above
         return dr.select(low < high, low, high), dr.select(low < high, high, low)
 
@@ -317,10 +317,10 @@ class DiffuseField:
             return
         smooth = uniform_filter(energy, SMOOTHED, mode="nearest")
         nodes = SINES_A_LOBE * RANGES_A_PULSE
-        amplitude = np.sqrt(np.maximum(smooth, 0) * (self.former.kept / nodes)).astype(np.float32)
+        amplitude = np.sqrt(np.maximum(smooth, 0) * (self.former.preserved_power / nodes)).astype(np.float32)
         grain = self._grain.reshape(self.shape[0], SINES_A_LOBE, self.shape[1], RANGES_A_PULSE)
-        made = (grain * amplitude[:, None, :, None]).reshape(self._grain.shape)
-        field += made[: field.shape[0], : field.shape[1]]
+        speckle = (grain * amplitude[:, None, :, None]).reshape(self._grain.shape)
+        field += speckle[: field.shape[0], : field.shape[1]]
 
     def energy(self, pose: NDArray[np.float64], time_s: float = 0.0) -> NDArray[np.float64]:
         """Return the energies of one ping in coarse cells ``self.shape``, relative to that of the source at 1 m."""
@@ -385,20 +385,20 @@ class DiffuseField:
 
     def _deposit(self, rays: FanRays, arrival: Arrival, cell: DeviceArray, sums: mi.UInt64) -> None:
         """Add the energies of arrivals to the coarse cells of the beams that receive them."""
-        other, tangent, ahead = rays.direction(arrival.toward)
-        sine, own = rays.sine, rays.tangent
+        end_sine, end_tangent, ahead = rays.direction(arrival.toward)
+        sine, ray_tangent = rays.sine, rays.tangent
         distance = dr.select(arrival.distance > self.nearest, arrival.distance, self.nearest)
         level = arrival.reflectivity * arrival.cosine * cell / dr.square(distance)
-        there = dr.square(elevation_gain_of_ends(self.sonar, own, tangent))
+        there = dr.square(elevation_gain_of_ends(self.sonar, ray_tangent, end_tangent))
         # paths via mirrors alone are left out: their fields have a phase, and GhostTracer sums them
-        active, both = arrival.active & ~arrival.pure & ahead, overlap(self.sonar, sine - other)
+        active, both = arrival.active & ~arrival.pure & ahead, overlap(self.sonar, sine - end_sine)
         if self.sonar.beam_pattern == "two_way":  # the beams between both ends receive path and reverse in phase
             level = level * there * dr.square(both) * dr.select(arrival.reverse, 4.0, 2.0)
-            self._add(sums, (sine + other) * 0.5, arrival.range_m, level, active)
+            self._add(sums, (sine + end_sine) * 0.5, arrival.range_m, level, active)
             return
-        back = dr.square(elevation_gain_of_ends(self.sonar, tangent, own))
+        back = dr.square(elevation_gain_of_ends(self.sonar, end_tangent, ray_tangent))
         self._add(sums, sine, arrival.range_m, level * there * (1 + both), active)
-        self._add(sums, other, arrival.range_m, level * back * (1 + both), active & arrival.reverse)
+        self._add(sums, end_sine, arrival.range_m, level * back * (1 + both), active & arrival.reverse)
 
     def _add(
         self, sums: mi.UInt64, sine: DeviceArray, range_m: DeviceArray, level: DeviceArray, active: DeviceArray
@@ -406,7 +406,7 @@ class DiffuseField:
         former = self.former
         line = (sine - former.first_sine) * (1 / (former.sine_step * SINES_A_LOBE))
         place = (range_m - former.first_range) * (1 / (former.range_step * RANGES_A_PULSE))
-        kept = active & (line >= 0) & (line < self.shape[0]) & (place >= 0) & (place < self.shape[1])
-        where = mi.UInt32(dr.select(kept, line, 0)) * self.shape[1] + mi.UInt32(dr.select(kept, place, 0))
+        inside = active & (line >= 0) & (line < self.shape[0]) & (place >= 0) & (place < self.shape[1])
+        where = mi.UInt32(dr.select(inside, line, 0)) * self.shape[1] + mi.UInt32(dr.select(inside, place, 0))
         value = mi.UInt64(mi.Float64(level) * 2.0**self.bits)
-        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, where, kept, mode=ADD)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, where, inside, mode=ADD)

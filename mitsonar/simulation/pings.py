@@ -61,8 +61,8 @@ def moments_of(
     table, groups = np.atleast_2d(np.asarray(poses, dtype=float)), sonar.ping_groups
     shapes = [(len(table), 6)] + ([(len(table), groups, 6)] if groups > 1 else [])
     if table.shape not in shapes or not len(table) or not np.isfinite(table).all():
-        known = "(frames, 6)" if groups == 1 else f"(frames, 6) or (frames, {groups}, 6)"
-        raise MitsonarError(f"poses must be finite numbers {known}: got {table.shape}; give m and rad")
+        allowed = "(frames, 6)" if groups == 1 else f"(frames, 6) or (frames, {groups}, 6)"
+        raise MitsonarError(f"poses must be finite numbers {allowed}: got {table.shape}; give m and rad")
     refuse_beyond_reach(table)
     numbers = (
         [first + place for place in range(len(table))]
@@ -70,7 +70,7 @@ def moments_of(
         else [int(number) for number in first]
     )
     if len(numbers) != len(table) or min(numbers) < 0:
-        raise MitsonarError(f"pings need a number of 0 or more each, {len(table)} of them: got {len(numbers)}")
+        raise MitsonarError(f"each of the {len(table)} pings needs a number of 0 or more: got {len(numbers)} numbers")
     time = np.array(numbers) / sonar.frame_rate_hz if time_s is None else np.asarray(time_s, dtype=float)
     if time.shape not in [shape[:-1] for shape in shapes] or not np.isfinite(time).all():
         raise MitsonarError(f"times must be finite numbers, one for each pose {table.shape[:-1]}: got {time.shape}; give s")
@@ -209,8 +209,8 @@ def labels_above(pings: RenderedPings, gain: float, floor: float | NDArray[np.fl
         return pings.labels
     bright = pings.echoes * np.float32(gain) > np.asarray(floor, dtype=np.float32)
     empty = {"elevation_rad": np.float32(np.nan), "shape_id": np.int32(-1), "object_id": np.int32(-1)}
-    kept = {name: np.where(bright, pings.labels[name], nothing) for name, nothing in empty.items()}
-    return {**kept, "shadow": shadow(pings, bright)}
+    labels = {name: np.where(bright, pings.labels[name], nothing) for name, nothing in empty.items()}
+    return {**labels, "shadow": shadow(pings, bright)}
 
 
 def shadow(pings: RenderedPings, echo: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
@@ -235,8 +235,8 @@ def shadow(pings: RenderedPings, echo: NDArray[np.bool_] | None = None) -> NDArr
 
 def _of_beams(counts: NDArray[Any], beams: int) -> NDArray[Any]:
     """Return the ray counts of the image's beams, without the boxes traced beside the fan for a beam pattern."""
-    beside = max(0, counts.shape[-1] - beams) // 2
-    return counts[..., beside : counts.shape[-1] - beside]
+    margin = max(0, counts.shape[-1] - beams) // 2
+    return counts[..., margin : counts.shape[-1] - margin]
 
 
 # ---------------- Tally of a run, for its warnings
@@ -304,59 +304,61 @@ class Tally:
         """Return the warnings of the run; ``source`` is the simulator, which traces the worst frame again for its ranges."""
         return list(self.findings(source, poses).values())
 
-    def findings(self, source: Any, poses: NDArray[np.float64], first: int = 0, told: Container[str] = ()) -> dict[str, str]:
+    def findings(
+        self, source: Any, poses: NDArray[np.float64], first: int = 0, issued: Container[str] = ()
+    ) -> dict[str, str]:
         """Return the sentences of :meth:`warnings`, keyed by the name of their subject.
 
         Args:
             source: the simulator, which traces the worst frame again for its ranges.
             poses: poses of the frames ``(frames, 6)`` [m, rad].
             first: number of the first of these frames.
-            told: names of warnings that have been issued already; frames are not traced again for these.
+            issued: names of warnings that have been issued already; frames are not traced again for these.
         """
         sonar, rays = self.sonar, self.rays
         outside = rays["nearer"] + rays["farther"]
         hits = rays["inside"] + outside
-        found = {}
-        if self.empty and "empty" not in told:
+        sentences = {}
+        if self.empty and "empty" not in issued:
             number, *its_rays = self.first_empty
             pose = poses[number - first]
             window = (sonar.range_min, sonar.range_max)
-            beside = source.window_range(pose, number)
-            found["empty"] = empty_frames(
-                self.empty, self.frames, (number, pose), its_rays, window, beside, source.buried(pose)
+            returns = source.window_range(pose, number)
+            sentences["empty"] = empty_frames(
+                self.empty, self.frames, (number, pose), its_rays, window, returns, source.buried(pose)
             )
-        if outside > NEGLIGIBLE * hits and "window" not in told:
+        if outside > NEGLIGIBLE * hits and "window" not in issued:
             frame = self.worst[1]
             ends = source.window_range(poses[frame - first], frame)
             where = f", in frame {frame} at {ends[0]:.2f}..{ends[1]:.2f} m" if ends else ""
-            found["window"] = (
+            sentences["window"] = (
                 f"{outside:,} of {hits:,} returns ({percent(outside / hits)} %) lie outside the window "
                 f"{sonar.range_min:g}..{sonar.range_max:g} m{where}: they are dropped; widen the window if they matter"
             )
         if self.saturated > 0.01 * self.pixels:
-            found["saturated"] = (
+            sentences["saturated"] = (
                 f"{percent(self.saturated / self.pixels)} % of pixels are at the maximum (more than 1 %): the gain, "
                 f"{self.gain_from}, is too high for the rest"
             )
         if self.cut:
-            found["cut"] = (
+            sentences["cut"] = (
                 f"{self.cut:,} rays met surfaces so flatly, or points so dense, that they looked through a part of their "
                 f"points only: these surfaces are too dark; a scatterer_spacing_m of {_up(self.enough_m)} m would do, or a "
                 "higher quality"
             )
         reach = rounding_reach_m(sonar)
         if reach is not None and np.abs(poses[:, :3]).max() > reach:
-            found["far"] = (
+            sentences["far"] = (
                 f"a pose lies {np.abs(poses[:, :3]).max():,.0f} m from the origin, where coordinates round to more than an "
                 f"eighth of the wavelength: speckle loses its place; move the scene so that poses lie within {reach:.0f} m "
                 "of the origin"
             )
         if sonar.model == "thesis" and 0 < rays["inside"] < 10 * self.filled:
-            found["rays"] = (
+            sentences["rays"] = (
                 f"{rays['inside'] / self.filled:.1f} rays a bin on average, below 10: point deposits make the levels "
                 "noisy; raise rays_per_beam, lower range_bins, or use the model physical"
             )
-        return found
+        return sentences
 
     def state(self) -> dict[str, Any]:
         """Return the totals in a form that JSON can hold; :meth:`restore` reads it back."""
@@ -370,10 +372,10 @@ class Tally:
         Raises:
             MitsonarError: the state is damaged.
         """
-        kept = cls(sonar)
+        blank = cls(sonar)
         rays, worst, empty = (state.get(name) for name in ("rays", "worst", "first_empty"))
-        if set(state) != set(kept.state()) or not isinstance(rays, dict) or set(rays) != set(kept.rays):
-            raise MitsonarError(f"the tally must hold {', '.join(kept.state())}, and rays {', '.join(kept.rays)}")
+        if set(state) != set(blank.state()) or not isinstance(rays, dict) or set(rays) != set(blank.rays):
+            raise MitsonarError(f"the tally must hold {', '.join(blank.state())}, and rays {', '.join(blank.rays)}")
         if not isinstance(worst, list) or len(worst) != 2 or not isinstance(empty, list) or len(empty) not in (0, 5):
             raise MitsonarError("worst of the tally must be two counts, first_empty five or none")
         for count in (*rays.values(), *worst, *empty):
@@ -417,7 +419,7 @@ def empty_frames(
     first: tuple[int, NDArray[np.float64]],
     rays: Sequence[int],
     window: tuple[float, float],
-    found: tuple[float, float] | None,
+    returns: tuple[float, float] | None,
     buried: str = "",
 ) -> str:
     """Describe empty frames in one sentence.
@@ -428,7 +430,7 @@ def empty_frames(
         first: number of the first empty frame, and its pose ``(6,)`` [m, rad].
         rays: numbers of that frame's rays that hit something inside the window, nearer, farther, and that hit nothing.
         window: nearest and farthest range of the image [m].
-        found: nearest and farthest return outside the window in that frame [m]; None if there is none.
+        returns: nearest and farthest return outside the window in that frame [m]; None if there is none.
         buried: description of how the sonar is below the ground or inside an object in that frame; empty if it is not.
     """
     number, pose = first
@@ -438,11 +440,11 @@ def empty_frames(
         text = f"no ray hit anything in {counted(empty, 'frame')}: {check}; in frame {number} {view_of(pose)}"
         return f"{text}; {hint}" if hint else text
     inside, nearer, farther, missed = (percent(count / sum(rays)) for count in rays)
-    beside = f" (returns at {found[0]:.3g}..{found[1]:.3g} m)" if found else ""
+    returns_text = f" (returns at {returns[0]:.3g}..{returns[1]:.3g} m)" if returns else ""
     check = "check the pose (m, pitch > 0 looks down), the window and the scene's units"
     return (
         f"empty: {empty} of {counted(frames, 'frame')}, frame {number} first: {inside} % of its rays meet something within "
-        f"the window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{beside}, {missed} % "
+        f"the window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{returns_text}, {missed} % "
         f"nothing; {view_of(pose)}; {hint or check}"
     )
 

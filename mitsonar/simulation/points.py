@@ -89,7 +89,7 @@ class HashedPoints:
     Attributes:
         axis: world axis nearest to each normal, 0 to 2.
         count: number of lattice cells to visit, which may hold a point of the ray.
-        wanted: number of lattice cells that each ray's cell covers, at most 2^30.
+        covered: number of lattice cells that each ray's cell covers, at most 2^30.
         cut: whether the ray covers more than :data:`MOST_CANDIDATES` of them.
         strength: square root of the reflectivity times the area of surface in a lattice cell [m].
     """
@@ -120,30 +120,30 @@ class HashedPoints:
         self.low = low
         # 3. Count them in floating point, since integers would overflow at grazing incidence.
         self.wide = high[0] - low[0] + 1
-        wanted = mi.Float(self.wide) * mi.Float(high[1] - low[1] + 1)
-        self.wanted: DeviceArray = dr.select(wanted < LARGEST_COUNT, wanted, LARGEST_COUNT)
-        self.cut = hit.valid & (wanted > MOST_CANDIDATES)
-        self.count = dr.select(hit.valid, mi.Int32(dr.select(self.cut, MOST_CANDIDATES, wanted)), 0)
+        covered = mi.Float(self.wide) * mi.Float(high[1] - low[1] + 1)
+        self.covered: DeviceArray = dr.select(covered < LARGEST_COUNT, covered, LARGEST_COUNT)
+        self.cut = hit.valid & (covered > MOST_CANDIDATES)
+        self.count = dr.select(hit.valid, mi.Int32(dr.select(self.cut, MOST_CANDIDATES, covered)), 0)
         # 4. Choose the hash of this lattice, and project the area of a lattice cell onto the surface.
         side = dr.select(self.normal[2] > 0, mi.UInt32(1), mi.UInt32(0))
         self.key = lattice_key(mi.UInt32(hit.shape_id), self.axis, side, seed)
         self.strength = dr.sqrt(hit.reflectivity * (pitch * pitch) / dr.abs(self.normal[2]))
 
-    def point(self, number: DeviceArray, patches: mi.Float, many: int) -> Point:
+    def point(self, number: DeviceArray, patches: mi.Float, entries: int) -> Point:
         """Return the point in one of each ray's lattice cells.
 
         Args:
             number: index of the cell, 0 to ``count`` - 1.
             patches: equiprobable patch amplitudes from :func:`mitsonar.acoustics.speckle.patch_amplitudes`.
-            many: number of entries of that table.
+            entries: number of entries of that table.
         """
         i, j = self.low[0] + number % self.wide, self.low[1] + number // self.wide
         p, q, bits = place_in_cell(i, j, self.key, self.pitch)
         slope = 1 / self.normal[2]
         a = self.middle[2] - slope * (self.normal[0] * (p - self.middle[0]) + self.normal[1] * (q - self.middle[1]))
         amplitude, turn, bits = weight_of(bits)
-        if many > 1:
-            amplitude = amplitude * patch_weight((p, q), bits, self.key, patches, many, self.patch)
+        if entries > 1:
+            amplitude = amplitude * patch_weight((p, q), bits, self.key, patches, entries, self.patch)
         return Point(p, q, a, amplitude, turn)
 
 
@@ -190,7 +190,7 @@ def weight_of(place: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray
 
 
 def patch_weight(
-    place: tuple[DeviceArray, DeviceArray], bits: DeviceArray, key: DeviceArray, patches: mi.Float, many: int, side: float
+    place: tuple[DeviceArray, DeviceArray], bits: DeviceArray, key: DeviceArray, patches: mi.Float, entries: int, side: float
 ) -> DeviceArray:
     """Return the amplitude of a point's patch, drawn from the four nearest patches with their bilinear weights.
 
@@ -201,21 +201,21 @@ def patch_weight(
         bits: bits from :func:`weight_of`.
         key: key from :func:`lattice_key`.
         patches: equiprobable patch amplitudes from :func:`mitsonar.acoustics.speckle.patch_amplitudes`.
-        many: number of entries of that table, a power of 2.
+        entries: number of entries of that table, a power of 2.
         side: side of a patch [m].
     """
     # a shift by up to half a patch each way chooses a patch with exactly its bilinear weight
     drawn = _mixed(bits ^ mi.UInt32(0x1B56C4E9))
     moved = (mi.Float(drawn & 0xFFFF) * 2.0**-16 - 0.5, mi.Float(drawn >> 16) * 2.0**-16 - 0.5)
     i, j = (mi.Int32(dr.floor(v * (1 / side) + by)) for v, by in zip(place, moved, strict=True))
-    return dr.gather(mi.Float, patches, _hash(i, j, key + 17) >> (32 - int(math.log2(many))))
+    return dr.gather(mi.Float, patches, _hash(i, j, key + 17) >> (32 - int(math.log2(entries))))
 
 
 def _hash(i: DeviceArray, j: DeviceArray, key: DeviceArray) -> DeviceArray:
     """Hash a cell to 32 bits."""
-    one: DeviceArray = dr.reinterpret_array(mi.UInt32, i)
-    other: DeviceArray = dr.reinterpret_array(mi.UInt32, j)
-    return _mixed(one * mi.UInt32(0x9E3779B1) ^ _mixed(other ^ key))
+    i_bits: DeviceArray = dr.reinterpret_array(mi.UInt32, i)
+    j_bits: DeviceArray = dr.reinterpret_array(mi.UInt32, j)
+    return _mixed(i_bits * mi.UInt32(0x9E3779B1) ^ _mixed(j_bits ^ key))
 
 
 def _mixed(x: DeviceArray) -> DeviceArray:
@@ -310,23 +310,23 @@ def lattice_points(shape: mi.Shape, number: int, pitch: float, seed: int, patche
         patches: patches of unequal strength; default: none.
     """
     search = _Search(shape, pitch, patches)
-    found = []
+    parts = []
     for cells in _cells_of(shape, pitch):
         for side in (1, 0):
             key = lattice_key(mi.UInt32(number), mi.UInt32(cells.axis), mi.UInt32(side), seed)
             count = cells.wide * cells.tall
             for begin in range(0, count, AT_A_TIME):
-                found += search.on_rays(cells, side, key, np.arange(begin, min(begin + AT_A_TIME, count), dtype=np.uint32))
-    return SurfacePoints(*(np.concatenate(values) for values in zip(*found, strict=True)))
+                parts += search.on_rays(cells, side, key, np.arange(begin, min(begin + AT_A_TIME, count), dtype=np.uint32))
+    return SurfacePoints(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
 def _cells_of(shape: mi.Shape, pitch: float) -> Iterator[_Cells]:
     """Yield the lattice cells that cover a shape, along each world axis."""
     low, high = _reach(shape)
     for axis in range(3):
-        one, other = (axis + 1) % 3, (axis + 2) % 3
-        first = [math.floor(low[k] / pitch) for k in (one, other)]
-        count = [math.floor(high[k] / pitch) - begin + 1 for k, begin in zip((one, other), first, strict=True)]
+        p_axis, q_axis = (axis + 1) % 3, (axis + 2) % 3
+        first = [math.floor(low[k] / pitch) for k in (p_axis, q_axis)]
+        count = [math.floor(high[k] / pitch) - begin + 1 for k, begin in zip((p_axis, q_axis), first, strict=True)]
         margin = pitch + 1e-4 * (high[axis] - low[axis])
         yield _Cells(axis, (first[0], first[1]), count[0], count[1], (low[axis] - margin, high[axis] + margin))
 
@@ -367,30 +367,32 @@ class _Search:
         a, skip = dr.full(mi.Float, begin, len(numbers)), way * reach
         u = _along(cells.axis, mi.Float(0), mi.Float(0), mi.Float(way))
         # 3. Trace, keep the points on suitable surfaces, and continue behind every hit until no ray hits anything.
-        made: list[SurfacePoints] = []
+        parts: list[SurfacePoints] = []
         while True:
             hit = self.surfaces.hit(self.scene, mi.Ray3f(mi.Point3f(_along(cells.axis, p, q, a)), u))
-            at = a + way * hit.t
-            made.append(self._kept(cells.axis, side, hit, (p, q, at), (amplitude, turn)))
+            a_hit = a + way * hit.t
+            parts.append(self._suitable_points(cells.axis, side, hit, (p, q, a_hit), (amplitude, turn)))
             going = np.flatnonzero(np.array(hit.valid))
             if not len(going):
-                return made
-            kept = mi.UInt32(padded(going.astype(np.uint32)))
-            p, q, amplitude, turn, at = (dr.gather(mi.Float, value, kept) for value in (p, q, amplitude, turn, at))
-            a = at + skip
+                return parts
+            remaining = mi.UInt32(padded(going.astype(np.uint32)))
+            p, q, amplitude, turn, a_hit = (
+                dr.gather(mi.Float, value, remaining) for value in (p, q, amplitude, turn, a_hit)
+            )
+            a = a_hit + skip
             dr.eval(p, q, amplitude, turn, a)
 
-    def _kept(
+    def _suitable_points(
         self, axis: int, side: int, hit: Hit, place: tuple[DeviceArray, ...], weight: tuple[DeviceArray, ...]
     ) -> SurfacePoints:
         """Return the hits on scattering surfaces whose normal is nearest to the axis and points to the given side."""
         along = pick(mi.UInt32(axis), hit.n)[2]
-        own = hit.valid & (nearest_axis(hit.n) == axis) & ((along > 0) == bool(side)) & (hit.reflectivity > 0)
+        suitable = hit.valid & (nearest_axis(hit.n) == axis) & ((along > 0) == bool(side)) & (hit.reflectivity > 0)
         strength = hit.reflectivity * (self.pitch * self.pitch) / dr.abs(along) * weight[0] * weight[0]
-        at = _along(axis, *place)
-        dr.eval(own, at, hit.n, strength, weight[1])
-        keep = np.flatnonzero(np.array(own))
-        points, normals = (np.ascontiguousarray(np.array(values).T[keep], np.float32) for values in (at, hit.n))
+        positions = _along(axis, *place)
+        dr.eval(suitable, positions, hit.n, strength, weight[1])
+        keep = np.flatnonzero(np.array(suitable))
+        points, normals = (np.ascontiguousarray(np.array(values).T[keep], np.float32) for values in (positions, hit.n))
         turn = np.array(weight[1])[keep]
         phase = np.asarray((turn - np.rint(turn)) * (2 * np.pi), np.float32)
         return SurfacePoints(points, normals, np.array(strength)[keep], phase)

@@ -47,7 +47,7 @@ class ReceiverNoise:
 
     def __init__(self, sonar: Sonar, former: BeamFormer) -> None:
         self.sonar, self.former = sonar, former
-        self._kept_waves: dict[int, NDArray[np.float32]] = {}
+        self._cached_waves: dict[int, NDArray[np.float32]] = {}
 
     def add(self, image: NDArray[Any], ping: int, side: int = 0) -> Image:
         """Apply all :data:`PROCESSES` to the echoes of one ping.
@@ -116,7 +116,7 @@ class ReceiverNoise:
 
     def beam_correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return the beam correlations ``(beams, beams)`` of noise, volume reverberation, and speckle on even ground."""
-        noise, volume = (self._plane_waves(ways).astype(float) for ways in (1, 2))
+        noise, volume = (self._plane_waves(passes).astype(float) for passes in (1, 2))
         lines = self.former.over_sine.T.astype(float)
         return noise.T @ noise, volume.T @ volume, _correlation(lines.T @ lines)
 
@@ -141,15 +141,15 @@ class ReceiverNoise:
         power = 10 ** (sonar.volume_db / 10) * volume / sonar.range_m**4 * loss_of(sonar)
         return np.asarray(np.sqrt(power), dtype=np.float64)
 
-    def _plane_waves(self, ways: int) -> NDArray[np.float32]:
+    def _plane_waves(self, passes: int) -> NDArray[np.float32]:
         """Return :meth:`_waves` from a cache."""
-        if ways not in self._kept_waves:
-            self._kept_waves[ways] = self._waves(ways)
-        return self._kept_waves[ways]
+        if passes not in self._cached_waves:
+            self._cached_waves[passes] = self._waves(passes)
+        return self._cached_waves[passes]
 
-    def _white(self, ping: int, salt: int, ways: int) -> NDArray[np.complex64]:
+    def _white(self, ping: int, salt: int, passes: int) -> NDArray[np.complex64]:
         """Return complex Gaussian noise of unit power ``(bins, beams)``, filtered by the array and the matched filter."""
-        waves = self._plane_waves(ways)
+        waves = self._plane_waves(passes)
         shape = 1, self.former.ranges, len(waves)
         first, second = uniform(shape, seed=self.sonar.seed ^ salt, frames=np.array([ping]), like=np.empty(0))
         # 1. Draw complex Gaussian noise of every plane wave and range (Box-Muller), real and imaginary part side by side.
@@ -160,16 +160,16 @@ class ReceiverNoise:
         real, imag = (np.ascontiguousarray(part) @ waves for part in np.split(filtered, 2, axis=1))
         return np.asarray(real + 1j * imag, dtype=np.complex64)
 
-    def _waves(self, ways: int) -> NDArray[np.float32]:
+    def _waves(self, passes: int) -> NDArray[np.float32]:
         """Return the amplitude of plane waves in each beam ``(waves, beams)``, for a one-way or two-way pattern.
 
-        Waves are 1 / (ways x length) apart in sine, which resolves that pattern. Each beam has unit power.
+        Waves are 1 / (passes x length) apart in sine, which resolves that pattern. Each beam has unit power.
         """
         length = self.former.aperture.length
         reach = math.sin(math.radians(self.sonar.azimuth_fov_deg) / 2) + 4 / length
-        wave = np.arange(-reach, reach, 1 / (ways * length))
+        wave = np.arange(-reach, reach, 1 / (passes * length))
         away = np.sin(self.sonar.bearing_rad)[:, None] - wave
-        amplitude = shaded_sinc(away * length, series(self.sonar.shading)) ** ways
+        amplitude = shaded_sinc(away * length, series(self.sonar.shading)) ** passes
         amplitude /= np.sqrt(np.square(amplitude).sum(axis=1, keepdims=True))
         return np.ascontiguousarray(amplitude.T, dtype=np.float32)
 

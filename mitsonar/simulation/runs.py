@@ -92,8 +92,10 @@ def write_run(
     Raises:
         MitsonarError: the folder exists; the run to resume has other settings; the folder cannot be written.
     """
-    wanted = {**destination.origin, **settings}
-    run = RunDirectory.begin(destination.folder, kind, wanted, resume=destination.resume, overwrite=destination.overwrite)
+    all_settings = {**destination.origin, **settings}
+    run = RunDirectory.begin(
+        destination.folder, kind, all_settings, resume=destination.resume, overwrite=destination.overwrite
+    )
     run.start(**notes)
     for pings, noted in steps(run):
         if noted:
@@ -204,7 +206,7 @@ def run(source: Source, trajectory: Trajectory, options: RenderOptions, destinat
     """
     timed = timed_path(source.sonar, trajectory)
     if options.exr and timed.time_s.ndim > 1:
-        raise MitsonarError("echoes of each ray are kept of frames that are one ping: leave --exr or ping_groups out")
+        raise MitsonarError("echoes of each ray are stored only if a frame is one ping: leave out --exr or ping_groups")
     settings = {
         "variant": source.variant,
         "sonar": source.sonar.model_dump(),
@@ -213,10 +215,12 @@ def run(source: Source, trajectory: Trajectory, options: RenderOptions, destinat
         **vars(options),
         "noise": options.noise.model_dump(),
     }
-    made = write_run(RENDERING, settings, destination, lambda run: _write_frames(source, timed, options, run), frames_done=0)
+    directory = write_run(
+        RENDERING, settings, destination, lambda run: _write_frames(source, timed, options, run), frames_done=0
+    )
     pictures = "cartesian" if options.cartesian else "fan" if options.fan else "images"
-    found = sorted((made.path / pictures).glob("[0-9]*[0-9].png"))
-    return RenderReport(len(timed.frames), found, made.notes.get("warnings") or [])
+    files = sorted((directory.path / pictures).glob("[0-9]*[0-9].png"))
+    return RenderReport(len(timed.frames), files, directory.notes.get("warnings") or [])
 
 
 def _write_frames(source: Source, timed: TimedPath, options: RenderOptions, run: RunDirectory) -> Steps:

@@ -28,17 +28,17 @@ from mitsonar.simulation.mirrors import (
     ROW,
     FlatMirrors,
     Mirrors,
-    MirrorWay,
+    MirrorSequence,
     PlaneRow,
     ScatteringPoints,
     flat_mirrors,
-    mirror_ways,
+    mirror_sequences,
     unfolded,
 )
 from mitsonar.simulation.points import Patches, SurfacePoints, lattice_points, lattice_size
 from mitsonar.simulation.tracing import height_below, hidden
 
-__all__ = ["DIRECT", "ChannelTracer", "EchoBatch", "EchoValues", "LinkGeometry", "ScattererWay", "Scatterers", "link_table"]
+__all__ = ["DIRECT", "ChannelTracer", "EchoBatch", "EchoValues", "LinkGeometry", "ScattererPath", "Scatterers", "link_table"]
 
 
 EchoValues: TypeAlias = dict[str, NDArray[Any]]
@@ -48,19 +48,19 @@ _Launch: TypeAlias = Callable[..., list[DeviceArray]]
 """A frozen launch, which maps indices, scene, link table and source tables to values."""
 
 
-class ScattererWay(NamedTuple):
+class ScattererPath(NamedTuple):
     """Mirrors between transmitter and scatterers, and between receiver and scatterers."""
 
-    out: MirrorWay = MirrorWay()
-    back: MirrorWay = MirrorWay()
+    out: MirrorSequence = MirrorSequence()
+    back: MirrorSequence = MirrorSequence()
 
     @property
     def name(self) -> str:
         """Return the names of what sound meets in turn, such as ``surface-scatterer-seabed``."""
-        return "-".join([name for name in (self.out.name, "scatterer", MirrorWay(self.back.planes[::-1]).name) if name])
+        return "-".join([name for name in (self.out.name, "scatterer", MirrorSequence(self.back.planes[::-1]).name) if name])
 
 
-DIRECT = ScattererWay()
+DIRECT = ScattererPath()
 """The path without mirrors."""
 
 
@@ -77,7 +77,7 @@ class ChannelTracer:
         notes: notes to the user about the scene's BSDFs.
         flat: the scene's mirrors.
         registry: registry index of each mirror's shape, keyed by the shape's index in the scene.
-        ways: kinds of paths that reach scatterers, the direct one first.
+        paths: kinds of paths that reach scatterers, the direct one first.
 
     Raises:
         MitsonarError: no surface can carry scatterers, or a mirror has too many triangles.
@@ -92,7 +92,7 @@ class ChannelTracer:
         self.notes = [*surfaces.notes, *self.flat.notes_on(sonar.bounces)]
         shapes = scene.shapes()
         self.registry = {plane.shape: registry_index(shapes[plane.shape]) for plane in self.flat.reflecting(2)}
-        self.ways = _scatterer_ways(self.flat, sonar.bounces)
+        self.paths = _scatterer_paths(self.flat, sonar.bounces)
         self.source: _WorldScatterers | _VehicleRays
         if sonar.model == "scatterers":
             shared = (
@@ -110,9 +110,9 @@ class ChannelTracer:
         pose: NDArray[np.float64],
         velocity: NDArray[np.float64],
         receiver: int,
-        wanted: tuple[str, ...],
-        asked: NDArray[np.uint32] | None = None,
-        way: ScattererWay = DIRECT,
+        names: tuple[str, ...],
+        points: NDArray[np.uint32] | None = None,
+        path: ScattererPath = DIRECT,
     ) -> EchoValues:
         """Trace one ping at one receiver; return echo values, one for each point that it may receive from.
 
@@ -120,37 +120,37 @@ class ChannelTracer:
             pose: pose of the transmitter ``(6,)`` [m, rad].
             velocity: velocity of the vehicle in its own axes ``(4,)`` [m/s, rad/s].
             receiver: index of the receiver.
-            wanted: names of the values to return.
-            asked: indices of the points to trace; default: those that the receiver may receive from.
-            way: mirrors between sonar and points.
+            names: names of the values to return.
+            points: indices of the points to trace; default: those that the receiver may receive from.
+            path: mirrors between sonar and points.
         """
-        asked = self.asked(pose, receiver, way) if asked is None else asked
-        if not len(asked):
-            return {name: np.zeros(0) for name in wanted}
-        key = (receiver, wanted, len(way.out.planes), len(way.back.planes))
+        points = self.candidates(pose, receiver, path) if points is None else points
+        if not len(points):
+            return {name: np.zeros(0) for name in names}
+        key = (receiver, names, len(path.out.planes), len(path.back.planes))
         if key not in self.launches:
             self.launches[key] = self._compile(*key)
-        table = mi.Float64(padded(self._table(pose, velocity, receiver, way)))
-        launch, inputs = self.launches[key], (mi.UInt32(padded(asked)), self.scene, table)
+        table = mi.Float64(padded(self._table(pose, velocity, receiver, path)))
+        launch, inputs = self.launches[key], (mi.UInt32(padded(points)), self.scene, table)
         received = replayed(launch, *inputs, self.source.tables(receiver))
-        return {name: np.broadcast_to(np.array(values), len(asked)) for name, values in zip(wanted, received, strict=True)}
+        return {name: np.broadcast_to(np.array(values), len(points)) for name, values in zip(names, received, strict=True)}
 
-    def asked(self, pose: NDArray[np.float64], receiver: int, way: ScattererWay = DIRECT) -> NDArray[np.uint32]:
+    def candidates(self, pose: NDArray[np.float64], receiver: int, path: ScattererPath = DIRECT) -> NDArray[np.uint32]:
         """Return indices of the points that a receiver may receive from, via the given mirrors."""
-        return self.source.asked(self._table(pose, np.zeros(4), receiver, way), receiver)
+        return self.source.candidates(self._table(pose, np.zeros(4), receiver, path), receiver)
 
     def _table(
-        self, pose: NDArray[np.float64], velocity: NDArray[np.float64], receiver: int, way: ScattererWay
+        self, pose: NDArray[np.float64], velocity: NDArray[np.float64], receiver: int, path: ScattererPath
     ) -> NDArray[np.float64]:
         table = link_table(self.sonar, receiver, pose, velocity)
-        return table if way == DIRECT else mirrored_table(table, way.out, way.back, self.registry)
+        return table if path == DIRECT else mirrored_table(table, path.out, path.back, self.registry)
 
     def height_m(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the height of each pose above the surface straight below it ``(pings,)`` [m]; nan if there is none."""
         place = mi.Point3f(*(mi.Float(padded(axis.astype(np.float32))) for axis in poses[:, :3].T))
         return np.array(height_below(self.scene, place), dtype=float)
 
-    def _compile(self, receiver: int, wanted: tuple[str, ...], out: int, back: int) -> _Launch:
+    def _compile(self, receiver: int, names: tuple[str, ...], out: int, back: int) -> _Launch:
         """Record a receiver's launch for the given numbers of mirrors; later calls replay it (``dr.freeze``)."""
 
         @Frozen
@@ -161,21 +161,21 @@ class ChannelTracer:
             else:
                 link = MirroredLink(self.sonar, receiver, table, out, back)
             received = self.source.received(link, index, scene, tables)
-            values = [getattr(received, name) for name in wanted]
+            values = [getattr(received, name) for name in names]
             dr.eval(values)
             return values
 
         return launch
 
 
-def _scatterer_ways(flat: FlatMirrors, bounces: int) -> list[ScattererWay]:
+def _scatterer_paths(flat: FlatMirrors, bounces: int) -> list[ScattererPath]:
     """Return all kinds of scatterer paths with up to ``bounces`` reflections, counting the scatterer as one."""
     return [
-        ScattererWay(out, back)
+        ScattererPath(out, back)
         for mirrors in range(bounces)
-        for there in range(mirrors + 1)
-        for out in mirror_ways(flat.reflecting(bounces), there)
-        for back in mirror_ways(flat.reflecting(bounces), mirrors - there)
+        for outward in range(mirrors + 1)
+        for out in mirror_sequences(flat.reflecting(bounces), outward)
+        for back in mirror_sequences(flat.reflecting(bounces), mirrors - outward)
     ]
 
 
@@ -210,7 +210,7 @@ class _WorldScatterers:
         rows[:, 4:7], rows[:, 7] = self.scatterers.normal, self.scatterers.phase
         return mi.Float(rows.ravel())
 
-    def asked(self, table: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
+    def candidates(self, table: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
         """Return indices of the scatterers that a receiver may receive from, given the geometry of its link."""
         return self.scatterers.within(table[3:6], table[12:21].reshape(3, 3), self.sonar.receivers[receiver].field)
 
@@ -223,9 +223,13 @@ class _WorldScatterers:
         # 1. fetch position, strength, normal and phase
         first: DeviceArray = dr.gather(mi.Vector4f, tables[0], index * 2)
         second: DeviceArray = dr.gather(mi.Vector4f, tables[0], index * 2 + 1)
-        at, strength, normal = mi.Point3f(first.x, first.y, first.z), first.w, mi.Normal3f(second.x, second.y, second.z)
+        position, strength, normal = (
+            mi.Point3f(first.x, first.y, first.z),
+            first.w,
+            mi.Normal3f(second.x, second.y, second.z),
+        )
         # 2. delay in double precision, since it determines the phase of the carrier
-        exact = [mi.Float64(value) for value in at]
+        exact = [mi.Float64(value) for value in position]
         to_point, from_receiver = link.to_point(exact)
         delay = delay_exact(to_point, from_receiver, link.velocity, self.sonar.sound_speed)
         # 3. directions and distances; single precision is enough for amplitudes
@@ -239,7 +243,7 @@ class _WorldScatterers:
         lambert = cosines[0] * cosines[1]
         inside = (weight > 0) & (lambert > 0)
         # 5. shadow rays, only for points that could contribute
-        point = ScatteringPoints(at, exact, normal)
+        point = ScatteringPoints(position, exact, normal)
         open_, factor = link.reached(scene, point, Leg(u_sent, sent), Leg(u_received, received), inside)
         seen = inside & open_
         # 6. amplitude: the strength is an energy; spreading and mirrors act on the pressure
@@ -265,11 +269,11 @@ class _VehicleRays:
 
     def __init__(self, sonar: ChannelSonar, surfaces: Surfaces) -> None:
         self.sonar, self.surfaces = sonar, surfaces
-        directions = [_even(field, sonar.rays) for field in sonar.field_of_view.values()]
+        directions = [_even_directions(field, sonar.rays) for field in sonar.field_of_view.values()]
         self.numbers = [np.arange(len(each), dtype=np.uint32) for each in directions]
         self.stored = [mi.Float64(each.ravel()) for each in directions]
 
-    def asked(self, table: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
+    def candidates(self, table: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
         """Return indices of the rays that belong to a receiver."""
         return self.numbers[receiver]
 
@@ -283,9 +287,9 @@ class _VehicleRays:
         """Return the echoes of the points that the rays hit."""
         # 1. turn the directions from the axes of the field of view to the world
         directions, facets = tables
-        own = [dr.gather(mi.Float64, directions, index * 3 + k) for k in range(3)]
+        local = [dr.gather(mi.Float64, directions, index * 3 + k) for k in range(3)]
         axes = [link.vector(12 + 3 * k) for k in range(3)]
-        u = [sum(own[k] * axes[k][axis] for k in range(3)) for axis in range(3)]
+        u = [sum(local[k] * axes[k][axis] for k in range(3)) for axis in range(3)]
         u_sent = mi.Vector3f(*u)
         # 2. trace from the transmitter; the point stays in double precision for the phase
         hit = replace(self.surfaces, **facets).hit(scene, mi.Ray3f(mi.Point3f(*link.sent_from), u_sent))
@@ -303,7 +307,7 @@ class _VehicleRays:
         return link.echo_batch(delay, amplitude, mi.Float(0), doppler, hit.valid & (weight > 0))
 
 
-def _even(field: FieldOfView, rays: int) -> NDArray[np.float64]:
+def _even_directions(field: FieldOfView, rays: int) -> NDArray[np.float64]:
     """Return directions that cover a field of view evenly, along its axes ``(n, 3)``; about ``rays`` lie within it.
 
     They exceed the field by :data:`MARGIN_DEG`, since the field is the receiver's but rays begin at the transmitter.
@@ -402,8 +406,8 @@ class LinkGeometry:
         self.sonar = sonar
         self.numbers = [dr.gather(mi.Float64, table, mi.UInt32(k)) for k in range(self.size)]
         dr.eval(self.numbers)  # read once, not once per point
-        self.listens: FieldOfView = sonar.field_of_view[sonar.receivers[receiver].name]
-        self.sends: FieldOfView = sonar.transmitter
+        self.receiver_field: FieldOfView = sonar.field_of_view[sonar.receivers[receiver].name]
+        self.transmitter_field: FieldOfView = sonar.transmitter
 
     @property
     def size(self) -> int:
@@ -436,10 +440,10 @@ class LinkGeometry:
     def sensitivity(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
         """Return the combined sensitivity of transmitter and receiver, given unit directions to the points."""
         ahead, aside, above = (dr.dot(axis, received) for axis in self.axes(0))
-        both = self.listens.sensitivity(ahead, aside, above, DRJIT)
-        if self.sends.shape != "all":
+        both = self.receiver_field.sensitivity(ahead, aside, above, DRJIT)
+        if self.transmitter_field.shape != "all":
             ahead, aside, above = (dr.dot(axis, sent) for axis in self.axes(1))
-            both = both * self.sends.sensitivity(ahead, aside, above, DRJIT)
+            both = both * self.transmitter_field.sensitivity(ahead, aside, above, DRJIT)
         return both
 
     def reached(
@@ -449,7 +453,7 @@ class LinkGeometry:
 
         Only the path from the transmitter is tested, since receivers are near it.
         """
-        return ~hidden(scene, point.at, point.normal, sent.u, sent.length, active), None
+        return ~hidden(scene, point.position, point.normal, sent.u, sent.length, active), None
 
     def doppler(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
         """Return the Doppler shift of the carrier [Hz], given unit directions to the points.
@@ -515,7 +519,7 @@ class MirroredLink(LinkGeometry):
 
 
 def mirrored_table(
-    table: NDArray[np.float64], out: MirrorWay, back: MirrorWay, registry: dict[int, int]
+    table: NDArray[np.float64], out: MirrorSequence, back: MirrorSequence, registry: dict[int, int]
 ) -> NDArray[np.float64]:
     """Return the geometry of a link via mirrors: :func:`link_table` of the images.
 
@@ -525,7 +529,7 @@ def mirrored_table(
         table: table of the link without mirrors ``(30,)``.
         out: mirrors from the transmitter to the points.
         back: mirrors from the receiver to the points, backwards in time.
-        registry: see :meth:`MirrorWay.rows`.
+        registry: see :meth:`MirrorSequence.rows`.
     """
     places = out.images(table[0:3])[-1], back.images(table[3:6])[-1]
     velocities = out.turn @ table[6:9], back.turn @ table[9:12]
@@ -547,10 +551,10 @@ def mirrored_table(
 MOST = 2**26
 """Largest number of points in a scene, 36 bytes each: position, normal, strength, phase and shape."""
 
-A_BUCKET = 256
+POINTS_PER_BUCKET = 256
 """Approximate number of points in a bucket: few enough to fit a field of view closely, enough to keep the buckets few."""
 
-A_BLOCK = 64
+BUCKETS_PER_BLOCK = 64
 """Number of buckets in a block; the search tests blocks first."""
 
 BITS = 20
@@ -586,8 +590,8 @@ class Spheres:
         # closed bodies: skip groups whose normals all face away from the eye
         away = np.einsum("gi,gi->g", self.facing[groups], unit) > np.sin(np.minimum(margin + self.spread[groups], np.pi / 2))
         ahead, aside, above = axes @ unit.T
-        kept: NDArray[np.int64] = groups[field.may_see(ahead, aside, above, margin) & ~away]
-        return kept
+        visible: NDArray[np.int64] = groups[field.may_see(ahead, aside, above, margin) & ~away]
+        return visible
 
 
 @dataclass(frozen=True)
@@ -652,8 +656,8 @@ class Scatterers:
     def spheres(self) -> tuple[Spheres, Spheres]:
         """Return the bounding spheres of the blocks, and those of the buckets."""
         buckets = np.arange(len(self.one_sided))
-        blocks = self.first[:-1][::A_BLOCK]
-        mixed = np.logical_and.reduceat(self.one_sided, buckets[::A_BLOCK])
+        blocks = self.first[:-1][::BUCKETS_PER_BLOCK]
+        mixed = np.logical_and.reduceat(self.one_sided, buckets[::BUCKETS_PER_BLOCK])
         return self._spheres(blocks, mixed), self._spheres(self.first[:-1], self.one_sided)
 
     def _spheres(self, first: NDArray[np.int64], one_sided: NDArray[np.bool_]) -> Spheres:
@@ -677,7 +681,7 @@ class Scatterers:
             return np.zeros(0, np.uint32)
         blocks, buckets = self.spheres
         near = blocks.may_be_seen(np.arange(len(blocks.radius)), eye, axes, field)
-        inner = (near[:, None] * A_BLOCK + np.arange(A_BLOCK)).ravel()
+        inner = (near[:, None] * BUCKETS_PER_BLOCK + np.arange(BUCKETS_PER_BLOCK)).ravel()
         return _ranges(self.first, buckets.may_be_seen(inner[inner < len(self.one_sided)], eye, axes, field))
 
 
@@ -764,7 +768,7 @@ def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> SurfacePoints:
     # 4. position on the surface, and the area of the cell there
     si = shape.eval_parameterization(uv, mi.RayFlags.All, inside)
     area = dr.norm(dr.cross(si.dp_du, si.dp_dv)) * abs(float(np.linalg.det(back[:2, :2]))) / (columns * rows)
-    return _kept(shape, si, area, _zeta_of(bits[0], bits[1] ^ _key(*seed, ZETA)), inside & si.is_valid())
+    return _scattering_points(shape, si, area, _zeta_of(bits[0], bits[1] ^ _key(*seed, ZETA)), inside & si.is_valid())
 
 
 def _on_lattice(shape: mi.Shape, sonar: ChannelSonar, number: int) -> SurfacePoints:
@@ -772,26 +776,30 @@ def _on_lattice(shape: mi.Shape, sonar: ChannelSonar, number: int) -> SurfacePoi
     pitch = sonar.lattice_pitch_m
     cells = lattice_size(shape, pitch) / 2
     enough = pitch * math.sqrt(cells / MOST) * 1.1
-    mend = "lower points_per_m2" if sonar.scatterer_spacing_m is None else "raise scatterer_spacing_m"
-    _check_count(shape, cells, f"{mend}; a spacing of {enough:.2g} m would do")
+    advice = "lower points_per_m2" if sonar.scatterer_spacing_m is None else "raise scatterer_spacing_m"
+    _check_count(shape, cells, f"{advice}; a spacing of {enough:.2g} m would do")
     patches = None if sonar.speckle_nu is None else Patches(sonar.speckle_nu, sonar.speckle_patch_m)
     return lattice_points(shape, number, pitch, sonar.seed, patches)
 
 
-def _kept(shape: mi.Shape, si: mi.SurfaceInteraction3f, area: DeviceArray, zeta: _Zeta, valid: DeviceArray) -> SurfacePoints:
+def _scattering_points(
+    shape: mi.Shape, si: mi.SurfaceInteraction3f, area: DeviceArray, zeta: _Zeta, valid: DeviceArray
+) -> SurfacePoints:
     """Return the points whose strength is above 0."""
     strength = dr.select(valid, reflectivity_at(shape.bsdf(), si) * area * zeta.power, 0)
     dr.eval(si.p, si.n, strength, zeta.phase)
-    found = np.array(strength)
-    keep = np.flatnonzero((found > 0) & np.isfinite(found))
-    place, normal = (np.broadcast_to(np.array(values).T, (len(found), 3))[keep] for values in (si.p, si.n))
-    return SurfacePoints(np.ascontiguousarray(place), np.ascontiguousarray(normal), found[keep], np.array(zeta.phase)[keep])
+    strengths = np.array(strength)
+    keep = np.flatnonzero((strengths > 0) & np.isfinite(strengths))
+    place, normal = (np.broadcast_to(np.array(values).T, (len(strengths), 3))[keep] for values in (si.p, si.n))
+    return SurfacePoints(
+        np.ascontiguousarray(place), np.ascontiguousarray(normal), strengths[keep], np.array(zeta.phase)[keep]
+    )
 
 
-def _check_count(shape: mi.Shape, count: float, mend: str) -> None:
+def _check_count(shape: mi.Shape, count: float, advice: str) -> None:
     if count > MOST:
         raise MitsonarError(
-            f"shape {shape.id() or 'of merged meshes'} would carry {count:,.0f} scatterers, more than {MOST:,}: {mend}"
+            f"shape {shape.id() or 'of merged meshes'} would carry {count:,.0f} scatterers, more than {MOST:,}: {advice}"
         )
 
 
@@ -824,8 +832,8 @@ def _buckets(place: NDArray[np.float32], side: NDArray[np.int64]) -> tuple[NDArr
     """
     low, high = place.min(axis=0).astype(float), place.max(axis=0).astype(float)
     reach = np.sort(high - low)[::-1]
-    # the edge of a cube that holds A_BUCKET points, if they cover a surface as large as the two longest sides
-    edge = math.sqrt(reach[0] * reach[1] * A_BUCKET / len(place))
+    # the edge of a cube that holds POINTS_PER_BUCKET points, if they cover a surface as large as the two longest sides
+    edge = math.sqrt(reach[0] * reach[1] * POINTS_PER_BUCKET / len(place))
     edge = max(edge, reach[0] / (2**BITS - 1), 1e-9)
     # key: side first, then the cube's position on Morton's curve
     key = side.astype(np.uint64) << np.uint64(3 * BITS)

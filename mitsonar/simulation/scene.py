@@ -148,9 +148,9 @@ def _loaded(path: Path, variant: str, parameters: dict[str, str]) -> object:
     with search_in([path.parent]):
         check_text(path, parameters, [Path(str(folder)) for folder in file_resolver()])
         state = parser.parse_file(config, str(path), **parameters)
-        looked_at = parser.ParserState(state)  # a copy: Mitsuba rejects properties that nothing has queried
-        check_parsed(looked_at)
-        refuse_unread_motions(looked_at)
+        checked = parser.ParserState(state)  # a copy: Mitsuba rejects properties that nothing has queried
+        check_parsed(checked)
+        refuse_unread_motions(checked)
         parser.transform_all(config, state)
         with own_code_only(node.props.plugin_name() for node in state.nodes):
             return parser.instantiate(config, state)
@@ -219,16 +219,16 @@ def sonar_in(scene: mi.Scene, index: int = 0) -> tuple[Sonar, Pose] | None:
     """
     from mitsonar.plugins.imaging_sonar_sensor import is_imaging_sonar
 
-    found = [sensor for sensor in scene.sensors() if is_imaging_sonar(sensor)]
-    return (found[index].sonar, found[index].pose) if index < len(found) else None
+    sonars = [sensor for sensor in scene.sensors() if is_imaging_sonar(sensor)]
+    return (sonars[index].sonar, sonars[index].pose) if index < len(sonars) else None
 
 
 def channel_sonar_in(scene: mi.Scene, index: int = 0) -> tuple[ChannelSonar, Pose] | None:
     """Return instrument and pose of the scene's ``channel_sonar`` number ``index``; None if there is none."""
     from mitsonar.plugins.channel_sonar_sensor import is_channel_sonar
 
-    found = [sensor for sensor in scene.sensors() if is_channel_sonar(sensor)]
-    return (found[index].sonar, found[index].pose) if index < len(found) else None
+    sonars = [sensor for sensor in scene.sensors() if is_channel_sonar(sensor)]
+    return (sonars[index].sonar, sonars[index].pose) if index < len(sonars) else None
 
 
 def scale_notes(scene: mi.Scene, sonar: Sonar) -> list[str]:
@@ -237,7 +237,7 @@ def scale_notes(scene: mi.Scene, sonar: Sonar) -> list[str]:
     A shape is too large if its smallest extent (floors are flat) exceeds :data:`TOO_LARGE` times the far end of the window.
     A window is too long if it ends beyond :data:`FARTHEST_WINDOW_M`. A scene is too small if it fits into a range bin.
     """
-    do = (
+    advice = (
         'scenes are in metres; where this one is in millimetres, give its shapes <scale value="0.001"/>, or `mitsonar '
         "world mesh` --scale 0.001"
     )
@@ -245,9 +245,11 @@ def scale_notes(scene: mi.Scene, sonar: Sonar) -> list[str]:
         extents = np.ravel(np.array(shape.bbox().extents(), dtype=float))
         if np.isfinite(extents).all() and extents.min() > TOO_LARGE * sonar.range_max:
             size = " x ".join(f"{edge:.3g}" for edge in extents)
-            return [f"shape {shape.id()} is {size} m large, and the window of the sonar ends at {sonar.range_max:g} m: {do}"]
+            return [
+                f"shape {shape.id()} is {size} m large, and the window of the sonar ends at {sonar.range_max:g} m: {advice}"
+            ]
     if sonar.range_max > FARTHEST_WINDOW_M:
-        return [f"the window ends at {sonar.range_max:g} m, farther than imaging sonars reach: {do}"]
+        return [f"the window ends at {sonar.range_max:g} m, farther than imaging sonars reach: {advice}"]
     diagonal = float(np.linalg.norm(np.ravel(np.array(scene.bbox().extents(), dtype=float)))) if scene.shapes() else 0.0
     if 0 < diagonal < sonar.bin_m:
         return [
@@ -422,7 +424,7 @@ def said_by(scene: mi.Scene) -> list[Said]:
     """Return the motion specifications of the shapes of a scene, without reading the files that they name."""
     from mitsonar.plugins.trajectory_texture import MOTION
 
-    found = []
+    specs = []
     for shape in scene.shapes():
         if not shape.has_attribute(MOTION)[0]:
             continue
@@ -430,33 +432,36 @@ def said_by(scene: mi.Scene) -> list[Said]:
         fields = getattr(texture, "fields", None)
         if fields is None:
             raise MitsonarError(f"the texture {MOTION} of {shape.id()} must be a trajectory: see docs/guides/moving.md")
-        found.append(Said(shape.id(), BodyMotion.create(shape.id(), fields), texture.folders))
-    return found
+        specs.append(Said(shape.id(), BodyMotion.create(shape.id(), fields), texture.folders))
+    return specs
 
 
-def read_said(said: Sequence[Said]) -> dict[str, Any]:
+def read_said(specs: Sequence[Said]) -> dict[str, Any]:
     """Read the files that motion specifications name, and return the motions keyed by shape id.
 
     Raises:
         MitsonarError: a file is unreadable; a shape that deforms or follows the vehicle has several motions.
     """
-    found: dict[str, Any] = {}
-    for name, motion, folders in said:
-        one = _loaded_motion(name, motion, folders)
-        if name in found and not (isinstance(one, list) and isinstance(found[name], list)):
-            raise MitsonarError(f"moving: {name} deforms or follows the vehicle, and is in one place: give it one motion")
-        found[name] = found[name] + one if name in found else one
-    return found
+    motions: dict[str, Any] = {}
+    for name, motion, folders in specs:
+        loaded = _loaded_motion(name, motion, folders)
+        if name in motions and not (isinstance(loaded, list) and isinstance(motions[name], list)):
+            raise MitsonarError(f"moving: {name} deforms or follows the vehicle, and can have only one motion: give it one")
+        motions[name] = motions[name] + loaded if name in motions else loaded
+    return motions
 
 
-def digests_of(said: Sequence[Said]) -> dict[str, str]:
+def digests_of(specs: Sequence[Said]) -> dict[str, str]:
     """Return a digest of each shape's motion, over its specification and its files, keyed by shape id."""
-    found: dict[str, str] = {}
-    for name, motion, folders in said:
-        named = [one for one in (motion.path, motion.meshes) if one and one != VEHICLE]
-        parts = [motion.model_dump_json(), *(file_digest(file) for one in named for file in _found(one, folders))]
-        found[name] = digest(found.get(name, "").encode(), *(part.encode() for part in parts))
-    return found
+    digests: dict[str, str] = {}
+    for name, motion, folders in specs:
+        named = [file_name for file_name in (motion.path, motion.meshes) if file_name and file_name != VEHICLE]
+        parts = [
+            motion.model_dump_json(),
+            *(file_digest(file) for file_name in named for file in _files_named(file_name, folders)),
+        ]
+        digests[name] = digest(digests.get(name, "").encode(), *(part.encode() for part in parts))
+    return digests
 
 
 def refuse_motion(scene: mi.Scene, what: str) -> None:
@@ -469,9 +474,9 @@ def refuse_motion(scene: mi.Scene, what: str) -> None:
     Raises:
         MitsonarError: a shape moves.
     """
-    said = said_by(scene)
-    if said:
-        raise MitsonarError(f"{what} are of still scenes: {said[0].name} has a trajectory; take the texture motion out")
+    specs = said_by(scene)
+    if specs:
+        raise MitsonarError(f"{what} need a still scene: {specs[0].name} has a trajectory; remove its texture motion")
 
 
 def refuse_unread_motions(state: mi.parser.ParserState) -> None:
@@ -494,14 +499,14 @@ def refuse_unread_motions(state: mi.parser.ParserState) -> None:
         if node.type == mi.ObjectType.Scene:  # a texture there is only a target of references
             continue
         for name in list(node.props):
-            kind, held = node.props.type(name), node.props[name]
-            inside = kind == kinds.ResolvedReference and held.index() in paths
-            named = kind == kinds.Reference and held.id() in ids
+            kind, value = node.props.type(name), node.props[name]
+            inside = kind == kinds.ResolvedReference and value.index() in paths
+            named = kind == kinds.Reference and value.id() in ids
             if (inside or named) and (name != MOTION or node.type != mi.ObjectType.Shape):
                 shown = "without a name" if name.startswith("_arg_") else f'with name="{name[:80]}"'
                 where = f"{node.props.plugin_name()} {node.props.id()}".strip()
                 raise MitsonarError(
-                    f"the texture trajectory in {where} stands there {shown}: nothing would move; write "
+                    f"the texture trajectory in {where} is given {shown}, so nothing would move: write "
                     f'name="{MOTION}", in a shape'
                 )
 
@@ -525,10 +530,10 @@ def load_meshes(files: Sequence[Path], rate_hz: float, *, loop: bool = True) -> 
     refuse_beyond_memory(len(files) * len(first) * BYTES_A_VERTEX, f"{len(files)} meshes like {files[0]}")
     vertices = np.empty((len(files), *first.shape), np.float32)
     for number, file in enumerate(files):
-        one, own = _mesh(file)
-        if one.shape != first.shape or not np.array_equal(own, faces):
+        positions, triangles = _mesh(file)
+        if positions.shape != first.shape or not np.array_equal(triangles, faces):
             raise MitsonarError(f"{file} has other triangles than {files[0]}: meshes of a body that deforms share them")
-        vertices[number] = one
+        vertices[number] = positions
     return MeshSequence(vertices, rate_hz, loop)
 
 
@@ -546,18 +551,18 @@ def _loaded_motion(name: str, motion: BodyMotion, folders: Sequence[Path]) -> An
     if motion.path == VEHICLE and motion.meshes is None:
         return VEHICLE
     if motion.path == VEHICLE:
-        raise MitsonarError(f"moving: {name} follows the vehicle and deforms: give it a path of its own")
-    files = [] if motion.path is None else _found(motion.path, folders)
+        raise MitsonarError(f"moving: {name} follows the vehicle and deforms: give it a separate path")
+    files = [] if motion.path is None else _files_named(motion.path, folders)
     paths = [Trajectory.load(file, motion.frame, looks_ahead=False) for file in files] or [STAYS]
     if motion.meshes is None:
         return paths
     if len(paths) > 1:
-        raise MitsonarError(f"moving: {name} deforms and has {len(paths)} paths: give each body a shape of its own")
-    return Deforming(paths[0], load_meshes(_found(motion.meshes, folders), motion.rate_hz, loop=motion.loop))
+        raise MitsonarError(f"moving: {name} deforms and has {len(paths)} paths: give each body a separate shape")
+    return Deforming(paths[0], load_meshes(_files_named(motion.meshes, folders), motion.rate_hz, loop=motion.loop))
 
 
-def _found(name: str, folders: Sequence[Path]) -> list[Path]:
-    """Return the files that a name stands for, in the first folder that contains all of them."""
+def _files_named(name: str, folders: Sequence[Path]) -> list[Path]:
+    """Return the files that a name denotes, in the first folder that contains all of them."""
     errors = []
     for folder in folders:
         try:

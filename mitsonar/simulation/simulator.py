@@ -73,17 +73,17 @@ class Simulator:
         from mitsonar.simulation.scene import sonar_in
 
         if sonar is None:
-            found = sonar_in(scene)
-            if found is None:
+            placed = sonar_in(scene)
+            if placed is None:
                 raise MitsonarError(
                     "the scene has no sensor of type imaging_sonar: add one, or name a sonar (--sonar didson300)"
                 )
-            sonar = found[0]
+            sonar = placed[0]
         self.sonar, self.mirrors = sonar, mirrors
         self._given = scene, views, moving, rays_per_launch
         self._build()
         self._watch = SceneWatch(scene, places=bool(self.motion or mirrors))
-        self._stepped, self._gain_from, self._told = 0, "", set[str]()
+        self._stepped, self._gain_from, self._issued = 0, "", set[str]()
         self.gain: float | None = None
 
     def __repr__(self) -> str:
@@ -188,10 +188,10 @@ class Simulator:
         """Describe how a pose lies below the ground or inside an object; empty if it does not, or if bodies move."""
         from mitsonar.simulation.tracing import buried_in
 
-        found = (
+        fault = (
             None if self.motion is not None else buried_in(self.tracer.scene, np.atleast_2d(np.asarray(pose, dtype=float)))
         )
-        return "" if found is None else found.text
+        return "" if fault is None else fault.text
 
     def render(
         self,
@@ -320,31 +320,31 @@ class Simulator:
                 f"a loop keeps its gain, {self.gain:g}: got {gain:g}; leave gain out, or call reset() to begin a new loop"
             )
         number = self._stepped
-        now = number / self.sonar.frame_rate_hz if time_s is None else time_s
-        (pings,) = self.pings(table, first=number, labels=labels, time_s=[now])
+        moment_s = number / self.sonar.frame_rate_hz if time_s is None else time_s
+        (pings,) = self.pings(table, first=number, labels=labels, time_s=[moment_s])
         if self.gain is None and (gain is not None or pings.levels.any()):
             self._gain_from = "set on the first frame with echoes" if gain is None else "as given"
             self.gain = constant_gain([pings])[0] if gain is None else gain
-        kept = 1.0 if self.gain is None else self.gain
+        applied_gain = 1.0 if self.gain is None else self.gain
         self._stepped = number + 1
-        image = to_image(pings.levels, kept, self.sonar)
+        image = to_image(pings.levels, applied_gain, self.sonar)
         self._warn_once(pings, image, table)
         noisy = image if noise is None else noise.apply(image, seed=seed, frames=np.array([number]))
-        labelled = labels_above(pings, kept, label_floor)
-        timed = TimedPath(Trajectory(table, np.array([now])), *moments_of(self.sonar, table, [now], number)[1::-1])
-        return self._frames(noisy, timed, pings.height_m, kept, labelled)
+        labelled = labels_above(pings, applied_gain, label_floor)
+        timed = TimedPath(Trajectory(table, np.array([moment_s])), *moments_of(self.sonar, table, [moment_s], number)[1::-1])
+        return self._frames(noisy, timed, pings.height_m, applied_gain, labelled)
 
     def reset(self) -> None:
         """Begin a new loop: the next :meth:`step` is ping 0, sets a new gain, and may repeat warnings."""
         self._stepped = 0
         self._gain_from, self.gain = "", None
-        self._told.clear()
+        self._issued.clear()
 
     def _warn_once(self, pings: RenderedPings, image: NDArray[np.float32], pose: NDArray[np.float64]) -> None:
         """Issue the warnings of one step, each kind once in a loop."""
         tally = Tally(self.sonar, self._gain_from)
         tally.add(pings, image)
-        found = {note: note for note in self.notes} | tally.findings(self, pose, pings.first, self._told)
-        for kind in [kind for kind in found if kind not in self._told]:
-            self._told.add(kind)
-            warnings.warn(found[kind], MitsonarWarning, stacklevel=3)
+        sentences = {note: note for note in self.notes} | tally.findings(self, pose, pings.first, self._issued)
+        for kind in [kind for kind in sentences if kind not in self._issued]:
+            self._issued.add(kind)
+            warnings.warn(sentences[kind], MitsonarWarning, stacklevel=3)

@@ -89,14 +89,14 @@ class SounderSimulator:
         rate = self.sounder.fan.frame_rate_hz
         time = (first + np.arange(len(table))) / rate if time_s is None else np.asarray(time_s, dtype=float)
         fans = len(self.sounder.channels)
-        together = FEW if self.sounder.fan.model == "coherent" else max(1, self.simulator.model.pings_per_launch // fans)
-        for start in range(0, len(table), together):
-            own = self.sounder.fan_poses(table[start : start + together])
-            now = np.repeat(time[start : start + together], fans)
-            rendered = list(self.simulator.pings(own.reshape(-1, 6), first=(first + start) * fans, time_s=now))
+        batch = FEW if self.sounder.fan.model == "coherent" else max(1, self.simulator.model.pings_per_launch // fans)
+        for start in range(0, len(table), batch):
+            fan_poses = self.sounder.fan_poses(table[start : start + batch])
+            fan_times_s = np.repeat(time[start : start + batch], fans)
+            rendered = list(self.simulator.pings(fan_poses.reshape(-1, 6), first=(first + start) * fans, time_s=fan_times_s))
             levels = np.concatenate([part.levels for part in rendered])
             height_m = np.concatenate([part.height_m for part in rendered])[::fans]
-            yield SoundedPings(first + start, levels.reshape(len(own), fans, *levels.shape[1:]), height_m)
+            yield SoundedPings(first + start, levels.reshape(len(fan_poses), fans, *levels.shape[1:]), height_m)
 
     def detect(self, levels: NDArray[np.float32]) -> Detected:
         """Detect an echo in each beam of levels ``(pings, channels, bins, beams)``; return ``(pings, channels, beams)``."""
@@ -119,8 +119,8 @@ class SounderSimulator:
 
     def soundings(self, flown: Trajectory) -> Soundings:
         """Render all pings and detect an echo in each beam."""
-        found = [self.detect(batch.levels) for batch in self.pings(flown.poses, time_s=flown.time_s)]
-        joined = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        detected = [self.detect(batch.levels) for batch in self.pings(flown.poses, time_s=flown.time_s)]
+        joined = (np.concatenate(parts) for parts in zip(*detected, strict=True))
         return Soundings(flown.time_s, flown.poses, self.sounder, *joined)
 
     def _noise(self) -> NDArray[np.float64]:

@@ -36,7 +36,7 @@ __all__ = [
     "Rays",
     "Tracer",
     "buried_in",
-    "free_way",
+    "free_distance",
     "going_on",
     "half_path_rate",
     "height_below",
@@ -104,8 +104,8 @@ def strip_columns(sonar: Sonar) -> int:
     """Return the columns of a strip: a power of two that divides all columns and makes 16 rays nearly square."""
     across = sonar.beam_width_rad / sonar.across
     down = math.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
-    wanted = 2 ** min(4, max(0, round(math.log2(math.sqrt(16 * down / across)))))
-    return math.gcd(wanted, sonar.columns)
+    columns = 2 ** min(4, max(0, round(math.log2(math.sqrt(16 * down / across)))))
+    return math.gcd(columns, sonar.columns)
 
 
 class Tracer:
@@ -123,7 +123,7 @@ class Tracer:
         self.sonar = sonar
         given = {name: value for name, value in sonar.model_dump(exclude={"name"}).items() if value is not None}
         self.sensor: imaging_sonar_sensor.ImagingSonar = load_dict({"type": "imaging_sonar", **given})
-        self.surfaces = surfaces.Surfaces.of(scene).heard_by(sonar)
+        self.surfaces = surfaces.Surfaces.of(scene).at_frequency_of(sonar)
         self.notes = self.surfaces.notes
 
     def inputs(self, poses: ArrayLike, numbers: Sequence[int]) -> tuple[mi.Float, mi.UInt32, LaunchTables]:
@@ -177,14 +177,14 @@ class Tracer:
 
 def height_below(scene: mi.Scene, place: mi.Point3f) -> DeviceArray:
     """Return the height of points above the surface straight below them [m]; nan where there is none."""
-    found = scene.ray_intersect_preliminary(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
-    return dr.select(found.is_valid(), found.t, dr.nan)
+    intersection = scene.ray_intersect_preliminary(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
+    return dr.select(intersection.is_valid(), intersection.t, dr.nan)
 
 
-def free_way(scene: DeviceArray, ray: mi.Ray3f) -> DeviceArray:
+def free_distance(scene: DeviceArray, ray: mi.Ray3f) -> DeviceArray:
     """Return the distance to the nearest surface along rays [m]; infinite where there is none."""
-    found = scene.ray_intersect_preliminary(ray)
-    return dr.select(found.is_valid(), found.t, dr.inf)
+    intersection = scene.ray_intersect_preliminary(ray)
+    return dr.select(intersection.is_valid(), intersection.t, dr.inf)
 
 
 def hidden(
@@ -242,18 +242,18 @@ class MovingSurfaces(Surfaces):
     @classmethod
     def of_motion(cls, motion: SceneMotion, sonar: Sonar) -> MovingSurfaces:
         """Return the tables of the scene that a motion belongs to, for one sonar's frequency and model."""
-        tables = cls.of(motion.scene, motion.shapes).heard_by(sonar)
+        tables = cls.of(motion.scene, motion.shapes).at_frequency_of(sonar)
         assert isinstance(tables, MovingSurfaces)
         return replace(tables, first_object=motion.first_objects, shape_count=len(motion.shapes), motion=motion)
 
     def arrays(self) -> dict[str, DeviceArray]:
         """Return the tables by name, after updating the normals of meshes that have deformed."""
         deformed = () if self.motion is None else self.motion.deformed
-        now = tuple(one.version for one in deformed)
-        if now != self.versions:
+        versions = tuple(one.version for one in deformed)
+        if versions != self.versions:
             for one in deformed:
                 self.turn_facets(one.mesh)
-            self.versions = now
+            self.versions = versions
         return super().arrays()
 
     def hit(self, scene: mi.Scene | MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
@@ -268,13 +268,13 @@ class MovingSurfaces(Surfaces):
 
     def hit_in_body(self, scene: MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[Hit, DeviceArray]:
         """Trace rays to the nearest surface; return the hit in the axes of its body and the number of the body."""
-        found, body = scene.find(ray, active)
-        hit = self.read(found, scene.carried(ray, body), active)
+        intersection, body = scene.find(ray, active)
+        hit = self.read(intersection, scene.carried(ray, body), active)
         numbered = (body > 0) & (hit.object_id == 0)
         object_id = dr.select(numbered, mi.Float(body) + float(self.first_object), hit.object_id)
         return replace(hit, object_id=object_id), body
 
-    def own_lattice(self, scene: MovingScene, hit: Hit, body: DeviceArray) -> DeviceArray:
+    def scatterer_lattice(self, scene: MovingScene, hit: Hit, body: DeviceArray) -> DeviceArray:
         """Return the scatterer lattice of each hit: the shape's number, or a unique one for further bodies of one shape."""
         number, first = hit.shape_id, 1
         for copies in scene.copies:
@@ -298,7 +298,7 @@ class MovingTracer(Tracer):
 
     def scene_at(self, time_s: ArrayLike) -> MovingScene:
         """Return the scene at the moments of a launch's pings [s]."""
-        return self.motion.at(np.ravel(time_s))
+        return self.motion.scene_at(np.ravel(time_s))
 
     def rays_of(self, rays: Rays, rows: mi.Float, keys: mi.UInt32) -> tuple[mi.Ray3f, Fan]:
         """Return the rays in world coordinates, each carrying the index of its moment as its time, and their fan."""
@@ -320,7 +320,7 @@ def tracer_of(scene: mi.Scene, sonar: Sonar, motion: SceneMotion | None) -> Trac
 
 def surfaces_of(scene: mi.Scene, sonar: Sonar, motion: SceneMotion | None) -> Surfaces:
     """Return the surface tables of a scene for a sonar, with or without moving bodies."""
-    return Surfaces.of(scene).heard_by(sonar) if motion is None else MovingSurfaces.of_motion(motion, sonar)
+    return Surfaces.of(scene).at_frequency_of(sonar) if motion is None else MovingSurfaces.of_motion(motion, sonar)
 
 
 # ---------------- Reflected and scattered rays
@@ -386,8 +386,8 @@ def overlap(sonar: Sonar, apart: DeviceArray) -> DeviceArray:
         sonar: the instrument, with its beam width and pattern.
         apart: difference between the sines of both bearings.
     """
-    ways = 1 if sonar.beam_pattern == "two_way" else 2
-    return dr.exp(dr.square(apart * (1 / sonar.beam_width_rad)) * (-HALF_LOG_2 * ways))
+    lobes = 1 if sonar.beam_pattern == "two_way" else 2
+    return dr.exp(dr.square(apart * (1 / sonar.beam_width_rad)) * (-HALF_LOG_2 * lobes))
 
 
 def half_path_rate(
@@ -422,7 +422,7 @@ class Clearance:
 
     def __init__(self, tracer: Tracer) -> None:
         self.tracer = tracer
-        self._ways = AROUND / np.linalg.norm(AROUND, axis=1, keepdims=True)
+        self._directions = AROUND / np.linalg.norm(AROUND, axis=1, keepdims=True)
         self._launches: dict[int, Callable[..., Any]] = {}
 
     def of(
@@ -443,35 +443,37 @@ class Clearance:
             return np.concatenate([self.of(before[one], after[one], time_s[one]) for one in each])
         # direction of travel; straight down for a vehicle that did not move
         way = after - before
-        gone = np.linalg.norm(way, axis=1)
-        ahead = np.where(gone[:, None] > 0, way / np.maximum(gone, 1e-12)[:, None], (0.0, 0.0, -1.0))
+        travelled = np.linalg.norm(way, axis=1)
+        ahead = np.where(travelled[:, None] > 0, way / np.maximum(travelled, 1e-12)[:, None], (0.0, 0.0, -1.0))
         # 26 rays from where each vehicle is, and one from where it was
-        ways = np.concatenate([np.broadcast_to(self._ways, (count, *self._ways.shape)), ahead[:, None]], axis=1)
-        begin = np.concatenate([np.repeat(after[:, None], len(self._ways), axis=1), before[:, None]], axis=1)
+        directions = np.concatenate(
+            [np.broadcast_to(self._directions, (count, *self._directions.shape)), ahead[:, None]], axis=1
+        )
+        begin = np.concatenate([np.repeat(after[:, None], len(self._directions), axis=1), before[:, None]], axis=1)
         # trace; the launch is recorded once for each number of vehicles
         if count not in self._launches:
             self._launches[count] = Frozen(self._traced)
-        number = mi.Float(np.repeat(np.arange(count), ways.shape[1]).astype(np.float32).tolist())
-        rays = [mi.Float(part.ravel().astype(np.float32).tolist()) for part in (begin, ways)]
+        number = mi.Float(np.repeat(np.arange(count), directions.shape[1]).astype(np.float32).tolist())
+        rays = [mi.Float(part.ravel().astype(np.float32).tolist()) for part in (begin, directions)]
         free = replayed(self._launches[count], self.tracer.scene_at(time_s), number, *rays)
-        distance = np.array(free, dtype=float).reshape(ways.shape[:2])
-        distance[:, -1] -= gone  # the last ray began at the old position
+        distance = np.array(free, dtype=float).reshape(directions.shape[:2])
+        distance[:, -1] -= travelled  # the last ray began at the old position
         return np.asarray(distance.min(axis=1))
 
-    def straight(self, places: NDArray[np.float64], way: tuple[float, float, float]) -> NDArray[np.float64]:
+    def straight(self, places: NDArray[np.float64], direction: tuple[float, float, float]) -> NDArray[np.float64]:
         """Return the distance from positions ``(n, 3)`` to the surface in one direction ``(n,)`` [m], at time 0; or inf."""
         begin = mi.Point3f(*(mi.Float(column.astype(np.float32).tolist()) for column in places.T))
-        found = free_way(self.tracer.scene_at(np.zeros(len(places))), mi.Ray3f(begin, mi.Vector3f(*way)))
-        return np.array(found, dtype=float)
+        distance = free_distance(self.tracer.scene_at(np.zeros(len(places))), mi.Ray3f(begin, mi.Vector3f(*direction)))
+        return np.array(distance, dtype=float)
 
     @staticmethod
-    def _traced(scene: DeviceArray, number: mi.Float, begin: mi.Float, ways: mi.Float) -> DeviceArray:
+    def _traced(scene: DeviceArray, number: mi.Float, begin: mi.Float, directions: mi.Float) -> DeviceArray:
         """Trace the rays of all vehicles; a ray carries the index of its vehicle, which is its moment, as its time."""
-        at = dr.arange(mi.UInt32, dr.width(number))
-        ray = mi.Ray3f(dr.gather(mi.Point3f, begin, at), dr.gather(mi.Vector3f, ways, at))
+        index = dr.arange(mi.UInt32, dr.width(number))
+        ray = mi.Ray3f(dr.gather(mi.Point3f, begin, index), dr.gather(mi.Vector3f, directions, index))
         time: DeviceArray = number
         ray.time = time
-        return free_way(scene, ray)
+        return free_distance(scene, ray)
 
 
 SEA_SURFACE = "surface"
@@ -510,13 +512,13 @@ def buried_in(scene: mi.Scene, poses: NDArray[np.float64]) -> Buried | None:
     # 1. Trace straight up and down from each pose; most often no ray meets the back of a surface.
     places = np.asarray(poses, dtype=float)[:, :3]
     begin = mi.Point3f(*(mi.Float(column.astype(np.float32).tolist()) for column in places.T))
-    above, below = (scene.ray_intersect(mi.Ray3f(begin, mi.Vector3f(0, 0, way))) for way in (1, -1))
+    above, below = (scene.ray_intersect(mi.Ray3f(begin, mi.Vector3f(0, 0, direction))) for direction in (1, -1))
     roofed = np.array(above.is_valid()) & (np.array(above.n)[2] > 0)
     open_below = ~np.array(below.is_valid())
     if not roofed.any():
         return None
     # 2. Identify the shapes met, by their numbers in the registry of Dr.Jit.
-    shapes = [dr.reinterpret_array(mi.UInt32, found.shape) for found in (above, below)]
+    shapes = [dr.reinterpret_array(mi.UInt32, hit.shape) for hit in (above, below)]
     names = {
         number: shape.id()
         for shape in scene.shapes()
@@ -526,18 +528,18 @@ def buried_in(scene: mi.Scene, poses: NDArray[np.float64]) -> Buried | None:
     # 3. A back above means buried if nothing, or the back of the same shape, lies below; the sea surface does not count.
     wet = np.array([names.get(int(number), "") == SEA_SURFACE for number in up])
     inside = (up == down) & ~open_below & (np.array(below.n)[2] < 0)
-    wrong = np.flatnonzero(roofed & ~wet & (open_below | inside))
-    if not len(wrong):
+    buried = np.flatnonzero(roofed & ~wet & (open_below | inside))
+    if not len(buried):
         return None
     # 4. Describe the first of them.
-    first = int(wrong[0])
+    first = int(buried[0])
     x, y, z = places[first]
     where, name = f"at ({x:g}, {y:g}, {z:g}) m", names.get(int(up[first]), "")
     if inside[first]:
         return Buried(
-            first, len(wrong), inside=True, text=f"{where} is inside {f'the shape {name}' if name else 'an object'}"
+            first, len(buried), inside=True, text=f"{where} is inside {f'the shape {name}' if name else 'an object'}"
         )
     depth = float(np.array(above.t)[first])
     ground = f"the ground, the shape {name}," if name else "the ground"
     text = f"{where} is {depth:.3g} m below {ground} at z = {z + depth:.3g} m (z points up)"
-    return Buried(first, len(wrong), text, inside=False)
+    return Buried(first, len(buried), text, inside=False)

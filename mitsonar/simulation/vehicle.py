@@ -39,10 +39,10 @@ __all__ = [
     "VehicleFile",
     "VehicleSimulator",
     "camera_of",
+    "camera_settings",
     "load_vehicle",
     "refuse_path",
     "sensors_in",
-    "told_of",
 ]
 
 
@@ -113,13 +113,14 @@ class VehicleSimulator:
         Raises:
             MitsonarError: a body moves, but a sensor supports still scenes only.
         """
-        found = MovingBodies.of(self.moving, vehicle=vehicle)
-        listens = [name for name, one in self.sensors(vehicle).items() if isinstance(one.instrument, ChannelSonar)]
-        if len(found) and listens:
+        bodies = MovingBodies.of(self.moving, vehicle=vehicle)
+        channel_sonars = [name for name, one in self.sensors(vehicle).items() if isinstance(one.instrument, ChannelSonar)]
+        if len(bodies) and channel_sonars:
             raise MitsonarError(
-                f"impulse responses are of still scenes: {found.shapes[0]} moves and {listens[0]} listens; leave one out"
+                f"impulse responses need a still scene: {bodies.shapes[0]} moves, and {channel_sonars[0]} is a channel "
+                "sonar; remove one of them"
             )
-        return found
+        return bodies
 
     def render(self, vehicle: Trajectory, *, labels: bool = False) -> dict[str, Record]:
         """Render all sensors into memory; return frames, soundings, responses or pictures, keyed by sensor name.
@@ -176,12 +177,12 @@ def sensors_in(scene: mi.Scene, vehicle: Pose) -> dict[str, Mounted]:
     from mitsonar.plugins.channel_sonar_sensor import is_channel_sonar
     from mitsonar.plugins.imaging_sonar_sensor import is_imaging_sonar
 
-    found: dict[str, Mounted] = {}
+    sensors: dict[str, Mounted] = {}
     for number, sensor in enumerate(scene.sensors()):
         name = sensor.id() or f"sensor{number}"
         check_sensor_name(name)
-        if name in found:
-            raise MitsonarError(f"two sensors of the scene have the id {name}: give each its own")
+        if name in sensors:
+            raise MitsonarError(f"two sensors of the scene have the id {name}: give them different ids")
         place = pose_from_to_world(np.array(sensor.world_transform().matrix, dtype=float).reshape(4, 4))
         away = math.dist(place[:3], vehicle[:3])
         if away > FARTHEST_M:
@@ -189,12 +190,12 @@ def sensors_in(scene: mi.Scene, vehicle: Pose) -> dict[str, Mounted]:
                 f"the sensor {name} is {away:.3g} m from the path's first pose: the scene must show the vehicle there; move "
                 "the sensors, or the path"
             )
-        own: Any = sensor
+        untyped: Any = sensor
         sonar = is_imaging_sonar(sensor) or is_channel_sonar(sensor)
-        found[name] = Mounted(own.sonar if sonar else sensor, mount_between(vehicle, place))
-    if not found:
+        sensors[name] = Mounted(untyped.sonar if sonar else sensor, mount_between(vehicle, place))
+    if not sensors:
         raise MitsonarError("the scene has no sensors: add some, or give a vehicle's file")
-    return found
+    return sensors
 
 
 def load_vehicle(file: str | Path) -> VehicleFile:
@@ -241,7 +242,7 @@ PATH_DEPTH = 8
 def camera_of(fov_deg: float, width: int, height: int, samples: int) -> mi.Sensor:
     """Create a Mitsuba pinhole camera; ``fov_deg`` is the horizontal field of view."""
     pixel = "luminance" if "mono" in str(mi.variant()) else "rgb"
-    made = load_dict(
+    camera = load_dict(
         {
             "type": "perspective",
             "fov": fov_deg,
@@ -251,8 +252,8 @@ def camera_of(fov_deg: float, width: int, height: int, samples: int) -> mi.Senso
             "sampler": {"type": "independent", "sample_count": samples},
         }
     )
-    assert isinstance(made, mi.Sensor)
-    return made
+    assert isinstance(camera, mi.Sensor)
+    return camera
 
 
 class CameraSimulator:
@@ -276,9 +277,9 @@ class CameraSimulator:
         self.camera, self._given = camera, (scene, moving)
         self._watch = SceneWatch(scene)
         self._build()
-        own = scene.integrator()
-        sees = own is not None and not type(own).__module__.startswith("mitsonar")
-        self.integrator = own if sees else load_dict({"type": "path", "max_depth": PATH_DEPTH})
+        integrator = scene.integrator()
+        for_cameras = integrator is not None and not type(integrator).__module__.startswith("mitsonar")
+        self.integrator = integrator if for_cameras else load_dict({"type": "path", "max_depth": PATH_DEPTH})
         self.samples = int(camera.sampler().sample_count())
 
     def _build(self) -> None:
@@ -301,9 +302,9 @@ class CameraSimulator:
         grey = "mono" in str(mi.variant())
         place = mi.Transform4f(self.camera.world_transform().matrix)
         try:
-            for number, (pose, now) in enumerate(zip(table, time, strict=True), first):
+            for number, (pose, moment_s) in enumerate(zip(table, time, strict=True), first):
                 if self.motion is not None:
-                    _place(self.scene, self.motion, float(now))
+                    _place(self.scene, self.motion, float(moment_s))
                 _turn(self.camera, mi.Transform4f(to_world_matrices(pose)[0].tolist()))
                 picture = self._picture(number)
                 yield picture[..., 0] if grey and picture.ndim == 3 else picture
@@ -317,11 +318,11 @@ class CameraSimulator:
         return np.array(module.util.convert_to_bitmap(film))
 
 
-def told_of(camera: mi.Sensor) -> dict[str, str]:
+def camera_settings(camera: mi.Sensor) -> dict[str, str]:
     """Return the parameters and the type of a camera as strings, without its pose."""
     values: Any = mi.traverse(camera)
-    told = {name: str(values[name]) for name in values.keys() if not name.endswith("to_world")}  # noqa: SIM118  no dict
-    return told | {"type": type(camera).__name__}
+    settings = {name: str(values[name]) for name in values.keys() if not name.endswith("to_world")}  # noqa: SIM118  no dict
+    return settings | {"type": type(camera).__name__}
 
 
 def _turn(camera: mi.Sensor, to_world: mi.Transform4f) -> None:
@@ -346,11 +347,11 @@ def _with_instances(scene: mi.Scene, motion: SceneMotion) -> mi.Scene:
         group = {"type": "ref", "id": f"group{motion.numbers[name]}"}
         parts[f"body{body}"] = {"type": "instance", "group": group}
     names = [shape.id() for shape in motion.shapes]
-    made = load_dict(parts, optimize=False)
+    instanced = load_dict(parts, optimize=False)
     for shape, name in zip(motion.shapes, names, strict=True):
         shape.set_id(name)  # restore the id, which the loader changes
-    assert isinstance(made, mi.Scene)
-    return made
+    assert isinstance(instanced, mi.Scene)
+    return instanced
 
 
 def _place(scene: mi.Scene, motion: SceneMotion, time_s: float) -> None:

@@ -47,7 +47,7 @@ def reflectivity(loaded: mi.Scene, ray: mi.Ray3f, sonar: Sonar | None = SONAR) -
     from mitsonar.plugins.surfaces import Surfaces
 
     tables = Surfaces.of(loaded)
-    hit = (tables if sonar is None else tables.heard_by(sonar)).hit(loaded, ray)
+    hit = (tables if sonar is None else tables.at_frequency_of(sonar)).hit(loaded, ray)
     assert np.array(hit.valid).all()
     return np.array(hit.reflectivity)
 
@@ -182,7 +182,7 @@ def test_materials_and_other_surfaces_side_by_side() -> None:
     wrapped = {"type": "twosided", "inner": made_of("sand", reflectance=0.2)}
     bsdfs = {"a": made_of("steel"), "b": diffuse(0.3), "c": made_of("sand"), "d": wrapped, "e": made_of("steel")}
     loaded = scene(**{name: {**at(k), "bsdf": bsdf} for k, (name, bsdf) in enumerate(bsdfs.items())})
-    tables = Surfaces.of(loaded).heard_by(SONAR)
+    tables = Surfaces.of(loaded).at_frequency_of(SONAR)
     assert not tables.notes or all("extrapolated" in note for note in tables.notes)
     hit = tables.hit(loaded, mi.Ray3f(mi.Point3f(3 * dr.arange(mi.Float, 6), 0.1, 5), mi.Vector3f(0.01, 0, -1)))
     numbers = np.array(hit.material)[:5].tolist()
@@ -199,7 +199,7 @@ def test_a_scene_without_materials_gathers_nothing() -> None:
     from mitsonar.plugins.surfaces import Surfaces
 
     tables = Surfaces.of(scene(floor=floor()))
-    assert tables.heard_by(SONAR) is tables
+    assert tables.at_frequency_of(SONAR) is tables
     assert not tables.lawful
 
 

@@ -156,7 +156,7 @@ def test_defaults_of_the_sensor_are_the_thesis() -> None:
         ('<float name="frequency_step_hz" value="20"/>', "frequency_step_hz must be below"),
         ('<float name="fronts_across_deg" value="3"/>', "did you mean front_across_deg"),
         ('<float name="carier_hz" value="3"/>', "did you mean carrier_hz"),
-        ('<string name="receivers" value="front right"/>', "with commas between them"),
+        ('<string name="receivers" value="front right"/>', "separated by commas"),
         ('<string name="receivers" value="keel"/><float name="keel_heading_deg" value="3"/>', "give keel_position "),
         ('<string name="front_position" value="0, ahead, 0"/>', "front_position is a point"),
     ],

@@ -186,6 +186,6 @@ def test_bright_surfaces_are_told() -> None:
     notes = Simulator(loaded, SONAR.replace(bounces=2)).notes
     assert any("above 1/pi" in note and "ground" in note for note in notes)
     merged = scene(ground=floor(diffuse(0.5)), wall=plate((0, 9, 0), (0, -1, 0), half=1.0, bsdf=diffuse(0.5)))
-    assert any("by way of shape number 0 are" in note for note in Simulator(merged, SONAR.replace(bounces=2)).notes)
+    assert any("via shape number 0 are" in note for note in Simulator(merged, SONAR.replace(bounces=2)).notes)
     assert not any("above 1/pi" in note for note in Simulator(loaded, SONAR).notes)
     assert not any("above 1/pi" in n for n in Simulator(scene(ground=floor(diffuse(0.3))), SONAR.replace(bounces=2)).notes)

@@ -112,5 +112,5 @@ def test_what_has_no_portions_is_refused() -> None:
         list(simulator(loaded, ["q1"]).render_views(pose_at()[None], labels=True))
     from mitsonar.simulation.models.coherent import CoherentImager
 
-    with pytest.raises(MitsonarError, match="mirrors are of whole views: got q1"):
+    with pytest.raises(MitsonarError, match="mirrors need the whole view: got q1"):
         CoherentImager(loaded, SONAR, {"floor": (0.5, 0.001)}, [Segment(SONAR, "q1")])

@@ -37,7 +37,7 @@ def test_sums_on_the_device_are_those_of_the_host() -> None:
     turn, strength = rng.uniform(-np.pi, np.pi, 5000), rng.normal(size=(5000, 2)) @ np.array([1, 1j])
     k = np.arange(-360, 361)
     direct = np.exp(-1j * np.outer(k, turn)) @ strength
-    assert np.abs(beams._on_the_device(turn, strength, 721) - direct).max() < 1e-7 * np.abs(direct).max()
+    assert np.abs(beams._sums_on_device(turn, strength, 721) - direct).max() < 1e-7 * np.abs(direct).max()
 
 
 def test_response_is_the_sum_of_pulses_and_nothing_wraps() -> None:

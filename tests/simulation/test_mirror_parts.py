@@ -155,7 +155,7 @@ def test_coarse_cells_are_warned_of() -> None:
     mirrors = mirror_of(source.scene, {"ball": (1.0, 0.0)})
     assert mirrors is not None
     coarse = MirrorTracer(source.scene, SONAR, source.former, mirrors, finest=1)
-    with pytest.warns(MitsonarWarning, match=r"half the Fresnel radius.*[\d,]+ rays would do"):
+    with pytest.warns(MitsonarWarning, match=r"half the Fresnel radius.*[\d,]+ rays are needed"):
         coarse.field(STILL)
     with warnings.catch_warnings():  # said once
         warnings.simplefilter("error")

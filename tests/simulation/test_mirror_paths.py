@@ -269,7 +269,7 @@ def test_mirrors_that_do_not_fit_are_refused() -> None:
         ChannelSimulator(guide(), ChannelSonar(model="rays"), mirrors=GUIDE)
     with pytest.raises(MitsonarError, match="bounces"):
         ChannelSonar().replace(bounces=4)
-    with pytest.raises(MitsonarError, match="no path goes by 'surfice'"):
+    with pytest.raises(MitsonarError, match="no kind of path is named 'surfice'"):
         ChannelSimulator(guide(), instrument(), mirrors=GUIDE).paths(SENT_FROM).by("surfice")
 
 
@@ -295,5 +295,5 @@ def test_mirrors_of_materials_where_there_are_none_are_told() -> None:
     assert not any("no mirrors" in note for note in ChannelSimulator(guide(), instrument(), mirrors=GUIDE).notes)
     (note,) = ChannelSimulator(guide(half=5.0), instrument(bounces=1), mirrors="materials").notes
     assert "the scene has no mirrors: no shape has an acoustic_material with reflection and roughness_m" in note
-    with pytest.raises(MitsonarError, match="mirrors are parts by the ids of the shapes, or `materials`: got 5"):
+    with pytest.raises(MitsonarError, match="mirrors must be mirror parts keyed by shape id, or `materials`: got 5"):
         ChannelSimulator(guide(), instrument(), mirrors=5)  # type: ignore[arg-type]

@@ -80,7 +80,7 @@ def test_what_is_no_plane_with_waves_makes_no_ghosts(tmp_path: Path) -> None:
     found = mirrors_of(scene)
     assert found.means == []
     assert found.notes_on(1) == []
-    assert found.notes_on(2) == ["the mirror surface is no plane with waves: it reflects once and makes no ghosts"]
+    assert found.notes_on(2) == ["the mirror surface is not a plane with waves: it reflects once and makes no ghosts"]
     made = ChannelSimulator(scene, instrument(bounces=3), mirrors={"surface": (-1.0, 0.0)})
     assert made.ways == ("scatterer", "surface")
 

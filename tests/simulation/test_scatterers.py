@@ -63,7 +63,7 @@ def test_a_field_of_view_selects_all_that_it_receives() -> None:
         made = simulator(sonar, floor=cells_floor(), body=box((3, 4, 1), (1, 1, 1)))
         pose = np.array([1.0, -2.0, 6.0, 0.2, -0.1, 0.7])
         stored = scatterers_of(made)
-        asked = made.tracer.asked(pose, 0)
+        asked = made.tracer.candidates(pose, 0)
         from mitsonar.motion.pose import vehicle_rotation
 
         way = stored.place - pose[:3]

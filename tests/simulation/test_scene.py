@@ -99,9 +99,9 @@ PATH = '<texture type="trajectory" {}><string name="filename" value="fish.tum"/>
 @pytest.mark.parametrize(
     ("shape", "said"),
     [
-        (PATH.format('name="moton"'), 'in sphere fish stands there with name="moton": nothing would move'),
-        (PATH.format(""), "stands there without a name"),
-        ('<ref id="way" name="moton"/>', 'stands there with name="moton"'),
+        (PATH.format('name="moton"'), 'in sphere fish is given with name="moton", so nothing would move'),
+        (PATH.format(""), "is given without a name"),
+        ('<ref id="way" name="moton"/>', 'is given with name="moton"'),
         (f'<bsdf type="diffuse">{PATH.format("")}</bsdf>', 'write name="motion", in a shape'),
         (PATH.format('name="motion"'), ""),
         ('<ref id="way" name="motion"/>', ""),

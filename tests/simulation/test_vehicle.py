@@ -77,7 +77,7 @@ def test_each_sensor_sees_what_it_would_alone(tank: Path) -> None:
 def test_hydrophones_and_bodies_that_move_are_refused(tank: Path) -> None:
     tank.write_text(re.sub("<texture.*?</texture>", "", SCENE))  # only what is given says that it moves
     sensors = {"ear": Mounted(ChannelSonar())}
-    with pytest.raises(MitsonarError, match=r"still scenes: fish moves and ear listens; leave one out"):
+    with pytest.raises(MitsonarError, match=r"still scene: fish moves, and ear is a channel sonar; remove one of them"):
         VehicleSimulator(load_scene(tank), sensors, moving={"fish": FISH}).render(PATH)
 
 

@@ -185,27 +185,27 @@ class CoherentImager:
 
     def in_views(self, pings: RenderedPings) -> list[RenderedPings]:
         """Split pings of all :attr:`sides` ``(pings, bins, sides * beams)`` into one part for each view."""
-        found = []
+        parts = []
         for view in self.views:
             first = self.sides.index(side_of(view)) * self.sonar.beams
-            own = view.beams if isinstance(view, Segment) else slice(0, self.sonar.beams)
-            found.append(replace(pings, levels=pings.levels[:, :, first + own.start : first + own.stop]))
-        return found
+            beams = view.beams if isinstance(view, Segment) else slice(0, self.sonar.beams)
+            parts.append(replace(pings, levels=pings.levels[:, :, first + beams.start : first + beams.stop]))
+        return parts
 
     def levels(
         self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0
     ) -> tuple[NDArray[np.float32], Counts, CutRays]:
         """Return the levels of one ping after gain ``(bins, sides * beams)`` float32, its ray counts, and its cut rays."""
-        image, found = self.image(pose, ping, time_s)
+        image, counts = self.image(pose, ping, time_s)
         power = image.real * image.real + image.imag * image.imag
-        rays = (np.array([[number]]) for number in (found.inside, found.nearer, found.farther, found.missed))
-        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), self._cut_rays(found)
+        rays = (np.array([[number]]) for number in (counts.inside, counts.nearer, counts.farther, counts.missed))
+        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), self._cut_rays(counts)
 
-    def _cut_rays(self, found: FieldCounts) -> CutRays:
+    def _cut_rays(self, counts: FieldCounts) -> CutRays:
         """Return the rays that missed points, if they are numerous enough to affect the image."""
-        if found.cut <= MOST_CUT * found.inside:
+        if counts.cut <= MOST_CUT * counts.inside:
             return CutRays()
-        return CutRays(found.cut, self.tracer.pitch * math.sqrt(1.1 * found.widest / MOST_CANDIDATES))
+        return CutRays(counts.cut, self.tracer.pitch * math.sqrt(1.1 * counts.widest / MOST_CANDIDATES))
 
     @cached_property
     def gain(self) -> NDArray[np.float32]:
@@ -222,13 +222,13 @@ def point_notes(sonar: Sonar) -> list[str]:
     """Return a warning if points are too sparse for speckle: a resolution cell should hold :data:`FEWEST_A_CELL`."""
     pitch = point_pitch(sonar)
     nearest = max(sonar.range_min, sonar.bin_m)
-    held = nearest * sonar.beam_width_rad * sonar.resolution_m / pitch**2
+    points = nearest * sonar.beam_width_rad * sonar.resolution_m / pitch**2
     needed = math.sqrt(nearest * sonar.beam_width_rad * sonar.resolution_m / FEWEST_A_CELL)
     enough = FEWEST_A_CELL * pitch**2 / (sonar.beam_width_rad * sonar.resolution_m)
-    if held >= FEWEST_A_CELL or (sonar.scatterer_spacing_m is None and enough <= sonar.range_max / 2):
+    if points >= FEWEST_A_CELL or (sonar.scatterer_spacing_m is None and enough <= sonar.range_max / 2):
         return []
     return [
-        f"a resolution cell holds {held:.2g} points at {nearest:g} m, {FEWEST_A_CELL:g} from {enough:.3g} m on: below, "
+        f"a resolution cell holds {points:.2g} points at {nearest:g} m, {FEWEST_A_CELL:g} from {enough:.3g} m on: below, "
         f"intensities vary more than speckle does; a scatterer_spacing_m of {needed:.2g} m would do everywhere"
     ]
 
@@ -246,7 +246,7 @@ def check_views(views: Sequence[View], mirrors: Mirroring) -> Sequence[View]:
                 "side or quadrants, or use the model physical"
             )
         if mirrors and side_of(view):
-            raise MitsonarError(f"mirrors are of whole views: got {view.name}; leave mirrors out, or render the whole view")
+            raise MitsonarError(f"mirrors need the whole view: got {view.name}; leave mirrors out, or render the whole view")
     return views
 
 

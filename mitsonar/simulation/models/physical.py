@@ -151,31 +151,31 @@ class ExpectedFormer:
     sonar: Sonar
 
     @cached_property
-    def beams_beside(self) -> int:
+    def extra_beams(self) -> int:
         """Return the number of boxes traced beside the fan, on each side."""
         sonar = self.sonar
         edge = math.radians(sonar.azimuth_fov_deg) / 2
         if sonar.beam_layout == "sine":
-            wanted = side_lobes(sonar.aperture) / (2 * math.sin(edge) / sonar.beams)
+            needed = side_lobes(sonar.aperture) / (2 * math.sin(edge) / sonar.beams)
             most = (1 / math.sin(edge) - 1) / 2 * sonar.beams
         else:
-            wanted = side_lobes(sonar.aperture) / sonar.beam_spacing_rad
+            needed = side_lobes(sonar.aperture) / sonar.beam_spacing_rad
             most = (math.pi / 2 / edge - 1) / 2 * sonar.beams
-        return max(0, math.floor(min(math.ceil(wanted), most)))
+        return max(0, math.floor(min(math.ceil(needed), most)))
 
     @cached_property
-    def bins_beside(self) -> tuple[int, int]:
+    def extra_bins(self) -> tuple[int, int]:
         """Return the numbers of bins traced before the window and after it."""
-        wanted = math.ceil(PULSE_LENGTHS / 2 * self.sonar.resolution_m / self.sonar.bin_m)
-        return min(wanted, math.floor(self.sonar.range_min / self.sonar.bin_m)), wanted
+        needed = math.ceil(PULSE_LENGTHS / 2 * self.sonar.resolution_m / self.sonar.bin_m)
+        return min(needed, math.floor(self.sonar.range_min / self.sonar.bin_m)), needed
 
     @cached_property
     def traced(self) -> Sonar:
         """Return the sonar whose hard-edged boxes are traced: its fan and window include the boxes and bins beside them."""
         # 1. Fan: as many boxes of the same width more, on both sides.
-        sonar, beside = self.sonar, self.beams_beside
-        before, after = self.bins_beside
-        beams = sonar.beams + 2 * beside
+        sonar, extra = self.sonar, self.extra_beams
+        before, after = self.extra_bins
+        beams = sonar.beams + 2 * extra
         if sonar.beam_layout == "sine":
             part = math.sin(math.radians(sonar.azimuth_fov_deg) / 2) * beams / sonar.beams
             fov = 2 * math.degrees(math.asin(min(1.0, part)))
@@ -220,12 +220,12 @@ class ExpectedFormer:
         # 1. Mean squared pulse over a traced bin, for every possible distance in bins.
         sonar, bins, pulse = self.sonar, self.traced.range_bins, Pulse(self.sonar.resolution_m)
         share = (np.arange(PARTS) + 0.5) / PARTS - 0.5
-        apart = np.arange(sonar.range_bins + bins - 1) - (bins - 1) + self.bins_beside[0]
+        apart = np.arange(sonar.range_bins + bins - 1) - (bins - 1) + self.extra_bins[0]
         row = (pulse.shape((apart[:, None] - share) * sonar.bin_m) ** 2).mean(axis=1) * sonar.bin_m / pulse.equivalent_m
         # 2. Arrange the row as a matrix, and scale each bin by its losses and gain.
         power = row[np.arange(sonar.range_bins)[:, None] + np.arange(bins)[::-1]]
-        kept = loss_of(sonar) * undone_absorption(sonar)
-        return np.asarray(power * kept[:, None], dtype=np.float32)
+        factor = loss_of(sonar) * undone_absorption(sonar)
+        return np.asarray(power * factor[:, None], dtype=np.float32)
 
     def levels(self, boxes: NDArray[np.float32]) -> NDArray[np.float32]:
         """Compute the levels ``(pings, bins, beams)`` from those of the traced boxes."""
@@ -233,8 +233,8 @@ class ExpectedFormer:
 
     def crop(self, boxes: NDArray[Any]) -> NDArray[Any]:
         """Crop values of the traced boxes to the bins and beams of the sonar."""
-        before, beside = self.bins_beside[0], self.beams_beside
-        return boxes[:, before : before + self.sonar.range_bins, beside : beside + self.sonar.beams]
+        before, extra = self.extra_bins[0], self.extra_beams
+        return boxes[:, before : before + self.sonar.range_bins, extra : extra + self.sonar.beams]
 
     def formed(self, pings: RenderedPings) -> RenderedPings:
         """Spread the levels of traced boxes over beams and pulse; the labels remain those of the boxes."""
@@ -264,8 +264,8 @@ class BounceSums:
 
     def __init__(self, scene: mi.Scene, sonar: Sonar, traced: Sonar, mirroring: Mirroring) -> None:
         self.sonar, self.traced, self.tracer = sonar, traced, WholeTracer(Whole(traced))
-        found = mirror_of(scene, mirroring)
-        if found is not None and sonar.frequency_hz is None and (found.roughness_m * (found.reflection != 0)).any():
+        parts = mirror_of(scene, mirroring)
+        if parts is not None and sonar.frequency_hz is None and (parts.roughness_m * (parts.reflection != 0)).any():
             raise MitsonarError(
                 "what a rough mirror loses depends on the carrier: got a rms height and no frequency_hz; give frequency_hz"
             )
@@ -274,11 +274,11 @@ class BounceSums:
         # the last surface may be near and the path long: R^g / nearest^2 against the R^(g - 2) of one reflection
         spread = max(1.0, traced.range_max / self.nearest) ** min(traced.gain_exponent, 2)
         self.tracer.bits = fraction_bits(traced, traced.rays, MOST_OF_A_RAY * spread)
-        self.second = SecondMirrors.of(scene, found, self.wavenumber) if sonar.bounces > 2 else None
+        self.second = SecondMirrors.of(scene, parts, self.wavenumber) if sonar.bounces > 2 else None
         self.mirrors: LaunchTables | None = None
-        if found is not None:
+        if parts is not None:
             lawless = [float(shape.bsdf() is None or material_of(shape) is None) for shape in scene.shapes()]
-            self.mirrors = {"parts": found.table(), "lawless": mi.Float([*lawless, 0.0])}
+            self.mirrors = {"parts": parts.table(), "lawless": mi.Float([*lawless, 0.0])}
             dr.eval(self.mirrors)
 
     def scattered(self, echoes: Echoes, mirrors: LaunchTables | None) -> tuple[Echoes, DeviceArray]:
@@ -290,8 +290,8 @@ class BounceSums:
         pair = dr.gather(mi.Vector2f, mirrors["parts"], place, known)
         share = smooth_share(pair.y, echoes.cosine, self.wavenumber)
         taken = (pair.x != 0) & (dr.gather(mi.Float, mirrors["lawless"], place, known) > 0)
-        kept = dr.select(taken, echoes.reflectivity * (1 - dr.square(share)), echoes.reflectivity)
-        return replace(echoes, reflectivity=kept), pair.x * share
+        reflectivity = dr.select(taken, echoes.reflectivity * (1 - dr.square(share)), echoes.reflectivity)
+        return replace(echoes, reflectivity=reflectivity), pair.x * share
 
     def sums(
         self,
@@ -341,12 +341,12 @@ class BounceSums:
         walk = Walk(scene, surfaces, table, self.sonar.bounces, self.wavenumber, origin, *cell, moment, self.second)
         sums: mi.UInt64 | None = None
         for arrival in walk.arrivals(begin, rays.ray, keys):
-            for heard in self._heard(arrival, echoes, fan, lines, rays):
-                sums = accumulate(heard, rays.ping, pings, self.tracer, sums, counted=False)
+            for received in self._receive(arrival, echoes, fan, lines, rays):
+                sums = accumulate(received, rays.ping, pings, self.tracer, sums, counted=False)
         assert sums is not None
         return sums
 
-    def _heard(self, arrival: Arrival, echoes: Echoes, fan: Fan, lines: list[mi.Vector4f], rays: Rays) -> list[ViewEchoes]:
+    def _receive(self, arrival: Arrival, echoes: Echoes, fan: Fan, lines: list[mi.Vector4f], rays: Rays) -> list[ViewEchoes]:
         """Return the arrivals in the beams that receive them: a path, and its reverse if that is to be added too."""
         sonar, traced = self.sonar, self.traced
         level = self._levels(arrival, echoes)
@@ -356,24 +356,27 @@ class BounceSums:
             return [ViewEchoes(_scaled(level, gain), rays.beam, arrival.active, fan.elevation)]
         # 2. angles of both ends; the other end must lie in the view, too
         bearing, elevation = self._angles(fan.d, lines)
-        other, lift = self._angles(arrival.toward, lines)
-        at, inside = beam_at(traced, other)
-        high: DeviceArray = dr.abs(lift)
+        end_bearing, end_elevation = self._angles(arrival.toward, lines)
+        end_beam, inside = beam_at(traced, end_bearing)
+        high: DeviceArray = dr.abs(end_elevation)
         active = arrival.active & inside & (high <= math.radians(traced.elevation_fov_deg) / 2)
-        there, back = dr.square(self._vertical(elevation, lift)), dr.square(self._vertical(lift, elevation))
+        there, back = (
+            dr.square(self._vertical(elevation, end_elevation)),
+            dr.square(self._vertical(end_elevation, elevation)),
+        )
         # 3. two-way pattern: the beams between both ends receive the path and its reverse in phase
         if sonar.beam_pattern == "two_way":
-            part = dr.square(overlap(sonar, dr.sin(bearing) - dr.sin(other))) * dr.select(arrival.reverse, 4.0, 2.0)
-            middle, known = beam_at(traced, (bearing + other) * 0.5)
+            part = dr.square(overlap(sonar, dr.sin(bearing) - dr.sin(end_bearing))) * dr.select(arrival.reverse, 4.0, 2.0)
+            middle, known = beam_at(traced, (bearing + end_bearing) * 0.5)
             return [ViewEchoes(_scaled(level, there * part), middle, active & known, fan.elevation)]
         # 4. otherwise each end receives one of them; they add coherently as far as the beams overlap
         if sonar.beam_pattern == "box":
-            together = dr.select(at == rays.beam, 2.0, 1.0)
+            coherence = dr.select(end_beam == rays.beam, 2.0, 1.0)
         else:
-            together = 1 + overlap(sonar, dr.sin(bearing) - dr.sin(other))
-        found = [ViewEchoes(_scaled(level, there * together), rays.beam, active, fan.elevation)]
-        found += [ViewEchoes(_scaled(level, back * together), at, active & arrival.reverse, fan.elevation)]
-        return found
+            coherence = 1 + overlap(sonar, dr.sin(bearing) - dr.sin(end_bearing))
+        received = [ViewEchoes(_scaled(level, there * coherence), rays.beam, active, fan.elevation)]
+        received += [ViewEchoes(_scaled(level, back * coherence), end_beam, active & arrival.reverse, fan.elevation)]
+        return received
 
     def _levels(self, arrival: Arrival, echoes: Echoes) -> Echoes:
         """Return arrivals as echoes from which :func:`mitsonar.acoustics.levels.level` computes their level."""

@@ -109,18 +109,18 @@ class ThesisModel:
         # 2. Run it. The scene comes first: it deforms bodies, and the inputs include their normals.
         scene = tracer.scene_at(time_s)
         inputs = tracer.inputs(poses, numbers)
-        tables = [own.tables(poses) for own in self.launch.view_tracers]
-        height, made = replayed(launch, rays, scene, *inputs, tables, self.launch.mirrors)
+        tables = [view_tracer.tables(poses) for view_tracer in self.launch.view_tracers]
+        height, images = replayed(launch, rays, scene, *inputs, tables, self.launch.mirrors)
         height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, tracer.sonar.ping_groups // 2]
         # 3. Copy levels, counts and labels of each view to NumPy.
-        found = []
-        for view, (image, counters, truth, single) in zip(self.views, made, strict=True):
+        rendered = []
+        for view, (image, counters, truth, single) in zip(self.views, images, strict=True):
             pings = RenderedPings(numbers[0], *fetch(image, counters, len(poses), view), height_m)
             if labels:
                 pings.expected = None if single is None else fetch(single, counters, len(poses), view)[0]
                 pings.labels = labels_of(pings, truth, tracer.sonar.rays)
-            found.append(pings)
-        return found
+            rendered.append(pings)
+        return rendered
 
 
 @dataclass(frozen=True)
@@ -168,10 +168,13 @@ class ImageLaunch:
             # 3. Sum the echoes of each view, and find the strongest ray of each cell for labels.
             weighted = self.weighted(fan, echoes)
             seen = [
-                own.view_echoes(scene, rays, fan, weighted, table)
-                for own, table in zip(self.view_tracers, tables, strict=True)
+                view_tracer.view_echoes(scene, rays, fan, weighted, table)
+                for view_tracer, table in zip(self.view_tracers, tables, strict=True)
             ]
-            sums = [accumulate(one, rays.ping, pings, own) for one, own in zip(seen, self.view_tracers, strict=True)]
+            sums = [
+                accumulate(one, rays.ping, pings, view_tracer)
+                for one, view_tracer in zip(seen, self.view_tracers, strict=True)
+            ]
             truths = [
                 (strongest(one, rays.ping, rays.ray, pings, view), one.elevation, one.echoes.shape_id, one.echoes.object_id)
                 if labels
@@ -181,12 +184,12 @@ class ImageLaunch:
             # 4. Evaluate everything that reads the echoes in one kernel, before any sum is read: rays are traced only once.
             dr.eval(sums, more, truths)
             # 5. Turn the sums into levels and counters.
-            made = []
-            for total, own, truth in zip(sums, self.view_tracers, truths, strict=True):
-                single = develop(total, pings, own)
-                levels, counters = single if more is None else develop(total, pings, own, more)
-                made.append((levels, counters, truth, single[0] if labels and more is not None else None))
-            return tracer.height_m(scene, rows), made
+            images = []
+            for total, view_tracer, truth in zip(sums, self.view_tracers, truths, strict=True):
+                single = develop(total, pings, view_tracer)
+                levels, counters = single if more is None else develop(total, pings, view_tracer, more)
+                images.append((levels, counters, truth, single[0] if labels and more is not None else None))
+            return tracer.height_m(scene, rows), images
 
         return launch, Rays.numbered(tracer.sonar, pings)
 
