@@ -217,7 +217,9 @@ class ImagingSonar(mi.Sensor):
                 f"{crop[0]} x {crop[1]}; remove the film from the sensor, it follows from beams and rays"
             )
         if not film.rfilter().is_box_filter():
-            raise MitsonarError("the film must have a box filter, one ray a pixel: remove the film from the sensor")
+            raise MitsonarError(
+                "the film must have a box filter, since each pixel is one ray: remove the film from the sensor"
+            )
 
 
 def _read_sonar(props: mi.Properties) -> Sonar:

@@ -95,8 +95,8 @@ def material_of(shape: mi.Shape) -> AcousticMaterial | None:
     names = sorted({one.material.name for one in materials})
     if len(materials) > 1 or (materials and others):
         raise MitsonarError(
-            f"shape {shape.id()} must have one material for all of it: got {', '.join(names)} together with another BSDF; "
-            "acoustic_material has two sides, give it alone"
+            f"shape {shape.id()} must have a single material: got {', '.join(names)} together with another BSDF; "
+            "acoustic_material covers both sides, use it alone"
         )
     return materials[0] if materials else None
 

@@ -359,11 +359,11 @@ def _notes(named: dict[str, list[str]]) -> list[str]:
     if named["approximated"]:
         notes.append(
             f"the BSDF of {', '.join(named['approximated'])} is not diffuse: its base colour, or the weighted mean of a "
-            "blend, is taken as reflectivity"
+            "blend, is used as reflectivity"
         )
     if named["without"]:
         notes.append(
             f"the BSDF of {', '.join(named['without'])} has no diffuse reflectance: reflectivity "
-            f"{DEFAULT_REFLECTIVITY:g} is taken; give the shape a diffuse BSDF to choose it"
+            f"{DEFAULT_REFLECTIVITY:g} is used; give the shape a diffuse BSDF to choose it"
         )
     return notes

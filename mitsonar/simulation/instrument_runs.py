@@ -172,7 +172,7 @@ def _write_responses(
     except MitsonarError:
         raise
     except Exception as error:  # a damaged Zarr store raises errors of any type
-        raise MitsonarError(f"cannot go on with {url}: {error}; make it again with --overwrite") from None
+        raise MitsonarError(f"cannot continue {url}: {error}; start again with --overwrite") from None
 
 
 def _check_store(group: zarr.Group, pings: int, sonar: ChannelSonar) -> None:
@@ -455,9 +455,9 @@ def _joined_parts(folder: Path, pings: int) -> dict[str, NDArray[Any]]:
         parts = [read_npz(path) for path in sorted(folder.glob("*.npz"))]
         joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     except Exception as error:  # damaged bytes raise errors of many kinds
-        raise MitsonarError(f"{folder} is damaged ({error}): begin anew with --overwrite") from None
+        raise MitsonarError(f"{folder} is damaged ({error}): start again with --overwrite") from None
     if len(joined["range_m"]) != pings:
-        raise MitsonarError(f"{folder} holds {len(joined['range_m'])} pings of {pings}: begin anew with --overwrite")
+        raise MitsonarError(f"{folder} holds {len(joined['range_m'])} pings of {pings}: start again with --overwrite")
     return joined
 
 

@@ -101,7 +101,7 @@ def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
         reflection, roughness_m = _numbers_of(name, part)
         if not (-1 <= reflection <= 1 and 0 <= roughness_m <= ROUGHEST_M):
             raise MitsonarError(
-                f"mirrors: the reflection of {name} lies in -1..1 and its rms height in 0..{ROUGHEST_M:g} m: "
+                f"mirrors: the reflection of {name} must lie in -1..1 and its rms height in 0..{ROUGHEST_M:g} m: "
                 f"got {reflection:g} and {roughness_m:g}"
             )
         for place in (place for place, shape_name in enumerate(names) if shape_name == name):
@@ -117,7 +117,7 @@ def _numbers_of(name: str, part: MirrorPart) -> tuple[float, float]:
         reflection, roughness_m = (float(number) for number in part)
     except (TypeError, ValueError):
         raise MitsonarError(
-            f"mirrors: {name} takes a pair, reflection and rms height in m, such as (-1.0, 0.0): got {shortened(part)}"
+            f"mirrors: {name} needs a pair, reflection and rms height in m, such as (-1.0, 0.0): got {shortened(part)}"
         ) from None
     return reflection, roughness_m
 
@@ -244,7 +244,7 @@ class FlatMirrors:
         planes: planes of the flat mirrors.
         facets: facets of the other mirrors.
         means: mean planes of the latter, for paths of several reflections; their roughness includes the waves.
-        notes: notes to the user about shapes that mirror nothing.
+        notes: notes to the user about shapes that do not mirror.
     """
 
     planes: list[MirrorPlane] = field(default_factory=list)
@@ -294,7 +294,7 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
         kind = shape.class_name()
         if not isinstance(shape, mi.Mesh) and kind not in FLAT:
             flat.notes.append(
-                f"shape {name} ({kind.lower()}) is curved and mirrors nothing in impulse responses: give it as a mesh"
+                f"shape {name} ({kind.lower()}) is curved and does not mirror in impulse responses: give it as a mesh"
             )
             continue
         corners = _triangles(shape)
@@ -303,7 +303,7 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
             flat.planes.extend(MirrorPlane(name, place, normal, offset, *part) for normal, offset in planes)
         elif len(corners) > MOST_FACETS:
             raise MitsonarError(
-                f"the mirror {name} has {len(corners):,} triangles: at most {MOST_FACETS:,} are possible; give it fewer, or "
+                f"the mirror {name} has {len(corners):,} triangles: at most {MOST_FACETS:,} are supported; use fewer, or "
                 "make it flat"
             )
         else:

@@ -167,7 +167,7 @@ class SceneMotion:
         instances = [shape.id() for shape in self.shapes if shape.class_name() == "Instance"]
         if instances:
             raise MitsonarError(
-                f"moving: bodies move in scenes without instances: got {', '.join(instances[:3])}; give these as meshes"
+                f"moving: moving bodies need a scene without instances: got {', '.join(instances[:3])}; give these as meshes"
             )
         moved = dict.fromkeys(bodies.shapes)
         self.numbers = {name: names.index(name) for name in moved}
@@ -278,7 +278,7 @@ class DeformingMesh:
 
     def __init__(self, shape: mi.Shape, law: VertexLaw) -> None:
         if not isinstance(shape, mi.Mesh):
-            raise MitsonarError(f"moving: only meshes deform: {shape.id()} is another shape; give a PLY file")
+            raise MitsonarError(f"moving: only meshes can deform: {shape.id()} is not a mesh; give a PLY file")
         self.mesh, self.law = _copied(shape), law
         self.scene: mi.Scene | None = None
         self.version, self._time_s = 0, float("nan")

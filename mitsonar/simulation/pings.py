@@ -342,20 +342,20 @@ class Tally:
             )
         if self.cut:
             sentences["cut"] = (
-                f"{self.cut:,} rays met surfaces so flatly, or points so dense, that they looked through a part of their "
-                f"points only: these surfaces are too dark; a scatterer_spacing_m of {_up(self.enough_m)} m would do, or a "
+                f"{self.cut:,} rays met surfaces at too flat an angle, or too dense points, and skipped some of their "
+                f"points: these surfaces are too dark; a scatterer_spacing_m of {_up(self.enough_m)} m is enough, or a "
                 "higher quality"
             )
         reach = rounding_reach_m(sonar)
         if reach is not None and np.abs(poses[:, :3]).max() > reach:
             sentences["far"] = (
                 f"a pose lies {np.abs(poses[:, :3]).max():,.0f} m from the origin, where coordinates round to more than an "
-                f"eighth of the wavelength: speckle loses its place; move the scene so that poses lie within {reach:.0f} m "
-                "of the origin"
+                f"eighth of the wavelength: speckle becomes inaccurate; move the scene so that poses lie within "
+                f"{reach:.0f} m of the origin"
             )
         if sonar.model == "thesis" and 0 < rays["inside"] < 10 * self.filled:
             sentences["rays"] = (
-                f"{rays['inside'] / self.filled:.1f} rays a bin on average, below 10: point deposits make the levels "
+                f"{rays['inside'] / self.filled:.1f} rays per bin on average, below 10: point deposits make the levels "
                 "noisy; raise rays_per_beam, lower range_bins, or use the model physical"
             )
         return sentences

@@ -777,7 +777,7 @@ def _on_lattice(shape: mi.Shape, sonar: ChannelSonar, number: int) -> SurfacePoi
     cells = lattice_size(shape, pitch) / 2
     enough = pitch * math.sqrt(cells / MOST) * 1.1
     advice = "lower points_per_m2" if sonar.scatterer_spacing_m is None else "raise scatterer_spacing_m"
-    _check_count(shape, cells, f"{advice}; a spacing of {enough:.2g} m would do")
+    _check_count(shape, cells, f"{advice}; a spacing of {enough:.2g} m is enough")
     patches = None if sonar.speckle_nu is None else Patches(sonar.speckle_nu, sonar.speckle_patch_m)
     return lattice_points(shape, number, pitch, sonar.seed, patches)
 

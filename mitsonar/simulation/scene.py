@@ -238,7 +238,7 @@ def scale_notes(scene: mi.Scene, sonar: Sonar) -> list[str]:
     A window is too long if it ends beyond :data:`FARTHEST_WINDOW_M`. A scene is too small if it fits into a range bin.
     """
     advice = (
-        'scenes are in metres; where this one is in millimetres, give its shapes <scale value="0.001"/>, or `mitsonar '
+        'scenes are in metres; if this one is in millimetres, give its shapes <scale value="0.001"/>, or `mitsonar '
         "world mesh` --scale 0.001"
     )
     for shape in scene.shapes():
@@ -523,16 +523,16 @@ def load_meshes(files: Sequence[Path], rate_hz: float, *, loop: bool = True) -> 
         MitsonarError: there is no mesh; a mesh is damaged or has other triangles; the sequence exceeds the memory.
     """
     if isinstance(files, str | Path) or not len(files):
-        raise MitsonarError(
-            f"{argument('files')} are PLY meshes in the order of time: got {str(files)!r}; give a list of them"
-        )
+        raise MitsonarError(f"{argument('files')} must be a list of PLY meshes in the order of time: got {str(files)!r}")
     first, faces = _mesh(files[0])
     refuse_beyond_memory(len(files) * len(first) * BYTES_A_VERTEX, f"{len(files)} meshes like {files[0]}")
     vertices = np.empty((len(files), *first.shape), np.float32)
     for number, file in enumerate(files):
         positions, triangles = _mesh(file)
         if positions.shape != first.shape or not np.array_equal(triangles, faces):
-            raise MitsonarError(f"{file} has other triangles than {files[0]}: meshes of a body that deforms share them")
+            raise MitsonarError(
+                f"{file} has other triangles than {files[0]}: the meshes of a deforming body must share them"
+            )
         vertices[number] = positions
     return MeshSequence(vertices, rate_hz, loop)
 

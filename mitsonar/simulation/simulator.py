@@ -88,7 +88,7 @@ class Simulator:
 
     def __repr__(self) -> str:
         shapes, moving = len(self.tracer.scene.shapes()), 0 if self.motion is None else len(self.motion.bodies)
-        also = f", {moving} bodies that move" if moving else ""
+        also = f", {moving} moving bodies" if moving else ""
         return f"Simulator({self.sonar} in a scene of {shapes} shapes{also}; {self.variant})"
 
     def _build(self) -> None:
@@ -317,7 +317,8 @@ class Simulator:
             raise MitsonarError(f"a step takes one pose x, y, z [m], pitch, roll, heading [rad]: got {table.shape}")
         if gain is not None and self.gain is not None and gain != self.gain:
             raise MitsonarError(
-                f"a loop keeps its gain, {self.gain:g}: got {gain:g}; leave gain out, or call reset() to begin a new loop"
+                f"the gain of a loop is constant, {self.gain:g}: got {gain:g}; leave gain out, or call reset() to begin a "
+                "new loop"
             )
         number = self._stepped
         moment_s = number / self.sonar.frame_rate_hz if time_s is None else time_s

@@ -158,7 +158,7 @@ def dvl_readings(soundings: Soundings, seed: int = 0) -> DvlReadings:
     """
     sounder = soundings.sounder
     if sounder.kind != "dvl":
-        raise MitsonarError(f"readings of a DVL need soundings of one: got a {sounder.kind}")
+        raise MitsonarError(f"readings of a DVL need soundings of a DVL: got those of a {sounder.kind}")
     true = true_rates(sounder, Trajectory(soundings.poses, soundings.time_s))
     scale = 1 + sounder.scale_std * np.random.default_rng([seed, SCALE]).normal()
     drawn = np.stack([np.random.default_rng([seed, RATES, ping]).normal(size=true.shape[1]) for ping in range(len(true))])

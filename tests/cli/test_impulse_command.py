@@ -205,7 +205,7 @@ def test_mirrors_that_do_not_fit_are_refused(mitsonar: Command, scene: Path, tmp
         (["--mirror", "=-1,0"], "--mirror takes NAME=V,H, reflection and rms height [m] of a shape: got '=-1,0'"),
         (["--mirror", "floor=-1,0", "--mirrors"], "give one of both"),
         (["--mirror", "flor=-1,0"], "the scene has no shape flor: did you mean floor?"),
-        (["--mirror", "floor=-2,0"], "lies in -1..1"),
+        (["--mirror", "floor=-2,0"], "must lie in -1..1"),
         (["--mirrors", "--set", "bounces=2"], "bounces 2 need mirrors"),
     ):
         refused(mitsonar("impulse", scene, *given, "-o", tmp_path / "out"), *words)

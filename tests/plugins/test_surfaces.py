@@ -83,7 +83,7 @@ def test_reflectivity_of_every_kind_of_bsdf(mesh: bool) -> None:
     got = dict(zip(RULE, np.array(hit.reflectivity), strict=True))
     assert got == pytest.approx({name: value for name, (_, value, _) in RULE.items()}, abs=1e-6)
     assert [loaded.shapes()[k].id() for k in np.array(hit.shape_id)] == list(shapes)
-    notes = {"approximated": "is not diffuse", "without": "has no diffuse reflectance: reflectivity 0.5 is taken"}
+    notes = {"approximated": "is not diffuse", "without": "has no diffuse reflectance: reflectivity 0.5 is used"}
     for kind, words in notes.items():
         note = [text for text in found.notes if words in text]
         assert len(note) == 1

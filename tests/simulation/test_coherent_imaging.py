@@ -166,7 +166,7 @@ def test_rays_that_miss_points_are_told_with_the_pitch_that_would_do(flat: mi.Sc
     with pytest.warns(MitsonarWarning, match="scatterer_spacing_m of") as caught:
         Simulator(flat, sonar).render([low, low], labels=True)
     (told,) = [str(one.message) for one in caught if "scatterer_spacing_m of" in str(one.message)]
-    rays, enough = re.match(r"([\d,]+) rays .* scatterer_spacing_m of ([\d.]+) m would do", told).groups()  # type: ignore[union-attr]
+    rays, enough = re.match(r"([\d,]+) rays .* scatterer_spacing_m of ([\d.]+) m is enough", told).groups()  # type: ignore[union-attr]
     assert int(rays.replace(",", "")) == 2 * imager(flat, sonar).image(np.array(low), 0)[1].cut > 0
     found = imager(flat, sonar.replace(scatterer_spacing_m=float(enough))).image(np.array(low), 0)[1]
     assert found.cut == found.widest == 0
@@ -460,9 +460,9 @@ def test_what_it_cannot_do_is_refused(flat: mi.Scene) -> None:
 
 def test_too_few_points_are_told_with_the_spacing_that_would_do(flat: mi.Scene) -> None:
     """A resolution cell at 4 m is 4 m x 0.3 deg by one bin; four points in it take half the root of its area."""
-    with pytest.warns(MitsonarWarning, match=r"holds 0\.25 points at 4 m.* scatterer_spacing_m of ([\d.]+) m would do"):
+    with pytest.warns(MitsonarWarning, match=r"holds 0\.25 points at 4 m.* scatterer_spacing_m of ([\d.]+) m is enough"):
         Simulator(flat, SONAR.replace(scatterer_spacing_m=0.02)).render([Pose(*POSE)])
     (told,) = imager(flat, SONAR.replace(scatterer_spacing_m=0.02)).notes
-    enough = float(told.split(" m would do")[0].rsplit(" ", 1)[1])
+    enough = float(told.split(" m is enough")[0].rsplit(" ", 1)[1])
     assert enough == pytest.approx(math.sqrt(4 * math.radians(0.3) * SONAR.bin_m) / 2, rel=0.05)
     assert not imager(flat, SONAR.replace(scatterer_spacing_m=0.97 * enough)).notes

@@ -106,7 +106,7 @@ def test_noise_is_of_each_side() -> None:
 
 def test_what_has_no_portions_is_refused() -> None:
     loaded = scene(floor=floor())
-    with pytest.raises(MitsonarError, match="no cones: got c1"):
+    with pytest.raises(MitsonarError, match="nor cones: got c1"):
         simulator(loaded, ["q1", "c1"])
     with pytest.raises(MitsonarError, match="portions have no labels"):
         list(simulator(loaded, ["q1"]).render_views(pose_at()[None], labels=True))

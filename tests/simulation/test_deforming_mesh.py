@@ -107,7 +107,7 @@ def test_mistakes_are_told(balls: list[Path], tmp_path: Path) -> None:
     import trimesh
 
     moving = {"ball": Deforming(fixed(Pose(0, 0, 0)), load_meshes(balls, 1.0))}
-    with pytest.raises(MitsonarError, match="only meshes deform: ball"):
+    with pytest.raises(MitsonarError, match="only meshes can deform: ball"):
         Simulator(separate(ball=sphere((0, 0, 0), 1)), SONAR, moving=moving)
     scene = separate(ball={"type": "ply", "filename": str(balls[0])})
     for wrong in (np.zeros((3, 3)), np.full((2562, 3), np.nan)):

@@ -278,13 +278,13 @@ def test_warned_of_too_few_rays_for_points(flat: mi.Scene) -> None:
     """Fewer than ten rays a filled bin: the model `thesis` says so, `physical` has footprints."""
     few = SMALL.replace(rays_per_beam=100, range_bins=512)
     Simulator(flat, few).render([POSE], gain=1e-3)
-    with pytest.warns(MitsonarWarning, match=r"1\.\d rays a bin on average, below 10: .* raise rays_per_beam"):
+    with pytest.warns(MitsonarWarning, match=r"1\.\d rays per bin on average, below 10: .* raise rays_per_beam"):
         Simulator(flat, few.replace(model="thesis")).render([POSE], gain=1e-3)
 
 
 def test_warned_of_surfaces_without_reflectivity() -> None:
     glass = scene(floor=floor({"type": "dielectric"}))
-    with pytest.warns(MitsonarWarning, match=r"the BSDF of floor has no diffuse reflectance: reflectivity 0\.5 is taken"):
+    with pytest.warns(MitsonarWarning, match=r"the BSDF of floor has no diffuse reflectance: reflectivity 0\.5 is used"):
         frames = Simulator(glass, SMALL).render([POSE], gain=1.0)
     np.testing.assert_allclose(frames.image[0], levels(scene(floor=floor(diffuse(0.5))), SMALL)[0], rtol=1e-6)
 

@@ -236,7 +236,7 @@ def test_mistakes_are_one_sentence() -> None:
     with pytest.raises(MitsonarError, match="no shape hull: known: target"):
         imager(loaded, hull=(1.0, 0.0))
     for part in ((1.5, 0.0), (1.0, -1e-4), (math.nan, 0.0), (0.5, math.inf)):
-        with pytest.raises(MitsonarError, match=r"lies in -1\.\.1"):
+        with pytest.raises(MitsonarError, match=r"must lie in -1\.\.1"):
             imager(loaded, target=part)
     with pytest.raises(MitsonarError, match="model physical has no mirrors"):
         Simulator(loaded, SONAR.replace(model="physical", coding="linear"), mirrors={"target": (1.0, 0.0)})

@@ -287,7 +287,7 @@ def test_receivers_have_names_and_numbers() -> None:
 
 @pytest.mark.parametrize("part", [-1.0, None, (1.0,), (1.0, 0.0, 0.0), "steel", ("x", 0)])
 def test_a_mirror_that_is_no_pair_is_told(part: Any) -> None:
-    with pytest.raises(MitsonarError, match=r"mirrors: surface takes a pair, .* such as \(-1\.0, 0\.0\): got"):
+    with pytest.raises(MitsonarError, match=r"mirrors: surface needs a pair, .* such as \(-1\.0, 0\.0\): got"):
         ChannelSimulator(guide(), instrument(), mirrors={"surface": part})
 
 

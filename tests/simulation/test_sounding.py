@@ -159,5 +159,5 @@ def test_faults_are_told() -> None:
         Sounder.create(kind="altimeter", mounts={"down": (0, 0, 0, 90, 0, 0)}, beams=2)
     sounder = load_sounder("altimeter").replace(model="physical", pattern="box", quality="draft")
     heights = SounderSimulator(floor(), sounder).soundings(flown(1))
-    with pytest.raises(MitsonarError, match="need soundings of one"):
+    with pytest.raises(MitsonarError, match="need soundings of a DVL"):
         dvl_readings(heights)

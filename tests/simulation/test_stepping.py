@@ -137,7 +137,7 @@ def test_what_a_step_refuses(ground: mi.Scene) -> None:
     with pytest.raises(MitsonarError, match=r"a step takes one pose .*got \(5, 6\)"):
         simulator.step(POSES)
     simulator.step(POSES[0], gain=2.0)
-    with pytest.raises(MitsonarError, match=r"a loop keeps its gain, 2: got 3; leave gain out, or call reset\(\)"):
+    with pytest.raises(MitsonarError, match=r"the gain of a loop is constant, 2: got 3; leave gain out, or call reset\(\)"):
         simulator.step(POSES[1], gain=3.0)
     assert simulator.step(POSES[1]).level_scale == 0.5
 

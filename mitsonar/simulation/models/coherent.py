@@ -229,7 +229,7 @@ def point_notes(sonar: Sonar) -> list[str]:
         return []
     return [
         f"a resolution cell holds {points:.2g} points at {nearest:g} m, {FEWEST_A_CELL:g} from {enough:.3g} m on: below, "
-        f"intensities vary more than speckle does; a scatterer_spacing_m of {needed:.2g} m would do everywhere"
+        f"intensities vary more than speckle does; a scatterer_spacing_m of {needed:.2g} m is enough everywhere"
     ]
 
 
@@ -242,8 +242,8 @@ def check_views(views: Sequence[View], mirrors: Mirroring) -> Sequence[View]:
     for view in views:
         if not isinstance(view, Whole | Segment) or view.name in CONES:
             raise MitsonarError(
-                f"the model coherent has no receivers elsewhere and no cones: got {view.name}; render the whole view, a "
-                "side or quadrants, or use the model physical"
+                f"the model coherent supports neither bistatic receivers nor cones: got {view.name}; render the whole view, "
+                "a side or quadrants, or use the model physical"
             )
         if mirrors and side_of(view):
             raise MitsonarError(f"mirrors need the whole view: got {view.name}; leave mirrors out, or render the whole view")

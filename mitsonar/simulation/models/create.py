@@ -92,10 +92,10 @@ def create_model(
             elsewhere or portions of the field of view; a mirror moves.
     """
     # 1. Reject views and mirrors that do not support the model, moving bodies or groups of beams.
-    what = "bodies that move" if motion is not None else "ping groups" if sonar.ping_groups > 1 else ""
+    what = "moving bodies" if motion is not None else "ping groups" if sonar.ping_groups > 1 else ""
     check_image_mirrors(sonar, views, bool(mirrors))
     if what and any(not isinstance(view, Whole) for view in views or ()):
-        raise MitsonarError(f"receivers elsewhere and portions have no {what}: render the whole view")
+        raise MitsonarError(f"bistatic receivers and portions do not support {what}: render the whole view")
     if mirrors and motion is not None:
         from mitsonar.simulation.mirrors import refuse_moving_mirrors
 

@@ -62,7 +62,7 @@ class PhysicalModel(ThesisModel):
         former: operator that spreads the levels of boxes over beams and pulse; None without a pattern.
 
     Raises:
-        MitsonarError: a sonar with a pattern has portions of the field of view or receivers elsewhere; there is absorption
+        MitsonarError: a sonar with a pattern has portions of the field of view or bistatic receivers; there is absorption
             without a pattern; mirrors are rough, but the sonar has no carrier.
     """
 
@@ -78,11 +78,11 @@ class PhysicalModel(ThesisModel):
         patterned = sonar.beam_pattern != "box"
         if not patterned and sonar_absorption(sonar):
             raise MitsonarError(
-                "the model physical loses sound to absorption with a pattern of the beams only: give pattern two_way as well"
+                "the model physical applies absorption only with a beam pattern: give pattern two_way as well"
             )
         if patterned and any(not isinstance(view, Whole) for view in views or ()):
             raise MitsonarError(
-                "portions of the field of view and receivers elsewhere have hard edges: leave pattern out, or render the "
+                "portions of the field of view and bistatic receivers have hard edges: leave pattern out, or render the "
                 "whole view"
             )
         self.former = ExpectedFormer(sonar) if patterned else None
@@ -267,7 +267,7 @@ class BounceSums:
         parts = mirror_of(scene, mirroring)
         if parts is not None and sonar.frequency_hz is None and (parts.roughness_m * (parts.reflection != 0)).any():
             raise MitsonarError(
-                "what a rough mirror loses depends on the carrier: got a rms height and no frequency_hz; give frequency_hz"
+                "the loss of a rough mirror depends on the carrier: got an rms height and no frequency_hz; give frequency_hz"
             )
         self.wavenumber = 2 * math.pi * (sonar.frequency_hz or 0.0) / sonar.sound_speed
         self.nearest = max(traced.range_min, traced.bin_m)
