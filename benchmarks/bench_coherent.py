@@ -155,7 +155,7 @@ def bare(case: Case) -> Callable[[int], object]:
     from mitsonar.simulation.beams import CommonFan
     from mitsonar.simulation.coherent_tracing import FanRays
 
-    sonar, fan = case.sonar, CommonFan.of(case.sonar)
+    sonar, fan = case.sonar, CommonFan.from_sonar(case.sonar)
     index = dr.arange(mi.UInt32, fan.rays)
     dr.make_opaque(index)
 

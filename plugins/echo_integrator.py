@@ -156,7 +156,7 @@ class Echo(ADIntegrator):
         self, mode: object, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, **_: object
     ) -> tuple[mi.Spectrum, DeviceArray, list[DeviceArray], None]:
         """Return values, validity, channels and no state, as ``ADIntegrator`` expects them."""
-        surfaces = Surfaces.of(scene)
+        surfaces = Surfaces.from_scene(scene)
         if self._sonar is not None:
             surfaces = surfaces.at_frequency_of(self._sonar)
         for note in surfaces.notes:

@@ -62,7 +62,7 @@ class Hit:
 
 @dataclass
 class Surfaces:
-    """Tables of the shapes of a scene, built once per scene by :meth:`of`.
+    """Tables of the shapes of a scene, built once per scene by :meth:`from_scene`.
 
     A triangle of a mesh is a row of four floats, normal and reflectivity. One fetch of 16 bytes replaces two virtual calls
     and a dozen scattered reads. If the reflectivity varies within triangles, a second table provides uv, and the BSDF is
@@ -99,7 +99,7 @@ class Surfaces:
     notes: list[str]
 
     @classmethod
-    def of(cls, scene: mi.Scene, shapes: Sequence[mi.Shape] | None = None) -> Surfaces:
+    def from_scene(cls, scene: mi.Scene, shapes: Sequence[mi.Shape] | None = None) -> Surfaces:
         """Build the tables of a scene, with one reflectivity per material for all angles; see :meth:`at_frequency_of`.
 
         Args:

@@ -81,7 +81,7 @@ class CommonFan:
     tangent: float
 
     @classmethod
-    def of(cls, sonar: Sonar) -> CommonFan:
+    def from_sonar(cls, sonar: Sonar) -> CommonFan:
         """Derive the fan of a sonar, with the ray density of its quality."""
         end = elevation_end(sonar)
         sine = min(0.999, math.sin(math.radians(sonar.azimuth_fov_deg) / 2) + side_lobes(sonar.aperture))
@@ -123,7 +123,7 @@ class BeamFormer:
 
     def __init__(self, sonar: Sonar) -> None:
         self.sonar, self.aperture, self.pulse = sonar, sonar.aperture, Pulse(sonar.resolution_m)
-        fan = CommonFan.of(sonar)
+        fan = CommonFan.from_sonar(sonar)
         self.sine_step = 1 / (SINES_A_LOBE * self.aperture.length)
         self.first_sine = -fan.sine - self.sine_step
         self.sines = math.ceil(2 * fan.sine / self.sine_step) + 4

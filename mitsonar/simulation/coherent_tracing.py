@@ -100,7 +100,7 @@ class CoherentTracer:
     ) -> None:
         assert sonar.frequency_hz is not None
         self.side, self.motion = side, motion
-        self.scene, self.sonar, self.former, self.fan = scene, sonar, former, CommonFan.of(sonar)
+        self.scene, self.sonar, self.former, self.fan = scene, sonar, former, CommonFan.from_sonar(sonar)
         self.surfaces = surfaces_of(scene, sonar, motion)
         self.wavelength = sonar.sound_speed / sonar.frequency_hz
         self.pitch = point_pitch(sonar)
@@ -212,7 +212,7 @@ class CoherentTracer:
         level = level * elevation_gain(self.sonar, seen.tangent)
         # 4. Deposit, if the point lies in the cell of this ray.
         wave = seen.sine, seen.range_m, level, cos, sin
-        deposited = add_waves(self.former, self.bits, sums, wave, seen.mine & (number < points.count))
+        deposited = add_waves(self.former, self.bits, sums, wave, seen.in_cell & (number < points.count))
         dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(COUNTED.index("points")), deposited, mode=ADD)
 
 
@@ -257,7 +257,7 @@ class SeenPoint:
         sine: sine of the bearing.
         tangent: tangent of the elevation.
         cosine: absolute cosine between the surface normal and the line of sight.
-        mine: whether the point's direction lies in the cell of the ray.
+        in_cell: whether the point's direction lies in the cell of the ray.
         ahead: whether the point's direction lies in the fan.
     """
 
@@ -265,7 +265,7 @@ class SeenPoint:
     sine: DeviceArray
     tangent: DeviceArray
     cosine: DeviceArray
-    mine: DeviceArray
+    in_cell: DeviceArray
     ahead: DeviceArray
 
 
@@ -378,9 +378,9 @@ class FanRays:
         # 4. Column and row of the fan, to compare with those of the ray: this assigns each point to one ray.
         column = mi.Int32(dr.floor((sine + self.fan.sine) * (1 / self.sine_step)))
         row = mi.Int32(dr.floor((self.fan.tangent - tangent) * (1 / self.tangent_step)))
-        mine = (column == self.column) & (row == self.row) & (forward > 0)
+        in_cell = (column == self.column) & (row == self.row) & (forward > 0)
         ahead = (forward > 0) & (dr.abs(sine) <= self.fan.sine) & (dr.abs(tangent) <= self.fan.tangent)
-        return SeenPoint(range_m, sine, tangent, cosine, mine, ahead)
+        return SeenPoint(range_m, sine, tangent, cosine, in_cell, ahead)
 
     def _along(self, points: HashedPoints, way: list[DeviceArray], column: int) -> DeviceArray:
         """Return the component of vectors along one axis of the sensor."""

@@ -171,7 +171,7 @@ def _compile_open(length: int, wavenumber: float) -> Callable[..., list[DeviceAr
         columns = _columns(mi.Float64, table, number, 6 + (ROW + 1) * length)
         position = columns[:3]
         point = ScatteringPoints(mi.Point3f(*position), position, mi.Normal3f(0, 0, 0))
-        rows = [PlaneRow.of(columns[6 + (ROW + 1) * k : 6 + (ROW + 1) * (k + 1)]) for k in range(length)]
+        rows = [PlaneRow.from_numbers(columns[6 + (ROW + 1) * k : 6 + (ROW + 1) * (k + 1)]) for k in range(length)]
         seen, factor = unfolded(scene, point, columns[3:6], rows, wavenumber, mi.Bool(True))
         dr.eval(seen, factor)
         return [seen, factor]

@@ -496,7 +496,7 @@ class PlaneRow(NamedTuple):
     registry: DeviceArray
 
     @classmethod
-    def of(cls, numbers: list[DeviceArray]) -> PlaneRow:
+    def from_numbers(cls, numbers: list[DeviceArray]) -> PlaneRow:
         """Create a mirror from the eleven numbers of a row."""
         return cls(numbers[:3], numbers[3:6], *numbers[6:])
 
@@ -644,7 +644,7 @@ class SecondMirrors:
     wavenumber: float
 
     @classmethod
-    def of(cls, scene: mi.Scene, mirrors: Mirrors | None, wavenumber: float) -> SecondMirrors | None:
+    def from_scene(cls, scene: mi.Scene, mirrors: Mirrors | None, wavenumber: float) -> SecondMirrors | None:
         """Find the planes of a scene's mirrors; None if there are fewer than two or more than :data:`MOST_SECOND`."""
         planes = mirror_planes(scene, mirrors)
         if not 2 <= len(planes) <= MOST_SECOND:

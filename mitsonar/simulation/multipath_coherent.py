@@ -112,8 +112,8 @@ class MirrorTracer:
     ) -> None:
         assert sonar.frequency_hz is not None
         self.scene, self.sonar, self.former, self.finest = scene, sonar, former, finest
-        self.motion, self.fan, self.table = motion, CommonFan.of(sonar), mirrors.table()
-        self.surfaces = Surfaces.of(scene) if motion is None else surfaces_of(scene, sonar, motion)
+        self.motion, self.fan, self.table = motion, CommonFan.from_sonar(sonar), mirrors.table()
+        self.surfaces = Surfaces.from_scene(scene) if motion is None else surfaces_of(scene, sonar, motion)
         self.wavelength = sonar.sound_speed / sonar.frequency_hz
         self.wavenumber = 2 * math.pi / self.wavelength
         self.last = former.first_range + (former.ranges - 1) * former.range_step
@@ -401,7 +401,7 @@ class GhostTracer:
         self.wavenumber = 2 * math.pi / tracer.wavelength
         self.nearest = max(tracer.former.first_range, tracer.sonar.bin_m)
         self.last = self.former.first_range + (self.former.ranges - 1) * self.former.range_step
-        self.second = SecondMirrors.of(tracer.scene, mirrors, self.wavenumber) if self.sonar.bounces > 2 else None
+        self.second = SecondMirrors.from_scene(tracer.scene, mirrors, self.wavenumber) if self.sonar.bounces > 2 else None
         more = 0 if self.second is None else len(self.second.mirrors)
         self.bits = tracer.bits - math.ceil(math.log2(PATHS + more))
         self.launch = self._compile()
@@ -535,7 +535,7 @@ class GhostTracer:
         # 2. the path and its reverse: one length, with both ends' patterns exchanged
         half = (there.range_m + here.range_m) * 0.5
         wave = (half, *self._turned(half, point))
-        seen = active[0] & there.mine & here.ahead
+        seen = active[0] & there.in_cell & here.ahead
         if self.sonar.beam_pattern == "two_way":
             gain = elevation_gain_of_ends(self.sonar, there.tangent, here.tangent) * overlap(
                 self.sonar, there.sine - here.sine
@@ -554,7 +554,7 @@ class GhostTracer:
                 * elevation_gain_of_ends(self.sonar, there.tangent, there.tangent)
             )
             wave = (there.range_m, *self._turned(there.range_m, point))
-            self._add(sums, there.sine, level * gain, wave, active[1] & there.mine)
+            self._add(sums, there.sine, level * gain, wave, active[1] & there.in_cell)
 
     def _deposit_return(
         self,
@@ -575,7 +575,7 @@ class GhostTracer:
         if self.sonar.beam_pattern == "two_way":
             level *= overlap(self.sonar, there.sine - back.sine)
             sine = (there.sine + back.sine) * 0.5
-        self._add(sums, sine, level, (half, *self._turned(half, point)), active & there.mine & back.ahead)
+        self._add(sums, sine, level, (half, *self._turned(half, point)), active & there.in_cell & back.ahead)
 
     def _clear(self, range_m: DeviceArray) -> DeviceArray:
         """Return ranges for spreading, which is constant closer than the window or one bin."""

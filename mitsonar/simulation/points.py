@@ -347,7 +347,7 @@ class _Search:
         name = shape.id()
         self.scene: mi.Scene = load_dict({"type": "scene", "shape": shape})
         shape.set_id(name)  # Mitsuba renames it
-        self.surfaces = Surfaces.of(self.scene)
+        self.surfaces = Surfaces.from_scene(self.scene)
         self.pitch, self.patches = pitch, patches
         self.table = None if patches is None else mi.Float(patch_amplitudes(BLENDED * patches.nu))
 

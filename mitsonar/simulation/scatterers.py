@@ -87,7 +87,7 @@ class ChannelTracer:
         self, scene: mi.Scene, sonar: ChannelSonar, like: ChannelTracer | None = None, mirrors: Mirrors | None = None
     ) -> None:
         self.scene, self.sonar = scene, sonar
-        surfaces = Surfaces.of(scene)
+        surfaces = Surfaces.from_scene(scene)
         self.flat: FlatMirrors = flat_mirrors(scene, mirrors)
         self.notes = [*surfaces.notes, *self.flat.notes_on(sonar.bounces)]
         shapes = scene.shapes()
@@ -195,7 +195,7 @@ class _WorldScatterers:
         if like is not None and _points_of(like.sonar) == _points_of(sonar) and like.smooth == self.smooth:
             self.scatterers, self.stored = like.scatterers, like.stored
         else:
-            self.scatterers = Scatterers.of(scene, sonar, self.smooth)
+            self.scatterers = Scatterers.from_scene(scene, sonar, self.smooth)
             self.stored = self._rows()
         self.wavenumber = 2 * math.pi / sonar.wavelength_m
         self.roughness: mi.Float | None = None  # rms height of each point's mirror; negative if it is no mirror
@@ -512,7 +512,7 @@ class MirroredLink(LinkGeometry):
     ) -> tuple[DeviceArray, DeviceArray]:
         """Return which points sound reaches via the mirrors, out and back, and the product of the mirrors' factors."""
         starts = [LINK + (ROW + 1) * k for k in range(self.out + self.back)]
-        rows = [PlaneRow.of(self.numbers[start : start + ROW + 1]) for start in starts]
+        rows = [PlaneRow.from_numbers(self.numbers[start : start + ROW + 1]) for start in starts]
         active, there = unfolded(scene, point, self.vector(0), rows[: self.out], self.wavenumber, active)
         active, back = unfolded(scene, point, self.vector(3), rows[self.out :], self.wavenumber, active)
         return active, there * back
@@ -617,7 +617,7 @@ class Scatterers:
     one_sided: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, scene: mi.Scene, sonar: ChannelSonar, smooth: frozenset[int] | None = None) -> Scatterers:
+    def from_scene(cls, scene: mi.Scene, sonar: ChannelSonar, smooth: frozenset[int] | None = None) -> Scatterers:
         """Place scatterers on a scene's shapes.
 
         Args:

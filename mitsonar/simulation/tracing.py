@@ -123,7 +123,7 @@ class Tracer:
         self.sonar = sonar
         given = {name: value for name, value in sonar.model_dump(exclude={"name"}).items() if value is not None}
         self.sensor: imaging_sonar_sensor.ImagingSonar = load_dict({"type": "imaging_sonar", **given})
-        self.surfaces = surfaces.Surfaces.of(scene).at_frequency_of(sonar)
+        self.surfaces = surfaces.Surfaces.from_scene(scene).at_frequency_of(sonar)
         self.notes = self.surfaces.notes
 
     def inputs(self, poses: ArrayLike, numbers: Sequence[int]) -> tuple[mi.Float, mi.UInt32, LaunchTables]:
@@ -240,9 +240,9 @@ class MovingSurfaces(Surfaces):
     versions: tuple[int, ...] = ()
 
     @classmethod
-    def of_motion(cls, motion: SceneMotion, sonar: Sonar) -> MovingSurfaces:
+    def from_motion(cls, motion: SceneMotion, sonar: Sonar) -> MovingSurfaces:
         """Return the tables of the scene that a motion belongs to, for one sonar's frequency and model."""
-        tables = cls.of(motion.scene, motion.shapes).at_frequency_of(sonar)
+        tables = cls.from_scene(motion.scene, motion.shapes).at_frequency_of(sonar)
         assert isinstance(tables, MovingSurfaces)
         return replace(tables, first_object=motion.first_objects, shape_count=len(motion.shapes), motion=motion)
 
@@ -294,7 +294,7 @@ class MovingTracer(Tracer):
     def __init__(self, motion: SceneMotion, sonar: Sonar) -> None:
         super().__init__(motion.scene, sonar)
         self.motion, self.deforms = motion, bool(motion.deformed)
-        self.surfaces = MovingSurfaces.of_motion(motion, sonar)
+        self.surfaces = MovingSurfaces.from_motion(motion, sonar)
 
     def scene_at(self, time_s: ArrayLike) -> MovingScene:
         """Return the scene at the moments of a launch's pings [s]."""
@@ -320,7 +320,7 @@ def tracer_of(scene: mi.Scene, sonar: Sonar, motion: SceneMotion | None) -> Trac
 
 def surfaces_of(scene: mi.Scene, sonar: Sonar, motion: SceneMotion | None) -> Surfaces:
     """Return the surface tables of a scene for a sonar, with or without moving bodies."""
-    return Surfaces.of(scene).at_frequency_of(sonar) if motion is None else MovingSurfaces.of_motion(motion, sonar)
+    return Surfaces.from_scene(scene).at_frequency_of(sonar) if motion is None else MovingSurfaces.from_motion(motion, sonar)
 
 
 # ---------------- Reflected and scattered rays

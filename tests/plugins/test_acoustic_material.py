@@ -46,7 +46,7 @@ def down(count: int, slant: float) -> mi.Ray3f:
 def reflectivity(loaded: mi.Scene, ray: mi.Ray3f, sonar: Sonar | None = SONAR) -> np.ndarray:
     from mitsonar.plugins.surfaces import Surfaces
 
-    tables = Surfaces.of(loaded)
+    tables = Surfaces.from_scene(loaded)
     hit = (tables if sonar is None else tables.at_frequency_of(sonar)).hit(loaded, ray)
     assert np.array(hit.valid).all()
     return np.array(hit.reflectivity)
@@ -182,7 +182,7 @@ def test_materials_and_other_surfaces_side_by_side() -> None:
     wrapped = {"type": "twosided", "inner": made_of("sand", reflectance=0.2)}
     bsdfs = {"a": made_of("steel"), "b": diffuse(0.3), "c": made_of("sand"), "d": wrapped, "e": made_of("steel")}
     loaded = scene(**{name: {**at(k), "bsdf": bsdf} for k, (name, bsdf) in enumerate(bsdfs.items())})
-    tables = Surfaces.of(loaded).at_frequency_of(SONAR)
+    tables = Surfaces.from_scene(loaded).at_frequency_of(SONAR)
     assert not tables.notes or all("extrapolated" in note for note in tables.notes)
     hit = tables.hit(loaded, mi.Ray3f(mi.Point3f(3 * dr.arange(mi.Float, 6), 0.1, 5), mi.Vector3f(0.01, 0, -1)))
     numbers = np.array(hit.material)[:5].tolist()
@@ -198,7 +198,7 @@ def test_materials_and_other_surfaces_side_by_side() -> None:
 def test_a_scene_without_materials_gathers_nothing() -> None:
     from mitsonar.plugins.surfaces import Surfaces
 
-    tables = Surfaces.of(scene(floor=floor()))
+    tables = Surfaces.from_scene(scene(floor=floor()))
     assert tables.at_frequency_of(SONAR) is tables
     assert not tables.lawful
 
@@ -247,7 +247,7 @@ def xml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_file_counts_from_the_scene(xml: Path) -> None:
     from mitsonar.plugins.surfaces import Surfaces
 
-    (one,) = Surfaces.of(load_scene(xml)).materials
+    (one,) = Surfaces.from_scene(load_scene(xml)).materials
     assert (one.material.name, one.material.volume) == ("mine", 0.001)
 
 

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 def surfaces(loaded: mi.Scene) -> Surfaces:
     from mitsonar.plugins.surfaces import Surfaces
 
-    return Surfaces.of(loaded)
+    return Surfaces.from_scene(loaded)
 
 
 def rays_down(count: int = 4000, reach: float = 2.0, slant: float = 0.3) -> mi.Ray3f:
@@ -215,6 +215,6 @@ def test_two_faces_have_two_reflectivities(variant: str) -> None:
     from mitsonar.plugins.surfaces import Surfaces
 
     both = {"type": "twosided", "front": diffuse(0.2), "back": diffuse(0.8)}
-    tables = Surfaces.of(loaded := scene(floor=floor(both)))
+    tables = Surfaces.from_scene(loaded := scene(floor=floor(both)))
     ray = mi.Ray3f(mi.Point3f([0.1, 0.1], [0.2, 0.2], [3, -3]), mi.Vector3f([0, 0], [0, 0], [-1, 1]))
     np.testing.assert_allclose(tables.hit(loaded, ray).reflectivity, [0.2, 0.8], rtol=1e-6)

@@ -277,5 +277,5 @@ def test_a_bitmap_is_read_where_it_lies() -> None:
     for kind, start in (("rectangle", (along, aside)), ("cube", (aside, along))):  # on a cube's top u runs along y
         loaded = scene(plate={"type": kind, "bsdf": diffuse(bitmap)})
         ray = mi.Ray3f(mi.Point3f(*start, 5), mi.Vector3f(0, 0, -1))
-        got = np.array(Surfaces.of(loaded).hit(loaded, ray).reflectivity)
+        got = np.array(Surfaces.from_scene(loaded).hit(loaded, ray).reflectivity)
         np.testing.assert_allclose(got, [0.2, 0.2, 0.8, 0.8], atol=1e-6)

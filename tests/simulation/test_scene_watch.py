@@ -197,7 +197,7 @@ def test_an_unchanged_scene_makes_nothing_anew(monkeypatch: pytest.MonkeyPatch) 
     scene = ground()
     simulator = Simulator(scene, SONAR)
     made: list[str] = []
-    monkeypatch.setattr(Surfaces, "of", lambda *_: made.append("anew"))
+    monkeypatch.setattr(Surfaces, "from_scene", lambda *_: made.append("anew"))
     levels(simulator)
     change(scene, _rolled)
     levels(simulator)

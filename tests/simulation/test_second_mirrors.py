@@ -101,7 +101,7 @@ def test_one_mirror_has_no_second() -> None:
     )
     for count, known in ((1, False), (2, True), (8, True), (9, False)):
         parts = mirror_of(loaded, {"ball": (0.5, 0.0), **{f"wall{k}": (0.5, 0.0) for k in range(count)}})
-        assert (SecondMirrors.of(loaded, parts, 1.0) is not None) == known
+        assert (SecondMirrors.from_scene(loaded, parts, 1.0) is not None) == known
     notes = second_notes(loaded, {f"wall{k}": (0.5, 0.0) for k in range(9)})
     assert "have 9 planes" in notes[0]
     assert second_notes(loaded, {"wall1": (0.5, 0.0)}) == []

@@ -274,7 +274,7 @@ class BounceSums:
         # the last surface may be near and the path long: R^g / nearest^2 against the R^(g - 2) of one reflection
         spread = max(1.0, traced.range_max / self.nearest) ** min(traced.gain_exponent, 2)
         self.tracer.bits = fraction_bits(traced, traced.rays, MOST_OF_A_RAY * spread)
-        self.second = SecondMirrors.of(scene, parts, self.wavenumber) if sonar.bounces > 2 else None
+        self.second = SecondMirrors.from_scene(scene, parts, self.wavenumber) if sonar.bounces > 2 else None
         self.mirrors: LaunchTables | None = None
         if parts is not None:
             lawless = [float(shape.bsdf() is None or material_of(shape) is None) for shape in scene.shapes()]
