@@ -60,15 +60,15 @@ def weighed(laws: mi.Float, material: DeviceArray, reflectivity: DeviceArray, co
     """
     known = material >= 0
     # Interpolate the tabulated law between whole degrees of the grazing angle.
-    place = dr.asin(cosine) * (180 / math.pi)
-    below = dr.select(place < 89, dr.floor(place), 89)
+    grazing_deg = dr.asin(cosine) * (180 / math.pi)
+    below = dr.select(grazing_deg < 89, dr.floor(grazing_deg), 89)
     begin = mi.UInt32(dr.select(known, material, 0)) * ENTRIES
     value = dr.gather(mi.Vector2f, laws, begin + mi.UInt32(below), known)
     power = dr.gather(mi.Vector2f, laws, begin + 90, known).x
     # Restore the power of the sine that was divided out of the table, then limit the result to 1 / cosine.
     steep = dr.select(cosine > FLATTEST, cosine, FLATTEST)
     shape = dr.select(power > 1.5, 1, dr.select(power > 0.5, 1 / steep, 1 / (steep * steep)))
-    law = reflectivity * (value.x + value.y * (place - below)) * shape
+    law = reflectivity * (value.x + value.y * (grazing_deg - below)) * shape
     return dr.select(known, dr.select(law * steep < 1, law, 1 / steep), reflectivity)
 
 

@@ -176,8 +176,8 @@ class Surfaces:
         facet = dr.arange(mi.UInt32, mesh.face_count())
         normal = facet_points(mesh, facet, mi.Point2f(1 / 3)).n
         facets = mi.Float(self.facets)
-        for place, value in enumerate((normal.x, normal.y, normal.z)):
-            dr.scatter(facets, value, (facet + first) * 4 + place)
+        for axis, value in enumerate((normal.x, normal.y, normal.z)):
+            dr.scatter(facets, value, (facet + first) * 4 + axis)
         self.facets = facets
         dr.eval(self.facets)
 

@@ -233,15 +233,15 @@ def angles_of(
 def beam_at(sonar: Sonar, bearing: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
     """Return the beam at bearings [rad], and whether a beam contains them."""
     # place in the fan in units of beams, by even angles or even sines
-    place: DeviceArray
+    position: DeviceArray
     half = math.radians(sonar.azimuth_fov_deg) / 2
     if sonar.beam_layout == "even":
-        place = bearing * (sonar.beams / (2 * half)) + sonar.beams / 2
+        position = bearing * (sonar.beams / (2 * half)) + sonar.beams / 2
     else:
-        place = dr.sin(bearing) * (sonar.beams / (2 * math.sin(half))) + sonar.beams / 2
+        position = dr.sin(bearing) * (sonar.beams / (2 * math.sin(half))) + sonar.beams / 2
     aside: DeviceArray = dr.abs(bearing)
-    inside = (place >= 0) & (place < sonar.beams) & (aside <= half)
-    beam = mi.UInt32(dr.select(inside, place, 0))
+    inside = (position >= 0) & (position < sonar.beams) & (aside <= half)
+    beam = mi.UInt32(dr.select(inside, position, 0))
     if sonar.beam_width_deg is not None and sonar.model == "physical":
         # beams narrower than their spacing leave gaps: compare with the axis of the beam
         part = (mi.Float(beam) + (0.5 - sonar.beams / 2)) * (2 / sonar.beams)  # computed: a table would not be an input

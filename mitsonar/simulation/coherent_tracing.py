@@ -185,9 +185,9 @@ class CoherentTracer:
     def _count(self, counts: mi.UInt32, rays: FanRays, hit: Hit, points: HashedPoints) -> None:
         """Count the outcomes of the rays in the field of view; rays beside it only carry side lobes and skirts."""
         near, far = hit.valid & (hit.t < self.sonar.range_min), hit.valid & (hit.t >= self.sonar.range_max)
-        for place, outcome in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
+        for counter, outcome in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
             counted = outcome & rays.inside
-            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(place), counted, mode=ADD)
+            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(counter), counted, mode=ADD)
         widest = mi.UInt32(COUNTED.index("widest"))
         dr.scatter_reduce(dr.ReduceOp.Max, counts, mi.UInt32(points.covered), widest, points.cut & rays.inside, mode=ADD)
 
@@ -291,8 +291,8 @@ class FanRays:
     def __init__(self, fan: CommonFan, sonar: Sonar, index: mi.UInt32, lines: list[list[Any]], side: int = 0) -> None:
         self.fan, self.cone, self.lines, self.sonar, self.index = fan, sonar.bearing == "cone", lines, sonar, index
         # 1. Column and row of each ray; rays run along the rows of a strip, then down.
-        strip, place = index // (STRIP * fan.rows), index % (STRIP * fan.rows)
-        self.column, self.row = mi.Int32(strip * STRIP + place % STRIP), mi.Int32(place // STRIP)
+        strip, offset = index // (STRIP * fan.rows), index % (STRIP * fan.rows)
+        self.column, self.row = mi.Int32(strip * STRIP + offset % STRIP), mi.Int32(offset // STRIP)
         # 2. Direction through the middle of each cell; row 0 is the highest.
         self.sine_step, self.tangent_step = 2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows
         u = (mi.Float(self.column) + 0.5) * self.sine_step - fan.sine
@@ -366,15 +366,15 @@ class FanRays:
             mi.Float64(coordinate) - begin for coordinate, begin in zip((point.p, point.q, point.a), origin, strict=True)
         ]
         range_m = dr.sqrt(sum(value * value for value in exact))
-        way = [mi.Float(value) for value in exact]
+        line_of_sight = [mi.Float(value) for value in exact]
         # 2. Direction in the axes of the sonar.
-        starboard, up, forward = (self._along(points, way, column) for column in (0, 1, 2))
+        starboard, up, forward = (self._along(points, line_of_sight, column) for column in (0, 1, 2))
         starboard, radius = -starboard, mi.Float(range_m)
         level = dr.sqrt(starboard * starboard + forward * forward)
         sine = starboard / (radius if self.cone else level)
         tangent = up / (forward if self.cone else level)
         # 3. Cosine of the angle of incidence.
-        cosine = dr.abs(sum(n * v for n, v in zip(points.normal, way, strict=True))) / radius
+        cosine = dr.abs(sum(n * v for n, v in zip(points.normal, line_of_sight, strict=True))) / radius
         # 4. Column and row of the fan, to compare with those of the ray: this assigns each point to one ray.
         column = mi.Int32(dr.floor((sine + self.fan.sine) * (1 / self.sine_step)))
         row = mi.Int32(dr.floor((self.fan.tangent - tangent) * (1 / self.tangent_step)))
@@ -382,10 +382,10 @@ class FanRays:
         ahead = (forward > 0) & (dr.abs(sine) <= self.fan.sine) & (dr.abs(tangent) <= self.fan.tangent)
         return SeenPoint(range_m, sine, tangent, cosine, in_cell, ahead)
 
-    def _along(self, points: HashedPoints, way: list[DeviceArray], column: int) -> DeviceArray:
+    def _along(self, points: HashedPoints, vector: list[DeviceArray], column: int) -> DeviceArray:
         """Return the component of vectors along one axis of the sensor."""
         axis = pick(points.axis, mi.Vector3f(*(mi.Float(line[column]) for line in self.lines)))
-        return sum(component * part for component, part in zip(axis, way, strict=True))
+        return sum(component * part for component, part in zip(axis, vector, strict=True))
 
 
 def point_pitch(sonar: Sonar) -> float:

@@ -551,11 +551,11 @@ def run_vehicle(
         vehicle.save(run.path / "vehicle.tum", options.frame)
         begun, warnings = list(run.notes.get("begun") or []), list(run.notes.get("warnings") or [])
         for name, one in sensors.items():
-            again = name in begun
-            if not again:
+            resumed = name in begun
+            if not resumed:
                 begun.append(name)
                 yield 0, {"begun": begun}  # noted first: only a sensor that was begun is resumed in its folder
-            inner = replace(destination, folder=run.path / name, resume=again, overwrite=not again)
+            inner = replace(destination, folder=run.path / name, resume=resumed, overwrite=not resumed)
             sentences = _run_sensor(simulator.scene, one, vehicle, bodies, options, inner)
             warnings += [line for line in (f"{name}: {sentence}" for sentence in sentences) if line not in warnings]
             yield 0, {"warnings": warnings}

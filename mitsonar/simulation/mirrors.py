@@ -104,8 +104,8 @@ def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
                 f"mirrors: the reflection of {name} must lie in -1..1 and its rms height in 0..{ROUGHEST_M:g} m: "
                 f"got {reflection:g} and {roughness_m:g}"
             )
-        for place in (place for place, shape_name in enumerate(names) if shape_name == name):
-            parts.reflection[place], parts.roughness_m[place] = reflection, roughness_m
+        for index in (index for index, shape_name in enumerate(names) if shape_name == name):
+            parts.reflection[index], parts.roughness_m[index] = reflection, roughness_m
     return parts if parts.reflection.any() else None
 
 
@@ -172,9 +172,12 @@ def without_mirror_part(table: mi.Float, hit: Hit, d: DeviceArray, wavenumber: f
     Other hits are unchanged. So are those with a material, whose scattering law includes this share already.
     """
     reflection, roughness_m = parts_at(table, hit)
-    taken = 1 - dr.square(smooth_share(roughness_m, dr.dot(hit.n, d), wavenumber))
+    scattered_share = 1 - dr.square(smooth_share(roughness_m, dr.dot(hit.n, d), wavenumber))
     return replace(
-        hit, reflectivity=dr.select((reflection == 0) | (hit.material >= 0), hit.reflectivity, hit.reflectivity * taken)
+        hit,
+        reflectivity=dr.select(
+            (reflection == 0) | (hit.material >= 0), hit.reflectivity, hit.reflectivity * scattered_share
+        ),
     )
 
 
@@ -285,9 +288,9 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
         MitsonarError: a curved mirror has more than :data:`MOST_FACETS` triangles.
     """
     flat = FlatMirrors()
-    for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
+    for index, shape in enumerate(scene.shapes() if mirrors is not None else []):
         assert mirrors is not None
-        part = float(mirrors.reflection[place]), float(mirrors.roughness_m[place])
+        part = float(mirrors.reflection[index]), float(mirrors.roughness_m[index])
         if part[0] == 0:
             continue
         name = shape.id()
@@ -300,7 +303,7 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
         corners = _triangles(shape)
         planes = _planes(corners)
         if planes is not None:
-            flat.planes.extend(MirrorPlane(name, place, normal, offset, *part) for normal, offset in planes)
+            flat.planes.extend(MirrorPlane(name, index, normal, offset, *part) for normal, offset in planes)
         elif len(corners) > MOST_FACETS:
             raise MitsonarError(
                 f"the mirror {name} has {len(corners):,} triangles: at most {MOST_FACETS:,} are supported; use fewer, or "
@@ -308,7 +311,7 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
             )
         else:
             flat.facets.append(MirrorFacets(name, corners, *part))
-            mean = _mean_plane(name, place, corners, *part)
+            mean = _mean_plane(name, index, corners, *part)
             flat.means.extend([] if mean is None else [mean])
     return flat
 
@@ -316,12 +319,12 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
 def mirror_planes(scene: mi.Scene, mirrors: Mirrors | None) -> list[MirrorPlane]:
     """Return the planes of a scene's flat mirrors."""
     flat_planes = []
-    for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
+    for index, shape in enumerate(scene.shapes() if mirrors is not None else []):
         assert mirrors is not None
-        part = float(mirrors.reflection[place]), float(mirrors.roughness_m[place])
+        part = float(mirrors.reflection[index]), float(mirrors.roughness_m[index])
         if part[0] != 0 and (isinstance(shape, mi.Mesh) or shape.class_name() in FLAT):
             planes = _planes(_triangles(shape)) or []
-            flat_planes += [MirrorPlane(shape.id(), place, normal, offset, *part) for normal, offset in planes]
+            flat_planes += [MirrorPlane(shape.id(), index, normal, offset, *part) for normal, offset in planes]
     return flat_planes
 
 
@@ -336,7 +339,7 @@ def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
 
 
 def _mean_plane(
-    name: str, place: int, corners: NDArray[np.float64], reflection: float, roughness_m: float
+    name: str, index: int, corners: NDArray[np.float64], reflection: float, roughness_m: float
 ) -> MirrorPlane | None:
     """Return the mean plane of a mesh of waves; None if heights or slopes are too large for waves."""
     # area-weighted principal axes; the axis of least variance is the normal
@@ -351,7 +354,7 @@ def _mean_plane(
     if steep.any() or height > HIGHEST * np.sqrt(variances[1]):
         return None
     slab = float(np.abs((points - middle) @ up).max())
-    return MirrorPlane(name, place, up, float(up @ middle), reflection, float(np.hypot(height, roughness_m)), slab)
+    return MirrorPlane(name, index, up, float(up @ middle), reflection, float(np.hypot(height, roughness_m)), slab)
 
 
 def _planes(corners: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]] | None:

@@ -105,9 +105,9 @@ class MovingScene:
     ) -> tuple[DeviceArray, DeviceArray]:
         """Return the nearer of the best hit so far and the hit of a body; rays that miss its sphere are not traced."""
         local = self.carried(ray, number)
-        way: DeviceArray = mi.Point3f(sphere.x, sphere.y, sphere.z) - local.o
-        along = dr.dot(way, local.d)
-        reach = dr.squared_norm(way - local.d * along) < dr.square(sphere.w)
+        to_centre: DeviceArray = mi.Point3f(sphere.x, sphere.y, sphere.z) - local.o
+        along = dr.dot(to_centre, local.d)
+        reach = dr.squared_norm(to_centre - local.d * along) < dr.square(sphere.w)
         local.maxt = best.t
         coherent: DeviceArray = True
         intersection: DeviceArray = scene.ray_intersect_preliminary(
@@ -189,9 +189,9 @@ class SceneMotion:
         """
         for one in self.deformed:
             one.deform(float(np.asarray(time_s, dtype=float).mean()))
-            place = list(self.numbers).index(one.mesh.id())
-            self._spheres[place] = _sphere(one.mesh)
-            dr.make_opaque(self._spheres[place])
+            index = list(self.numbers).index(one.mesh.id())
+            self._spheres[index] = _sphere(one.mesh)
+            dr.make_opaque(self._spheres[index])
         rows = self.bodies.from_world(time_s)
         rest = np.broadcast_to(np.eye(4)[:3], (len(rows), 1, 3, 4))
         table = np.concatenate([rest, rows], axis=1).astype(np.float32)

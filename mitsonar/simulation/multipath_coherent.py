@@ -666,7 +666,7 @@ class LastMirror:
     """Last mirror of each ray.
 
     Attributes:
-        way: vector from the sonar to the point on the mirror, in double precision [m].
+        from_sonar: vector from the sonar to the point on the mirror, in double precision [m].
         distance: length of that vector, in double precision [m].
         length: distance of the point from the image of the sonar, in double precision [m].
         u: unit direction from the sonar to the point.
@@ -675,7 +675,7 @@ class LastMirror:
         reflects_back: whether the mirror sends anything back.
     """
 
-    way: DeviceArray
+    from_sonar: DeviceArray
     distance: DeviceArray
     length: DeviceArray
     u: DeviceArray
@@ -719,9 +719,9 @@ class CornerTracer(MirrorTracer):
         image, origin = (mi.Point3d(*(line[3] for line in one.lines)) for one in (mirrored.rays, rays))
         ray: DeviceArray = mi.Vector3d(d)
         place: DeviceArray = image + ray * mi.Float64(hit.t)
-        way = place - origin
-        distance, length = dr.norm(way), dr.norm(place - image)
-        u: DeviceArray = mi.Vector3f(way / distance)
+        from_sonar = place - origin
+        distance, length = dr.norm(from_sonar), dr.norm(place - image)
+        u: DeviceArray = mi.Vector3f(from_sonar / distance)
         # 2. what counts: a mirror that faces the sonar from the side that the ray meets, within the window, and visible
         share = facing_share(dr.dot(reflected(d, hit.n), -u))
         reflects_back = hit.valid & (reflection != 0) & (share > 0) & (length < distance * MOST_STRETCH)
@@ -730,7 +730,7 @@ class CornerTracer(MirrorTracer):
         reflects_back &= (half > self.former.first_range) & (half < self.last)
         reflects_back &= ~hidden(scene, mi.Point3f(place), hit.n, u, mi.Float(distance), reflects_back)
         left = smooth_share(roughness_m, dr.dot(hit.n, d), self.wavenumber)
-        return LastMirror(way, distance, length, u, mirrored.gain * reflection * left, share, reflects_back)
+        return LastMirror(from_sonar, distance, length, u, mirrored.gain * reflection * left, share, reflects_back)
 
     # ---------------- First launch: which cells to divide
 

@@ -196,9 +196,9 @@ class Walk:
     def _direct_return(self, vertex: Vertex) -> Arrival:
         """Return what arrives from a surface that the sonar insonifies directly."""
         # 1. visible from the sonar, on the side that the path meets
-        way: DeviceArray = vertex.place - self.origin
-        distance = dr.norm(way)
-        u = way / distance
+        from_sonar: DeviceArray = vertex.place - self.origin
+        distance = dr.norm(from_sonar)
+        u = from_sonar / distance
         toward = dr.dot(vertex.n, u)
         lit = vertex.valid & (vertex.reflectivity > 0) & (toward * dr.dot(vertex.n, vertex.d) > 0)
         lit &= ~hidden(self.scene, mi.Point3f(vertex.place), vertex.n, u, distance, lit, self.moment)
@@ -404,9 +404,9 @@ class DiffuseField:
         self, sums: mi.UInt64, sine: DeviceArray, range_m: DeviceArray, level: DeviceArray, active: DeviceArray
     ) -> None:
         former = self.former
-        line = (sine - former.first_sine) * (1 / (former.sine_step * SINES_A_LOBE))
-        place = (range_m - former.first_range) * (1 / (former.range_step * RANGES_A_PULSE))
-        inside = active & (line >= 0) & (line < self.shape[0]) & (place >= 0) & (place < self.shape[1])
-        where = mi.UInt32(dr.select(inside, line, 0)) * self.shape[1] + mi.UInt32(dr.select(inside, place, 0))
+        sine_cell = (sine - former.first_sine) * (1 / (former.sine_step * SINES_A_LOBE))
+        range_cell = (range_m - former.first_range) * (1 / (former.range_step * RANGES_A_PULSE))
+        inside = active & (sine_cell >= 0) & (sine_cell < self.shape[0]) & (range_cell >= 0) & (range_cell < self.shape[1])
+        where = mi.UInt32(dr.select(inside, sine_cell, 0)) * self.shape[1] + mi.UInt32(dr.select(inside, range_cell, 0))
         value = mi.UInt64(mi.Float64(level) * 2.0**self.bits)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, where, inside, mode=ADD)

@@ -65,7 +65,7 @@ def moments_of(
         raise MitsonarError(f"poses must be finite numbers {allowed}: got {table.shape}; give m and rad")
     refuse_beyond_reach(table)
     numbers = (
-        [first + place for place in range(len(table))]
+        [first + offset for offset in range(len(table))]
         if isinstance(first, int | np.integer)
         else [int(number) for number in first]
     )

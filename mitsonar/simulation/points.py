@@ -177,15 +177,15 @@ def place_in_cell(
         key: key from :func:`lattice_key`.
         pitch: pitch of the lattice [m].
     """
-    place = _hash(i, j, key)
-    p = (mi.Float(i) + (mi.Float(place & 0xFFFF) + 0.5) * 2.0**-16) * pitch
-    q = (mi.Float(j) + (mi.Float(place >> 16) + 0.5) * 2.0**-16) * pitch
-    return p, q, place
+    cell_bits = _hash(i, j, key)
+    p = (mi.Float(i) + (mi.Float(cell_bits & 0xFFFF) + 0.5) * 2.0**-16) * pitch
+    q = (mi.Float(j) + (mi.Float(cell_bits >> 16) + 0.5) * 2.0**-16) * pitch
+    return p, q, cell_bits
 
 
-def weight_of(place: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+def weight_of(cell_bits: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
     """Return amplitude and phase (turns 0..1) of a point's complex Gaussian weight, and 32 bits for further draws."""
-    bits = _mixed(place ^ mi.UInt32(0x68BC21EB))
+    bits = _mixed(cell_bits ^ mi.UInt32(0x68BC21EB))
     return dr.sqrt(-dr.log(_unit(bits))), _unit(_mixed(bits + mi.UInt32(0x2545F491))), bits
 
 
@@ -362,15 +362,15 @@ class _Search:
         if self.patches is not None and self.table is not None:
             amplitude *= patch_weight((p, q), bits, key, self.table, dr.width(self.table), self.patches.side_m)
         # 2. Start each ray outside the shape, on the side that the surfaces face.
-        begin, way = (cells.ends[1], -1.0) if side else (cells.ends[0], 1.0)
+        begin, sign = (cells.ends[1], -1.0) if side else (cells.ends[0], 1.0)
         reach = max(BEYOND * (cells.ends[1] - cells.ends[0]), ROUNDING * max(abs(end) for end in cells.ends))
-        a, skip = dr.full(mi.Float, begin, len(numbers)), way * reach
-        u = _along(cells.axis, mi.Float(0), mi.Float(0), mi.Float(way))
+        a, skip = dr.full(mi.Float, begin, len(numbers)), sign * reach
+        u = _along(cells.axis, mi.Float(0), mi.Float(0), mi.Float(sign))
         # 3. Trace, keep the points on suitable surfaces, and continue behind every hit until no ray hits anything.
         parts: list[SurfacePoints] = []
         while True:
             hit = self.surfaces.hit(self.scene, mi.Ray3f(mi.Point3f(_along(cells.axis, p, q, a)), u))
-            a_hit = a + way * hit.t
+            a_hit = a + sign * hit.t
             parts.append(self._suitable_points(cells.axis, side, hit, (p, q, a_hit), (amplitude, turn)))
             going = np.flatnonzero(np.array(hit.valid))
             if not len(going):

@@ -82,9 +82,9 @@ class ReceiverNoise:
         # split the excess power of the glow into a part that is constant over pings and a part drawn for each ping
         power = np.square(amplitude)
         still = sonar.near_glow_still * power * (1 - 10 ** (-self._glow / 10))
-        new = self._white(ping, NOISE ^ salt, 1) * np.asarray(np.sqrt(power - still), np.float32)
-        stays = self._white(0, GLOW ^ salt, 1) * np.asarray(np.sqrt(still), np.float32)
-        return np.asarray(new + stays, dtype=np.complex64)
+        per_ping = self._white(ping, NOISE ^ salt, 1) * np.asarray(np.sqrt(power - still), np.float32)
+        constant = self._white(0, GLOW ^ salt, 1) * np.asarray(np.sqrt(still), np.float32)
+        return np.asarray(per_ping + constant, dtype=np.complex64)
 
     @cached_property
     def _glow(self) -> NDArray[np.float64]:

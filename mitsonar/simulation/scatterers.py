@@ -583,9 +583,9 @@ class Spheres:
     ) -> NDArray[np.int64]:
         """Return the subset of groups that may have a visible point in a field of view at ``eye``."""
         # direction to each sphere, and its angular radius as a margin; the eye inside a sphere sees all of it
-        way = self.middle[groups] - eye
-        distance = np.sqrt(np.einsum("gi,gi->g", way, way))
-        unit, radius = way / np.maximum(distance, 1e-12)[:, None], self.radius[groups]
+        from_eye = self.middle[groups] - eye
+        distance = np.sqrt(np.einsum("gi,gi->g", from_eye, from_eye))
+        unit, radius = from_eye / np.maximum(distance, 1e-12)[:, None], self.radius[groups]
         margin = np.where(distance > radius, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-12), 1)), np.pi)
         # closed bodies: skip groups whose normals all face away from the eye
         away = np.einsum("gi,gi->g", self.facing[groups], unit) > np.sin(np.minimum(margin + self.spread[groups], np.pi / 2))

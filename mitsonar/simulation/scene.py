@@ -261,11 +261,11 @@ def scale_notes(scene: mi.Scene, sonar: Sonar) -> list[str]:
 
 def _parameters(path: Path, error: BaseException) -> str:
     """Suggest the known parameters of a scene if the error is an unknown parameter; otherwise return an empty string."""
-    wrong = re.search(r"unused parameters:\s*-?\s*\$(\w+)", str(error))
-    if wrong is None:
+    unknown = re.search(r"unused parameters:\s*-?\s*\$(\w+)", str(error))
+    if unknown is None:
         return ""
     known = re.findall(r"<default\s+name=[\"'](\w+)[\"']", path.read_text(encoding="utf-8", errors="replace"))
-    return f"; {nearest_names(wrong[1], known)}" if known else "; the scene has no parameters"
+    return f"; {nearest_names(unknown[1], known)}" if known else "; the scene has no parameters"
 
 
 def _reason(error: BaseException) -> str:

@@ -88,8 +88,8 @@ class Simulator:
 
     def __repr__(self) -> str:
         shapes, moving = len(self.tracer.scene.shapes()), 0 if self.motion is None else len(self.motion.bodies)
-        also = f", {moving} moving bodies" if moving else ""
-        return f"Simulator({self.sonar} in a scene of {shapes} shapes{also}; {self.variant})"
+        moving_text = f", {moving} moving bodies" if moving else ""
+        return f"Simulator({self.sonar} in a scene of {shapes} shapes{moving_text}; {self.variant})"
 
     def _build(self) -> None:
         """Build everything derived from the current scene: moving bodies, and the model with its tables and launches."""

@@ -77,8 +77,8 @@ class Rays:
         # 1. Ping, and place of the ray in its strip: rays run along the rows of a strip, then down.
         wide = strip_columns(sonar)
         self.ping, self.ray = index // sonar.rays, index % sonar.rays
-        strip, place = self.ray // (wide * sonar.rays_per_beam), self.ray % (wide * sonar.rays_per_beam)
-        self.column, self.row = strip * wide + place % wide, place // wide
+        strip, offset = self.ray // (wide * sonar.rays_per_beam), self.ray % (wide * sonar.rays_per_beam)
+        self.column, self.row = strip * wide + offset % wide, offset // wide
         self.beam = self.column // sonar.across
         # 2. Pose: one for each ping, or one for each group of beams of a ping.
         self.moment = self.ping
@@ -354,9 +354,9 @@ def lambert_direction(normal: DeviceArray, d: DeviceArray, ray: DeviceArray, key
         key: 32-bit key of the draw.
     """
     first, second = mi.sample_tea_32(ray, key, ROUNDS)
-    place = mi.Point2f((mi.Float(first >> 8) + 0.5) * 2.0**-24, (mi.Float(second >> 8) + 0.5) * 2.0**-24)
+    sample = mi.Point2f((mi.Float(first >> 8) + 0.5) * 2.0**-24, (mi.Float(second >> 8) + 0.5) * 2.0**-24)
     facing: DeviceArray = mi.Vector3f(normal * dr.select(dr.dot(normal, d) > 0, -1.0, 1.0))
-    drawn: DeviceArray = mi.warp.square_to_cosine_hemisphere(place)
+    drawn: DeviceArray = mi.warp.square_to_cosine_hemisphere(sample)
     return mi.Vector3f(mi.Frame3f(facing).to_world(drawn))
 
 
@@ -442,9 +442,9 @@ class Clearance:
             each = (slice(number, number + 1) for number in range(count))
             return np.concatenate([self.of(before[one], after[one], time_s[one]) for one in each])
         # direction of travel; straight down for a vehicle that did not move
-        way = after - before
-        travelled = np.linalg.norm(way, axis=1)
-        ahead = np.where(travelled[:, None] > 0, way / np.maximum(travelled, 1e-12)[:, None], (0.0, 0.0, -1.0))
+        displacement = after - before
+        travelled = np.linalg.norm(displacement, axis=1)
+        ahead = np.where(travelled[:, None] > 0, displacement / np.maximum(travelled, 1e-12)[:, None], (0.0, 0.0, -1.0))
         # 26 rays from where each vehicle is, and one from where it was
         directions = np.concatenate(
             [np.broadcast_to(self._directions, (count, *self._directions.shape)), ahead[:, None]], axis=1

@@ -183,16 +183,16 @@ def sensors_in(scene: mi.Scene, vehicle: Pose) -> dict[str, Mounted]:
         check_sensor_name(name)
         if name in sensors:
             raise MitsonarError(f"two sensors of the scene have the id {name}: give them different ids")
-        place = pose_from_to_world(np.array(sensor.world_transform().matrix, dtype=float).reshape(4, 4))
-        away = math.dist(place[:3], vehicle[:3])
-        if away > FARTHEST_M:
+        sensor_pose = pose_from_to_world(np.array(sensor.world_transform().matrix, dtype=float).reshape(4, 4))
+        distance_m = math.dist(sensor_pose[:3], vehicle[:3])
+        if distance_m > FARTHEST_M:
             raise MitsonarError(
-                f"the sensor {name} is {away:.3g} m from the path's first pose: the scene must show the vehicle there; move "
-                "the sensors, or the path"
+                f"the sensor {name} is {distance_m:.3g} m from the path's first pose: the scene must show the vehicle "
+                "there; move the sensors, or the path"
             )
         untyped: Any = sensor
         sonar = is_imaging_sonar(sensor) or is_channel_sonar(sensor)
-        sensors[name] = Mounted(untyped.sonar if sonar else sensor, mount_between(vehicle, place))
+        sensors[name] = Mounted(untyped.sonar if sonar else sensor, mount_between(vehicle, sensor_pose))
     if not sensors:
         raise MitsonarError("the scene has no sensors: add some, or give a vehicle's file")
     return sensors
@@ -300,7 +300,7 @@ class CameraSimulator:
             self._build()
         table, time = np.atleast_2d(np.asarray(poses, dtype=float)), np.atleast_1d(np.asarray(time_s, dtype=float))
         grey = "mono" in str(mi.variant())
-        place = mi.Transform4f(self.camera.world_transform().matrix)
+        scene_pose = mi.Transform4f(self.camera.world_transform().matrix)
         try:
             for number, (pose, moment_s) in enumerate(zip(table, time, strict=True), first):
                 if self.motion is not None:
@@ -309,7 +309,7 @@ class CameraSimulator:
                 picture = self._picture(number)
                 yield picture[..., 0] if grey and picture.ndim == 3 else picture
         finally:
-            _turn(self.camera, place)  # restore the pose that the scene gives the camera
+            _turn(self.camera, scene_pose)  # restore the pose that the scene gives the camera
 
     def _picture(self, number: int) -> NDArray[np.uint8]:
         """Render the scene in its current state; ``number`` seeds the rendering noise."""

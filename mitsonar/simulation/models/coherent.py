@@ -91,8 +91,8 @@ class CoherentModel:
         """
         if labels and self.imager.sides != (0,):
             raise MitsonarError("portions have no labels in the model coherent: leave labels out, or use physical")
-        for place, number in enumerate(numbers):
-            pose, time = poses[place : place + 1], time_s[place : place + 1]
+        for index, number in enumerate(numbers):
+            pose, time = poses[index : index + 1], time_s[index : index + 1]
             levels, counts, cut = self.imager.levels(pose[0], number, time[0])
             if labels:
                 pings = next(self._expected.render(pose, time, [number], True))[0]

@@ -92,34 +92,34 @@ def create_model(
             elsewhere or portions of the field of view; a mirror moves.
     """
     # 1. Reject views and mirrors that do not support the model, moving bodies or groups of beams.
-    what = "moving bodies" if motion is not None else "ping groups" if sonar.ping_groups > 1 else ""
+    feature = "moving bodies" if motion is not None else "ping groups" if sonar.ping_groups > 1 else ""
     check_image_mirrors(sonar, views, bool(mirrors))
-    if what and any(not isinstance(view, Whole) for view in views or ()):
-        raise MitsonarError(f"bistatic receivers and portions do not support {what}: render the whole view")
+    if feature and any(not isinstance(view, Whole) for view in views or ()):
+        raise MitsonarError(f"bistatic receivers and portions do not support {feature}: render the whole view")
     if mirrors and motion is not None:
         from mitsonar.simulation.mirrors import refuse_moving_mirrors
 
         refuse_moving_mirrors(scene, mirrors, motion.bodies.shapes)
     # 2. Find the sonar of one ping of a group, unless one launch traces all groups.
-    together = sonar.ping_groups == 1 or (sonar.beam_pattern == "box" and sonar.bounces == 1)
-    one = sonar if together else one_beam(sonar) if scans(sonar) else sonar.replace(ping_groups=1)
+    single_launch = sonar.ping_groups == 1 or (sonar.beam_pattern == "box" and sonar.bounces == 1)
+    ping_sonar = sonar if single_launch else one_beam(sonar) if scans(sonar) else sonar.replace(ping_groups=1)
     # 3. Create its model; what other models need is not imported.
     model: PingModel
     if sonar.model == "coherent":
         from mitsonar.simulation.models.coherent import CoherentModel
 
-        model = CoherentModel(scene, one, views, mirrors, motion, rays_per_launch)
+        model = CoherentModel(scene, ping_sonar, views, mirrors, motion, rays_per_launch)
     elif sonar.model == "physical":
         from mitsonar.simulation.models.physical import PhysicalModel
 
-        model = PhysicalModel(scene, one, views, mirrors, motion, rays_per_launch)
+        model = PhysicalModel(scene, ping_sonar, views, mirrors, motion, rays_per_launch)
     else:
         from mitsonar.simulation.models.thesis import ImageLaunch, ThesisModel
         from mitsonar.simulation.tracing import tracer_of
 
-        shown = [Whole(one)] if views is None else views
-        model = ThesisModel(ImageLaunch(tracer_of(scene, one, motion), shown), rays_per_launch)
-    return model if together else GroupedPings(model, sonar)
+        shown = [Whole(ping_sonar)] if views is None else views
+        model = ThesisModel(ImageLaunch(tracer_of(scene, ping_sonar, motion), shown), rays_per_launch)
+    return model if single_launch else GroupedPings(model, sonar)
 
 
 class GroupedPings:
@@ -156,9 +156,9 @@ class GroupedPings:
         """Yield frames one at a time; see :meth:`PingModel.render`."""
         groups = self.sonar.ping_groups
         heads = turned_heads(self.sonar, poses) if scans(self.sonar) else poses
-        for place, number in enumerate(numbers):
+        for index, number in enumerate(numbers):
             parts = range(number * groups, (number + 1) * groups)
-            batches = self.inner.render(heads[place], time_s[place], list(parts), labels)
+            batches = self.inner.render(heads[index], time_s[index], list(parts), labels)
             yield [self._joined([batch[0] for batch in batches], number)]
 
     def _joined(self, parts: list[RenderedPings], number: int) -> RenderedPings:

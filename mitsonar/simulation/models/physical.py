@@ -285,12 +285,12 @@ class BounceSums:
         """Return echoes without the mirror part, and the amplitude factor of mirrors; 0 if there is no mirror."""
         if mirrors is None:
             return echoes, mi.Float(0)
-        known = (echoes.hit > 0) & (echoes.shape_id >= 0)
-        place = mi.UInt32(dr.select(known, echoes.shape_id, 0))
-        pair = dr.gather(mi.Vector2f, mirrors["parts"], place, known)
+        valid = (echoes.hit > 0) & (echoes.shape_id >= 0)
+        shape_index = mi.UInt32(dr.select(valid, echoes.shape_id, 0))
+        pair = dr.gather(mi.Vector2f, mirrors["parts"], shape_index, valid)
         share = smooth_share(pair.y, echoes.cosine, self.wavenumber)
-        taken = (pair.x != 0) & (dr.gather(mi.Float, mirrors["lawless"], place, known) > 0)
-        reflectivity = dr.select(taken, echoes.reflectivity * (1 - dr.square(share)), echoes.reflectivity)
+        loses_mirror_part = (pair.x != 0) & (dr.gather(mi.Float, mirrors["lawless"], shape_index, valid) > 0)
+        reflectivity = dr.select(loses_mirror_part, echoes.reflectivity * (1 - dr.square(share)), echoes.reflectivity)
         return replace(echoes, reflectivity=reflectivity), pair.x * share
 
     def sums(

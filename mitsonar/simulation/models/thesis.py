@@ -249,9 +249,9 @@ def accumulate(
     value = level(exact, sonar, dr.select) * 2.0**tracer.bits
     # 2. Model thesis: one addition to the bin that contains the range, or 1 to a counter.
     if sonar.model == "thesis":
-        place = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
-        inside = active & hit & (place >= 0) & (place < sonar.range_bins)
-        cell = dr.select(inside, _whole(place), _counter(hit, place < 0, sonar))
+        position = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
+        inside = active & hit & (position >= 0) & (position < sonar.range_bins)
+        cell = dr.select(inside, _whole(position), _counter(hit, position < 0, sonar))
         dr.scatter_reduce(dr.ReduceOp.Add, sums, dr.select(inside, mi.UInt64(value), 1), start + cell, active, mode=ADD)
         return sums
     # 3. Model physical: clip the footprint to the window; its density stays that of the whole footprint.
@@ -331,8 +331,8 @@ def strongest(seen: ViewEchoes, ping: mi.UInt32, ray: mi.UInt32, pings: int, vie
     best = dr.zeros(mi.UInt64, pings * beams * sonar.range_bins)
     value = level(exact, sonar, dr.select)
     if sonar.model == "thesis":
-        place = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
-        a, b = dr.floor(place), dr.floor(place) + 1
+        position = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
+        a, b = dr.floor(position), dr.floor(position) + 1
     else:
         a, b, width = footprint(exact, sonar)
         value = value / width
@@ -364,13 +364,13 @@ def _counter(hit: mi.Bool, near: mi.Bool, sonar: Sonar) -> mi.UInt32:
     return dr.select(hit, dr.select(near, near_cell, near_cell + 1), near_cell + 2)
 
 
-def _clip(place: DeviceArray, bins: int) -> DeviceArray:
+def _clip(position: DeviceArray, bins: int) -> DeviceArray:
     """Clip to 0..bins by comparisons, since LLVM 15 and 16 abort on `max` (see CONTRIBUTING.md)."""
-    return dr.select(place > 0, dr.select(place < bins, place, bins), 0)
+    return dr.select(position > 0, dr.select(position < bins, position, bins), 0)
 
 
-def _whole(place: DeviceArray) -> mi.UInt32:
-    return mi.UInt32(dr.select(place > 0, place, 0))
+def _whole(position: DeviceArray) -> mi.UInt32:
+    return mi.UInt32(dr.select(position > 0, position, 0))
 
 
 # ---------------- Views: the whole field of view or a portion
@@ -495,9 +495,9 @@ class ReceiverTracer:
         u: DeviceArray
         normal: DeviceArray = mi.Normal3f(echoes.nx, echoes.ny, echoes.nz)
         point = mi.Point3f(echoes.x, echoes.y, echoes.z)
-        way = mi.Vector3f(*(p - line.w for p, line in zip(point, lines, strict=True)))
-        distance = dr.norm(way)
-        u = way / distance
+        from_receiver = mi.Vector3f(*(p - line.w for p, line in zip(point, lines, strict=True)))
+        distance = dr.norm(from_receiver)
+        u = from_receiver / distance
         # 2. The receiver's beam in that direction.
         port, up, forward = (sum(line[axis] * u[row] for row, line in enumerate(lines)) for axis in range(3))
         beam, inside, elevation = beam_of(self.view.sonar, -port, forward, up)
@@ -505,12 +505,16 @@ class ReceiverTracer:
         toward = dr.dot(normal, u)
         lit = (echoes.hit > 0) & inside & (toward * dr.dot(normal, fan.d) > 0)
         active = lit & ~hidden(scene, point, normal, u, distance, lit)
-        return ViewEchoes(self._received(echoes, fan, way, distance, normal), dr.select(active, beam, 0), active, elevation)
+        return ViewEchoes(
+            self._received(echoes, fan, from_receiver, distance, normal), dr.select(active, beam, 0), active, elevation
+        )
 
-    def _received(self, echoes: Echoes, fan: Fan, way: DeviceArray, distance: DeviceArray, normal: DeviceArray) -> Echoes:
+    def _received(
+        self, echoes: Echoes, fan: Fan, from_receiver: DeviceArray, distance: DeviceArray, normal: DeviceArray
+    ) -> Echoes:
         """Compute range, footprint, cosine and weight of the echoes at the receiver.
 
-        ``way`` is the vector from the receiver to the point hit, and ``distance`` its length [m].
+        ``from_receiver`` is the vector from the receiver to the point hit, and ``distance`` its length [m].
         """
         # 1. The range is half of the path. The copy leaves the echoes of other views unchanged.
         half = (echoes.range_m + distance) * 0.5
@@ -521,7 +525,7 @@ class ReceiverTracer:
             return received
         # 2. Footprint: carry half the path from the ray to the lower and upper edge of its cell, on the tangent plane.
         # Jitter displaces the ray from the middle of its cell, by ``aside`` in bearing.
-        u = way / distance
+        u = from_receiver / distance
         lift = half_path_rate(echoes.range_m, fan.d, fan.lift, u, normal)
         side = half_path_rate(echoes.range_m, fan.d, fan.side, u, normal)
         middle = half + side * fan.aside
@@ -529,7 +533,7 @@ class ReceiverTracer:
         rises = dr.dot(normal, fan.lift) * dr.dot(normal, fan.d) < 0
         ends = (dr.select(rises, echoes.near_m, echoes.far_m), dr.select(rises, echoes.far_m, echoes.near_m))
         low, high = (
-            self._edge(echoes, fan, angle, end, way, normal, middle + lift * angle)
+            self._edge(echoes, fan, angle, end, from_receiver, normal, middle + lift * angle)
             for angle, end in zip((fan.below, fan.above), ends, strict=True)
         )
         received.near_m, received.far_m = dr.select(low < high, low, high), dr.select(low < high, high, low)
@@ -546,7 +550,7 @@ class ReceiverTracer:
         fan: Fan,
         angle: DeviceArray,
         end: DeviceArray,
-        way: DeviceArray,
+        from_receiver: DeviceArray,
         normal: DeviceArray,
         otherwise: DeviceArray,
     ) -> DeviceArray:
@@ -555,7 +559,7 @@ class ReceiverTracer:
         ``end`` is the distance of the edge from the transmitter [m], ``angle`` its elevation relative to the ray [rad].
         """
         toward = edge_direction(fan, angle)
-        back = dr.norm(way + toward * end - fan.d * echoes.range_m)
+        back = dr.norm(from_receiver + toward * end - fan.d * echoes.range_m)
         return dr.select(flatter(normal, fan.d, toward), (end + back) * 0.5, otherwise)
 
 
