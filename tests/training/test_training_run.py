@@ -518,7 +518,7 @@ def test_a_stop_leaves_a_network_and_a_row_of_the_log(made: Path, tmp_path: Path
     assert train(TrainOptions(told, made, tmp_path / "run", resume=True, minutes=5)).trained["steps"] == 3
 
 
-def test_runs_that_are_there_are_kept(made: Path, other: Path, tmp_path: Path) -> None:
+def test_runs_that_are_there_are_kept(made: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     told = recipe(steps=2)
     first = train(TrainOptions(told, made, out, threads=1))
@@ -526,6 +526,8 @@ def test_runs_that_are_there_are_kept(made: Path, other: Path, tmp_path: Path) -
         train(TrainOptions(told, made, out))
     with pytest.raises(MitsonarError, match=r"begun with recipe\.optimiser\.rate 0\.001, not 0\.002"):
         train(TrainOptions(recipe(steps=2, optimiser={"rate": 2e-3}), made, out, resume=True))
+    other = tmp_path / "other.zarr"
+    make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 10}], seed=3), str(other))
     with pytest.raises(MitsonarError, match="begun with digest"):
         train(TrainOptions(told, other, out, resume=True))
     before = weights(out)
