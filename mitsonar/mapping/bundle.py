@@ -101,18 +101,18 @@ class _Blocks(NamedTuple):
 
     Attributes:
         poses: matrix of the free poses ``(6 k, 6 k)``.
-        pull: right-hand side of the free poses ``(6 k,)``.
+        pose_rhs: right-hand side of the free poses ``(6 k,)``.
         between: matrix between poses and landmarks ``(6 k, 3 l)``.
         landmarks: diagonal blocks of the landmarks ``(l, 3, 3)``.
-        landmark_pull: right-hand side of the landmarks ``(l, 3)``.
+        landmark_rhs: right-hand side of the landmarks ``(l, 3)``.
         faults: mean squared error of each landmark, relative to the usual one ``(l,)``.
     """
 
     poses: Array
-    pull: Array
+    pose_rhs: Array
     between: Array
     landmarks: Array
-    landmark_pull: Array
+    landmark_rhs: Array
     faults: Array
 
 
@@ -128,8 +128,8 @@ def track_weight(faults: Array) -> Array:
 
 def adjusted(
     poses: Array,
-    held: int,
-    told: Array,
+    fixed: int,
+    measured: Array,
     attitude_std: Array,
     points: Array,
     seen: Observations,
@@ -140,8 +140,8 @@ def adjusted(
 
     Args:
         poses: initial poses ``(k, 6)`` [m, rad].
-        held: number of poses, from the first, that stay fixed.
-        told: measured heights [m], pitches and rolls [rad] of the other poses ``(k - held, 3)``.
+        fixed: number of poses, from the first, that stay fixed.
+        measured: measured heights [m], pitches and rolls [rad] of the other poses ``(k - fixed, 3)``.
         attitude_std: standard deviations of these heights [m], pitches and rolls [rad] ``(3,)``.
         points: initial points of the landmarks, with z as height over the ground ``(l, 3)`` [m].
         seen: observations of the landmarks.
@@ -154,33 +154,33 @@ def adjusted(
     Raises:
         LinAlgError: the observations do not suffice.
     """
-    found, place = poses.copy(), points.copy()
+    adjusted_poses, adjusted_points = poses.copy(), points.copy()
     for _ in range(ROUNDS):
         # 1. normal equations of the observations, with the priors of heights and attitudes
-        blocks = _normal_equations(found, held, place, seen, bearing)
-        _add_heights(blocks, place[:, 2], relief_m)
-        _add_attitudes(blocks, found[held:, 2:5], told, attitude_std)
+        blocks = _normal_equations(adjusted_poses, fixed, adjusted_points, seen, bearing)
+        _add_heights(blocks, adjusted_points[:, 2], relief_m)
+        _add_attitudes(blocks, adjusted_poses[fixed:, 2:5], measured, attitude_std)
         # 2. eliminate the landmarks, whose blocks are independent of each other, and solve for the poses
         inverse = np.asarray(np.linalg.inv(blocks.landmarks), dtype=np.float64)
         crossed = _crossed(blocks.between, inverse)
         reduced = blocks.poses - crossed @ blocks.between.T
         factor = cho_factor(reduced)
-        step = cho_solve(factor, blocks.pull - crossed @ blocks.landmark_pull.ravel())
+        step = cho_solve(factor, blocks.pose_rhs - crossed @ blocks.landmark_rhs.ravel())
         # 3. substitute back for the landmarks
-        rest = blocks.landmark_pull - (blocks.between.T @ step).reshape(-1, 3)
-        found[held:] += step.reshape(-1, 6)
-        place += np.einsum("lab,lb->la", inverse, rest)
+        rest = blocks.landmark_rhs - (blocks.between.T @ step).reshape(-1, 3)
+        adjusted_poses[fixed:] += step.reshape(-1, 6)
+        adjusted_points += np.einsum("lab,lb->la", inverse, rest)
         if np.abs(step).max() < STILL:
             break
     # 4. marginal covariance of the last pose: the last block of the inverse
     last = cho_solve(factor, np.eye(len(reduced))[:, -6:])[-6:]
-    return Adjusted(found, place, inverse, blocks.faults, last[np.ix_(PLANAR, PLANAR)])
+    return Adjusted(adjusted_poses, adjusted_points, inverse, blocks.faults, last[np.ix_(PLANAR, PLANAR)])
 
 
-def _normal_equations(poses: Array, held: int, points: Array, seen: Observations, bearing: Bearing) -> _Blocks:
+def _normal_equations(poses: Array, fixed: int, points: Array, seen: Observations, bearing: Bearing) -> _Blocks:
     """Return the normal equations of the observations, with robust weights."""
     # 1. errors of the observations, normalised by their covariances
-    count, free = len(points), len(poses) - held
+    count, free = len(points), len(poses) - fixed
     projected = projection_of(points[seen.landmark], Views.of(poses).take(seen.view), bearing)
     error = seen.polar - projected.polar
     information = np.linalg.inv(seen.covariance)
@@ -196,19 +196,19 @@ def _normal_equations(poses: Array, held: int, points: Array, seen: Observations
     # 4. blocks of the landmarks
     of_point = projected.by_point.transpose(0, 2, 1) @ information
     landmarks = _summed(of_point @ projected.by_point, seen.landmark, count) + LOOSE * np.eye(3)
-    landmark_pull = _summed((of_point @ error[:, :, None])[:, :, 0], seen.landmark, count)
+    landmark_rhs = _summed((of_point @ error[:, :, None])[:, :, 0], seen.landmark, count)
     # 5. blocks of the free poses, and between them and the landmarks; fixed poses only constrain landmarks
-    moves = seen.view >= held
-    view, landmark = seen.view[moves] - held, seen.landmark[moves]
+    moves = seen.view >= fixed
+    view, landmark = seen.view[moves] - fixed, seen.landmark[moves]
     of_pose = projected.by_pose[moves].transpose(0, 2, 1) @ information[moves]
-    own = _summed(of_pose @ projected.by_pose[moves], view, free) + LOOSE * np.eye(6)
-    pull = _summed((of_pose @ error[moves][:, :, None])[:, :, 0], view, free)
+    pose_blocks = _summed(of_pose @ projected.by_pose[moves], view, free) + LOOSE * np.eye(6)
+    pose_rhs = _summed((of_pose @ error[moves][:, :, None])[:, :, 0], view, free)
     between = np.zeros((free, count, 6, 3))
     between[view, landmark] = of_pose @ projected.by_point[moves]
     whole = np.zeros((free, 6, free, 6))
-    whole[np.arange(free), :, np.arange(free)] = own
+    whole[np.arange(free), :, np.arange(free)] = pose_blocks
     table = between.transpose(0, 2, 1, 3).reshape(6 * free, 3 * count)
-    return _Blocks(whole.reshape(6 * free, 6 * free), pull.ravel(), table, landmarks, landmark_pull, faults)
+    return _Blocks(whole.reshape(6 * free, 6 * free), pose_rhs.ravel(), table, landmarks, landmark_rhs, faults)
 
 
 def _crossed(between: Array, inverse: Array) -> Array:
@@ -228,15 +228,15 @@ def _add_heights(blocks: _Blocks, height: Array, relief_m: float) -> None:
     law = known * np.where(height > 0, 1 / relief_m, 1 / BELOW_M) / np.maximum(np.abs(height), NEAREST_M)
     mean = (1 - known) / relief_m**2
     blocks.landmarks[:, 2, 2] += law + mean
-    blocks.landmark_pull[:, 2] += mean * (relief_m - height) - law * height
+    blocks.landmark_rhs[:, 2] += mean * (relief_m - height) - law * height
 
 
-def _add_attitudes(blocks: _Blocks, attitudes: Array, told: Array, std: Array) -> None:
+def _add_attitudes(blocks: _Blocks, attitudes: Array, measured: Array, std: Array) -> None:
     """Add the measured heights, pitches and rolls ``(poses, 3)`` as a prior of the poses."""
-    information, off = np.zeros(6), np.zeros((len(told), 6))
-    information[2:5], off[:, 2:5] = 1 / std**2, told - attitudes
-    blocks.poses[np.diag_indices(len(blocks.poses))] += np.tile(information, len(told))
-    blocks.pull[:] += (information * off).ravel()
+    information, off = np.zeros(6), np.zeros((len(measured), 6))
+    information[2:5], off[:, 2:5] = 1 / std**2, measured - attitudes
+    blocks.poses[np.diag_indices(len(blocks.poses))] += np.tile(information, len(measured))
+    blocks.pose_rhs[:] += (information * off).ravel()
 
 
 def _summed(values: Array, group: Index, groups: int) -> Array:

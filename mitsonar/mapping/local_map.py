@@ -33,9 +33,9 @@ __all__ = [
     "FEWEST",
     "PAIR_STD",
     "USED",
-    "Found",
     "ImageAxes",
     "Landmarks",
+    "Matches",
     "Registered",
     "level_turn",
     "map_attitudes",
@@ -55,7 +55,7 @@ PIXELS = len(ROWS)
 ANCHOR = np.array([0.1, 0.08])
 """Standard deviation of the position of a new landmark [bins, beams], due to the noise of its patch."""
 
-LEAST_ALIKE = 0.75
+LEAST_CORRELATION = 0.75
 FARTHEST = np.array([8.0, 2.5])
 """Smallest correlation at which a patch counts as found, and its largest distance from the prediction [bins, beams]."""
 
@@ -110,7 +110,7 @@ class ImageAxes:
         return self.range_m, self.bearing_rad
 
 
-class Found(NamedTuple):
+class Matches(NamedTuple):
     """Landmarks that were found in a frame.
 
     Attributes:
@@ -125,9 +125,9 @@ class Found(NamedTuple):
     covariance: Array
     correlation: Array
 
-    def take(self, index: Index | NDArray[np.bool_]) -> Found:
+    def take(self, index: Index | NDArray[np.bool_]) -> Matches:
         """Return the selected landmarks."""
-        return Found(self.landmark[index], self.polar[index], self.covariance[index], self.correlation[index])
+        return Matches(self.landmark[index], self.polar[index], self.covariance[index], self.correlation[index])
 
 
 def _empty(*shape: int) -> Array:
@@ -166,12 +166,12 @@ class Landmarks:
         default_factory=lambda: Observations(np.zeros(0, np.intp), np.zeros(0, np.intp), _empty(2), _empty(2, 2))
     )
 
-    def find(self, image: PatchImage, view: Views) -> tuple[Found, int]:
+    def find(self, image: PatchImage, view: Views) -> tuple[Matches, int]:
         """Find the landmarks in a frame taken from an expected view; also return how many it should show."""
         # 1. landmarks in use whose predicted place lies well inside the frame
         number = np.flatnonzero(self.used)
         if not len(number):
-            return Found(number, _empty(2), _empty(2, 2), _empty()), 0
+            return Matches(number, _empty(2), _empty(2, 2), _empty()), 0
         middle = polar_of(self.points[number], view, self.axes.bearing)
         place = self.axes.cells(middle)
         inside = (np.abs(place - self._middle) < self._half).all(axis=1)
@@ -182,11 +182,11 @@ class Landmarks:
         cells = cells.reshape(len(number), PIXELS, 2)
         there = align(image, self.patches.take(number), cells[..., 0], cells[..., 1])
         # 3. keep those that correlate well near the prediction, converted from cells to range and bearing
-        good = (there.correlation > LEAST_ALIKE) & (np.abs(there.shift) < FARTHEST).all(axis=1)
+        good = (there.correlation > LEAST_CORRELATION) & (np.abs(there.shift) < FARTHEST).all(axis=1)
         spacing = self.axes.spacing(middle)
         covariance = there.covariance * spacing[:, :, None] * spacing[:, None, :]
-        found = Found(number, middle + there.shift * spacing, covariance, there.correlation)
-        return found.take(good), len(number)
+        matches = Matches(number, middle + there.shift * spacing, covariance, there.correlation)
+        return matches.take(good), len(number)
 
     @property
     def _middle(self) -> Array:
@@ -197,22 +197,22 @@ class Landmarks:
     def _half(self) -> Array:
         return np.asarray(self._middle - EDGE)
 
-    def observe(self, keyframe: int, found: Found) -> None:
+    def observe(self, keyframe: int, matches: Matches) -> None:
         """Store the observations of a keyframe, and drop landmarks that were missed too often."""
-        views = np.full(len(found.landmark), keyframe, dtype=np.intp)
-        new = Observations(views, found.landmark, found.polar, found.covariance)
+        views = np.full(len(matches.landmark), keyframe, dtype=np.intp)
+        new = Observations(views, matches.landmark, matches.polar, matches.covariance)
         self.seen = Observations(*(np.concatenate(pair) for pair in zip(self.seen, new, strict=True)))
         self.missed += self.used
-        self.missed[found.landmark] = 0
+        self.missed[matches.landmark] = 0
         self.used &= self.missed < MISSED
 
     def give_up(self) -> None:
         """Stop searching for all current landmarks, because the map restarts."""
         self.used[:] = False
 
-    def renew(self, image: PatchImage, view: Views, found: Found) -> None:
+    def renew(self, image: PatchImage, view: Views, matches: Matches) -> None:
         """Cut new patches for landmarks whose appearance has changed since they were chosen."""
-        old = found.take(found.correlation < STALE)
+        old = matches.take(matches.correlation < STALE)
         if not len(old.landmark):
             return
         middle = self.axes.cells(old.polar)
@@ -352,7 +352,7 @@ FRAMES_A_READ = 16
 WINDOW = 30
 """Number of keyframes whose poses are adjusted."""
 
-KEPT = 60
+STORED_KEYFRAMES = 60
 """Number of keyframes whose observations are stored; older ones show no landmark still in view."""
 
 MOVED = np.array([10.0, 2.2])
@@ -402,7 +402,7 @@ class _Map:
         attitude_std: standard deviations of measured height [m], pitch and roll [rad] ``(3,)``.
         keyframes: frame number of each keyframe.
         poses: pose of each keyframe ``(6,)``.
-        told: measured height, pitch and roll of each keyframe ``(3,)``.
+        measured: measured height, pitch and roll of each keyframe ``(3,)``.
         begun: first keyframe since the map was last restarted.
         relief_m: mean height of visible relief over the ground [m].
         lean: adjusted minus measured height, pitch and roll of the last keyframe ``(3,)``.
@@ -413,7 +413,7 @@ class _Map:
     attitude_std: Array
     keyframes: list[int] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
-    told: list[Array] = field(default_factory=list)
+    measured: list[Array] = field(default_factory=list)
     begun: int = 0
     relief_m: float = RELIEF_M
     lean: Array = field(default_factory=lambda: np.zeros(3))
@@ -458,9 +458,9 @@ def mapped(
         progress(1)
     # 2. apply the adjustments of keyframes, which later frames improved, to the frames between them
     corrected = _corrected(np.array(path), state)
-    found = motions(corrected)
+    refined = motions(corrected)
     drift = _drift_a_frame(state, len(path))
-    return [_decided(one, found[k], reasons[k + 1], drift[k + 1], corrected[k + 1]) for k, one in enumerate(estimates)]
+    return [_decided(one, refined[k], reasons[k + 1], drift[k + 1], corrected[k + 1]) for k, one in enumerate(estimates)]
 
 
 # ---------------- Local map: prediction
@@ -482,7 +482,7 @@ def map_attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
     heights = None if source.height_m is None else source.height_m[numbers]
     if heights is None or not np.isfinite(heights).any():
         raise MitsonarError(
-            f"{source.name}: the local map needs the height over the ground, and the frames tell none: give it, or "
+            f"{source.name}: the local map needs the height over the ground, which the frames lack: give it, or "
             "leave the map out"
         )
     heights = np.where(np.isfinite(heights), heights, np.nanmedian(heights))
@@ -502,7 +502,7 @@ def map_attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
         table[:, 3:5] = measured
     else:
         raise MitsonarError(
-            f"{source.name}: the local map needs the pitch of the sonar, and the frames tell none: give it, or "
+            f"{source.name}: the local map needs the pitch of the sonar, which the frames lack: give it, or "
             "leave the map out"
         )
     return table, ROUGH_STD
@@ -544,7 +544,7 @@ def _update(
     frames: SonarFrames,
     image: PatchImage,
     answer: Registered,
-    told: Array,
+    attitude: Array,
 ) -> Array:
     """Add a keyframe if the sonar has moved on, adjust the last ones, and return the pose of the frame."""
     # 1. a registered frame close to the last keyframe changes nothing; a frame that was not registered restarts the map
@@ -557,10 +557,10 @@ def _update(
     # 2. the new keyframe, with the drift of the one before until it is adjusted
     state.keyframes.append(frame)
     state.poses.append(answer.pose.copy())
-    state.told.append(told[2:5])
+    state.measured.append(attitude[2:5])
     state.drift.append(state.drift[-1] if state.drift else np.diag(PAIR_STD**2))
     # 3. store its observations, and adjust the window of keyframes
-    good = answer.found.take(answer.squared < WORST)
+    good = answer.matches.take(answer.squared < WORST)
     if number and not answer.reason:
         landmarks.observe(number, good)
         landmarks.renew(image, Views.of(answer.pose), good)
@@ -569,18 +569,20 @@ def _update(
     state.relief_m = _relief(frames, state.poses[-1], state.relief_m)
     view = Views.of(state.poses[-1])
     landmarks.choose(image, view, number, _usual_height(state))
-    landmarks.forget(number - KEPT)
+    landmarks.forget(number - STORED_KEYFRAMES)
     return state.poses[-1].copy()
 
 
 def _moved_on(state: _Map, answer: Registered) -> bool:
     """Return whether the landmarks of the last keyframe have moved far, or many of them are lost."""
-    number = answer.found.landmark
+    number = answer.matches.landmark
     if len(number) < max(FEWEST, LOST * int(state.landmarks.used.sum())):
         return bool(np.abs(answer.pose - state.poses[-1]).max() > 1e-6)
     axes, points = state.landmarks.axes, state.landmarks.points[number]
-    now, then = (axes.cells(polar_of(points, Views.of(pose), axes.bearing)) for pose in (answer.pose, state.poses[-1]))
-    return bool((np.median(np.abs(now - then), axis=0) > MOVED).any())
+    current, previous = (
+        axes.cells(polar_of(points, Views.of(pose), axes.bearing)) for pose in (answer.pose, state.poses[-1])
+    )
+    return bool((np.median(np.abs(current - previous), axis=0) > MOVED).any())
 
 
 def _adjust(state: _Map) -> None:
@@ -597,7 +599,7 @@ def _adjust(state: _Map) -> None:
         new = adjusted(
             poses,
             first - oldest,
-            np.array(state.told[first:]),
+            np.array(state.measured[first:]),
             state.attitude_std,
             landmarks.points[number],
             seen._replace(view=seen.view - oldest),
@@ -608,12 +610,12 @@ def _adjust(state: _Map) -> None:
         return  # the keyframes keep their registered poses
     # 2. take over the result
     landmarks.refine(number, new.points, new.point_covariance, new.faults)
-    state.lean = new.poses[-1, 2:5] - state.told[-1]
+    state.lean = new.poses[-1, 2:5] - state.measured[-1]
     state.poses[first:] = list(new.poses[first - oldest :])
-    state.drift[-1] = _of_one(new.last_covariance, np.array(state.poses[first - 1 :]))
+    state.drift[-1] = _covariance_per_motion(new.last_covariance, np.array(state.poses[first - 1 :]))
 
 
-def _of_one(whole: Array, poses: Array) -> Array:
+def _covariance_per_motion(whole: Array, poses: Array) -> Array:
     """Return the covariance of one motion between poses ``(k, 6)``, of which equal ones add up to that of the last pose."""
     # a heading error of an early motion moves the last pose by its lever arm: remove the mean effect, and divide the rest
     lever = (poses[-1, :2] - poses[:-1, :2]).mean(axis=0)
@@ -693,7 +695,7 @@ def _decided(estimate: Estimate, motion: Array, reason: str, drift: Array, pose:
 FEWEST = 12
 """Smallest number of landmarks with which a frame is registered."""
 
-LEAST_FOUND = 0.5
+LEAST_MATCHED = 0.5
 """Smallest fraction of the landmarks in view that a frame must show. The fraction is about 0.9 without noise, and 0.2 with
 pixel noise that hides the ground."""
 
@@ -718,13 +720,13 @@ class Registered:
 
     Attributes:
         pose: pose of the frame ``(6,)`` [m, rad].
-        found: landmarks found in the frame.
+        matches: landmarks found in the frame.
         squared: squared normalised error of each of them ``(n,)``.
         reason: why the result is not used; empty if it is.
     """
 
     pose: Array
-    found: Found
+    matches: Matches
     squared: Array
     reason: str = ""
 
@@ -744,29 +746,31 @@ def registered(landmarks: Landmarks, image: PatchImage, expected: Array, spread:
     turn = np.eye(3)
     turn[:2, :2] = level_turn(expected[5])
     predicted = turn.T @ spread @ turn
-    found, shown = landmarks.find(image, Views.of(expected))
-    found = found.take(_residuals(landmarks, found, expected, predicted).squared < GATE)
+    matches, shown = landmarks.find(image, Views.of(expected))
+    matches = matches.take(_residuals(landmarks, matches, expected, predicted).squared < GATE)
     pose, prior = expected.copy(), PAIR_SHARE * np.linalg.inv(predicted)
-    needed = max(FEWEST, int(LEAST_FOUND * shown))
-    if len(found.landmark) < needed:
-        few = f"the map finds {len(found.landmark)} of {shown} landmarks, {needed} are needed"
-        return Registered(pose, found, np.zeros(len(found.landmark)), few)
+    needed = max(FEWEST, int(LEAST_MATCHED * shown))
+    if len(matches.landmark) < needed:
+        few = f"the map finds {len(matches.landmark)} of {shown} landmarks, {needed} are needed"
+        return Registered(pose, matches, np.zeros(len(matches.landmark)), few)
     # 2. Gauss-Newton with robust weights, and with the prediction as a weak prior
     for _ in range(ROUNDS):
-        at = _residuals(landmarks, found, pose, None)
-        weight = cauchy(at.squared) * track_weight(landmarks.faults[found.landmark])
-        weighted = at.by_pose.transpose(0, 2, 1) @ (at.inverse * weight[:, None, None])
-        normal = (weighted @ at.by_pose).sum(axis=0) + prior
-        pull = (weighted @ at.error[:, :, None])[:, :, 0].sum(axis=0) - prior @ (pose - expected)[PLANAR]
-        step = np.linalg.solve(normal, pull)
+        residuals = _residuals(landmarks, matches, pose, None)
+        weight = cauchy(residuals.squared) * track_weight(landmarks.faults[matches.landmark])
+        weighted = residuals.by_pose.transpose(0, 2, 1) @ (residuals.inverse * weight[:, None, None])
+        normal = (weighted @ residuals.by_pose).sum(axis=0) + prior
+        rhs = (weighted @ residuals.error[:, :, None])[:, :, 0].sum(axis=0) - prior @ (pose - expected)[PLANAR]
+        step = np.linalg.solve(normal, rhs)
         pose[PLANAR] += step
         if np.abs(step).max() < STILL:
             break
     # 3. reject a pose that contradicts the prediction
     off = (pose - expected)[PLANAR]
     if off @ np.linalg.solve(predicted, off) > ASTRAY:
-        return Registered(expected, found, at.squared, "the map and the motion between two frames contradict each other")
-    return Registered(pose, found, at.squared)
+        return Registered(
+            expected, matches, residuals.squared, "the map and the motion between two frames contradict each other"
+        )
+    return Registered(pose, matches, residuals.squared)
 
 
 class _Residuals(NamedTuple):
@@ -785,12 +789,12 @@ class _Residuals(NamedTuple):
     by_pose: Array
 
 
-def _residuals(landmarks: Landmarks, found: Found, pose: Array, predicted: Array | None) -> _Residuals:
+def _residuals(landmarks: Landmarks, matches: Matches, pose: Array, predicted: Array | None) -> _Residuals:
     """Return the residuals of found landmarks at a pose, whose covariance ``predicted`` enters theirs if it is given."""
-    projected = projection_of(landmarks.points[found.landmark], Views.of(pose), landmarks.axes.bearing)
-    error, by_pose = found.polar - projected.polar, projected.by_pose[:, :, PLANAR]
-    covariance = landmarks.covariance[found.landmark]
-    spread = found.covariance + projected.by_point @ covariance @ projected.by_point.transpose(0, 2, 1)
+    projected = projection_of(landmarks.points[matches.landmark], Views.of(pose), landmarks.axes.bearing)
+    error, by_pose = matches.polar - projected.polar, projected.by_pose[:, :, PLANAR]
+    covariance = landmarks.covariance[matches.landmark]
+    spread = matches.covariance + projected.by_point @ covariance @ projected.by_point.transpose(0, 2, 1)
     if predicted is not None:
         spread = spread + by_pose @ predicted @ by_pose.transpose(0, 2, 1)
     inverse = np.asarray(np.linalg.inv(spread), dtype=np.float64)

@@ -102,12 +102,12 @@ class Canvas:
         """Draw a frame by its height and attitude, without its illumination; None if unknown, or with too little ground."""
         # 1. where each cell of the canvas lies in the frame; the height or attitude may be unknown
         try:
-            own = attitude_of(frame, "a search for loops", None, None)
+            attitude = attitude_of(frame, "a search for loops", None, None)
         except MitsonarError:
             return None
-        if own.reason:
+        if attitude.reason:
             return None
-        row, column, shown = fan_places(own.ground(frame), frame.sonar, self.view.points)
+        row, column, shown = fan_places(attitude.ground(frame), frame.sonar, self.view.points)
         inside = shown.astype(np.float32)
         if inside.sum() < FEWEST_CELLS**2:
             return None
@@ -162,11 +162,11 @@ def likenesses(first: CoarseView, second: CoarseView, yaws: Array, expected: Arr
         expected: sideways, forward [m] of the expected motion, the centre of the search ``(2,)``.
         window: half width of the search, sideways and forward [m] ``(2,)``; the larger one applies to both.
     """
-    found = []
+    matches = []
     for yaw in yaws:
         motion = Motion(float(expected[0]), float(expected[1]), float(yaw))
-        found += _best_shifts(first, second, motion, window)
-    return sorted(found, key=lambda one: -one.correlation)
+        matches += _best_shifts(first, second, motion, window)
+    return sorted(matches, key=lambda one: -one.correlation)
 
 
 def _best_shifts(first: CoarseView, second: CoarseView, motion: Motion, window: Array) -> list[Likeness]:
@@ -183,22 +183,22 @@ def _best_shifts(first: CoarseView, second: CoarseView, motion: Motion, window: 
     )
     # 2. sums over the overlap, at every shift: number of cells, product, sums and squares of both images
     spectra = [np.fft.rfft2(part, canvas.shape) for part in (image, image * image, inside)]
-    one, squared, there = first.transforms
-    overlap, product, own, others, own_squared, others_squared = (
+    spectrum, squared, mask = first.transforms
+    overlap, product, first_sum, second_sum, first_squares, second_squares = (
         np.fft.irfft2(a * b, canvas.shape)
         for a, b in (
-            (there, spectra[2]),
-            (one, spectra[0]),
-            (one, spectra[2]),
-            (there, spectra[0]),
+            (mask, spectra[2]),
+            (spectrum, spectra[0]),
+            (spectrum, spectra[2]),
+            (mask, spectra[0]),
             (squared, spectra[2]),
-            (there, spectra[1]),
+            (mask, spectra[1]),
         )
     )
     # 3. the correlation coefficient over the overlap
     count = np.maximum(overlap, 1.0)
-    spread = np.maximum(own_squared - own**2 / count, 0) * np.maximum(others_squared - others**2 / count, 0)
-    correlation = (product - own * others / count) / np.sqrt(spread + 1e-6 * count**2)
+    spread = np.maximum(first_squares - first_sum**2 / count, 0) * np.maximum(second_squares - second_sum**2 / count, 0)
+    correlation = (product - first_sum * second_sum / count) / np.sqrt(spread + 1e-6 * count**2)
     # 4. only shifts within the window, with enough overlap
     rows, columns = (np.fft.fftfreq(n, 1 / n) for n in canvas.shape)
     edge = canvas.view.edge
@@ -206,15 +206,15 @@ def _best_shifts(first: CoarseView, second: CoarseView, motion: Motion, window: 
     allowed = (np.abs(rows - expected[1]) <= farthest)[:, None] & (np.abs(columns - expected[0]) <= farthest)[None]
     allowed = allowed & (overlap >= LEAST_OVERLAP * float(first.inside.sum()))
     # 5. the best shift, then the best one away from it: the caller needs a rival to detect ambiguity
-    found: list[Likeness] = []
-    while allowed.any() and len(found) < 2:
+    best: list[Likeness] = []
+    while allowed.any() and len(best) < 2:
         row, column = np.unravel_index(int(np.where(allowed, correlation, -2).argmax()), canvas.shape)
         shifted = warp.astype(float)
         shifted[:, 2] += shifted[:, :2] @ [columns[column], rows[row]]
-        found.append(Likeness(canvas.view.motion(shifted), float(correlation[row, column])))
+        best.append(Likeness(canvas.view.motion(shifted), float(correlation[row, column])))
         near = (np.abs(rows - rows[row]) < RIVAL_CELLS)[:, None] & (np.abs(columns - columns[column]) < RIVAL_CELLS)[None]
         allowed &= ~near
-    return found
+    return best
 
 
 # ---------------- Loop closure: search
@@ -241,7 +241,7 @@ TURN_STEP = np.radians(3)
 OVERLAP = 0.6
 """Largest distance between the middles of the ground in two views, in extents, at which the views can match."""
 
-LEAST_LIKE = 0.5
+LEAST_CORRELATION = 0.5
 """Smallest correlation of two views of one place; views of different places reach 0.45 over rocks."""
 
 RIVAL = 0.85
@@ -259,7 +259,7 @@ WITNESS = 0.4
 NEIGHBOURS = 6
 """Number of keyframes within which loops confirm each other."""
 
-AGREEING_STD, AGREEING_WAY, AGREEING_M = 3.0, 0.03, 0.005
+AGREEING_STD, AGREEING_FRACTION, AGREEING_M = 3.0, 0.03, 0.005
 """Largest difference of two neighbouring loops: standard deviations of both, fraction of the distance between them, [m]."""
 
 
@@ -298,7 +298,7 @@ class _Searched:
     """A path with its covariances, keyframes and their views.
 
     Attributes:
-        own: marginal covariances of the poses ``(frames, 3, 3)``.
+        covariances: marginal covariances of the poses ``(frames, 3, 3)``.
         solution: solution of the pose graph without loops.
         keys: frames that are keyframes ``(keyframes,)``.
         views: view of each keyframe that shows ground.
@@ -306,7 +306,7 @@ class _Searched:
         canvas: canvas of all views.
     """
 
-    own: Array
+    covariances: Array
     solution: GraphSolution
     keys: Index
     views: dict[int, CoarseView]
@@ -379,7 +379,7 @@ def search_loops(
     register = _Register(source, estimator, numbers, searched, store)
     # 2. for each keyframe: one unambiguous place by appearance, confirmed by registration
     rejected: Counter[str] = Counter()
-    compared, found = 0, []
+    compared, registered = 0, []
     for second in (int(one) for one in searched.keys if int(one) in searched.views):
         matches, tried = _matches(searched, second)
         compared += tried
@@ -387,15 +387,15 @@ def search_loops(
         if candidate is not None:
             estimate = register(candidate)
             reason = _astray(estimate, candidate.motion, searched)
-            found += [] if reason else [(candidate, estimate)]
+            registered += [] if reason else [(candidate, estimate)]
         rejected[reason] += bool(reason)
     # 3. keep loops that a neighbour or a new witness confirms
-    loops = [loop for one in found for loop in _with_witness(one, found, register)]
-    rejected["no other loop beside it agrees"] += len(found) - sum(one in found for one in loops)
+    loops = [loop for one in registered for loop in _with_witness(one, registered, register)]
+    rejected["no neighbouring loop agrees"] += len(registered) - sum(one in registered for one in loops)
     edges = _edges(sorted(loops, key=lambda one: one[0].second), searched, errors)
     # 4. group loops by stretches of the path, within which they later vote
-    way = searched.travelled[edges.second]
-    group = np.cumsum(np.diff(way, prepend=way[:1]) > NEIGHBOURS * SPACING * searched.reach).astype(np.intp)
+    travelled = searched.travelled[edges.second]
+    group = np.cumsum(np.diff(travelled, prepend=travelled[:1]) > NEIGHBOURS * SPACING * searched.reach).astype(np.intp)
     return LoopSearch(edges, group, compared, +rejected)
 
 
@@ -403,14 +403,14 @@ def _searched(source: FrameSource, numbers: Index, solution: GraphSolution, canv
     """Choose keyframes at equal displacements of the ground in view, and draw their views."""
     poses, reach = solution.poses, canvas.reach_m
     moved = relative_motions(poses, np.arange(len(poses) - 1), np.arange(1, len(poses)))
-    way = np.hypot(moved[:, 0] + reach * moved[:, 2], moved[:, 1])
-    travelled = np.concatenate([[0.0], np.cumsum(way)])
+    displacement = np.hypot(moved[:, 0] + reach * moved[:, 2], moved[:, 1])
+    travelled = np.concatenate([[0.0], np.cumsum(displacement)])
     keys = np.unique(np.searchsorted(travelled, np.arange(0, travelled[-1] + 1e-9, SPACING * reach)))
     keys = np.unique(np.append(keys, len(poses) - 1)).astype(np.intp)
     drawn = {int(key): canvas.draw(source.read([numbers[key]])) for key in keys}
     views = {key: view for key, view in drawn.items() if view is not None}
-    own, _ = solution.covariances()
-    return _Searched(own, solution, keys, views, travelled, canvas)
+    covariances, _ = solution.covariances()
+    return _Searched(covariances, solution, keys, views, travelled, canvas)
 
 
 # ---------------- Loop closure: appearance
@@ -436,15 +436,15 @@ def _matches(searched: _Searched, second: int) -> tuple[list[tuple[int, Likeness
     order = np.argsort(np.linalg.norm(off, axis=1) / (searched.extent + spread), kind="stable")
     chosen = order[distance[order] <= OVERLAP * searched.extent][:MOST_COMPARED]
     # 4. correlate the views over the turns and shifts that the uncertainty allows
-    found = []
+    matches = []
     for place in chosen:
         std = np.sqrt(np.diag(covariances[place]))
         turns = _turns(float(motions[place, 2]), float(std[2]))
         window = np.minimum(GATE * std[:2], 2 * searched.extent)
         first = int(earlier[place])
         views = searched.views[first], searched.views[second]
-        found += [(first, one) for one in likenesses(*views, turns, motions[place, :2], window)]
-    return found, len(chosen)
+        matches += [(first, one) for one in likenesses(*views, turns, motions[place, :2], window)]
+    return matches, len(chosen)
 
 
 def _turns(expected: float, std: float) -> Array:
@@ -459,8 +459,8 @@ def _relative(searched: _Searched, first: Index, second: int) -> tuple[Array, Ar
     others = np.full(len(first), second)
     by_first, by_second = motion_derivatives(searched.poses, first, others)
     both = by_first @ cross @ by_second.swapaxes(1, 2)
-    covariances = by_first @ searched.own[first] @ by_first.swapaxes(1, 2) + both + both.swapaxes(1, 2)
-    covariances = covariances + by_second @ searched.own[others] @ by_second.swapaxes(1, 2)
+    covariances = by_first @ searched.covariances[first] @ by_first.swapaxes(1, 2) + both + both.swapaxes(1, 2)
+    covariances = covariances + by_second @ searched.covariances[others] @ by_second.swapaxes(1, 2)
     return relative_motions(searched.poses, first, others), covariances
 
 
@@ -469,13 +469,13 @@ def _unambiguous(searched: _Searched, second: int, matches: list[tuple[int, Like
     if not matches:
         return "", None
     first, best = max(matches, key=lambda one: one[1].correlation)
-    if best.correlation < LEAST_LIKE:
+    if best.correlation < LEAST_CORRELATION:
         return "", None
     place = _middle_of(_composed(searched.poses[first], best.motion), searched.reach)
     for other, one in matches:
         there = _middle_of(_composed(searched.poses[other], one.motion), searched.reach)
         if one.correlation > RIVAL * best.correlation and np.hypot(*(there - place)) > SAME_PLACE * searched.reach:
-            return "two places are alike", None
+            return "two places look similar", None
     return "", _nearest(searched, first, second, best.motion)
 
 
@@ -486,9 +486,9 @@ def _nearest(searched: _Searched, key: int, second: int, motion: Motion) -> _Can
     begin, end = searched.keys[max(0, place - 2)], searched.keys[min(len(searched.keys) - 1, place + 2)]
     there = np.vstack([searched.poses[begin : end + 1], _composed(searched.poses[key], motion)])
     count = len(there) - 1
-    ways = relative_motions(there, np.arange(count), np.full(count, count))
-    least = int(np.argmin(np.linalg.norm(ways * [1, 1, searched.reach], axis=1)))
-    return _Candidate(int(begin) + least, second, Motion(*(float(value) for value in ways[least])))
+    motions = relative_motions(there, np.arange(count), np.full(count, count))
+    least = int(np.argmin(np.linalg.norm(motions * [1, 1, searched.reach], axis=1)))
+    return _Candidate(int(begin) + least, second, Motion(*(float(value) for value in motions[least])))
 
 
 def _composed(pose: Array, motion: Motion) -> Array:
@@ -535,16 +535,16 @@ def _astray(estimate: Estimate, motion: Motion, searched: _Searched) -> str:
     return "the registration ends elsewhere than appearance" if far else ""
 
 
-_Found = tuple[_Candidate, Estimate]
+_Loop = tuple[_Candidate, Estimate]
 
 
-def _with_witness(one: _Found, found: list[_Found], register: _Register) -> list[_Found]:
+def _with_witness(one: _Loop, others: list[_Loop], register: _Register) -> list[_Loop]:
     """Return a loop that a neighbour confirms; a lone loop together with a new one that confirms it; or nothing."""
     searched = register.searched
-    beside = [other for other in found if other is not one and _is_beside(one, other, searched)]
-    if any(_same_place(one, other, searched) for other in beside):
+    neighbours = [other for other in others if other is not one and _is_neighbour(one, other, searched)]
+    if any(_same_place(one, other, searched) for other in neighbours):
         return [one]
-    for candidate in () if beside else _witnesses(one, searched):
+    for candidate in () if neighbours else _witnesses(one, searched):
         estimate = register(candidate)
         witness = candidate, estimate
         if not _astray(estimate, candidate.motion, searched) and _same_place(one, witness, searched):
@@ -552,27 +552,27 @@ def _with_witness(one: _Found, found: list[_Found], register: _Register) -> list
     return []
 
 
-def _is_beside(one: _Found, other: _Found, searched: _Searched) -> bool:
+def _is_neighbour(one: _Loop, other: _Loop, searched: _Searched) -> bool:
     """Return whether the later frames of two loops are neighbouring keyframes."""
-    way = abs(searched.travelled[other[0].second] - searched.travelled[one[0].second])
-    return bool(way <= NEIGHBOURS * SPACING * searched.reach)
+    distance = abs(searched.travelled[other[0].second] - searched.travelled[one[0].second])
+    return bool(distance <= NEIGHBOURS * SPACING * searched.reach)
 
 
-def _witnesses(one: _Found, searched: _Searched) -> list[_Candidate]:
+def _witnesses(one: _Loop, searched: _Searched) -> list[_Candidate]:
     """Return candidates for the same loop from frames slightly before and after the later one, smaller motion first."""
     candidate, estimate = one
     there = _composed(searched.poses[candidate.first], estimate.motion)
-    way, found = searched.travelled, []
+    travelled, candidates = searched.travelled, []
     for off in (-WITNESS, WITNESS):
-        other = int(np.searchsorted(way, way[candidate.second] + off * SPACING * searched.reach))
-        if 0 < other < len(way) and other != candidate.second:
+        other = int(np.searchsorted(travelled, travelled[candidate.second] + off * SPACING * searched.reach))
+        if 0 < other < len(travelled) and other != candidate.second:
             onward = relative_motions(searched.poses, [candidate.second], [other])[0]
             ends = np.array([searched.poses[candidate.first], _composed(there, Motion(*onward.tolist()))])
-            found.append(_Candidate(candidate.first, other, Motion(*relative_motions(ends, [0], [1])[0].tolist())))
-    return sorted(found, key=lambda each: float(np.hypot(each.motion.sideways, each.motion.forward)))
+            candidates.append(_Candidate(candidate.first, other, Motion(*relative_motions(ends, [0], [1])[0].tolist())))
+    return sorted(candidates, key=lambda each: float(np.hypot(each.motion.sideways, each.motion.forward)))
 
 
-def _same_place(one: _Found, other: _Found, searched: _Searched) -> bool:
+def _same_place(one: _Loop, other: _Loop, searched: _Searched) -> bool:
     """Return whether two loops agree: with the path between their later frames, both predict the same pose."""
     # 1. both predictions of the later frame of the second loop, and their difference
     poses = searched.poses
@@ -583,9 +583,9 @@ def _same_place(one: _Found, other: _Found, searched: _Searched) -> bool:
     off = np.abs(relative_motions(np.array([by_other, there]), [0], [1])[0])
     # 2. the limit allows for the errors of both registrations and for the drift of the path between them
     variance = np.diag(_covariance_of(one[1], searched) + _covariance_of(other[1], searched))
-    way = searched.travelled[[one[0].second, other[0].second]]
+    travelled = searched.travelled[[one[0].second, other[0].second]]
     limit = AGREEING_STD * np.sqrt([variance[:2].sum(), variance[2]])
-    limit += (AGREEING_WAY * float(np.ptp(way)) + AGREEING_M) * np.array([1, 1 / searched.reach])
+    limit += (AGREEING_FRACTION * float(np.ptp(travelled)) + AGREEING_M) * np.array([1, 1 / searched.reach])
     return bool(np.hypot(off[0], off[1]) <= limit[0] and off[2] <= limit[1])
 
 
@@ -595,21 +595,21 @@ def _covariance_of(estimate: Estimate, searched: _Searched) -> Array:
     return rough if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float)
 
 
-def _edges(found: list[_Found], searched: _Searched, errors: ErrorCorrelation) -> PoseEdges:
+def _edges(loops: list[_Loop], searched: _Searched, errors: ErrorCorrelation) -> PoseEdges:
     """Return loops as edges of a pose graph, whose errors are independent.
 
     Errors of neighbouring loops are correlated. Their covariances are inflated, so that the covariance of their mean is
     right.
     """
-    if not found:
+    if not loops:
         return PoseEdges.none()
-    motions = np.array([one.motion for _, one in found], dtype=float)
-    known = [_covariance_of(one, searched) for _, one in found]
+    motions = np.array([one.motion for _, one in loops], dtype=float)
+    known = [_covariance_of(one, searched) for _, one in loops]
     # errors in proportion to the motion, which registrations do not report
     slopes = errors.along(np.vstack([motions, motions[:1]]), searched.reach).slope_std
     scaled = (motions**2) @ (slopes**2).T
     # the mean of a first-order chain with correlation r has (1 + r) / (1 - r) times the variance of independent errors
     correlation = errors.share * np.exp(-SPACING / errors.length)
     covariances = (1 + correlation) / (1 - correlation) * (np.array(known) + scaled[:, None] * np.eye(3))
-    first, second = (np.array([place[k] for place, _ in found], dtype=np.intp) for k in (0, 1))
+    first, second = (np.array([place[k] for place, _ in loops], dtype=np.intp) for k in (0, 1))
     return PoseEdges(first, second, motions, covariances)

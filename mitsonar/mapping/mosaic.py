@@ -181,7 +181,7 @@ class Mosaic:
         images = self._flat(levels_of(frames))
         table, heights = poses_and_heights(frames, poses, height_m)
         if np.shape(whole) not in ((), (len(frames),)):
-            raise MitsonarError(f"whole must be one truth, or one for each of {len(frames)} frames: got {np.shape(whole)}")
+            raise MitsonarError(f"whole must be one boolean, or one for each of {len(frames)} frames: got {np.shape(whole)}")
         entire = np.broadcast_to(np.asarray(whole, dtype=bool), len(frames))
         for image, pose, height, all_beams in zip(images, table, heights, entire, strict=True):
             fan = fan_of(frames, pose, height)
@@ -322,8 +322,8 @@ class Mosaic:
     @property
     def mean(self) -> Floats:
         """Return the mean level ``(rows, columns)`` in 0..1; row 0 is northernmost, column 0 westernmost; nan: unknown."""
-        found = self._north_up()
-        return np.where(found.seen > 0, found.mean, np.float32(np.nan))
+        cells = self._north_up()
+        return np.where(cells.seen > 0, cells.mean, np.float32(np.nan))
 
     @property
     def std(self) -> Floats:
@@ -333,11 +333,11 @@ class Mosaic:
         The variance is unbiased: sum w (x - mean)^2 / (W - sum w^2 / W) with W = sum w. With equal weights this is
         the usual division by n - 1.
         """
-        found = self._north_up()
+        cells = self._north_up()
         with np.errstate(invalid="ignore", divide="ignore"):
-            free = found.weight - found.weight2 / found.weight
-            known = (found.seen > 1) & (free > ONE_ALONE * found.weight)
-            return np.where(known, np.sqrt(np.maximum(found.squares, 0) / free), np.float32(np.nan))
+            free = cells.weight - cells.weight2 / cells.weight
+            known = (cells.seen > 1) & (free > ONE_ALONE * cells.weight)
+            return np.where(known, np.sqrt(np.maximum(cells.squares, 0) / free), np.float32(np.nan))
 
     @property
     def weight(self) -> Floats:
@@ -421,13 +421,13 @@ def _check_all_used(frames: int, poses: Array | None, heights: Array | None) -> 
 
 def _and_whether_last(chunks: Iterable[SonarFrames]) -> Iterator[tuple[SonarFrames, bool]]:
     """Yield each chunk and whether it is the last one, by reading one chunk ahead."""
-    held = None
+    previous = None
     for chunk in chunks:
-        if held is not None:
-            yield held, False
-        held = chunk
-    if held is not None:
-        yield held, True
+        if previous is not None:
+            yield previous, False
+        previous = chunk
+    if previous is not None:
+        yield previous, True
 
 
 # ---------------- Cells and their running sums
@@ -540,7 +540,7 @@ def levels_of(frames: SonarFrames) -> Floats:
     if min(bins, beams) < 2 or max(bins, beams) > LONGEST_SIDE:
         raise MitsonarError(f"a mosaic needs images of 2 to {LONGEST_SIDE:,} bins and beams: got {bins:,} x {beams:,}")
     if (np.diff(frames.range_m) <= 0).any() or (np.diff(frames.bearing_rad) <= 0).any():
-        raise MitsonarError("range_m and bearing_rad must rise: sort the images' rows and columns")
+        raise MitsonarError("range_m and bearing_rad must increase: sort the images' rows and columns")
     images = frames.matching_values()
     if not np.isfinite(images).all():
         raise MitsonarError("images must be finite: got inf or nan; 0 means no echo")
@@ -598,8 +598,8 @@ def checked_poses(poses: ArrayLike | None) -> NDArray[np.float64]:
 
 def fan_of(frames: SonarFrames, pose: NDArray[np.float64], height: float) -> FrameFan:
     """Return the geometry of a frame at a pose and a height [m] over the ground."""
-    at = Pose.from_row(pose)
-    ground = GroundGeometry(frames.range_m, frames.bearing_rad, frames.sonar.bearing, float(height), at.pitch, at.roll)
+    _, _, _, pitch, roll, _ = Pose.from_row(pose)
+    ground = GroundGeometry(frames.range_m, frames.bearing_rad, frames.sonar.bearing, float(height), pitch, roll)
     return FrameFan(ground, math.radians(frames.sonar.elevation_fov_deg) / 2)
 
 

@@ -328,7 +328,7 @@ class Odometry:
             rows += [(f"scale of {axis.name}, {how}", float(f), "") for axis, f in zip(AXES, self.factors, strict=True)]
         if self.series.covariances is not None:
             std = np.sqrt(np.diagonal(self.series.covariances, axis1=1, axis2=2).mean(axis=0))
-            rows += _by_axis("standard deviation of a motion as told", in_units(std))
+            rows += _by_axis("estimated standard deviation of a motion", in_units(std))
         if self.closure is not None:
             rows += _by_axis(f"closure over {self.closure.steps} motions, rms", in_units(self.closure.rms))
             rows += _by_axis(f"closure over {self.closure.steps} motions, mean", in_units(self.closure.mean))
@@ -341,7 +341,7 @@ class Odometry:
         rows += _by_axis("RMSE of always answering zero", errors.zero)
         rows += [(f"slope over the true {axis.name}", float(s), "") for axis, s in zip(AXES, errors.slope, strict=True)]
         if np.isfinite(errors.nees):
-            rows.append(("NEES (1 is honest)", errors.nees, ""))
+            rows.append(("NEES (ideally 1)", errors.nees, ""))
         return rows + [(name, float(value), unit) for name, value, unit in assess(self.path, self.true).rows()]
 
     def warnings(self) -> list[str]:
@@ -358,7 +358,7 @@ class Odometry:
         doubts = [str(one.about["doubt"]) for one in self.estimates if "doubt" in one.about]
         if doubts:
             warnings.append(
-                f"{len(doubts)} of {len(self.estimates)} pairs of frames contradict the height that they are given, which "
+                f"{len(doubts)} of {len(self.estimates)} pairs of frames contradict the height given, which "
                 f"counts unless the ground rises: {_frequent(doubts)}; check height and pitch (faint ground near the sonar "
                 "looks so, too)"
             )
@@ -446,8 +446,8 @@ def closure_of(
 ) -> Closure | None:
     """Compare composed single motions with motions that are estimated over several steps at once.
 
-    Loops follow one another without overlap, so that their errors are independent. In a short run they overlap to give 16
-    loops, or as many as fit.
+    Loops follow one another without overlap, so that their errors are independent. In a short run they overlap, to give
+    up to 16 loops.
 
     Args:
         source: source of the records.
@@ -553,10 +553,10 @@ class GraphPath:
                 ("loops", float(self.accepted.sum()), ""),
                 ("loops rejected", float(out + sum(self.search.rejected.values())), ""),
                 ("pairs of views compared for loops", float(self.search.compared), ""),
-                ("standard deviation of the end as told, before loops", 1e3 * self.end_std_before_m, "mm"),
+                ("estimated standard deviation of the end, before loops", 1e3 * self.end_std_before_m, "mm"),
                 ("end moved by loops", 1e3 * self.end_moved_m, "mm"),
             ]
-        rows.append(("standard deviation of the end as told", 1e3 * self.end_std_m, "mm"))
+        rows.append(("estimated standard deviation of the end", 1e3 * self.end_std_m, "mm"))
         if true is not None:
             each = normalised_errors(self.path, self.covariances, true)
             rows.append(("squared pose error over its covariance, a third, mean along the path", float(each.mean()), ""))
@@ -653,7 +653,7 @@ def _closed(graph: PoseGraph, search: LoopSearch, before: GraphSolution) -> Grap
     if not out.any():
         return after
     accepted = after.accepted & ~out
-    rest = solved(replace(graph, loops=search.loops.at(accepted))) if accepted.any() else before
+    rest = solved(replace(graph, loops=search.loops.select(accepted))) if accepted.any() else before
     accepted[accepted] = rest.accepted if accepted.any() else True
     return replace(rest, accepted=accepted)
 
@@ -668,19 +668,19 @@ def _path_of(
 ) -> GraphPath:
     """Collect the path, its covariances and its motions."""
     count = len(time_s)
-    own, following = solution.covariances()
+    covariances, following = solution.covariances()
     poses = np.tile(np.asarray(start, dtype=float), (count, 1))
     poses[:, [0, 1, 5]] = solution.poses
     rises = None if sensors is None else sensors.rises(time_s)
     poses[:, 2] += 0.0 if rises is None else rises
     moved = relative_motions(solution.poses, np.arange(count - 1), np.arange(1, count))
-    covariances = solution.motion_covariances(own, following)
+    motion_covariances = solution.motion_covariances(covariances, following)
     last = count - 1
     end = before.columns([last])[last, :2, 0, :2]
     return GraphPath(
         path=Trajectory(poses, time_s),
-        covariances=own,
-        series=MotionSeries(moved, time_s, (covariances + covariances.swapaxes(1, 2)) / 2),
+        covariances=covariances,
+        series=MotionSeries(moved, time_s, (motion_covariances + motion_covariances.swapaxes(1, 2)) / 2),
         sensors=() if sensors is None else tuple(sensors.names),
         search=search,
         accepted=solution.accepted,

@@ -118,9 +118,9 @@ class OdometryFolder(EstimateStore):
             MitsonarError: a journal is damaged.
         """
         pairs = read_journal(self.path / "estimates.jsonl", "pair")
-        self.pairs = {of["pair"]: estimate for of, estimate in pairs}
+        self.pairs = {key["pair"]: estimate for key, estimate in pairs}
         loops = read_journal(self.path / "loops.jsonl", "first", "second")
-        self.loops = {(of["first"], of["second"], of["guess"]): estimate for of, estimate in loops}
+        self.loops = {(key["first"], key["second"], key["guess"]): estimate for key, estimate in loops}
         return self
 
     def add_pair(self, pair: int, estimate: Estimate) -> None:
@@ -139,30 +139,32 @@ class OdometryFolder(EstimateStore):
 
     # ---------------- Results
 
-    def write(self, found: Odometry, title: str, more: PlainTable) -> None:
+    def write(self, result: Odometry, title: str, notes: PlainTable) -> None:
         """Write all results. ``run.json`` comes last and marks them as complete."""
         self.run.start()
         self.run.finished = False
-        self.run.note(**more)
+        self.run.note(**notes)
         frame = str(self.run.notes.get("frame", "mitsonar"))
-        _save_tum(self.path / "estimated.tum", found.path, frame)
-        if found.true is not None:
-            _save_tum(self.path / "true.tum", found.true, frame)
-        write_whole(self.path / "motions.csv", _motions_csv(found).encode())
-        write_whole(self.path / "covariances.npz", _covariances(found))
-        if np.isfinite(found.heights.height_m).any():
-            write_whole(self.path / "height_profile.csv", found.heights.csv().encode())
+        _save_tum(self.path / "estimated.tum", result.path, frame)
+        if result.true is not None:
+            _save_tum(self.path / "true.tum", result.true, frame)
+        write_whole(self.path / "motions.csv", _motions_csv(result).encode())
+        write_whole(self.path / "covariances.npz", _covariances(result))
+        if np.isfinite(result.heights.height_m).any():
+            write_whole(self.path / "height_profile.csv", result.heights.csv().encode())
         else:
             (self.path / "height_profile.csv").unlink(missing_ok=True)  # left from an earlier run with heights
-        if found.graph is not None and found.graph.search is not None:
-            write_whole(self.path / "loops.csv", _loops_csv(found, found.graph.search.loops, found.graph.accepted).encode())
+        if result.graph is not None and result.graph.search is not None:
+            write_whole(
+                self.path / "loops.csv", _loops_csv(result, result.graph.search.loops, result.graph.accepted).encode()
+            )
         else:
             (self.path / "loops.csv").unlink(missing_ok=True)  # left from an earlier search
-        rows = found.rows()
+        rows = result.rows()
         write_whole(self.path / "table.md", ("\n".join(table_lines(rows)) + "\n").encode())
         table = [{"name": name, "value": value if np.isfinite(value) else None, "unit": unit} for name, value, unit in rows]
         write_json(self.path / "table.json", {"rows": table})
-        save_figure(self.path / "path.png", _figure(found, title))
+        save_figure(self.path / "path.png", _figure(result, title))
         self.run.finish()
 
 
@@ -201,18 +203,19 @@ def run_odometry(
     folder = OdometryFolder(run).read_journals() if run.resumed else OdometryFolder(run)
     # 2. compute the path; each new estimate goes to the journals at once
     begun = time.perf_counter()
-    found = odometry(source, estimator, options, store=folder, progress=progress)
+    result = odometry(source, estimator, options, store=folder, progress=progress)
     # 3. write the results, with notes for `run.json`
     notes = {
         **{"source": source.name, "inputs": estimator.inputs, "smooth": options.smooth},
         "scale": options.scale if isinstance(options.scale, str) or options.scale is None else "given",
-        **{"frame": frame, "factors": found.factors, "from": found.path.poses[0], "not_believed": int((~found.valid).sum())},
-        **{"warnings": found.warnings(), "seconds": time.perf_counter() - begun},
-        **{"pairs_in_these_seconds": len(found.estimates) - len(folder.pairs), "workers": options.workers},
+        **{"frame": frame, "factors": result.factors, "from": result.path.poses[0]},
+        **{"not_believed": int((~result.valid).sum())},
+        **{"warnings": result.warnings(), "seconds": time.perf_counter() - begun},
+        **{"pairs_in_these_seconds": len(result.estimates) - len(folder.pairs), "workers": options.workers},
         **{"closure": options.closure, "loops": options.loops, "local_map": options.local_map},
     }
-    folder.write(found, f"{Path(source.name).name}, {name}", notes)
-    return found
+    folder.write(result, f"{Path(source.name).name}, {name}", notes)
+    return result
 
 
 def _settings(source: Source, name: str, estimator: AnyEstimator, options: OdometryOptions) -> PlainTable:
@@ -236,24 +239,24 @@ def _save_tum(path: Path, trajectory: Trajectory, frame: str) -> None:
     part.replace(path)
 
 
-def _motions_csv(found: Odometry) -> str:
+def _motions_csv(result: Odometry) -> str:
     """Return a CSV table with one line per motion, in mm and deg; unknown standard deviations are empty."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     names = [f"{axis.name}_{axis.unit}" for axis in AXES]
     stds = [f"{axis.name}_std_{axis.unit}" for axis in AXES]
     table.writerow(["from_frame", "frame", "time_s", *names, *stds, "believed", "reason"])
-    moved = in_units(found.series.motions)
-    std = _std(found.series.covariances)
-    for k, estimate in enumerate(found.estimates):
+    moved = in_units(result.series.motions)
+    std = _std(result.series.covariances)
+    for k, estimate in enumerate(result.estimates):
         deviations = ["", "", ""] if std is None else [f"{value:.6g}" for value in std[k]]
         numbers = [f"{value:.6f}" for value in moved[k]]
-        frames = [int(found.frames[k]), int(found.frames[k + 1]), f"{found.series.time_s[k + 1]:.9g}"]
+        frames = [int(result.frames[k]), int(result.frames[k + 1]), f"{result.series.time_s[k + 1]:.9g}"]
         table.writerow([*frames, *numbers, *deviations, int(estimate.valid), estimate.reason])
     return text.getvalue()
 
 
-def _loops_csv(found: Odometry, loops: PoseEdges, accepted: NDArray[np.bool_]) -> str:
+def _loops_csv(result: Odometry, loops: PoseEdges, accepted: NDArray[np.bool_]) -> str:
     """Return a CSV table with one line per loop, in mm and deg."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -262,7 +265,7 @@ def _loops_csv(found: Odometry, loops: PoseEdges, accepted: NDArray[np.bool_]) -
     moved, std = in_units(loops.motions), in_units(np.sqrt(np.diagonal(loops.covariances, axis1=1, axis2=2)))
     for k, (first, second) in enumerate(zip(loops.first, loops.second, strict=True)):
         numbers = [f"{value:.6f}" for value in moved[k]] + [f"{value:.6g}" for value in std[k]]
-        table.writerow([int(found.frames[first]), int(found.frames[second]), *numbers, int(accepted[k])])
+        table.writerow([int(result.frames[first]), int(result.frames[second]), *numbers, int(accepted[k])])
     return text.getvalue()
 
 
@@ -270,17 +273,17 @@ def _std(covariances: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
     return None if covariances is None else in_units(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)))
 
 
-def _covariances(found: Odometry) -> bytes:
+def _covariances(result: Odometry) -> bytes:
     """Return an ``.npz`` file of times, motions and covariances in m and rad; unknown covariances are nan."""
-    count = len(found.estimates)
-    motions, poses = found.series.covariances, found.pose_covariances
+    count = len(result.estimates)
+    motions, poses = result.series.covariances, result.pose_covariances
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
-        time_s=found.series.time_s,
-        frames=found.frames,
-        motions=found.series.motions,
-        believed=found.valid,
+        time_s=result.series.time_s,
+        frames=result.frames,
+        motions=result.series.motions,
+        believed=result.valid,
         motion_covariances=np.full((count, 3, 3), np.nan) if motions is None else motions,
         pose_covariances=np.full((count + 1, 3, 3), np.nan) if poses is None else poses,
     )
@@ -301,10 +304,10 @@ def _number(value: float, unit: str) -> str:
     return f"{value:,.0f}" if unit == "" and float(value).is_integer() else f"{value:.4g}"
 
 
-def _figure(found: Odometry, title: str) -> Figure:
-    true = found.true_at_frames
-    paths = {"estimated": found.path} | ({} if true is None else {"true": true})
-    motions, poses = found.series.covariances, found.pose_covariances
+def _figure(result: Odometry, title: str) -> Figure:
+    true = result.true_at_frames
+    paths = {"estimated": result.path} | ({} if true is None else {"true": true})
+    motions, poses = result.series.covariances, result.pose_covariances
     return path_figure(
         paths,
         motion_covariances=None if motions is None else {"estimated": motions},
@@ -323,17 +326,17 @@ HEIGHTS = ("height_m", "height_std_m")
 """Height over the ground and its standard deviation [m], which an estimator may report."""
 
 
-def add_to_journal(path: Path, of: PlainTable, estimate: Estimate) -> None:
+def add_to_journal(path: Path, key: PlainTable, estimate: Estimate) -> None:
     """Append an estimate to a journal as one JSON line, which preserves every bit of its numbers.
 
     Args:
         path: path of the journal.
-        of: identifies the estimate: its ``pair``; or its ``first`` and ``second`` frame and the initial ``guess``.
+        key: identifies the estimate: its ``pair``; or its ``first`` and ``second`` frame and the initial ``guess``.
         estimate: estimate to append.
     """
     covariance = None if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float).tolist()
     motion = [float(value) for value in estimate.motion]
-    line = of | {"motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
+    line = key | {"motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
     about = {name: estimate.about[name] for name in ("modes", "spreads", *HEIGHTS) if name in estimate.about}
     text = json.dumps(line | {"reason": estimate.reason} | ({"about": about} if about else {})) + "\n"
     with path.open("a", encoding="utf-8") as file:
@@ -352,10 +355,10 @@ def read_journal(path: Path, *names: str) -> Iterator[tuple[PlainTable, Estimate
     """
     for number, line in enumerate(whole_lines(path, "journal", LARGEST_JOURNAL), start=1):
         try:
-            found = _estimate_in(line, names)
+            entry = _estimate_in(line, names)
         except Exception:  # a damaged line may raise anything
             raise MitsonarError(f"{path}, line {number} is damaged: start over with --overwrite") from None
-        yield found
+        yield entry
 
 
 def _estimate_in(line: bytes, names: tuple[str, ...]) -> tuple[PlainTable, Estimate]:
@@ -371,10 +374,10 @@ def _estimate_in(line: bytes, names: tuple[str, ...]) -> tuple[PlainTable, Estim
         raise ValueError("covariance is not a covariance")
     about = table.get("about", {})
     if not isinstance(about, dict):
-        raise ValueError("about is no table")
+        raise ValueError("about is not a table")
     for name in set(HEIGHTS) & set(about):
         finite_number(about[name], name, above=0)
-    of: PlainTable = {name: whole_number(table[name], name, 0, 2**40) for name in names}
+    key: PlainTable = {name: whole_number(table[name], name, 0, 2**40) for name in names}
     if "first" in names:
-        of["guess"] = Motion(*(float(value) for value in np.array(table["guess"], dtype=float).reshape(3)))
-    return of, Estimate(Motion(*(float(value) for value in motion)), covariance, table["valid"], table["reason"], about)
+        key["guess"] = Motion(*(float(value) for value in np.array(table["guess"], dtype=float).reshape(3)))
+    return key, Estimate(Motion(*(float(value) for value in motion)), covariance, table["valid"], table["reason"], about)

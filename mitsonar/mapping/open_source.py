@@ -105,7 +105,7 @@ class ViewSource:
             MitsonarError: the data set lacks these views.
         """
         if estimator.views is not None:
-            _check_there(self.store, estimator.views, estimator.kind)
+            _check_views(self.store, estimator.views, estimator.kind)
         return replace(self, altimeter=estimator)
 
     @property
@@ -137,18 +137,18 @@ class ViewSource:
 
         # one slice from the first to the last ping, from which the chosen ones are picked
         here = slice(self.first + int(chosen[0]), self.first + int(chosen[-1]) + 1)
-        kept = chosen - chosen[0]
+        offsets = chosen - chosen[0]
         values, known = {}, {view.name: view for view in self.store.recipe.views}
-        made = arrangement_of(self.store.recipe, views=views, kind=kind, noise=self.noise or "none")
+        arrangement = arrangement_of(self.store.recipe, views=views, kind=kind, noise=self.noise or "none")
         for number, view in enumerate(views):
             frames = {
-                (view if stored == kind else f"nonzero_{view}"): self.store.read(name, here)[kept][None]
-                for name, (stored, of) in array_names(self.store.recipe).items()
-                if of == view and (stored == kind or (stored == "nonzero" and kind == "vector"))
+                (view if stored == kind else f"nonzero_{view}"): self.store.read(name, here)[offsets][None]
+                for name, (stored, stored_view) in array_names(self.store.recipe).items()
+                if stored_view == view and (stored == kind or (stored == "nonzero" and kind == "vector"))
             }
             # noise is a function of the frame number in the store, and of the seed, which differs between views
             numbers = (self.first + chosen.astype(np.int64))[None]
-            values[view] = np.asarray(made.noisy(frames, view, numbers, self.seed + number))[0]
+            values[view] = np.asarray(arrangement.noisy(frames, view, numbers, self.seed + number))[0]
         return ViewFrames(
             kind=kind,
             values=values,
@@ -171,7 +171,7 @@ class ViewSource:
 
 
 def open_views(url: str, views: Sequence[str], kind: str, *, sequence: int | None = None) -> ViewSource:
-    """Open views of a sequence of a data set, by default the longest sequence, and the first of several as long.
+    """Open views of a sequence of a data set, by default the longest sequence, the first if several are equally long.
 
     Raises:
         MitsonarError: there is no data set, or it lacks these views, this kind or this sequence.
@@ -179,7 +179,7 @@ def open_views(url: str, views: Sequence[str], kind: str, *, sequence: int | Non
     from mitsonar.datasets.store import DataStore  # its import takes half a second
 
     store = DataStore.open(url)
-    _check_there(store, views, kind)
+    _check_views(store, views, kind)
     here, number, note = sequence_in(store, sequence)
     time_s, sonar_poses, height_m = (store.read(name, here) for name in ("time_s", "pose", "height_m"))
     poses = store.read("vehicle_pose", here) if "vehicle_pose" in store.group else sonar_poses
@@ -187,7 +187,7 @@ def open_views(url: str, views: Sequence[str], kind: str, *, sequence: int | Non
     return ViewSource(name, store, tuple(views), kind, here.start, time_s, poses, sonar_poses, height_m, note=which)
 
 
-def _check_there(store: DataStore, views: Sequence[str], kind: str) -> None:
+def _check_views(store: DataStore, views: Sequence[str], kind: str) -> None:
     """Check that a data set holds these views.
 
     Raises:
@@ -195,11 +195,11 @@ def _check_there(store: DataStore, views: Sequence[str], kind: str) -> None:
     """
     from mitsonar.config.data import array_names
 
-    there = {view for kind_there, view in array_names(store.recipe).values() if kind_there == kind}
-    lacking = [view for view in views if view not in there]
-    if lacking:
-        had = nearest_names(lacking[0], sorted(there)) if there else f"it holds no {kind}s"
-        raise MitsonarError(f"{store.place.url} has no {kind}s of view {lacking[0]!r}: {had}")
+    available = {view for kind_there, view in array_names(store.recipe).values() if kind_there == kind}
+    missing = [view for view in views if view not in available]
+    if missing:
+        hint = nearest_names(missing[0], sorted(available)) if available else f"it holds no {kind}s"
+        raise MitsonarError(f"{store.place.url} has no {kind}s of view {missing[0]!r}: {hint}")
 
 
 # ---------------- Impulse responses
@@ -413,18 +413,18 @@ def open_source(where: str, estimator: AnyEstimator, reading: Reading) -> Source
     Raises:
         MitsonarError: there are no records, the estimator does not consume them, or the options do not fit them.
     """
-    there, wanted = record_at(where), estimator.consumes
-    if there is ImpulseResponses:
-        _check_consumed(where, there, wanted)
+    available, consumed = record_at(where), estimator.consumes
+    if available is ImpulseResponses:
+        _check_consumed(where, available, consumed)
         return _responses_for(where, reading)
-    if wanted is ViewFrames:
+    if consumed is ViewFrames:
         return _with_heights(_views_of(where, cast(ViewReader, estimator), reading), reading)
     if reading.height_m is not None and reading.height_by is not None:
-        raise MitsonarError("--height gives the height and --height-by measures it: give one of them")
+        raise MitsonarError("--height gives the height and --height-by measures it: give only one of them")
     source = frames_for(where, reading)
-    _check_consumed(where, there, wanted)
+    _check_consumed(where, available, consumed)
     source = _with_heights(source, reading)
-    bare = not _tells_height(source) and is_recording(where)
+    bare = not _has_height(source) and is_recording(where)
     return _with_contrast(with_assumed_plane(source) if bare else source, reading, bare=bare)
 
 
@@ -477,7 +477,7 @@ def _responses_for(where: str, reading: Reading) -> ResponseSource:
     return open_responses(where).with_noise(reading.noise, reading.seed).with_height(reading.height_m)
 
 
-def _tells_height(source: FrameSource) -> bool:
+def _has_height(source: FrameSource) -> bool:
     """Return whether all frames have a height, given or measured."""
     return source.altimeter is not None or (source.height_m is not None and bool(np.isfinite(source.height_m).all()))
 
@@ -500,7 +500,7 @@ def with_assumed_plane(source: FrameSource) -> FrameSource:
     The assumed ground plane is visible over the whole range window within the vertical opening of the beams. Motions hardly
     depend on it: they scale with the cosine of the grazing angle at which the sonar looks at the ground.
     """
-    if _tells_height(source):
+    if _has_height(source):
         return source
     # the depression angles asin(height / range) at both ends must fit in the opening, which bounds the height
     far = float(source.like.range_m[-1])
@@ -509,7 +509,7 @@ def with_assumed_plane(source: FrameSource) -> FrameSource:
     height = min(ASSUMED_HEIGHT * far, opening * near * far / max(far - near, 1e-3 * far))
     pitch = (math.asin(height / near) + math.asin(height / far)) / 2
     warnings.warn(
-        f"{source.name} tells no height over the ground: {height:.3g} m and a pitch of {math.degrees(pitch):.1f} deg are "
+        f"{source.name} has no height over the ground: {height:.3g} m and a pitch of {math.degrees(pitch):.1f} deg are "
         "assumed, so that the beams meet the ground over the whole window; give --height and --pitch-deg",
         MitsonarWarning,
         stacklevel=3,
@@ -523,10 +523,10 @@ def _with_heights(source: Framed, reading: Reading) -> Framed:
     return source if reading.height_by is None else source.with_heights_by(height_estimator_from(reading.height_by))
 
 
-def _check_consumed(where: str, there: type, wanted: type) -> None:
-    if wanted not in (there, object):
+def _check_consumed(where: str, available: type, consumed: type) -> None:
+    if consumed not in (available, object):
         raise MitsonarError(
-            f"{where} holds {WORDS[there]}, and this estimator reads {WORDS[wanted]}: choose another estimator"
+            f"{where} holds {WORDS[available]}, and this estimator reads {WORDS[consumed]}: choose another estimator"
         )
 
 

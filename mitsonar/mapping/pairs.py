@@ -99,8 +99,8 @@ def estimate_motions(
     run = _run_serial if workers <= 1 else _run_parallel
     of_pairs: Priors = [None] * (len(numbers) - 1) if priors is None else list(priors)
     with closing(run(source, estimator, numbers, of_pairs, batches, workers)) as finished:
-        for batch, made in finished:
-            for pair, estimate in zip(batch, made, strict=True):
+        for batch, batch_estimates in finished:
+            for pair, estimate in zip(batch, batch_estimates, strict=True):
                 estimates[pair] = estimate
                 store.add_pair(pair, estimate)
             progress(len(batch))
@@ -266,13 +266,13 @@ def _marginals(modes: list[Array]) -> list[Array]:
     """Return the probability of each mode of each step, given all steps; steps without modes are skipped."""
     # 1. log probabilities of the modes alone, and of the changes between successive steps that have modes
     known = [k for k, mine in enumerate(modes) if len(mine)]
-    own = [np.log(np.maximum(modes[k][:, 0], 1e-300)) for k in known]
+    log_probabilities = [np.log(np.maximum(modes[k][:, 0], 1e-300)) for k in known]
     change = [_change(modes[a][:, 1:], modes[b][:, 1:], b - a) for a, b in pairwise(known)]
     # 2. forward pass over all earlier steps, backward pass over all later ones, in logs against underflow
-    before, after = [own[0]], [np.zeros(len(own[-1]))]
-    for between, mine in zip(change, own[1:], strict=True):
+    before, after = [log_probabilities[0]], [np.zeros(len(log_probabilities[-1]))]
+    for between, mine in zip(change, log_probabilities[1:], strict=True):
         before.append(logsumexp(before[-1][:, None] + between, axis=0) + mine)
-    for between, mine in zip(change[::-1], own[:0:-1], strict=True):
+    for between, mine in zip(change[::-1], log_probabilities[:0:-1], strict=True):
         after.append(logsumexp(between + (mine + after[-1])[None], axis=1))
     # 3. their product, normalised, is the probability given all steps
     shares = [np.empty(0)] * len(modes)

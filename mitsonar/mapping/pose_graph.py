@@ -65,7 +65,7 @@ class PoseEdges(NamedTuple):
         first = np.arange(len(table), dtype=np.intp)
         return cls(first, first + 1, table, np.asarray(covariances, dtype=float))
 
-    def at(self, chosen: ArrayLike) -> Self:
+    def select(self, chosen: ArrayLike) -> Self:
         """Return the edges selected by an index array or a boolean mask."""
         return type(self)(*(np.asarray(values)[np.asarray(chosen)] for values in self))
 
@@ -79,7 +79,9 @@ class PoseEdges(NamedTuple):
         try:
             return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariances)))
         except np.linalg.LinAlgError:
-            raise MitsonarError("a pose graph needs covariances of motions that are positive: got one that is not") from None
+            raise MitsonarError(
+                "covariances of motions in a pose graph must be positive definite: got one that is not"
+            ) from None
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,7 @@ class _Stretch(NamedTuple):
     Attributes:
         poses: indices of the poses ``(n,)``.
         around: unknowns of both nodes, and the common unknowns ``(m,)``.
-        own: covariances of the poses, given ``around`` ``(n, 3, 3)``.
+        covariances: covariances of the poses, given ``around`` ``(n, 3, 3)``.
         following: covariances of each pose with the next, given ``around`` ``(n - 1, 3, 3)``.
         gain: derivative of the poses by ``around`` ``(n, 3, m)``.
         added: Schur complement to add to the normal equations of ``around`` ``(m, m)``.
@@ -166,7 +168,7 @@ class _Stretch(NamedTuple):
 
     poses: Index
     around: Index
-    own: Array
+    covariances: Array
     following: Array
     gain: Array
     added: Array
@@ -175,11 +177,11 @@ class _Stretch(NamedTuple):
 def marginals_by_nodes(normal: csc_array, pose_of: Index, states: Index, nodes: int) -> tuple[Array, Array]:
     """Return the marginal covariances of the poses of a long graph, and those with the next pose.
 
-    The result is exact, in time proportional to the number of poses; the whole inverse would need columns as many and as
-    long as the poses. Some poses are nodes. The stretch between two nodes depends on the rest only through them and the
-    common unknowns, so that its covariance is the covariance given the nodes, plus that of the nodes propagated to it. The
-    normal equations of the nodes follow by eliminating the stretches (Schur complement). Both terms are covariances, so that
-    their sum is positive definite.
+    The result is exact, in time proportional to the number of poses; the whole inverse would need quadratic time and memory.
+    Some poses are nodes. The stretch between two nodes depends on the rest only through them and the common unknowns, so
+    that its covariance is the covariance given the nodes, plus that of the nodes propagated to it. The normal equations of
+    the nodes follow by eliminating the stretches (Schur complement). Both terms are covariances, so that their sum is
+    positive definite.
 
     Args:
         normal: normal equations ``(unknowns, unknowns)``.
@@ -218,22 +220,22 @@ def _stretch(table: csr_array, begin: Index, states: Index, first: int, last: in
     start, stop, common = begin[first], begin[last + 1], np.arange(begin[-1], table.shape[0])
     whole = np.concatenate([np.arange(start, stop), common])
     inner = slice(begin[first + 1] - start, begin[last] - start)
-    beside = np.delete(np.arange(len(whole)), inner)
+    outer = np.delete(np.arange(len(whole)), inner)
     rows = table[begin[first + 1] : begin[last]][:, whole].toarray()
     # 2. covariance of the inner unknowns given the others, and their response to the others; the extra last row of zeros
     # serves components that are known, which have no error
-    covariance, gain = np.zeros((len(whole) + 1, len(whole) + 1)), np.zeros((len(whole) + 1, len(beside)))
-    gain[beside] = np.eye(len(beside))
+    covariance, gain = np.zeros((len(whole) + 1, len(whole) + 1)), np.zeros((len(whole) + 1, len(outer)))
+    gain[outer] = np.eye(len(outer))
     if len(rows):
         covariance[inner, inner] = cho_solve(cho_factor(rows[:, inner]), np.eye(len(rows)))
-        gain[inner] = -covariance[inner, inner] @ rows[:, beside]
-    added = rows[:, beside].T @ gain[inner]
+        gain[inner] = -covariance[inner, inner] @ rows[:, outer]
+    added = rows[:, outer].T @ gain[inner]
     # 3. the same for x, y and heading of each pose
     poses = np.arange(first, last + 1)
     row = np.where(states[poses] < 0, len(whole), states[poses] - start)
     return _Stretch(
         poses,
-        whole[beside],
+        whole[outer],
         covariance[row[:, :, None], row[:, None]],
         covariance[row[:-1, :, None], row[1:, None]],
         gain[row],
@@ -241,34 +243,34 @@ def _stretch(table: csr_array, begin: Index, states: Index, first: int, last: in
     )
 
 
-def _reduced(table: csr_array, kept: Index, stretches: list[_Stretch]) -> csc_array:
-    """Return the normal equations of the unknowns ``kept`` after elimination of all others (Schur complement)."""
+def _reduced(table: csr_array, remaining: Index, stretches: list[_Stretch]) -> csc_array:
+    """Return the normal equations of the unknowns ``remaining`` after elimination of all others (Schur complement)."""
     parts = [np.broadcast_arrays(one.added, one.around[:, None], one.around) for one in stretches]
     added, row, column = (np.concatenate([part[axis].ravel() for part in parts]) for axis in range(3))
-    place = (np.searchsorted(kept, row), np.searchsorted(kept, column))
-    return csc_array(table[kept][:, kept] + coo_array((added, place), shape=(len(kept), len(kept))))
+    place = (np.searchsorted(remaining, row), np.searchsorted(remaining, column))
+    return csc_array(table[remaining][:, remaining] + coo_array((added, place), shape=(len(remaining), len(remaining))))
 
 
 def _joined(table: csr_array, common: int, stretches: list[_Stretch]) -> tuple[Array, Array]:
     """Return the covariances of all poses: those given the nodes, plus those of the nodes propagated to the stretches."""
-    kept = np.unique(np.concatenate([one.around for one in stretches]))
-    factor = NormalFactor.of(_reduced(table, kept, stretches), common)
+    remaining = np.unique(np.concatenate([one.around for one in stretches]))
+    factor = NormalFactor.factorise(_reduced(table, remaining, stretches), common)
     last = int(stretches[-1].poses[-1])
-    own, following = np.zeros((last + 1, 3, 3)), np.zeros((last, 3, 3))
+    covariances, following = np.zeros((last + 1, 3, 3)), np.zeros((last, 3, 3))
     for begin in range(0, len(stretches), TOGETHER):
         # columns of the inverse for the nodes of a few stretches: bounded memory, and few solves
         part = stretches[begin : begin + TOGETHER]
-        wanted = np.searchsorted(kept, np.unique(np.concatenate([one.around for one in part])))
-        right = np.zeros((len(kept), len(wanted)))
-        right[wanted, np.arange(len(wanted))] = 1.0
-        inverse = factor.solve(right)[wanted]
+        columns = np.searchsorted(remaining, np.unique(np.concatenate([one.around for one in part])))
+        right = np.zeros((len(remaining), len(columns)))
+        right[columns, np.arange(len(columns))] = 1.0
+        inverse = factor.solve(right)[columns]
         for one in part:
-            place = np.searchsorted(kept[wanted], one.around)
+            place = np.searchsorted(remaining[columns], one.around)
             nodes = inverse[np.ix_(place, place)]
             carried = one.gain @ ((nodes + nodes.T) / 2)
-            own[one.poses] = one.own + carried @ one.gain.swapaxes(1, 2)
+            covariances[one.poses] = one.covariances + carried @ one.gain.swapaxes(1, 2)
             following[one.poses[:-1]] = one.following + carried[:-1] @ one.gain[1:].swapaxes(1, 2)
-    return (own + own.swapaxes(1, 2)) / 2, following
+    return (covariances + covariances.swapaxes(1, 2)) / 2, following
 
 
 # ---------------- Factor of the normal equations
@@ -286,7 +288,7 @@ class NormalFactor(NamedTuple):
     order: NDArray[np.intp] | None = None
 
     @classmethod
-    def of(cls, normal: csc_array, common: int = 0) -> Self:
+    def factorise(cls, normal: csc_array, common: int = 0) -> Self:
         """Factor normal equations.
 
         Args:
@@ -301,22 +303,22 @@ class NormalFactor(NamedTuple):
         try:
             if not common:
                 return cls(_split(normal, "MMD_AT_PLUS_A"))
-            own = size - common
-            first = np.argsort(_split(csc_array(normal[:own, :own]), "MMD_AT_PLUS_A").perm_c)
-            order = np.concatenate([first, np.arange(own, size)])
+            separate = size - common
+            first = np.argsort(_split(csc_array(normal[:separate, :separate]), "MMD_AT_PLUS_A").perm_c)
+            order = np.concatenate([first, np.arange(separate, size)])
             return cls(_split(csc_array(normal[order][:, order]), "NATURAL"), order)
         except RuntimeError:
             raise MitsonarError(
-                "some poses of the graph are tied by nothing: give motions between all consecutive poses"
+                "some poses of the graph are not connected by any measurement: give motions between all consecutive poses"
             ) from None
 
     def solve(self, right: Array) -> Array:
         """Solve the normal equations for a right-hand side ``(unknowns,)`` or ``(unknowns, n)``."""
         if self.order is None:
             return np.asarray(self.lower_upper.solve(right))
-        found = np.empty_like(right)
-        found[self.order] = self.lower_upper.solve(right[self.order])
-        return found
+        solution = np.empty_like(right)
+        solution[self.order] = self.lower_upper.solve(right[self.order])
+        return solution
 
 
 def _split(normal: csc_array, order: str) -> SuperLU:
@@ -371,11 +373,11 @@ class GraphSolution:
     def columns(self, poses: ArrayLike) -> Array:
         """Return the covariances of all poses with the chosen ones ``(poses, 3, chosen, 3)``."""
         chosen = np.atleast_1d(np.asarray(poses, dtype=np.intp))
-        wanted = (3 * chosen[:, None] + np.arange(3)).ravel()
-        place = self.states[wanted]
-        right = np.zeros((self.normal.shape[0], len(wanted)))
+        unknowns = (3 * chosen[:, None] + np.arange(3)).ravel()
+        place = self.states[unknowns]
+        right = np.zeros((self.normal.shape[0], len(unknowns)))
         right[place[place >= 0], np.flatnonzero(place >= 0)] = 1.0
-        solution = np.vstack([self.factor.solve(right), np.zeros((1, len(wanted)))])  # the last row: known components
+        solution = np.vstack([self.factor.solve(right), np.zeros((1, len(unknowns)))])  # the last row: known components
         count = 3 * len(self.poses)
         return np.asarray(solution[self.states[:count]].reshape(-1, 3, len(chosen), 3))
 
@@ -388,26 +390,26 @@ class GraphSolution:
         if count > LONG:
             nodes = min(NODES, count // STRETCH + 1)
             return marginals_by_nodes(self.normal, self.pose_of, self.states[: 3 * count].reshape(-1, 3), nodes)
-        own, following = np.zeros((count, 3, 3)), np.zeros((count - 1, 3, 3))
+        marginal, following = np.zeros((count, 3, 3)), np.zeros((count - 1, 3, 3))
         for begin in range(0, count, COLUMNS // 3):
             chosen = np.arange(begin, min(begin + COLUMNS // 3, count))
             table = self.columns(chosen)
-            own[chosen] = table[chosen, :, np.arange(len(chosen))]
+            marginal[chosen] = table[chosen, :, np.arange(len(chosen))]
             before = chosen[chosen > 0]
             following[before - 1] = table[before - 1, :, before - begin]
-        return (own + own.swapaxes(1, 2)) / 2, following
+        return (marginal + marginal.swapaxes(1, 2)) / 2, following
 
-    def motion_covariances(self, own: Array, following: Array) -> Array:
+    def motion_covariances(self, marginal: Array, following: Array) -> Array:
         """Return the covariances of the motions between consecutive poses ``(poses - 1, 3, 3)``.
 
         Args:
-            own: marginal covariances of the poses, from :meth:`covariances`.
+            marginal: marginal covariances of the poses, from :meth:`covariances`.
             following: covariances of each pose with the next, from :meth:`covariances`.
         """
         first = np.arange(len(self.poses) - 1)
         by_first, by_second = motion_derivatives(self.poses, first, first + 1)
         cross = by_first @ following @ by_second.swapaxes(1, 2)
-        ends = by_first @ own[:-1] @ by_first.swapaxes(1, 2) + by_second @ own[1:] @ by_second.swapaxes(1, 2)
+        ends = by_first @ marginal[:-1] @ by_first.swapaxes(1, 2) + by_second @ marginal[1:] @ by_second.swapaxes(1, 2)
         return np.asarray(ends + cross + cross.swapaxes(1, 2))
 
 
@@ -424,7 +426,7 @@ def solved(graph: PoseGraph) -> GraphSolution:
     accepted = np.ones(len(graph.loops.first), dtype=bool)
     poses = graph.start
     while True:
-        closed = replace(graph, loops=graph.loops.at(accepted))
+        closed = replace(graph, loops=graph.loops.select(accepted))
         # robust solution: drop the outliers among the loops, and repeat without them
         if accepted.any():
             poses = _gauss_newton(closed, poses, robust=True)[0]
@@ -477,7 +479,7 @@ def _gauss_newton(graph: PoseGraph, start: Array, *, robust: bool) -> tuple[Arra
     poses, errors = start.copy(), np.zeros(graph.unknown_errors)
     for _ in range(ITERATIONS):
         normal, right = _normal_equations(graph, poses, errors, unknown, robust=robust)
-        factor = NormalFactor.of(normal, common)
+        factor = NormalFactor.factorise(normal, common)
         step = np.zeros(total)
         step[unknown] = factor.solve(right)
         poses, errors = poses + step[: poses.size].reshape(-1, 3), errors + step[poses.size :]
@@ -586,12 +588,12 @@ def _add_correlated(rows: _Rows, edges: PoseEdges, correlated: CorrelatedErrors,
     # 1. motions: the independent part of their errors whitens the residuals; the shared part and the slopes are unknowns
     count = len(edges.first)
     wander, slopes = errors[: 3 * count].reshape(-1, 3), errors[3 * count : 3 * count + 9]
-    own = 1 / np.sqrt(1 - correlated.share)
-    whitening = edges.whitening * own
+    scale = 1 / np.sqrt(1 - correlated.share)
+    whitening = edges.whitening * scale
     by_first, by_second = motion_derivatives(poses, edges.first, edges.second)
-    common = np.broadcast_to(np.sqrt(correlated.share) * own * np.eye(3), (count, 3, 3))
+    common = np.broadcast_to(np.sqrt(correlated.share) * scale * np.eye(3), (count, 3, 3))
     by_slopes = whitening @ correlated.by_slopes()
-    off = _residuals(edges, poses) * own + (common @ wander[..., None])[..., 0] + by_slopes @ slopes
+    off = _residuals(edges, poses) * scale + (common @ wander[..., None])[..., 0] + by_slopes @ slopes
     number, begin = np.arange(count), poses.size
     rows.add(
         off,

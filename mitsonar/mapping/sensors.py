@@ -80,7 +80,7 @@ def sensors_in_bag(path: str | Path) -> VehicleSensors:
     sideways, forward = _velocities(bag, topics)
     if yaw_rate is None and sideways is None:
         raise MitsonarError(
-            f"{path} holds no sensor whose messages tell their covariance ({IMU}, {', '.join(TWISTS)}): write the readings "
+            f"{path} holds no sensor whose messages state their covariance ({IMU}, {', '.join(TWISTS)}): write the readings "
             "to a CSV file, with their noise"
         )
     return VehicleSensors(yaw_rate, sideways, forward, name=f"the sensors of {Path(path).name}")
@@ -224,12 +224,12 @@ def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> Ve
         sideways = Readings(time, (moved[:, 0] * cos + moved[:, 1] * sin) / step + std * draws[1], std)
         forward = Readings(time, (moved[:, 1] * cos - moved[:, 0] * sin) / step + std * draws[2], std)
     # 4. depth, compass and dead reckoning at the times themselves
-    at = straight_poses(true, time)
+    poses = straight_poses(true, time)
     if noise.depth_m is not None:
-        depth = Readings(time, -at[:, 2] + noise.depth_m * draws[3], np.full(count, noise.depth_m))
+        depth = Readings(time, -poses[:, 2] + noise.depth_m * draws[3], np.full(count, noise.depth_m))
     if noise.compass_deg is not None:
         std = np.full(count, np.radians(noise.compass_deg))
-        heading = Readings(time, at[:, 5] + std * draws[4], std)
+        heading = Readings(time, poses[:, 5] + std * draws[4], std)
     if noise.walk is not None:
         dead = _simulated_reckoning(on_edges, edges, noise.walk, draws[[5, 6, 4]].T)
     return VehicleSensors(yaw_rate, sideways, forward, depth, heading, dead, bias_std, "simulated sensors")

@@ -88,18 +88,20 @@ class MotionSeries:
 
     def _check_covariances(self, covariances: Array) -> None:
         if covariances.shape != (len(self), 3, 3):
-            raise MitsonarError(f"covariances must be ({len(self)}, 3, 3), one a motion: got {covariances.shape}")
+            raise MitsonarError(f"covariances must be ({len(self)}, 3, 3), one per motion: got {covariances.shape}")
         self._refuse(~np.isfinite(covariances).all(axis=(1, 2)), "has a covariance that is not finite")
         known = np.where(self.is_valid[:, None, None], covariances, np.eye(3))
         crooked = np.abs(known - known.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(known).max(axis=(1, 2))
         least = np.linalg.eigvalsh(known)
-        self._refuse(crooked | (least[:, 0] < -1e-9 * least[:, 2]), "has a covariance with a negative variance, or lopsided")
+        self._refuse(
+            crooked | (least[:, 0] < -1e-9 * least[:, 2]), "has a covariance with a negative variance, or asymmetric"
+        )
 
     def _refuse(self, bad: ArrayLike, what: str) -> None:
         where = np.flatnonzero(np.asarray(bad) & self.is_valid)
         if where.size:
             raise MitsonarError(
-                f"the motion from frame {where[0]} to {where[0] + 1} {what} ({where.size} of {len(self)} are so): "
+                f"the motion from frame {where[0]} to {where[0] + 1} {what} ({where.size} of {len(self)} motions): "
                 "mark it as not valid, or leave it out"
             )
 
@@ -200,7 +202,7 @@ def fit_scale(estimated: ArrayLike, true: ArrayLike) -> Array:
     e, t = np.asarray(estimated, dtype=float), np.asarray(true, dtype=float)
     if e.shape != t.shape or e.ndim != 2 or e.shape[1] != 3 or not (np.isfinite(e).all() and np.isfinite(t).all()):
         raise MitsonarError(
-            f"scale factors need as many true as estimated motions (motions, 3): got {e.shape} and {t.shape}"
+            f"scale factors need finite true and estimated motions of one shape (motions, 3): got {e.shape} and {t.shape}"
         )
     power = (e * e).sum(axis=0)
     return np.where(power > 0, (e * t).sum(axis=0) / np.where(power > 0, power, 1), 1.0)
@@ -270,11 +272,11 @@ def spline_smoothed(measured: MotionSeries, period_s: ArrayLike | None = None) -
         if not (period > 0).all() or period.shape not in ((), (3,)):
             raise MitsonarError(f"period_s must be a positive number of seconds, or three: got {period_s!r}")
         strength = _strength(np.minimum(np.broadcast_to(period, 3) / gap, LONGEST_PERIOD))
-        held = np.clip(measured.middle_s, measured.middle_s[known[0]], measured.middle_s[known[-1]])
+        clamped_s = np.clip(measured.middle_s, measured.middle_s[known[0]], measured.middle_s[known[-1]])
         for axis in range(3):
             values = measured.velocity[known, axis]
             spline = make_smoothing_spline(abscissa, values, w=weight[:, axis], lam=strength[axis])
-            velocity[:, axis] = spline((held - measured.middle_s[known[0]]) / gap)
+            velocity[:, axis] = spline((clamped_s - measured.middle_s[known[0]]) / gap)
     return MotionSeries(velocity * measured.step_s[:, None], measured.time_s)
 
 
@@ -581,16 +583,16 @@ def pose_covariances(
         gaps = int((~series.is_valid).sum())
         raise MitsonarError(f"{gaps} motions are not valid, so that their errors are not known: use kalman_smoothed first")
     poses = path_of(series.motions, start, series.time_s).poses
-    found = np.zeros((len(poses), 3, 3))
-    found[0] = 0.0 if at_start is None else np.asarray(at_start, dtype=float)
+    covariances = np.zeros((len(poses), 3, 3))
+    covariances[0] = 0.0 if at_start is None else np.asarray(at_start, dtype=float)
     # 1. model of the errors: a state shared by consecutive motions, and an independent rest for each
     if correlated is None:
-        shared, steps = np.zeros((3, 3)), _as_next_says(series.covariances, series.with_next)
+        shared, steps = np.zeros((3, 3)), _regressed_on_previous(series.covariances, series.with_next)
     else:
         # the nine slopes are constant with unit variance; the wandering part starts with the first motion
         shared, steps = np.diag([0.0] * 3 + [1.0] * 9), _correlated(series, correlated, alone)
     # 2. propagate the joint covariance of the pose and the shared state from frame to frame
-    joint = block_diag(found[0], shared)
+    joint = block_diag(covariances[0], shared)
     for k, ((x, y), step) in enumerate(zip(np.diff(poses[:, :2], axis=0), steps, strict=True)):
         sin, cos = np.sin(poses[k + 1, 5]), np.cos(poses[k + 1, 5])
         pose = np.array([[1, 0, y], [0, 1, -x], [0, 0, 1]])  # derivative of eq. 3.4 by the pose
@@ -599,10 +601,10 @@ def pose_covariances(
         onward = np.block([[pose, by_shared @ step.onward], [np.zeros((len(step.onward), 3)), step.onward]])
         fresh_by = np.vstack([by_shared, np.eye(len(step.onward))])
         joint = onward @ joint @ onward.T + fresh_by @ step.fresh @ fresh_by.T
-        joint[:3, :3] += motion @ step.own @ motion.T
+        joint[:3, :3] += motion @ step.independent @ motion.T
         joint = (joint + joint.T) / 2
-        found[k + 1] = joint[:3, :3]
-    return found
+        covariances[k + 1] = joint[:3, :3]
+    return covariances
 
 
 class _Step(NamedTuple):
@@ -612,16 +614,16 @@ class _Step(NamedTuple):
         onward: transition matrix of the state from the motion before ``(m, m)``.
         fresh: covariance of the innovation of the state ``(m, m)``.
         by_shared: derivative of the error of the motion by the state ``(3, m)``.
-        own: covariance of the independent rest ``(3, 3)``.
+        independent: covariance of the independent rest ``(3, 3)``.
     """
 
     onward: Array
     fresh: Array
     by_shared: Array
-    own: Array
+    independent: Array
 
 
-def _as_next_says(covariances: Array, with_next: Array | None) -> Iterator[_Step]:
+def _regressed_on_previous(covariances: Array, with_next: Array | None) -> Iterator[_Step]:
     """Yield steps whose shared state is the error itself, regressed on the error of the motion before."""
     along, fresh = np.zeros_like(covariances), covariances.copy()
     if with_next is not None and len(with_next):
@@ -639,11 +641,11 @@ def _correlated(series: MotionSeries, correlated: CorrelatedErrors, alone: NDArr
     root = axes * np.sqrt(np.maximum(variance, 0))[:, None] @ axes.swapaxes(1, 2)
     wander = np.sqrt(correlated.share) * root
     by_shared = np.concatenate([wander, correlated.by_slopes()], axis=2)
-    own = (1 - correlated.share) * series.covariances
+    independent = (1 - correlated.share) * series.covariances
     if alone is not None:
-        by_shared[alone], own[alone] = 0.0, series.covariances[alone]
+        by_shared[alone], independent[alone] = 0.0, series.covariances[alone]
     # 2. the wandering part is a first-order chain of unit variance; slopes stay constant
-    for along, by, rest in zip(np.append(0.0, correlated.onward), by_shared, own, strict=True):
+    for along, by, rest in zip(np.append(0.0, correlated.onward), by_shared, independent, strict=True):
         onward, fresh = np.ones(12), np.zeros(12)
         onward[:3], fresh[:3] = along, 1 - along**2
         yield _Step(np.diag(onward), np.diag(fresh), by, rest)

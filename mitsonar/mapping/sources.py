@@ -169,7 +169,7 @@ class FrameSource:
             pattern = np.asarray(levels.mean(axis=0), dtype=np.float32)
         if contrast is None:
             starts = np.unique(np.linspace(0, max(0, len(self) - FITTED), FITTED_RUNS).astype(np.intp))
-            runs = [plain.read(np.arange(at, min(at + FITTED, len(self)))).in_decibels() for at in starts]
+            runs = [plain.read(np.arange(start, min(start + FITTED, len(self)))).in_decibels() for start in starts]
             contrast = fitted_contrast([run if pattern is None else run - pattern for run in runs])
         return replace(self, contrast=contrast, pattern_db=pattern)
 
@@ -195,12 +195,12 @@ class FrameSource:
         lacking = self.height_m is None or not np.isfinite(self.height_m).all()
         if height_m is not None and not lacking:
             raise MitsonarError(
-                f"{self.name}: the frames tell their heights, so that {height_m:g} m would not be used: leave it out, "
+                f"{self.name}: the frames have heights, so that {height_m:g} m would not be used: leave it out, "
                 "or give it to the estimator, as NAME:height_m=2.5"
             )
         if pitch_rad is not None and self.poses is not None:
             raise MitsonarError(
-                f"{self.name}: the frames tell their pitch, so that {np.degrees(pitch_rad):g} deg would not be used: leave "
+                f"{self.name}: the frames have a pitch, so that {np.degrees(pitch_rad):g} deg would not be used: leave "
                 "it out, or give it to the estimator, as NAME:pitch_deg=35"
             )
         if height_m is not None and not 0 < height_m < np.inf:
@@ -369,8 +369,8 @@ def open_frames(
 
     Args:
         where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
-        sequence: number of the sequence of a data set, or of the part of a recording; by default the longest, and the first
-            of several as long.
+        sequence: number of the sequence of a data set, or of the part of a recording; by default the longest, the
+            first if several are equally long.
         view: view of a data set, or topic of a ROS bag; by default the first, or the only one.
         geometry: file that describes the layout of the pictures of a recording.
 
@@ -380,19 +380,19 @@ def open_frames(
     path = Path(where)
     data_set = is_data_set(where)
     if not data_set and is_recording(where):
-        return _of_recording(path, sequence, view, geometry)
+        return _open_recording(path, sequence, view, geometry)
     if geometry is not None:
-        raise MitsonarError(f"{where} is no recording of pictures: it tells its geometry itself; leave {geometry} out")
+        raise MitsonarError(f"{where} is not a recording of pictures, and states its geometry: leave {geometry} out")
     if data_set:
-        return _of_data_set(str(where), sequence, view)
+        return _open_data_set(str(where), sequence, view)
     if sequence is not None or view is not None:
-        raise MitsonarError(f"{where} is no data set or recording: sequence and view choose among theirs; leave them out")
+        raise MitsonarError(f"{where} is neither a data set nor a recording: leave sequence and view out")
     if os.path.isdir(path) and not os.path.isfile(path / "zarr.json"):
-        found = [path / name for name in RUN_FRAMES if os.path.exists(path / name)]
-        if not found:
+        candidates = [path / name for name in RUN_FRAMES if os.path.exists(path / name)]
+        if not candidates:
             raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {FINDING}")
-        path = found[0]
-    return _of_zarr(path, str(where)) if os.path.isdir(path) else _of_npz(path, str(where))
+        path = candidates[0]
+    return _open_zarr(path, str(where)) if os.path.isdir(path) else _open_npz(path, str(where))
 
 
 def load_frames(
@@ -404,8 +404,8 @@ def load_frames(
 
     Args:
         where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
-        sequence: number of the sequence of a data set, or of the part of a recording; by default the longest, and the first
-            of several as long.
+        sequence: number of the sequence of a data set, or of the part of a recording; by default the longest, the
+            first if several are equally long.
         view: view of a data set, or topic of a ROS bag; by default the first, or the only one.
         geometry: file that describes the layout of the pictures of a recording.
 
@@ -419,7 +419,7 @@ def load_frames(
 def is_data_set(where: str | Path) -> bool:
     """Return whether a path or URL is a data set.
 
-    Every URL counts as one. The frames of a long run are a Zarr group too, told apart by its attributes.
+    Every URL counts as one. The frames of a long run are a Zarr group too, distinguished by its attributes.
     """
     path = Path(where)
     if "://" in str(where):
@@ -444,7 +444,7 @@ def is_recording(where: str | Path) -> bool:
     return format_of(where) is not None
 
 
-def _of_recording(path: Path, number: int | None, view: str | None, geometry: str | Path | None) -> FrameSource:
+def _open_recording(path: Path, number: int | None, view: str | None, geometry: str | Path | None) -> FrameSource:
     """Open a part of a recording, by default the longest."""
     from mitsonar.recordings.open import open_recording
 
@@ -459,7 +459,7 @@ def _of_recording(path: Path, number: int | None, view: str | None, geometry: st
     return FrameSource.of_part(part, str(path), which)
 
 
-def _of_npz(path: Path, name: str) -> FrameSource:
+def _open_npz(path: Path, name: str) -> FrameSource:
     """Open the frames of ``frames.npz``.
 
     Raises:
@@ -476,18 +476,18 @@ def _of_npz(path: Path, name: str) -> FrameSource:
     return FrameSource.of(SonarFrames.load(path), name)
 
 
-def _of_zarr(path: Path, name: str) -> FrameSource:
+def _open_zarr(path: Path, name: str) -> FrameSource:
     """Open the frames of a long run, even if it is not finished."""
     # 1. read everything but images and labels, up to the frames that are written
     try:
-        found, done = open_group(path, COLUMNS, "time_s", "frames_done")
-        arrays = {name: one for name, one in found.items() if not isinstance(one, np.ndarray)}
+        columns, done = open_group(path, COLUMNS, "time_s", "frames_done")
+        arrays = {name: one for name, one in columns.items() if not isinstance(one, np.ndarray)}
         arrays = {name: array for name, array in arrays.items() if name not in (*LABELS, "pitch_rad")}
         image = arrays["image"]
         table: dict[str, Any] = {
             name: array[:done] if name in PER_FRAME else array[...] for name, array in arrays.items() if name != "image"
         }
-        table |= {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
+        table |= {name: value for name, value in columns.items() if isinstance(value, np.ndarray)}
         nothing = np.zeros((0, *image.shape[1:]), dtype=image.dtype)
         none_of = {name: values[:0] for name, values in table.items() if name in PER_FRAME}
     except Exception as error:
@@ -513,7 +513,7 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
     return FrameSource.of_arrays(like, table["time_s"], poses, height, images, name, attitude_rad=attitude)
 
 
-def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSource:
+def _open_data_set(url: str, sequence: int | None, view: str | None) -> FrameSource:
     from mitsonar.datasets.store import DataStore  # its import takes half a second
 
     store = DataStore.open(url)
@@ -558,7 +558,7 @@ def view_in(store: DataStore, view: str | None = None) -> StoredView:
 
     stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}
     if not stored:
-        raise MitsonarError(f"{store.place.url} holds vectors, no images: give a data set of images")
+        raise MitsonarError(f"{store.place.url} holds vectors but no images: give a data set of images")
     name = next(iter(stored)) if view is None else view
     if name not in stored:
         raise MitsonarError(f"{store.place.url} has no view {name!r}: {nearest_names(name, stored)}")
@@ -579,7 +579,7 @@ def view_in(store: DataStore, view: str | None = None) -> StoredView:
 def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, int, str]:
     """Return the frames of a sequence of a data set, its number and a description.
 
-    The default is the longest sequence, and the first of several as long.
+    The default is the longest sequence, the first if several are equally long.
 
     Raises:
         MitsonarError: there is no such sequence.
@@ -679,8 +679,8 @@ def _labels_at(path: Path) -> Callable[[Index], Labels] | None:
         path = next(one for one in (path / "frames.npz", path / "frames.zarr") if os.path.exists(one))
     if os.path.isfile(path):
         frames = SonarFrames.load(path)
-        kept = {name: getattr(frames, name) for name in LABELS if getattr(frames, name) is not None}
-        return (lambda index: {name: values[index] for name, values in kept.items()}) if kept else None
+        labels = {name: getattr(frames, name) for name in LABELS if getattr(frames, name) is not None}
+        return (lambda index: {name: values[index] for name, values in labels.items()}) if labels else None
     try:
         arrays = {name: one for name, one in open_group(path, COLUMNS, "time_s", "frames_done")[0].items() if name in LABELS}
     except Exception as error:  # a damaged Zarr raises errors of many kinds
@@ -719,7 +719,7 @@ def measured(
     read = frames if like is None else like
     estimates = [by.height(read.select(slice(k, k + 1))) for k in range(len(read))]
     heights = np.array([one.height_m if one.valid else np.nan for one in estimates])
-    return replace(frames, height_m=heights, poses=_at(frames.poses, heights)), estimates
+    return replace(frames, height_m=heights, poses=_with_heights(frames.poses, heights)), estimates
 
 
 def without_height(frames: Record) -> bool:
@@ -730,7 +730,7 @@ def without_height(frames: Record) -> bool:
     return poses is None or not np.isfinite(poses[:, 2]).any()
 
 
-def _at(poses: NDArray[np.float64] | None, heights: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _with_heights(poses: NDArray[np.float64] | None, heights: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Return poses with these heights over the ground."""
     if poses is None:
         return None
@@ -776,7 +776,7 @@ def poses_at(
     """
     times = path.time_s
     if not (np.diff(times) > 0).all():
-        raise MitsonarError("the times of the path must rise: sort its poses")
+        raise MitsonarError("the times of the path must increase: sort its poses")
     # 1. the poses of the path before and after each frame, and whether they are close enough
     after = np.clip(np.searchsorted(times, time_s), 1, max(1, len(times) - 1)).astype(np.intp)
     before = after - 1
@@ -793,8 +793,8 @@ def poses_at(
     poses = np.full((len(time_s), 6), np.nan)
     poses[known] = _interpolated(path, np.clip(time_s[known], times[0], times[-1]))
     if attitude_rad is not None and (np.ptp(path.poses[:, 2:5], axis=0) < PLANAR).all():
-        told = known[:, None] & np.isfinite(attitude_rad[:, :2])
-        poses[:, 3:5] = np.where(told, attitude_rad[:, :2], poses[:, 3:5])
+        measured = known[:, None] & np.isfinite(attitude_rad[:, :2])
+        poses[:, 3:5] = np.where(measured, attitude_rad[:, :2], poses[:, 3:5])
     return poses, known
 
 
@@ -809,7 +809,7 @@ def stretches(known: NDArray[np.bool_], time_s: Array) -> list[slice]:
     usual = float(np.median(steps)) if len(steps) else 0.0
     ends = np.flatnonzero(~(known[1:] & known[:-1]) | (steps > PAUSE * usual)) + 1
     borders = [0, *ends.tolist(), len(known)]
-    return [slice(one, other) for one, other in pairwise(borders) if other - one > 1]
+    return [slice(begin, end) for begin, end in pairwise(borders) if end - begin > 1]
 
 
 def _interpolated(path: Trajectory, time_s: Array) -> Array:

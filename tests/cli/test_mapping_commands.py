@@ -138,7 +138,7 @@ def test_sensors_and_loops_make_a_graph(mitsonar: Command, drawn: Path, tmp_path
     found = table(tmp_path / "out")
     assert found["loops"] == 0
     assert abs(found["heading error at the end"]) < 0.05
-    assert found["standard deviation of the end as told"] > 0
+    assert found["estimated standard deviation of the end"] > 0
     assert (tmp_path / "out" / "loops.csv").exists()
     (tmp_path / "bad.csv").write_text("time_s,yaw_rate\n0,1\n")
     refused(mitsonar("odometry", drawn, "-o", tmp_path / "no", "--sensors", tmp_path / "bad.csv"), "yaw_rate_deg_s")
@@ -274,7 +274,7 @@ def test_bad_options_are_answered_by_one_sentence(mitsonar: Command, drawn: Path
     refused(mitsonar("odometry", drawn, "-o", out, "--from", "1,2"), "--from", "6 numbers")
     refused(mitsonar("odometry", drawn, "-o", out, "--every", 0), "every")
     refused(mitsonar("odometry", drawn, "-o", out, "--noise", "loud"), "noise", "low")
-    refused(mitsonar("odometry", drawn, "-o", out, "--height", 2), "tell their heights")
+    refused(mitsonar("odometry", drawn, "-o", out, "--height", 2), "the frames have heights")
     refused(mitsonar("odometry", drawn, "-o", out, "--sequence", 1), "no data set")
     refused(mitsonar("odometry", drawn, "-o", out, "--overwrite", "--resume"), "contradict")
     refused(mitsonar("odometry", drawn, "-o", drawn), "is a file and is kept")

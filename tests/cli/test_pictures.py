@@ -59,5 +59,5 @@ def test_faults_are_one_sentence(mitsonar: Command, pictures: Path, tmp_path: Pa
     bad.write_text("layout: fan\nkx: 1.24\n")
     told = ["--geometry", bad]
     refused(mitsonar("odometry", pictures / "pictures", "-o", tmp_path / "a", *told), "unknown geometry key kx")
-    refused(mitsonar("mosaic", pictures, "true", "-o", tmp_path / "a.png", *told), "is no recording of pictures")
+    refused(mitsonar("mosaic", pictures, "true", "-o", tmp_path / "a.png", *told), "is not a recording of pictures")
     assert not (tmp_path / "a").exists()

@@ -68,7 +68,7 @@ def test_axes_that_point_down_have_the_other_sign_and_readings_without_noise_are
 def test_bags_that_tell_no_sensor_are_refused(tmp_path: Path) -> None:
     maker = Maker(ros1=True)
     silent: list[Sent] = [("/imu", t, imu(maker, t, 0.2, 0.0)) for t in TIMES]
-    with pytest.raises(MitsonarError, match="no sensor whose messages tell their covariance"):
+    with pytest.raises(MitsonarError, match="no sensor whose messages state their covariance"):
         open_sensors(write_bag(tmp_path / "silent.bag", maker, silent))
     two: list[Sent] = [(topic, t, imu(maker, t, 0.2, 1e-4)) for topic in ("/a", "/b") for t in TIMES]
     with pytest.raises(MitsonarError, match="several topics of sensor_msgs/msg/Imu"):

@@ -123,7 +123,7 @@ def test_a_window_s_covariance_is_shared_among_motions_that_add_up_to_it() -> No
     whole = pose_covariances(series, Pose(0, 0, 0))[-1]
     poses = path_of(series.motions, Pose(0, 0, 0), series.time_s).poses
     scatter = np.diag([one[2, 2] * step**2 * (count**2 - 1) / 12, 0, 0])
-    np.testing.assert_allclose(local_map._of_one(whole, poses), one + scatter, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(local_map._covariance_per_motion(whole, poses), one + scatter, rtol=1e-9, atol=1e-18)
 
 
 def test_the_answer_is_a_function_of_frames_and_estimates() -> None:

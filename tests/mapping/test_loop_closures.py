@@ -103,7 +103,7 @@ def kept_loops(found: Odometry) -> PoseEdges:
     """The loops that were kept."""
     assert found.graph is not None
     assert found.graph.search is not None
-    return found.graph.search.loops.at(found.graph.accepted)
+    return found.graph.search.loops.select(found.graph.accepted)
 
 
 def test_blank_frames_have_no_view() -> None:
@@ -131,7 +131,9 @@ def test_a_circle_is_closed_where_it_began(round_trip: tuple[SonarFrames, Drifti
     before = {name: value for name, value, _ in plain.rows()}
     assert rows["loops"] == len(loops.first)
     assert rows["end-point error"] < 0.35 * before["end-point error"]
-    assert rows["standard deviation of the end as told"] < rows["standard deviation of the end as told, before loops"] / 5
+    assert (
+        rows["estimated standard deviation of the end"] < rows["estimated standard deviation of the end, before loops"] / 5
+    )
     moved = np.hypot(*(closed.path.poses[-1] - plain.path.poses[-1])[:2])
     assert rows["end moved by loops"] == pytest.approx(1e3 * moved, rel=0.05)
     assert rows["squared pose error over its covariance, a third, mean along the path"] < 3
@@ -177,7 +179,7 @@ def test_a_floor_that_repeats_within_the_covariance_is_ambiguous(round_trip: tup
     found = odometry(frames, Loose(path), LOOPS)
     assert found.graph is not None
     assert found.graph.search is not None
-    assert found.graph.search.rejected["two places are alike"] > 0
+    assert found.graph.search.rejected["two places look similar"] > 0
     assert len(kept_loops(found).first) == 0
 
 

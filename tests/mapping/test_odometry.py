@@ -319,11 +319,11 @@ def test_the_table_tells_what_a_hand_finds() -> None:
         assert rows[f"RMSE of always answering zero, {name}"][0] == pytest.approx(
             scale * np.sqrt((driven[:, k] ** 2).mean())
         )
-        assert rows[f"standard deviation of a motion as told, {name}"][0] == pytest.approx(scale * STD[k])
+        assert rows[f"estimated standard deviation of a motion, {name}"][0] == pytest.approx(scale * STD[k])
         slope = ((driven + off[:40])[:, k] * driven[:, k]).sum() / (driven[:, k] ** 2).sum()
         assert rows[f"slope over the true {name}"][0] == pytest.approx(slope)
     nees = ((off[:40] / STD) ** 2).sum(axis=1).mean() / 3
-    assert rows["NEES (1 is honest)"][0] == pytest.approx(nees)
+    assert rows["NEES (ideally 1)"][0] == pytest.approx(nees)
     end = np.linalg.norm(found.path.poses[-1, :2] - path.poses[-1, :2])
     assert rows["end-point error"][0] == pytest.approx(1e3 * end)
     assert rows["end-point error"][1] == "mm"
@@ -464,9 +464,9 @@ def test_geometry_is_given_where_it_lacks_and_only_there() -> None:
     assert seen.height_m.tolist() == [2.5, 3.0]
     assert seen.poses[:, 3].tolist() == [0.5, 0.5]
     assert source.true is None
-    with pytest.raises(MitsonarError, match="tell their heights"):
+    with pytest.raises(MitsonarError, match="the frames have heights"):
         source.with_geometry(2.0)
-    with pytest.raises(MitsonarError, match="tell their pitch"):
+    with pytest.raises(MitsonarError, match="the frames have a pitch"):
         FrameSource.of(numbered(sway(4))).with_geometry(pitch_rad=0.5)
     with pytest.raises(MitsonarError, match="above 0"):
         FrameSource.of(frames).with_geometry(-1.0)
@@ -540,7 +540,7 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
     ):
         with pytest.raises(MitsonarError, match=message):
             open_frames(tmp_path / name)
-    with pytest.raises(MitsonarError, match="is no data set"):
+    with pytest.raises(MitsonarError, match="is neither a data set nor a recording"):
         open_frames(tmp_path, sequence=1)
 
 

@@ -139,7 +139,7 @@ def test_a_series_of_estimates() -> None:
         ({"covariances": np.zeros((3, 3))}, r"covariances must be \(9, 3, 3\)"),
         ({"covariances": np.full((9, 3, 3), np.nan)}, "frame 0 to 1 has a covariance that is not finite .9 of 9"),
         ({"covariances": np.tile(np.diag([1, 1, -1e-6]), (9, 1, 1))}, "negative variance"),
-        ({"covariances": np.tile([[1, 0.5, 0], [0, 1, 0], [0, 0, 1]], (9, 1, 1))}, "lopsided"),
+        ({"covariances": np.tile([[1, 0.5, 0], [0, 1, 0], [0, 0, 1]], (9, 1, 1))}, "asymmetric"),
         ({"valid": np.zeros(9, dtype=bool)}, "none of 9 motions is valid"),
         ({"valid": np.ones(8, dtype=bool)}, r"valid must be \(9,\)"),
         ({"with_next": np.zeros((9, 3, 3))}, r"with_next must be \(8, 3, 3\)"),
@@ -179,7 +179,7 @@ def test_scale_factors_that_cannot_be() -> None:
         scaled(measured, [1, 2])
     with pytest.raises(MitsonarError, match="three finite numbers"):
         scaled(measured, [1, 2, np.nan])
-    with pytest.raises(MitsonarError, match=r"as many true as estimated motions .* got \(4, 3\) and \(3, 3\)"):
+    with pytest.raises(MitsonarError, match=r"true and estimated motions .* got \(4, 3\) and \(3, 3\)"):
         fit_scale(measured.motions, np.zeros((3, 3)))
 
 

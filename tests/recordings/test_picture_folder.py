@@ -218,5 +218,5 @@ def test_what_is_missing_is_told(tmp_path: Path) -> None:
     (path / "run.json").write_text("{}")  # a run's folder is no recording
     with pytest.raises(MitsonarError, match="is not a recording that mitsonar reads"):
         open_recording(path, tmp_path / "told.yaml")
-    with pytest.raises(MitsonarError, match="is no recording of pictures: it tells its geometry itself"):
+    with pytest.raises(MitsonarError, match="is not a recording of pictures, and states its geometry"):
         open_frames(path, geometry=tmp_path / "told.yaml")

@@ -305,7 +305,7 @@ def test_what_is_assumed_of_a_recording_is_told_once(tmp_path: Path, frames: Son
     wanted = Wanted((str(tmp_path / "dive.aris"),), methods=("zero", "flow"), frames=4)
     report = benchmark_odometry(wanted, tmp_path / "bench")
     assert [row["frames"] for row in report["rows"]] == [4, 4]
-    assert sum("tells no height over the ground" in note for note in report["notes"]) == 1
+    assert sum("has no height over the ground" in note for note in report["notes"]) == 1
 
 
 def test_a_method_that_takes_other_frames_is_a_note(run_of: Path, tmp_path: Path, monkeypatch: Any) -> None:
