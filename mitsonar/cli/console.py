@@ -76,7 +76,7 @@ RESUMES = ("make", "reproduce")
 """Commands that resume without an option; others resume with ``--resume``, if they can."""
 
 
-def goes_on(command: Callable[..., object]) -> str:
+def _resume_hint(command: Callable[..., object]) -> str:
     """Return the part of a sentence that explains how to resume a stopped command; empty if it cannot."""
     if command.__name__ in RESUMES:
         return ": what is whole on disk stays, and the same command goes on"
@@ -88,7 +88,7 @@ def goes_on(command: Callable[..., object]) -> str:
 def say_stopped(command: Callable[..., object], stop: KeyboardInterrupt) -> int:
     """Print that Ctrl-C or SIGTERM has stopped a command and how to resume it; return the exit code."""
     _silence_asyncio()
-    typer.echo(f"stopped{goes_on(command)}", err=True)
+    typer.echo(f"stopped{_resume_hint(command)}", err=True)
     return 128 + (signal.SIGTERM if isinstance(stop, Terminated) else signal.SIGINT)
 
 
@@ -105,28 +105,28 @@ def _signals_stop() -> Iterator[None]:
     any exception. A second SIGTERM ends the process at once, and so does one in a child that was forked.
     """
     usual: dict[int, object] = {signal.SIGTERM: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
-    ours = [number for number, handler in usual.items() if signal.getsignal(number) is handler]
+    handled = [number for number, handler in usual.items() if signal.getsignal(number) is handler]
     if threading.current_thread() is not threading.main_thread():
-        ours = []
-    owner, come = os.getpid(), list[type[KeyboardInterrupt]]()
+        handled = []
+    owner, received = os.getpid(), list[type[KeyboardInterrupt]]()
 
     def stop(number: int, _: FrameType | None) -> None:
         signal.signal(number, usual[number])  # type: ignore[arg-type]
         if os.getpid() != owner:
             os.kill(os.getpid(), number)
-        come.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
-        raise come[0]
+        received.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
+        raise received[0]
 
-    for number in ours:
+    for number in handled:
         signal.signal(number, stop)
     try:
         yield
     except Exception:
-        if come:
-            raise come[0] from None
+        if received:
+            raise received[0] from None
         raise
     finally:
-        for number in ours:
+        for number in handled:
             signal.signal(number, usual[number])  # type: ignore[arg-type]
 
 
@@ -189,7 +189,7 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
             _silence_asyncio()
             where = f" ({error.filename})" if error.filename else ""
             full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-            typer.echo(f"error: {error.strerror or error}{where}{goes_on(command) if full else ''}", err=True)
+            typer.echo(f"error: {error.strerror or error}{where}{_resume_hint(command) if full else ''}", err=True)
         except MemoryError:
             typer.echo("error: out of memory; ask for less: beams, rays or bins of the sonar, objects of a world", err=True)
         except RuntimeError as error:
@@ -274,20 +274,20 @@ class _Log:
 
     def __init__(self, what: str, total: int, unit: str, every_s: float = 10.0) -> None:
         self.what, self.total, self.unit, self.every_s = what, total, unit, every_s
-        self.done, self.had, self.begun = 0, 0, time.monotonic()
-        self.said = self.begun
+        self.done, self.resumed, self.begun = 0, 0, time.monotonic()
+        self.reported_s = self.begun
 
     def __call__(self, done: int) -> None:
-        now = time.monotonic()
-        if self.done == 0 and now - self.begun < 0.5:  # frames that a resumed run already had
-            self.had = done
+        time_s = time.monotonic()
+        if self.done == 0 and time_s - self.begun < 0.5:  # frames that a resumed run already had
+            self.resumed = done
         self.done += done
-        if now - self.said >= self.every_s and self.done > self.had:
-            rate = (self.done - self.had) / (now - self.begun)
+        if time_s - self.reported_s >= self.every_s and self.done > self.resumed:
+            rate = (self.done - self.resumed) / (time_s - self.begun)
             left = (self.total - self.done) / rate
             line = f"{self.what} {self.done}/{self.total}, {rate:.1f} {self.unit}/s, {left:.0f} s left"
             typer.echo(line, err=True)
-            self.said = now
+            self.reported_s = time_s
 
 
 class LaterBar:

@@ -98,30 +98,30 @@ def make(
     if workers is not None and scheduler is not None:
         raise MitsonarError("--workers and --scheduler contradict each other: a scheduler has its own workers")
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
-    made = _made(described, out, sequences=sequences, workers=processes, scheduler=scheduler, verify=verify)
-    there = made.shards - made.made
+    report = _make_with_bar(described, out, sequences=sequences, workers=processes, scheduler=scheduler, verify=verify)
+    present = report.shards - report.made
     say(
-        f"{counted(made.frames, 'frame')} in {made.url}: {counted(made.made, 'shard')} made"
-        + (f", {there} were there" if there else "")
+        f"{counted(report.frames, 'frame')} in {report.url}: {counted(report.made, 'shard')} made"
+        + (f", {present} were already complete" if present else "")
     )
-    say(f"show it: {command_line('dataset', 'show', made.url)}")
+    say(f"show it: {command_line('dataset', 'show', report.url)}")
 
 
-def _made(recipe: Recipe, out: str, **words: object) -> Made:
-    """Make a data set with a bar; Ctrl-C ends the process at once."""
+def _make_with_bar(recipe: Recipe, out: str, **words: object) -> Made:
+    """Make a data set with a progress bar; Ctrl-C ends the process at once."""
     from mitsonar.datasets.make import make_dataset
 
     bar = LaterBar("rendering", "frames")
     try:
         with bar:
-            made = make_dataset(recipe, out, **words, begun=bar.begin, progress=bar.advance)  # type: ignore[arg-type]
+            report = make_dataset(recipe, out, **words, begun=bar.begin, progress=bar.advance)  # type: ignore[arg-type]
     except KeyboardInterrupt as stop:
         code = say_stopped(make, stop)
         sys.stdout.flush()
         os._exit(code)  # threads of Zarr and dask would complain one by one
-    for sentence in made.warnings:
+    for sentence in report.warnings:
         warn(sentence)
-    return made
+    return report
 
 
 @answered
@@ -171,8 +171,8 @@ def detector(
     for note in notes:
         say(note)
     store = f"{out}.zarr"
-    made = _made(recipe, store, workers=workers or len(os.sched_getaffinity(0)))
-    say(f"{made.frames:,} frames in {made.url}: `mitsonar dataset export` writes them again with other classes")
+    report = _make_with_bar(recipe, store, workers=workers or len(os.sched_getaffinity(0)))
+    say(f"{report.frames:,} frames in {report.url}: `mitsonar dataset export` writes them again with other classes")
     exported(store, to, out, picture, [*rules, *ground], least, least_snr_db, None, polygons, None, every_class=True)
 
 
@@ -244,7 +244,7 @@ def show(
     store = DataStore.open(data)
     path = out or Path(Path(store.place.url).stem + ".png")
     if path.suffix.lower() != ".png" or not path.parent.is_dir():
-        raise MitsonarError(f"-o must name a .png file in a folder that is there: got {path}")
+        raise MitsonarError(f"-o must name a .png file in an existing folder: got {path}")
     refuse_to_replace(path, overwrite=overwrite)
     buffer = io.BytesIO()
     sheet_figure(store, samples=samples, view=view, seed=seed).savefig(buffer, format="png", dpi=90)
@@ -319,7 +319,7 @@ def from_frames(
             metavar="RUN|FILE...", help="Folders of runs, frames.npz, frames.zarr or recordings, all of one sonar."
         ),
     ],
-    out: Annotated[str, typer.Option("-o", "--out", help="Folder of the data set, whole or absent.")],
+    out: Annotated[str, typer.Option("-o", "--out", help="Folder of the data set; complete or absent.")],
     poses: Annotated[
         list[Path] | None,
         typer.Option(
@@ -348,12 +348,12 @@ def from_frames(
     sources = [frames_with_poses(file, path=path, **words) for file, path in each]  # type: ignore[arg-type]
     bar = LaterBar("copying", "frames")
     with bar:
-        made = write_recorded(sources, out, begun=bar.begin, progress=bar.advance)
-    for sentence in made.notes:
+        report = write_recorded(sources, out, begun=bar.begin, progress=bar.advance)
+    for sentence in report.notes:
         warn(sentence)
-    say(f"{counted(made.frames, 'frame')} in {counted(made.sequences, 'sequence')} in {made.path}")
-    part = ["--part", "all"] if made.sequences == 1 else []
-    say(f"compare estimators on it: {command_line('compare', made.path, *part)}")
+    say(f"{counted(report.frames, 'frame')} in {counted(report.sequences, 'sequence')} in {report.path}")
+    part = ["--part", "all"] if report.sequences == 1 else []
+    say(f"compare estimators on it: {command_line('compare', report.path, *part)}")
 
 
 # ---------------- ``mitsonar world``: make a scene and its meshes from a seed or from a user's model
@@ -537,11 +537,11 @@ def _pairs(pairs: list[str], option: str, form: str) -> dict[str, str]:
         if not all(pair.rpartition("=")):
             raise MitsonarError(f"{option} takes {form}: got {pair!r}")
     parts = [pair.rpartition("=") for pair in pairs]
-    found = {name: value for name, _, value in parts}
-    if len(found) < len(parts):
-        twice = next(name for name in found if sum(name == one for one, _, _ in parts) > 1)
+    values = {name: value for name, _, value in parts}
+    if len(values) < len(parts):
+        twice = next(name for name in values if sum(name == one for one, _, _ in parts) > 1)
         raise MitsonarError(f"{option} gives {twice[:80]} twice: give it once")
-    return found
+    return values
 
 
 def _joint_values(pairs: list[str]) -> dict[str, float]:

@@ -31,12 +31,12 @@ def doctor() -> None:
     say(f"python {platform.python_version()}, {platform.system()} {platform.machine()}")
     for package in PACKAGES:
         say(f"  {package:10} {_version(package)}")
-    found = backend()
-    llvm = "" if found.llvm is None else f", LLVM {'.'.join(map(str, found.llvm))}"
-    say(f"variant {found.variant}{llvm}")
-    if found.llvm is not None and found.llvm[0] < 17:
+    device = backend()
+    llvm = "" if device.llvm is None else f", LLVM {'.'.join(map(str, device.llvm))}"
+    say(f"variant {device.variant}{llvm}")
+    if device.llvm is not None and device.llvm[0] < 17:
         warn(
-            f"LLVM {found.llvm[0]} ends the process on some Mitsuba plugins (it cannot compile `max`); mitsonar's own "
+            f"LLVM {device.llvm[0]} ends the process on some Mitsuba plugins (it cannot compile `max`); mitsonar's own "
             "avoid it; better: sudo apt-get install libllvm19"
         )
     _check_sphere()
@@ -125,7 +125,7 @@ def presets(
         say(f"{key:22} {field:14} {sonar.beams:5} {width:>6}  {window:12} {sonar.range_bins:5}  {title}")
     for line in [*_instruments(), *_accuracy(list(named_sonars()))]:
         say(line)
-    say("`mitsonar presets NAME` prints where each number comes from; docs/guides/sonars.md tells how to write your own.")
+    say("`mitsonar presets NAME` prints where each number comes from; docs/guides/sonars.md explains how to write one.")
 
 
 def _one(name: str) -> None:
@@ -137,25 +137,25 @@ def _one(name: str) -> None:
     from mitsonar.instruments.sounder import OF_KIND, load_sounder, named_sonars, named_sounders, preset
 
     sonars, sounders = named_sonars(), named_sounders()
-    found = OF_KIND.get(name, name)
-    if found not in sonars and found not in sounders:
+    key = OF_KIND.get(name, name)
+    if key not in sonars and key not in sounders:
         raise MitsonarError(f"unknown preset {shortened(name)}: {nearest_names(name, [*sonars, *sounders])}")
-    if found in sonars:
-        _print_keys(found, sonars[found], preset(found))
-        for line in _accuracy([found]):
+    if key in sonars:
+        _print_keys(key, sonars[key], preset(key))
+        for line in _accuracy([key]):
             say(line)
     else:
-        sounder = load_sounder(found)
-        _print_keys(found, sounders[found], sounder.fan, sounder.model_dump(exclude={"name", "fan"}))
+        sounder = load_sounder(key)
+        _print_keys(key, sounders[key], sounder.fan, sounder.model_dump(exclude={"name", "fan"}))
 
 
-def _print_keys(name: str, known: Preset, sonar: Sonar, own: dict[str, object] | None = None) -> None:
+def _print_keys(name: str, known: Preset, sonar: Sonar, instrument_keys: dict[str, object] | None = None) -> None:
     """Print every key with its source: those of an instrument first, then those of its sonar."""
     from mitsonar.acoustics.water import absorption_line
     from mitsonar.instruments.sonar import RAYS
 
     say(f"{name}: {known.about}")
-    for key, value in {**(own or {}), **sonar.model_dump(exclude={"name"})}.items():
+    for key, value in {**(instrument_keys or {}), **sonar.model_dump(exclude={"name"})}.items():
         shown = f"{value:g}" if isinstance(value, float) else "-" if value is None else str(value)
         say(f"  {key:18} {shown:10} {known.sources.get(key, 'from quality' if key in RAYS else 'default')}")
     if line := absorption_line(sonar):

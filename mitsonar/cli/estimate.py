@@ -54,7 +54,7 @@ def odometry(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="zero, ecc, flow, phase, direct, corrnet, a checkpoint, or a class of your own as my_module:MyEstimator; "
+            help="zero, ecc, flow, phase, direct, corrnet, a checkpoint, or your class as my_module:MyEstimator; "
             "NAME:key=value:key=value. Of several checkpoints, separated by commas, the one trained nearest to the height "
             "is used. For impulse responses: zero, correlation, likelihood, impulse-posenet. Default: direct, or likelihood."
         ),
@@ -169,16 +169,16 @@ def odometry(
         workers=workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER)),
     )
     with progress_bar("estimating", pairs + closing + frames_mapped, "pairs") as progress:
-        found = run_odometry(
+        result = run_odometry(
             source, estimator, method, out, options, frame=frame, overwrite=overwrite, resume=resume, progress=progress
         )
-    for line in table_lines(found.rows()):
+    for line in table_lines(result.rows()):
         say(line)
-    for sentence in found.warnings():
+    for sentence in result.warnings():
         warn(sentence)
-    count, lost = len(found.estimates), int((~found.valid).sum())
-    if found.graph is not None and found.graph.sensors:
-        say(f"sensors: {', '.join(found.graph.sensors)}")
+    count, lost = len(result.estimates), int((~result.valid).sum())
+    if result.graph is not None and result.graph.sensors:
+        say(f"sensors: {', '.join(result.graph.sensors)}")
     say(f"{counted(count, 'motion')} by {estimator} ({method.inputs}), {lost} invalid and bridged, in {out}")
     say(f"picture: {out / 'path.png'}")
 
@@ -258,24 +258,26 @@ def mosaic(
         some = np.unique(np.linspace(0, len(index) - 1, min(ILLUMINATION_FRAMES, len(index))).astype(np.intp))
         light = illumination(source.read(index[some]), poses[some], heights[some])
     with progress_bar("laying", len(index), "frames") as progress:
-        found = build_mosaic(_counted(source.chunks(index), progress), poses, heights, options, illumination=light)
+        ground_map = build_mosaic(_counted(source.chunks(index), progress), poses, heights, options, illumination=light)
     if len(index) < len(source):
         warn(f"left out without a pose at their time: {len(source) - len(index):,} of {counted(len(source), 'frame')}")
-    if found.frames_without_ground:
-        warn(f"left out since they show no ground: {found.frames_without_ground:,} of {counted(found.frames, 'frame')}")
+    if ground_map.frames_without_ground:
+        without, frames_added = ground_map.frames_without_ground, counted(ground_map.frames, "frame")
+        warn(f"left out since they show no ground: {without:,} of {frames_added}")
     if quality is None:
-        save_geotiff(out, found)
+        save_geotiff(out, ground_map)
     else:
         from mitsonar.plotting.figures import mosaic_figure, quality_figure, save_figure
 
         name = Path(source.name).name
-        save_figure(out, mosaic_figure(found, paths, title=f"{name}, along the {laid_along} path"))
-        save_figure(quality, quality_figure(found, title=name))
-    rows, columns = found.mean.shape
-    spread = float(np.nanmedian(found.std)) if np.isfinite(found.std).any() else float("nan")
+        save_figure(out, mosaic_figure(ground_map, paths, title=f"{name}, along the {laid_along} path"))
+        save_figure(quality, quality_figure(ground_map, title=name))
+    rows, columns = ground_map.mean.shape
+    spread = float(np.nanmedian(ground_map.std)) if np.isfinite(ground_map.std).any() else float("nan")
     say(
-        f"{counted(found.frames, 'frame')} along the {laid_along} path: {rows:,} x {columns:,} cells of {cell_mm:g} mm, "
-        f"{rows * cell_mm / 1e3:.4g} x {columns * cell_mm / 1e3:.4g} m; median standard deviation {spread:.4f}"
+        f"{counted(ground_map.frames, 'frame')} along the {laid_along} path: {rows:,} x {columns:,} cells of "
+        f"{cell_mm:g} mm, {rows * cell_mm / 1e3:.4g} x {columns * cell_mm / 1e3:.4g} m; "
+        f"median standard deviation {spread:.4f}"
     )
     say(f"mosaic: {out}" + (f", quality: {quality}" if quality else " (bands: mean, standard deviation, count)"))
 
@@ -317,7 +319,7 @@ def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Tr
         paths["estimated"] = Trajectory.load(trajectory, frame)
     if true is not None:
         if trajectory == "true":
-            raise MitsonarError("--true and TRAJECTORY true are one path: leave --true out")
+            raise MitsonarError("--true and TRAJECTORY true are the same path: leave --true out")
         paths["true"] = Trajectory.load(true, frame)
     return paths, height
 
@@ -452,7 +454,7 @@ def crlb(
     ] = None,
     gain: Annotated[float | None, typer.Option(help="Constant gain (default: the data set's, or from the frames).")] = None,
     pings: Annotated[
-        int | None, typer.Option(help="Pings in each half of the derivatives (default: as many as needed).")
+        int | None, typer.Option(help="Pings in each half of the derivatives (default: until they suffice).")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the rays.")] = None,
     plot: Annotated[
@@ -487,7 +489,7 @@ def crlb(
     if Path(source).suffix == ".zarr" or "://" in source:
         scene_only = (start, end, poses, trajectory, sonar, model, segments, parameter)
         if any(value is not None for value in scene_only):
-            raise MitsonarError(f"{source} is a data set, which has its own sonar, poses and segments: give none of them")
+            raise MitsonarError(f"{source} is a data set, which defines sonar, poses and segments: leave these options out")
         subject = subject_of_data(source, pairs, part=part, seed=seed)
     else:
         loaded = load_scene(source, **scene_parameters(parameter or []))
@@ -551,7 +553,7 @@ def compare(
     estimators: Annotated[
         str | None,
         typer.Option(
-            help="Names of estimators, checkpoints of networks, or classes of your own (my_module:MyEstimator), separated "
+            help="Names of estimators, checkpoints of networks, or your classes (my_module:MyEstimator), separated "
             "by commas; NAME:key=value:key=value gives options (default: all that need no training)."
         ),
     ] = None,
@@ -602,13 +604,13 @@ def compare(
         reference=reference,
         seed=seed,
     )
-    found = compared(data, estimators, options, out=out, begin=lambda what, count: progress_bar(what, count, "pairs"))
-    for sentence in found.notes:
+    comparison = compared(data, estimators, options, out=out, begin=lambda what, count: progress_bar(what, count, "pairs"))
+    for sentence in comparison.notes:
         warn(sentence)
     if as_json:
-        say_json(found.report, indent=1)
+        say_json(comparison.report, indent=1)
         return
-    for line in found.to_markdown().splitlines():
+    for line in comparison.to_markdown().splitlines():
         say(line)
     if out is not None:
         say(f"\ntables: {out / 'table.md'}, {out / 'table.json'}")
@@ -644,7 +646,7 @@ def odometry_benchmark(
         list[str] | None,
         typer.Option(
             help="zero, ecc, phase, flow, direct, corrnet, corrnet-coherent, cfar-gicp, fourier-mellin, stackreg, a "
-            "checkpoint, or a class of yours as my_module:MyEstimator; several times (default: all; in speckle "
+            "checkpoint, or your class as my_module:MyEstimator; several times (default: all; in speckle "
             "corrnet-coherent for corrnet)."
         ),
     ] = None,
@@ -668,12 +670,12 @@ def odometry_benchmark(
     """
     from mitsonar.reproduction.odometry_benchmark import Wanted, benchmark_lines, benchmark_odometry
 
-    asked = {"sets": set_, "textures": texture, "noises": noise, "methods": method}
-    wanted = Wanted(
-        **{name: tuple(words) for name, words in asked.items() if words}, frames=frames, geometry=geometry, bound=bound
+    chosen = {"sets": set_, "textures": texture, "noises": noise, "methods": method}
+    selection = Wanted(
+        **{name: tuple(words) for name, words in chosen.items() if words}, frames=frames, geometry=geometry, bound=bound
     )
     report = benchmark_odometry(
-        wanted,
+        selection,
         out,
         resume=resume,
         overwrite=overwrite,

@@ -1,4 +1,4 @@
-"""``mitsonar serve``: poses in, sonar out, ping by ping."""
+"""Commands ``mitsonar serve`` and ``mitsonar view``: serve a live sonar, and show frames in Rerun."""
 
 from __future__ import annotations
 
@@ -33,17 +33,19 @@ def serve(
     set_: options.SonarKeys = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the Foxglove WebSocket; 0: a free one.")] = 8765,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0: all of this machine.")] = "127.0.0.1",
-    rate: Annotated[float | None, typer.Option(help="Pings a second of the path (default: the sonar's) [Hz].")] = None,
+    rate: Annotated[float | None, typer.Option(help="Pings per second along the path [Hz] (default: the sonar's).")] = None,
     start: options.Start = None,
     trajectory: Annotated[
-        Path | None, typer.Option(help="Path that is played while no pose comes: a TUM or CSV file, or `shipped`.")
+        Path | None, typer.Option(help="Path to play while no pose arrives: a TUM or CSV file, or `shipped`.")
     ] = None,
     frame: options.Frame = "mitsonar",
     noise: options.Noise = "none",
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
     parameter: options.Parameters = None,
-    pings: Annotated[int | None, typer.Option(min=1, help="End after so many pings (default: never).")] = None,
-    ros: Annotated[bool, typer.Option("--ros", help="A ROS 2 node in place of the Foxglove server; needs rclpy.")] = False,
+    pings: Annotated[int | None, typer.Option(min=1, help="End after this many pings (default: never).")] = None,
+    ros: Annotated[
+        bool, typer.Option("--ros", help="Start a ROS 2 node instead of the Foxglove server; needs rclpy.")
+    ] = False,
 ) -> None:
     """Serve a live sonar: clients publish poses on /pose and get fan, polar image, transform and timing. Ctrl-C ends it."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
@@ -58,7 +60,7 @@ def serve(
     path = options.path_for(instrument, attitude, scene, None, start, None, trajectory, frame)
     hertz = instrument.frame_rate_hz if rate is None else rate
     if not hertz > 0:
-        raise MitsonarError(f"--rate must be positive: got {hertz:g}; give pings a second")
+        raise MitsonarError(f"--rate must be positive: got {hertz:g}; give pings per second")
     simulator = Simulator(loaded, instrument)
     mailbox, served = PoseMailbox(), 0
     publisher = _ros_node(mailbox) if ros else _foxglove(mailbox, host, port)
@@ -120,31 +122,33 @@ def view(
             metavar="RUN|FILE|DATA.zarr|SCENE", help="A run, frames, a recording, a data set, or a scene (XML or name)."
         ),
     ],
-    save: Annotated[Path | None, typer.Option("--save", help="Write a recording (.rrd) and open no viewer.")] = None,
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write a recording (.rrd) instead of opening the viewer.")
+    ] = None,
     html: Annotated[
-        Path | None, typer.Option("--html", help="Make a folder: a page with the viewer, for any web server.")
+        Path | None, typer.Option("--html", help="Make a folder with a page and the viewer, for any web server.")
     ] = None,
     path: Annotated[
-        Path | None, typer.Option("--path", help="Estimated path too: the folder of an odometry, a TUM or CSV file.")
+        Path | None, typer.Option("--path", help="Estimated path to add: the folder of an odometry, a TUM or CSV file.")
     ] = None,
     frame: options.Frame = "mitsonar",
     scene: Annotated[
-        str | None, typer.Option(help="Scene to draw: XML or name (default: that of the run; `none`: no scene).")
+        str | None, typer.Option(help="Scene to draw: XML file or name (default: the run's; `none`: no scene).")
     ] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
     view_: Annotated[str | None, typer.Option("--view", help="View of a data set (default: the first).")] = None,
     parameter: options.Parameters = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file or page.")] = False,
 ) -> None:
-    """Show fan, polar image and levels of each frame; scene, wedge of the beams, true and estimated path."""
+    """Show fan, polar image and levels of each frame, with scene, beams, true and estimated path."""
     from mitsonar.bridges.rerun import write_recording
     from mitsonar.bridges.viewer_page import RECORDING, VIEWER, write_page
     from mitsonar.io.runs import refuse_to_replace
 
     if save is not None and html is not None:
-        raise MitsonarError("--save and --html contradict each other: the page has the recording in it")
+        raise MitsonarError("--save and --html contradict each other: the page contains the recording; give one")
     if save is not None and (save.suffix != ".rrd" or not save.parent.is_dir()):
-        raise MitsonarError(f"--save must name an .rrd file in a folder that is there: got {save}")
+        raise MitsonarError(f"--save must name an .rrd file in an existing folder: got {save}")
     target = html / RECORDING if html is not None else save
     if target is not None:
         option = "--save" if html is None else "--html"
@@ -157,14 +161,14 @@ def view(
         boxed = write_recording(shown, target, progress)
     if boxed:
         names = ", ".join(boxed[:5]) + (" ..." if len(boxed) > 5 else "")
-        warn(f"of {len(boxed)} shapes only the box is drawn, of instances and of meshes that are too large: {names}")
-    said = f"{counted(frames, 'frame')}, {counted(len(shown.shapes), 'shape')}"
-    said += f", {counted(len(shown.estimated), 'estimated path')}"
+        warn(f"{len(boxed)} shapes are drawn as boxes, since they are instances or too large meshes: {names}")
+    summary = f"{counted(frames, 'frame')}, {counted(len(shown.shapes), 'shape')}"
+    summary += f", {counted(len(shown.estimated), 'estimated path')}"
     if html is not None:
         write_page(html)
-        say(f"{said}: {html}; serve it: python -m http.server -d {html}")
+        say(f"{summary}: {html}; serve it: python -m http.server -d {html}")
     elif target is not None:
-        say(f"{said}: {target} ({target.stat().st_size:,} bytes); open it: rerun {target}")
+        say(f"{summary}: {target} ({target.stat().st_size:,} bytes); open it: rerun {target}")
 
 
 def _shown(
@@ -175,62 +179,62 @@ def _shown(
     sequence: int | None,
     view_: str | None,
 ) -> Shown:
-    """Return what to show: frames with the scene they were made of, or a scene with its sonar and its shipped path."""
+    """Return the content to show: frames with their scene, or a scene with its sonar and its shipped path."""
     from mitsonar.bridges.rerun import Shown
     from mitsonar.mapping.sources import is_data_set, is_recording, open_frames
 
-    place = Path(what)
-    frames_there = is_data_set(what) or is_recording(what) or place.is_dir() or place.suffix in (".npz", ".zarr")
+    run = Path(what)
+    frames_there = is_data_set(what) or is_recording(what) or run.is_dir() or run.suffix in (".npz", ".zarr")
     if frames_there:
         source = open_frames(what, sequence=sequence, view=view_)
-        named, told = (scene, parameters) if scene is not None else _scene_of(place)
-        shapes = [] if named in (None, "none") else _loaded(str(named), told)[0]
+        scene_name, scene_parameters = (scene, parameters) if scene is not None else _scene_of(run)
+        shapes = [] if scene_name in (None, "none") else _loaded(str(scene_name), scene_parameters)[0]
         return Shown(source.name, source, source.like.sonar, None, shapes, estimated)
     if sequence is not None or view_ is not None or scene is not None:
-        raise MitsonarError(f"--sequence, --view and --scene are for frames: {what} is a scene, or is not there")
-    shapes, found, path = _loaded(what, parameters)
-    return Shown(what, None, found, path, shapes, estimated)
+        raise MitsonarError(f"--sequence, --view and --scene apply only to frames: {what} is a scene, or does not exist")
+    shapes, sonar, path = _loaded(what, parameters)
+    return Shown(what, None, sonar, path, shapes, estimated)
 
 
 def _loaded(scene: str, parameters: dict[str, str]) -> tuple[Any, Any, Any]:
-    """Load a scene: its triangles, its sonar, and the path that lies beside it or the pose of the sonar."""
+    """Load a scene: its triangles, its sonar, and the path next to its file or the pose of the sonar."""
     import numpy as np
 
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.scene import find_scene, load_scene, sonar_in, triangles_in
 
     loaded = load_scene(scene, **parameters)
-    found = sonar_in(loaded)
-    beside = find_scene(scene).with_suffix(".tum")
-    path = Trajectory(np.array([found[1]]), np.zeros(1)) if found else None
-    if beside.is_file():
-        path = Trajectory.load_tum(beside)
-    return triangles_in(loaded), found and found[0], path
+    sonar_and_pose = sonar_in(loaded)
+    path_file = find_scene(scene).with_suffix(".tum")
+    path = Trajectory(np.array([sonar_and_pose[1]]), np.zeros(1)) if sonar_and_pose else None
+    if path_file.is_file():
+        path = Trajectory.load_tum(path_file)
+    return triangles_in(loaded), sonar_and_pose and sonar_and_pose[0], path
 
 
 def _scene_of(run: Path) -> tuple[str | None, dict[str, str]]:
-    """Return the scene that a run was made of, where it says it and it is there, and its parameters."""
+    """Return the scene of a run and its parameters, if run.json names the scene and the file exists."""
     from mitsonar.io.files import read_json
     from mitsonar.simulation.scene import find_scene
 
     folder = run if run.is_dir() else run.parent
     if not (folder / "run.json").is_file():
         return None, {}
-    told = read_json(folder / "run.json")
-    asked = told.get("asked", told)
-    name, parameters = asked.get("scene", told.get("scene")), asked.get("parameters", told.get("parameters", {}))
+    record = read_json(folder / "run.json")
+    request = record.get("asked", record)
+    name, parameters = request.get("scene", record.get("scene")), request.get("parameters", record.get("parameters", {}))
     if not isinstance(name, str) or not isinstance(parameters, dict):
         return None, {}
     try:
         find_scene(name)
     except MitsonarError:
-        warn(f"the scene of the run, {name}, is not there: give it by --scene, or `--scene none`")
+        warn(f"the scene of the run, {name}, was not found: give it with --scene, or give `--scene none`")
         return None, {}
     return name, {str(key): str(value) for key, value in parameters.items()}
 
 
 def _paths(path: Path | None, frame: str) -> dict[str, Trajectory]:
-    """Load an estimated path; of an odometry's folder the true one as well."""
+    """Load an estimated path; from the folder of an odometry also the true one."""
     from mitsonar.mapping.odometry_run import OdometryFolder
     from mitsonar.motion.trajectory import Trajectory
 

@@ -26,19 +26,19 @@ if TYPE_CHECKING:
 
 SIX = "x,y,z,pitch,roll,heading in m and deg"
 FRAMES = (
-    "Number of frames: with --trajectory evenly spaced in time over all of it; of a head that turns (ping360) of sweeps, "
-    "the first ones; of --vehicle of poses."
+    "Number of frames, with --trajectory evenly spaced in time. For a rotating head (ping360) the number of sweeps from the "
+    "start, with --vehicle the number of poses."
 )
 NOISE = (
-    "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; no realism, it shows which "
-    "pixels are empty"
+    "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; not realistic, since it "
+    "reveals empty pixels"
 )
 
 SceneName = Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")]
 Parameters = Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")]
 Moving = Annotated[
     list[str] | None,
-    typer.Option("--moving", help="ID=FILE.tum: the shape ID follows that path; or FILE.yaml (docs/guides/moving.md)."),
+    typer.Option("--moving", help="ID=FILE.tum: move the shape ID along a path; or FILE.yaml (docs/guides/moving.md)."),
 ]
 Start = Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")]
 End = Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")]
@@ -47,12 +47,12 @@ Speed = Annotated[
 ]
 Frame = Annotated[
     str,
-    typer.Option(help="Convention of pose files, read and written: mitsonar, ros-enu or ned (not of --from)."),
+    typer.Option(help="Convention of pose files to read and write: mitsonar, ros-enu or ned; --from is always mitsonar."),
 ]
 SonarName = Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")]
-SonarKeys = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the sonar: range_max=8.")]
+SonarKeys = Annotated[list[str] | None, typer.Option("--set", help="Change a key of the sonar, KEY=VALUE: range_max=8.")]
 Noise = Annotated[str, typer.Option(help=f"{NOISE}.")]
-RaysPerLaunch = Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")]
+RaysPerLaunch = Annotated[int, typer.Option(help="Rays traced at once, about 30 bytes each: limits memory.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")]
 
@@ -84,7 +84,7 @@ def path_for(
         raise MitsonarError(f"--frames must be at least 1: got {frames}")
     if speed is not None and (file is not None or end is None or not 0 < speed < 1e4):
         raise MitsonarError(
-            f"--speed is above 0 m/s, of --from and --to: got {speed:g}{' without --to' if end is None else ''}"
+            f"--speed must be above 0 m/s, and needs --from and --to: got {speed:g}{' without --to' if end is None else ''}"
         )
     if file is not None:
         if start or end:
@@ -94,10 +94,10 @@ def path_for(
             raise MitsonarError(
                 f"there is no trajectory {file}: give a TUM or CSV file, or `shipped`{meant(file, ['shipped'])}"
             )
-        flown = Trajectory.load_tum(shipped_trajectory(scene)) if shipped else Trajectory.load(file, frame)
+        path = Trajectory.load_tum(shipped_trajectory(scene)) if shipped else Trajectory.load(file, frame)
         if frames is None:
-            return flown
-        return first_sweeps(sonar, flown, frames) if scans(sonar) else flown.resample(frames)
+            return path
+        return first_sweeps(sonar, path, frames) if scans(sonar) else path.resample(frames)
     first = numbers(start, 6, "--from")
     last = numbers(end, 6, "--to")
     begin = Pose.from_degrees(first) if first else attitude
@@ -109,10 +109,10 @@ def path_for(
     if frames is None or (frames < 2 and not scans(sonar)):
         raise MitsonarError("--to needs --frames T, 2 or more: how many frames lie between --from and --to")
     ends, poses = (begin, Pose.from_degrees(last)), frames + 1 if scans(sonar) else frames
-    away = math.dist(ends[0][:3], ends[1][:3])
-    if speed is not None and away == 0:
-        raise MitsonarError("--speed needs --from and --to that lie apart: they are one place; leave --speed out")
-    rate_hz = 1 / frame_period_s(sonar) if speed is None else (poses - 1) * speed / away
+    distance_m = math.dist(ends[0][:3], ends[1][:3])
+    if speed is not None and distance_m == 0:
+        raise MitsonarError("--speed needs different places --from and --to: they are the same; leave --speed out")
+    rate_hz = 1 / frame_period_s(sonar) if speed is None else (poses - 1) * speed / distance_m
     return Trajectory.between(*ends, poses, rate_hz)
 
 
@@ -159,14 +159,14 @@ def poses_line(path: Trajectory, mounts: Mapping[str, ArrayLike] | None = None) 
 
 def warn_of_speed(path: Trajectory, end: str | None, speed: float | None) -> None:
     """Warn if the frame rate makes the vehicle faster than real ones, since --to is given without --speed."""
-    lasts = float(path.time_s[-1] - path.time_s[0])
-    if end is None or speed is not None or lasts <= 0:
+    duration_s = float(path.time_s[-1] - path.time_s[0])
+    if end is None or speed is not None or duration_s <= 0:
         return
-    away = math.dist(path.poses[0, :3], path.poses[-1, :3])
-    if away / lasts > FAST_M_S:
+    distance_m = math.dist(path.poses[0, :3], path.poses[-1, :3])
+    if distance_m / duration_s > FAST_M_S:
         warn(
-            f"the vehicle flies {away:.3g} m in {lasts:.3g} s, {away / lasts:.3g} m/s, since frames follow each other at "
-            "the sonar's rate; give --speed 1 (m/s), or more --frames"
+            f"the vehicle moves {distance_m:.3g} m in {duration_s:.3g} s, {distance_m / duration_s:.3g} m/s, since "
+            "frames follow each other at the sonar's rate; give --speed 1 (m/s), or more --frames"
         )
 
 
@@ -185,7 +185,7 @@ def sonar_changes(pairs: list[str] | None, quality: str | None, model: str | Non
         raise MitsonarError(f"--set takes KEY=VALUE: got {wrong[0]!r}")
     changes: dict[str, Any] = dict(pair.split("=", 1) for pair in pairs or [])
     if "preset" in changes:
-        raise MitsonarError(f"--set changes keys of the sonar: got preset={changes['preset']}; name it by --sonar")
+        raise MitsonarError(f"--set changes keys of the sonar: got preset={changes['preset']}; name it with --sonar")
     if quality is not None and changes.get("quality", quality) != quality:
         raise MitsonarError(f"--quality {quality} and --set quality={changes['quality']} contradict each other: give one")
     given = {"quality": quality, "model": model, "seed": seed}
@@ -197,16 +197,16 @@ def instrument_for(scene: Any, name: str | None, changes: dict[str, Any]) -> tup
     from mitsonar.instruments.sounder import load_sonar
     from mitsonar.simulation.scene import sonar_in
 
-    found = sonar_in(scene)
-    if name is None and found is None:
+    scene_sonar = sonar_in(scene)
+    if name is None and scene_sonar is None:
         raise MitsonarError(
             "the scene has no sensor of type imaging_sonar: add one, or name a sonar (--sonar didson300) and a pose (--from)"
         )
-    sonar = load_sonar(name) if name is not None else found[0]  # type: ignore[index]
+    sonar = load_sonar(name) if name is not None else scene_sonar[0]  # type: ignore[index]
     sonar = sonar.replace(**changes)
     if "quality" in changes and sonar.model == "thesis":
         raise MitsonarError(
-            "quality is of the model physical, the thesis model has its own number of rays: got quality "
-            f"{changes['quality']}; leave it out, or give --set rays_per_beam=N"
+            "quality applies to the model physical; the model thesis takes its number of rays from rays_per_beam: got "
+            f"quality {changes['quality']}; leave it out, or give --set rays_per_beam=N"
         )
-    return sonar, found[1] if found else None
+    return sonar, scene_sonar[1] if scene_sonar else None

@@ -92,20 +92,20 @@ def info(
 
     recording = _opened(file, topic, geometry)
     summary = summary_of(recording)
-    found = None
+    verdict = None
     if handedness or turn_deg is not None:
-        found = handedness_of(recording.part(), None if turn_deg is None else math.radians(turn_deg))
+        verdict = handedness_of(recording.part(), None if turn_deg is None else math.radians(turn_deg))
     if as_json:
-        told = {} if found is None else {"handedness": found._asdict()}
-        say_json({**summary, **told})
+        extra = {} if verdict is None else {"handedness": verdict._asdict()}
+        say_json({**summary, **extra})
         return
     for line in summary_lines(summary):
         say(line)
-    if found is not None:
-        why = f" ({found.reason})" if found.reason else ""
+    if verdict is not None:
+        why = f" ({verdict.reason})" if verdict.reason else ""
         say(
-            f"handedness             {found.verdict}{why}: "
-            f"correlation {found.correlation:.2f} over {counted(found.pairs, 'pair')}"
+            f"handedness             {verdict.verdict}{why}: "
+            f"correlation {verdict.correlation:.2f} over {counted(verdict.pairs, 'pair')}"
         )
 
 
@@ -148,11 +148,11 @@ def video(
     _say_notes(recording)
     chosen = recording.part(part)
     steps = np.diff(chosen.time_s)
-    found = 1 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else 10.0
+    frame_rate_hz = 1 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else 10.0
     if rate is not None and not 0 < rate <= 1000:
         raise MitsonarError(f"--rate must lie in 0..1000 a second: got {rate:g}")
     with progress_bar("drawing", len(chosen), "frames") as progress:
-        speed = rate or min(1000.0, found)
+        speed = rate or min(1000.0, frame_rate_hz)
         count = write_fan_video(chosen.chunks(), out, speed, span_db=span_db, overwrite=overwrite, progress=progress)
     say(f"{counted(count, 'frame')} at {speed:.4g} a second in {out}")
 
@@ -187,9 +187,9 @@ def convert(
     if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
         raise MitsonarError(f"{out}: unknown ending; {nearest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
     if (full or labels) and out.suffix != ".mcap":
-        raise MitsonarError(f"--full and --labels are of MCAP files: got {out}; leave them out")
+        raise MitsonarError(f"--full and --labels apply only to MCAP files: got {out}; leave them out")
     if resume and out.suffix:
-        raise MitsonarError("--resume is for folders: files are whole or absent")
+        raise MitsonarError("--resume applies only to folders, since a file is written whole: leave it out")
     recording = _opened(file, topic, geometry)
     _say_notes(recording)
     chosen = recording.part(part)
@@ -202,7 +202,7 @@ def convert(
         # a resumed conversion compares formats, so that it does not go on with another crop
         crop = ", ".join(f"{what} {text}" for what, text in (("bins", crop_bins), ("beams", crop_beams)) if text)
         recording, part = replace(recording, format=f"{crop} of {recording.format}", parts=(chosen,)), None
-    made = out
+    written = out
     with progress_bar("converting", len(chosen), "frames") as progress:
         if out.suffix == ".mcap":
             words = {"picture": picture, "full": full, "labels": labels, "overwrite": overwrite}
@@ -210,8 +210,8 @@ def convert(
         elif out.suffix == ".aris":
             _to_aris(chosen, out, beams=beams, overwrite=overwrite, progress=progress)
         else:
-            made = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
-    say(f"{counted(len(chosen), 'frame')} in {made}")
+            written = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
+    say(f"{counted(len(chosen), 'frame')} in {written}")
 
 
 def _span(text: str, what: str) -> tuple[int, int]:
@@ -298,8 +298,8 @@ def fit(
     from mitsonar.records.frames import SonarFrames
 
     refuse_to_replace(out, overwrite=overwrite)
-    told = _told(sonar, changes)
-    _fit_and_write(SonarFrames.load(frames), told, out, measure_coding=measure_coding)
+    known = _known_fields(sonar, changes)
+    _fit_and_write(SonarFrames.load(frames), known, out, measure_coding=measure_coding)
 
 
 @answered
@@ -336,30 +336,30 @@ def from_recording(
     for path in (out, noise):
         if path is not None:
             refuse_to_replace(path, overwrite=overwrite)
-    told = _told(sonar, changes)
+    known = _known_fields(sonar, changes)
     source = open_frames(file, sequence=part, view=topic, geometry=geometry)
     first = max(0, (len(source) - frames) // 2)
     chosen, notes = as_instrument(source.read(range(first, min(first + frames, len(source)))))
-    _fit_and_write(chosen, told, out, noise, notes, measure_coding=measure_coding)
+    _fit_and_write(chosen, known, out, noise, notes, measure_coding=measure_coding)
 
 
-class _Told(NamedTuple):
+class _KnownFields(NamedTuple):
     """A sonar that fitting starts from, and fields that are known."""
 
     sonar: Sonar | None
     fields: dict[str, Any]  # pairs of a command line, which the sonar checks
 
 
-def _told(sonar: str | None, changes: list[str] | None) -> _Told:
+def _known_fields(sonar: str | None, changes: list[str] | None) -> _KnownFields:
     """Return the sonar and fields that the user gives; their faults are reported before frames are read."""
     from mitsonar.instruments.sounder import load_sonar
 
-    return _Told(None if sonar is None else load_sonar(sonar), dict(changes_of(changes or [], None)))
+    return _KnownFields(None if sonar is None else load_sonar(sonar), dict(changes_of(changes or [], None)))
 
 
 def _fit_and_write(
     frames: SonarFrames,
-    told: _Told,
+    known: _KnownFields,
     out: Path,
     noise: Path | None = None,
     notes: Sequence[str] = (),
@@ -369,15 +369,15 @@ def _fit_and_write(
     """Fit a sonar to frames, write it to OUT, or its noise to another file, and print the result."""
     from mitsonar.estimation.sonar_fit import NOISE_FIELDS, fit_sonar
 
-    found = fit_sonar(frames, told.sonar, measure_coding=measure_coding, **told.fields)
+    fitted = fit_sonar(frames, known.sonar, measure_coding=measure_coding, **known.fields)
     if noise is None:
-        write_whole(out, found.yaml().encode())
+        write_whole(out, fitted.yaml().encode())
     else:
-        write_whole(out, found.yaml(leave=NOISE_FIELDS).encode())
-        write_whole(noise, found.yaml(only=NOISE_FIELDS).encode())
-    for line in found.lines():
+        write_whole(out, fitted.yaml(leave=NOISE_FIELDS).encode())
+        write_whole(noise, fitted.yaml(only=NOISE_FIELDS).encode())
+    for line in fitted.lines():
         say(line)
-    for note in (*notes, *found.notes):
+    for note in (*notes, *fitted.notes):
         warn(note)
     say(f"{out}: {command_line('render', 'SCENE', '--sonar', out if noise is None else f'{out},{noise}')}")
 
@@ -485,7 +485,7 @@ def numbers_of(text: str, option: str, count: int | None) -> list[float]:
     except ValueError:
         numbers = []
     if not numbers or len(numbers) != (count or len(numbers)) or not all(map(math.isfinite, numbers)):
-        raise MitsonarError(f"{option} takes {count or 'some'} numbers with commas between: got {text!r}")
+        raise MitsonarError(f"{option} takes {count or 'some'} numbers, separated by commas: got {text!r}")
     return numbers
 
 
@@ -510,11 +510,12 @@ def exported(
     words = {"classes": classes, "least": least, "least_snr_db": least_snr_db, "polygons": polygons}
     with progress_bar("exporting", source.frames, "frames") as progress:
         kind = cast(PictureKind, picture)
-        made = export_to(to, source, out, picture=kind, every_class=every_class, progress=progress, **words)  # type: ignore[arg-type]
+        report = export_to(to, source, out, picture=kind, every_class=every_class, progress=progress, **words)  # type: ignore[arg-type]
     say(f"{counted(source.frames, 'frame')} as {to}: {out}")
     for part in ("train", "validation", "test"):
-        counts = ", ".join(f"{name} {made.boxes[part, name]:,}" for name in made.classes)
+        counts = ", ".join(f"{name} {report.boxes[part, name]:,}" for name in report.classes)
         if to in ("coco", "yolo") and (source.part == part).any():
             say(f"{part:10} {int((source.part == part).sum()):,} pictures, boxes: {counts}")
-    if to in ("coco", "yolo") and made.faint + made.small:
-        say(f"without a box: {made.faint:,} below {least_snr_db:g} dB over the noise, {made.small:,} below {least} pixels")
+    if to in ("coco", "yolo") and report.faint + report.small:
+        faint, small = f"{report.faint:,} below {least_snr_db:g} dB over the noise", f"{report.small:,} below {least} pixels"
+        say(f"without a box: {faint}, {small}")

@@ -1,4 +1,4 @@
-"""``mitsonar render``: a scene becomes sonar frames on disk."""
+"""Commands ``mitsonar render``, ``impulse``, ``sound`` and ``image``: simulate sonars in a scene."""
 
 from __future__ import annotations
 
@@ -43,40 +43,47 @@ def render(
     ] = None,
     frame: options.Frame = "mitsonar",
     sonar: options.SonarName = None,
-    model: Annotated[str | None, typer.Option(help="coherent (as of most presets), physical or thesis.")] = None,
+    model: Annotated[str | None, typer.Option(help="coherent (default of most presets), physical or thesis.")] = None,
     quality: Annotated[
-        str | None, typer.Option(help="draft, standard or fine: rays by the error wanted (`mitsonar presets`).")
+        str | None, typer.Option(help="draft, standard or fine: number of rays by accuracy (`mitsonar presets`).")
     ] = None,
     set_: options.SonarKeys = None,
     noise: options.Noise = "none",
-    labels: Annotated[bool, typer.Option("--labels", help="Per-pixel elevation, shape id and shadow too.")] = False,
+    labels: Annotated[
+        bool, typer.Option("--labels", help="Write elevation, shape id, object id and shadow of each pixel.")
+    ] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
     label_floor: Annotated[
-        float, typer.Option(min=0, max=1, help="Label only pixels above this part of full scale, before noise.")
+        float, typer.Option(min=0, max=1, help="Label only pixels above this fraction of full scale, before noise.")
     ] = 0.0,
     fan: Annotated[
-        bool, typer.Option("--fan", help="A plain fan picture of each frame, in fan/; with --labels of these as well.")
+        bool, typer.Option("--fan", help="Write a plain fan picture of each frame to fan/; with --labels also of labels.")
     ] = False,
-    cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
-    exr: Annotated[bool, typer.Option("--exr", help="Every ray's echo, one EXR a frame.")] = False,
+    cartesian: Annotated[bool, typer.Option("--cartesian", help="Draw each frame as a fan with axes in metres.")] = False,
+    exr: Annotated[bool, typer.Option("--exr", help="Write the echo of every ray, one EXR file per frame.")] = False,
     mirrors: Annotated[
         bool,
-        typer.Option("--mirrors", help="Smooth materials glint (coherent) and mirror (bounces); docs/guides/multipath.md."),
+        typer.Option(
+            "--mirrors",
+            help="Render glints (coherent) and mirrors (bounces) of smooth materials; see docs/guides/multipath.md.",
+        ),
     ] = False,
     moving: options.Moving = None,
     all_sensors: Annotated[
         bool,
-        typer.Option("--all-sensors", help="All sonars and cameras of the scene, on one vehicle (docs/guides/bridges.md)."),
+        typer.Option(
+            "--all-sensors", help="Use all sonars and cameras of the scene, on one vehicle (docs/guides/bridges.md)."
+        ),
     ] = False,
     vehicle: Annotated[
-        Path | None, typer.Option(help="All sensors of a vehicle, a YAML file; see docs/guides/bridges.md.")
+        Path | None, typer.Option(help="YAML file with the sensors of a vehicle; see docs/guides/bridges.md.")
     ] = None,
     rays_per_launch: options.RaysPerLaunch = 2**22,
     parameter: options.Parameters = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+    overwrite: options.Overwrite = False,
+    resume: options.Resume = False,
 ) -> None:
-    """Render what the sonar receives: frames.npz, images/, poses.tum and run.json in the folder OUT."""
+    """Render sonar frames: frames.npz, images/, poses.tum and run.json in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.acoustics.water import absorption_line
     from mitsonar.instruments.sonar import Sonar
@@ -95,15 +102,13 @@ def render(
     folder = out or Path("out") / find_scene(scene).stem
     if all_sensors or vehicle is not None:
         if mirrors:
-            raise MitsonarError("--mirrors is of one sonar: leave it out, or render the sonars one by one")
+            raise MitsonarError("--mirrors applies to a single sonar: leave it out, or render the sonars one by one")
         file = _vehicle_file(vehicle, all_sensors, sonar)
-        found = (sonar_in(loaded) or channel_sonar_in(loaded)) if file is None else None
-        flown = options.path_for(Sonar(), found and found[1], scene, frames, start, end, trajectory, frame, speed)
-        options.warn_of_speed(flown, end, speed)
+        scene_sonar = (sonar_in(loaded) or channel_sonar_in(loaded)) if file is None else None
+        path = options.path_for(Sonar(), scene_sonar and scene_sonar[1], scene, frames, start, end, trajectory, frame, speed)
+        options.warn_of_speed(path, end, speed)
         motions = _motions(loaded, moving, named, [] if file is None else file.said)
-        return _render_vehicle(
-            loaded, file, flown, changes, motions, outputs, Destination(folder, origin, overwrite, resume)
-        )
+        return _render_vehicle(loaded, file, path, changes, motions, outputs, Destination(folder, origin, overwrite, resume))
     instrument, attitude = options.instrument_for(loaded, sonar, changes)
     refuse_noise(outputs.noise, instrument)
     path = options.path_for(instrument, attitude, scene, frames, start, end, trajectory, frame, speed)
@@ -145,7 +150,7 @@ def _load(scene: str, parameter: list[str] | None) -> tuple[Any, dict[str, Any]]
 
 
 def _check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: Simulator | None = None) -> None:
-    """Refuse a path below the ground or inside an object if the sonar sees nothing from there; warn if it sees something.
+    """Reject a path below the ground or inside an object if the sonar sees nothing from there; warn if it sees something.
 
     Args:
         scene: the Mitsuba scene.
@@ -155,20 +160,21 @@ def _check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: S
     """
     from mitsonar.simulation.tracing import buried_in
 
-    found = None if moving else buried_in(scene, path.poses)
-    if found is None:
+    buried = None if moving else buried_in(scene, path.poses)
+    if buried is None:
         return
-    frames = f"pose {found.frame}" if found.frames == 1 else f"pose {found.frame}, the first of {found.frames:,} such poses,"
+    more = "" if buried.frames == 1 else f", the first of {buried.frames:,} such poses,"
+    frames = f"pose {buried.frame}{more}"
     if simulator is not None:
-        echoes, sonar = simulator.film_echoes(path.poses[found.frame], found.frame), simulator.sonar
+        echoes, sonar = simulator.film_echoes(path.poses[buried.frame], buried.frame), simulator.sonar
         if not ((echoes.hit > 0) & (echoes.far_m >= sonar.range_min) & (echoes.near_m < sonar.range_max)).any():
-            raise MitsonarError(f"{frames} {found.text}, and sees nothing from there: correct --from, --to or --trajectory")
-    if not found.inside:  # a tank is an object, too
-        warn(f"{frames} {found.text}: its frames show the ground from below")
+            raise MitsonarError(f"{frames} {buried.text}, and sees nothing from there: correct --from, --to or --trajectory")
+    if not buried.inside:  # a tank is an object, too
+        warn(f"{frames} {buried.text}: its frames show the ground from below")
 
 
 def _motions(scene: Any, moving: list[str] | None, frame: str, also: Sequence[Said] = ()) -> list[Said]:
-    """Return the motions of bodies: those of --moving, of other bodies those of a vehicle's file, then of the scene."""
+    """Return the motions of bodies: from --moving, else from the file of the vehicle, else from the scene."""
     from mitsonar.motion.bodies import BodyMotion
     from mitsonar.simulation.scene import Said, said_by, said_in
 
@@ -187,7 +193,7 @@ def _motions(scene: Any, moving: list[str] | None, frame: str, also: Sequence[Sa
     return given
 
 
-# ---------------- What ``mitsonar render --all-sensors`` and ``--vehicle`` do: all sensors of a vehicle in one run
+# ---------------- ``mitsonar render --all-sensors`` and ``--vehicle``: all sensors of a vehicle in one run
 
 
 def _vehicle_file(file: Path | None, all_sensors: bool, sonar: str | None) -> VehicleFile | None:
@@ -253,7 +259,7 @@ def impulse(
     ] = None,
     frames: Annotated[
         int | None,
-        typer.Option(help="Number of pings (default: 1); with --trajectory evenly spaced in time over all of it."),
+        typer.Option(help="Number of pings (default: 1), with --trajectory evenly spaced in time."),
     ] = None,
     start: options.Start = None,
     trajectory: Annotated[
@@ -272,11 +278,13 @@ def impulse(
     parameter: options.Parameters = None,
     mirrors: Annotated[
         bool,
-        typer.Option("--mirrors", help="Paths by way of smooth materials; see docs/guides/impulse-responses.md."),
+        typer.Option("--mirrors", help="Add paths reflected by smooth materials; see docs/guides/impulse-responses.md."),
     ] = False,
     mirror: Annotated[
         list[str] | None,
-        typer.Option("--mirror", help="NAME=V,H: reflection of pressures and rms height [m] of a shape: surface=-1,0.002."),
+        typer.Option(
+            "--mirror", help="Reflection coefficient of pressure and rms height [m] of a shape, NAME=V,H: surface=-1,0.002."
+        ),
     ] = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
@@ -319,19 +327,19 @@ def impulse(
 
 
 def _channel_sonar(
-    found: tuple[ChannelSonar, Pose] | None, model: str | None, seed: int | None, changes: list[str]
+    scene_sonar: tuple[ChannelSonar, Pose] | None, model: str | None, seed: int | None, changes: list[str]
 ) -> tuple[ChannelSonar, Pose | None]:
     """Return the instrument with its changes, and its pose in the scene; by default the instrument of Almanza-Medina."""
     from mitsonar.instruments.hydrophones import ChannelSonar
 
-    sonar, attitude = found if found is not None else (ChannelSonar(name="thesis"), None)
+    sonar, attitude = scene_sonar if scene_sonar is not None else (ChannelSonar(name="thesis"), None)
     fields: dict[str, Any] = {}
     for pair in changes:
         key, equals, value = pair.partition("=")
         if not equals:
             raise MitsonarError(f"--set takes KEY=VALUE: got {pair!r}")
         if key == "transmitter":
-            raise MitsonarError(f"fields of view are set in the scene, or in Python, not by --set: got {pair!r}")
+            raise MitsonarError(f"fields of view are set in the scene or in Python, not with --set: got {pair!r}")
         fields[key] = _receivers(sonar, value) if key == "receivers" else value
     fields |= {} if model is None else {"model": model}
     fields |= {} if seed is None else {"seed": seed}
@@ -343,7 +351,7 @@ def _mirrors(materials: bool, given: list[str]) -> dict[str, tuple[float, float]
     if not given:
         return "materials" if materials else None
     if materials:
-        raise MitsonarError("--mirrors takes the mirrors of all materials, --mirror those of named shapes: give one of both")
+        raise MitsonarError("--mirrors takes the mirrors of all materials, --mirror those of named shapes: give only one")
     parts: dict[str, tuple[float, float]] = {}
     for one in given:
         name, _, values = one.rpartition("=")
@@ -357,14 +365,14 @@ def _mirrors(materials: bool, given: list[str]) -> dict[str, tuple[float, float]
 def _receivers(sonar: ChannelSonar, names: str) -> list[dict[str, object]]:
     """Return the named receivers of an instrument."""
     known = {one.name: one for one in sonar.receivers}
-    wanted = [name.strip() for name in names.split(",")]
-    for name in wanted:
+    chosen = [name.strip() for name in names.split(",")]
+    for name in chosen:
         if name not in known:
             raise MitsonarError(
-                f"--set receivers=NAME,NAME chooses of the receivers {', '.join(known)}: got {name!r}{meant(name, known)}; "
-                "others are described in the scene's channel_sonar"
+                f"--set receivers=NAME,NAME chooses among the receivers {', '.join(known)}: got "
+                f"{name!r}{meant(name, known)}; describe others in the channel_sonar of the scene"
             )
-    return [known[name].model_dump() for name in wanted]
+    return [known[name].model_dump() for name in chosen]
 
 
 def _channel_path(
@@ -412,7 +420,7 @@ def _channel_path(
     count = 2 if velocity is None else velocity.count(",") + 1
     speed = [*(numbers(velocity, count, "--velocity (m/s, m/s, deg/s)") or [0.0, 0.0]), 0.0][:3]
     if velocity is None and (frames or 1) > 1:
-        warn("the vehicle stands still, and all pings are alike: give --velocity vx,vy in m/s, or --trajectory")
+        warn("the vehicle does not move, so that all pings are equal: give --velocity vx,vy in m/s, or --trajectory")
     return steady(begin, (speed[0], speed[1], math.radians(speed[2])), frames or 1, sonar.frame_rate_hz)
 
 
@@ -427,28 +435,28 @@ def sound(
         typer.Option(help="sidescan, altimeter, profiler, dvl, range-image, a preset (`mitsonar presets`) or a YAML file."),
     ],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/INSTRUMENT).")] = None,
-    frames: Annotated[
-        int | None, typer.Option(help="Number of pings; with --trajectory evenly spaced in time over all of it.")
-    ] = None,
+    frames: Annotated[int | None, typer.Option(help="Number of pings, with --trajectory evenly spaced in time.")] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose of the vehicle: {options.SIX}.")] = None,
     end: options.End = None,
     speed: options.Speed = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped`, level below the sonar of the scene."),
+        typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped` (levelled)."),
     ] = None,
     frame: options.Frame = "mitsonar",
-    model: Annotated[str | None, typer.Option(help="coherent, with speckle and noise, or physical.")] = None,
-    quality: Annotated[str | None, typer.Option(help="draft, standard or fine: rays by the error wanted.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the instrument: range_max=20.")] = None,
+    model: Annotated[str | None, typer.Option(help="coherent (speckle and noise) or physical.")] = None,
+    quality: Annotated[str | None, typer.Option(help="draft, standard or fine: number of rays by accuracy.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a key of the instrument, KEY=VALUE: range_max=20.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter, speckle and noise.")] = None,
     moving: options.Moving = None,
     rays_per_launch: options.RaysPerLaunch = 2**22,
     parameter: options.Parameters = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+    overwrite: options.Overwrite = False,
+    resume: options.Resume = False,
 ) -> None:
-    """Simulate an instrument of beams on a vehicle: waterfall, ranges, points or velocities in the folder OUT."""
+    """Simulate a side-scan, altimeter, profiler, DVL or 3-D sonar on a vehicle, and write its records into OUT."""
     from mitsonar.instruments.sounder import load_sounder
     from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.pose import Pose
@@ -487,7 +495,7 @@ def sound(
 
 @answered
 def image(
-    run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run that was rendered with --exr.")],
+    run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run rendered with --exr.")],
     bins: Annotated[int | None, typer.Option(help="Number of range bins (default: as rendered).")] = None,
     window: Annotated[str | None, typer.Option("--range", help="Range window from,to [m] (default: as rendered).")] = None,
     noise: options.Noise = "none",

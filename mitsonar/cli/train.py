@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mitsonar.networks.checkpoint import Checkpoint
     from mitsonar.training.journal import TrainingReport
 
-__all__ = ["Run", "TrainingBar", "asked_to_stop", "checkpoint_from", "evaluate", "export", "reproduce", "train"]
+__all__ = ["Run", "TrainingBar", "checkpoint_from", "evaluate", "export", "reproduce", "stop_on_signals", "train"]
 
 
 @answered
@@ -69,37 +69,37 @@ def train(
 
     changes = changes_of(given.pop("change") or [], None)
     options = TrainOptions(**{**given, "recipe": load_training_recipe(recipe, changes)})
-    with asked_to_stop() as stop, TrainingBar() as bar:
-        made = train_network(options, progress=bar, stop=stop)
+    with stop_on_signals() as stop, TrainingBar() as bar:
+        report = train_network(options, progress=bar, stop=stop)
     if not leads():
         return
-    for name, text in made.rows():
+    for name, text in report.rows():
         say(f"{name:18} {text}")
     say(f"network: {out / 'network.ckpt'}; learning curve: {out / 'curve.png'}, {out / 'log.csv'}")
 
 
 @contextmanager
-def asked_to_stop() -> Iterator[Callable[[], bool]]:
+def stop_on_signals() -> Iterator[Callable[[], bool]]:
     """Stop training after its step at Ctrl-C or SIGTERM, with its state saved; stop at once at the second signal.
 
     Yields a function that returns whether to stop.
     """
-    asked, come = threading.Event(), list[int]()
+    stop_requested, received = threading.Event(), list[int]()
 
     def first(number: int, frame: FrameType | None) -> None:
-        come.append(number)
-        asked.set()
+        received.append(number)
+        stop_requested.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
     if threading.current_thread() is not threading.main_thread():
-        yield asked.is_set
+        yield stop_requested.is_set
         return
     before = {number: signal.signal(number, first) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield asked.is_set
+        yield stop_requested.is_set
     except KeyboardInterrupt:
-        if come == [signal.SIGTERM]:
+        if received == [signal.SIGTERM]:
             raise Terminated from None
         raise
     finally:
@@ -346,8 +346,8 @@ def reproduce(
         raise MitsonarError(f"--workers must be at least 1: got {workers}")
     from mitsonar.reproduction.tables import rows_named, table_named
 
-    wanted = [name.strip() for name in rows.split(",") if name.strip()] if rows is not None else None
-    rows_named(table_named(table), wanted)
+    row_names = [name.strip() for name in rows.split(",") if name.strip()] if rows is not None else None
+    rows_named(table_named(table), row_names)
     if out is None:
         raise MitsonarError(f"table {table} needs a folder: give -o")
     from mitsonar.reproduction.tables import Effort
@@ -359,7 +359,7 @@ def reproduce(
         with ExitStack() as stack:
             watch = stack.enter_context(_Console())
             reproduced(
-                table, out, effort, rows=wanted, workers=processes, accelerator=accelerator, devices=devices, watch=watch
+                table, out, effort, rows=row_names, workers=processes, accelerator=accelerator, devices=devices, watch=watch
             )
     except KeyboardInterrupt as stop:
         code = say_stopped(reproduce, stop)
@@ -373,7 +373,7 @@ def _list() -> None:
     """List all tables and figures with their rows, or with the command that makes them."""
     from mitsonar.reproduction.tables import LOUD, NOISES, ScriptedTable, contents
 
-    printed = [said for noise, said in NOISES.items() if noise != LOUD]
+    printed = [text for noise, text in NOISES.items() if noise != LOUD]
     say(f"RMSE in Almanza-Medina, sideways mm / forward mm / yaw deg: {', '.join(printed)}")
     for table in contents():
         say(f"\n{table.name}  {table.title}")
@@ -409,5 +409,5 @@ class _Console:
         """Show the bar of a training. Ctrl-C stops the training after its step."""
         self.bar.close()
         typer.echo(f"training {what}", err=True)
-        with asked_to_stop() as stop, TrainingBar() as bar:
+        with stop_on_signals() as stop, TrainingBar() as bar:
             yield bar, stop

@@ -115,7 +115,7 @@ def test_fewer_pings_of_a_path_keep_its_velocity_and_some_receivers_may_do(
 
 def test_standing_still_is_told(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     done = mitsonar("impulse", scene, "--frames", 2, "-o", tmp_path / "out")
-    assert "stands still" in done.stderr
+    assert "does not move" in done.stderr
     response = ImpulseResponses.load(tmp_path / "out").response
     np.testing.assert_allclose(response[1], response[0], atol=1e-6 * np.abs(response).max())
 
@@ -203,7 +203,7 @@ def test_mirrors_that_do_not_fit_are_refused(mitsonar: Command, scene: Path, tmp
     for given, *words in (
         (["--mirror", "floor=-1"], "--mirror NAME=V,H takes 2 numbers, separated by commas: got '-1'"),
         (["--mirror", "=-1,0"], "--mirror takes NAME=V,H, reflection and rms height [m] of a shape: got '=-1,0'"),
-        (["--mirror", "floor=-1,0", "--mirrors"], "give one of both"),
+        (["--mirror", "floor=-1,0", "--mirrors"], "give only one"),
         (["--mirror", "flor=-1,0"], "the scene has no shape flor: did you mean floor?"),
         (["--mirror", "floor=-2,0"], "must lie in -1..1"),
         (["--mirrors", "--set", "bounces=2"], "bounces 2 need mirrors"),

@@ -40,7 +40,7 @@ SLIPS = [
     ("render flat_floor -D cells=3", "unused parameters: - $cells=3"),
     ("impulse hydrophones --trajectory squar", "did you mean square?"),
     ("impulse hydrophones --model scaterers", "--model: input should be", "did you mean scatterers?"),
-    ("impulse hydrophones --set receivers=forwrd", "chooses of the receivers"),
+    ("impulse hydrophones --set receivers=forwrd", "chooses among the receivers"),
     (
         "crlb flat_floor --sonar didson300 --noise low",
         "the model coherent adds its own noise",

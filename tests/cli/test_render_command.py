@@ -135,10 +135,10 @@ def test_quality_and_numbers_of_rays_are_chosen_on_the_command_line(mitsonar: Co
     assert rays("--set", "rays_per_beam=20", "--set", "rays_across=3")[1:] == (20, 3)
     assert rays("--model", "thesis")[1:] == told[1:]
     refused(mitsonar("render", scene, "--quality", "fien"), "unknown quality 'fien': did you mean fine?")
-    refused(mitsonar("render", scene, "--quality", "fine", "--model", "thesis"), "quality is of the model physical")
+    refused(mitsonar("render", scene, "--quality", "fine", "--model", "thesis"), "quality applies to the model physical")
     refused(mitsonar("render", scene, "--set", "rays_per_bem=20"), "did you mean rays_per_beam")
     refused(mitsonar("render", scene, "--set", "rays_per_beam"), "--set takes KEY=VALUE: got 'rays_per_beam'")
-    refused(mitsonar("render", scene, "--set", "preset=aris3000"), "name it by --sonar")
+    refused(mitsonar("render", scene, "--set", "preset=aris3000"), "name it with --sonar")
     refused(mitsonar("render", scene, "--quality", "fine", "--set", "quality=draft"), "contradict each other")
 
 
@@ -435,12 +435,12 @@ def test_speed_and_sweeps_are_as_asked_and_haste_is_told(mitsonar: Command, tmp_
     out, draft = tmp_path / "o", ("--model", "physical", "--quality", "draft", "--set", "beams=8", "--overwrite")
     way = ("--from", "0,0,2,30,0,0", "--to", "0,3,2,30,0,0", "--frames", 4)
     done = mitsonar("render", "flat_floor", "--sonar", "didson300", *way, "-o", out, *draft)
-    assert "flies 3 m in 0.143 s, 21 m/s" in done.stderr
+    assert "moves 3 m in 0.143 s, 21 m/s" in done.stderr
     done = mitsonar("render", "flat_floor", "--sonar", "didson300", *way, "--speed", 2, "-o", out, *draft)
     assert done.returncode == 0, done.stderr
-    assert "flies" not in done.stderr
+    assert "the vehicle moves" not in done.stderr
     assert np.loadtxt(out / "poses.tum")[:, 0] == pytest.approx([0, 0.5, 1, 1.5])
-    refused(mitsonar("render", "flat_floor", "--speed", 1, "-o", out), "--speed is above 0 m/s, of --from and --to")
+    refused(mitsonar("render", "flat_floor", "--speed", 1, "-o", out), "--speed must be above 0 m/s, and needs")
     head = ("render", "objects", "--sonar", "ping360", "--set", "range_max=10", "--trajectory", "shipped", "-o", out)
     refused(mitsonar(*head, "--frames", 5), "a sweep lasts 13.33 s", "--frames counts the sweeps")
 

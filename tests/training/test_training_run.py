@@ -708,9 +708,9 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
         if report.step == 9:
             os.kill(os.getpid(), signal.SIGINT)
 
-    from mitsonar.cli.train import asked_to_stop
+    from mitsonar.cli.train import stop_on_signals
 
-    with asked_to_stop() as stop, pytest.raises(KeyboardInterrupt):
+    with stop_on_signals() as stop, pytest.raises(KeyboardInterrupt):
         train(TrainOptions(told, made, out, threads=1), progress=interrupt, stop=stop)
     assert torch.load(out / "last.ckpt", weights_only=True)["global_step"] in (9, 10)
     train(TrainOptions(told, made, out, resume=True, threads=1))
