@@ -79,9 +79,9 @@ RESUMES = ("make", "reproduce")
 def _resume_hint(command: Callable[..., object]) -> str:
     """Return the part of a sentence that explains how to resume a stopped command; empty if it cannot."""
     if command.__name__ in RESUMES:
-        return ": what is whole on disk stays, and the same command goes on"
+        return ": complete files stay on disk, and the same command continues"
     if "resume" in inspect.signature(command).parameters:
-        return ": what is whole on disk stays, and the same command with --resume goes on"
+        return ": complete files stay on disk, and the same command with --resume continues"
     return ""
 
 

@@ -266,7 +266,7 @@ def check(data: Data) -> None:
     if faults:
         raise MitsonarError(
             f"{len(faults)} faults in {data}: the `mitsonar dataset make` that made it resumes where it stopped, and with "
-            "--verify makes damaged shards anew; empty frames stay until the recipe changes"
+            "--verify remakes damaged shards; empty frames stay until the recipe changes"
         )
     say(f"{counted(len(store), 'frame')} in {counted(store.shards, 'shard')}: all is well")
 

@@ -151,7 +151,7 @@ def _run_parallel(
             whole = True
         except BrokenProcessPool:
             raise MitsonarError(
-                "a worker was lost: it was killed, or the memory did not suffice; go on with fewer workers"
+                "a worker was lost: it was killed, or the memory did not suffice; resume with fewer workers"
             ) from None
         finally:
             if not whole:  # nobody will read the remaining results, and a batch may take long

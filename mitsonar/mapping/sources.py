@@ -793,8 +793,8 @@ def poses_at(
     poses = np.full((len(time_s), 6), np.nan)
     poses[known] = _interpolated(path, np.clip(time_s[known], times[0], times[-1]))
     if attitude_rad is not None and (np.ptp(path.poses[:, 2:5], axis=0) < PLANAR).all():
-        measured = known[:, None] & np.isfinite(attitude_rad[:, :2])
-        poses[:, 3:5] = np.where(measured, attitude_rad[:, :2], poses[:, 3:5])
+        has_attitude = known[:, None] & np.isfinite(attitude_rad[:, :2])
+        poses[:, 3:5] = np.where(has_attitude, attitude_rad[:, :2], poses[:, 3:5])
     return poses, known
 
 

@@ -217,7 +217,7 @@ def test_a_collada_file_without_its_package_names_the_extra(
 
 # ---------------------------------------------------------------- signals
 
-STAYS = "what is whole on disk stays, and the same command"
+STAYS = "complete files stay on disk, and the same command"
 
 
 @pytest.fixture
@@ -244,7 +244,7 @@ def test_a_signal_ends_a_command_with_a_sentence(
             raise SystemError("native code was broken off") from None
 
     for command, words in (
-        (with_folder, ": what is whole on disk stays, and the same command with --resume goes on"),
+        (with_folder, ": complete files stay on disk, and the same command with --resume continues"),
         (without, ""),
     ):
         with pytest.raises(typer.Exit) as end:
@@ -285,7 +285,7 @@ def test_a_signal_ends_a_rendering_that_goes_on(number: signal.Signals, mitsonar
         process.send_signal(number)
         _, said = process.communicate(timeout=30)
     assert process.returncode == 128 + number
-    assert said.splitlines()[-1] == f"stopped: {STAYS} with --resume goes on"
+    assert said.splitlines()[-1] == f"stopped: {STAYS} with --resume continues"
     assert mitsonar(*words, "--resume", cwd=tmp_path).returncode == 0
 
 
