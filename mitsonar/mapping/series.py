@@ -93,9 +93,7 @@ class MotionSeries:
         known = np.where(self.is_valid[:, None, None], covariances, np.eye(3))
         crooked = np.abs(known - known.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(known).max(axis=(1, 2))
         least = np.linalg.eigvalsh(known)
-        self._refuse(
-            crooked | (least[:, 0] < -1e-9 * least[:, 2]), "has a covariance with a negative variance, or asymmetric"
-        )
+        self._refuse(crooked | (least[:, 0] < -1e-9 * least[:, 2]), "has an asymmetric covariance, or a negative variance")
 
     def _refuse(self, bad: ArrayLike, what: str) -> None:
         where = np.flatnonzero(np.asarray(bad) & self.is_valid)

@@ -305,7 +305,7 @@ def test_a_bad_mosaic_is_answered_by_one_sentence(mitsonar: Command, drawn: Path
     refused(mitsonar("mosaic", drawn, "true", "-o", tmp_path / "no" / "map.png"), "no folder")
     refused(mitsonar("mosaic", drawn, "true", "-o", out, "--cell-mm", 0), "above 0")
     refused(mitsonar("mosaic", drawn, "true", "-o", out, "--blend", "center"), "centre")
-    refused(mitsonar("mosaic", drawn, "true", "-o", out, "--true", later), "one path")
+    refused(mitsonar("mosaic", drawn, "true", "-o", out, "--true", later), "the same path")
     refused(mitsonar("mosaic", drawn, later, "-o", tmp_path / "map.tif", "--true", later), "figure")
     frames.image[...] = 0
     frames.save(tmp_path / "dark.npz")

@@ -228,7 +228,7 @@ def test_portions_as_images_know_their_rays(tmp_path: Path, mitsonar: Command) -
     with pytest.raises(MitsonarError, match="has no vectors of view 'q1'"):
         open_views(str(url), ["c1"], "vector").with_heights_by(DirectHeight(views=("q1",)))
     words = ("--height-by", "direct", "--height", "2.5", "-o", tmp_path / "path")
-    refused(mitsonar("odometry", url, "--view", "whole", *words), "give one of them")
+    refused(mitsonar("odometry", url, "--view", "whole", *words), "give only one of them")
 
 
 @pytest.mark.usefixtures("bare_curves")
