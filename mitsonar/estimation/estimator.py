@@ -39,11 +39,11 @@ __all__ = [
     "correlation_excess",
     "correlation_of",
     "correlation_rejection",
+    "is_distinct",
     "matching_rejection",
     "prior_rejection",
     "rejected",
     "spread_of",
-    "stands_out",
     "two_frames",
     "without_slow",
 ]
@@ -190,7 +190,7 @@ def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.flo
     rising = (np.diff(frames.range_m) > 0).all() and (np.diff(frames.bearing_rad) > 0).all()
     if min(frames.image.shape[1:]) < FEWEST_CELLS or not rising:
         raise MitsonarError(
-            f"estimators need {FEWEST_CELLS} bins and beams or more, ranges and bearings that rise: got "
+            f"estimators need {FEWEST_CELLS} bins and beams or more, and increasing ranges and bearings: got "
             f"{frames.image.shape[1]} x {frames.image.shape[2]}; sort rows and columns"
         )
     if not np.isfinite(frames.image).all():
@@ -200,7 +200,7 @@ def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.flo
 
 
 def reuse_freed_memory() -> None:
-    """Make glibc reuse freed arrays: once an array of this size was freed, it returns no memory to the system.
+    """Make glibc reuse freed arrays: once an array of this size is freed, it returns no memory to the system.
 
     A pair of frames allocates and frees images by the hundred; fresh pages took a fifth of the time of ``direct``.
     """
@@ -243,12 +243,12 @@ def correlation_rejection(correlation: float, independent: float, excess: Excess
         independent: number of cells with independent noise.
         excess: result of :func:`correlation_excess`, if it was measured.
     """
-    if correlation >= max(LEAST_AT_BEST, LEAST_CORRELATION / np.sqrt(independent)) or stands_out(independent, excess):
+    if correlation >= max(LEAST_AT_BEST, LEAST_CORRELATION / np.sqrt(independent)) or is_distinct(independent, excess):
         return ""
     return f"the frames as matched correlate by {correlation:.2f} only"
 
 
-def stands_out(independent: float, excess: Excess) -> bool:
+def is_distinct(independent: float, excess: Excess) -> bool:
     """Return whether registered frames correlate far more than displaced ones do.
 
     Args:
@@ -270,17 +270,22 @@ def correlation_excess(first: Real, second: Real, inside: NDArray[np.bool_], asi
         inside: which pixels count.
         aside: smallest displacement [columns]; once and twice this displacement are used, to both sides.
     """
-    others: list[float] = []
+    displaced: list[float] = []
     for shift in (-2 * aside, -aside, aside, 2 * aside):
-        here, there = slice(max(shift, 0), min(shift, 0) or None), slice(max(-shift, 0), min(-shift, 0) or None)
-        both = inside[:, here] & inside[:, there]
-        others.append(correlation_of(first[:, here][both], second[:, there][both]) if both.any() else 1.0)
-    excess = correlation_of(first[inside], second[inside]) - float(np.mean(others))
-    return Excess(excess, float(np.std(others, ddof=1)))
+        first_columns, second_columns = (
+            slice(max(shift, 0), min(shift, 0) or None),
+            slice(max(-shift, 0), min(-shift, 0) or None),
+        )
+        both = inside[:, first_columns] & inside[:, second_columns]
+        displaced.append(
+            correlation_of(first[:, first_columns][both], second[:, second_columns][both]) if both.any() else 1.0
+        )
+    excess = correlation_of(first[inside], second[inside]) - float(np.mean(displaced))
+    return Excess(excess, float(np.std(displaced, ddof=1)))
 
 
 def ambiguity(excess: float, independent: float) -> float:
-    """Return the factor by which the covariance grows where a match hardly stands out.
+    """Return the factor by which the covariance grows where a match is hardly distinct.
 
     There, noise adds curvature that the covariance does not account for. Without this factor, squared errors of ``direct``
     on hulls in high noise were 5.0 times the covariance at an excess of 6 to 8 standard deviations, 2.6 times at 10 to 14,
@@ -354,17 +359,19 @@ def prior_rejection(motion: Motion, covariance: NDArray[np.float64] | None, prio
     """
     if prior is None:
         return ""
-    apart = np.array(motion) - np.array(prior.motion)
-    together = prior.covariance if covariance is None else prior.covariance + covariance
-    std = np.sqrt(np.diag(together))
+    difference = np.array(motion) - np.array(prior.motion)
+    total = prior.covariance if covariance is None else prior.covariance + covariance
+    std = np.sqrt(np.diag(total))
     std[std == 0] = 1
-    scaled = apart / std  # otherwise the solver drops all but a component of large variance
-    square = float(scaled @ np.linalg.lstsq(together / np.outer(std, std), scaled, rcond=None)[0])
+    scaled = difference / std  # otherwise the solver drops all but a component of large variance
+    square = float(scaled @ np.linalg.lstsq(total / np.outer(std, std), scaled, rcond=None)[0])
     if square <= LARGEST_SQUARE:
         return ""
-    sideways, forward, yaw = in_units(apart)
-    off = np.sqrt(square)
-    return f"the motion is {sideways:.0f}, {forward:.0f} mm, {yaw:.2f} deg from the prior: {off:.1f} standard deviations"
+    sideways, forward, yaw = in_units(difference)
+    deviations = np.sqrt(square)
+    return (
+        f"the motion is {sideways:.0f}, {forward:.0f} mm, {yaw:.2f} deg from the prior: {deviations:.1f} standard deviations"
+    )
 
 
 # ---------------- Options of estimators

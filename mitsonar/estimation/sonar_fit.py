@@ -83,7 +83,7 @@ class SonarFit:
             codings.
         speckle_gamma: exponent of value = amplitude^gamma, from the coefficient of variation of the values; None in dB.
         glow_db: level of the first bins over the trend beyond them [dB].
-        notes: sentences on what was assumed or not found.
+        notes: sentences on assumptions and on quantities that could not be fitted.
     """
 
     sonar: Sonar
@@ -98,7 +98,7 @@ class SonarFit:
     def lines(self) -> list[str]:
         """Return the results as lines of text, one per quantity, with units."""
         sonar = self.sonar
-        noise = "not seen" if self.noise_db is None else f"{self.noise_db:.1f} dB at mid range"
+        noise_text = "not seen" if self.noise_db is None else f"{self.noise_db:.1f} dB at mid range"
         grain = (
             f"a span of {self.speckle_span_db:.1f} dB"
             if self.speckle_span_db is not None
@@ -106,25 +106,25 @@ class SonarFit:
         )
         coding = {"dB": f"dB, span {sonar.coding_db:g} dB", "gamma": f"gamma {sonar.coding_gamma:g}"}
         level = "not fitted" if sonar.noise_level_db is None else f"{sonar.noise_level_db:.1f} dB"
-        leak = "none seen" if sonar.crosstalk_db is None else f"{sonar.crosstalk_db:.1f} dB"
-        law = "none: exponential intensities" if sonar.speckle_nu is None else f"{sonar.speckle_nu:.2g}"
-        glow = "none seen"
+        crosstalk_text = "none seen" if sonar.crosstalk_db is None else f"{sonar.crosstalk_db:.1f} dB"
+        speckle_text = "none: exponential intensities" if sonar.speckle_nu is None else f"{sonar.speckle_nu:.2g}"
+        glow_text = "none seen"
         if sonar.near_glow_db > 0:
-            glow = (
+            glow_text = (
                 f"{sonar.near_glow_db:.1f} dB at range 0, gone at {sonar.near_glow_m:.3g} m; outermost beams "
                 f"{sonar.near_glow_edge_db:.1f} dB below the middle one, spread {sonar.near_glow_spread_db:.1f} dB; "
                 f"{100 * sonar.near_glow_still:.0f} % stay from ping to ping"
             )
-        drifting = "none seen" if sonar.volume_db is None else f"{sonar.volume_db:.1f} dB re 1/m"
+        volume_text = "none seen" if sonar.volume_db is None else f"{sonar.volume_db:.1f} dB re 1/m"
         return [
-            f"noise over full scale   {noise} (noise_level_db: {level})",
+            f"noise over full scale   {noise_text} (noise_level_db: {level})",
             f"99.9th percentile       {self.bright_db:.1f} dB over full scale",
-            f"coding                  {coding.get(sonar.value_coding, 'linear')}; the grain says {grain}",
+            f"coding                  {coding.get(sonar.value_coding, 'linear')}; the grain suggests {grain}",
             f"stripes_db              {sonar.stripes_db:.2f}",
-            f"crosstalk_db            {leak}",
-            f"speckle_nu              {law}",
-            f"near glow over noise    {glow}",
-            f"volume_db               {drifting}",
+            f"crosstalk_db            {crosstalk_text}",
+            f"speckle_nu              {speckle_text}",
+            f"near glow over noise    {glow_text}",
+            f"volume_db               {volume_text}",
         ]
 
     def yaml(self, *, only: Container[str] | None = None, leave: Container[str] = ()) -> str:
@@ -163,10 +163,10 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     """
     _check(frames)
     # 1. geometry and coding from the frames, everything else from the base
-    told = frames.sonar
-    known = {name: getattr(told, name) for name in GEOMETRY}
-    coded = {"coding": frames.level, "coding_db": told.coding_db, "coding_gamma": told.coding_gamma}
-    sonar = (told if base is None else base).replace(**{"model": "coherent", **known, **coded, **given})
+    recorded_sonar = frames.sonar
+    known = {name: getattr(recorded_sonar, name) for name in GEOMETRY}
+    coding = {"coding": frames.level, "coding_db": recorded_sonar.coding_db, "coding_gamma": recorded_sonar.coding_gamma}
+    sonar = (recorded_sonar if base is None else base).replace(**{"model": "coherent", **known, **coding, **given})
     value = np.asarray(frames.image, dtype=float) / (255 if frames.image.dtype.kind == "u" else 1)
     notes: list[str] = []
     # 2. the grain of dark windows gives a coding; with it, values become intensities
@@ -179,7 +179,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     noise = _noise(flat, value, level, notes)
     nu = _nu(flat, value, noise or 0.0)
     if nu is not None and nu < STRUCTURED:
-        notes.append(f"a speckle_nu of {nu:g} is more than a bottom's texture: objects and edges of the scene count in it")
+        notes.append(f"a speckle_nu of {nu:g} is more than the texture of a bottom: it includes objects and edges")
     # 4. a steady rise of quiet beams beside a strong echo is crosstalk, normalised by the beam pattern
     leak = statistics.leak_power(intensity[:, statistics.GLOW_BINS :], limit=float(decoded(FULL, sonar))) / _lobe_sum(sonar)
     fitted: dict[str, Any] = {
@@ -189,12 +189,12 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         "crosstalk_db": round(float(np.clip(10 * math.log10(leak), -120, 0)), 1) if leak > 0 else None,
         "speckle_nu": nu,
     }
-    told_notes: list[str] = []
-    full_scale_db = _full_scale_db(frames, sonar, flat, told_notes)
+    scale_notes: list[str] = []
+    full_scale_db = _full_scale_db(frames, sonar, flat, scale_notes)
     # 5. what exceeds the noise near the sonar is glow; what is new in every frame is volume
     if noise is not None:
         fitted |= _water(flat, level, noise, sonar, full_scale_db, notes)
-        notes += told_notes
+        notes += scale_notes
     middle = float(gain_of(sonar)[len(frames.range_m) // 2])
     return SonarFit(
         sonar=sonar.replace(**fitted),
@@ -210,17 +210,17 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
 
 def _water(flat: Array, level: Array, noise: float, sonar: Sonar, full_scale_db: float, notes: list[str]) -> dict[str, Any]:
     """Return the fields of noise, near glow and volume."""
-    found: dict[str, Any] = {"noise_level_db": round(float(statistics.decibels(noise)) + full_scale_db, 1)}
+    fields: dict[str, Any] = {"noise_level_db": round(float(statistics.decibels(noise)) + full_scale_db, 1)}
     glow = near_glow(flat, noise, sonar.range_m)
     if glow is not None:
         edge, spread, still = glow_by_beam(flat, noise, sonar.range_m, sonar.bearing_rad, glow)
-        found |= {"near_glow_db": round(glow[0], 1), "near_glow_m": round(glow[1], 4)}
-        found |= {"near_glow_edge_db": round(float(np.clip(edge, -60, 60)), 1), "near_glow_still": round(still, 2)}
-        found["near_glow_spread_db"] = round(min(spread, 20.0), 1)
-    drifting = volume(flat, level, noise, sonar, notes)
-    if drifting is not None:
-        found["volume_db"] = round(float(np.clip(drifting + full_scale_db - sonar.source_level_db, -200, 0)), 1)
-    return found
+        fields |= {"near_glow_db": round(glow[0], 1), "near_glow_m": round(glow[1], 4)}
+        fields |= {"near_glow_edge_db": round(float(np.clip(edge, -60, 60)), 1), "near_glow_still": round(still, 2)}
+        fields["near_glow_spread_db"] = round(min(spread, 20.0), 1)
+    strength_db = volume(flat, level, noise, sonar, notes)
+    if strength_db is not None:
+        fields["volume_db"] = round(float(np.clip(strength_db + full_scale_db - sonar.source_level_db, -200, 0)), 1)
+    return fields
 
 
 def _check(frames: SonarFrames) -> None:
@@ -232,7 +232,7 @@ def _check(frames: SonarFrames) -> None:
             f"{shape[0]} of {shape[1]} x {shape[2]}; record a longer or wider window"
         )
     if not np.ptp(frames.image):
-        raise MitsonarError("a fit needs frames that vary: all cells have one value; give frames with echoes")
+        raise MitsonarError("a fit needs frames that vary: all cells have the same value; give frames with echoes")
 
 
 # ---------------- Coding
@@ -278,27 +278,27 @@ def _gamma(value: Array) -> float:
     """Return the gamma that gives the coefficient of variation of dark windows; 2 is linear."""
     parts = _grain_windows(value)[0]
     mean = parts.mean(axis=1)
-    found = _mode(parts.std(axis=1, ddof=1)[mean > 0] / mean[mean > 0])
+    variation = _mode(parts.std(axis=1, ddof=1)[mean > 0] / mean[mean > 0])
     low, high = 0.05, 4.0
-    if not _variation(low) < found < _variation(high):
-        return low if found <= _variation(low) else high
-    return float(optimize.brentq(lambda gamma: _variation(gamma) - found, low, high))
+    if not _variation(low) < variation < _variation(high):
+        return low if variation <= _variation(low) else high
+    return float(optimize.brentq(lambda gamma: _variation(gamma) - variation, low, high))
 
 
 def _with_coding(sonar: Sonar, span: float | None, gamma: float | None, measure: bool, notes: list[str]) -> Sonar:
     """Return the sonar with the measured coding if requested; else add a note if it differs from the stated one."""
     if span is not None:
-        stated, found, changed = sonar.coding_db, span, {"coding": "dB", "coding_db": round(span, 1)}
+        stated, measured, coding = sonar.coding_db, span, {"coding": "dB", "coding_db": round(span, 1)}
     else:
         assert gamma is not None
         stated = sonar.coding_gamma if sonar.value_coding == "gamma" else 2.0
-        found, changed = gamma, {"coding": "gamma", "coding_gamma": round(gamma, 2)}
+        measured, coding = gamma, {"coding": "gamma", "coding_gamma": round(gamma, 2)}
     if measure:
-        return sonar.replace(**changed)
-    if abs(math.log(found / stated)) > 0.15:
+        return sonar.replace(**coding)
+    if abs(math.log(measured / stated)) > 0.15:
         notes.append(
-            f"the grain says {found:.3g} where the frames state {stated:g}: several looks, compression, or another coding "
-            "(--measure-coding takes the grain's)"
+            f"the grain suggests {measured:.3g}, but the frames state {stated:g}: several looks, compression, or another "
+            "coding (--measure-coding uses the grain's)"
         )
     return sonar
 
@@ -308,17 +308,18 @@ def _with_coding(sonar: Sonar, span: float | None, gamma: float | None, measure:
 
 def _noise(flat: Array, value: Array, level: Array, notes: list[str]) -> float | None:
     """Return the mean intensity of the darkest windows; None if it is below the coding's floor, or not new in each frame."""
-    beyond = slice(statistics.GLOW_BINS, None)
-    parts = statistics.window_values(flat[:, beyond])
+    beyond_glow = slice(statistics.GLOW_BINS, None)
+    parts = statistics.window_values(flat[:, beyond_glow])
     mean = parts.mean(axis=1)
     dark = mean <= np.percentile(mean, DARKEST) * WITHIN
-    empty = statistics.window_values(value[:, beyond] <= 0)[dark].mean()
+    empty = statistics.window_values(value[:, beyond_glow] <= 0)[dark].mean()
     if empty > 0.2:
-        notes.append("the noise is below the least level of the coding: noise_level_db is left out")
+        notes.append("the noise is below the lowest level of the coding: noise_level_db is left out")
         return None
-    if len(level) > 1 and (still := float(statistics.correlation_by_level(level)[1][0])) > STILL:
+    if len(level) > 1 and (correlation := float(statistics.correlation_by_level(level)[1][0])) > STILL:
         notes.append(
-            f"the darkest tenth correlates by {still:.2f} from frame to frame, so it is no noise: noise_level_db is left out"
+            f"the darkest tenth correlates by {correlation:.2f} from frame to frame, so it is not noise: noise_level_db is "
+            "left out"
         )
         return None
     return float(np.median(mean[dark]))
@@ -333,15 +334,15 @@ def _full_scale_db(frames: SonarFrames, sonar: Sonar, flat: Array, notes: list[s
         return float(10 * np.log10(frames.level_scale)) + sonar.source_level_db
     flat = flat[:, statistics.GLOW_BINS :]
     bright = np.percentile(flat, 99.9)
-    at = np.nonzero(flat >= bright)[1] + statistics.GLOW_BINS
-    range_m = float(np.median(sonar.range_m[at]))
+    bright_bins = np.nonzero(flat >= bright)[1] + statistics.GLOW_BINS
+    range_m = float(np.median(sonar.range_m[bright_bins]))
     face = FACE * SLANT * sonar.beam_width_rad * sonar.bin_m / range_m**3 * math.log(1000)
-    lost = -float(10 * np.log10(np.interp(range_m, sonar.range_m, loss_of(sonar))))
+    loss_db = -float(10 * np.log10(np.interp(range_m, sonar.range_m, loss_of(sonar))))
     notes.append(
-        f"levels have no scale: noise_level_db takes the brightest thousandth, at {range_m:.3g} m, for a face "
-        f"of reflectivity {FACE:g} at 45 deg"
+        f"levels have no scale: noise_level_db assumes that the brightest thousandth, at {range_m:.3g} m, is a face of "
+        f"reflectivity {FACE:g} at 45 deg"
     )
-    return float(10 * np.log10(face / bright)) - lost + sonar.source_level_db
+    return float(10 * np.log10(face / bright)) - loss_db + sonar.source_level_db
 
 
 def _nu(flat: Array, value: Array, noise: float) -> float | None:
@@ -354,13 +355,13 @@ def _nu(flat: Array, value: Array, noise: float) -> float | None:
     parts, levels = (statistics.window_values(one, FLAT_WINDOW) for one in (flat / smooth[:, None], flat))
     clipped = statistics.window_values(value >= FULL, FLAT_WINDOW).mean(axis=1)
     mean = levels.mean(axis=1)
-    kept = (mean > (1 + FLAT_ABOVE) * noise) & (clipped <= MOST_CLIPPED) & (mean > 0)
-    if not kept.any():
+    bright = (mean > (1 + FLAT_ABOVE) * noise) & (clipped <= MOST_CLIPPED) & (mean > 0)
+    if not bright.any():
         return None
     # excess of the squared contrast over that of exponential intensities, corrected for the noise
-    excess = (parts[kept] ** 2).mean(axis=1) / (2 * parts[kept].mean(axis=1) ** 2) - 1
-    found = float(np.median(excess * (mean[kept] / (mean[kept] - noise)) ** 2))
-    return None if found < NEAR_RAYLEIGH else round(float(np.clip(1 / found, 0.1, 100)), 2)
+    excess = (parts[bright] ** 2).mean(axis=1) / (2 * parts[bright].mean(axis=1) ** 2) - 1
+    inverse_nu = float(np.median(excess * (mean[bright] / (mean[bright] - noise)) ** 2))
+    return None if inverse_nu < NEAR_RAYLEIGH else round(float(np.clip(1 / inverse_nu, 0.1, 100)), 2)
 
 
 def _lobe_sum(sonar: Sonar) -> float:
@@ -416,24 +417,24 @@ def near_glow(flat: Array, noise: float, range_m: Array) -> tuple[float, float] 
     excess = statistics.decibels(np.median(flat, axis=(0, 2)) / math.log(2) / noise)
     first = _first(excess)
     last = max(2 * FEWEST, round(len(excess) * WATER_WITHIN))
-    at, excess = range_m[first : first + last], excess[first : first + last]
+    fit_range_m, excess = range_m[first : first + last], excess[first : first + last]
     # two lines with the best break between them
     best: tuple[float, int, Array, Array] | None = None
     for end in range(FEWEST, last - FEWEST):
-        lines = [np.polyfit(at[part], excess[part], 1) for part in (slice(end), slice(end, None))]
-        model = np.where(np.arange(last) < end, np.polyval(lines[0], at), np.polyval(lines[1], at))
-        missed = float(np.square(excess - model).sum())
-        if best is None or missed < best[0]:
-            best = missed, end, lines[0], lines[1]
+        lines = [np.polyfit(fit_range_m[part], excess[part], 1) for part in (slice(end), slice(end, None))]
+        model = np.where(np.arange(last) < end, np.polyval(lines[0], fit_range_m), np.polyval(lines[1], fit_range_m))
+        squared_error = float(np.square(excess - model).sum())
+        if best is None or squared_error < best[0]:
+            best = squared_error, end, lines[0], lines[1]
     assert best is not None
-    _, end, (slope, start), (behind, _) = best
+    _, end, (slope, start), (slope_beyond, _) = best
     # a glow falls far, and much more steeply than the profile beyond it
-    fall = -slope * (at[end - 1] - at[0])
-    if fall < LEAST_FALL_DB or -slope < STEEPER * abs(behind):
+    fall = -slope * (fit_range_m[end - 1] - fit_range_m[0])
+    if fall < LEAST_FALL_DB or -slope < STEEPER * abs(slope_beyond):
         return None
     if start <= MOST_GLOW_DB:
         return float(start), float(-start / slope)
-    middle = float(at[:end].mean())  # a line from 120 dB at range 0 through the middle of the glow
+    middle = float(fit_range_m[:end].mean())  # a line from 120 dB at range 0 through the middle of the glow
     height = min(start + slope * middle, 0.95 * MOST_GLOW_DB)
     return MOST_GLOW_DB, middle / (1 - height / MOST_GLOW_DB)
 
@@ -466,28 +467,30 @@ def glow_by_beam(
     # bins well within the glow
     line = glow[0] * (1 - range_m / glow[1])
     first = _first(statistics.decibels(np.median(flat, axis=(0, 2)) / math.log(2) / noise))
-    at = np.arange(len(range_m))
-    kept = (at >= first) & (line > GLOWING_DB)
-    if kept.sum() < FEWEST_GLOWING:
+    bins = np.arange(len(range_m))
+    glowing = (bins >= first) & (line > GLOWING_DB)
+    if glowing.sum() < FEWEST_GLOWING:
         return 0.0, 0.0, 0.0
     # level of each beam relative to the common line, and its robust trend over the squared bearing
     least = noise * 1e-3
-    rest = statistics.decibels(np.maximum(flat[:, kept], least) / noise) - line[kept][None, :, None]
-    own = np.median(rest, axis=(0, 1))
+    over_line_db = statistics.decibels(np.maximum(flat[:, glowing], least) / noise) - line[glowing][None, :, None]
+    beam_glow_db = np.median(over_line_db, axis=(0, 1))
     square = (np.sin(bearing_rad) / np.sin(np.abs(bearing_rad).max())) ** 2
-    found = optimize.least_squares(
-        lambda x: x[0] - x[1] * square - own, (0.0, 0.0), loss="soft_l1", f_scale=statistics.RAYLEIGH_DB
+    trend = optimize.least_squares(
+        lambda x: x[0] - x[1] * square - beam_glow_db, (0.0, 0.0), loss="soft_l1", f_scale=statistics.RAYLEIGH_DB
     )
     # spread of the beams about the trend, minus the grain of a median
-    miss = own - found.x[0] + found.x[1] * square
-    spread = 1.4826 * float(np.median(np.abs(miss - np.median(miss))))
-    still = _stays(rest - own, line[kept][:, None] + own > CLEAR_DB)
+    residual_db = beam_glow_db - trend.x[0] + trend.x[1] * square
+    spread = 1.4826 * float(np.median(np.abs(residual_db - np.median(residual_db))))
+    still = _coherence(over_line_db - beam_glow_db, line[glowing][:, None] + beam_glow_db > CLEAR_DB)
     frames = 1 + (len(flat) - 1) * (1 - still)  # the part that stays is one draw
-    grain = 1.57 * statistics.RAYLEIGH_DB**2 / (frames * kept.sum() / 2)  # of a median, while neighbouring bins share grain
-    return float(found.x[1]), math.sqrt(max(spread**2 - grain, 0.0)), still
+    grain = (
+        1.57 * statistics.RAYLEIGH_DB**2 / (frames * glowing.sum() / 2)
+    )  # of a median, while neighbouring bins share grain
+    return float(trend.x[1]), math.sqrt(max(spread**2 - grain, 0.0)), still
 
 
-def _stays(grain_db: Array, clear: NDArray[np.bool_]) -> float:
+def _coherence(grain_db: Array, clear: NDArray[np.bool_]) -> float:
     """Return the coherence of consecutive frames from the correlation of their levels in the clear cells."""
     if len(grain_db) < 2 or clear.sum() < FEWEST_CELLS:
         return 0.0
@@ -501,11 +504,11 @@ def moved_correlation(level_db: Array) -> float:
     """Return the largest correlation of consecutive detrended frames in their brighter half, over all shifts of cells."""
     grain, mean = statistics.detrended(level_db), statistics.local_mean(level_db)
     grain = np.where(mean >= np.median(mean), grain, 0)
-    found = []
+    correlations = []
     for one, other in pairwise(grain):
-        across = np.fft.irfft2(np.conj(np.fft.rfft2(one)) * np.fft.rfft2(other), one.shape)
-        found.append(across.max() / max(math.sqrt(np.square(one).sum() * np.square(other).sum()), 1e-30))
-    return float(np.mean(found)) if found else math.nan
+        correlation = np.fft.irfft2(np.conj(np.fft.rfft2(one)) * np.fft.rfft2(other), one.shape)
+        correlations.append(correlation.max() / max(math.sqrt(np.square(one).sum() * np.square(other).sum()), 1e-30))
+    return float(np.mean(correlations)) if correlations else math.nan
 
 
 def volume(flat: Array, level_db: Array, noise: float, sonar: Sonar, notes: list[str]) -> float | None:
@@ -529,22 +532,26 @@ def volume(flat: Array, level_db: Array, noise: float, sonar: Sonar, notes: list
         return None
     # bins that exceed the noise, beyond the near glow
     echo = flat.mean(axis=(0, 2)) - noise
-    kept = echo > (ABOVE - 1) * noise
-    kept[: statistics.GLOW_BINS] = False
-    if kept.sum() < statistics.WINDOW[0]:
+    above_noise = echo > (ABOVE - 1) * noise
+    above_noise[: statistics.GLOW_BINS] = False
+    if above_noise.sum() < statistics.WINDOW[0]:
         return None
     # divide by the echo of volume of strength 1; check the profile of the whole window
-    held = sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m / sonar.range_m**2 * loss_of(sonar)
-    strength = statistics.decibels(echo[kept] / held[kept])
-    found = float(np.median(strength))
-    rest = statistics.decibels((echo + noise) / (noise + 10 ** (found / 10) * held))[statistics.GLOW_BINS :]
-    if np.diff(np.percentile(rest, [10, 90]))[0] / 2 > UNEVEN_DB:
+    unit_echo = (
+        sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m / sonar.range_m**2 * loss_of(sonar)
+    )
+    strengths_db = statistics.decibels(echo[above_noise] / unit_echo[above_noise])
+    strength_db = float(np.median(strengths_db))
+    residual_db = statistics.decibels((echo + noise) / (noise + 10 ** (strength_db / 10) * unit_echo))[
+        statistics.GLOW_BINS :
+    ]
+    if np.diff(np.percentile(residual_db, [10, 90]))[0] / 2 > UNEVEN_DB:
         return None
     notes.append(
-        "bright speckle is new in every frame and falls with range as volume does, so it is taken for it (volume_db): "
-        "this holds for a sonar that rests"
+        "bright speckle is new in every frame and falls with range as volume scattering does, so it is counted as such "
+        "(volume_db): this holds for a sonar at rest"
     )
-    return found
+    return strength_db
 
 
 # ---------------- Instrument of a recording
@@ -558,7 +565,7 @@ NOISE_FIELDS = (
 )
 """Fields of a sonar that describe noise, water and grain, not the instrument's geometry."""
 
-TELLING = 0.1
+NOTED_DEVIATION = 0.1
 """Deviation of a beam from its place in the layout above which a note is added, as a fraction of the beam spacing."""
 
 
@@ -586,16 +593,16 @@ def as_instrument(frames: SonarFrames) -> tuple[SonarFrames, list[str]]:
         )
         for layout, opening in layouts.items()
     }
-    away = {layout: float(np.abs(sonar.bearing_rad + middle - bearings).max()) for layout, sonar in sonars.items()}
-    chosen = min(sonars, key=lambda layout: away[layout])
+    deviation_rad = {layout: float(np.abs(sonar.bearing_rad + middle - bearings).max()) for layout, sonar in sonars.items()}
+    chosen = min(sonars, key=lambda layout: deviation_rad[layout])
     spacing = float(bearings[-1] - bearings[0]) / (count - 1)
     notes = []
-    if away[chosen] > TELLING * spacing:
+    if deviation_rad[chosen] > NOTED_DEVIATION * spacing:
         notes.append(
-            f"the beams are not even: up to {np.degrees(away[chosen]):.2g} deg from the layout {chosen} of the simulator, "
-            f"which is {away[chosen] / spacing:.2g} of their distance"
+            f"the beams are not evenly spaced: up to {np.degrees(deviation_rad[chosen]):.2g} deg from the layout {chosen} "
+            f"of the simulator, which is {deviation_rad[chosen] / spacing:.2g} of their spacing"
         )
-    if abs(middle) > TELLING * spacing:
+    if abs(middle) > NOTED_DEVIATION * spacing:
         notes.append(f"the fan is centred on {np.degrees(middle):.2g} deg; the simulator's is centred on the axis")
     return replace(frames, sonar=sonars[chosen]), notes
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsonar.estimation.estimator import Excess, ambiguity, correlation_excess, correlation_of, correlation_rejection
-from mitsonar.estimation.image.registration import DirectLevel, Held
+from mitsonar.estimation.image.registration import DirectLevel, StartPrior
 
 SIZE = (200, 96)
 
@@ -59,5 +59,5 @@ def test_doubt_grows_as_a_match_stands_out_less() -> None:
 def test_a_prior_weighs_as_much_as_the_noise_of_cells_that_count_once() -> None:
     """Cells that smoothing makes alike are as many times one measurement; an infinite deviation holds nothing."""
     level = DirectLevel(4, (8.0, 1.5), (0.0, 0.0), 10)
-    weight = Held(np.zeros(3), np.array([0.05, np.inf, 0.01])).weight(0.2, level)
+    weight = StartPrior(np.zeros(3), np.array([0.05, np.inf, 0.01])).weight(0.2, level)
     np.testing.assert_allclose(weight, 4 * np.pi * 2.0 * 1.5 * 0.2**2 * np.array([400.0, 0.0, 1e4]))

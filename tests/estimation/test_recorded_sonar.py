@@ -37,7 +37,7 @@ def test_beams_that_are_neither_are_told_by_how_much() -> None:
     frames = frames_of(Sonar(beams=64))
     bent = frames.bearing_rad + np.radians(0.3) * np.sin(np.linspace(0, 2 * np.pi, 64))
     _, (note,) = as_instrument(replace(frames, bearing_rad=bent))
-    assert note.startswith("the beams are not even: up to 0.2")
+    assert note.startswith("the beams are not evenly spaced: up to 0.2")
 
 
 def test_a_fan_off_the_axis_is_told() -> None:

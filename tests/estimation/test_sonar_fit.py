@@ -121,10 +121,10 @@ def test_a_recording_without_scale_gets_one(recordings: dict[str, SonarFrames]) 
 def test_noise_that_does_not_show_is_not_invented(recordings: dict[str, SonarFrames]) -> None:
     frames = recordings["dB"].select(slice(None))
     still = frames.select(np.zeros(3, dtype=int))
-    assert "it is no noise" in fit_sonar(still).notes[0]
+    assert "it is not noise" in fit_sonar(still).notes[0]
     assert fit_sonar(still).sonar.noise_level_db is None
     frames.image = np.where(frames.image < 0.6, 0, frames.image).astype(np.float32)
-    assert any("below the least level" in note for note in fit_sonar(frames).notes)
+    assert any("below the lowest level" in note for note in fit_sonar(frames).notes)
 
 
 def blank(bins: int = 128, beams: int = 32, value: Array | float = 0.5) -> SonarFrames:
@@ -136,7 +136,7 @@ def blank(bins: int = 128, beams: int = 32, value: Array | float = 0.5) -> Sonar
 def test_frames_that_tell_nothing_are_refused() -> None:
     with pytest.raises(MitsonarError, match="at least one frame of 96 bins x 16 beams: got 2 of 64 x 32"):
         fit_sonar(blank(bins=64))
-    with pytest.raises(MitsonarError, match="all cells have one value"):
+    with pytest.raises(MitsonarError, match="all cells have the same value"):
         fit_sonar(blank())
     varied = np.random.default_rng(0).exponential(0.05, (2, 128, 32)).clip(0, 1)
     with pytest.raises(MitsonarError, match="needs the carrier: give frequency_hz"):
@@ -156,4 +156,4 @@ def test_the_command_writes_what_the_simulator_reads(
     refused(mitsonar("sonar", "fit", tmp_path / "frames.npz", "-o", tmp_path / "mine.yaml"), "exists", "--overwrite")
     refused(mitsonar("sonar", "fit", tmp_path / "none.npz", "-o", tmp_path / "x.yaml"), "there are no frames at")
     blank().save(tmp_path / "flat.npz")
-    refused(mitsonar("sonar", "fit", tmp_path / "flat.npz", "-o", tmp_path / "x.yaml"), "all cells have one value")
+    refused(mitsonar("sonar", "fit", tmp_path / "flat.npz", "-o", tmp_path / "x.yaml"), "all cells have the same value")

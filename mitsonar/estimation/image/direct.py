@@ -6,7 +6,7 @@ are used: if both frames are interpolated at once, a texture finer than a beam b
 beams. The slopes of the denoised mean of both frames turn differences into motion. Single differences, and whole blocks
 that move independently, have Cauchy weights: shadow edges and relief are outliers.
 
-The iteration starts from zero motion, or from a prior. Where that fails or the match hardly stands out, ``phase`` finds a
+The iteration starts from zero motion, or from a prior. Where that fails or the match is hardly distinct, ``phase`` finds a
 start. Over far motions relief dominates the error, so the heights of blocks are estimated as well
 (:func:`registered_over_relief`).
 """
@@ -28,10 +28,10 @@ from mitsonar.estimation.estimator import (
     Estimate,
     correlation_of,
     correlation_rejection,
+    is_distinct,
     prior_rejection,
     rejected,
     spread_of,
-    stands_out,
     two_frames,
 )
 from mitsonar.estimation.image.phase import Phase
@@ -41,7 +41,7 @@ from mitsonar.estimation.image.registration import (
     DirectLevel,
     Fit,
     GroundNodes,
-    Held,
+    StartPrior,
     blurred,
     by_block,
     cauchy,
@@ -99,7 +99,7 @@ MOST_CELLS = 196_608
 FARTHEST = np.array([0.15, 0.15, np.radians(3)])
 """Largest valid distance of a motion from its start. Up to 100 mm and 2 deg it is always found; far beyond is noise."""
 
-CLEARLY = 1.2
+CLEARLY_FAR = 1.2
 """Motions this many times farther than :data:`FAR` count as far, whatever the finest level would show."""
 
 FAR, FAR_RAD = 0.02, float(np.radians(1.5))
@@ -108,7 +108,7 @@ FAR, FAR_RAD = 0.02, float(np.radians(1.5))
 GRAZING = 0.32
 """Squared ratio of height to range over rocky fields. Relief moves less at more grazing angles, as on a plate at 0.3 m."""
 
-HELD = np.array([0.05, 0.05, np.radians(1)])
+START_STD = np.array([0.05, 0.05, np.radians(1)])
 """Standard deviation of a prior that holds a motion at its start, so that noise cannot drive it where frames show little.
 
 Few beams hardly separate sideways motion from yaw. Without this prior, one pair in twenty of hulls in high noise was
@@ -180,7 +180,7 @@ class Direct:
         Args:
             frames: two frames.
             prior: where to start and how far to search; a motion that contradicts it is rejected. Default: start from zero
-                motion. If that finds no motion, or none that stands out, :class:`Phase` finds the start, unless the prior
+                motion. If that finds no motion, or no distinct one, :class:`Phase` finds the start, unless the prior
                 shows that the motion is near.
 
         Returns:
@@ -195,50 +195,48 @@ class Direct:
             return rejected(attitude.reason)
         task = _Task(*_resolved(frames, images), attitude, prior)
         start = Motion(0.0, 0.0, 0.0) if prior is None else prior.motion
-        found = self._from(task, start, "zero" if prior is None else "prior")
-        # lighting over even ground correlates at any motion: a match that hardly stands out may be far from the true one
-        if (found.valid and found.about.get("stands_out", True)) or (
-            prior is not None and (3 * prior.std <= FARTHEST).all()
-        ):
-            return found
-        elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
-        if not elsewhere.valid or not is_far(elsewhere.motion, attitude.height_m):
-            return found  # the first registration has already searched near motions
-        second = self._from(replace(task, prior=None), elsewhere.motion, "phase")
-        reason = second.reason or prior_rejection(second.motion, second.covariance, prior)
-        return replace(second, valid=not reason, reason=reason)
+        near = self._estimate_from(task, start, "zero" if prior is None else "prior")
+        # lighting over even ground correlates at any motion: a match that is hardly distinct may be far from the true one
+        if (near.valid and near.about.get("distinct", True)) or (prior is not None and (3 * prior.std <= FARTHEST).all()):
+            return near
+        phase_estimate = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
+        if not phase_estimate.valid or not is_far(phase_estimate.motion, attitude.height_m):
+            return near  # the first registration has already searched near motions
+        far = self._estimate_from(replace(task, prior=None), phase_estimate.motion, "phase")
+        reason = far.reason or prior_rejection(far.motion, far.covariance, prior)
+        return replace(far, valid=not reason, reason=reason)
 
-    def _from(self, task: _Task, start: Motion, named: str) -> Estimate:
+    def _estimate_from(self, task: _Task, start: Motion, start_name: str) -> Estimate:
         """Register from a start: over level ground while the motion is near, over relief if it is far."""
         if self.heave_std_m:
-            return self._over_level(task, start, named)
+            return self._over_level(task, start, start_name)
         if not is_far(start, task.relief_m):
-            near = self._over_level(task, start, named, until_far=True)
+            near = self._over_level(task, start, start_name, until_far=True)
             if isinstance(near, Motion):
-                far = self._over_relief(task, start, near, named)
-                return far if far.valid else self._over_level(task, start, named)
+                far = self._over_relief(task, start, near, start_name)
+                return far if far.valid else self._over_level(task, start, start_name)
             if not near.valid or not is_far(near.motion, task.relief_m):
                 return near
-            far = self._over_relief(task, start, near.motion, named)
+            far = self._over_relief(task, start, near.motion, start_name)
             return far if far.valid else near
         if task.prior is not None and (3 * task.prior.std > NEARBY).any():
-            near = self._over_level(task, start, named)
-            return self._over_relief(task, start, near.motion, named) if near.covariance is not None else near
-        return self._over_relief(task, start, start, named)
+            near = self._over_level(task, start, start_name)
+            return self._over_relief(task, start, near.motion, start_name) if near.covariance is not None else near
+        return self._over_relief(task, start, start, start_name)
 
     @overload
-    def _over_level(self, task: _Task, start: Motion, named: str) -> Estimate: ...
+    def _over_level(self, task: _Task, start: Motion, start_name: str) -> Estimate: ...
     @overload
-    def _over_level(self, task: _Task, start: Motion, named: str, *, until_far: bool) -> Estimate | Motion: ...
-    def _over_level(self, task: _Task, start: Motion, named: str, *, until_far: bool = False) -> Estimate | Motion:
+    def _over_level(self, task: _Task, start: Motion, start_name: str, *, until_far: bool) -> Estimate | Motion: ...
+    def _over_level(self, task: _Task, start: Motion, start_name: str, *, until_far: bool = False) -> Estimate | Motion:
         """Register from a start over level ground.
 
         With ``until_far``, skip the finest level and return the motion alone if it is clearly far.
         """
         v = np.zeros(4 if self.heave_std_m else 3)
         v[:3] = start
-        std = HELD if task.prior is None else np.maximum(HELD, task.prior.std)
-        held = Held(v.copy(), np.append(std, self.heave_std_m)[: len(v)])
+        std = START_STD if task.prior is None else np.maximum(START_STD, task.prior.std)
+        start_prior = StartPrior(v.copy(), np.append(std, self.heave_std_m)[: len(v)])
         fit = None
         levels, nodes = self._levels(task), GroundNodes(task.frames, task.attitude, heave=bool(self.heave_std_m))
         for number, level in enumerate(levels):
@@ -246,17 +244,17 @@ class Direct:
             last = number + 1 == len(levels)
             if not last and not is_resolved(len(task.images[0]), level):
                 continue
-            if last and until_far and is_far(Motion(*v[:3].tolist()), CLEARLY * task.relief_m):
+            if last and until_far and is_far(Motion(*v[:3].tolist()), CLEARLY_FAR * task.relief_m):
                 return Motion(*v[:3].tolist())
             pair = smoothed(task.images[0], level), smoothed(task.images[1], level)
             cells = Cells(nodes, level)
-            found = register(pair, cells, v, level, last=last, held=held)
-            if found is None:
-                return replace(rejected("nothing in the frames to match"), about={"start": named})
-            v, fit = found
+            registration = register(pair, cells, v, level, last=last, prior=start_prior)
+            if registration is None:
+                return replace(rejected("nothing in the frames to match"), about={"start": start_name})
+            v, fit = registration
         assert fit is not None
         about = {"heave_m": float(v[3])} if self.heave_std_m else {}
-        return self._judged(task, start, v[:3], fit, MODEL, {**about, "start": named})
+        return self._estimate_of_fit(task, start, v[:3], fit, MODEL, {**about, "start": start_name})
 
     def _levels(self, task: _Task) -> tuple[DirectLevel, ...]:
         """Return the levels to run; skip those coarser than one that covers the uncertainty of the prior."""
@@ -274,30 +272,30 @@ class Direct:
         ]
         return levels[needed[-1] if needed else 0 :]
 
-    def _over_relief(self, task: _Task, start: Motion, near: Motion, named: str) -> Estimate:
+    def _over_relief(self, task: _Task, start: Motion, near: Motion, start_name: str) -> Estimate:
         """Register over relief from a nearby motion; the distance of the result is measured from ``start``."""
-        found = registered_over_relief(task.images, task.frames, task.attitude, np.array(near))
-        if found is None:
-            return replace(rejected("nothing in the frames to match"), about={"start": named})
+        registration = registered_over_relief(task.images, task.frames, task.attitude, np.array(near))
+        if registration is None:
+            return replace(rejected("nothing in the frames to match"), about={"start": start_name})
         # far motions also match the ground between rocks, since rocks look different from elsewhere
         std = float(np.hypot(task.attitude.height_std_m, task.attitude.tops_m))
-        unsure = replace(task, attitude=replace(task.attitude, height_std_m=std))
-        return self._judged(unsure, start, *found, FAR_MODEL, {"start": named})
+        uncertain_task = replace(task, attitude=replace(task.attitude, height_std_m=std))
+        return self._estimate_of_fit(uncertain_task, start, *registration, FAR_MODEL, {"start": start_name})
 
-    def _judged(
+    def _estimate_of_fit(
         self, task: _Task, start: Motion, v: NDArray[np.float64], fit: Fit, model: float, about: dict[str, object]
     ) -> Estimate:
         """Return the estimate with its covariance, rejected if it must not be used."""
-        height = fit.by_height[:3] * task.attitude.height_std_m
-        covariance = model * fit.covariance[:3, :3] + np.outer(height, height)
+        by_height = fit.by_height[:3] * task.attitude.height_std_m
+        covariance = model * fit.covariance[:3, :3] + np.outer(by_height, by_height)
         motion = Motion(*(float(x) for x in v))
         reason = _rejection(fit, covariance, v - np.array(start))
-        lean = fit.by_lean[:3] * task.attitude.unsure * ([0, 1, 1] if self.heave_std_m else [1, 1, 1])
-        covariance = covariance + lean @ lean.T
+        by_lean = fit.by_lean[:3] * task.attitude.unsure * ([0, 1, 1] if self.heave_std_m else [1, 1, 1])
+        covariance = covariance + by_lean @ by_lean.T
         reason = reason or prior_rejection(motion, covariance, task.prior)
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about, **task.attitude.about}
         if fit.excess != UNMEASURED:
-            about["stands_out"] = stands_out(fit.independent, fit.excess)
+            about["distinct"] = is_distinct(fit.independent, fit.excess)
         if task.attitude.first is not None:
             first_m = task.attitude.first.height_m  # the motion uses a different height over rising ground
             about |= {"height_m": first_m, "height_std_m": STD_MEASURED * first_m}
@@ -305,7 +303,7 @@ class Direct:
 
 
 def _resolved(frames: SonarFrames, images: tuple[Floats, Floats]) -> tuple[SonarFrames, tuple[Floats, Floats]]:
-    """Reduce frames to at most :data:`MOST_CELLS` cells by averaging bins and beams.
+    """Reduce frames to :data:`MOST_CELLS` cells or fewer by averaging bins and beams.
 
     Beams closer together than their width are averaged first, then the axis with more cells.
     """
@@ -318,12 +316,12 @@ def _resolved(frames: SonarFrames, images: tuple[Floats, Floats]) -> tuple[Sonar
     if along == across == 1:
         return frames, images
     rows, columns = bins // along, beams // across
-    cut = (image[: rows * along, : columns * across] for image in images)
-    image = np.stack([cv2.resize(one, (columns, rows), interpolation=cv2.INTER_AREA) for one in cut]).astype(np.float32)
+    trimmed = (image[: rows * along, : columns * across] for image in images)
+    image = np.stack([cv2.resize(one, (columns, rows), interpolation=cv2.INTER_AREA) for one in trimmed]).astype(np.float32)
     axes = (frames.range_m, rows, along), (frames.bearing_rad, columns, across)
     range_m, bearing_rad = (axis[: count * size].reshape(count, size).mean(axis=1) for axis, count, size in axes)
-    without: dict[str, Any] = dict.fromkeys((*LABELS, "beam_poses"))
-    return replace(frames, image=image, range_m=range_m, bearing_rad=bearing_rad, **without), (image[0], image[1])
+    unset_fields: dict[str, Any] = dict.fromkeys((*LABELS, "beam_poses"))
+    return replace(frames, image=image, range_m=range_m, bearing_rad=bearing_rad, **unset_fields), (image[0], image[1])
 
 
 def is_far(motion: Motion, height_m: float) -> bool:
@@ -331,15 +329,15 @@ def is_far(motion: Motion, height_m: float) -> bool:
     return bool(np.hypot(motion.sideways, motion.forward) > FAR * height_m or abs(motion.yaw) > FAR_RAD)
 
 
-def _rejection(fit: Fit, covariance: NDArray[np.float64], off: NDArray[np.float64]) -> str:
-    """Return why an estimate is rejected, given its distance ``off`` from the start; empty if it is valid."""
+def _rejection(fit: Fit, covariance: NDArray[np.float64], from_start: NDArray[np.float64]) -> str:
+    """Return why an estimate is rejected, given its distance from the start; empty if it is valid."""
     std = np.sqrt(np.diag(covariance))
     if not fit.converged:
         return "the iteration did not settle"
     mismatch = correlation_rejection(fit.correlation, fit.independent, fit.excess)
     if mismatch:
         return mismatch
-    if (np.abs(off) > FARTHEST).any():
+    if (np.abs(from_start) > FARTHEST).any():
         return "a motion beyond 150 mm or 3 deg of its start is farther than the coarsest level searches"
     if fit.blocks < FEWEST_BLOCKS:
         return "too small a part of the frames holds anything to match"
@@ -377,7 +375,7 @@ SETTLED = np.array([3e-4, 3e-4, 6e-5])
 TALLEST_STEP = 0.06
 """Largest change of a height in one iteration, as a fraction of the sonar's height."""
 
-SMALL = (2e-3, 2e-3, 5e-4, 0.04)
+DERIVATIVE_STEPS = (2e-3, 2e-3, 5e-4, 0.04)
 """Steps of numerical derivatives [m, m, rad], and of the height as a fraction of the sonar's: 0.1 m at 2.5 m."""
 
 
@@ -386,41 +384,45 @@ class _Equations(NamedTuple):
 
     Attributes:
         normal: of the motion ``(3, 3)``.
-        both: cross terms of motion and heights ``(3, blocks)``.
+        cross: cross terms of motion and heights ``(3, blocks)``.
         height: diagonal term of each block's height ``(blocks,)``.
-        pulls: gradient by the motion, from each block ``(3, blocks)``.
-        height_pull: gradient by each height ``(blocks,)``.
+        gradients: gradient by the motion, from each block ``(3, blocks)``.
+        height_gradient: gradient by each height ``(blocks,)``.
         noise: variance of the residuals, times the number of residuals that count as one.
         correlation: of the first frame and the second, resampled.
         cells: number of cells used.
     """
 
     normal: NDArray[np.float64]
-    both: NDArray[np.float64]
+    cross: NDArray[np.float64]
     height: NDArray[np.float64]
-    pulls: NDArray[np.float64]
-    height_pull: NDArray[np.float64]
+    gradients: NDArray[np.float64]
+    height_gradient: NDArray[np.float64]
     noise: float
     correlation: float
     cells: int
 
-    def without_heights(self, prior: float, off: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def without_heights(
+        self, prior: float, height_offsets: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return normal matrix ``(3, 3)`` and gradient ``(3,)`` of the motion; heights are eliminated (Schur complement).
 
         Args:
             prior: information of each height [1/m^2].
-            off: heights minus their prior mean ``(blocks,)`` [m].
+            height_offsets: heights minus their prior mean ``(blocks,)`` [m].
         """
-        held = self.height + self.noise * prior
-        return self.normal - (self.both / held) @ self.both.T, self.pulls_alone(prior, off).sum(axis=1)
+        height_normal = self.height + self.noise * prior
+        return self.normal - (self.cross / height_normal) @ self.cross.T, self.reduced_gradients(prior, height_offsets).sum(
+            axis=1
+        )
 
-    def pulls_alone(self, prior: float, off: NDArray[np.float64]) -> NDArray[np.float64]:
+    def reduced_gradients(self, prior: float, height_offsets: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return each block's gradient by the motion, its height eliminated ``(3, blocks)``; see :meth:`without_heights`."""
-        pulled = (self.height_pull + self.noise * prior * off) / (self.height + self.noise * prior)
-        return self.pulls - self.both * pulled
+        height_steps = (self.height_gradient + self.noise * prior * height_offsets) / (self.height + self.noise * prior)
+        return self.gradients - self.cross * height_steps
 
 
-class _Drawn(NamedTuple):
+class _ResampledFrame(NamedTuple):
     """One frame resampled at the cells of the other, as maps ``(bins, beams)``.
 
     Attributes:
@@ -460,16 +462,16 @@ class _ReliefLevel:
 
     def _derivatives(self, v: NDArray[np.float64], *, back: bool) -> Floats:
         """Return the derivatives of the displacement by motion and height ``(4, 2, bins, beams)``."""
-        found = []
-        steps = *SMALL[:3], SMALL[3] * self.nodes.attitude.height_m
+        derivatives = []
+        steps = *DERIVATIVE_STEPS[:3], DERIVATIVE_STEPS[3] * self.nodes.attitude.height_m
         for k, small in enumerate(steps):
             change = np.zeros(4)
             change[k] = small
             ahead, behind = (
                 self.cells.shift(v + sign * change[:3], back=back, lift_m=sign * float(change[3])) for sign in (1, -1)
             )
-            found.append((ahead - behind) / np.float32(2 * small))
-        return np.stack(found)
+            derivatives.append((ahead - behind) / np.float32(2 * small))
+        return np.stack(derivatives)
 
     def _mean(self, frames: SonarFrames, attitude: Attitude) -> NDArray[np.float64]:
         """Return the prior mean of the heights ``(blocks,)`` [m]: level ground, as far as the fan illuminates it.
@@ -485,33 +487,33 @@ class _ReliefLevel:
 
     def equations(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> _Equations | None:
         """Return the normal equations at a motion and heights; None where too few cells remain."""
-        sides = self._drawn(v, heights)
+        sides = self._resample(v, heights)
         if sides is None:
             return None
-        one = sides[0]
-        summed = (self._summed(side, side.after - side.before) for side in sides)
-        total = np.sum(list(summed), axis=0)  # motion-motion, motion-residual, height-motion, height-height, height-residual
-        by_motion, both, height = total[:12].reshape(3, 4, -1), total[12:15], total[15:]
-        correlation = correlation_of(one.before[one.inside], one.after[one.inside])
-        normal, pulls = by_motion[:, :3].sum(axis=-1), by_motion[:, 3]
+        first = sides[0]
+        sums = (self._block_sums(side, side.after - side.before) for side in sides)
+        total = np.sum(list(sums), axis=0)  # motion-motion, motion-residual, height-motion, height-height, height-residual
+        by_motion, cross, height = total[:12].reshape(3, 4, -1), total[12:15], total[15:]
+        correlation = correlation_of(first.before[first.inside], first.after[first.inside])
+        normal, gradients = by_motion[:, :3].sum(axis=-1), by_motion[:, 3]
         return _Equations(
-            normal, both, height[0], pulls, height[1], CORRELATED * one.scale**2, correlation, int(one.inside.sum())
+            normal, cross, height[0], gradients, height[1], CORRELATED * first.scale**2, correlation, int(first.inside.sum())
         )
 
-    def pulls_by_lean(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradients_by_lean(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the derivatives of all gradients by the frames' differences of height, pitch, roll ``(3, 4, blocks)``."""
-        sides, shifts = self._drawn(v, heights), self.cells.leaning_shift_of_cells(v)
+        sides, shifts = self._resample(v, heights), self.cells.leaning_shift_of_cells(v)
         assert sides is not None
         sums = [
-            np.sum([self._summed(side, side.slopes[0] * bins + side.slopes[1] * beams) for side in sides], axis=0)
+            np.sum([self._block_sums(side, side.slopes[0] * bins + side.slopes[1] * beams) for side in sides], axis=0)
             for bins, beams in shifts
         ]
         return np.stack(sums)[:, [3, 7, 11, 16]]
 
-    def _drawn(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> list[_Drawn] | None:
+    def _resample(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> list[_ResampledFrame] | None:
         """Resample each frame at the cells of the other; return None where too few cells remain."""
         relief = on_cells(heights.reshape(self.blocks), self.shape, self.block)
-        scale, found = 0.0, []
+        scale, resampled = 0.0, []
         for back, derivatives in zip((False, True), self.sides, strict=True):
             # displace the cells by the motion, then by the height of their block, which belongs to the first frame
             level_shift = self.cells.shift(v, back=back)
@@ -521,8 +523,8 @@ class _ReliefLevel:
             if inside.sum() < FEWEST_CELLS:
                 return None
             # both residuals are second minus first, so that they share one scale and one sign
-            drawn = sampled(self.images[0 if back else 1], row, column)
-            before, after = (drawn, self.images[1]) if back else (self.images[0], drawn)
+            warped = sampled(self.images[0 if back else 1], row, column)
+            before, after = (warped, self.images[1]) if back else (self.images[0], warped)
             residual = after - before
             if not back:
                 scale = noise_of(residual[inside][::5])
@@ -531,15 +533,15 @@ class _ReliefLevel:
             slopes = slopes_of((before + after) * np.float32(0.5), self.level, scale)
             jacobian = (slopes[0] * derivatives[:, 0] + slopes[1] * derivatives[:, 1]) * np.float32(-1 if back else 1)
             shown = self._places(level_shift) if back else None  # blocks belong to the first frame
-            found.append(_Drawn(before, after, inside, slopes, jacobian, jacobian * weight, scale, shown))
-        return found
+            resampled.append(_ResampledFrame(before, after, inside, slopes, jacobian, jacobian * weight, scale, shown))
+        return resampled
 
-    def _summed(self, side: _Drawn, residual: Floats) -> NDArray[np.float64]:
+    def _block_sums(self, side: _ResampledFrame, residual: Floats) -> NDArray[np.float64]:
         """Return sums over blocks ``(17, blocks)``: motion by motion, motion by residual, height by all."""
         jacobian, weighted, shown = side.jacobian, side.weighted, side.shown
-        pairs = [(weighted[k], other) for k in range(3) for other in jacobian[k:3]]  # the other half is symmetric
+        pairs = [(weighted[k], right) for k in range(3) for right in jacobian[k:3]]  # the other half is symmetric
         pairs += [(weighted[k], residual) for k in range(3)]
-        pairs += [(weighted[3], other) for other in (*jacobian, residual)]
+        pairs += [(weighted[3], right) for right in (*jacobian, residual)]
         if shown is None:
             sums = products_by_block(pairs, self.block)
         else:
@@ -588,46 +590,53 @@ def registered_over_relief(
     """
     v, heights, shape = np.asarray(start, dtype=np.float64), None, (0, 0)
     prior = 1 / (RELIEF_STD * attitude.height_m) ** 2
-    found, converged = None, False
+    equations, converged = None, False
     nodes = GroundNodes(frames, attitude, heave=False)
     for number, level in enumerate(RELIEF_LEVELS):
         if number + 1 < len(RELIEF_LEVELS) and not is_resolved(len(images[0]), level):
             continue
-        at = _ReliefLevel(images, nodes, v, level)
+        relief_level = _ReliefLevel(images, nodes, v, level)
         # heights of the coarser level, resampled to the blocks of this one
         if heights is not None:
             table = heights.reshape(shape).astype(np.float32)
-            heights = cv2.resize(table, at.blocks[::-1]).ravel().astype(np.float64)
-        heights, shape = at.mean.copy() if heights is None else np.asarray(heights), at.blocks
+            heights = cv2.resize(table, relief_level.blocks[::-1]).ravel().astype(np.float64)
+        heights, shape = relief_level.mean.copy() if heights is None else np.asarray(heights), relief_level.blocks
         for _ in range(level.iterations):
             # Gauss-Newton step of the motion with the heights eliminated
-            found = at.equations(v, heights)
-            if found is None:
+            equations = relief_level.equations(v, heights)
+            if equations is None:
                 return None
-            normal, pull = found.without_heights(prior, heights - at.mean)
+            normal, gradient = equations.without_heights(prior, heights - relief_level.mean)
             if np.linalg.eigvalsh(normal)[0] <= 0:
                 return None
-            step = -np.linalg.solve(normal, pull)
+            step = -np.linalg.solve(normal, gradient)
             # back-substitute the heights; limit their change, since the slopes are valid over short distances only
-            held = found.height + found.noise * prior
-            change = -(found.height_pull + found.noise * prior * (heights - at.mean) + found.both.T @ step) / held
-            most = TALLEST_STEP * attitude.height_m
-            v, heights = v + step, heights + np.clip(change, -most, most)
+            height_normal = equations.height + equations.noise * prior
+            change = (
+                -(
+                    equations.height_gradient
+                    + equations.noise * prior * (heights - relief_level.mean)
+                    + equations.cross.T @ step
+                )
+                / height_normal
+            )
+            largest_change = TALLEST_STEP * attitude.height_m
+            v, heights = v + step, heights + np.clip(change, -largest_change, largest_change)
             converged = bool((np.abs(step) < SETTLED).all())
             if converged:
                 break
-    assert found is not None
+    assert equations is not None
     assert heights is not None
-    leaning = at.pulls_by_lean(v, heights) if any(attitude.unsure) else None
-    return v, _assessed(found, prior, heights - at.mean, level, leaning, converged=converged)
+    lean_gradients = relief_level.gradients_by_lean(v, heights) if any(attitude.unsure) else None
+    return v, _assessed(equations, prior, heights - relief_level.mean, level, lean_gradients, converged=converged)
 
 
 def _assessed(
-    found: _Equations,
+    equations: _Equations,
     prior: float,
-    off: NDArray[np.float64],
+    height_offsets: NDArray[np.float64],
     level: DirectLevel,
-    leaning: NDArray[np.float64] | None,
+    lean_gradients: NDArray[np.float64] | None,
     *,
     converged: bool,
 ) -> Fit:
@@ -636,21 +645,21 @@ def _assessed(
     The covariance is that of the blocks' gradients, which include all errors common to a block: noise, speckle, relief.
     """
     # motion per gradient, with the heights eliminated; the change by each block gives the covariance
-    normal, _ = found.without_heights(prior, off)
-    undone = np.linalg.inv(normal)
-    held = found.noise * prior
-    each = undone @ found.pulls_alone(prior, off)
+    normal, _ = equations.without_heights(prior, height_offsets)
+    inverse = np.linalg.inv(normal)
+    prior_weight = equations.noise * prior
+    block_changes = inverse @ equations.reduced_gradients(prior, height_offsets)
     # these differences change the gradients of both motion and heights; eliminate the heights as above
     by_lean = np.zeros((3, 3))
-    if leaning is not None:
-        alone = leaning[:, :3] - found.both * (leaning[:, 3:] / (found.height + held))
-        by_lean = undone @ alone.sum(axis=-1).T
+    if lean_gradients is not None:
+        reduced = lean_gradients[:, :3] - equations.cross * (lean_gradients[:, 3:] / (equations.height + prior_weight))
+        by_lean = inverse @ reduced.sum(axis=-1).T
     return Fit(
         converged=converged,
-        covariance=np.asarray(each @ each.T, dtype=np.float64),
-        by_height=undone @ (found.both @ (held / (found.height + held))),
+        covariance=np.asarray(block_changes @ block_changes.T, dtype=np.float64),
+        by_height=inverse @ (equations.cross @ (prior_weight / (equations.height + prior_weight))),
         by_lean=by_lean,
-        correlation=found.correlation,
-        independent=found.cells / correlated_cells(level),
-        blocks=spread_of(found.height),
+        correlation=equations.correlation,
+        independent=equations.cells / correlated_cells(level),
+        blocks=spread_of(equations.height),
     )

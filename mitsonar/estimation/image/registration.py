@@ -25,7 +25,7 @@ __all__ = [
     "DirectLevel",
     "Fit",
     "GroundNodes",
-    "Held",
+    "StartPrior",
     "blurred",
     "by_block",
     "cauchy",
@@ -66,7 +66,7 @@ NEGLIGIBLE = 0.1
 """Standard deviations of the estimate below which a remaining step is lost in the noise."""
 
 ASIDE = 8
-"""Beams by which one frame is displaced to measure how much the match stands out."""
+"""Beams by which one frame is displaced to measure how distinct the match is."""
 
 COARSE = 10.0
 """Factor on the step that ends the iteration of a level followed by a finer one."""
@@ -113,7 +113,7 @@ class Fit(NamedTuple):
     excess: Excess = UNMEASURED
 
 
-class Held(NamedTuple):
+class StartPrior(NamedTuple):
     """Gaussian prior of the unknowns: mean and standard deviation of each [m, m, rad, m]; infinite: no prior."""
 
     mean: Doubles
@@ -131,7 +131,7 @@ def register(
     level: DirectLevel,
     *,
     last: bool,
-    held: Held,
+    prior: StartPrior,
 ) -> tuple[Doubles, Fit | None] | None:
     """Run Gauss-Newton from a start; return None if there is nothing to match.
 
@@ -141,30 +141,30 @@ def register(
         start: sideways, forward [m], yaw [rad], and heave [m] if it is unknown ``(3,)`` or ``(4,)``.
         level: smoothing and iterations.
         last: whether it is the finest level: frames are resampled in both directions, and the fit is assessed.
-        held: prior of the unknowns.
+        prior: prior of the unknowns.
 
     Returns:
         The motion, and its fit at the finest level.
     """
     v, accelerate, converged = start.copy(), _AndersonAcceleration(), False
-    still = STILL if last else COARSE * STILL
-    at, margins = None, np.zeros((2, 2))
+    step_limit = STILL if last else COARSE * STILL
+    linearisation, margins = None, np.zeros((2, 2))
     for _ in range(level.iterations):
-        at = _linearised(*pair, cells, v, level, margins, last=last)
-        if at is None:
+        linearisation = _linearised(*pair, cells, v, level, margins, last=last)
+        if linearisation is None:
             return None
         # the prior enters the normal equations in units of the residuals' noise
-        weight = held.weight(at.scale, level)
-        pull = at.pull + weight * (v - held.mean)
-        step = np.asarray(-np.linalg.solve(at.normal + np.diag(weight), pull), dtype=np.float64)
+        weight = prior.weight(linearisation.scale, level)
+        gradient = linearisation.gradient + weight * (v - prior.mean)
+        step = np.asarray(-np.linalg.solve(linearisation.normal + np.diag(weight), gradient), dtype=np.float64)
         v = np.add(v, accelerate(v, step))
-        converged = bool((np.abs(step[:3]) < still).all())
+        converged = bool((np.abs(step[:3]) < step_limit).all())
         if converged:
             break
-    if not last or at is None:
+    if not last or linearisation is None:
         return v, None
     # a long step is acceptable if it is small against the uncertainty of the estimate
-    fit = _fit(at, cells, v, level, held.weight(at.scale, level), converged)
+    fit = _fit(linearisation, cells, v, level, prior.weight(linearisation.scale, level), converged)
     return v, fit if converged else fit._replace(converged=_is_small(step[:3], fit.covariance[:3, :3]))
 
 
@@ -173,7 +173,7 @@ def _is_small(step: Doubles, covariance: Doubles) -> bool:
     return bool(step @ np.linalg.lstsq(covariance, step, rcond=None)[0] < NEGLIGIBLE**2)
 
 
-class _Side(NamedTuple):
+class _ResampledPair(NamedTuple):
     """One frame resampled at the cells of the other: residual, weights, and sums over patches.
 
     Attributes:
@@ -185,7 +185,7 @@ class _Side(NamedTuple):
         across: weight times the slope over beams.
         patches: weight of each patch ``(patches,)``.
         slopes: sums of both weights times slope by slope: over bins, mixed, over beams ``(3, patches)``.
-        pull: sums of both weights times slope by residual: over bins, over beams ``(2, patches)``.
+        gradients: sums of both weights times slope by residual: over bins, over beams ``(2, patches)``.
     """
 
     before: Floats
@@ -196,16 +196,16 @@ class _Side(NamedTuple):
     across: Floats
     patches: Doubles
     slopes: Doubles
-    pull: Doubles
+    gradients: Doubles
 
 
 class _Linearisation(NamedTuple):
     """Both resampled frames at one motion, the noise of their differences, and the normal equations."""
 
-    sides: list[_Side]
+    sides: list[_ResampledPair]
     scale: float
     normal: Doubles
-    pull: Doubles
+    gradient: Doubles
 
 
 def _linearised(
@@ -219,12 +219,12 @@ def _linearised(
     # resample in one direction, or in both so that the interpolation of either frame does not bias the motion
     pairs = []
     for back in (False, True) if last else (False,):
-        there = cells.shift(v, back=back)
-        inner = _inner(there, cells.usable, margins[int(back)])
+        displacement = cells.shift(v, back=back)
+        inner = _inner(displacement, cells.usable, margins[int(back)])
         if inner is None:
             return None
-        drawn = sampled(first if back else second, cells.row + there[0], cells.column + there[1])
-        pairs.append((drawn, second, inner) if back else (first, drawn, inner))
+        resampled = sampled(first if back else second, cells.row + displacement[0], cells.column + displacement[1])
+        pairs.append((resampled, second, inner) if back else (first, resampled, inner))
     # one scale for both directions, from the residuals of the first
     residuals = [after - before for before, after, _ in pairs]
     counted = residuals[0][pairs[0][2]]
@@ -232,10 +232,13 @@ def _linearised(
         return None
     scale = noise_of(counted[:: SAMPLED[0], :: SAMPLED[1]].ravel())
     # weigh the residuals, then project the sums over patches onto the motion
-    sides = [_side(*pair, residual, cells, level, scale, last=last) for pair, residual in zip(pairs, residuals, strict=True)]
+    sides = [
+        _weighted_pair(*pair, residual, cells, level, scale, last=last)
+        for pair, residual in zip(pairs, residuals, strict=True)
+    ]
     normal = np.sum([_by_motion(cells.derivative, side.slopes) for side in sides], axis=0)
-    pull = np.sum([_flat(cells.derivative) @ side.pull.ravel() for side in sides], axis=0)
-    return None if _singular(normal) else _Linearisation(sides, scale, normal, pull)
+    gradient = np.sum([_flat(cells.derivative) @ side.gradients.ravel() for side in sides], axis=0)
+    return None if _singular(normal) else _Linearisation(sides, scale, normal, gradient)
 
 
 def noise_of(residual: Floats) -> float:
@@ -248,7 +251,7 @@ def median_of(values: NDArray[np.floating]) -> float:
     return float(np.partition(values, len(values) // 2)[len(values) // 2])
 
 
-def _side(
+def _weighted_pair(
     before: Floats,
     after: Floats,
     inner: tuple[slice, slice],
@@ -258,7 +261,7 @@ def _side(
     scale: float,
     *,
     last: bool,
-) -> _Side:
+) -> _ResampledPair:
     """Weigh cells, and at the last level blocks; sum over patches."""
     along, across = slopes_of((before + after) * np.float32(0.5), level, scale)
     # downweight outliers cell by cell; cells outside both images, or that show no ground, do not count
@@ -273,7 +276,7 @@ def _side(
     # downweight whole patches whose surroundings move independently
     patches = _patch_weight(sums.reshape(5, *cells.patches)) if last else np.ones(sums.shape[1])
     sums *= patches
-    return _Side(before, after, inner, weight, bins, beams, patches, sums[:3], sums[3:])
+    return _ResampledPair(before, after, inner, weight, bins, beams, patches, sums[:3], sums[3:])
 
 
 def cauchy(residual: Floats, scale: float) -> Floats:
@@ -304,35 +307,39 @@ def _information(derivative: Doubles, slopes: Doubles) -> Doubles:
     return np.asarray(derivative * slopes[::2] + derivative[:, ::-1] * slopes[1])
 
 
-def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held: Doubles, converged: bool) -> Fit:
+def _fit(
+    linearisation: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, prior_weight: Doubles, converged: bool
+) -> Fit:
     """Assess the motion from slopes of one frame times those of the other, and from the gradients of blocks.
 
     The gradients include all errors common to a block, in both directions of resampling: noise, speckle, relief.
     """
     # curvature without the noise of the slopes, which is independent in the two frames
-    informed = _information(cells.derivative, np.sum([_cross(side, cells, level) for side in at.sides], axis=0))
-    true = _flat(informed) @ _flat(cells.derivative).T
+    information = _information(
+        cells.derivative, np.sum([_cross(side, cells, level) for side in linearisation.sides], axis=0)
+    )
+    curvature = _flat(information) @ _flat(cells.derivative).T
     # exactly symmetric: sums of float32 are not, and a path refuses such covariances
-    sound = true if np.linalg.eigvalsh(true)[0] > 0 else (at.normal + at.normal.T) / 2
-    undone = np.linalg.inv(sound + np.diag(held))
+    normal = curvature if np.linalg.eigvalsh(curvature)[0] > 0 else (linearisation.normal + linearisation.normal.T) / 2
+    inverse = np.linalg.inv(normal + np.diag(prior_weight))
     # the jackknife over blocks gives the covariance of what the frames contribute
-    each = _without_each(sound + np.diag(held), informed, at, cells)
+    changes = _jackknife(normal + np.diag(prior_weight), information, linearisation, cells)
     # the error of the prior adds to it: where the frames hold no information, it is all there is
-    known = undone * (correlated_cells(level) * at.scale**2 * held) @ undone.T
+    prior_part = inverse * (correlated_cells(level) * linearisation.scale**2 * prior_weight) @ inverse.T
     # share of each block in the information, and sensitivity to the height and to differences of height, pitch and roll
-    side = at.sides[0]
-    both = [_information(cells.derivative, one.slopes) for one in at.sides]
-    shares = _together((np.tensordot(undone, both[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
+    first = linearisation.sides[0]
+    informations = [_information(cells.derivative, one.slopes) for one in linearisation.sides]
+    shares = _by_correlated_block((np.tensordot(inverse, informations[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
     by_height, by_lean = (
-        undone @ np.sum([_flat(one) @ _flat(shift).T for one in both], axis=0)
+        inverse @ np.sum([_flat(one) @ _flat(shift).T for one in informations], axis=0)
         for shift in (cells.lifted_shift(v)[None], cells.leaning_shift(v))
     )
-    # a match that hardly stands out from displaced ones has a larger covariance
-    before, after = side.before[side.inner], side.after[side.inner]
-    independent, excess = before.size / correlated_cells(level), _excess(side, cells)
+    # a match that hardly differs from displaced ones has a larger covariance
+    before, after = first.before[first.inner], first.after[first.inner]
+    independent, excess = before.size / correlated_cells(level), _excess(first, cells)
     return Fit(
         converged=converged,
-        covariance=ambiguity(excess.mean, independent) * (each @ each.T + (known + known.T) / 2),
+        covariance=ambiguity(excess.mean, independent) * (changes @ changes.T + (prior_part + prior_part.T) / 2),
         by_height=by_height[:, 0],
         by_lean=by_lean,
         correlation=correlation_of(before, after),
@@ -342,19 +349,19 @@ def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held:
     )
 
 
-def _without_each(whole: Doubles, informed: Doubles, at: _Linearisation, cells: Cells) -> Doubles:
-    """Return how much the motion would change without each of the blocks ``(n, blocks)``: the jackknife.
+def _jackknife(normal: Doubles, information: Doubles, linearisation: _Linearisation, cells: Cells) -> Doubles:
+    """Return the change of the motion without each of the blocks ``(n, blocks)``: the jackknife.
 
     Blocks that hold much of the information have small gradients, since the motion follows them.
     """
-    pulls = np.sum([(cells.derivative * side.pull).sum(axis=1) for side in at.sides], axis=0)
-    parts = np.einsum("ikp,jkp->ijp", informed, cells.derivative)
-    left = whole - np.moveaxis(_together((parts + np.swapaxes(parts, 0, 1)) / 2, cells), -1, 0)
-    change = np.linalg.solve(left, np.moveaxis(_together(pulls, cells), -1, 0)[..., None])
+    gradients = np.sum([(cells.derivative * side.gradients).sum(axis=1) for side in linearisation.sides], axis=0)
+    of_patches = np.einsum("ikp,jkp->ijp", information, cells.derivative)
+    remaining = normal - np.moveaxis(_by_correlated_block((of_patches + np.swapaxes(of_patches, 0, 1)) / 2, cells), -1, 0)
+    change = np.linalg.solve(remaining, np.moveaxis(_by_correlated_block(gradients, cells), -1, 0)[..., None])
     return np.asarray(change[..., 0].T)
 
 
-def _excess(side: _Side, cells: Cells) -> Excess:
+def _excess(side: _ResampledPair, cells: Cells) -> Excess:
     """Return how much more the frames correlate than when displaced across the beams."""
     before, after = side.before[side.inner], side.after[side.inner]
     inside = np.ones(before.shape, dtype=bool) if cells.seen is None else cells.seen[side.inner] > 0
@@ -405,21 +412,21 @@ class _AndersonAcceleration:
         return accelerated if lengths[0] < LONGEST * lengths[1] else step
 
 
-def _inner(there: Floats, usable: slice, least: Doubles) -> tuple[slice, slice] | None:
+def _inner(displacement: Floats, usable: slice, margins: Doubles) -> tuple[slice, slice] | None:
     """Return the cells that meet the ground and stay within both images; None if there are none.
 
-    ``least`` are the margins so far ``(2,)``, which grow in place: cells that come and go would keep it from settling.
+    ``margins`` are those so far ``(2,)``, which grow in place: cells that come and go would keep it from settling.
     """
-    _, bins, beams = there.shape
-    reach = np.array([max(one.max(), -one.min()) for one in there])
+    _, bins, beams = displacement.shape
+    reach = np.array([max(one.max(), -one.min()) for one in displacement])
     if not np.isfinite(reach).all():
         return None
-    least[:] = np.maximum(least, np.ceil(reach) + 1)
-    margin = [int(far) for far in least]
-    start = max(margin[0], usable.start)
-    if not (start + margin[0] < bins and 2 * margin[1] < beams):
+    margins[:] = np.maximum(margins, np.ceil(reach) + 1)
+    widths = [int(far) for far in margins]
+    start = max(widths[0], usable.start)
+    if not (start + widths[0] < bins and 2 * widths[1] < beams):
         return None
-    return slice(start, bins - margin[0]), slice(margin[1], beams - margin[1])
+    return slice(start, bins - widths[0]), slice(widths[1], beams - widths[1])
 
 
 def _singular(normal: Doubles) -> bool:
@@ -431,7 +438,7 @@ def _singular(normal: Doubles) -> bool:
     return bool(stretch[-1] > 1e8 * stretch[0])
 
 
-def _cross(side: _Side, cells: Cells, level: DirectLevel) -> Doubles:
+def _cross(side: _ResampledPair, cells: Cells, level: DirectLevel) -> Doubles:
     """Return sums of slopes of one frame times slopes of the other ``(3, patches)``, whose noise is independent.
 
     Outliers, whose weight falls as they grow, count with the derivative of weight times residual, which is negative: a
@@ -441,8 +448,8 @@ def _cross(side: _Side, cells: Cells, level: DirectLevel) -> Doubles:
     (along, across), others = (central_differences(blurred(image, *level.slopes)) for image in (side.before, side.after))
     bins, beams = along * curvature, across * curvature
     products = (bins, others[0]), (bins, others[1]), (beams, others[0]), (beams, others[1])
-    along_both, one, other, across_both = products_by_block(products, cells.patch)
-    return np.stack([along_both, (one + other) / 2, across_both]) * side.patches
+    along_both, mixed, mixed_back, across_both = products_by_block(products, cells.patch)
+    return np.stack([along_both, (mixed + mixed_back) / 2, across_both]) * side.patches
 
 
 def _patch_weight(sums: Doubles) -> Doubles:
@@ -453,18 +460,18 @@ def _patch_weight(sums: Doubles) -> Doubles:
     """
     # sum over the surroundings of each patch
     around = np.array([cv2.boxFilter(one, -1, AROUND, normalize=False, borderType=cv2.BORDER_CONSTANT) for one in sums])
-    aa, ab, bb, pull_a, pull_b = around.reshape(5, -1)
-    holds = aa + bb > 0
-    if not holds.any():
+    aa, ab, bb, gradient_a, gradient_b = around.reshape(5, -1)
+    textured = aa + bb > 0
+    if not textured.any():
         return np.ones(aa.shape)
     # regularise, then solve for the decrease by the best shift
-    aa, bb = (one + 1e-3 * one[holds].mean() + 1e-12 for one in (aa, bb))
-    decrease = (bb * pull_a**2 - 2 * ab * pull_a * pull_b + aa * pull_b**2) / (aa * bb - ab * ab)
+    aa, bb = (one + 1e-3 * one[textured].mean() + 1e-12 for one in (aa, bb))
+    decrease = (bb * gradient_a**2 - 2 * ab * gradient_a * gradient_b + aa * gradient_b**2) / (aa * bb - ab * ab)
     # compare with the usual decrease, since noise alone causes some
-    return np.asarray(1 / (1 + decrease / (BLOCK_CAUCHY**2 * median_of(decrease[holds]) + 1e-12)))
+    return np.asarray(1 / (1 + decrease / (BLOCK_CAUCHY**2 * median_of(decrease[textured]) + 1e-12)))
 
 
-def _together(values: Doubles, cells: Cells) -> Doubles:
+def _by_correlated_block(values: Doubles, cells: Cells) -> Doubles:
     """Sum values of patches ``(..., patches)`` over the blocks whose errors are correlated ``(..., blocks)``."""
     return by_block(values.reshape(*values.shape[:-1], *cells.patches), TOGETHER)
 
@@ -656,16 +663,16 @@ class GroundNodes:
         return GroundGeometry(*self.axes, self.frames.sonar.bearing, *pose)
 
     @cached_property
-    def _of_frames(self) -> tuple[GroundGeometry, GroundGeometry]:
+    def _grounds_of_frames(self) -> tuple[GroundGeometry, GroundGeometry]:
         """Return the geometry of the nodes in each frame."""
         return (self._ground(0), self._ground(1)) if self.attitude.apart else (self.ground, self.ground)
 
     @cached_property
-    def _from_nodes_of_frames(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    def _source_nodes_of_frames(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
         """Return, for each frame, the nodes from which its nodes take their values."""
         if not self.attitude.apart:
             return [self.from_node, self.from_node]
-        return [nearest_known(np.asarray(np.isfinite(one.points).all(axis=-1))) for one in self._of_frames]
+        return [nearest_known(np.asarray(np.isfinite(one.points).all(axis=-1))) for one in self._grounds_of_frames]
 
     def _derivative(self, ground: GroundGeometry) -> Doubles:
         """Return the derivative by motion (and heave), from the nearest valid node where a node meets no ground."""
@@ -690,21 +697,24 @@ class GroundNodes:
 
     def shift(self, v: Doubles, *, back: bool, lift_m: float) -> Doubles:
         """Return the displacement of the nodes in range [m] and bearing [rad]; see :meth:`Cells.shift`."""
-        ground, other = self._of_frames[:: -1 if back else 1]
+        ground, other_ground = self._grounds_of_frames[:: -1 if back else 1]
         if lift_m:
-            ground, other = (replace(one, height_m=one.height_m - lift_m) for one in (ground, other))
+            ground, other_ground = (replace(one, height_m=one.height_m - lift_m) for one in (ground, other_ground))
         if self.heave:
             half = float(v[3]) / (2 if back else -2)
-            ground, other = replace(ground, height_m=ground.height_m + half), replace(other, height_m=other.height_m - half)
-        nodes = self._between(ground, other, inverse(v[:3]) if back else v[:3])
+            ground, other_ground = (
+                replace(ground, height_m=ground.height_m + half),
+                replace(other_ground, height_m=other_ground.height_m - half),
+            )
+        nodes = self._between(ground, other_ground, inverse(v[:3]) if back else v[:3])
         # a cell that meets level ground may not meet ground that lies lower
-        known = self._from_nodes_of_frames[int(back)]
+        known = self._source_nodes_of_frames[int(back)]
         row, column = nearest_known(np.asarray(np.isfinite(nodes).all(axis=0), dtype=bool)) if lift_m else known
         return np.asarray(nodes[:, row, column], dtype=np.float64)
 
-    def _between(self, ground: GroundGeometry, other: GroundGeometry, motion: Doubles | Motion) -> Doubles:
+    def _between(self, ground: GroundGeometry, other_ground: GroundGeometry, motion: Doubles | Motion) -> Doubles:
         """Return the displacement of one frame's ground nodes in another ``(2, nodes, nodes)``; nan off the ground."""
-        radius, bearing = other.to_polar(moved(ground.points, motion))
+        radius, bearing = other_ground.to_polar(moved(ground.points, motion))
         return np.stack([radius - self.axes[0][:, None], bearing - self.axes[1]])
 
     def leaning_shift(self, v: Doubles) -> Doubles:
@@ -716,16 +726,16 @@ class GroundNodes:
         """
         if not any(self.attitude.unsure):
             return np.zeros((3, *self.derivative.shape[1:]))
-        row, column = self._from_nodes_of_frames[0]
+        row, column = self._source_nodes_of_frames[0]
         changes = []
         for name in ("height_m", "pitch_rad", "roll_rad"):
             ends = []
             for sign in (-1, 1):
-                ground, other = (
-                    replace(one, **{name: getattr(one, name) + way * sign * LEAN_STEP / 2})
-                    for one, way in zip(self._of_frames, (-1, 1), strict=True)
+                ground, other_ground = (
+                    replace(one, **{name: getattr(one, name) + half * sign * LEAN_STEP / 2})
+                    for one, half in zip(self._grounds_of_frames, (-1, 1), strict=True)
                 )
-                ends.append(self._between(ground, other, v[:3]))
+                ends.append(self._between(ground, other_ground, v[:3]))
             changes.append((ends[1] - ends[0]) / (2 * LEAN_STEP))
         return np.nan_to_num(np.stack(changes)[:, :, row, column])
 
@@ -783,8 +793,8 @@ def on_cells(table: NDArray[np.float64], shape: tuple[int, ...], block: tuple[in
         ((np.arange(size) + 0.5) / edge - 0.5).astype(np.float32) for size, edge in zip(shape, block, strict=True)
     )
     column, row = (np.ascontiguousarray(axis) for axis in np.broadcast_arrays(column[None], row[:, None]))
-    drawn = cv2.remap(table.astype(np.float32), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(drawn, dtype=np.float32)
+    interpolated = cv2.remap(table.astype(np.float32), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(interpolated, dtype=np.float32)
 
 
 # ---------------- Smoothing, interpolation and slopes
@@ -802,9 +812,11 @@ def blurred(image: Floats, bins: float, beams: float) -> Floats:
     if not bins and not beams:
         return image
     size = tuple(2 * int(np.ceil(3 * sigma)) + 1 for sigma in (beams, bins))
-    least = 1e-3  # OpenCV replaces 0 by the other sigma
+    smallest_sigma = 1e-3  # OpenCV replaces 0 by the other sigma
     return np.asarray(
-        cv2.GaussianBlur(image, size, sigmaX=max(beams, least), sigmaY=max(bins, least), borderType=cv2.BORDER_REPLICATE)
+        cv2.GaussianBlur(
+            image, size, sigmaX=max(beams, smallest_sigma), sigmaY=max(bins, smallest_sigma), borderType=cv2.BORDER_REPLICATE
+        )
     )
 
 
@@ -822,8 +834,8 @@ def slopes_of(image: Floats, level: DirectLevel, scale: float) -> tuple[Floats, 
     if scale > FAINTEST:
         mean = cv2.blur(smooth, NEIGHBOURS)
         variance = cv2.blur(smooth * smooth, NEIGHBOURS) - mean * mean
-        kept = np.maximum(0, 1 - np.float32(2 * (scale / 2) ** 2) / np.maximum(variance, np.float32(1e-9)))
-        smooth = mean + (smooth - mean) * kept
+        wiener_gain = np.maximum(0, 1 - np.float32(2 * (scale / 2) ** 2) / np.maximum(variance, np.float32(1e-9)))
+        smooth = mean + (smooth - mean) * wiener_gain
     return central_differences(smooth)
 
 
