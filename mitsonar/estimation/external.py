@@ -325,7 +325,7 @@ class OwnEstimator:
         if not isinstance(consumes, type):
             raise MitsonarError(f"{path}: consumes must be a class such as mitsonar.SonarFrames: got {consumes!r}")
         self.consumes: type = consumes
-        self.inputs = str(getattr(made, "inputs", "its own"))
+        self.inputs = str(getattr(made, "inputs", "custom"))
         self.digest = str(getattr(made, "digest", ""))
         try:
             estimate = made.estimate

@@ -42,7 +42,7 @@ class HeightNetwork(Trained):
                 "give one that was trained with input.frames: 1, or direct"
             )
         self.force = force
-        self._take(checkpoint)
+        self._set_checkpoint(checkpoint)
 
     @property
     def views(self) -> tuple[str, ...] | None:
@@ -80,11 +80,9 @@ class HeightNetwork(Trained):
             return self._input_of_views(frame)
         names = self._checkpoint.arrangement["views"]
         if len(names) > 1:
-            raise MitsonarError(
-                f"this {self._checkpoint.network} is given {', '.join(names)}: use a data set that holds them"
-            )
+            raise MitsonarError(f"this {self._checkpoint.network} takes {', '.join(names)}: use a data set that holds them")
         self._check_instrument(names[0], TrainedInstrument.in_frames(frame.sonar, frame.range_m, frame.bearing_rad))
         values = {names[0]: torch.from_numpy(np.asarray(frame.image)[None])}
-        arranged = self._arranged({names[0]: (frame.range_m, frame.bearing_rad)})
-        inputs: NetworkInput = arranged(values, torch.arange(1)[None], 0)
+        arrangement = self._arrangement_for({names[0]: (frame.range_m, frame.bearing_rad)})
+        inputs: NetworkInput = arrangement(values, torch.arange(1)[None], 0)
         return inputs

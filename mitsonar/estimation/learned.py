@@ -96,11 +96,11 @@ class HeightEnsemble:
     inputs: str = field(default="height, which chooses the network", init=False)
 
     def __post_init__(self) -> None:
-        reads = {(type(one), getattr(one, "views", None), one.kind) for one in self._members}
-        if len(reads) != 1 or len(self._members) != len(self.networks):
-            said = "; ".join(sorted(f"{kind}s of {', '.join(views or ('one view',))}" for _, views, kind in reads))
-            raise MitsonarError(f"networks that stand in for each other must read the same views: got {said}")
-        ((_, self.views, self.kind),) = reads
+        signatures = {(type(one), getattr(one, "views", None), one.kind) for one in self._members}
+        if len(signatures) != 1 or len(self._members) != len(self.networks):
+            got = "; ".join(sorted(f"{kind}s of {', '.join(views or ('one view',))}" for _, views, kind in signatures))
+            raise MitsonarError(f"the networks of an ensemble must read the same views: got {got}")
+        ((_, self.views, self.kind),) = signatures
 
     @property
     def _members(self) -> list[ImageNetwork | ViewNetwork]:
@@ -127,24 +127,24 @@ class HeightEnsemble:
         Raises:
             MitsonarError: frames without a height, or the errors of the network.
         """
-        known = None if frames.height_m is None else frames.height_m[np.isfinite(frames.height_m)]
-        if known is None or not len(known):
+        heights = None if frames.height_m is None else frames.height_m[np.isfinite(frames.height_m)]
+        if heights is None or not len(heights):
             raise MitsonarError(
-                "the height chooses the network, and the frames tell none: measure it with --height-by direct"
+                "the height selects the network, but the frames hold none: measure it with --height-by direct"
             )
-        height = float(known.mean())
+        height = float(heights.mean())
         network: AnyEstimator = self.chosen(height)
         return network.estimate(frames, prior)
 
     def chosen(self, height_m: float) -> ImageNetwork | ViewNetwork:
         """Return the network whose training heights are nearest in ratio; among several, that with the nearest middle."""
 
-        def away(network: ImageNetwork | ViewNetwork) -> tuple[float, float]:
+        def distance(network: ImageNetwork | ViewNetwork) -> tuple[float, float]:
             low, high = network.heights
             outside = max(np.log(low / height_m), np.log(height_m / high), 0.0)
             return float(outside), float(abs(np.log(height_m / np.sqrt(low * high))))
 
-        return min(self._members, key=away)
+        return min(self._members, key=distance)
 
 
 # ---------------- Networks of the user
@@ -165,7 +165,7 @@ class OwnNetwork:
     """
 
     consumes = SonarFrames
-    inputs = "its own"
+    inputs = "custom"
     digest = ""
 
     def __init__(self, network: nn.Module, samples: Samples | None = None) -> None:
@@ -173,7 +173,7 @@ class OwnNetwork:
             samples.frames != 2 or len(samples.arrange.views) != 1 or samples.arrange.kind != "image" or samples.ground
         ):
             raise MitsonarError(
-                "a network of your own estimates from two images of one view: give samples with frames=2, kind='image', one "
+                "a user's network estimates from two images of one view: give samples with frames=2, kind='image', one "
                 "view, and no ground"
             )
         self._network = copy.deepcopy(network).eval()
@@ -194,17 +194,17 @@ class OwnNetwork:
         if self._shape is not None and frames.image.shape[1:] != self._shape:
             raise MitsonarError(f"the network was trained on images of {self._shape}: got {frames.image.shape[1:]}")
         # prepare the frames as in training, on the device of the network
-        like = next(self._network.parameters(), torch.empty(0))
-        images = torch.from_numpy(np.ascontiguousarray(to_float32(frames.image)))[None].to(like.device)
+        parameter = next(self._network.parameters(), torch.empty(0))
+        images = torch.from_numpy(np.ascontiguousarray(to_float32(frames.image)))[None].to(parameter.device)
         inputs: NetworkInput = images
         if self._arrange is not None:
-            inputs = self._arrange({self._arrange.views[0]: images}, torch.arange(2, device=like.device)[None], 0)
+            inputs = self._arrange({self._arrange.views[0]: images}, torch.arange(2, device=parameter.device)[None], 0)
         with torch.inference_mode(), one_thread():
             answer = answer_of(self._network, inputs)
         # check the answer before it is decoded
         if not isinstance(answer, torch.Tensor) or answer.shape != (1, 3):
-            got = f"a tensor of {tuple(answer.shape)}" if isinstance(answer, torch.Tensor) else type(answer).__name__
-            raise MitsonarError(f"a network of motions must return labels (batch, 3): got {got} for a batch of one")
+            output = f"a tensor of {tuple(answer.shape)}" if isinstance(answer, torch.Tensor) else type(answer).__name__
+            raise MitsonarError(f"a network of motions must return labels (batch, 3): got {output} for a batch of one")
         labels = answer[0].double().cpu().numpy()
         if not np.isfinite(labels).all():
             return rejected("the network's answer is not finite")
@@ -258,19 +258,19 @@ class TrainedInstrument(NamedTuple):
 
     def unlike(self, other: TrainedInstrument) -> str:
         """Return the properties in which another sonar differs: ``beams 128, not 96; ...``; empty if none does."""
-        found = []
+        differences = []
         for what in ("bins", "beams", "bearing"):
             if getattr(self, what) != getattr(other, what):
-                found.append(f"{what} {getattr(other, what)}, not {getattr(self, what)}")
+                differences.append(f"{what} {getattr(other, what)}, not {getattr(self, what)}")
         for what in ("azimuth_fov_deg", "elevation_fov_deg"):
-            mine, its = getattr(self, what), getattr(other, what)
-            if abs(its - mine) > WINDOW_OFF * mine:
-                found.append(f"{what} {its:.4g}, not {mine:.4g}")
+            trained, actual = getattr(self, what), getattr(other, what)
+            if abs(actual - trained) > WINDOW_OFF * trained:
+                differences.append(f"{what} {actual:.4g}, not {trained:.4g}")
         ends = zip(self.window_m, other.window_m, strict=True)
-        if any(abs(its - mine) > WINDOW_OFF * self.window_m[1] for mine, its in ends):
-            mine, its = (f"{near:.3g}..{far:.3g} m" for near, far in (self.window_m, other.window_m))
-            found.append(f"window {its}, not {mine}")
-        return "; ".join(found)
+        if any(abs(actual - trained) > WINDOW_OFF * self.window_m[1] for trained, actual in ends):
+            trained, actual = (f"{near:.3g}..{far:.3g} m" for near, far in (self.window_m, other.window_m))
+            differences.append(f"window {actual}, not {trained}")
+        return "; ".join(differences)
 
 
 @dataclass(init=False, eq=False)
@@ -299,12 +299,12 @@ class Trained:
         low, high = self._checkpoint.trained_at["height_m"]
         return float(low), float(high)
 
-    def _take(self, checkpoint: Checkpoint) -> None:
+    def _set_checkpoint(self, checkpoint: Checkpoint) -> None:
         """Store the network outside the fields: files and comparisons of options need only the digest."""
         self.digest, self.inputs = checkpoint.digest, inputs_of(checkpoint)
         self._checkpoint, self._network = checkpoint, checkpoint.build()
         self._trained = {view: TrainedInstrument.of(sonar) for view, sonar in checkpoint.sonars.items()}
-        self._last: tuple[bytes, Arrangement] | None = None
+        self._cached_arrangement: tuple[bytes, Arrangement] | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """Return the state for other processes, with the checkpoint as bytes: torch would share file descriptors."""
@@ -314,7 +314,7 @@ class Trained:
         content = state.pop("content")
         assert isinstance(content, bytes)
         vars(self).update(state)
-        self._take(Checkpoint.from_bytes(content))
+        self._set_checkpoint(Checkpoint.from_bytes(content))
 
     @property
     def kind(self) -> str:
@@ -328,10 +328,10 @@ class Trained:
             MitsonarError: missing views, or views of a sonar other than that of training.
         """
         names = self._checkpoint.arrangement["views"]
-        lacking = [view for view in names if view not in frames.values]
-        if lacking:
+        missing = [view for view in names if view not in frames.values]
+        if missing:
             raise MitsonarError(
-                f"this {self._checkpoint.network} is given {', '.join(names)}: got {', '.join(frames.values)}; read them "
+                f"this {self._checkpoint.network} takes {', '.join(names)}: got {', '.join(frames.values)}; read them "
                 "from a data set that holds them"
             )
         for view in names:
@@ -340,31 +340,35 @@ class Trained:
         if frames.kind == "vector":  # the noise is already included
             values |= {f"nonzero_{view}": torch.zeros_like(one, dtype=torch.int32) for view, one in values.items()}
         axes = {view: (frames.sonars[view].range_m, frames.bearing_rad[view]) for view in names}
-        inputs: NetworkInput = self._arranged(axes)(values, torch.arange(len(frames))[None], 0)
+        inputs: NetworkInput = self._arrangement_for(axes)(values, torch.arange(len(frames))[None], 0)
         return inputs
 
-    def _check_instrument(self, view: str, has: TrainedInstrument) -> None:
+    def _check_instrument(self, view: str, instrument: TrainedInstrument) -> None:
         """Raise an error for a sonar other than that of training, unless forced."""
-        unlike = self._trained[view].unlike(has) if view in self._trained and not self.force else ""
-        if unlike:
+        differences = self._trained[view].unlike(instrument) if view in self._trained and not self.force else ""
+        if differences:
             raise MitsonarError(
                 f"this {self._checkpoint.network} was trained on the sonar {self._trained[view].name}, the frames are of "
-                f"{has.name}: {unlike}; train on that sonar, use {self.instead}, or force it with RUN:force=1"
+                f"{instrument.name}: {differences}; train on that sonar, use {self.instead}, or force it with RUN:force=1"
             )
 
-    def _arranged(self, axes: dict[str, Axes]) -> Arrangement:
+    def _arrangement_for(self, axes: dict[str, Axes]) -> Arrangement:
         """Return the transform from frames of these views to the network's input; the last one is cached."""
-        key = b"".join(axis.tobytes() for both in axes.values() for axis in both)
-        if self._last is None or self._last[0] != key:
-            words = self._checkpoint.arrangement
+        key = b"".join(axis.tobytes() for view_axes in axes.values() for axis in view_axes)
+        if self._cached_arrangement is None or self._cached_arrangement[0] != key:
+            settings = self._checkpoint.arrangement
             maps = {}
-            if words["coordinates"] != "polar":
-                maps = {view: cartesian_map(*both, words["cartesian_rows"]) for view, both in axes.items()}
+            if settings["coordinates"] != "polar":
+                maps = {view: cartesian_map(*view_axes, settings["cartesian_rows"]) for view, view_axes in axes.items()}
             beams = {view: len(bearing_rad) for view, (_, bearing_rad) in axes.items()}
-            made = Arrangement(tuple(axes), words["kind"], words["layout"], words["coordinates"], NoiseModel(), beams, maps)
-            made = replace(made, range_levels=words.get("range_levels"), halves=words.get("halves", False))
-            self._last = key, made
-        return self._last[1]
+            arrangement = Arrangement(
+                tuple(axes), settings["kind"], settings["layout"], settings["coordinates"], NoiseModel(), beams, maps
+            )
+            arrangement = replace(
+                arrangement, range_levels=settings.get("range_levels"), halves=settings.get("halves", False)
+            )
+            self._cached_arrangement = key, arrangement
+        return self._cached_arrangement[1]
 
     # ---------------- Rejections
 
@@ -380,7 +384,7 @@ class Trained:
         ):  # over z = 0, since there may be a rock straight below
             heights.append(frames.poses[:, 2].mean())
         if heights and not any(low * (1 - HEIGHT_OFF) <= height <= high * (1 + HEIGHT_OFF) for height in heights):
-            return f"the sonar stood at {heights[0]:.2f} m: {self._checkpoint.fixed} are fixed by training"
+            return f"the sonar was at {heights[0]:.2f} m: {self._checkpoint.fixed} are fixed by training"
         return self._rejection_of_attitude(frames)
 
     def _rejection_of_attitude(self, frames: SonarFrames | ViewFrames) -> str:
@@ -397,15 +401,15 @@ class Trained:
         """Return why the motion, relative to the start of the iterations, exceeds those of training; empty if not."""
         coder = self._checkpoint.coder
         middle, half = (coder.low + coder.high) / 2, (coder.high - coder.low) / 2
-        off = (np.array(motion) - (np.zeros(3) if start is None else np.array(start)))[: len(half)]
-        beyond = np.abs(off - middle) > BEYOND * half
+        from_start = (np.array(motion) - (np.zeros(3) if start is None else np.array(start)))[: len(half)]
+        beyond = np.abs(from_start - middle) > BEYOND * half
         if not beyond.any():
             return ""
         axis = int(beyond.argmax())
         name, unit, scale = AXES[axis]
-        value, low, high = scale * np.array([off, coder.low, coder.high])[:, axis]
-        since = "" if start is None else ", counted from the start,"
-        return f"{name} {value:.3g} {unit}{since} is beyond the motions of training, {low:.3g}..{high:.3g} {unit}"
+        value, low, high = scale * np.array([from_start, coder.low, coder.high])[:, axis]
+        suffix = "" if start is None else ", counted from the start,"
+        return f"{name} {value:.3g} {unit}{suffix} is beyond the motions of training, {low:.3g}..{high:.3g} {unit}"
 
 
 def inputs_of(checkpoint: Checkpoint) -> str:
@@ -431,12 +435,12 @@ def answer_of(network: nn.Module, inputs: NetworkInput) -> Tensor | GaussianHead
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Limit torch to one thread: a pair is too small for more, and processes share the pairs."""
-    had = torch.get_num_threads()
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(had)
+        torch.set_num_threads(threads)
 
 
 # ---------------- Networks of two images
@@ -521,18 +525,18 @@ class ImageNetwork(Trained):
     ) -> None:
         self._check_input(checkpoint)
         if not checkpoint.arrangement["ground"] and any(value is not None for value in (height_m, pitch_rad, relief_m)):
-            raise MitsonarError(f"this {checkpoint.network} is given no geometry: {checkpoint.fixed} are fixed by training")
+            raise MitsonarError(f"this {checkpoint.network} takes no geometry: {checkpoint.fixed} are fixed by training")
         self.force, self.height_m, self.pitch_rad, self.relief_m = force, height_m, pitch_rad, relief_m
-        self._take(checkpoint)
+        self._set_checkpoint(checkpoint)
 
     def _check_input(self, checkpoint: Checkpoint) -> None:
         """Raise an error if the network needs inputs that an estimator does not have."""
-        words = checkpoint.arrangement
-        if words["frames"] != 2 or len(words["views"]) != 1:
+        settings = checkpoint.arrangement
+        if settings["frames"] != 2 or len(settings["views"]) != 1:
             raise MitsonarError(
-                f"an estimator has two frames of one view: this {checkpoint.network} is given {words['frames']} frames of "
-                f"{', '.join(words['views'])} as {words['kind']}s; use `mitsonar odometry` on a data set that holds them, "
-                "`mitsonar evaluate`, or another checkpoint"
+                f"an estimator has two frames of one view: this {checkpoint.network} takes {settings['frames']} frames of "
+                f"{', '.join(settings['views'])} as {settings['kind']}s; use `mitsonar odometry` on a data set that holds "
+                "them, `mitsonar evaluate`, or another checkpoint"
             )
 
     def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
@@ -561,36 +565,36 @@ class ImageNetwork(Trained):
         if attitude is not None and attitude.reason:
             return rejected(attitude.reason)
         if attitude is None:
-            return self._from(frames, images, {}, None)
+            return self._estimate_from(frames, images, {}, None)
         ground = _batch({**ground_of(frames, attitude), **light_of(frames, attitude)})
         # 1. estimate from the prior or from zero motion; run again where noise may have shortened the steps
-        found = self._from(frames, images, ground, None if prior is None else prior.motion)
-        if found.covariance is not None and _correlation_of_answer(images, ground, found.motion) < NOISY:
-            found = self._again(frames, images, ground, found)
-        found = self._judged(frames, found, prior, "zero" if prior is None else "prior", attitude, ground)
+        near = self._estimate_from(frames, images, ground, None if prior is None else prior.motion)
+        if near.covariance is not None and _correlation_of_answer(images, ground, near.motion) < NOISY:
+            near = self._refined(frames, images, ground, near)
+        near = self._finalised(frames, near, prior, "zero" if prior is None else "prior", attitude, ground)
         # 2. accept it if it is valid and the frames correlate, or if the prior leaves no far motion
-        doubtful = found.valid and _correlation_of_answer(images, ground, found.motion) < LEAST_AT_BEST
+        doubtful = near.valid and _correlation_of_answer(images, ground, near.motion) < LEAST_AT_BEST
         is_near = prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))
-        if is_near or (found.valid and not doubtful):
-            return found
+        if is_near or (near.valid and not doubtful):
+            return near
         # 3. otherwise let phase correlation find a far start
-        elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
-        if not elsewhere.valid or not self._rejection_of_size(elsewhere.motion):
-            return found  # the first estimate has already searched near motions
-        second = self._from(frames, images, ground, elsewhere.motion)
-        if self._rejection_of_size(second.motion, elsewhere.motion):  # the error of phase exceeds the motions of training
-            second = self._from(frames, images, ground, second.motion)
-        second = self._judged(frames, second, prior, "phase", attitude, ground)
-        if doubtful and (not second.valid or _correlation_of_answer(images, ground, second.motion) < LEAST_AT_BEST):
-            return found
-        return second
+        phase_estimate = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
+        if not phase_estimate.valid or not self._rejection_of_size(phase_estimate.motion):
+            return near  # the first estimate has already searched near motions
+        far = self._estimate_from(frames, images, ground, phase_estimate.motion)
+        if self._rejection_of_size(far.motion, phase_estimate.motion):  # the error of phase exceeds the motions of training
+            far = self._estimate_from(frames, images, ground, far.motion)
+        far = self._finalised(frames, far, prior, "phase", attitude, ground)
+        if doubtful and (not far.valid or _correlation_of_answer(images, ground, far.motion) < LEAST_AT_BEST):
+            return near
+        return far
 
-    def _judged(
+    def _finalised(
         self,
         frames: SonarFrames,
-        found: Estimate,
+        estimate: Estimate,
         prior: MotionPrior | None,
-        named: str,
+        start_name: str,
         attitude: Attitude,
         ground: Ground,
     ) -> Estimate:
@@ -599,21 +603,21 @@ class ImageNetwork(Trained):
         The covariance grows for motions beyond training, for heights less certain than those of training, and for unknown
         heave, pitch and roll.
         """
-        covariance = found.covariance
+        covariance = estimate.covariance
         if covariance is not None:
-            covariance = FAR_MODEL * covariance if self._rejection_of_size(found.motion) else covariance
-            unsure = (attitude.height_std_m / attitude.height_m) ** 2 - STD_MEASURED**2
-            if unsure > 0:
-                by_height = _by_height(ground, found.motion)
-                covariance = covariance + unsure * np.outer(by_height, by_height)
+            covariance = FAR_MODEL * covariance if self._rejection_of_size(estimate.motion) else covariance
+            height_variance = (attitude.height_std_m / attitude.height_m) ** 2 - STD_MEASURED**2
+            if height_variance > 0:
+                by_relative_height = _by_height(ground, estimate.motion)
+                covariance = covariance + height_variance * np.outer(by_relative_height, by_relative_height)
             covariance = attitude.widened(covariance, frames)
-        reason = found.reason or prior_rejection(found.motion, covariance, prior)
+        reason = estimate.reason or prior_rejection(estimate.motion, covariance, prior)
         return replace(
-            found,
+            estimate,
             covariance=covariance,
             valid=not reason,
             reason=reason,
-            about={**found.about, **attitude.about, **self._untrained(frames), "start": named},
+            about={**estimate.about, **attitude.about, **self._untrained(frames), "start": start_name},
         )
 
     @cached_property
@@ -624,22 +628,26 @@ class ImageNetwork(Trained):
 
     def _untrained(self, frames: SonarFrames) -> dict[str, str]:
         """Return a note on frames unlike those of training, for a network that accepts any sonar."""
-        found = []
+        differences = []
         if frames.sonar.model == "coherent" and "coherent" not in self._checkpoint.model:
-            found.append("speckle")
-        has = TrainedInstrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad)
-        if abs(math.log(has.azimuth_fov_deg / self._fan_deg)) > math.log(OTHER_FAN):
-            found.append(f"a fan of {has.azimuth_fov_deg:.3g} deg (but {self._fan_deg:.3g})")
-        return {"untrained": f"{self._checkpoint.network} was not trained for {' or '.join(found)}"} if found else {}
+            differences.append("speckle")
+        instrument = TrainedInstrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad)
+        if abs(math.log(instrument.azimuth_fov_deg / self._fan_deg)) > math.log(OTHER_FAN):
+            differences.append(f"a fan of {instrument.azimuth_fov_deg:.3g} deg (but {self._fan_deg:.3g})")
+        return (
+            {"untrained": f"{self._checkpoint.network} was not trained for {' or '.join(differences)}"}
+            if differences
+            else {}
+        )
 
-    def _from(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Estimate:
+    def _estimate_from(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Estimate:
         """Estimate the motion from a start of the network's iterations; None: zero motion."""
         with torch.inference_mode(), one_thread():
             targets, covariances = self._checkpoint.decode(self._answer(frames, images, ground, start))
         if not np.isfinite(targets).all():
             return rejected("the network's answer is not finite")
         if targets.shape[1] != 3:
-            raise MitsonarError(f"a motion has three numbers: this {self._checkpoint.network} says {targets.shape[1]}")
+            raise MitsonarError(f"a motion has three numbers: this {self._checkpoint.network} returns {targets.shape[1]}")
         # check the answer: a valid covariance, the geometry and motions of training, and frames that match
         if covariances is not None and not _is_covariance(covariances[0]):
             return rejected("the network's covariance is not positive: images unlike those of its training")
@@ -650,37 +658,37 @@ class ImageNetwork(Trained):
             reason = _rejection_of_answer(images, ground, motion) if ground else self._rejection_of_match(frames, images)
         return Estimate(motion, covariance, not reason, reason)
 
-    def _again(self, frames: SonarFrames, images: Pair, ground: Ground, first: Estimate) -> Estimate:
+    def _refined(self, frames: SonarFrames, images: Pair, ground: Ground, first: Estimate) -> Estimate:
         """Estimate again, starting from an answer that noise may have shortened, and also backwards from the second frame.
 
         The result is the mean of both directions. The change by the second run and the difference of the directions enter
         the covariance, since nothing better is known of these errors.
         """
-        found = self._from(frames, images, ground, first.motion)
-        if found.covariance is None:
-            return found
-        motion, apart = self._both_ways(frames, images, found.motion)
-        went = np.array(found.motion) - np.array(first.motion)
+        second = self._estimate_from(frames, images, ground, first.motion)
+        if second.covariance is None:
+            return second
+        motion, asymmetry = self._mean_of_directions(frames, images, second.motion)
+        change = np.array(second.motion) - np.array(first.motion)
         fine = COMPARISONS[-1]
-        one, other, inside = _brought_together(images, ground, motion, fine)
-        excess = correlation_excess(one, other, inside, BLOCK // 2).mean
-        unsure = ambiguity(excess, inside.sum() / fine.correlated)
-        reason = found.reason or self._rejection_of_size(motion)
-        covariance = unsure * found.covariance + np.outer(went, went) + np.outer(apart, apart) / 2
-        return Estimate(motion, covariance, not reason, reason, found.about)
+        first_image, second_image, inside = _registered(images, ground, motion, fine)
+        excess = correlation_excess(first_image, second_image, inside, BLOCK // 2).mean
+        factor = ambiguity(excess, inside.sum() / fine.correlated)
+        reason = second.reason or self._rejection_of_size(motion)
+        covariance = factor * second.covariance + np.outer(change, change) + np.outer(asymmetry, asymmetry) / 2
+        return Estimate(motion, covariance, not reason, reason, second.about)
 
-    def _both_ways(self, frames: SonarFrames, images: Pair, there: Motion) -> tuple[Motion, NDArray[np.float64]]:
+    def _mean_of_directions(self, frames: SonarFrames, images: Pair, motion: Motion) -> tuple[Motion, NDArray[np.float64]]:
         """Return the mean of a motion and the one estimated from the second frame to the first, and their difference."""
         swapped = frames.select(np.array([1, 0]))
         attitude = self._attitude_of(swapped)
         if attitude is None or attitude.reason:
-            return there, np.zeros(3)
+            return motion, np.zeros(3)
         ground = _batch({**ground_of(swapped, attitude), **light_of(swapped, attitude)})
-        back = self._from(swapped, images[::-1], ground, Motion(*inverse(np.array(there)).tolist()))
-        if back.covariance is None:
-            return there, np.zeros(3)
-        apart = inverse(np.array(back.motion)) - np.array(there)
-        return Motion(*(np.array(there) + apart / 2).tolist()), apart
+        backward = self._estimate_from(swapped, images[::-1], ground, Motion(*inverse(np.array(motion)).tolist()))
+        if backward.covariance is None:
+            return motion, np.zeros(3)
+        difference = inverse(np.array(backward.motion)) - np.array(motion)
+        return Motion(*(np.array(motion) + difference / 2).tolist()), difference
 
     def _attitude_of(self, frames: SonarFrames) -> Attitude | None:
         """Return the attitude, for a network that takes the geometry; None for others."""
@@ -702,7 +710,7 @@ class ImageNetwork(Trained):
     def _arrangement(self, frames: SonarFrames) -> Arrangement:
         """Return the transform from the frames to the network's input."""
         (view,) = self._checkpoint.arrangement["views"]
-        return self._arranged({view: (frames.range_m, frames.bearing_rad)})
+        return self._arrangement_for({view: (frames.range_m, frames.bearing_rad)})
 
     # ---------------- Rejections
 
@@ -713,11 +721,11 @@ class ImageNetwork(Trained):
         rows, columns = (min(reach, length // 3) for reach, length in zip(self._reach(frames), size, strict=True))
         # compare the middle of the second frame with the first at all these shifts
         middle = second[rows : size[0] - rows, columns : size[1] - columns]
-        found = cv2.matchTemplate(without_slow(first, 32), without_slow(middle, 32), cv2.TM_CCOEFF_NORMED)
-        row, column = np.unravel_index(int(found.argmax()), found.shape)
-        there = first[row : row + middle.shape[0], column : column + middle.shape[1]]
+        correlation = cv2.matchTemplate(without_slow(first, 32), without_slow(middle, 32), cv2.TM_CCOEFF_NORMED)
+        row, column = np.unravel_index(int(correlation.argmax()), correlation.shape)
+        matched = first[row : row + middle.shape[0], column : column + middle.shape[1]]
         inside = np.ones(middle.shape, dtype=bool)
-        return matching_rejection(there, middle, inside, correlated=4 * math.pi * SMOOTH[0] * SMOOTH[1])
+        return matching_rejection(matched, middle, inside, correlated=4 * math.pi * SMOOTH[0] * SMOOTH[1])
 
     def _reach(self, frames: SonarFrames) -> tuple[int, int]:
         """Return how far an echo can move between frames in bins and in beams, by the motions of training."""
@@ -737,9 +745,9 @@ def _batch(table: dict[str, NDArray[np.float32]]) -> Ground:
 def _by_height(ground: Ground, motion: Motion) -> NDArray[np.float64]:
     """Return the derivative of an estimated motion by the relative height: another motion explains the same shifts."""
     lit = ground["lit"][0].numpy() >= 0 if "lit" in ground else np.ones(ground["derivative"].shape[-2:], dtype=bool)
-    here, lower = (ground[name][0].numpy()[..., lit] for name in ("derivative", "by_relief"))
-    change = np.tensordot(np.array(motion), lower, axes=(0, 1))
-    return np.asarray(np.linalg.lstsq(np.moveaxis(here, 1, -1).reshape(-1, 3), change.ravel(), rcond=None)[0])
+    by_motion, by_relief = (ground[name][0].numpy()[..., lit] for name in ("derivative", "by_relief"))
+    shift_change = np.tensordot(np.array(motion), by_relief, axes=(0, 1))
+    return np.asarray(np.linalg.lstsq(np.moveaxis(by_motion, 1, -1).reshape(-1, 3), shift_change.ravel(), rcond=None)[0])
 
 
 def _rejection_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
@@ -753,17 +761,17 @@ def _rejection_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
 
 def _mismatch(images: Pair, ground: Ground, motion: Motion, comparison: Comparison) -> str:
     """Return why the frames registered by an answer do not match in one comparison; empty if they do."""
-    first, second, inside = _brought_together(images, ground, motion, comparison)
+    first, second, inside = _registered(images, ground, motion, comparison)
     return matching_rejection(first, second, inside, correlated=comparison.correlated, block=BLOCK, aside=BLOCK // 2)
 
 
 def _correlation_of_answer(images: Pair, ground: Ground, motion: Motion) -> float:
     """Return the correlation of the frames registered by an answer."""
-    first, second, inside = _brought_together(images, ground, motion, COMPARISONS[0])
+    first, second, inside = _registered(images, ground, motion, COMPARISONS[0])
     return correlation_of(without_slow(first, BLOCK)[inside], without_slow(second, BLOCK)[inside])
 
 
-def _brought_together(
+def _registered(
     images: Pair, ground: Ground, motion: Motion, comparison: Comparison
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Return the first frame, the second one resampled at its cells, and which cells both show."""
@@ -771,8 +779,8 @@ def _brought_together(
     means = (image[: rows * comparison.cell].reshape(rows, comparison.cell, beams).mean(axis=1) for image in images)
     first, second = (smooth(mean, comparison) for mean in means)
     warp_grid = WarpGrid(ground, torch.ones(1, 3), (comparison.cell, 1), images[0].shape, first.shape, None)
-    back, inside = warp_grid.draw(torch.from_numpy(second)[None, None], torch.tensor([motion]))
-    return first, back[0, 0].numpy(), inside[0].numpy() > 0
+    warped, inside = warp_grid.draw(torch.from_numpy(second)[None, None], torch.tensor([motion]))
+    return first, warped[0, 0].numpy(), inside[0].numpy() > 0
 
 
 def smooth(image: NDArray[np.float32], comparison: Comparison) -> NDArray[np.float32]:
@@ -817,7 +825,7 @@ class ResponseNetwork(Trained):
 
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
         self.force = force
-        self._take(checkpoint)
+        self._set_checkpoint(checkpoint)
 
     def estimate(self, responses: ImpulseResponses, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion from the first to the last ping, with the covariance of validation.
@@ -825,7 +833,7 @@ class ResponseNetwork(Trained):
         A network trained without turns returns zero yaw with zero variance, as ``likelihood`` does.
 
         Args:
-            responses: as many pings as in training.
+            responses: the same number of pings as in training.
             prior: ignored: the network answers in the range of its training.
 
         Raises:
@@ -833,11 +841,11 @@ class ResponseNetwork(Trained):
         """
         count = self._checkpoint.arrangement["frames"]
         if len(responses) != count:
-            raise MitsonarError(f"this {self._checkpoint.network} is given {count} pings: got {len(responses)}")
+            raise MitsonarError(f"this {self._checkpoint.network} takes {count} pings: got {len(responses)}")
         pings = pings_of(responses)
         self._check_channel(responses.sonar)
         if len(pings.silent) == len(responses.sonar.receivers):
-            return rejected("no receiver heard anything")
+            return rejected("no receiver has any echo")
         inputs = torch.from_numpy(packed(pings.response)[None, None])
         with torch.inference_mode(), one_thread():
             targets, _ = self._checkpoint.decode(answer_of(self._network, inputs))
@@ -859,20 +867,23 @@ class ResponseNetwork(Trained):
         variances[: len(rmse)] = (rmse / [axis.scale for axis in AXES[: len(rmse)]]) ** 2
         return np.diag(variances)
 
-    def _check_channel(self, has: ChannelSonar) -> None:
+    def _check_channel(self, sonar: ChannelSonar) -> None:
         """Raise an error for an instrument or model of echoes other than that of training, unless forced."""
         trained = self._checkpoint.channel
         if trained is None or self.force:
             return
-        left_out = {*UNREAD, *(() if trained.model == has.model == "rays" else ("rays",))}
-        mine, its = (one.model_dump(exclude=left_out) for one in (trained, has))
-        receivers = mine.pop("receivers") != its.pop("receivers")
-        unlike = [f"{name} {its[name]}, not {value}" for name, value in mine.items() if value != its[name]]
-        unlike += ["other receivers"] if receivers else []
-        if unlike:
+        left_out = {*UNREAD, *(() if trained.model == sonar.model == "rays" else ("rays",))}
+        trained_fields, fields = (one.model_dump(exclude=left_out) for one in (trained, sonar))
+        receivers = trained_fields.pop("receivers") != fields.pop("receivers")
+        differences = [
+            f"{name} {fields[name]}, not {value}" for name, value in trained_fields.items() if value != fields[name]
+        ]
+        differences += ["other receivers"] if receivers else []
+        if differences:
             raise MitsonarError(
                 f"this {self._checkpoint.network} was trained on the channel sonar {trained.name}, the responses are of "
-                f"{has.name}: {'; '.join(unlike)}; train on that one, use {self.instead}, or force it with RUN:force=1"
+                f"{sonar.name}: {'; '.join(differences)}; train on that one, use {self.instead}, or force it with "
+                "RUN:force=1"
             )
 
     def _rejection_of_height(self, responses: ImpulseResponses) -> str:
@@ -883,13 +894,13 @@ class ResponseNetwork(Trained):
         height = float(np.mean(responses.height_m))
         if low * (1 - HEIGHT_OFF) <= height <= high * (1 + HEIGHT_OFF):
             return ""
-        return f"the transmitter stood at {height:.2f} m: {self._checkpoint.fixed} are fixed by training"
+        return f"the transmitter was at {height:.2f} m: {self._checkpoint.fixed} are fixed by training"
 
 
 # ---------------- Networks of several views or vectors
 
 
-ALIKE = 0.4
+LEAST_PROFILE_CORRELATION = 0.4
 """Smallest valid correlation of two pings' profiles without their slow variation, the median over the views.
 
 Pairs 20 mm apart from 10 m have 0.8 to 0.97 at 512 and 1024 levels. Pings of different places have less than 0.4, except
@@ -899,15 +910,15 @@ for the vector of a whole view.
 SLOW = 4.0
 """Standard deviation of the filter that defines the slow variation [bins]."""
 
-FEW = 256
+FEWEST_LEVELS = 256
 """Number of levels below which profiles of any two places are similar, so that they are not compared."""
 
 
 def reads_views(checkpoint: Checkpoint) -> bool:
     """Return whether a network takes several views, a portion of one, or vectors as a data set stores them."""
-    words = checkpoint.arrangement
-    vectors = words["kind"] == "vector" and not words.get("halves", False)
-    return vectors or len(words["views"]) > 1 or words["views"][0] in SEGMENTS
+    settings = checkpoint.arrangement
+    vectors = settings["kind"] == "vector" and not settings.get("halves", False)
+    return vectors or len(settings["views"]) > 1 or settings["views"][0] in SEGMENTS
 
 
 @dataclass(init=False, eq=False)
@@ -932,11 +943,11 @@ class ViewNetwork(Trained):
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
         if checkpoint.arrangement["frames"] != 2:
             raise MitsonarError(
-                f"an estimator has two frames: this {checkpoint.network} is given {checkpoint.arrangement['frames']}; use "
+                f"an estimator has two frames: this {checkpoint.network} takes {checkpoint.arrangement['frames']}; use "
                 "`mitsonar evaluate`, or another checkpoint"
             )
         self.force = force
-        self._take(checkpoint)
+        self._set_checkpoint(checkpoint)
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -974,8 +985,8 @@ class ViewNetwork(Trained):
         views = ", ".join(self.views)
         if not isinstance(frames, ViewFrames):
             raise MitsonarError(
-                f"this {self._checkpoint.network} is given {self.kind}s of {views}: use `mitsonar odometry` or `mitsonar "
-                "evaluate` on a data set that holds them"
+                f"this {self._checkpoint.network} takes {self.kind}s of {views}: use `mitsonar odometry` or `mitsonar evaluate` "
+                "on a data set that holds them"
             )
         if len(frames) != 2 or any(view not in frames.values for view in self.views):
             raise MitsonarError(f"two pings of {views} are needed: got {len(frames)} of {', '.join(frames.values)}")
@@ -987,12 +998,14 @@ def _rejection_of_profiles(profiles: NDArray[np.float32]) -> str:
 
     Their quick variation along range must correlate.
     """
-    if profiles.shape[2] < FEW:
+    if profiles.shape[2] < FEWEST_LEVELS:
         return ""
     quick = profiles - gaussian_filter1d(profiles, SLOW, axis=2)
-    found = []
+    correlations = []
     for first, second in quick:
         shifted = [(first[3 : len(first) - 3], second[3 + lag : len(second) - 3 + lag]) for lag in range(-3, 4)]
-        found.append(max(np.vdot(a, b) / np.sqrt(np.vdot(a, a) * np.vdot(b, b) + 1e-12) for a, b in shifted))
-    alike = float(np.median(found))
-    return "" if alike >= ALIKE else f"the profiles of both pings correlate by {alike:.2f} only"
+        correlations.append(max(np.vdot(a, b) / np.sqrt(np.vdot(a, a) * np.vdot(b, b) + 1e-12) for a, b in shifted))
+    correlation = float(np.median(correlations))
+    return (
+        "" if correlation >= LEAST_PROFILE_CORRELATION else f"the profiles of both pings correlate by {correlation:.2f} only"
+    )

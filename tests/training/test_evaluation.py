@@ -151,7 +151,7 @@ def posed(frames: SonarFrames, column: int, value: float, **fields: Any) -> Sona
         (lambda f: changed(f, image=np.stack([f.image[0], np.full_like(f.image[0], 0.5)])), "nothing in the frames"),
         (lambda f: changed(f, image=np.random.default_rng(0).random(f.image.shape, dtype=np.float32)), "correlate by"),
         (lambda f: changed(f, image=np.stack([f.image[0], f.image[0, ::-1]])), "correlate by"),
-        (lambda f: posed(f, 2, 2.1, height_m=np.full(2, 2.1)), "stood at 2.10 m: height 2.5 m"),
+        (lambda f: posed(f, 2, 2.1, height_m=np.full(2, 2.1)), "was at 2.10 m: height 2.5 m"),
         (lambda f: posed(f, 3, np.radians(38)), "a pitch of 38.0 deg: height 2.5 m, pitch 35 deg"),
         (lambda f: posed(f, 4, np.radians(-4)), "a roll of -4.0 deg"),
     ],
@@ -224,7 +224,7 @@ def test_checkpoints_that_two_frames_cannot_serve(checkpoint: Checkpoint) -> Non
     for change in ({"frames": 3}, {"views": ["left", "right"]}, {"kind": "vector", "views": ["q1", "q2"]}):
         with pytest.raises(MitsonarError, match=r"two frames of one view.*evaluate"):
             ImageNetwork(replace(checkpoint, arrangement={**words, **change}))
-    with pytest.raises(MitsonarError, match=r"given no geometry: height 2\.5 m, pitch 35 deg are fixed by training"):
+    with pytest.raises(MitsonarError, match=r"takes no geometry: height 2\.5 m, pitch 35 deg are fixed by training"):
         ImageNetwork(checkpoint, height_m=2.0)
 
 
@@ -308,7 +308,7 @@ def test_estimators_are_named_by_checkpoint_or_folder(
     for text, words in {
         f"{run}:force=2": "force must be 0 or 1",
         f"{run}:levels=2": "takes force, height_m, pitch_deg, relief_m",
-        f"{run}:height_m=2": "given no geometry",
+        f"{run}:height_m=2": "takes no geometry",
         f"{run}/absent.ckpt": "no checkpoint",
         str(tmp_path): "holds no network.ckpt",
         "dierct": "did you mean direct.*or give a checkpoint",

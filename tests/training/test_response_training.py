@@ -280,7 +280,7 @@ def test_it_refuses_what_it_was_not_trained_for(made: Path, run: Path) -> None:
     assert forced.covariance is not None
     elsewhere = estimator.estimate(records(pairs, 0, height_m=np.full(3, 44.0)))
     assert not elsewhere.valid
-    assert "stood at 44.00 m" in elsewhere.reason
+    assert "was at 44.00 m" in elsewhere.reason
     loud = records(pairs, 0)
     silent = estimator.estimate(ImpulseResponses(0 * loud.response, loud.time_s, loud.sonar, height_m=loud.height_m))
-    assert (silent.valid, silent.reason) == (False, "no receiver heard anything")
+    assert (silent.valid, silent.reason) == (False, "no receiver has any echo")

@@ -92,10 +92,10 @@ class Correlation:
         received = [_products(responses.sonar, z, number, height) for number, z in enumerate(pings.response.swapaxes(0, 1))]
         received = [one for one in received if one.energy.any()]
         if not received:
-            return rejected("no receiver heard anything")
+            return rejected("no receiver has any echo")
         if np.linalg.matrix_rank(np.array([one.look for one in received]), tol=0.1) < 2:
-            deaf = f" (nothing heard: {', '.join(pings.silent)})" if pings.silent else ""
-            return rejected(f"receivers that hear look along one line{deaf}: motions across it do not show")
+            silent = f" (silent: {', '.join(pings.silent)})" if pings.silent else ""
+            return rejected(f"the receivers with echoes look along one line{silent}: motions across it do not show")
         reach = reach_of(pings.interval_s, self.speed, responses.sonar.wavelength_m, MOST_WAVES)
         coarse, reason = _coarse(received, reach, responses.sonar.wavelength_m * STEP)
         motion = (len(responses) - 1) * _fine(received, coarse)
@@ -131,12 +131,12 @@ def _coarse(received: list[Products], reach: float, step: float) -> tuple[Array,
     line = np.linspace(-reach, reach, 2 * math.ceil(reach / step) + 1)
     sideways, forward = np.meshgrid(line, line, indexing="ij")
     total, spread = np.zeros(sideways.shape), 0.0
-    far = np.linspace(-1.5 * reach, 1.5 * reach, 6 * math.ceil(reach / step) + 1)
+    displacements = np.linspace(-1.5 * reach, 1.5 * reach, 6 * math.ceil(reach / step) + 1)
     # compensate each receiver for motions along its axis, and add its sums to the map of motions
-    for one in received:
-        weight = one.product / max(float(one.energy.sum()), 1e-300)
-        sums = (np.exp(1j * far[:, None] * one.turn) @ weight).real
-        total += np.interp(one.look[0] * sideways + one.look[1] * forward, far, sums)
+    for receiver in received:
+        weight = receiver.product / max(float(receiver.energy.sum()), 1e-300)
+        sums = (np.exp(1j * displacements[:, None] * receiver.turn) @ weight).real
+        total += np.interp(receiver.look[0] * sideways + receiver.look[1] * forward, displacements, sums)
         spread += float((np.abs(weight) ** 2).sum()) / 2
     # compare the largest maximum with that of unrelated pings, and with the second
     peaks = np.argwhere((total == maximum_filter(total, size=5)) & (total > 0))
@@ -146,25 +146,25 @@ def _coarse(received: list[Products], reach: float, step: float) -> tuple[Array,
     best = total[tuple(peaks[0])]
     reason = "" if best > LEAST * math.sqrt(spread) else "the pings have nothing in common"
     if not reason and len(peaks) > 1 and total[tuple(peaks[1])] > CLOSE * best:
-        reason = "two motions fit alike"
+        reason = "two motions fit equally well"
     return line[peaks[0]], reason
 
 
 def _fine(received: list[Products], motion: Array) -> Array:
     """Refine a motion ``(2,)`` [m] by the residual phases."""
     for _ in range(3):
-        information, pull = np.zeros((2, 2)), np.zeros(2)
+        information, gradient = np.zeros((2, 2)), np.zeros(2)
         # residual phase of each window, after the current motion is compensated
-        for one in received:
-            product = _windows(one.product * np.exp(1j * (one.look @ motion) * one.turn))
-            energy = _windows(one.energy)
-            turn = _windows(one.turn * one.energy) / np.maximum(energy, 1e-300)
+        for receiver in received:
+            product = _windows(receiver.product * np.exp(1j * (receiver.look @ motion) * receiver.turn))
+            energy = _windows(receiver.energy)
+            turn = _windows(receiver.turn * receiver.energy) / np.maximum(energy, 1e-300)
             likeness = np.minimum(np.abs(product) / np.maximum(energy, 1e-300), 0.999)
             # variance of the phase of the mean of n products (Rodriguez and Martin, 1992)
             weight = np.where(energy > 0, 2 * WINDOW * likeness**2 / (1 - likeness**2), 0)
-            information += (weight * turn**2).sum() * np.outer(one.look, one.look)
-            pull += (weight * turn * -np.angle(product)).sum() * one.look
-        motion = motion + np.linalg.lstsq(information, pull, rcond=None)[0]
+            information += (weight * turn**2).sum() * np.outer(receiver.look, receiver.look)
+            gradient += (weight * turn * -np.angle(product)).sum() * receiver.look
+        motion = motion + np.linalg.lstsq(information, gradient, rcond=None)[0]
     return motion
 
 
@@ -209,7 +209,8 @@ def pings_of(responses: ImpulseResponses) -> Pings:
     interval = float(steps.mean())
     if not (np.isfinite(interval) and interval > 0 and (np.abs(steps - interval) <= UNEVEN * interval).all()):
         raise MitsonarError(
-            f"pings must come at equal times that rise: got steps of {steps.min():g} to {steps.max():g} s; select such pings"
+            f"pings must be evenly spaced in increasing time: got steps of {steps.min():g} to {steps.max():g} s; select "
+            "such pings"
         )
     quiet = np.asarray(~responses.response.any(axis=2).all(axis=0), dtype=bool)
     names = tuple(one.name for number, one in enumerate(responses.sonar.receivers) if quiet[number])
@@ -225,8 +226,8 @@ def reach_of(interval_s: float, speed: float, wavelength_m: float, most_waves: f
     reach = speed * interval_s
     if reach > most_waves * wavelength_m:
         raise MitsonarError(
-            f"pings {interval_s:g} s apart at up to {speed:g} m/s leave motions of up to {reach:.3g} m open, "
-            f"{reach / wavelength_m:.3g} wavelengths, of which at most {most_waves:g} can be searched: measure more often, "
+            f"pings {interval_s:g} s apart at up to {speed:g} m/s allow motions of up to {reach:.3g} m, "
+            f"{reach / wavelength_m:.3g} wavelengths, of which {most_waves:g} can be searched: measure more often, "
             f"or give the estimator a lower speed (NAME:speed={most_waves * wavelength_m / interval_s:.2g})"
         )
     return reach
@@ -275,13 +276,13 @@ class Band(NamedTuple):
     place: NDArray[np.int64]
     gain: NDArray[np.float64]
 
-    def of(self, response: Complex) -> Complex:
+    def part_of(self, response: Complex) -> Complex:
         """Return the response of this part ``(..., taps)`` from the response of the whole band."""
         return np.asarray(np.fft.ifft(np.fft.fft(response, axis=-1)[..., self.place] * self.gain, axis=-1))
 
 
 def bands_of(sonar: ChannelSonar, width_hz: float = BAND_HZ) -> list[Band]:
-    """Divide an instrument's band into as many equally sampled parts as are at least ``width_hz`` wide.
+    """Divide an instrument's band into equally sampled parts, the narrowest that are at least ``width_hz`` wide.
 
     For unknown scatterers, frequencies farther apart than one over the spread of delays (some 100 Hz) are independent. Parts
     of a band that do not overlap therefore hold independent information on the motion; each is a channel sonar with a
@@ -292,7 +293,7 @@ def bands_of(sonar: ChannelSonar, width_hz: float = BAND_HZ) -> list[Band]:
     while sonar.taps % count:
         count -= 1
     step, spacing = sonar.frequency_step_hz, (1 + sonar.rolloff) * sonar.bandwidth_hz / count
-    found = []
+    bands = []
     for number in range(count):
         # the centre lies on the grid of frequencies, so that a part is a choice of the whole band's frequencies
         offset = step * round((number - (count - 1) / 2) * spacing / step)
@@ -304,5 +305,5 @@ def bands_of(sonar: ChannelSonar, width_hz: float = BAND_HZ) -> list[Band]:
         frequency = np.asarray(np.fft.fftfreq(part.taps, 1 / part.sampling_hz), dtype=np.float64)
         whole = sonar.raised_cosine(frequency + offset)
         gain = np.where(whole > FAINT, part.raised_cosine(frequency) / np.maximum(whole, FAINT), 0) / count
-        found.append(Band(part, np.rint((frequency + offset) / step).astype(np.int64) % sonar.taps, gain))
-    return found
+        bands.append(Band(part, np.rint((frequency + offset) / step).astype(np.int64) % sonar.taps, gain))
+    return bands

@@ -94,8 +94,8 @@ def link_response(
     there, back = np.sqrt((sent**2).sum(axis=0)), np.sqrt((received**2).sum(axis=0))
     # the receiver moves while the sound travels
     speed = np.asarray(velocity, dtype=float)
-    own = np.array([speed[0] * cos - speed[1] * sin, speed[0] * sin + speed[1] * cos, 0.0])
-    delay = np.asarray(delay_exact(list(sent), list(received), list(own), sonar.sound_speed))
+    velocity_in_axes = np.array([speed[0] * cos - speed[1] * sin, speed[0] * sin + speed[1] * cos, 0.0])
+    delay = np.asarray(delay_exact(list(sent), list(received), list(velocity_in_axes), sonar.sound_speed))
     # amplitude: sensitivities, the cosines of incidence and reflection, and spreading
     amplitude = _sensitivity(sonar, None, sent / there) * _sensitivity(sonar, receiver, received / back)
     amplitude *= np.sqrt(height_m / there * (height_m + up) / back)
@@ -200,13 +200,15 @@ class ResponseCovariance:
         sideways, forward, yaw, heave = _four(motion)
         # eq. 3.4 counts along the new heading, which differs by half the turn from that at the midpoint
         cos, sin = math.cos(yaw / 2), math.sin(yaw / 2)
-        way = np.array([sideways * cos + forward * sin, forward * cos - sideways * sin])
-        found = []
+        displacement = np.array([sideways * cos + forward * sin, forward * cos - sideways * sin])
+        links = []
         for half in (-lag / 2, lag / 2):
-            pose, height = (*(half * way), half * yaw), self.height_m + half * heave
-            velocity = _clockwise(way, half * yaw) / self.interval_s  # along the arc whose chord is the displacement
-            found.append(link_response(self.sonar, self.receiver, height, self.nodes.points, pose, velocity))
-        return found[0], found[1]
+            pose, height = (*(half * displacement), half * yaw), self.height_m + half * heave
+            velocity = (
+                _clockwise(displacement, half * yaw) / self.interval_s
+            )  # along the arc whose chord is the displacement
+            links.append(link_response(self.sonar, self.receiver, height, self.nodes.points, pose, velocity))
+        return links[0], links[1]
 
     def covariance(self, motion: ArrayLike, lag: float = 1.0) -> Complex:
         """Return E[h_i h_j*] of taps i of the earlier and j of the later ping ``(taps, taps)``; ``lag`` 0: of one ping.
@@ -230,38 +232,38 @@ class ResponseCovariance:
             step[number] = STEP
             (low_i, low_j), (high_i, high_j) = (self.link_responses(_four(motion) + sign * step, lag) for sign in (-1, 1))
             amplitude = high_i.amplitude * high_j.amplitude - low_i.amplitude * low_j.amplitude
-            way = (high_i.delay - high_j.delay) - (low_i.delay - low_j.delay)
-            weights.append((amplitude - 2j * np.pi * self.sonar.carrier_hz * weight * way) / (2 * STEP))
+            delay_change = (high_i.delay - high_j.delay) - (low_i.delay - low_j.delay)
+            weights.append((amplitude - 2j * np.pi * self.sonar.carrier_hz * weight * delay_change) / (2 * STEP))
         return self._taps_of(self._spectra(first, second, self.nodes.area * np.array(weights)))
 
     def _spectra(self, first: LinkResponse, second: LinkResponse, weight: NDArray[np.inexact]) -> Complex:
         """Integrate n weights over the ground at the frequencies of both pings ``(n, frequencies, frequencies)``."""
         import finufft
 
-        middle, period, made = self.synthesis
+        middle, period, synthesis = self.synthesis
         x = 2 * np.pi / period * (first.delay - middle)
         y = -2 * np.pi / period * (second.delay - middle)
-        turned = weight * np.exp(-2j * np.pi * self.sonar.carrier_hz * (first.delay - second.delay))
-        count = made.shape[1]
-        found = finufft.nufft2d1(x, y, turned, (count, count), eps=PRECISION, isign=-1, nthreads=1)
-        return np.asarray(found, dtype=np.complex128).reshape(len(weight), count, count)
+        carrier_weight = weight * np.exp(-2j * np.pi * self.sonar.carrier_hz * (first.delay - second.delay))
+        count = synthesis.shape[1]
+        spectra = finufft.nufft2d1(x, y, carrier_weight, (count, count), eps=PRECISION, isign=-1, nthreads=1)
+        return np.asarray(spectra, dtype=np.complex128).reshape(len(weight), count, count)
 
     def _taps_of(self, spectra: Complex) -> Complex:
         """Return the taps of both pings ``(n, taps, taps)`` from spectra ``(n, frequencies, frequencies)``."""
-        made = self.synthesis[2]
-        return np.asarray(made @ spectra @ made.conj().T)
+        synthesis = self.synthesis[2]
+        return np.asarray(synthesis @ spectra @ synthesis.conj().T)
 
 
-def _clockwise(way: Array, turn: float) -> Array:
+def _clockwise(displacement: Array, turn: float) -> Array:
     """Turn a level displacement clockwise."""
     cos, sin = math.cos(turn), math.sin(turn)
-    return np.array([way[0] * cos + way[1] * sin, way[1] * cos - way[0] * sin])
+    return np.array([displacement[0] * cos + displacement[1] * sin, displacement[1] * cos - displacement[0] * sin])
 
 
 def _four(motion: ArrayLike) -> Array:
     """Return sideways, forward, yaw and rise of a motion; a missing rise is 0."""
-    given = np.asarray(motion, dtype=float)
-    return np.append(given, 0.0) if len(given) == 3 else given
+    values = np.asarray(motion, dtype=float)
+    return np.append(values, 0.0) if len(values) == 3 else values
 
 
 def _panels(start: float, end: float, panels: int, nodes: int) -> tuple[Array, Array]:
@@ -275,17 +277,17 @@ def _panels(start: float, end: float, panels: int, nodes: int) -> tuple[Array, A
 def _extent(sonar: ChannelSonar, receiver: Hydrophone, height_m: float) -> tuple[Array, tuple[Array, Array]]:
     """Return the footprint of a receiver: positions along its axis ``(n,)``, and its two edges across ``(n,)`` each [m]."""
     # which points of a grid in the receiver's axes it receives
-    far = math.sqrt(max(sonar.range_max**2 - height_m**2, 0.0))
+    farthest = math.sqrt(max(sonar.range_max**2 - height_m**2, 0.0))
     step = height_m / 200
-    line = np.arange(-far - step, far + 2 * step, step)
+    line = np.arange(-farthest - step, farthest + 2 * step, step)
     turn = math.radians(receiver.field.heading_deg)
     u, w = np.meshgrid(line, line, indexing="ij")
     x, y = u * math.sin(turn) + w * math.cos(turn), u * math.cos(turn) - w * math.sin(turn)
     links = link_response(sonar, receiver, height_m, np.stack([x.ravel(), y.ravel()], axis=1), (0, 0, 0), (0, 0))
-    received = (links.amplitude > 0).reshape(u.shape) & (np.hypot(u, w) <= far)
+    received = (links.amplitude > 0).reshape(u.shape) & (np.hypot(u, w) <= farthest)
     if not received.any():
         raise MitsonarError(
-            f"receiver {receiver.name} hears no level ground {height_m:g} m below within {sonar.range_max:g} m: "
+            f"receiver {receiver.name} receives no echo of level ground {height_m:g} m below within {sonar.range_max:g} m: "
             "tilt it down, or raise range_max"
         )
     # edges of each row that has such points, with a margin around

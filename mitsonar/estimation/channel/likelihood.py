@@ -73,7 +73,7 @@ MOST_WAVES = 25.0
 PLACES = 33
 """Number of motions across an axis for which the likelihood is computed."""
 
-ALIKE = 0.01
+AMBIGUOUS_SHARE = 0.01
 """Probability from which a mode counts as ambiguous."""
 
 UNSURE = 0.15
@@ -148,23 +148,23 @@ class Likelihood:
         height = assumed_height(responses, "likelihood", self.height_m)
         received = [k for k, one in enumerate(responses.sonar.receivers) if one.name not in pings.silent]
         if not received:
-            return rejected("no receiver heard anything")
+            return rejected("no receiver has any echo")
         reach = reach_of(pings.interval_s, self.speed, responses.sonar.wavelength_m, MOST_WAVES)
         bands = bands_of(responses.sonar)
         receiver_bands, data = [], []
         for band in bands:
-            part = band.of(pings.response)
+            part = band.part_of(pings.response)
             for receiver_band in receiver_bands_of(band.sonar, height, pings.interval_s, 1.1 * reach):
                 if receiver_band.number in received:
                     receiver_bands.append(receiver_band)
                     data.append(part[:, receiver_band.number, receiver_band.law.taps])
-        search = Search.of(bands, pings.response, height, pings.interval_s, reach, received)
-        found = self._modes(receiver_bands, data, search)
-        alone = sum(
+        search = Search.from_response(bands, pings.response, height, pings.interval_s, reach, received)
+        modes = self._modes(receiver_bands, data, search)
+        unrelated = sum(
             judged(receiver_band, z, np.zeros(4), (), 0).likelihood
             for receiver_band, z in zip(receiver_bands, data, strict=True)
         )
-        return self._answer(found, alone, responses, pings.silent)
+        return self._combined(modes, unrelated, responses, pings.silent)
 
     @property
     def free(self) -> tuple[int, ...]:
@@ -173,57 +173,59 @@ class Likelihood:
 
     def _modes(self, receiver_bands: list[ReceiverBand], data: list[Complex], search: Search) -> list[Mode]:
         """Return the modes, the most probable first."""
-        near = NEAR * receiver_bands[0].law.sonar.wavelength_m
+        near_m = NEAR * receiver_bands[0].law.sonar.wavelength_m
         # 1. refine the best motion of the search, then others along its less certain axis
-        found = [refined(receiver_bands, data, np.array([*search.peaks()[0], 0.0, 0.0]), self.free, 1)]
-        for number, start in enumerate(across_from(receiver_bands, data, search, found[0])[: self.modes + 1]):
-            if number == 0 or all(np.abs(start - one.motion[:2]).max() > near for one in found):
+        modes = [refined(receiver_bands, data, np.array([*search.peaks()[0], 0.0, 0.0]), self.free, 1)]
+        for number, start in enumerate(across_from(receiver_bands, data, search, modes[0])[: self.modes + 1]):
+            if number == 0 or all(np.abs(start - one.motion[:2]).max() > near_m for one in modes):
                 mode = refined(receiver_bands, data, np.array([*start, 0.0, 0.0]), self.free, 1)
-                if all(_apart(mode, other) > APART for other in found):
-                    found.append(mode)
+                if all(_distance(mode, known) > APART for known in modes):
+                    modes.append(mode)
         # 2. add turns; their sign is hardly observable
         if self.yaw:
-            found = self._turned(receiver_bands, data, found)
+            modes = self._with_turns(receiver_bands, data, modes)
         # 3. refine the probable modes again, conditioned on more pings
         depth = min(SURE_PINGS, len(data[0]) - 1)
         if depth > 1:
-            best = max(one.mass for one in found)
-            found = [refined(receiver_bands, data, one.motion, self.free, depth) for one in found if one.mass > best - 20]
-        return sorted(found, key=lambda one: -one.mass)
+            best = max(one.mass for one in modes)
+            modes = [refined(receiver_bands, data, one.motion, self.free, depth) for one in modes if one.mass > best - 20]
+        return sorted(modes, key=lambda one: -one.mass)
 
-    def _turned(self, receiver_bands: list[ReceiverBand], data: list[Complex], found: list[Mode]) -> list[Mode]:
+    def _with_turns(self, receiver_bands: list[ReceiverBand], data: list[Complex], modes: list[Mode]) -> list[Mode]:
         """Add modes from initial turns to both sides, since the loss of coherence hardly shows the sign of a turn."""
-        all_ = list(found)
-        for mode in found:
+        extended = list(modes)
+        for mode in modes:
             for yaw in TURNS:
-                other = refined(
+                turned = refined(
                     receiver_bands, data, np.array([*mode.motion[:2], yaw / max(1, len(data[0]) - 1), 0.0]), self.free, 1
                 )
-                if other.likelihood > found[0].likelihood - 20 and all(_far(other, one) for one in all_):
-                    all_.append(other)
-        return all_
+                if turned.likelihood > modes[0].likelihood - 20 and all(_is_distinct(turned, one) for one in extended):
+                    extended.append(turned)
+        return extended
 
-    def _answer(self, found: list[Mode], alone: float, responses: ImpulseResponses, silent: tuple[str, ...]) -> Estimate:
+    def _combined(
+        self, modes: list[Mode], unrelated: float, responses: ImpulseResponses, silent: tuple[str, ...]
+    ) -> Estimate:
         """Combine several modes into one estimate."""
         intervals, wavelength_m = len(responses) - 1, responses.sonar.wavelength_m
         # mean and covariance of the mixture of modes
-        mass = np.array([one.mass for one in found])
+        mass = np.array([one.mass for one in modes])
         share = np.exp(mass - mass.max())
         share /= share.sum()
         free = list(self.free)
-        places = np.array([one.motion for one in found])
-        mean = share @ places
+        motions = np.array([one.motion for one in modes])
+        mean = share @ motions
         spread = np.zeros((4, 4))
-        for part, one in zip(share, found, strict=True):
+        for part, one in zip(share, modes, strict=True):
             spread[np.ix_(free, free)] += part * one.covariance
             spread += part * np.outer(one.motion - mean, one.motion - mean)
         # a motion must explain more than unrelated pings do
-        gain = found[0].likelihood - alone
-        listed = list(zip(share, found, strict=True)) if gain >= LEAST_GAIN else []
+        gain = modes[0].likelihood - unrelated
+        listed = list(zip(share, modes, strict=True)) if gain >= LEAST_GAIN else []
         about: PlainTable = {
-            "modes": [(float(part), *(float(v) for v in _whole(one.motion, intervals))) for part, one in listed],
-            "spreads": [_spread_of(one, free, intervals) for _, one in listed],
-            "noise": [float(v) for v in found[0].noise],
+            "modes": [(float(part), *(float(v) for v in _over_intervals(one.motion, intervals))) for part, one in listed],
+            "spreads": [_covariance_of(one, free, intervals) for _, one in listed],
+            "noise": [float(v) for v in modes[0].noise],
             "gain": gain,
             "silent": silent,
         }
@@ -237,12 +239,12 @@ class Likelihood:
         if not reason and abs(turn) > self.turn_rate * span:
             reason = f"turns by {np.degrees(turn):.2g} deg, faster than {np.degrees(self.turn_rate):.3g} deg/s"
         if not reason and ambiguous > UNSURE * wavelength_m:
-            alike = int((share > ALIKE).sum())
-            reason = f"{f'{alike} motions fit alike: ' if alike > 1 else ''}known to {1e3 * ambiguous:.0f} mm only"
-        return Estimate(_whole(mean, intervals), covariance, not reason, reason, about)
+            count = int((share > AMBIGUOUS_SHARE).sum())
+            reason = f"{f'{count} motions fit equally well: ' if count > 1 else ''}known to {1e3 * ambiguous:.0f} mm only"
+        return Estimate(_over_intervals(mean, intervals), covariance, not reason, reason, about)
 
 
-def _spread_of(mode: Mode, free: list[int], intervals: int) -> list[list[float]]:
+def _covariance_of(mode: Mode, free: list[int], intervals: int) -> list[list[float]]:
     """Return the covariance of sideways, forward [m], yaw [rad] of a mode over all intervals."""
     spread = np.zeros((4, 4))
     spread[np.ix_(free, free)] = mode.covariance
@@ -259,44 +261,44 @@ def across_from(receiver_bands: list[ReceiverBand], data: list[Complex], search:
     # likelihood along the less certain axis, summed over the receivers
     axis = int(np.diag(mode.covariance)[:2].argmax())
     total = np.zeros(len(search.line))
-    few = np.linspace(search.line[0], search.line[-1], PLACES)
+    sampled = np.linspace(search.line[0], search.line[-1], PLACES)
     for number, (receiver_band, z) in enumerate(zip(receiver_bands, data, strict=True)):
         if abs(receiver_band.turn[1, axis]) > 0.5:
             total += search.along(number, mode.motion, axis)
         else:
             values = np.array(
-                [judged(receiver_band, z, _moved(mode.motion, axis, place), (), 1).likelihood for place in few]
+                [judged(receiver_band, z, _with_component(mode.motion, axis, place), (), 1).likelihood for place in sampled]
             )
-            total += PchipInterpolator(few, values)(search.line)
+            total += PchipInterpolator(sampled, values)(search.line)
     # its maxima that are not hopeless, best first
     peaks = np.flatnonzero(total == maximum_filter(total, size=5))
     peaks = peaks[(total > total.max() - HOPELESS)[peaks]]
     peaks = peaks[np.argsort(-total[peaks])]
     places = [-mode.motion[axis], *search.line[peaks]]
-    return np.array([_moved(mode.motion, axis, float(place))[:2] for place in places])
+    return np.array([_with_component(mode.motion, axis, float(place))[:2] for place in places])
 
 
-def _moved(motion: Array, axis: int, place: float) -> Array:
+def _with_component(motion: Array, axis: int, value: float) -> Array:
     """Return a motion with another value along an axis."""
-    there = motion.copy()
-    there[axis] = place
-    return there
+    moved = motion.copy()
+    moved[axis] = value
+    return moved
 
 
-def _apart(one: Mode, other: Mode) -> float:
+def _distance(one: Mode, other: Mode) -> float:
     """Return the distance of two modes in standard deviations of the less certain one."""
-    way = (one.motion - other.motion)[:2]
-    return float(np.sqrt(min(way @ np.linalg.solve(mode.covariance[:2, :2], way) for mode in (one, other))))
+    difference = (one.motion - other.motion)[:2]
+    return float(np.sqrt(min(difference @ np.linalg.solve(mode.covariance[:2, :2], difference) for mode in (one, other))))
 
 
-def _far(one: Mode, other: Mode) -> bool:
+def _is_distinct(one: Mode, other: Mode) -> bool:
     """Return whether two modes differ by more than a few standard deviations in position or turn."""
-    way = (one.motion - other.motion)[:3]
+    difference = (one.motion - other.motion)[:3]
     spread = np.sqrt(np.maximum(np.diag(one.covariance)[:3], np.diag(other.covariance)[:3]))
-    return bool((np.abs(way) > APART * np.maximum(spread, 1e-6)).any())
+    return bool((np.abs(difference) > APART * np.maximum(spread, 1e-6)).any())
 
 
-def _whole(motion: Array, intervals: int) -> Motion:
+def _over_intervals(motion: Array, intervals: int) -> Motion:
     """Compose a constant motion over many intervals, along the last heading (Almanza-Medina, eq. 3.4)."""
     sideways, forward, yaw = motion[:3]
     turn = (intervals - 1) * yaw / 2
@@ -312,36 +314,38 @@ def refined(receiver_bands: list[ReceiverBand], data: list[Complex], motion: Arr
     """Refine a motion to the nearest maximum of the likelihood."""
     columns = list(free)
 
-    def judge(where: Array) -> list[MotionScore]:
-        return [judged(receiver_band, z, where, free, depth) for receiver_band, z in zip(receiver_bands, data, strict=True)]
+    def scores_at(at_motion: Array) -> list[MotionScore]:
+        return [
+            judged(receiver_band, z, at_motion, free, depth) for receiver_band, z in zip(receiver_bands, data, strict=True)
+        ]
 
-    said = judge(motion)
+    scores = scores_at(motion)
     for _ in range(STEPS):
         # scoring step from all receivers, limited in length
-        total = sum(one.likelihood for one in said)
-        information = sum((one.information for one in said), np.zeros((len(free),) * 2))
-        step = np.linalg.lstsq(information, sum((one.gradient for one in said), np.zeros(len(free))), rcond=None)[0]
+        total = sum(one.likelihood for one in scores)
+        information = sum((one.information for one in scores), np.zeros((len(free),) * 2))
+        step = np.linalg.lstsq(information, sum((one.gradient for one in scores), np.zeros(len(free))), rcond=None)[0]
         step *= min(1.0, LONGEST / float(np.abs(step).max() + 1e-12))
         # halve the step until the log likelihood decreases by less than LEVEL
         for _ in range(4):
-            there = motion.copy()
-            there[columns] += step
-            new = judge(there)
-            if sum(one.likelihood for one in new) > total - LEVEL:
-                motion, said = there, new
+            trial = motion.copy()
+            trial[columns] += step
+            trial_scores = scores_at(trial)
+            if sum(one.likelihood for one in trial_scores) > total - LEVEL:
+                motion, scores = trial, trial_scores
                 break
             step /= 2
         else:
             break
         if step @ information @ step < 0.2**2 * len(free):
             break
-    information = sum((one.information for one in said), np.zeros((len(free),) * 2))
+    information = sum((one.information for one in scores), np.zeros((len(free),) * 2))
     covariance = np.linalg.pinv(information, hermitian=True)
     return Mode(
         motion,
         np.asarray(covariance, dtype=float),
-        sum(one.likelihood for one in said),
-        np.array([one.noise for one in said]),
+        sum(one.likelihood for one in scores),
+        np.array([one.noise for one in scores]),
     )
 
 
@@ -374,26 +378,27 @@ def judged(receiver_band: ReceiverBand, response: Complex, motion: Array, free: 
     Each ping is conditioned on the ``depth`` pings before it. Level and variance of noise take their most likely values.
     """
     # 1. covariances by lag, and their derivatives, in the axes of the receiver
-    here, turn = receiver_band.turn @ motion, receiver_band.turn[np.ix_(free, free)]
-    blocks = [receiver_band.law.slopes(here, lag, free if lag else ()) for lag in range(depth + 1)]
+    receiver_motion, turn = receiver_band.turn @ motion, receiver_band.turn[np.ix_(free, free)]
+    blocks = [receiver_band.law.slopes(receiver_motion, lag, free if lag else ()) for lag in range(depth + 1)]
     taps = blocks[0].shape[1]
     power = float(np.diag(blocks[0][0]).real.mean())
     # 2. conditioning: likelihood of the long runs minus that of the runs that are conditioned on
     runs = [
-        _PingRuns.of(response, [block[0] for block in blocks[:pings]], sign) for pings, sign in ((depth + 1, 1), (depth, -1))
+        _PingRuns.from_response(response, [block[0] for block in blocks[:pings]], sign)
+        for pings, sign in ((depth + 1, 1), (depth, -1))
     ]
     parts = [part for part in runs if part is not None]
     # 3. most likely level for each candidate variance of noise, then the most likely variance
     noise = NOISE * power
     energy = sum(part.sign * (part.power[:, None] / (part.size[:, None] + noise)).sum(axis=0) for part in parts)
-    there = energy > 0  # the conditional energy may vanish where a motion does not fit at all
-    level = np.where(there, energy, 1.0) / response.size
+    positive = energy > 0  # the conditional energy may vanish where a motion does not fit at all
+    level = np.where(positive, energy, 1.0) / response.size
     log = sum(part.sign * part.count * np.log(part.size[:, None] + noise).sum(axis=0) for part in parts)
-    likelihood = np.where(there, -response.size * np.log(level) - log, -np.inf)
+    likelihood = np.where(positive, -response.size * np.log(level) - log, -np.inf)
     best = int(likelihood.argmax())
     # 4. gradient and information at these values
     gradient, information = np.zeros(len(free)), np.zeros((len(free),) * 2)
-    for part in parts if free and there[best] else []:
+    for part in parts if free and positive[best] else []:
         slopes = [
             block_toeplitz([np.zeros((taps, taps), dtype=complex), *(block[1 + k] for block in blocks[1 : part.pings])])
             for k in range(len(free))
@@ -412,18 +417,18 @@ class _PingRuns:
         pings: number of pings in a run.
         size: eigenvalues ``(n,)``.
         vectors: eigenvectors ``(n, n)``.
-        inside: the runs as coefficients of the eigenvectors ``(n, runs)``.
+        coefficients: the runs as coefficients of the eigenvectors ``(n, runs)``.
     """
 
     sign: int
     pings: int
     size: Array
     vectors: Complex
-    inside: Complex
+    coefficients: Complex
 
     @classmethod
-    def of(cls, response: Complex, blocks: list[Complex], sign: int) -> _PingRuns | None:
-        """Collect all runs of as many pings as there are blocks; runs that are conditioned on begin with the second ping."""
+    def from_response(cls, response: Complex, blocks: list[Complex], sign: int) -> _PingRuns | None:
+        """Collect all runs with one ping per block; runs that are conditioned on begin with the second ping."""
         first = 0 if sign > 0 else 1
         last = len(response) - len(blocks) + (0 if sign > 0 else -1)
         if not blocks or last < first:
@@ -506,18 +511,18 @@ def response_covariance_of(alone: ChannelSonar, height_m: float, interval_s: flo
 
 def receiver_bands_of(sonar: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> list[ReceiverBand]:
     """Return all receivers of an instrument, each turned forward."""
-    found = []
+    receiver_bands = []
     for number, receiver in enumerate(sonar.receivers):
         heading = math.radians(receiver.field.heading_deg)
         cos, sin = math.cos(heading), math.sin(heading)
         turn = np.eye(4)
         turn[:2, :2] = [[cos, -sin], [sin, cos]]
-        found.append(
+        receiver_bands.append(
             ReceiverBand(
                 response_covariance_of(single_receiver(sonar, receiver), height_m, interval_s, reach_m), turn, number
             )
         )
-    return found
+    return receiver_bands
 
 
 @dataclass(frozen=True)
@@ -540,20 +545,20 @@ class CovarianceTable:
     shared: NDArray[np.complex64]
 
     @classmethod
-    def of(cls, law: ResponseCovariance) -> Self:
+    def from_covariance(cls, law: ResponseCovariance) -> Self:
         """Compute the table for all motions within the reach of the covariance."""
         # whiten the strong directions of a single ping
-        own = law.covariance((0, 0, 0), 0)
-        power = float(np.diag(own).real.mean())
-        size, vectors = np.linalg.eigh(own + FLOOR * power * np.eye(len(own)))
+        single = law.covariance((0, 0, 0), 0)
+        power = float(np.diag(single).real.mean())
+        size, vectors = np.linalg.eigh(single + FLOOR * power * np.eye(len(single)))
         strong = size > 2 * FLOOR * power
         basis = (vectors[:, strong] / np.sqrt(size[strong])).conj().T
         along, across = (_grid(law.reach_m, law.sonar.wavelength_m / parts) for parts in (ALONG, ACROSS))
         # a receiver in the plane of its axis has equal covariances for motions to port and to starboard
-        alike = law.receiver.position[0] == 0 and law.sonar.transmitter.shape == "all"
+        symmetric = law.receiver.position[0] == 0 and law.sonar.transmitter.shape == "all"
         shared = np.empty((len(along), len(across), len(basis), len(basis)), dtype=np.complex64)
         for i, j in np.ndindex(len(along), len(across)):
-            if alike and across[j] > 0:
+            if symmetric and across[j] > 0:
                 shared[i, j] = shared[i, len(across) - 1 - j]
             else:
                 shared[i, j] = basis @ law.covariance(np.array([across[j], along[i], 0.0])) @ basis.conj().T
@@ -575,7 +580,7 @@ def _grid(reach: float, step: float) -> Array:
 
 @lru_cache(maxsize=32)
 def _table_of(alone: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> CovarianceTable:
-    return CovarianceTable.of(response_covariance_of(alone, height_m, interval_s, reach_m))
+    return CovarianceTable.from_covariance(response_covariance_of(alone, height_m, interval_s, reach_m))
 
 
 @dataclass(frozen=True)
@@ -591,14 +596,14 @@ class Search:
     scores: Array
 
     @classmethod
-    def of(
+    def from_response(
         cls, bands: list[Band], response: Complex, height_m: float, interval_s: float, reach_m: float, received: list[int]
     ) -> Self:
         """Score pings ``(pings, receivers, taps)`` by the receivers ``received``, for motions up to ``reach_m`` [m]."""
         line = _grid(reach_m, min(band.sonar.wavelength_m for band in bands) / FINE)
         plane, scores = np.stack(np.meshgrid(line, line, indexing="ij")), []
         for band in bands:
-            part = band.of(response)
+            part = band.part_of(response)
             for receiver_band in receiver_bands_of(band.sonar, height_m, interval_s, 1.5 * reach_m):
                 if receiver_band.number in received:
                     table = _table_of(receiver_band.law.sonar, height_m, interval_s, 1.5 * reach_m)

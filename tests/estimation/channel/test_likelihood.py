@@ -284,7 +284,7 @@ def test_bad_responses_are_refused(name: str) -> None:
     broken[1, 2, 5] = np.nan
     with pytest.raises(MitsonarError, match="nan or inf"):
         estimator.estimate(replace(good, response=broken))
-    with pytest.raises(MitsonarError, match="equal times"):
+    with pytest.raises(MitsonarError, match="evenly spaced"):
         estimator.estimate(replace(good, time_s=np.array([0.0, 0.0])))
 
 
