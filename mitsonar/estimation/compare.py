@@ -77,9 +77,9 @@ Samples = SonarPairs | ImpulseSamples
 
 VARIATIONS: dict[str, str] = {
     "as told": "height, pitch, roll and sound speed are right",
-    "height 5 %": "the height told is 5 % too large or too small (of no effect where first echoes tell it)",
-    "pitch 1 deg": "the pitch told is 1 deg off",
-    "roll 1 deg": "the roll told is 1 deg off",
+    "height 5 %": "the given height is 5 % too large or too small (without effect where first echoes give it)",
+    "pitch 1 deg": "the given pitch is 1 deg off",
+    "roll 1 deg": "the given roll is 1 deg off",
     "sound speed 1 %": "ranges are 1 % too long or too short",
     "heave 5 mm": "the sonar rises or sinks by 5 mm between the pings (rendered again)",
     "jitter": "rays move within their cells, anew each ping (rendered again)",
@@ -112,7 +112,7 @@ class Answers:
         return cls(np.zeros((count, 3)), np.zeros(count, dtype=bool), nan, np.full(count, np.nan))
 
     @property
-    def asked(self) -> NDArray[np.bool_]:
+    def estimated(self) -> NDArray[np.bool_]:
         """Return which pairs have been estimated ``(n,)``."""
         return np.isfinite(self.ms)
 
@@ -163,7 +163,7 @@ def frames_of(pairs: Samples, numbers: Sequence[int], variation: str) -> Iterato
         yield from re_rendered(pairs, numbers, jitter=True)
     elif variation in VARIATIONS:
         for number in numbers:
-            yield number, _misinformed(pairs.sonar_frames(number), variation, _sign(number))
+            yield number, _with_wrong_inputs(pairs.sonar_frames(number), variation, _sign(number))
     else:
         raise MitsonarError(f"unknown variation {variation!r}: known are {', '.join(VARIATIONS)}")
 
@@ -178,7 +178,7 @@ def _heaved(number: int, poses: Array) -> Array:
     return moved
 
 
-def _misinformed(frames: SonarFrames, variation: str, sign: int) -> SonarFrames:
+def _with_wrong_inputs(frames: SonarFrames, variation: str, sign: int) -> SonarFrames:
     """Return frames with a wrong height, attitude or sound speed."""
     change: dict[str, Array] = {}
     poses = None if frames.poses is None else frames.poses.copy()
@@ -217,7 +217,7 @@ def answers_of(
     """
     table = {name: (known or {}).get(name) or Answers.unasked(len(numbers)) for name in estimators}
     index = {number: k for k, number in enumerate(numbers)}
-    missing = [number for number in numbers if not all(table[name].asked[index[number]] for name in estimators)]
+    missing = [number for number in numbers if not all(table[name].estimated[index[number]] for name in estimators)]
     if progress is not None:
         progress(len(numbers) - len(missing))
     threads = cv2.getNumThreads()
@@ -225,7 +225,7 @@ def answers_of(
     try:
         for count, (number, frames) in enumerate(frames_of(pairs, missing, variation), start=1):
             for name, estimator in estimators.items():
-                if not table[name].asked[index[number]]:
+                if not table[name].estimated[index[number]]:
                     table[name].ask(index[number], estimator, frames)
             if progress is not None:
                 progress(1)
@@ -260,17 +260,17 @@ def bounds_of_pairs(
 
     It is the root of the mean variance over the first poses of these samples; 0 where there is no bound without noise.
     """
-    wanted = np.asarray(numbers, dtype=np.int64)
-    scene_of = pairs.scene[pairs.first[wanted]]
+    indices = np.asarray(numbers, dtype=np.int64)
+    scene_of = pairs.scene[pairs.first[indices]]
     gain = float(pairs.store.about["gain"])
     stds: dict[str, list[Array]] = {}
     for scene in scenes_of(pairs.recipe, pairs.recipe.sequences):
-        mine = wanted[scene_of == scene.number]
-        if not len(mine):
+        in_scene = indices[scene_of == scene.number]
+        if not len(in_scene):
             continue
         renderer = SceneRenderer(pairs.recipe, scene)
-        for found in bounds_at(renderer.simulator, pairs.pose[pairs.first[mine]], noise, gain):
-            for (_, kind, law), bound in found.items():
+        for bounds in bounds_at(renderer.simulator, pairs.pose[pairs.first[in_scene]], noise, gain):
+            for (_, kind, law), bound in bounds.items():
                 if kind == "image":
                     stds.setdefault(law, []).append(np.zeros(3) if bound is None else bound.std(2))
             if progress is not None:
@@ -307,15 +307,15 @@ class BenchmarkRow:
     def plain(self) -> PlainTable:
         """Return the row as a JSON object of numbers and strings: nan becomes None."""
 
-        def value(one: object) -> object:
+        def plain_value(one: object) -> object:
             if isinstance(one, np.ndarray):
-                return [value(float(v)) for v in one]
+                return [plain_value(float(v)) for v in one]
             if isinstance(one, float | np.floating):
                 return float(one) if np.isfinite(one) else None
             return one
 
-        own = {f.name: value(getattr(self, f.name)) for f in fields(self) if f.name != "errors"}
-        return own | {f.name: value(getattr(self.errors, f.name)) for f in fields(self.errors)}
+        values = {f.name: plain_value(getattr(self, f.name)) for f in fields(self) if f.name != "errors"}
+        return values | {f.name: plain_value(getattr(self.errors, f.name)) for f in fields(self.errors)}
 
 
 def rows_of(
@@ -344,16 +344,16 @@ def rows_of(
     def squares(one: Answers) -> Array:
         return in_units(np.where(one.valid[:, None], one.motion, 0.0) - truth) ** 2
 
-    against = squares(answers[reference])
+    reference_squares = squares(answers[reference])
     rows = []
     for name, one in answers.items():
         errors = motion_errors(one.motion, truth, one.valid, one.covariance, resamples)
         # the same resamples for both methods give a paired interval of their difference
-        drawn = [np.sqrt(table[resamples].mean(axis=1)) for table in (squares(one), against)]
+        drawn = [np.sqrt(table[resamples].mean(axis=1)) for table in (squares(one), reference_squares)]
         low, high = np.percentile(drawn[0] - drawn[1], [2.5, 97.5], axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.where((bound > 0) & np.isfinite(bound), errors.rmse / bound, np.nan)
-        difference = errors.rmse - np.sqrt(against.mean(axis=0))
+        difference = errors.rmse - np.sqrt(reference_squares.mean(axis=0))
         ms = float(np.median(one.ms[one.valid] if one.valid.any() else one.ms))
         rows.append(BenchmarkRow(name, inputs[name], errors, ms, ratio, difference, low, high))
     return rows
@@ -612,7 +612,7 @@ def compare(
     data = str(data)
     bench = _bench(data, estimators, options)
     settings = _settings(bench, options)
-    kept = kept_answers(out, settings)
+    answer_store = kept_answers(out, settings)
     variations = _variations(options)
     with begin("comparing", len(bench.levels) * len(variations) * len(bench.numbers)) as progress:
         answers = {
@@ -621,8 +621,8 @@ def compare(
                 bench.samples[level],
                 bench.numbers,
                 variation,
-                known=kept.load(_key(level, model), variation, bench.methods, len(bench.numbers)),
-                keep=partial(kept.keep, _key(level, model), variation),
+                known=answer_store.load(_key(level, model), variation, bench.methods, len(bench.numbers)),
+                keep=partial(answer_store.keep, _key(level, model), variation),
                 progress=progress,
             )
             for level, model in bench.levels.items()
@@ -630,7 +630,7 @@ def compare(
         }
     tables = []
     for level in bench.levels:
-        bounds = _bounds(bench, level, options.limit, kept, begin)
+        bounds = _bounds(bench, level, options.limit, answer_store, begin)
         tables += [_table(bench, options, level, variation, answers[level, variation], bounds) for variation in variations]
     scenes = len(np.unique(bench.scenes))
     notes = [f"{counted(scenes, 'scene')} only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
@@ -643,7 +643,7 @@ def compare(
     ]
     report = {"data": data, "model": modality_of(bench.first.recipe).sonar.model, **settings, "scenes": scenes}
     report |= {"notes": notes, "tables": tables, **versions(("mitsonar",))}
-    kept.finish(report)
+    answer_store.finish(report)
     return Comparison(report)
 
 
@@ -666,11 +666,11 @@ def _bench(data: str, estimators: Estimators, options: ComparisonOptions) -> Ben
         )
     perturb, jitter, prior = (argument(name) for name in ("perturb", "jitter", "prior"))
     if not modality.variations and (options.perturb or options.jitter or options.prior):
-        raise MitsonarError(f"{perturb}, {jitter} and {prior} are for data sets of images: leave them out")
+        raise MitsonarError(f"{perturb}, {jitter} and {prior} apply only to data sets of images: omit them")
     if recipe.recorded is not None and (options.perturb or options.jitter):
-        raise MitsonarError(f"{perturb} and {jitter} render anew, and recorded frames have no world: leave them out")
-    words = list(dict.fromkeys(options.noise.split(";" if ";" in options.noise else ",")))
-    levels = {word: modality.noise_model(word) for word in words}
+        raise MitsonarError(f"{perturb} and {jitter} render the frames again, but recorded frames have no world: omit them")
+    names = list(dict.fromkeys(options.noise.split(";" if ";" in options.noise else ",")))
+    levels = {word: modality.noise_model(word) for word in names}
     split = _split(options.split, methods, recipe)
     chosen_samples = {
         **{"part": options.part or split.unseen, "split": split},
@@ -681,14 +681,14 @@ def _bench(data: str, estimators: Estimators, options: ComparisonOptions) -> Ben
     if len(first) < 2:
         raise MitsonarError(f"a comparison needs two pairs or more: give {argument('part')} all, or a larger data set")
     if options.jitter and first.recipe.instrument.jittered:
-        raise MitsonarError(f"the rays of this data set move already: {jitter} is for Almanza-Medina's model")
+        raise MitsonarError(f"the rays of this data set already move: {jitter} is for Almanza-Medina's model")
     numbers = chosen(len(first), options.pairs, options.seed)
     # motion of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
     pose = first.chosen.pose
     truth = np.array([motions(pose[first.frame_numbers(number)][[0, -1]])[0] for number in numbers])
     learnt = {
-        name: int(np.any([one.learnt(first)[numbers] for one in of], axis=0).sum())
-        for name, of in _checkpoints(methods).items()
+        name: int(np.any([one.learnt(first)[numbers] for one in checkpoints], axis=0).sum())
+        for name, checkpoints in _checkpoints(methods).items()
     }
     return Bench(methods, levels, samples, numbers, truth, first.scene[first.first[numbers]], learnt)
 
@@ -701,15 +701,17 @@ def _split(requested: str | None, methods: Mapping[str, AnyEstimator], recipe: R
     """
     if requested is not None:
         return split_for(requested, recipe)
-    known = [(name, one.split_of_training(recipe)) for name, of in _checkpoints(methods).items() for one in of]
-    theirs = [(name, split) for name, split in known if split is not None]
-    if len({split.model_dump_json() for _, split in theirs}) > 1:
-        splits = ", ".join(f"{name} by {split.by}" for name, split in theirs)
+    splits = [
+        (name, one.split_of_training(recipe)) for name, checkpoints in _checkpoints(methods).items() for one in checkpoints
+    ]
+    known_splits = [(name, split) for name, split in splits if split is not None]
+    if len({split.model_dump_json() for _, split in known_splits}) > 1:
+        text = ", ".join(f"{name} by {split.by}" for name, split in known_splits)
         raise MitsonarError(
-            f"the networks were trained on other parts of this data set: {splits}; choose {argument('split')}, which marks "
+            f"the networks were trained on other parts of this data set: {text}; choose {argument('split')}, which marks "
             "rows with pairs that training has seen"
         )
-    return theirs[0][1] if theirs else recipe.split
+    return known_splits[0][1] if known_splits else recipe.split
 
 
 def _checkpoints(methods: Mapping[str, AnyEstimator]) -> dict[str, tuple[Checkpoint, ...]]:
@@ -770,18 +772,18 @@ def _key(level: str, model: NoiseModel | None) -> str:
 # ---------------- Bounds and tables of errors
 
 
-def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Begin) -> dict[str, Array]:
+def _bounds(bench: Bench, level: str, limit: int, answer_store: AnswerFolder, begin: Begin) -> dict[str, Array]:
     """Return the bound by law over some pairs; empty if not requested, and for responses and recorded frames."""
     model, samples = bench.levels[level], bench.samples[level]
     if not limit or model is None or isinstance(samples, ImpulseSamples) or samples.recipe.recorded is not None:
         return {}
-    found = kept.load_bounds(_key(level, model), limit)
-    if found is None:
-        places = np.linspace(0, len(bench.numbers) - 1, min(limit, len(bench.numbers))).astype(int)
-        with begin("limit", len(places)) as progress:
-            found = bounds_of_pairs(samples, [bench.numbers[k] for k in places], model, progress)
-        kept.keep_bounds(_key(level, model), limit, found)
-    return found
+    bounds = answer_store.load_bounds(_key(level, model), limit)
+    if bounds is None:
+        sampled = np.linspace(0, len(bench.numbers) - 1, min(limit, len(bench.numbers))).astype(int)
+        with begin("limit", len(sampled)) as progress:
+            bounds = bounds_of_pairs(samples, [bench.numbers[k] for k in sampled], model, progress)
+        answer_store.keep_bounds(_key(level, model), limit, bounds)
+    return bounds
 
 
 def _table(
@@ -793,18 +795,18 @@ def _table(
     bounds: dict[str, Array],
 ) -> PlainTable:
     """Return the errors of all methods as a JSON object."""
-    found = dict(answers)
+    by_row = dict(answers)
     if options.prior:
         flight = bench.first.recipe.flight
-        largest = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
-        known = {name: one for name, one in found.items() if np.isfinite(one.covariance).any()}
-        found |= {f"{name}{PRIOR}": with_prior(one, largest) for name, one in known.items()}
-    inputs = {name: bench.methods[name.removesuffix(PRIOR)].inputs for name in found}
+        largest_motion = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
+        known = {name: one for name, one in by_row.items() if np.isfinite(one.covariance).any()}
+        by_row |= {f"{name}{PRIOR}": with_prior(one, largest_motion) for name, one in known.items()}
+    inputs = {name: bench.methods[name.removesuffix(PRIOR)].inputs for name in by_row}
     inputs = {name: f"{text}, prior" if name.endswith(PRIOR) else text for name, text in inputs.items()}
     reference = options.reference or list(bench.methods)[-1]
     resamples = cluster_resamples(bench.scenes, seed=options.seed)
     law = list(bounds)[-1] if bounds else "rays"
-    rows = rows_of(found, inputs, bench.truth, resamples, limit=bounds.get(law), reference=reference)
+    rows = rows_of(by_row, inputs, bench.truth, resamples, limit=bounds.get(law), reference=reference)
     return {
         "noise": level,
         "variation": variation,
@@ -881,12 +883,12 @@ class AnswersOnDisk(AnswerFolder):
             return None
         try:
             table = read_npz(path)
-            found = {name: Answers.from_arrays(table, name) for name in methods}
-            if any(len(values) != count for one in found.values() for values in vars(one).values()):
-                raise ValueError("it holds other numbers of pairs")
-            return found
+            answers = {name: Answers.from_arrays(table, name) for name in methods}
+            if any(len(values) != count for one in answers.values() for values in vars(one).values()):
+                raise ValueError("it holds another number of pairs")
+            return answers
         except Exception as error:  # a damaged zip may raise any exception
-            raise MitsonarError(f"{path} is damaged ({error}): remove it, it is made again") from None
+            raise MitsonarError(f"{path} is damaged ({error}): remove it, and it is computed again") from None
 
     def keep(self, level: str, variation: str, answers: dict[str, Answers]) -> None:
         """Store all estimates made so far."""
@@ -906,13 +908,13 @@ class AnswersOnDisk(AnswerFolder):
         path = self._path(f"limit {level} {count}", ".json")
         if not path.exists():
             return None
-        found = read_json(path)
+        stored = read_json(path)
         try:
-            bounds = {law: np.array(std, dtype=float) for law, std in found.items()}
+            bounds = {law: np.array(std, dtype=float) for law, std in stored.items()}
             if not bounds or any(std.shape != (3,) for std in bounds.values()):
                 raise ValueError("a bound is three numbers")
         except (AttributeError, ValueError, TypeError) as error:
-            raise MitsonarError(f"{path} is damaged ({error}): remove it, it is made again") from None
+            raise MitsonarError(f"{path} is damaged ({error}): remove it, and it is computed again") from None
         return bounds
 
     def keep_bounds(self, level: str, count: int, bounds: dict[str, Array]) -> None:

@@ -377,20 +377,20 @@ def prior_rejection(motion: Motion, covariance: NDArray[np.float64] | None, prio
 # ---------------- Options of estimators
 
 
-def checked_options(name: str, options: Options, made: Callable[..., object], but: int = 0) -> Options:
+def checked_options(name: str, options: Options, factory: Callable[..., object], but: int = 0) -> Options:
     """Check the names of options, and return the options.
 
     Args:
         name: name of the estimator, for the message.
         options: options by name.
-        made: the function or class that takes them.
+        factory: the function or class that takes them.
         but: number of its first arguments that are not options.
 
     Raises:
         MitsonarError: an option that it does not take.
     """
     try:
-        parameters = list(inspect.signature(made).parameters.values())[but:]
+        parameters = list(inspect.signature(factory).parameters.values())[but:]
     except (TypeError, ValueError):  # implemented in C, without a signature
         return options
     if any(one.kind is one.VAR_KEYWORD for one in parameters):

@@ -86,9 +86,9 @@ class CfarGicp:
         clouds = [self._points(image, frames, attitude) for image in images]
         if attitude.reason or min(len(cloud) for cloud in clouds) < FEWEST:
             return rejected(attitude.reason or f"fewer than {FEWEST} detections")
-        to_first, settled = _to_first(Motion(0.0, 0.0, 0.0) if prior is None else prior.motion), False
+        to_first, converged = _to_first(Motion(0.0, 0.0, 0.0) if prior is None else prior.motion), False
         for distance in NEIGHBOURS_M:
-            found = package("small_gicp").align(
+            registration = package("small_gicp").align(
                 *clouds,
                 init_T_target_source=to_first,
                 downsampling_resolution=VOXEL_M,
@@ -97,8 +97,8 @@ class CfarGicp:
                 rotation_epsilon=1e-5,
                 translation_epsilon=1e-5,
             )
-            to_first, settled = found.T_target_source, bool(found.converged)
-        return Estimate(_motion_of(to_first)) if settled else rejected("the registration does not converge")
+            to_first, converged = registration.T_target_source, bool(registration.converged)
+        return Estimate(_motion_of(to_first)) if converged else rejected("the registration does not converge")
 
     def _points(self, image: NDArray[np.float32], frames: SonarFrames, attitude: Attitude) -> NDArray[np.float64]:
         """Return detections as points ``(n, 3)`` [m]: starboard, forward, 0."""
@@ -164,10 +164,10 @@ class FourierMellin:
             return rejected(pair.reason)
         square, corner = _square(pair.first.shape)
         images = [np.pad(_tapered(image), square) for image in (pair.first, pair.second)]
-        found = package("fourier_mellin", INSTALL).FourierMellin(images[0]).register_image(images[1])
+        registration = package("fourier_mellin", INSTALL).FourierMellin(images[0]).register_image(images[1])
         middle = (len(images[0]) - 1) / 2
-        warp = np.array(cv2.getRotationMatrix2D((middle, middle), found.rotation, 1.0), dtype=float)
-        warp[:, 2] += found.x, -found.y  # the package counts rows upwards
+        warp = np.array(cv2.getRotationMatrix2D((middle, middle), registration.rotation, 1.0), dtype=float)
+        warp[:, 2] += registration.x, -registration.y  # the package counts rows upwards
         warp[:, 2] += warp[:, :2] @ np.array(corner) - np.array(corner)
         return pair.estimate(warp)
 
@@ -218,9 +218,9 @@ class GroundPair:
 
     def motion(self, warp: NDArray[np.floating]) -> Motion:
         """Return the motion of the warp ``(2, 3)`` that takes pixels (column, row) of the first image to the second."""
-        whole = np.array(warp, dtype=float)
-        whole[:, 2] += np.array(self.corner) - whole[:, :2] @ np.array(self.corner)
-        return self.view.motion(whole)
+        view_warp = np.array(warp, dtype=float)
+        view_warp[:, 2] += np.array(self.corner) - view_warp[:, :2] @ np.array(self.corner)
+        return self.view.motion(view_warp)
 
     def estimate(self, warp: NDArray[np.floating]) -> Estimate:
         """Return the estimate of such a warp; reject one that displaces the images by half their size or more."""
@@ -308,10 +308,10 @@ class OwnEstimator:
 
     Args:
         path: its name in messages and files: ``my_module:MyEstimator``, or that of its class.
-        made: the object. ``estimate`` takes records, and a ``prior`` if it has an argument of that name. Attributes
+        wrapped: the object. ``estimate`` takes records, and a ``prior`` if it has an argument of that name. Attributes
             ``consumes``, ``inputs`` and ``digest`` are used if present, as in
             :class:`~mitsonar.estimation.estimator.Estimator`; otherwise it consumes ``SonarFrames``.
-        again: recreates the object in another process, where it need not be picklable.
+        recreate: recreates the object in another process, where it need not be picklable.
 
     Raises:
         MitsonarError: an object without a method ``estimate`` that takes records only, or records and a prior.
@@ -319,16 +319,16 @@ class OwnEstimator:
 
     path: str
 
-    def __init__(self, path: str, made: AnyObject, again: _FromText | None = None) -> None:
-        self.path, self._made, self._again = path, made, again
-        consumes = getattr(made, "consumes", SonarFrames)
+    def __init__(self, path: str, wrapped: AnyObject, recreate: _FromText | None = None) -> None:
+        self.path, self._wrapped, self._recreate = path, wrapped, recreate
+        consumes = getattr(wrapped, "consumes", SonarFrames)
         if not isinstance(consumes, type):
             raise MitsonarError(f"{path}: consumes must be a class such as mitsonar.SonarFrames: got {consumes!r}")
         self.consumes: type = consumes
-        self.inputs = str(getattr(made, "inputs", "custom"))
-        self.digest = str(getattr(made, "digest", ""))
+        self.inputs = str(getattr(wrapped, "inputs", "custom"))
+        self.digest = str(getattr(wrapped, "digest", ""))
         try:
-            estimate = made.estimate
+            estimate = wrapped.estimate
         except AttributeError:
             raise MitsonarError(f"{path} has no method estimate(frames), which returns an Estimate") from None
         if not callable(estimate):
@@ -337,10 +337,10 @@ class OwnEstimator:
 
     def __reduce__(self) -> tuple[Callable[..., OwnEstimator], tuple[object, ...]]:
         """Return how another process recreates the estimator."""
-        if self._again is not None:
-            return self._again, ()
+        if self._recreate is not None:
+            return self._recreate, ()
         try:
-            return _unpickled, (self.path, pickle.dumps(self._made))
+            return _unpickled, (self.path, pickle.dumps(self._wrapped))
         except Exception as error:
             raise MitsonarError(
                 f"{self.path} cannot be sent to another process ({_words_of(error)}): use one worker, or name it as "
@@ -351,51 +351,51 @@ class OwnEstimator:
         """Estimate the motion by the object, which gets the prior if it takes one.
 
         Raises:
-            MitsonarError: it raises an error, or returns no :class:`~mitsonar.estimation.estimator.Estimate`.
+            MitsonarError: it raises an error, or does not return an :class:`~mitsonar.estimation.estimator.Estimate`.
         """
         try:
-            found = self._made.estimate(records, **({"prior": prior} if self._takes_prior else {}))
+            estimate = self._wrapped.estimate(records, **({"prior": prior} if self._takes_prior else {}))
         except MitsonarError:
             raise
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1]
-            where = f"{os.path.basename(last.filename)}, line {last.lineno}"
-            raise MitsonarError(f"{self.path}: estimate raises {_words_of(error)} at {where}") from error
+            location = f"{os.path.basename(last.filename)}, line {last.lineno}"
+            raise MitsonarError(f"{self.path}: estimate raises {_words_of(error)} at {location}") from error
         try:
-            motion = Motion(*(float(value) for value in found.motion))
-            covariance = None if found.covariance is None else self._covariance(found.covariance)
-            return Estimate(motion, covariance, bool(found.valid), str(found.reason), found.about)
+            motion = Motion(*(float(value) for value in estimate.motion))
+            covariance = None if estimate.covariance is None else self._covariance(estimate.covariance)
+            return Estimate(motion, covariance, bool(estimate.valid), str(estimate.reason), estimate.about)
         except (AttributeError, TypeError):
-            raise MitsonarError(f"{self.path}: estimate must return an Estimate: got {type(found).__name__}") from None
+            raise MitsonarError(f"{self.path}: estimate must return an Estimate: got {type(estimate).__name__}") from None
 
-    def _covariance(self, given: AnyObject) -> NDArray[np.float64]:
+    def _covariance(self, values: AnyObject) -> NDArray[np.float64]:
         """Return a covariance as an array of 3 x 3."""
-        covariance = np.asarray(given, dtype=np.float64)
+        covariance = np.asarray(values, dtype=np.float64)
         if covariance.shape != (3, 3):
             raise MitsonarError(f"{self.path}: the covariance of an Estimate must be 3 x 3 or None: got {covariance.shape}")
         return covariance
 
 
-def own_estimator(made: AnyObject, options: Options, again: _FromText | None = None, name: str = "") -> OwnEstimator:
+def own_estimator(wrapped: AnyObject, options: Options, recreate: _FromText | None = None, name: str = "") -> OwnEstimator:
     """Return an object of the user, or a PyTorch network, as an estimator.
 
     Args:
-        made: the object.
+        wrapped: the object.
         options: options, which only a network takes: see :class:`~mitsonar.estimation.learned.OwnNetwork`.
-        again: recreates it in another process.
+        recreate: recreates it in another process.
         name: its name in messages; default: that of its class.
 
     Raises:
         MitsonarError: an object that is neither, or options that it does not take.
     """
-    name = name or type(made).__name__
-    if not hasattr(made, "estimate") and _is_network(made):
+    name = name or type(wrapped).__name__
+    if not hasattr(wrapped, "estimate") and _is_network(wrapped):
         from mitsonar.estimation.learned import OwnNetwork
 
-        return OwnEstimator(name, OwnNetwork(made, **checked_options(name, options, OwnNetwork, but=1)), again)
+        return OwnEstimator(name, OwnNetwork(wrapped, **checked_options(name, options, OwnNetwork, but=1)), recreate)
     if options:
-        raise MitsonarError(f"{name} is made already and takes no options: got {', '.join(options)}; give its class")
-    return OwnEstimator(name, made, again)
+        raise MitsonarError(f"{name} is already an instance and takes no options: got {', '.join(options)}; give its class")
+    return OwnEstimator(name, wrapped, recreate)
 
 
 def own_class(text: str, options: Options) -> OwnEstimator | None:
@@ -410,16 +410,16 @@ def own_class(text: str, options: Options) -> OwnEstimator | None:
         MitsonarError: no such module or class, one without ``estimate``, one that cannot be imported or created, or an
             option that it does not take.
     """
-    found = PATH.fullmatch(text)
-    if found is None:
+    match = PATH.fullmatch(text)
+    if match is None:
         return None
     values = dict(options)
-    for word in found[2].split(":")[1:]:
-        key, equals, value = word.partition("=")
+    for setting in match[2].split(":")[1:]:
+        key, equals, value = setting.partition("=")
         if not (key and equals):
             raise MitsonarError(f"a class is my_module:MyEstimator or my_module:MyEstimator:key=value: got {text!r}")
         values[key] = _value(value)
-    return _FromText(found[1], os.getcwd(), values)()
+    return _FromText(match[1], os.getcwd(), values)()
 
 
 @dataclass(frozen=True)
@@ -439,47 +439,51 @@ class _FromText:
     def __call__(self) -> OwnEstimator:
         module, _, name = self.path.partition(":")
         with _importable(self.folder):
-            found = vars(self._imported(module)).get(name)
-            if found is None:
+            definition = vars(self._imported(module)).get(name)
+            if definition is None:
                 raise MitsonarError(f"{self.path}: {module} has no {name}: give the name of a class in it")
-            made = created(found, self.options, self.path) if callable(found) and not _is_network(found) else found
+            instance = (
+                created(definition, self.options, self.path)
+                if callable(definition) and not _is_network(definition)
+                else definition
+            )
         words = [self.path, *(f"{key}={value}" for key, value in self.options.items())]
-        return own_estimator(made, {}, self, ":".join(words))
+        return own_estimator(instance, {}, self, ":".join(words))
 
     def _imported(self, module: str) -> ModuleType:
         """Return the module of that name."""
         try:
             return importlib.import_module(module)
         except ModuleNotFoundError as error:
-            where = f"needs {error.name}, which is not installed" if error.name != module else "is no module here"
-            raise MitsonarError(f"{self.path}: {module} {where}: start in its folder, or install it") from None
+            problem = f"needs {error.name}, which is not installed" if error.name != module else "is not a module here"
+            raise MitsonarError(f"{self.path}: {module} {problem}: start in its folder, or install it") from None
         except Exception as error:
             raise MitsonarError(f"{self.path}: {module} raises {_words_of(error)} when it is imported") from error
 
 
-def created(found: Callable[..., object], options: Options, name: str) -> AnyObject:
+def created(factory: Callable[..., object], options: Options, name: str) -> AnyObject:
     """Return an instance of a user's class.
 
     Raises:
         MitsonarError: it cannot be created with these options.
     """
-    checked_options(name, options, found)
-    words = ", ".join(f"{key}={value!r}" for key, value in options.items())
+    checked_options(name, options, factory)
+    arguments = ", ".join(f"{key}={value!r}" for key, value in options.items())
     try:
-        return found(**options)
+        return factory(**options)
     except Exception as error:
-        needs = "" if options else ": it must need no arguments, or give them as options"
-        raise MitsonarError(f"{name}: {name.rpartition(':')[2]}({words}) raises {_words_of(error)}{needs}") from error
+        hint = "" if options else ": it must need no arguments, or give them as options"
+        raise MitsonarError(f"{name}: {name.rpartition(':')[2]}({arguments}) raises {_words_of(error)}{hint}") from error
 
 
 def _unpickled(path: str, content: bytes) -> OwnEstimator:
     return OwnEstimator(path, pickle.loads(content))
 
 
-def _is_network(made: AnyObject) -> bool:
+def _is_network(candidate: AnyObject) -> bool:
     """Return whether an object is a PyTorch network, without importing torch: a network's owner has already done so."""
     torch = sys.modules.get("torch")
-    return torch is not None and isinstance(made, torch.nn.Module)
+    return torch is not None and isinstance(candidate, torch.nn.Module)
 
 
 def _takes_prior(path: str, estimate: Callable[..., object]) -> bool:

@@ -51,7 +51,7 @@ ends at a lower height. These values err least on rocky fields from 1 to 10 m an
 SPREAD = 0.1
 """Distance of the quantiles, to either side, that give the standard deviation."""
 
-KEPT = 16
+MAX_CACHED_FLOORS = 16
 """Number of attitudes, to a milliradian, whose profiles of level ground are cached."""
 
 FINEST = 0.01
@@ -139,24 +139,26 @@ class DirectHeight:
         floor = self._floor_of(frame, sonar)
         edges = np.linspace(sonar.range_min, sonar.range_max, len(profile) + 1)
         # initial search: the height whose ground correlates best with the profile
-        guess = _nearest_alike(profile, floor, edges)
+        guess = _best_matching_height(profile, floor, edges)
         if guess is None:
             return HeightEstimate(np.nan, np.nan, False, "the window shows no ground")
         height = guess
         # resolve the profile into ground at heights around the estimate; the floor is a high quantile of them
-        for around, lowest in PASSES:
-            heights = height * np.geomspace(*around, PARTS)
-            ground = floor.at(heights, edges).T
-            part = _resolved(ground, profile)
-            if not part.any():
-                return HeightEstimate(np.nan, np.nan, False, "the levels along range are not those of ground")
-            share = np.cumsum(part) / part.sum()
-            low, height, high = np.interp([lowest - SPREAD, lowest, lowest + SPREAD], share, heights)
+        for span, lowest in PASSES:
+            heights = height * np.geomspace(*span, PARTS)
+            ground = floor.levels_at(heights, edges).T
+            parts = _resolved(ground, profile)
+            if not parts.any():
+                return HeightEstimate(np.nan, np.nan, False, "the levels along range do not match those of ground")
+            cumulative = np.cumsum(parts) / parts.sum()
+            low, height, high = np.interp([lowest - SPREAD, lowest, lowest + SPREAD], cumulative, heights)
         # accept the height only if the sum of these grounds resembles the profile
-        alike = float(np.corrcoef(ground @ part, profile)[0, 1])
+        correlation = float(np.corrcoef(ground @ parts, profile)[0, 1])
         std = float(max((high - low) / 2, FINEST * height))
-        if not alike >= LEAST:
-            return HeightEstimate(float(height), std, False, f"levels along range are those of ground by {alike:.2f} only")
+        if not correlation >= LEAST:
+            return HeightEstimate(
+                float(height), std, False, f"levels along range correlate with those of ground by {correlation:.2f} only"
+            )
         return HeightEstimate(float(height), std)
 
     def _floor_of(self, frame: Above, sonar: Sonar) -> FloorProfile:
@@ -164,13 +166,13 @@ class DirectHeight:
         pose = None if frame.poses is None else frame.poses[0]
         pitch = self.pitch_rad if self.pitch_rad is not None else (None if pose is None else float(pose[3]))
         if pitch is None or not np.isfinite(pitch):
-            raise MitsonarError(f"the height needs the pitch: the frames lack poses; give {argument('pitch_deg')}")
+            raise MitsonarError(f"the height needs the pitch, but the frames have no poses: give {argument('pitch_deg')}")
         roll = 0.0 if pose is None or not np.isfinite(pose[4]) else float(pose[4])
         views = tuple(frame.values) if isinstance(frame, ViewFrames) else ()
         pitch, roll = round(pitch, 3), round(roll, 3)
         key = (sonar.model_dump_json(), views, pitch, roll)
         if key not in self._floors:
-            if len(self._floors) >= KEPT:
+            if len(self._floors) >= MAX_CACHED_FLOORS:
                 self._floors.clear()
             self._floors[key] = FloorProfile(sonar, pitch, roll, _weight_of(sonar, views))
         return self._floors[key]
@@ -203,7 +205,7 @@ def _finite(profile: Array) -> Array:
 
 def rejection_of_profile(profile: Array) -> str:
     """Return why a profile holds no information; empty if it does."""
-    return "" if np.ptp(profile) > 0 else "nothing in the frame to tell a height from"
+    return "" if np.ptp(profile) > 0 else "nothing in the frame from which to estimate a height"
 
 
 def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
@@ -226,21 +228,21 @@ def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
 
 def _resolved(ground: Array, profile: Array) -> Array:
     """Return the fraction of a profile that is ground at each height ``(heights,)``, besides a uniform background."""
-    even = np.full((len(profile), 1), 1 / len(profile))
-    return np.asarray(nnls(np.hstack([ground, even]), profile / profile.max())[0][:-1])
+    uniform = np.full((len(profile), 1), 1 / len(profile))
+    return np.asarray(nnls(np.hstack([ground, uniform]), profile / profile.max())[0][:-1])
 
 
-def _nearest_alike(profile: Array, floor: FloorProfile, edges: Array) -> float | None:
+def _best_matching_height(profile: Array, floor: FloorProfile, edges: Array) -> float | None:
     """Return the height whose ground correlates best with a profile; None if no height shows ground in the window."""
     heights = np.geomspace(max(edges[0], edges[-1] / 1e3) / floor.farthest, edges[-1] / floor.nearest, CANDIDATES)
-    ground = floor.at(heights, edges)
+    ground = floor.levels_at(heights, edges)
     ground -= ground.mean(axis=1, keepdims=True)
-    size = np.linalg.norm(ground, axis=1)
-    lit = size > 0
-    if not lit.any():
+    norms = np.linalg.norm(ground, axis=1)
+    visible = norms > 0
+    if not visible.any():
         return None
-    alike = (ground[lit] / size[lit, None]) @ (profile - profile.mean())
-    return float(heights[lit][int(alike.argmax())])
+    correlations = (ground[visible] / norms[visible, None]) @ (profile - profile.mean())
+    return float(heights[visible][int(correlations.argmax())])
 
 
 # ---------------- Range profile of level ground
@@ -311,11 +313,11 @@ class FloorProfile:
         """Return the range of the last return divided by the height."""
         return float(self._along[0][-1])
 
-    def at(self, height_m: float | Array, edges_m: Array) -> Array:
+    def levels_at(self, height_m: float | Array, edges_m: Array) -> Array:
         """Return the levels of the bins between edges ``(..., bins)`` at heights ``(...)`` [m]; their sum is at most 1."""
         away, total = self._along
-        ends = np.asarray(edges_m) / np.asarray(height_m, dtype=float)[..., None]
-        return np.asarray(np.diff(np.interp(ends, away, total, left=0.0), axis=-1) / total[-1])
+        edges_over_height = np.asarray(edges_m) / np.asarray(height_m, dtype=float)[..., None]
+        return np.asarray(np.diff(np.interp(edges_over_height, away, total, left=0.0), axis=-1) / total[-1])
 
 
 # ---------------- Measured heights as a table, and in sentences
@@ -345,11 +347,11 @@ def heights_lines(estimates: list[HeightEstimate], true: Array | None) -> list[s
     heights = np.array([one.height_m for one in estimates])[valid]
     lines = []
     for reason in dict.fromkeys(one.reason for one in estimates if not one.valid):
-        lines.append(f"not believed, {sum(one.reason == reason for one in estimates):,} frames: {reason}")
+        lines.append(f"rejected, {sum(one.reason == reason for one in estimates):,} frames: {reason}")
     if len(heights):
         lines.append(f"height {heights.min():.3f} .. {heights.max():.3f} m, median {np.median(heights):.3f} m")
     if true is not None and len(heights):
         error = heights - true[valid]
-        rmse, middle = 100 * np.sqrt((error**2).mean()), 100 * np.median(np.abs(error))
-        lines.append(f"against the true z: RMSE {rmse:.2f} cm, median {middle:.2f} cm, bias {100 * error.mean():+.2f} cm")
+        rmse, median = 100 * np.sqrt((error**2).mean()), 100 * np.median(np.abs(error))
+        lines.append(f"against the true z: RMSE {rmse:.2f} cm, median {median:.2f} cm, bias {100 * error.mean():+.2f} cm")
     return lines

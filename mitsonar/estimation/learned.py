@@ -985,8 +985,8 @@ class ViewNetwork(Trained):
         views = ", ".join(self.views)
         if not isinstance(frames, ViewFrames):
             raise MitsonarError(
-                f"this {self._checkpoint.network} takes {self.kind}s of {views}: use `mitsonar odometry` or `mitsonar evaluate` "
-                "on a data set that holds them"
+                f"this {self._checkpoint.network} takes {self.kind}s of {views}: use `mitsonar odometry` or `mitsonar "
+                "evaluate` on a data set that holds them"
             )
         if len(frames) != 2 or any(view not in frames.values for view in self.views):
             raise MitsonarError(f"two pings of {views} are needed: got {len(frames)} of {', '.join(frames.values)}")

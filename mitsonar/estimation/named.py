@@ -106,7 +106,7 @@ NAMES = (*UNTRAINED, *SHIPPED)
 
 def estimators_for(record: type) -> tuple[str, ...]:
     """Return the names of the untrained estimators that consume a class of records, such as ``SonarFrames``."""
-    return tuple(name for name, made in ESTIMATORS.items() if made.consumes in (record, object))
+    return tuple(name for name, estimator in ESTIMATORS.items() if estimator.consumes in (record, object))
 
 
 def create_estimator(estimator: EstimatorLike, **options: object) -> AnyEstimator:
@@ -133,9 +133,9 @@ def create_estimator(estimator: EstimatorLike, **options: object) -> AnyEstimato
     if isinstance(estimator, str):
         return _from_text(estimator, options)
     if isinstance(estimator, os.PathLike):
-        return _made(os.fspath(estimator), _trained(os.fspath(estimator)), options)
+        return _create(os.fspath(estimator), _factory_of_checkpoint(os.fspath(estimator)), options)
     if isinstance(estimator, type) and _is_ours(estimator):
-        return _made(estimator.__name__, cast(Callable[..., AnyEstimator], estimator), options)
+        return _create(estimator.__name__, cast(Callable[..., AnyEstimator], estimator), options)
     if isinstance(estimator, type):
         return own_estimator(created(estimator, options, estimator.__name__), {})
     if _is_ours(type(estimator)) and not options and hasattr(estimator, "estimate"):
@@ -151,58 +151,60 @@ def _is_ours(kind: type) -> bool:
 def _from_text(text: str, options: Options) -> AnyEstimator:
     """Create the estimator that a string names; see :func:`create_estimator`."""
     if "," in text and not os.path.exists(text):
-        return _nearest([part.strip() for part in text.split(",") if part.strip()], options)
+        return _ensemble_of([part.strip() for part in text.split(",") if part.strip()], options)
     name, *words = text.split(":")
     if name in NAMES:
-        made = _maker(name)
-        return _made(name, made, {**options_from(name, words, made), **options})
-    own = own_class(text, options)
-    if own is not None:
-        return own
+        factory = _factory_of(name)
+        return _create(name, factory, {**options_from(name, words, factory), **options})
+    user_estimator = own_class(text, options)
+    if user_estimator is not None:
+        return user_estimator
     if not names_checkpoint(name):
         names = nearest_names(name, NAMES)
-        other = "a checkpoint, the folder of a training run, or a class as my_module:MyEstimator"
-        raise MitsonarError(f"unknown estimator {name!r}: {names}; or give {other}")
-    made = _trained(name)
-    return _made(name, made, {**options_from(name, words, made), **options})
+        alternatives = "a checkpoint, the folder of a training run, or a class as my_module:MyEstimator"
+        raise MitsonarError(f"unknown estimator {name!r}: {names}; or give {alternatives}")
+    factory = _factory_of_checkpoint(name)
+    return _create(name, factory, {**options_from(name, words, factory), **options})
 
 
-def _made(name: str, made: Callable[..., AnyEstimator], options: Options) -> AnyEstimator:
+def _create(name: str, factory: Callable[..., AnyEstimator], options: Options) -> AnyEstimator:
     """Create an estimator from options keyed by argument name.
 
     Raises:
         MitsonarError: an unknown option, or a value that is not a number where one is needed.
     """
-    for key, value in checked_options(name, options, made).items():
-        kind = str(inspect.signature(made).parameters[key].annotation)
+    for key, value in checked_options(name, options, factory).items():
+        kind = str(inspect.signature(factory).parameters[key].annotation)
         is_number = isinstance(value, int | float | np.number) or (value is None and "None" in kind)
         if kind.removesuffix(" | None") in ("float", "bool", "int") and not is_number:
             raise MitsonarError(f"{name}: {key} must be a number: got {value!r}")
-    return made(**options)
+    return factory(**options)
 
 
-def _nearest(texts: list[str], options: Options) -> AnyEstimator:
+def _ensemble_of(texts: list[str], options: Options) -> AnyEstimator:
     """Create the ensemble of several checkpoints.
 
     Raises:
         MitsonarError: fewer than two, or estimators that are not networks.
     """
-    made = [_from_text(text, options) for text in texts]
-    plain = [text for text, one in zip(texts, made, strict=True) if not one.digest]
-    if plain or len(made) < 2:
-        fault = f"{plain[0]} was not trained at a height" if plain else f"got {len(made)}"
-        raise MitsonarError(f"commas stand between two or more checkpoints, of which the height chooses one: {fault}")
+    estimators = [_from_text(text, options) for text in texts]
+    untrained = [text for text, one in zip(texts, estimators, strict=True) if not one.digest]
+    if untrained or len(estimators) < 2:
+        problem = f"{untrained[0]} was not trained at a height" if untrained else f"got {len(estimators)}"
+        raise MitsonarError(
+            f"a comma-separated list names two or more checkpoints, from which the height selects one: {problem}"
+        )
     from mitsonar.estimation.learned import HeightEnsemble
 
-    return HeightEnsemble(made)
+    return HeightEnsemble(estimators)
 
 
-def _maker(name: str) -> Callable[..., AnyEstimator]:
+def _factory_of(name: str) -> Callable[..., AnyEstimator]:
     """Return the function that creates the estimator of this name from options."""
-    return UNTRAINED[name] if name in UNTRAINED else _trained(shipped_path(name))
+    return UNTRAINED[name] if name in UNTRAINED else _factory_of_checkpoint(shipped_path(name))
 
 
-def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
+def _factory_of_checkpoint(path: str | Path) -> Callable[..., AnyEstimator]:
     """Return the function that creates the estimator of a checkpoint from options.
 
     Raises:
@@ -234,13 +236,13 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     return Checkpoint.load(path)
 
 
-def options_from(name: str, words: list[str], made: Callable[..., object]) -> Options:
+def options_from(name: str, words: list[str], factory: Callable[..., object]) -> Options:
     """Parse the options of an estimator from words of the command line.
 
     Raises:
         MitsonarError: an unknown option, or a value that is not a number.
     """
-    known, options = _numbers(made), {}
+    known, options = _numeric_options(factory), {}
     for word in words:
         key, _, value = word.partition("=")
         if not value:
@@ -258,9 +260,9 @@ def options_from(name: str, words: list[str], made: Callable[..., object]) -> Op
     return options
 
 
-def _numbers(made: Callable[..., object]) -> dict[str, tuple[str, str]]:
+def _numeric_options(factory: Callable[..., object]) -> dict[str, tuple[str, str]]:
     """Return the numeric and boolean options: argument name and type, keyed by name on the command line."""
-    parameters = inspect.signature(made).parameters.values()
+    parameters = inspect.signature(factory).parameters.values()
     kinds = {one.name: str(one.annotation) for one in parameters}
     numbers = {name: kind for name, kind in kinds.items() if ("float" in kind or kind == "bool") and "tuple" not in kind}
     return {name.replace("_rad", "_deg") if name.endswith("_rad") else name: (name, kind) for name, kind in numbers.items()}
@@ -280,11 +282,11 @@ def height_estimator_from(text: str) -> HeightEstimator:
         return DirectHeight(**options_from(name, words, DirectHeight))
     if not names_checkpoint(name):
         raise MitsonarError(
-            "heights are told by direct, or by the checkpoint or folder of a training: got "
+            "a height estimator is direct, a checkpoint or the folder of a training run: got "
             f"{name!r}{meant(name, ['direct'])}"
         )
     from mitsonar.estimation.height_network import HeightNetwork  # loads torch
 
     checkpoint = load_checkpoint(name)
-    made = partial(HeightNetwork, checkpoint)
-    return made(**options_from(name, words, made))
+    factory = partial(HeightNetwork, checkpoint)
+    return factory(**options_from(name, words, factory))

@@ -56,12 +56,12 @@ def channel_crlb(
         snr_db: mean power of the taps that hold echoes over the variance of a tap's noise.
         free: which of the four parameters are unknown.
     """
-    found = impulse_information(sonar, height_m, motion, pings=pings, span_s=span_s, snr_db=snr_db, free=free)
-    scale = 1 / np.sqrt(np.maximum(np.diag(found), 1e-300))
-    size, axes = np.linalg.eigh(found * np.outer(scale, scale))
-    lost = (axes[:, size < UNKNOWN] ** 2).sum(axis=1) > 1e-3
+    information = impulse_information(sonar, height_m, motion, pings=pings, span_s=span_s, snr_db=snr_db, free=free)
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    size, axes = np.linalg.eigh(information * np.outer(scale, scale))
+    unobservable = (axes[:, size < UNKNOWN] ** 2).sum(axis=1) > 1e-3
     variance = ((axes[:, size >= UNKNOWN] ** 2) / size[size >= UNKNOWN]).sum(axis=1) * scale**2
-    return np.asarray(np.where(lost, np.inf, np.sqrt(variance)))
+    return np.asarray(np.where(unobservable, np.inf, np.sqrt(variance)))
 
 
 def impulse_information(
@@ -80,14 +80,14 @@ def impulse_information(
         MitsonarError: fewer than two pings.
     """
     if pings < 2:
-        raise MitsonarError(f"a motion shows in two pings or more: got {pings}")
-    given = np.zeros(4)
-    given[: len(np.atleast_1d(motion))] = motion
-    reach = 1.2 * max(float(np.abs(given[:2]).max()) / (pings - 1), 0.1 * sonar.wavelength_m)
+        raise MitsonarError(f"a bound needs two pings or more: got {pings}")
+    full_motion = np.zeros(4)
+    full_motion[: len(np.atleast_1d(motion))] = motion
+    reach = 1.2 * max(float(np.abs(full_motion[:2]).max()) / (pings - 1), 0.1 * sonar.wavelength_m)
     total = np.zeros((len(free), len(free)))
     for band in bands_of(sonar):
         for receiver_band in receiver_bands_of(band.sonar, height_m, span_s / (pings - 1), reach):
-            total += _information(receiver_band, given, pings, 10 ** (-snr_db / 10), free)
+            total += _information(receiver_band, full_motion, pings, 10 ** (-snr_db / 10), free)
     return total
 
 

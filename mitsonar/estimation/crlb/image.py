@@ -72,11 +72,11 @@ ALL = "all views"
 VARIABLES = {
     "height_m": "of the sonar over the ground",
     "pitch_deg": "of the sonar",
-    "azimuth_fov_deg": "beams stay as many, and as wide as their spacing",
-    "elevation_fov_deg": "rays over it stay as many",
-    "beams": "the field of view stays, beams are as wide as their spacing",
-    "range_bins": "the window stays",
-    "window": "both ends [m], 3.2..5.6; bins stay as many",
+    "azimuth_fov_deg": "constant number of beams, which are as wide as their spacing",
+    "elevation_fov_deg": "constant number of rays over it",
+    "beams": "constant field of view, beams are as wide as their spacing",
+    "range_bins": "constant window",
+    "window": "both ends [m], 3.2..5.6; constant number of bins",
 }
 """Variables for which a bound can be computed over many values, with their meaning and what remains constant."""
 
@@ -137,9 +137,9 @@ def laws_of(sonar: Sonar) -> dict[str, str]:
 
 
 def _check(kind: str, law: str, kinds: Sequence[str] = tuple(KINDS), laws: Sequence[str] = tuple(LAWS)) -> None:
-    for what, word, known in (("kind", kind, kinds), ("law", law, laws)):
-        if word not in known:
-            raise MitsonarError(f"unknown {what} {word!r}: {nearest_names(word, known)}")
+    for label, word, names in (("kind", kind, kinds), ("law", law, laws)):
+        if word not in names:
+            raise MitsonarError(f"unknown {label} {word!r}: {nearest_names(word, names)}")
 
 
 def _terms(derivative: Derivative, noise: NoiseModel, kind: str, greys: int = 255) -> InformationTerms:
@@ -150,10 +150,10 @@ def _by_pixels(derivative: Derivative, noise: NoiseModel, greys: int) -> Informa
     """Return the information of pixels."""
     changing = derivative.jacobian.any(axis=(0, 3, 4))
     level, filled = derivative.level[changing], derivative.filled[changing]
-    told = information(noise, level, filled, greys=greys)
+    value_information = information(noise, level, filled, greys=greys)
     switching = level**2 * (1 / filled - 1)  # variance of echoes that are there or not, which the law includes
-    rays = np.maximum(derivative.variance[changing] - switching, 0.0) * told.slope[:, 0] ** 2
-    return InformationTerms(told, derivative.jacobian[:, changing].astype(float), rays)
+    rays = np.maximum(derivative.variance[changing] - switching, 0.0) * value_information.slope[:, 0] ** 2
+    return InformationTerms(value_information, derivative.jacobian[:, changing].astype(float), rays)
 
 
 def _by_sums(derivative: Derivative, noise: NoiseModel) -> InformationTerms:
@@ -161,11 +161,11 @@ def _by_sums(derivative: Derivative, noise: NoiseModel) -> InformationTerms:
     jacobian = derivative.jacobian.sum(axis=2, dtype=float)
     changing = jacobian.any(axis=(0, 2, 3))
     level, filled = derivative.level[changing], derivative.filled[changing]
-    told = information_of_sums(noise, filled.sum(axis=1), filled.shape[1])
-    by_filled = told.slope[:, 1:]
+    value_information = information_of_sums(noise, filled.sum(axis=1), filled.shape[1])
+    by_filled = value_information.slope[:, 1:]
     # no ray falls into two beams, so the variances of a row's pixels add up
     rays = derivative.variance[changing] + (2 * by_filled * level + by_filled**2 * filled) * (1 - filled)
-    return InformationTerms(told, jacobian[:, changing], np.maximum(rays.sum(axis=1), 0.0))
+    return InformationTerms(value_information, jacobian[:, changing], np.maximum(rays.sum(axis=1), 0.0))
 
 
 def bounds_of_views(
@@ -179,15 +179,15 @@ def bounds_of_views(
         noise: noise of their pixels.
         apart: whether no two views receive the same rays; views that share rays have no sum.
     """
-    found: dict[tuple[str, str, str], Bound | None] = {}
+    bounds: dict[tuple[str, str, str], Bound | None] = {}
     for kind in KINDS:
-        told = [_terms(view, noise, kind) for view in views]
+        terms = [_terms(view, noise, kind) for view in views]
         for law in LAWS:
-            parts = [one.bound(law) for one in told]
+            parts = [term.bound(law) for term in terms]
             if len(parts) > 1 and apart:
-                found[ALL, kind, law] = together(parts)
-            found |= {(name, kind, law): part for name, part in zip(names, parts, strict=True)}
-    return found
+                bounds[ALL, kind, law] = together(parts)
+            bounds |= {(name, kind, law): part for name, part in zip(names, parts, strict=True)}
+    return bounds
 
 
 def bounds_at(
@@ -206,8 +206,8 @@ def bounds_at(
     """
     if simulator.sonar.model == "coherent":
         refuse_noise(noise, simulator.sonar)
-        for laws in SpeckleBounds(simulator, gain).at(poses, pings=pings):
-            yield {(simulator.views[0].name, "image", law): found for law, found in laws.items()}
+        for laws in SpeckleBounds(simulator, gain).at_poses(poses, pings=pings):
+            yield {(simulator.views[0].name, "image", law): one for law, one in laws.items()}
         return
     source, names = jittered(simulator), [view.name for view in simulator.views]
     portions = [view.member for view in simulator.views if isinstance(view, Segment)]
@@ -216,11 +216,11 @@ def bounds_at(
         for count in (PINGS, 4 * PINGS, 16 * PINGS) if pings is None else (pings,):
             first = FIRST_PING + 32 * PINGS * number
             views = next(differentiate(source, pose, gain, pings=count, first=first))
-            found = bounds_of_views(names, views, noise, apart=apart)
-            images = [one for (_, kind, _), one in found.items() if kind == "image" and one is not None]
+            bounds = bounds_of_views(names, views, noise, apart=apart)
+            images = [one for (_, kind, _), one in bounds.items() if kind == "image" and one is not None]
             if all(np.isfinite(one.std()).all() for one in images):
                 break
-        yield found
+        yield bounds
 
 
 def cramer_rao_bound(
@@ -263,13 +263,13 @@ def cramer_rao_bound(
     law = law or ("ground" if speckle else "pixel")
     _check(kind, law, ["image"] if speckle else list(KINDS), list(laws_of(simulator.sonar)))
     portion = view or (ALL if len(simulator.views) > 1 else simulator.views[0].name)
-    found = []
-    for one in bounds_at(simulator, poses, noise, gain, pings=pings):
-        if (portion, kind, law) not in one:
+    bounds = []
+    for at_pose in bounds_at(simulator, poses, noise, gain, pings=pings):
+        if (portion, kind, law) not in at_pose:
             names = ", ".join(known.name for known in simulator.views)
-            raise MitsonarError(f"portions that overlap have no bound together: got view {view!r}; name one of {names}")
-        found.append(one[portion, kind, law])
-    return np.array([np.zeros(3) if one is None else one.std(frames) for one in found]).reshape(-1, 3)
+            raise MitsonarError(f"overlapping portions have no common bound: got view {view!r}; name one of {names}")
+        bounds.append(at_pose[portion, kind, law])
+    return np.array([np.zeros(3) if one is None else one.std(frames) for one in bounds]).reshape(-1, 3)
 
 
 # ---------------- Changed sonars and poses
@@ -299,29 +299,29 @@ def varied(
     if name == "window":
         near, far = value  # type: ignore[misc]
         return sonar.replace(range_min=near, range_max=far), poses
-    changed, number = poses.copy(), float(value)  # type: ignore[arg-type]
+    varied_poses, number = poses.copy(), float(value)  # type: ignore[arg-type]
     # change the variable itself
     before = floor_ranges(sonar, float(heights.mean()), float(poses[:, 3].mean())) if name in MOVING else None
-    height, other = heights, sonar
+    height, varied_sonar = heights, sonar
     if name == "height_m":
         if not number > 0:
             raise MitsonarError(f"height_m must be above 0: got {number:g}")
-        changed[:, 2] += number - heights
+        varied_poses[:, 2] += number - heights
         height = np.full_like(heights, number)
     elif name == "pitch_deg":
-        changed[:, 3] = np.radians(number)
+        varied_poses[:, 3] = np.radians(number)
     else:
-        whole = name in ("beams", "range_bins", "rays_per_beam")
-        if whole and number != round(number):
+        is_whole = name in ("beams", "range_bins", "rays_per_beam")
+        if is_whole and number != round(number):
             raise MitsonarError(f"{name} must be a whole number: got {number:g}")
         width = {"beam_width_deg": None} if name in ("azimuth_fov_deg", "beams") else {}
-        other = sonar.replace(**{name: round(number) if whole else number}, **width)
+        varied_sonar = sonar.replace(**{name: round(number) if is_whole else number}, **width)
     if before is None:
-        return other, changed
+        return varied_sonar, varied_poses
     # scale the window with the range of the floor
-    after = floor_ranges(other, float(height.mean()), float(changed[:, 3].mean()))
+    after = floor_ranges(varied_sonar, float(height.mean()), float(varied_poses[:, 3].mean()))
     near, far = (end * new / old for end, new, old in zip((sonar.range_min, sonar.range_max), after, before, strict=True))
-    return other.replace(range_min=near, range_max=far), changed
+    return varied_sonar.replace(range_min=near, range_max=far), varied_poses
 
 
 def floor_ranges(sonar: Sonar, height_m: float, pitch_rad: float) -> tuple[float, float]:
@@ -373,7 +373,7 @@ class Bound:
         infinite variance.
         """
         if frames not in (1, 2):
-            raise MitsonarError(f"a bound is that of 1 or 2 noisy frames: got {frames}")
+            raise MitsonarError(f"a bound is for 1 or 2 noisy frames: got {frames}")
         # scale F to a unit diagonal; keep the directions that exceed their errors
         diagonal = np.diag(self.information)
         scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
@@ -427,13 +427,13 @@ def fisher_by(jacobian: NDArray[np.float64], weigh: Callable[[NDArray[np.float64
     """
     mean, half = jacobian.mean(axis=0), (jacobian[0] - jacobian[1]) / 2
     weighted = weigh(half)
-    own = mean.transpose(0, 2, 1) @ weigh(mean)
-    own = (own + own.transpose(0, 2, 1)) / 2
+    mean_information = mean.transpose(0, 2, 1) @ weigh(mean)
+    mean_information = (mean_information + mean_information.transpose(0, 2, 1)) / 2
     noise = half.transpose(0, 2, 1) @ weighted
     noise = (noise + noise.transpose(0, 2, 1)) / 2
     mixed = mean.transpose(0, 2, 1) @ weighted
     parts = np.concatenate([mixed + mixed.transpose(0, 2, 1), np.sqrt(2) * noise]).reshape(-1, 9)
-    return Bound((own - noise).sum(axis=0), (parts.T @ parts).reshape(3, 3, 3, 3))
+    return Bound((mean_information - noise).sum(axis=0), (parts.T @ parts).reshape(3, 3, 3, 3))
 
 
 def together(parts: Sequence[Bound | None]) -> Bound | None:
@@ -489,14 +489,14 @@ class ScoreCovariance:
 
     Attributes:
         parts: weights w ``(bins, beams)`` with the correlation R.
-        own: variance of each cell that is uncorrelated with others ``(bins, beams)``, so that all have variance 1.
+        uncorrelated: variance of each cell that is uncorrelated with others ``(bins, beams)``, so that all have variance 1.
     """
 
     parts: list[tuple[NDArray[Any], CellCorrelation]]
-    own: Floats
+    uncorrelated: Floats
 
     @classmethod
-    def of(cls, parts: list[tuple[NDArray[Any], CellCorrelation]], shape: tuple[int, int]) -> ScoreCovariance:
+    def from_parts(cls, parts: list[tuple[NDArray[Any], CellCorrelation]], shape: tuple[int, int]) -> ScoreCovariance:
         """Add the uncorrelated part that makes all variances 1.
 
         Args:
@@ -508,11 +508,11 @@ class ScoreCovariance:
 
     def __matmul__(self, values: Floats) -> Floats:
         """Apply to maps ``(k, bins, beams)``."""
-        found = self.own * values
+        product = self.uncorrelated * values
         for weight, correlation in self.parts:
-            for total, one in zip(found, values, strict=True):
+            for total, one in zip(product, values, strict=True):
                 total += (np.conj(weight) * (correlation @ (weight * one))).real
-        return found
+        return product
 
     def solve(self, values: Floats) -> Floats:
         """Return C^-1 of maps ``(k, bins, beams)``, by conjugate gradients.
@@ -520,20 +520,22 @@ class ScoreCovariance:
         Raises:
             MitsonarError: the iteration does not converge.
         """
-        found, rest = np.zeros_like(values), values.copy()
-        way, size = rest.copy(), np.einsum("kij,kij->k", rest, rest)
-        goal = TOLERANCE**2 * size
+        solution, residual = np.zeros_like(values), values.copy()
+        direction, size = residual.copy(), np.einsum("kij,kij->k", residual, residual)
+        target = TOLERANCE**2 * size
         for _ in range(MOST_STEPS):
-            if (size <= goal).all():
-                return found
+            if (size <= target).all():
+                return solution
             # one step along the conjugate direction of each map; maps of zeros stay zero
-            spread = self @ way
-            along = np.einsum("kij,kij->k", way, spread)
+            spread = self @ direction
+            along = np.einsum("kij,kij->k", direction, spread)
             step = np.divide(size, along, out=np.zeros_like(size), where=along > 0)[:, None, None]
-            found += step * way
-            rest -= step * spread
-            before, size = size, np.einsum("kij,kij->k", rest, rest)
-            way = rest + np.divide(size, before, out=np.zeros_like(size), where=before > 0)[:, None, None] * way
+            solution += step * direction
+            residual -= step * spread
+            before, size = size, np.einsum("kij,kij->k", residual, residual)
+            direction = (
+                residual + np.divide(size, before, out=np.zeros_like(size), where=before > 0)[:, None, None] * direction
+            )
         raise MitsonarError("the covariance of the cells cannot be inverted: give beams nearer to the width of the spacing")
 
 
@@ -601,10 +603,10 @@ class SpeckleBounds:
         beams = self.imager.receiver.beam_correlations()
         share = float(volume.sum()) / max(float((noise + volume).sum()), 1e-300)
         bins = self.imager.receiver.bin_correlation().astype(float)
-        self.of_noise = CellCorrelation(bins, (1 - share) * beams[0] + share * beams[1])
-        self.of_speckle = CellCorrelation(bins, beams[2])
+        self.noise_correlation = CellCorrelation(bins, (1 - share) * beams[0] + share * beams[1])
+        self.speckle_correlation = CellCorrelation(bins, beams[2])
 
-    def at(self, poses: ArrayLike, *, pings: int | None = None) -> Iterator[dict[str, Bound]]:
+    def at_poses(self, poses: ArrayLike, *, pings: int | None = None) -> Iterator[dict[str, Bound]]:
         """Compute the bounds at each pose, keyed by :data:`SPECKLE_LAWS`.
 
         Args:
@@ -622,19 +624,19 @@ class SpeckleBounds:
 
         Args:
             pose: pose of the sonar ``(6,)``.
-            pings: see :meth:`at`.
+            pings: see :meth:`at_poses`.
         """
         # two independent estimates of the derivative, by two sets of rays
         step = np.array(step_for(self.sonar, GRAIN_STEP))
         jacobian = np.stack([_power_slopes(imager, pose, step, pings or GRAIN_PINGS) for imager in self.halves])
-        echo, other = (imager.echoes(pose)[0].astype(np.complex128) for imager in self.halves)
+        echo, other_echo = (imager.echoes(pose)[0].astype(np.complex128) for imager in self.halves)
         level = np.abs(echo) ** 2 + self.noise
         # leave out clipped pixels and echoes on which the rays disagree; rounding adds variance
         scale = self.gain * self.imager.gain.astype(float)[:, None]
         slope = coding_slope(level * scale, self.sonar) * scale
-        use = (slope > 0) & (np.abs(echo - other) < AGREEING * np.abs(echo + other) / 2)
-        rounding = np.divide(1 / (12 * GREYS**2), slope**2, out=np.full_like(slope, np.inf), where=use)
-        return CellScores(jacobian, *grain_law(echo, self.noise, self.of_noise, rounding))
+        used = (slope > 0) & (np.abs(echo - other_echo) < AGREEING * np.abs(echo + other_echo) / 2)
+        rounding = np.divide(1 / (12 * GREYS**2), slope**2, out=np.full_like(slope, np.inf), where=used)
+        return CellScores(jacobian, *grain_law(echo, self.noise, self.noise_correlation, rounding))
 
     def ground(self, pose: Floats, pings: int | None = None, first: int = FIRST_PING) -> CellScores:
         """Return the information of cells about the motion if the expected level is known.
@@ -643,7 +645,7 @@ class SpeckleBounds:
 
         Args:
             pose: pose of the sonar ``(6,)``.
-            pings: see :meth:`at`.
+            pings: see :meth:`at_poses`.
             first: number of the first ping, which determines the rays' jitter.
         """
         # expected level and derivative, scaled well below clipping
@@ -653,15 +655,15 @@ class SpeckleBounds:
         known = (level > 0) & (derivative.variance < (AGREEING * level) ** 2)
         safe = np.where(known, level, 1)
         # fractions of speckle and noise, whose products give the covariance of the scores
-        echo = np.where(known, derivative.level, 0) / safe
-        other = np.where(known, 1 - echo, 0.0)
+        echo_share = np.where(known, derivative.level, 0) / safe
+        noise_share = np.where(known, 1 - echo_share, 0.0)
         parts = [
-            (echo, self.of_speckle * self.of_speckle),
-            (np.sqrt(2 * echo * other), self.of_speckle * self.of_noise),
-            (other, self.of_noise * self.of_noise),
+            (echo_share, self.speckle_correlation * self.speckle_correlation),
+            (np.sqrt(2 * echo_share * noise_share), self.speckle_correlation * self.noise_correlation),
+            (noise_share, self.noise_correlation * self.noise_correlation),
         ]
         jacobian = derivative.jacobian[..., 0, :] / safe[..., None]
-        return CellScores(jacobian, known.astype(float), ScoreCovariance.of(parts, level.shape))
+        return CellScores(jacobian, known.astype(float), ScoreCovariance.from_parts(parts, level.shape))
 
 
 class CellScores(NamedTuple):
@@ -710,20 +712,22 @@ def grain_law(
     # without noise only rounding limits the information
     if not (noise > 0).all():
         if not (rounding > 0).all():
-            raise MitsonarError("without noise amplitudes tell the motion without limit: give the sonar noise_level_db")
+            raise MitsonarError(
+                "without noise, amplitudes determine the motion without limit: give the sonar noise_level_db"
+            )
         return 1 / rounding, ScoreCovariance([], np.ones(power.shape))
     variance = 1 / rician_information(power, noise)
     total = variance + rounding
-    kept = np.sqrt(variance / total)  # fraction of the score's standard deviation that is not rounding
+    score_fraction = np.sqrt(variance / total)  # fraction of the score's standard deviation that is not rounding
     # the score is a sum of terms in the noise, in its power and in its square, each with its correlation
     shares = score_shares(power, noise)
     turn = np.exp(1j * np.angle(echo))
     parts = [
-        (kept * shares.linear * turn, shared),
-        (kept * shares.power, shared * shared),
-        (kept * shares.double * turn**2, shared * shared),
+        (score_fraction * shares.linear * turn, shared),
+        (score_fraction * shares.power, shared * shared),
+        (score_fraction * shares.double * turn**2, shared * shared),
     ]
-    return 1 / total, ScoreCovariance.of(parts, power.shape)
+    return 1 / total, ScoreCovariance.from_parts(parts, power.shape)
 
 
 def expected_sonar(sonar: Sonar) -> Sonar:
@@ -734,10 +738,10 @@ def expected_sonar(sonar: Sonar) -> Sonar:
 
 def _power_slopes(imager: CoherentImager, pose: Floats, step: Floats, pings: int) -> Floats:
     """Return the derivative of the power of echoes by the motion ``(bins, beams, 3)``: mean over places within the step."""
-    within = evenly(pings) * step
+    offsets = evenly(pings) * step
     slopes = np.zeros((imager.sonar.range_bins, imager.sonar.beams, 3))
     for axis in range(3):
-        for motion in within:
+        for motion in offsets:
             for side in (1, -1):
                 moved = motion.copy()
                 moved[axis] = side * step[axis]

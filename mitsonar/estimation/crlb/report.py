@@ -53,7 +53,7 @@ class BoundOptions:
     """Choices of bounds.
 
     Attributes:
-        noise: noise of the pixels; None: high, or none in the model ``coherent``, which has noise of its own.
+        noise: noise of the pixels; None: high, or none in the model ``coherent``, which includes noise.
         height_m: height of the sonar over the ground [m]; None: that of the poses.
         vary: name of one of :data:`~mitsonar.estimation.crlb.image.VARIABLES`, if any.
         values: values of this variable.
@@ -137,14 +137,14 @@ def bounds_of_subject(
         sonar, poses, heights = subject.sonar, place.poses, place.heights
         if sonar.model == "coherent" and place.seed is not None:
             sonar = sonar.replace(seed=place.seed)
-        for name, changed in changes:
-            sonar, poses = varied(sonar, poses, heights, name, changed)
-            heights = np.full_like(heights, changed) if name == "height_m" else heights
+        for name, varied_value in changes:
+            sonar, poses = varied(sonar, poses, heights, name, varied_value)
+            heights = np.full_like(heights, varied_value) if name == "height_m" else heights
         simulator = Simulator(place.scene, sonar, views=subject.views(sonar), mirrors=subject.mirrors)
         gain = gain if gain is not None else _gain(simulator, poses)
         for bounds in bounds_at(simulator, poses, noise, gain, pings=options.pings):
-            for key, found in bounds.items():
-                table.setdefault(key, []).append(found)
+            for key, bound in bounds.items():
+                table.setdefault(key, []).append(bound)
             progress(1)
     return table
 
@@ -265,7 +265,7 @@ def subject_of_data(source: str, pairs: int, *, part: str | None = None, seed: i
         seed: seed of the rays; None: that of the data set.
 
     Raises:
-        MitsonarError: no pair, or no data set.
+        MitsonarError: no pair, or not a data set.
     """
     if pairs < 1:
         raise MitsonarError(f"--pairs must be at least 1: got {pairs}")
@@ -273,27 +273,27 @@ def subject_of_data(source: str, pairs: int, *, part: str | None = None, seed: i
     recipe = store.recipe
     scene, sequence, pose, height = (store.read(name) for name in ("scene", "sequence", "pose", "height_m"))
     part = part or recipe.split.unseen
-    mine = np.flatnonzero(deal(world_of(recipe, store.scenes)[scene], sequence, recipe.split, part) & np.isfinite(height))
-    first = mine[np.unique(sequence[mine], return_index=True)[1]]
+    in_part = np.flatnonzero(deal(world_of(recipe, store.scenes)[scene], sequence, recipe.split, part) & np.isfinite(height))
+    first = in_part[np.unique(sequence[in_part], return_index=True)[1]]
     if not len(first):
         raise MitsonarError(f"{source} has no frame over ground in part {part!r}: give --part all")
     chosen = first[np.unique(np.linspace(0, len(first) - 1, min(pairs, len(first))).round().astype(int))]
 
     def places() -> Iterator[Place]:
         for number in np.unique(scene[chosen]):
-            here = chosen[scene[chosen] == number]
+            in_scene = chosen[scene[chosen] == number]
             renderer = SceneRenderer(recipe, store.scenes[int(number)])
-            yield Place(renderer.simulator.tracer.scene, pose[here], height[here], renderer.simulator.sonar.seed)
+            yield Place(renderer.simulator.tracer.scene, pose[in_scene], height[in_scene], renderer.simulator.sonar.seed)
             del renderer
             release_memory()
 
     def views(other: Sonar) -> list[View]:
-        if recipe.receivers and other != own:
-            raise MitsonarError("--vary and --height need one sonar that sends and hears: this data set has receivers")
+        if recipe.receivers and other != instrument:
+            raise MitsonarError("--vary and --height need one sonar that sends and receives: this data set has receivers")
         return recipe.views if recipe.receivers else _views(other, recipe.segments)
 
-    own = recipe.instrument if seed is None else recipe.instrument.replace(seed=seed)
-    return Subject(own, views, places, len(chosen), float(store.about["gain"]), recipe.mirrors)
+    instrument = recipe.instrument if seed is None else recipe.instrument.replace(seed=seed)
+    return Subject(instrument, views, places, len(chosen), float(store.about["gain"]), recipe.mirrors)
 
 
 def _views(sonar: Sonar, segments: list[str]) -> list[View]:

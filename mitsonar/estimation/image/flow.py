@@ -138,11 +138,11 @@ class WindowGrid:
     @cached_property
     def _higher(self) -> tuple[GroundGeometry, GroundGeometry]:
         """Geometry of both frames with the sonar raised by :data:`HIGHER` times the height of the first."""
-        ground, other = (replace(one, height_m=one.height_m + HIGHER * self.ground.height_m) for one in self._both)
-        return ground, other
+        ground, second = (replace(one, height_m=one.height_m + HIGHER * self.ground.height_m) for one in self._both_grounds)
+        return ground, second
 
     @property
-    def _both(self) -> tuple[GroundGeometry, GroundGeometry]:
+    def _both_grounds(self) -> tuple[GroundGeometry, GroundGeometry]:
         return self.ground, self.other
 
     @cached_property
@@ -307,9 +307,9 @@ def _warped(second: Floats, grid: WindowGrid, v: Doubles) -> tuple[Floats, Float
     row, column = _place(radius, grid.ground.range_m), _place(bearing, grid.ground.bearing_rad)
     bins, beams = second.shape
     inside = (row >= 0) & (row <= bins - 1) & (column >= 0) & (column <= beams - 1)  # False for nan
-    held_column, held_row = (np.where(inside, place, np.float32(0)) for place in (column, row))
-    drawn = cv2.remap(second, held_column, held_row, cv2.INTER_LINEAR)
-    return np.asarray(drawn, dtype=np.float32), inside.astype(np.float32)
+    safe_column, safe_row = (np.where(inside, place, np.float32(0)) for place in (column, row))
+    warped = cv2.remap(second, safe_column, safe_row, cv2.INTER_LINEAR)
+    return np.asarray(warped, dtype=np.float32), inside.astype(np.float32)
 
 
 def _place(value: Floats, axis: Doubles) -> Floats:
@@ -372,14 +372,14 @@ def _symmetric(one: Doubles, cross: Doubles, other: Doubles) -> Doubles:
 
 def _correlation(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid) -> float:
     """Return the correlation of the matched frames within windows; shading common to the whole images does not count."""
-    one, other = first * inside, warped * inside
+    first_inside, warped_inside = first * inside, warped * inside
     count = np.maximum(_in_windows(inside, grid), 1)
-    mean, mean_there = _in_windows(one, grid), _in_windows(other, grid)
-    together = (_in_windows(one * other, grid) - mean * mean_there / count).sum()
-    alone = (_in_windows(one * one, grid) - mean**2 / count).sum()
-    alone_there = (_in_windows(other * other, grid) - mean_there**2 / count).sum()
-    both = float(alone * alone_there)
-    return float(together) / np.sqrt(both) if both > TINY else 0.0
+    mean, mean_there = _in_windows(first_inside, grid), _in_windows(warped_inside, grid)
+    covariance = (_in_windows(first_inside * warped_inside, grid) - mean * mean_there / count).sum()
+    variance = (_in_windows(first_inside * first_inside, grid) - mean**2 / count).sum()
+    variance_there = (_in_windows(warped_inside * warped_inside, grid) - mean_there**2 / count).sum()
+    product = float(variance * variance_there)
+    return float(covariance) / np.sqrt(product) if product > TINY else 0.0
 
 
 def _structure(flow: WindowFlow, grid: WindowGrid) -> Doubles:
@@ -464,7 +464,7 @@ def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float)
 
     The unknowns are the motion and, unless ``height_std`` is 0, the relative change of the height.
     """
-    found = grid.map(v) + flow.displacement
+    measured = grid.map(v) + flow.displacement
     unknowns = grid.derivative if not height_std else np.concatenate([grid.derivative, grid.by_height(v)], axis=-1)
     used = flow.information.any(axis=(2, 3))
     if used.sum() < BLOCK * BLOCK:
@@ -473,15 +473,15 @@ def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float)
     prior = np.zeros(len(p))
     for _ in range(10):
         # misfit of the windows, and its usual square
-        misfit = found - grid.map(p[:3]) - (unknowns[..., 3:] @ p[3:])
-        pull = (flow.information @ misfit[..., None])[..., 0]
-        squared = np.maximum((misfit * pull).sum(axis=-1), 0)
-        usual = float(np.median(squared[used])) / 1.39 + TINY  # the median of chi-square with 2 degrees of freedom
+        misfit = measured - grid.map(p[:3]) - (unknowns[..., 3:] @ p[3:])
+        gradient = (flow.information @ misfit[..., None])[..., 0]
+        squared = np.maximum((misfit * gradient).sum(axis=-1), 0)
+        usual_square = float(np.median(squared[used])) / 1.39 + TINY  # the median of chi-square with 2 degrees of freedom
         # the prior of the height in units of the misfit; robust weights of the windows
-        prior[3:] = usual * BLOCK**2 / height_std**2 if height_std else 0.0
-        weight = 1 / (1 + squared / (CAUCHY * usual))
+        prior[3:] = usual_square * BLOCK**2 / height_std**2 if height_std else 0.0
+        weight = 1 / (1 + squared / (CAUCHY * usual_square))
         # Gauss-Newton step
-        scores = _apply(unknowns, pull) * weight[..., None]
+        scores = _apply(unknowns, gradient) * weight[..., None]
         normal = _normal(unknowns, flow.information * weight[..., None, None]).sum(axis=(0, 1)) + np.diag(prior)
         if not _regular(normal):
             return None
@@ -501,20 +501,22 @@ def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | N
 
     They are the mean displacements in range and in bearing, and the slope of the displacement in range over bearing.
     """
-    found = grid.map(v) + flow.displacement
+    measured = grid.map(v) + flow.displacement
     used = flow.information.any(axis=(2, 3))
     count = int(used.sum())
     if count < BLOCK * BLOCK:
         return None
-    aside = np.where(used, grid.home[..., 1] - grid.home[..., 1][used].mean(), 0.0)
+    bearing_offset = np.where(used, grid.home[..., 1] - grid.home[..., 1][used].mean(), 0.0)
     one, none = used.astype(float), np.zeros(used.shape)
     # contribution of each window to the vector: (n, m, 2, 3)
-    summary = np.stack([np.stack([one, none, aside], axis=-1), np.stack([none, one, none], axis=-1)], axis=-2) / count
+    summary = (
+        np.stack([np.stack([one, none, bearing_offset], axis=-1), np.stack([none, one, none], axis=-1)], axis=-2) / count
+    )
     slope = (np.swapaxes(summary, -1, -2) @ grid.derivative).sum(axis=(0, 1))
     if np.linalg.matrix_rank(slope * SIZE) < 3:
         return None
     for _ in range(10):
-        scores = _apply(summary, found - grid.map(v))
+        scores = _apply(summary, measured - grid.map(v))
         step = np.linalg.solve(slope, scores.sum(axis=(0, 1)))
         v = v + step
         if (np.abs(step) < STILL / 10).all():
@@ -525,9 +527,9 @@ def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | N
     return MapMatch(v, _covariance(normals, scores, np.zeros(3), 0.0))
 
 
-def _apply(unknowns: Doubles, pull: Doubles) -> Doubles:
+def _apply(unknowns: Doubles, gradient: Doubles) -> Doubles:
     """Return the gradient by each unknown, for each window ``(n, m, unknowns)``."""
-    return (np.swapaxes(unknowns, -1, -2) @ pull[..., None])[..., 0]
+    return (np.swapaxes(unknowns, -1, -2) @ gradient[..., None])[..., 0]
 
 
 def _normal(unknowns: Doubles, information: Doubles) -> Doubles:
@@ -547,15 +549,15 @@ def _covariance(normals: Doubles, scores: Doubles, prior: Doubles, height_std: f
 
     It sums the changes when one block of windows is left out (jackknife) and the uncertainty of the assumed height.
     """
-    each, said = in_blocks(normals), in_blocks(scores)
-    whole = each.sum(axis=0) + np.diag(prior)
+    block_normals, block_scores = in_blocks(normals), in_blocks(scores)
+    total = block_normals.sum(axis=0) + np.diag(prior)
     try:
-        change = np.linalg.solve(whole - each, said[..., None])[..., 0]
-        assumed = np.linalg.solve(whole, np.diag(prior * height_std))
+        change = np.linalg.solve(total - block_normals, block_scores[..., None])[..., 0]
+        by_height = np.linalg.solve(total, np.diag(prior * height_std))
     except np.linalg.LinAlgError:
         return None
-    blocks = len(each)
-    return np.asarray((change.T @ change * (blocks - 1) / blocks + assumed @ assumed.T)[:3, :3])
+    blocks = len(block_normals)
+    return np.asarray((change.T @ change * (blocks - 1) / blocks + by_height @ by_height.T)[:3, :3])
 
 
 def in_blocks(values: Doubles) -> Doubles:

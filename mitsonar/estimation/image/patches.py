@@ -117,20 +117,22 @@ def corners(image: PatchImage, taken: NDArray[np.bool_]) -> tuple[Index, Index]:
     # smaller eigenvalue of the structure tensor: large where a patch is distinct in both directions
     by_bin, by_beam = image.by_bin * image.lit, image.by_beam * (image.lit / np.float32(BEAM))
     size = (0.7 * REACH[0], 0.7 * REACH[1])
-    one, both, other = (blurred(product, *size) for product in (by_bin**2, by_bin * by_beam, by_beam**2))
-    least = (one + other) / 2 - np.sqrt(((one - other) / 2) ** 2 + both**2)
+    by_bin_squared, mixed, by_beam_squared = (
+        blurred(product, *size) for product in (by_bin**2, by_bin * by_beam, by_beam**2)
+    )
+    eigenvalue = (by_bin_squared + by_beam_squared) / 2 - np.sqrt(((by_bin_squared - by_beam_squared) / 2) ** 2 + mixed**2)
     # leave out patches that would reach beyond the image
-    rows, columns = (int(length) // cell * cell for length, cell in zip(least.shape, CELL, strict=True))
+    rows, columns = (int(length) // cell * cell for length, cell in zip(eigenvalue.shape, CELL, strict=True))
     margin = [reach + 2 for reach in REACH]
-    inside = np.zeros_like(least)
-    inside[margin[0] : -margin[0], margin[1] : -margin[1]] = least[margin[0] : -margin[0], margin[1] : -margin[1]]
+    inside = np.zeros_like(eigenvalue)
+    inside[margin[0] : -margin[0], margin[1] : -margin[1]] = eigenvalue[margin[0] : -margin[0], margin[1] : -margin[1]]
     # best pixel of each grid cell, unless the cell is too faint or already has a patch
     tiles, full = (_tiles(table[:rows, :columns]) for table in (inside, taken))
     best = tiles.argmax(axis=1)
     chosen = (tiles[np.arange(len(tiles)), best] > FAINTEST) & ~full.any(axis=1)
     tile, place = np.flatnonzero(chosen), best[chosen]
-    across = columns // CELL[1]
-    return tile // across * CELL[0] + place // CELL[1], tile % across * CELL[1] + place % CELL[1]
+    tiles_per_row = columns // CELL[1]
+    return tile // tiles_per_row * CELL[0] + place // CELL[1], tile % tiles_per_row * CELL[1] + place % CELL[1]
 
 
 def cut(image: PatchImage, row: Array, column: Array, weights: Floats | None = None) -> tuple[Patches, NDArray[np.bool_]]:
@@ -172,25 +174,25 @@ def align(image: PatchImage, patches: Patches, row: Array, column: Array) -> Ali
     for _ in range(ROUNDS):
         # sample the frame at the shifted places; centre levels and slopes, since the offset is free
         weights, template = patches.weights[moving], patches.values[moving]
-        there = row[moving] + shift[moving, :1], column[moving] + shift[moving, 1:]
-        level, deviation = _normalised(_sampled(image.level, *there), weights)
-        by_bin, by_beam = (_centred(_sampled(slope, *there), weights) for slope in (image.by_bin, image.by_beam))
+        place = row[moving] + shift[moving, :1], column[moving] + shift[moving, 1:]
+        level, deviation = _normalised(_sampled(image.level, *place), weights)
+        by_bin, by_beam = (_centred(_sampled(slope, *place), weights) for slope in (image.by_bin, image.by_beam))
         # residual after the best gain
-        alike = (level * template * weights).sum(axis=1) / deviation[:, 0]
-        rest = level - template * alike[:, None] * deviation
+        match = (level * template * weights).sum(axis=1) / deviation[:, 0]
+        remainder = level - template * match[:, None] * deviation
         # Gauss-Newton step from the 2 x 2 normal equations of each patch
         aa, ab, bb = (
             (one * other * weights).sum(axis=1).astype(float)
             for one, other in ((by_bin, by_bin), (by_bin, by_beam), (by_beam, by_beam))
         )
-        pull_a, pull_b = (-(slope * rest * weights).sum(axis=1).astype(float) for slope in (by_bin, by_beam))
+        gradient_a, gradient_b = (-(slope * remainder * weights).sum(axis=1).astype(float) for slope in (by_bin, by_beam))
         det = aa * bb - ab * ab + 1e-14
-        step = np.stack([(bb * pull_a - ab * pull_b) / det, (aa * pull_b - ab * pull_a) / det], axis=1)
+        step = np.stack([(bb * gradient_a - ab * gradient_b) / det, (aa * gradient_b - ab * gradient_a) / det], axis=1)
         step = np.clip(step, -LONGEST, LONGEST)
         shift[moving] += step
         # keep what the covariance needs; patches that settled leave the iteration
         normal[moving] = np.stack([np.stack([aa, ab], axis=-1), np.stack([ab, bb], axis=-1)], axis=-2)
-        residual[moving], correlation[moving] = (rest * rest * weights).sum(axis=1), alike
+        residual[moving], correlation[moving] = (remainder * remainder * weights).sum(axis=1), match
         moving = moving[(np.abs(step) > STILL).any(axis=1)]
         if not len(moving):
             break

@@ -90,11 +90,11 @@ class Phase:
         turn, shift = _PhaseCorrelation(_spectrum_by_angle(fixed, larger), LOW), _PhaseCorrelation(fixed, LOW * larger)
         for _ in range(ROUNDS):
             # rotation first, since the spectra's magnitudes do not depend on the translation
-            _, rows = turn.offset(_spectrum_by_angle(_windowed(_back(second, view, motion), window), larger))
+            _, rows = turn.offset(_spectrum_by_angle(_windowed(_warped_back(second, view, motion), window), larger))
             motion = _turned(motion, -rows * np.pi / ANGLES)
-            motion = _shifted(motion, shift.offset(_windowed(_back(second, view, motion), window)), view)
+            motion = _shifted(motion, shift.offset(_windowed(_warped_back(second, view, motion), window)), view)
         # accept the motion only if the aligned frames match, away from the fan's outline
-        matched = _back(second, view, motion)
+        matched = _warped_back(second, view, motion)
         smooth = [cv2.GaussianBlur(image, (5, 5), 0) for image in (first, matched)]
         reason = matching_rejection(smooth[0], smooth[1], window > 0.3, correlated=4 * np.pi * 1.1**2)
         return Estimate(motion, None, not reason, reason, attitude.about)
@@ -107,7 +107,7 @@ def _window(inside: NDArray[np.bool_]) -> Floats:
     return np.asarray(np.sin(np.pi / 2 * np.minimum(distance / (0.5 * distance.max() + 1e-9), 1)) ** 2, dtype=np.float32)
 
 
-def _back(second: Floats, view: GroundView, motion: Motion) -> Floats:
+def _warped_back(second: Floats, view: GroundView, motion: Motion) -> Floats:
     """Warp the second frame to the first."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(second, view.warp(motion), second.shape[::-1], flags=flags))
@@ -155,10 +155,10 @@ class _PhaseCorrelation:
         return float(column + 1 + columns - self.shape[1] // 2), float(row + 1 + rows - self.shape[0] // 2)
 
 
-def _summit(three: NDArray[np.float64]) -> float:
+def _summit(values: NDArray[np.float64]) -> float:
     """Return the vertex of the parabola through three values, of which the middle one is the largest."""
-    bend = three[0] - 2 * three[1] + three[2]
-    return float(np.clip((three[0] - three[2]) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
+    curvature = values[0] - 2 * values[1] + values[2]
+    return float(np.clip((values[0] - values[2]) / (2 * curvature), -0.5, 0.5)) if curvature < 0 else 0.0
 
 
 def _turned(motion: Motion, yaw: float) -> Motion:
@@ -239,8 +239,8 @@ class Ecc:
             if min(first.shape) < 4 * size:
                 return rejected("the fan meets too little ground")
             try:
-                words = (warp, cv2.MOTION_EUCLIDEAN, SETTLED, size)
-                warp = np.asarray(cv2.findTransformECCWithMask(first, second, mask, mask, *words)[1], dtype=np.float32)
+                arguments = (warp, cv2.MOTION_EUCLIDEAN, SETTLED, size)
+                warp = np.asarray(cv2.findTransformECCWithMask(first, second, mask, mask, *arguments)[1], dtype=np.float32)
             except cv2.error:
                 return rejected("the correlation has no maximum nearby")
             motion = view.motion(warp)
@@ -257,9 +257,9 @@ class Ecc:
     ) -> str:
         """Return why a match is rejected, from images smoothed as in OpenCV; empty if it is valid."""
         smooth = [cv2.GaussianBlur(image, (size, size), 0) for image in (first, second)]
-        back = cv2.warpAffine(smooth[1], warp, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        warped = cv2.warpAffine(smooth[1], warp, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
         seen = cv2.warpAffine(
             inside.astype(np.float32), warp, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         )
         edge = cv2.erode((inside & (seen > 0.99)).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
-        return matching_rejection(smooth[0], back, edge, correlated=4 * np.pi * (0.3 * ((size - 1) / 2 - 1) + 0.8) ** 2)
+        return matching_rejection(smooth[0], warped, edge, correlated=4 * np.pi * (0.3 * ((size - 1) / 2 - 1) + 0.8) ** 2)

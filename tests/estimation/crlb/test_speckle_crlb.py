@@ -52,7 +52,7 @@ def test_the_covariance_is_that_of_the_formula_and_is_inverted() -> None:
     shape, shared = (7, 5), near(7, 5)
     turn = np.sqrt(0.6) * np.exp(2j * np.pi * rng.random(shape))
     power = np.sqrt(0.3) * np.ones(shape)
-    covariance = ScoreCovariance.of([(turn, shared), (power, shared * shared)], shape)
+    covariance = ScoreCovariance.from_parts([(turn, shared), (power, shared * shared)], shape)
     whole = np.kron(neighbours(7, 0.42), neighbours(5, 0.45))
     flat = turn.ravel()
     wanted = (flat.conj()[:, None] * whole * flat).real + 0.3 * whole**2 + 0.1 * np.eye(35)
@@ -67,7 +67,7 @@ def test_the_covariance_is_that_of_the_formula_and_is_inverted() -> None:
 def test_an_even_change_of_speckle_counts_independent_cells() -> None:
     """A level that changes by one factor everywhere: cells over the sum of squared coherences, apart from the edges."""
     shape, shared = (200, 120), near(200, 120)
-    covariance = ScoreCovariance.of([(np.ones(shape), shared * shared)], shape)
+    covariance = ScoreCovariance.from_parts([(np.ones(shape), shared * shared)], shape)
     jacobian = np.zeros((2, *shape, 3))
     jacobian[..., 0] = 1
     told = CellScores(jacobian, np.ones(shape), covariance).bound().information[0, 0]
@@ -143,7 +143,7 @@ def grain_oracle(bounds: SpeckleBounds, draws: int) -> float:
     """e' F e / 3 of scoring from a start that is off, with the echoes rendered anew at each step; noise as pings have it."""
     pose = np.array(POSE)
     told = bounds.grain(pose)
-    weight, covariance = grain_law(bounds.imager.echoes(pose)[0].astype(complex), bounds.noise, bounds.of_noise)
+    weight, covariance = grain_law(bounds.imager.echoes(pose)[0].astype(complex), bounds.noise, bounds.noise_correlation)
     told = CellScores(told.jacobian, weight, covariance)  # amplitudes are not rounded here
     limit = told.bound()
     echo = bounds.imager.echoes(pose)[0]
@@ -196,7 +196,7 @@ def test_an_oracle_of_the_level_reaches_the_ground_bound() -> None:
 @pytest.mark.usefixtures("variant")
 @pytest.mark.thorough
 def test_grain_tells_far_more_than_ground_and_noise_hides_both() -> None:
-    quiet, loud = (next(limits(noise_db).at(np.array(POSE))) for noise_db in (-90.0, -75.0))
+    quiet, loud = (next(limits(noise_db).at_poses(np.array(POSE))) for noise_db in (-90.0, -75.0))
     assert (quiet["grain"].std(2) < 0.05 * quiet["ground"].std(2)).all()
     for law in ("grain", "ground"):
         assert (quiet[law].std(2) < loud[law].std(2)).all()

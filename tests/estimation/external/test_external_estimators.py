@@ -192,7 +192,7 @@ def test_a_class_of_the_users_own_is_an_estimator(ground: NDArray[np.float64]) -
     [
         ("my_module:Missing", "my_module has no Missing"),
         ("my_module:Other", r"has no method estimate\(frames\)"),
-        ("no_module_of_this_name:Fixed", "is no module here: start in its folder, or install it"),
+        ("no_module_of_this_name:Fixed", "is not a module here: start in its folder, or install it"),
         ("my_module:KeyMissing", r"KeyMissing\(\) raises KeyError \('weights'\)"),
         ("my_module:AttributeMissing", r"AttributeMissing\(\) raises AttributeError \(.* no attribute 'weights'"),
         ("my_module:Needy", r"Needy\(\) raises TypeError \(.*\): it must need no arguments"),
@@ -227,7 +227,7 @@ def test_one_door_for_estimators_of_ones_own(ground: NDArray[np.float64]) -> Non
         odometry(frames, "my_module:Failing")
     with pytest.raises(MitsonarError, match=r"unknown option 'kye': Biased takes key, name, wide_rad; did you mean key\?"):
         create_estimator(kind, kye=5)
-    with pytest.raises(MitsonarError, match="Biased is made already and takes no options: got key; give its class"):
+    with pytest.raises(MitsonarError, match="Biased is already an instance and takes no options: got key; give its class"):
         create_estimator(kind(), key=5)
     with pytest.raises(MitsonarError, match=r"int has no method estimate\(frames\)"):
         create_estimator(5)  # type: ignore[arg-type]  # anything may be given

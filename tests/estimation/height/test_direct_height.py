@@ -51,7 +51,7 @@ def test_the_profile_of_the_floor_is_its_quadrature(model: str, bearing: str, ga
     for height in (2.1, 2.6):
         wanted = floor_levels(sonar, height, np.radians(35), 0.5, axis_only=model == "thesis").sum(axis=1)
         wanted = wanted.reshape(40, 4).sum(axis=1)
-        found = FloorProfile(sonar, np.radians(35)).at(height, edges)
+        found = FloorProfile(sonar, np.radians(35)).levels_at(height, edges)
         np.testing.assert_allclose(found / found.sum(), wanted / wanted.sum(), atol=0.004)
 
 
@@ -61,8 +61,8 @@ def test_ranges_are_proportional_to_the_height() -> None:
     corner = np.cos(np.radians(50)) ** 2
     assert abs(ground.farthest * corner - 1) < 0.05
     edges = np.linspace(0, 20, 50)
-    np.testing.assert_allclose(ground.at(4.0, edges), ground.at(2.0, edges / 2), atol=1e-12)
-    np.testing.assert_allclose(ground.at(np.array([3.0, 5.0]), edges).sum(axis=1), 1)
+    np.testing.assert_allclose(ground.levels_at(4.0, edges), ground.levels_at(2.0, edges / 2), atol=1e-12)
+    np.testing.assert_allclose(ground.levels_at(np.array([3.0, 5.0]), edges).sum(axis=1), 1)
     with pytest.raises(MitsonarError, match="sees no level ground"):
         FloorProfile(load_sonar("lookdown100").replace(**LOOKING_DOWN), np.radians(-90))
 
@@ -96,8 +96,8 @@ def test_what_stands_on_the_floor_does_not_lift_it() -> None:
     ground = FloorProfile(sonar, np.radians(90))
     edges = np.linspace(2.0, 6.1, 129)
     rng = np.random.default_rng(4)
-    tops = ground.at(2.5 * rng.uniform(0.85, 1, 200), edges).mean(axis=0)
-    levels = (2 * ground.at(2.5, edges) + tops) * rng.uniform(0.8, 1.2, 128)
+    tops = ground.levels_at(2.5 * rng.uniform(0.85, 1, 200), edges).mean(axis=0)
+    levels = (2 * ground.levels_at(2.5, edges) + tops) * rng.uniform(0.8, 1.2, 128)
     image = np.tile(levels[None, :, None] / levels.max(), (1, 1, 64)).astype(np.float32)
     frame = frame_of(image, sonar)
     found = DirectHeight().height(frame)
@@ -129,7 +129,7 @@ def test_frames_without_ground_are_not_believed() -> None:
     assert not DirectHeight().height(frame_of(dots, sonar)).valid
     frame = frame_of(rng.random((1, 128, 64)).astype(np.float32), sonar)
     assert not DirectHeight().height(frame).valid
-    with pytest.raises(MitsonarError, match="lack poses; give pitch_deg"):
+    with pytest.raises(MitsonarError, match="have no poses: give pitch_deg"):
         DirectHeight().height(replace(frame, poses=None))
     with pytest.raises(MitsonarError, match="holds nan or inf"):
         DirectHeight().height(frame_of(np.full((1, 128, 64), np.nan, np.float32), sonar))
@@ -160,7 +160,7 @@ def test_heights_of_a_data_set_s_vectors(heights: Path, tmp_path: Path, mitsonar
     np.testing.assert_allclose([float(row["true_z_m"]) for row in rows], true, rtol=1e-5)
     assert np.abs([float(row["height_m"]) for row in rows] - true).max() < 0.1 * true[0]
     refused(mitsonar("height", heights, "-o", tmp_path / "heights.csv"), "exists and is kept as it is")
-    refused(mitsonar("height", heights, "--by", "directly"), "told by direct, or by the checkpoint")
+    refused(mitsonar("height", heights, "--by", "directly"), "a height estimator is direct, a checkpoint")
     refused(mitsonar("height", heights, "--view", "q1"), "has no vectors of view 'q1'")
 
 
