@@ -103,7 +103,7 @@ class Estimate:
 
     Attributes:
         motion: sideways, forward [m], yaw [rad] (Almanza-Medina, eq. 3.4); zero where nothing can be estimated.
-        covariance: of the motion ``(3, 3)`` [m, m, rad]; None where the estimator does not know it.
+        covariance: of the motion ``(3, 3)`` [m, m, rad]; None where it is unknown.
         valid: False where the motion must not be used.
         reason: why the estimate was rejected; empty if it is valid.
         about: further results, such as correlation, iterations and candidates.
@@ -245,7 +245,7 @@ def correlation_rejection(correlation: float, independent: float, excess: Excess
     """
     if correlation >= max(LEAST_AT_BEST, LEAST_CORRELATION / np.sqrt(independent)) or is_distinct(independent, excess):
         return ""
-    return f"the frames as matched correlate by {correlation:.2f} only"
+    return f"the matched frames correlate by {correlation:.2f} only"
 
 
 def is_distinct(independent: float, excess: Excess) -> bool:

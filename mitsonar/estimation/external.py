@@ -49,7 +49,7 @@ SMOOTH = (3, 5)
 NEIGHBOURS_M, VOXEL_M = (0.3, 0.1), 0.01
 """Largest distance of corresponding points, far then near, and edge of the cells in which points are merged [m]."""
 
-FEWEST = 30
+FEWEST_POINTS = 30
 """Smallest number of points of a frame that can be registered."""
 
 
@@ -84,8 +84,8 @@ class CfarGicp:
         images = two_frames(frames)
         attitude = attitude_of(frames, "cfar-gicp", None, None)
         clouds = [self._points(image, frames, attitude) for image in images]
-        if attitude.reason or min(len(cloud) for cloud in clouds) < FEWEST:
-            return rejected(attitude.reason or f"fewer than {FEWEST} detections")
+        if attitude.reason or min(len(cloud) for cloud in clouds) < FEWEST_POINTS:
+            return rejected(attitude.reason or f"fewer than {FEWEST_POINTS} detections")
         to_first, converged = _to_first(Motion(0.0, 0.0, 0.0) if prior is None else prior.motion), False
         for distance in NEIGHBOURS_M:
             registration = package("small_gicp").align(
@@ -191,10 +191,10 @@ def _tapered(image: NDArray[np.float32]) -> NDArray[np.float32]:
 
 Picture = NDArray[np.float32]
 
-PIXEL = 0.5
+RELATIVE_PIXEL = 0.5
 """Edge of a pixel relative to the beam spacing at the middle of the window."""
 
-SMALLEST = 32
+SMALLEST_IMAGE = 32
 """Smallest number of rows and columns of an image that can be registered."""
 
 
@@ -228,7 +228,7 @@ class GroundPair:
         corners = np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]], dtype=float)
         moved = np.abs(corners @ warp[:, :2].T + warp[:, 2] - corners)
         if not (moved < np.array([columns, rows]) / 2).all():
-            return rejected("the pictures as registered do not overlap by half")
+            return rejected("the registered images overlap by less than half")
         return Estimate(self.motion(warp))
 
 
@@ -245,10 +245,10 @@ def ground_pair(frames: SonarFrames, name: str) -> GroundPair:
     images = two_frames(frames)
     attitude = attitude_of(frames, name, None, None)
     spacing = float(np.ptp(frames.bearing_rad)) / (len(frames.bearing_rad) - 1)
-    view = GroundView(frames, attitude, PIXEL * spacing * float(frames.range_m[0] + frames.range_m[-1]) / 2)
+    view = GroundView(frames, attitude, RELATIVE_PIXEL * spacing * float(frames.range_m[0] + frames.range_m[-1]) / 2)
     rows, columns = _filled_rectangle(view.inside)
     first, second = (np.ascontiguousarray(view.draw(image, k)[rows, columns]) for k, image in enumerate(images))
-    small = "" if min(first.shape) >= SMALLEST else "the fan meets too little ground"
+    small = "" if min(first.shape) >= SMALLEST_IMAGE else "the fan meets too little ground"
     blank = "" if small or (np.ptp(first) > 0 and np.ptp(second) > 0) else "nothing in the frames to match"
     return GroundPair(first, second, view, (columns.start, rows.start), attitude.reason or small or blank)
 
@@ -447,8 +447,8 @@ class _FromText:
                 if callable(definition) and not _is_network(definition)
                 else definition
             )
-        words = [self.path, *(f"{key}={value}" for key, value in self.options.items())]
-        return own_estimator(instance, {}, self, ":".join(words))
+        parts = [self.path, *(f"{key}={value}" for key, value in self.options.items())]
+        return own_estimator(instance, {}, self, ":".join(parts))
 
     def _imported(self, module: str) -> ModuleType:
         """Return the module of that name."""

@@ -48,16 +48,16 @@ from above the floor: tops and flanks of objects on it. Noise spreads fractions 
 ends at a lower height. These values err least on rocky fields from 1 to 10 m and on hulls, without noise and in high noise.
 """
 
-SPREAD = 0.1
+QUANTILE_DISTANCE = 0.1
 """Distance of the quantiles, to either side, that give the standard deviation."""
 
 MAX_CACHED_FLOORS = 16
 """Number of attitudes, to a milliradian, whose profiles of level ground are cached."""
 
-FINEST = 0.01
+LEAST_RELATIVE_STD = 0.01
 """Smallest standard deviation, as a fraction of the height."""
 
-LEAST = 0.5
+LEAST_CORRELATION = 0.5
 """Smallest correlation of a profile with the fitted ground for a valid height."""
 
 Array = NDArray[np.float64]
@@ -151,11 +151,13 @@ class DirectHeight:
             if not parts.any():
                 return HeightEstimate(np.nan, np.nan, False, "the levels along range do not match those of ground")
             cumulative = np.cumsum(parts) / parts.sum()
-            low, height, high = np.interp([lowest - SPREAD, lowest, lowest + SPREAD], cumulative, heights)
+            low, height, high = np.interp(
+                [lowest - QUANTILE_DISTANCE, lowest, lowest + QUANTILE_DISTANCE], cumulative, heights
+            )
         # accept the height only if the sum of these grounds resembles the profile
         correlation = float(np.corrcoef(ground @ parts, profile)[0, 1])
-        std = float(max((high - low) / 2, FINEST * height))
-        if not correlation >= LEAST:
+        std = float(max((high - low) / 2, LEAST_RELATIVE_STD * height))
+        if not correlation >= LEAST_CORRELATION:
             return HeightEstimate(
                 float(height), std, False, f"levels along range correlate with those of ground by {correlation:.2f} only"
             )
@@ -185,7 +187,7 @@ def profile_of(frame: Above) -> tuple[Array, Sonar]:
         MitsonarError: not one frame, or levels that are not linear or not finite.
     """
     if len(frame) != 1:
-        raise MitsonarError(f"a height is that of one frame: got {len(frame)}")
+        raise MitsonarError(f"a height is estimated from one frame: got {len(frame)}")
     if isinstance(frame, ViewFrames):
         return _finite(frame.profiles().sum(axis=(0, 1), dtype=float)), next(iter(frame.sonars.values()))
     if frame.level != "linear":
@@ -248,7 +250,7 @@ def _best_matching_height(profile: Array, floor: FloorProfile, edges: Array) -> 
 # ---------------- Range profile of level ground
 
 
-MANY = 256
+MAX_RAYS = 256
 """Largest number of beams, and of rays per beam, that are used."""
 
 FARTHEST = 40.0
@@ -276,21 +278,21 @@ class FloorProfile:
     def __init__(self, sonar: Sonar, pitch_rad: float, roll_rad: float = 0.0, weight: Array | None = None) -> None:
         self.sonar, self.pitch_rad, self.roll_rad = sonar, pitch_rad, roll_rad
         # directions of a subset of rays, and the downward component of each
-        rows, beams = (np.unique(np.linspace(0, n - 1, min(n, MANY)).astype(int)) for n in (self._rows, sonar.beams))
+        rows, beams = (np.unique(np.linspace(0, n - 1, min(n, MAX_RAYS)).astype(int)) for n in (self._rows, sonar.beams))
         elevation = (0.5 - (rows + 0.5) / self._rows) * np.radians(sonar.elevation_fov_deg)
         bearing = sonar.bearing_rad[beams]
         rays = directions(sonar.bearing, bearing[None, :], elevation[:, None])
         down = -(vehicle_rotation(Pose(0, 0, 0, pitch_rad, roll_rad, 0)).apply(rays.reshape(-1, 3))[:, 2])
         # weight of each ray: views, and in the physical model its solid angle
-        part = np.ones(rays.shape[:2]) if weight is None else weight[np.ix_(rows, beams)]
+        weights = np.ones(rays.shape[:2]) if weight is None else weight[np.ix_(rows, beams)]
         angle = elevation[:, None] if sonar.bearing == "azimuth" else bearing[None, :]
-        part = part * (1.0 if sonar.model == "thesis" else np.cos(angle))
+        weights = weights * (1.0 if sonar.model == "thesis" else np.cos(angle))
         # rays that meet the ground, nearest first
-        meets = (down > 1 / FARTHEST) & (part.ravel() > 0)
-        if not meets.any():
+        on_ground = (down > 1 / FARTHEST) & (weights.ravel() > 0)
+        if not on_ground.any():
             raise MitsonarError(f"at a pitch of {np.degrees(pitch_rad):g} deg the sonar sees no level ground")
-        order = np.argsort(-down[meets])
-        self._down, self._part = down[meets][order], part.ravel()[meets][order]
+        order = np.argsort(-down[on_ground])
+        self._down, self._part = down[on_ground][order], weights.ravel()[on_ground][order]
 
     @property
     def _rows(self) -> int:
@@ -299,9 +301,9 @@ class FloorProfile:
     @cached_property
     def _along(self) -> tuple[Array, Array]:
         """Return range over height of the rays in increasing order, and the cumulative sum of their levels."""
-        away = 1 / self._down
-        gain = 1.0 if self.sonar.model == "thesis" else away ** (self.sonar.gain_exponent - 2)
-        return away, np.cumsum(self._part * self._down * gain)
+        range_over_height = 1 / self._down
+        gain = 1.0 if self.sonar.model == "thesis" else range_over_height ** (self.sonar.gain_exponent - 2)
+        return range_over_height, np.cumsum(self._part * self._down * gain)
 
     @property
     def nearest(self) -> float:
@@ -315,9 +317,9 @@ class FloorProfile:
 
     def levels_at(self, height_m: float | Array, edges_m: Array) -> Array:
         """Return the levels of the bins between edges ``(..., bins)`` at heights ``(...)`` [m]; their sum is at most 1."""
-        away, total = self._along
+        range_over_height, total = self._along
         edges_over_height = np.asarray(edges_m) / np.asarray(height_m, dtype=float)[..., None]
-        return np.asarray(np.diff(np.interp(edges_over_height, away, total, left=0.0), axis=-1) / total[-1])
+        return np.asarray(np.diff(np.interp(edges_over_height, range_over_height, total, left=0.0), axis=-1) / total[-1])
 
 
 # ---------------- Measured heights as a table, and in sentences

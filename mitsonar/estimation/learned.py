@@ -448,7 +448,7 @@ def one_thread() -> Iterator[None]:
 
 Pair = tuple[NDArray[np.float32], NDArray[np.float32]]
 
-SMOOTH = (2.0, 0.8)
+SMOOTHING = (2.0, 0.8)
 """Standard deviations of the filter applied before frames are matched [bins, beams]."""
 
 
@@ -464,7 +464,7 @@ class Comparison(NamedTuple):
         return 4 * math.pi * math.hypot(self.smoothing[0] / self.cell, 12**-0.5) * self.smoothing[1]
 
 
-COMPARISONS = (Comparison(4, SMOOTH), Comparison(1, (0.7, 0.5)))
+COMPARISONS = (Comparison(4, SMOOTHING), Comparison(1, (0.7, 0.5)))
 """Comparisons of registered frames, coarse then fine.
 
 The second is used only if the first finds no match: fine texture remains visible in noise that hides coarse structure.
@@ -473,7 +473,7 @@ The second is used only if the first finds no match: fine texture remains visibl
 BLOCK = 16
 """Size in cells and beams of the blocks over which the matched energy must be spread."""
 
-NOISY = 0.83
+NOISY_CORRELATION = 0.83
 """Correlation of matched frames below which noise shortens the network's steps, so that it is run again from its answer.
 
 Without noise hulls have 0.84 and more, and rocky fields 0.95. In high noise hulls have 0.82 and less, and rocky fields
@@ -481,7 +481,7 @@ Without noise hulls have 0.84 and more, and rocky fields 0.95. In high noise hul
 times the covariance.
 """
 
-OTHER_FAN = 1.5
+MAX_FAN_RATIO = 1.5
 """Ratio to the fan of training, wider or narrower, beyond which a fan is reported."""
 
 FAR_MODEL = 4.0
@@ -569,7 +569,7 @@ class ImageNetwork(Trained):
         ground = _batch({**ground_of(frames, attitude), **light_of(frames, attitude)})
         # 1. estimate from the prior or from zero motion; run again where noise may have shortened the steps
         near = self._estimate_from(frames, images, ground, None if prior is None else prior.motion)
-        if near.covariance is not None and _correlation_of_answer(images, ground, near.motion) < NOISY:
+        if near.covariance is not None and _correlation_of_answer(images, ground, near.motion) < NOISY_CORRELATION:
             near = self._refined(frames, images, ground, near)
         near = self._finalised(frames, near, prior, "zero" if prior is None else "prior", attitude, ground)
         # 2. accept it if it is valid and the frames correlate, or if the prior leaves no far motion
@@ -632,7 +632,7 @@ class ImageNetwork(Trained):
         if frames.sonar.model == "coherent" and "coherent" not in self._checkpoint.model:
             differences.append("speckle")
         instrument = TrainedInstrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad)
-        if abs(math.log(instrument.azimuth_fov_deg / self._fan_deg)) > math.log(OTHER_FAN):
+        if abs(math.log(instrument.azimuth_fov_deg / self._fan_deg)) > math.log(MAX_FAN_RATIO):
             differences.append(f"a fan of {instrument.azimuth_fov_deg:.3g} deg (but {self._fan_deg:.3g})")
         return (
             {"untrained": f"{self._checkpoint.network} was not trained for {' or '.join(differences)}"}
@@ -716,7 +716,7 @@ class ImageNetwork(Trained):
 
     def _rejection_of_match(self, frames: SonarFrames, images: Pair) -> str:
         """Return why the frames do not show the same place: they must correlate at a shift within training's motions."""
-        first, second = (smooth(image, Comparison(1, SMOOTH)) for image in images)
+        first, second = (smooth(image, Comparison(1, SMOOTHING)) for image in images)
         size = first.shape
         rows, columns = (min(reach, length // 3) for reach, length in zip(self._reach(frames), size, strict=True))
         # compare the middle of the second frame with the first at all these shifts
@@ -725,7 +725,7 @@ class ImageNetwork(Trained):
         row, column = np.unravel_index(int(correlation.argmax()), correlation.shape)
         matched = first[row : row + middle.shape[0], column : column + middle.shape[1]]
         inside = np.ones(middle.shape, dtype=bool)
-        return matching_rejection(matched, middle, inside, correlated=4 * math.pi * SMOOTH[0] * SMOOTH[1])
+        return matching_rejection(matched, middle, inside, correlated=4 * math.pi * SMOOTHING[0] * SMOOTHING[1])
 
     def _reach(self, frames: SonarFrames) -> tuple[int, int]:
         """Return how far an echo can move between frames in bins and in beams, by the motions of training."""
@@ -800,7 +800,7 @@ def _is_covariance(matrix: NDArray[np.float64]) -> bool:
 # ---------------- Networks of impulse responses
 
 
-UNREAD = ("name", "frame_rate_hz", "seed")
+IGNORED_FIELDS = ("name", "frame_rate_hz", "seed")
 """Fields of a channel sonar that do not affect a network's input; ``rays`` is one too, except for the model ``rays``."""
 
 
@@ -872,7 +872,7 @@ class ResponseNetwork(Trained):
         trained = self._checkpoint.channel
         if trained is None or self.force:
             return
-        left_out = {*UNREAD, *(() if trained.model == sonar.model == "rays" else ("rays",))}
+        left_out = {*IGNORED_FIELDS, *(() if trained.model == sonar.model == "rays" else ("rays",))}
         trained_fields, fields = (one.model_dump(exclude=left_out) for one in (trained, sonar))
         receivers = trained_fields.pop("receivers") != fields.pop("receivers")
         differences = [
@@ -907,7 +907,7 @@ Pairs 20 mm apart from 10 m have 0.8 to 0.97 at 512 and 1024 levels. Pings of di
 for the vector of a whole view.
 """
 
-SLOW = 4.0
+SLOW_STD_BINS = 4.0
 """Standard deviation of the filter that defines the slow variation [bins]."""
 
 FEWEST_LEVELS = 256
@@ -1000,7 +1000,7 @@ def _rejection_of_profiles(profiles: NDArray[np.float32]) -> str:
     """
     if profiles.shape[2] < FEWEST_LEVELS:
         return ""
-    quick = profiles - gaussian_filter1d(profiles, SLOW, axis=2)
+    quick = profiles - gaussian_filter1d(profiles, SLOW_STD_BINS, axis=2)
     correlations = []
     for first, second in quick:
         shifted = [(first[3 : len(first) - 3], second[3 + lag : len(second) - 3 + lag]) for lag in range(-3, 4)]

@@ -44,29 +44,29 @@ GEOMETRY = (
 LEAST_SHAPE = (96, 16)
 """Smallest number of bins and beams of a frame."""
 
-DARKEST, WITHIN = 2.0, 2.0
+NOISE_PERCENTILE, NOISE_FACTOR = 2.0, 2.0
 """Percentile of the windows' means that is noise, and the factor above it up to which windows count as noise."""
 
-STILL = 0.5
+STATIC_CORRELATION = 0.5
 """Correlation between frames above which the darkest parts are not noise."""
 
-FLAT_WINDOW, FLAT_ABOVE, MOST_CLIPPED = (64, 24), 10.0, 0.005
+FLAT_WINDOW, FLAT_NOISE_RATIO, MOST_CLIPPED = (64, 24), 10.0, 0.005
 """Windows from which the speckle law is fitted: bins and beams, smallest ratio to the noise, and the largest fraction of
 their cells at full scale."""
 
-STRUCTURED = 0.5
+STRUCTURED_NU = 0.5
 """Shape of the K law below which the scene's structure contributes."""
 
 NEAR_RAYLEIGH = 0.02
 """Excess of the squared contrast below which intensities are exponential: a nu of 100."""
 
-GRAIN_PART, LEAST_WINDOWS = 20.0, 8
+GRAIN_PERCENTILE, LEAST_WINDOWS = 20.0, 8
 """Percentile of the windows' means below which the grain gives the coding, and the smallest number of windows."""
 
-FULL = 0.996
+FULL_SCALE = 0.996
 """Value from which a cell may be clipped."""
 
-FACE, SLANT = 0.5, 0.5
+FACE_REFLECTIVITY, FACE_SQUARED_COSINE = 0.5, 0.5
 """Assumptions where levels have no scale: reflectivity of the brightest thousandth, and the squared cosine of its slant."""
 
 
@@ -178,10 +178,12 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     flat = intensity / gain_of(sonar)[:, None]
     noise = _noise(flat, value, level, notes)
     nu = _nu(flat, value, noise or 0.0)
-    if nu is not None and nu < STRUCTURED:
+    if nu is not None and nu < STRUCTURED_NU:
         notes.append(f"a speckle_nu of {nu:g} is more than the texture of a bottom: it includes objects and edges")
-    # 4. a steady rise of quiet beams beside a strong echo is crosstalk, normalised by the beam pattern
-    leak = statistics.leak_power(intensity[:, statistics.GLOW_BINS :], limit=float(decoded(FULL, sonar))) / _lobe_sum(sonar)
+    # 4. a steady rise of quiet beams next to a strong echo is crosstalk, normalised by the beam pattern
+    leak = statistics.leak_power(intensity[:, statistics.GLOW_BINS :], limit=float(decoded(FULL_SCALE, sonar))) / _lobe_sum(
+        sonar
+    )
     fitted: dict[str, Any] = {
         **{"near_glow_db": 0.0, "near_glow_edge_db": 0.0, "near_glow_spread_db": 0.0, "near_glow_still": 0.0},
         "volume_db": None,
@@ -255,11 +257,11 @@ def _grain_windows(value: Array) -> tuple[Array, Array]:
     which the texture of the bottom does not change.
     """
     parts, rest = (statistics.window_values(one) for one in (value, statistics.detrended(value)))
-    inside = ((parts > 0) & (parts < FULL)).mean(axis=1) > 1 - MOST_CLIPPED
+    inside = ((parts > 0) & (parts < FULL_SCALE)).mean(axis=1) > 1 - MOST_CLIPPED
     if inside.sum() >= LEAST_WINDOWS:
         parts, rest = parts[inside], rest[inside]
     mean = parts.mean(axis=1)
-    dark = mean <= max(np.percentile(mean, GRAIN_PART), np.sort(mean)[min(LEAST_WINDOWS, len(mean)) - 1])
+    dark = mean <= max(np.percentile(mean, GRAIN_PERCENTILE), np.sort(mean)[min(LEAST_WINDOWS, len(mean)) - 1])
     return parts[dark], rest[dark]
 
 
@@ -311,12 +313,12 @@ def _noise(flat: Array, value: Array, level: Array, notes: list[str]) -> float |
     beyond_glow = slice(statistics.GLOW_BINS, None)
     parts = statistics.window_values(flat[:, beyond_glow])
     mean = parts.mean(axis=1)
-    dark = mean <= np.percentile(mean, DARKEST) * WITHIN
+    dark = mean <= np.percentile(mean, NOISE_PERCENTILE) * NOISE_FACTOR
     empty = statistics.window_values(value[:, beyond_glow] <= 0)[dark].mean()
     if empty > 0.2:
         notes.append("the noise is below the lowest level of the coding: noise_level_db is left out")
         return None
-    if len(level) > 1 and (correlation := float(statistics.correlation_by_level(level)[1][0])) > STILL:
+    if len(level) > 1 and (correlation := float(statistics.correlation_by_level(level)[1][0])) > STATIC_CORRELATION:
         notes.append(
             f"the darkest tenth correlates by {correlation:.2f} from frame to frame, so it is not noise: noise_level_db is "
             "left out"
@@ -336,11 +338,11 @@ def _full_scale_db(frames: SonarFrames, sonar: Sonar, flat: Array, notes: list[s
     bright = np.percentile(flat, 99.9)
     bright_bins = np.nonzero(flat >= bright)[1] + statistics.GLOW_BINS
     range_m = float(np.median(sonar.range_m[bright_bins]))
-    face = FACE * SLANT * sonar.beam_width_rad * sonar.bin_m / range_m**3 * math.log(1000)
+    face = FACE_REFLECTIVITY * FACE_SQUARED_COSINE * sonar.beam_width_rad * sonar.bin_m / range_m**3 * math.log(1000)
     loss_db = -float(10 * np.log10(np.interp(range_m, sonar.range_m, loss_of(sonar))))
     notes.append(
         f"levels have no scale: noise_level_db assumes that the brightest thousandth, at {range_m:.3g} m, is a face of "
-        f"reflectivity {FACE:g} at 45 deg"
+        f"reflectivity {FACE_REFLECTIVITY:g} at 45 deg"
     )
     return float(10 * np.log10(face / bright)) - loss_db + sonar.source_level_db
 
@@ -353,9 +355,9 @@ def _nu(flat: Array, value: Array, noise: float) -> float | None:
     # remove the trend along range, and keep bright windows without clipping
     smooth = ndimage.uniform_filter1d(flat.mean(axis=(0, 2)), statistics.WINDOW[0], mode="nearest")
     parts, levels = (statistics.window_values(one, FLAT_WINDOW) for one in (flat / smooth[:, None], flat))
-    clipped = statistics.window_values(value >= FULL, FLAT_WINDOW).mean(axis=1)
+    clipped = statistics.window_values(value >= FULL_SCALE, FLAT_WINDOW).mean(axis=1)
     mean = levels.mean(axis=1)
-    bright = (mean > (1 + FLAT_ABOVE) * noise) & (clipped <= MOST_CLIPPED) & (mean > 0)
+    bright = (mean > (1 + FLAT_NOISE_RATIO) * noise) & (clipped <= MOST_CLIPPED) & (mean > 0)
     if not bright.any():
         return None
     # excess of the squared contrast over that of exponential intensities, corrected for the noise
@@ -377,10 +379,10 @@ def _lobe_sum(sonar: Sonar) -> float:
 # ---------------- Near glow and volume scattering
 
 
-FEWEST, WATER_WITHIN = 3, 0.25
+FEWEST_GLOW_BINS, GLOW_WINDOW_FRACTION = 3, 0.25
 """Number of bins of the shortest glow, and the fraction of the window within which it ends."""
 
-LEAST_FALL_DB, STEEPER = 10.0, 4.0
+LEAST_FALL_DB, GLOW_STEEPNESS_RATIO = 10.0, 4.0
 """Smallest fall of a glow, and how many times steeper it is than the profile beyond it."""
 
 MOST_GLOW_DB = 120.0
@@ -390,12 +392,12 @@ GLOWING_DB, FEWEST_GLOWING = 10.0, 8
 """Smallest glow of the bins that show how beams differ [dB], and the smallest number of them."""
 
 CLEAR_DB, FEWEST_CELLS = 15.0, 64
-"""Smallest glow of the cells that show what stays, so that noise contributes at most 3 %, and their smallest number."""
+"""Smallest glow of the cells that give the constant part, so that noise contributes 3 % or less, and their least number."""
 
-NEW = 0.3
+NEW_GRAIN_CORRELATION = 0.3
 """Correlation of bright grain between frames below which it is new."""
 
-ABOVE = 3.0
+VOLUME_NOISE_RATIO = 3.0
 """Smallest ratio of a bin's mean to the noise where volume is measured."""
 
 UNEVEN_DB = 3.0
@@ -403,7 +405,7 @@ UNEVEN_DB = 3.0
 
 
 def near_glow(flat: Array, noise: float, range_m: Array) -> tuple[float, float] | None:
-    """Return the noise at range 0 above the noise beyond [dB], and the range where it is gone [m]; None without glow.
+    """Return the noise at range 0 above the noise beyond [dB], and the range where it ends [m]; None without glow.
 
     Two straight lines in dB are fitted to the medians of the first quarter of the bins, starting at the highest of the first
     :data:`~mitsonar.acoustics.statistics.GLOW_BINS`. The first line is the glow.
@@ -416,11 +418,11 @@ def near_glow(flat: Array, noise: float, range_m: Array) -> tuple[float, float] 
     # profile relative to the noise: the median of exponential intensities is ln 2 times their mean
     excess = statistics.decibels(np.median(flat, axis=(0, 2)) / math.log(2) / noise)
     first = _first(excess)
-    last = max(2 * FEWEST, round(len(excess) * WATER_WITHIN))
+    last = max(2 * FEWEST_GLOW_BINS, round(len(excess) * GLOW_WINDOW_FRACTION))
     fit_range_m, excess = range_m[first : first + last], excess[first : first + last]
     # two lines with the best break between them
     best: tuple[float, int, Array, Array] | None = None
-    for end in range(FEWEST, last - FEWEST):
+    for end in range(FEWEST_GLOW_BINS, last - FEWEST_GLOW_BINS):
         lines = [np.polyfit(fit_range_m[part], excess[part], 1) for part in (slice(end), slice(end, None))]
         model = np.where(np.arange(last) < end, np.polyval(lines[0], fit_range_m), np.polyval(lines[1], fit_range_m))
         squared_error = float(np.square(excess - model).sum())
@@ -430,7 +432,7 @@ def near_glow(flat: Array, noise: float, range_m: Array) -> tuple[float, float] 
     _, end, (slope, start), (slope_beyond, _) = best
     # a glow falls far, and much more steeply than the profile beyond it
     fall = -slope * (fit_range_m[end - 1] - fit_range_m[0])
-    if fall < LEAST_FALL_DB or -slope < STEEPER * abs(slope_beyond):
+    if fall < LEAST_FALL_DB or -slope < GLOW_STEEPNESS_RATIO * abs(slope_beyond):
         return None
     if start <= MOST_GLOW_DB:
         return float(start), float(-start / slope)
@@ -526,13 +528,13 @@ def volume(flat: Array, level_db: Array, noise: float, sonar: Sonar, notes: list
         notes: list to which sentences are added.
     """
     # only speckle that is new in every frame, at any shift, can be volume
-    if len(flat) < 2 or not float(statistics.correlation_by_level(level_db)[1][-3:].mean()) < NEW:
+    if len(flat) < 2 or not float(statistics.correlation_by_level(level_db)[1][-3:].mean()) < NEW_GRAIN_CORRELATION:
         return None
-    if moved_correlation(level_db) > NEW:
+    if moved_correlation(level_db) > NEW_GRAIN_CORRELATION:
         return None
     # bins that exceed the noise, beyond the near glow
     echo = flat.mean(axis=(0, 2)) - noise
-    above_noise = echo > (ABOVE - 1) * noise
+    above_noise = echo > (VOLUME_NOISE_RATIO - 1) * noise
     above_noise[: statistics.GLOW_BINS] = False
     if above_noise.sum() < statistics.WINDOW[0]:
         return None

@@ -30,22 +30,22 @@ __all__ = ["BAND_HZ", "Band", "Correlation", "Pings", "assumed_height", "bands_o
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-ACROSS = 41
+BEAM_ANGLES = 41
 """Number of angles across a beam over which directions are averaged."""
 
 STEP = 1 / 16
 """Step of the motions that are searched [wavelengths]."""
 
-WINDOW = 8
+WINDOW_TAPS = 8
 """Number of taps whose products are averaged."""
 
 MOST_WAVES = 50.0
 """Longest motion between pings that is searched, in both directions [wavelengths]."""
 
-LEAST = 4.0
+LEAST_MAXIMUM = 4.0
 """Smallest valid maximum of the sum, in standard deviations of the sum of unrelated pings."""
 
-CLOSE = 0.9
+AMBIGUOUS_RATIO = 0.9
 """Fraction of the largest sum from which a second maximum makes the motion ambiguous."""
 
 
@@ -56,13 +56,13 @@ class Products(NamedTuple):
         product: product of each tap of a ping with the conjugate of that of the next, summed over all pairs ``(taps,)``.
         energy: energy of both pings ``(taps,)``.
         turn: phase by which taps rotate with a motion along the axis ``(taps,)`` [rad/m].
-        look: direction of the axis of the receiver: to starboard, forward ``(2,)``.
+        axis: direction of the axis of the receiver: to starboard, forward ``(2,)``.
     """
 
     product: Complex
     energy: Array
     turn: Array
-    look: Array
+    axis: Array
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Correlation:
         received = [one for one in received if one.energy.any()]
         if not received:
             return rejected("no receiver has any echo")
-        if np.linalg.matrix_rank(np.array([one.look for one in received]), tol=0.1) < 2:
+        if np.linalg.matrix_rank(np.array([one.axis for one in received]), tol=0.1) < 2:
             silent = f" (silent: {', '.join(pings.silent)})" if pings.silent else ""
             return rejected(f"the receivers with echoes look along one line{silent}: motions across it do not show")
         reach = reach_of(pings.interval_s, self.speed, responses.sonar.wavelength_m, MOST_WAVES)
@@ -120,8 +120,10 @@ def _along(field: FieldOfView, cosine: Array) -> Array:
 
     At a slant range R and an angle psi aside, sin^2 psi + along^2 + (height / R)^2 = 1.
     """
-    aside = np.linspace(-0.5, 0.5, ACROSS) * math.radians(min(field.across_deg, 90.0))
-    energy = field.sensitivity(np.cos(aside), np.sin(aside), 0 * aside) ** 2 if field.shape != "all" else np.ones(ACROSS)
+    aside = np.linspace(-0.5, 0.5, BEAM_ANGLES) * math.radians(min(field.across_deg, 90.0))
+    energy = (
+        field.sensitivity(np.cos(aside), np.sin(aside), 0 * aside) ** 2 if field.shape != "all" else np.ones(BEAM_ANGLES)
+    )
     along = np.sqrt(np.maximum(np.cos(aside)[:, None] ** 2 - cosine**2, 0))
     return np.asarray((energy[:, None] * along).sum(axis=0) / energy.sum())
 
@@ -136,7 +138,7 @@ def _coarse(received: list[Products], reach: float, step: float) -> tuple[Array,
     for receiver in received:
         weight = receiver.product / max(float(receiver.energy.sum()), 1e-300)
         sums = (np.exp(1j * displacements[:, None] * receiver.turn) @ weight).real
-        total += np.interp(receiver.look[0] * sideways + receiver.look[1] * forward, displacements, sums)
+        total += np.interp(receiver.axis[0] * sideways + receiver.axis[1] * forward, displacements, sums)
         spread += float((np.abs(weight) ** 2).sum()) / 2
     # compare the largest maximum with that of unrelated pings, and with the second
     peaks = np.argwhere((total == maximum_filter(total, size=5)) & (total > 0))
@@ -144,8 +146,8 @@ def _coarse(received: list[Products], reach: float, step: float) -> tuple[Array,
         return np.zeros(2), "the pings have nothing in common"
     peaks = peaks[np.argsort(-total[tuple(peaks.T)])]
     best = total[tuple(peaks[0])]
-    reason = "" if best > LEAST * math.sqrt(spread) else "the pings have nothing in common"
-    if not reason and len(peaks) > 1 and total[tuple(peaks[1])] > CLOSE * best:
+    reason = "" if best > LEAST_MAXIMUM * math.sqrt(spread) else "the pings have nothing in common"
+    if not reason and len(peaks) > 1 and total[tuple(peaks[1])] > AMBIGUOUS_RATIO * best:
         reason = "two motions fit equally well"
     return line[peaks[0]], reason
 
@@ -156,28 +158,28 @@ def _fine(received: list[Products], motion: Array) -> Array:
         information, gradient = np.zeros((2, 2)), np.zeros(2)
         # residual phase of each window, after the current motion is compensated
         for receiver in received:
-            product = _windows(receiver.product * np.exp(1j * (receiver.look @ motion) * receiver.turn))
+            product = _windows(receiver.product * np.exp(1j * (receiver.axis @ motion) * receiver.turn))
             energy = _windows(receiver.energy)
             turn = _windows(receiver.turn * receiver.energy) / np.maximum(energy, 1e-300)
             likeness = np.minimum(np.abs(product) / np.maximum(energy, 1e-300), 0.999)
             # variance of the phase of the mean of n products (Rodriguez and Martin, 1992)
-            weight = np.where(energy > 0, 2 * WINDOW * likeness**2 / (1 - likeness**2), 0)
-            information += (weight * turn**2).sum() * np.outer(receiver.look, receiver.look)
-            gradient += (weight * turn * -np.angle(product)).sum() * receiver.look
+            weight = np.where(energy > 0, 2 * WINDOW_TAPS * likeness**2 / (1 - likeness**2), 0)
+            information += (weight * turn**2).sum() * np.outer(receiver.axis, receiver.axis)
+            gradient += (weight * turn * -np.angle(product)).sum() * receiver.axis
         motion = motion + np.linalg.lstsq(information, gradient, rcond=None)[0]
     return motion
 
 
 def _windows(taps: NDArray[np.inexact]) -> NDArray[np.inexact]:
     """Sum over windows of neighbouring taps."""
-    whole = len(taps) // WINDOW * WINDOW
-    return np.asarray(taps[:whole].reshape(-1, WINDOW).sum(axis=1))
+    used = len(taps) // WINDOW_TAPS * WINDOW_TAPS
+    return np.asarray(taps[:used].reshape(-1, WINDOW_TAPS).sum(axis=1))
 
 
 # ---------------- Checks shared by all channel estimators
 
 
-UNEVEN = 0.01
+INTERVAL_TOLERANCE = 0.01
 """Largest deviation of the time between pings, as a fraction of it."""
 
 
@@ -207,7 +209,7 @@ def pings_of(responses: ImpulseResponses) -> Pings:
         raise MitsonarError("the responses hold nan or inf: leave such pings out")
     steps = np.diff(responses.time_s)
     interval = float(steps.mean())
-    if not (np.isfinite(interval) and interval > 0 and (np.abs(steps - interval) <= UNEVEN * interval).all()):
+    if not (np.isfinite(interval) and interval > 0 and (np.abs(steps - interval) <= INTERVAL_TOLERANCE * interval).all()):
         raise MitsonarError(
             f"pings must be evenly spaced in increasing time: got steps of {steps.min():g} to {steps.max():g} s; select "
             "such pings"
@@ -259,7 +261,7 @@ def assumed_height(responses: ImpulseResponses, name: str, height_m: float | Non
 BAND_HZ = 4800.0
 """Smallest bandwidth of a part [Hz]."""
 
-FAINT = 1e-3
+FAINTEST_AMPLITUDE = 1e-3
 """Relative amplitude of the whole band below which frequencies are left out."""
 
 
@@ -304,6 +306,9 @@ def bands_of(sonar: ChannelSonar, width_hz: float = BAND_HZ) -> list[Band]:
         )
         frequency = np.asarray(np.fft.fftfreq(part.taps, 1 / part.sampling_hz), dtype=np.float64)
         whole = sonar.raised_cosine(frequency + offset)
-        gain = np.where(whole > FAINT, part.raised_cosine(frequency) / np.maximum(whole, FAINT), 0) / count
+        gain = (
+            np.where(whole > FAINTEST_AMPLITUDE, part.raised_cosine(frequency) / np.maximum(whole, FAINTEST_AMPLITUDE), 0)
+            / count
+        )
         bands.append(Band(part, np.rint((frequency + offset) / step).astype(np.int64) % sonar.taps, gain))
     return bands

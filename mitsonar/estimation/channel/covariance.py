@@ -31,13 +31,13 @@ __all__ = ["LinkResponse", "ResponseCovariance", "block_toeplitz", "link_respons
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-TAILS = 1.0
+LEADING_PULSES = 1.0
 """Taps before the first echo that are used, in pulses of 1 / F_d."""
 
 FAINTEST = 1e-4
 """Power of the last taps that are used, as a fraction of the largest."""
 
-QUIET = 24.0
+SILENCE_PULSES = 24.0
 """Length of silence after which a response may repeat, in pulses: their tails are then below 1e-5."""
 
 NODES = 4.0
@@ -91,16 +91,16 @@ def link_response(
     starboard, ahead = east * cos - north * sin, east * sin + north * cos
     sent = np.stack([starboard, ahead, np.full_like(east, -height_m)])
     received = sent - np.array([[to_starboard], [forward], [up]])
-    there, back = np.sqrt((sent**2).sum(axis=0)), np.sqrt((received**2).sum(axis=0))
+    distance_out, distance_back = np.sqrt((sent**2).sum(axis=0)), np.sqrt((received**2).sum(axis=0))
     # the receiver moves while the sound travels
     speed = np.asarray(velocity, dtype=float)
     velocity_in_axes = np.array([speed[0] * cos - speed[1] * sin, speed[0] * sin + speed[1] * cos, 0.0])
     delay = np.asarray(delay_exact(list(sent), list(received), list(velocity_in_axes), sonar.sound_speed))
     # amplitude: sensitivities, the cosines of incidence and reflection, and spreading
-    amplitude = _sensitivity(sonar, None, sent / there) * _sensitivity(sonar, receiver, received / back)
-    amplitude *= np.sqrt(height_m / there * (height_m + up) / back)
+    amplitude = _sensitivity(sonar, None, sent / distance_out) * _sensitivity(sonar, receiver, received / distance_back)
+    amplitude *= np.sqrt(height_m / distance_out * (height_m + up) / distance_back)
     if sonar.spreads:
-        amplitude /= there * back
+        amplitude /= distance_out * distance_back
     return LinkResponse(delay, amplitude)
 
 
@@ -140,21 +140,21 @@ class ResponseCovariance:
         """Return the points of the integral over the ground, relative to the midpoint between the pings."""
         # 1. panels along the axis: dense enough for the phase of the band and for the longest motion
         along, across = _extent(self.sonar, self.receiver, self.height_m)
-        steep = np.abs(along).max() + MARGIN_M
-        sine = steep / math.hypot(steep, self.height_m)
+        farthest = np.abs(along).max() + MARGIN_M
+        sine = farthest / math.hypot(farthest, self.height_m)
         band = (1 + self.sonar.rolloff) * self.sonar.bandwidth_hz
         moves = 2 * self.reach_m / (self.sonar.wavelength_m * self.height_m)
         panels = math.ceil((along[-1] - along[0]) * (band * 2 * sine / self.sonar.sound_speed + moves) * NODES / PANEL)
         u, du = _panels(along[0], along[-1], panels, PANEL)
         # 2. points across it, within the edges of the footprint
         low, high = (np.interp(u, along, edge) for edge in across)
-        wide = (high - low).max()
-        cycles = wide * (band * wide / (self.sonar.sound_speed * self.height_m) + moves)
+        width = (high - low).max()
+        cycles = width * (band * width / (self.sonar.sound_speed * self.height_m) + moves)
         count = math.ceil(8 + NODES * cycles)
         if len(u) * count > MOST_POINTS:
             raise MitsonarError(
                 f"receiver {self.receiver.name} covers too much ground to compute its covariance: {len(u)} x {count} "
-                f"points; give it a field of view narrower than {wide:.0f} m on the ground"
+                f"points; give it a field of view narrower than {width:.0f} m on the ground"
             )
         w, dw = np.polynomial.legendre.leggauss(count)
         side = (low + high)[:, None] / 2 + (high - low)[:, None] / 2 * w
@@ -176,7 +176,7 @@ class ResponseCovariance:
         tap = np.rint(links.delay * self.sonar.sampling_hz).astype(int)
         power = np.bincount(tap, links.amplitude**2 * self.nodes.area)
         loud = np.flatnonzero(power > FAINTEST * power.max())
-        tail = math.ceil(TAILS / self.sonar.bandwidth_hz * self.sonar.sampling_hz)
+        tail = math.ceil(LEADING_PULSES / self.sonar.bandwidth_hz * self.sonar.sampling_hz)
         return slice(max(0, int(loud[0]) - tail), min(self.sonar.taps, int(loud[-1]) + 1))
 
     @cached_property
@@ -184,7 +184,7 @@ class ResponseCovariance:
         """Return the middle delay and the period [s] of the spectrum, and the matrix to taps ``(taps, frequencies)``."""
         delay = self.sonar.delay_s[self.taps]
         middle = (delay[0] + delay[-1]) / 2
-        period = delay[-1] - delay[0] + QUIET / self.sonar.bandwidth_hz
+        period = delay[-1] - delay[0] + SILENCE_PULSES / self.sonar.bandwidth_hz
         count = 2 * math.ceil((1 + self.sonar.rolloff) * self.sonar.bandwidth_hz / 2 * period) + 2
         frequency = np.arange(-count // 2, count - count // 2) / period
         level = self.sonar.raised_cosine(frequency) / (self.sonar.sampling_hz * period)
@@ -302,5 +302,5 @@ def _extent(sonar: ChannelSonar, receiver: Hydrophone, height_m: float) -> tuple
 def block_toeplitz(blocks: Sequence[Complex]) -> Complex:
     """Assemble the covariance of all pings from the covariances by lag, the earlier ping first."""
     count = range(len(blocks))
-    whole = np.block([[blocks[j - i] if j >= i else blocks[i - j].conj().T for j in count] for i in count])
-    return np.asarray((whole + whole.conj().T) / 2)
+    joint = np.block([[blocks[j - i] if j >= i else blocks[i - j].conj().T for j in count] for i in count])
+    return np.asarray((joint + joint.conj().T) / 2)

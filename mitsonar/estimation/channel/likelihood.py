@@ -46,40 +46,40 @@ __all__ = [
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-SURE_PINGS = 3
+CONDITIONING_PINGS = 3
 """Number of pings on which the next one is conditioned."""
 
-STEPS = 8
+MAX_STEPS = 8
 """Largest number of scoring steps; the iteration ends when a step is below a fifth of a standard deviation."""
 
-LEVEL = 0.05
+MAX_DECREASE = 0.05
 """Largest decrease of the log likelihood in a step."""
 
-LONGEST = 3e-3
+LONGEST_STEP = 3e-3
 """Longest step [m, rad]."""
 
-APART = 5.0
+MODE_SEPARATION = 5.0
 """Distance of two modes [standard deviations]; nearer ones count as one mode."""
 
-NEAR = 0.1
+NEAR_WAVELENGTHS = 0.1
 """Distance [wavelengths] within which a start leads to a known mode."""
 
-TURNS = (-0.006, -0.003, 0.003, 0.006)
+INITIAL_TURNS_RAD = (-0.006, -0.003, 0.003, 0.006)
 """Initial turns over all pings [rad]."""
 
 MOST_WAVES = 25.0
 """Longest motion between pings that is searched, in both directions [wavelengths]."""
 
-PLACES = 33
+SAMPLED_MOTIONS = 33
 """Number of motions across an axis for which the likelihood is computed."""
 
 AMBIGUOUS_SHARE = 0.01
 """Probability from which a mode counts as ambiguous."""
 
-UNSURE = 0.15
+LARGEST_STD_WAVELENGTHS = 0.15
 """Largest standard deviation of a valid motion [wavelengths]."""
 
-HOPELESS = 25.0
+MAX_DEFICIT = 25.0
 """Largest deficit of the log likelihood of a start relative to the best."""
 
 LEAST_GAIN = 12.0
@@ -173,19 +173,19 @@ class Likelihood:
 
     def _modes(self, receiver_bands: list[ReceiverBand], data: list[Complex], search: Search) -> list[Mode]:
         """Return the modes, the most probable first."""
-        near_m = NEAR * receiver_bands[0].law.sonar.wavelength_m
+        near_m = NEAR_WAVELENGTHS * receiver_bands[0].law.sonar.wavelength_m
         # 1. refine the best motion of the search, then others along its less certain axis
         modes = [refined(receiver_bands, data, np.array([*search.peaks()[0], 0.0, 0.0]), self.free, 1)]
         for number, start in enumerate(across_from(receiver_bands, data, search, modes[0])[: self.modes + 1]):
             if number == 0 or all(np.abs(start - one.motion[:2]).max() > near_m for one in modes):
                 mode = refined(receiver_bands, data, np.array([*start, 0.0, 0.0]), self.free, 1)
-                if all(_distance(mode, known) > APART for known in modes):
+                if all(_distance(mode, known) > MODE_SEPARATION for known in modes):
                     modes.append(mode)
         # 2. add turns; their sign is hardly observable
         if self.yaw:
             modes = self._with_turns(receiver_bands, data, modes)
         # 3. refine the probable modes again, conditioned on more pings
-        depth = min(SURE_PINGS, len(data[0]) - 1)
+        depth = min(CONDITIONING_PINGS, len(data[0]) - 1)
         if depth > 1:
             best = max(one.mass for one in modes)
             modes = [refined(receiver_bands, data, one.motion, self.free, depth) for one in modes if one.mass > best - 20]
@@ -195,7 +195,7 @@ class Likelihood:
         """Add modes from initial turns to both sides, since the loss of coherence hardly shows the sign of a turn."""
         extended = list(modes)
         for mode in modes:
-            for yaw in TURNS:
+            for yaw in INITIAL_TURNS_RAD:
                 turned = refined(
                     receiver_bands, data, np.array([*mode.motion[:2], yaw / max(1, len(data[0]) - 1), 0.0]), self.free, 1
                 )
@@ -238,7 +238,7 @@ class Likelihood:
         turn, span = float(intervals * mean[2]), float(responses.time_s[-1] - responses.time_s[0])
         if not reason and abs(turn) > self.turn_rate * span:
             reason = f"turns by {np.degrees(turn):.2g} deg, faster than {np.degrees(self.turn_rate):.3g} deg/s"
-        if not reason and ambiguous > UNSURE * wavelength_m:
+        if not reason and ambiguous > LARGEST_STD_WAVELENGTHS * wavelength_m:
             count = int((share > AMBIGUOUS_SHARE).sum())
             reason = f"{f'{count} motions fit equally well: ' if count > 1 else ''}known to {1e3 * ambiguous:.0f} mm only"
         return Estimate(_over_intervals(mean, intervals), covariance, not reason, reason, about)
@@ -261,7 +261,7 @@ def across_from(receiver_bands: list[ReceiverBand], data: list[Complex], search:
     # likelihood along the less certain axis, summed over the receivers
     axis = int(np.diag(mode.covariance)[:2].argmax())
     total = np.zeros(len(search.line))
-    sampled = np.linspace(search.line[0], search.line[-1], PLACES)
+    sampled = np.linspace(search.line[0], search.line[-1], SAMPLED_MOTIONS)
     for number, (receiver_band, z) in enumerate(zip(receiver_bands, data, strict=True)):
         if abs(receiver_band.turn[1, axis]) > 0.5:
             total += search.along(number, mode.motion, axis)
@@ -272,7 +272,7 @@ def across_from(receiver_bands: list[ReceiverBand], data: list[Complex], search:
             total += PchipInterpolator(sampled, values)(search.line)
     # its maxima that are not hopeless, best first
     peaks = np.flatnonzero(total == maximum_filter(total, size=5))
-    peaks = peaks[(total > total.max() - HOPELESS)[peaks]]
+    peaks = peaks[(total > total.max() - MAX_DEFICIT)[peaks]]
     peaks = peaks[np.argsort(-total[peaks])]
     places = [-mode.motion[axis], *search.line[peaks]]
     return np.array([_with_component(mode.motion, axis, float(place))[:2] for place in places])
@@ -295,7 +295,7 @@ def _is_distinct(one: Mode, other: Mode) -> bool:
     """Return whether two modes differ by more than a few standard deviations in position or turn."""
     difference = (one.motion - other.motion)[:3]
     spread = np.sqrt(np.maximum(np.diag(one.covariance)[:3], np.diag(other.covariance)[:3]))
-    return bool((np.abs(difference) > APART * np.maximum(spread, 1e-6)).any())
+    return bool((np.abs(difference) > MODE_SEPARATION * np.maximum(spread, 1e-6)).any())
 
 
 def _over_intervals(motion: Array, intervals: int) -> Motion:
@@ -320,18 +320,18 @@ def refined(receiver_bands: list[ReceiverBand], data: list[Complex], motion: Arr
         ]
 
     scores = scores_at(motion)
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         # scoring step from all receivers, limited in length
         total = sum(one.likelihood for one in scores)
         information = sum((one.information for one in scores), np.zeros((len(free),) * 2))
         step = np.linalg.lstsq(information, sum((one.gradient for one in scores), np.zeros(len(free))), rcond=None)[0]
-        step *= min(1.0, LONGEST / float(np.abs(step).max() + 1e-12))
-        # halve the step until the log likelihood decreases by less than LEVEL
+        step *= min(1.0, LONGEST_STEP / float(np.abs(step).max() + 1e-12))
+        # halve the step until the log likelihood decreases by less than MAX_DECREASE
         for _ in range(4):
             trial = motion.copy()
             trial[columns] += step
             trial_scores = scores_at(trial)
-            if sum(one.likelihood for one in trial_scores) > total - LEVEL:
+            if sum(one.likelihood for one in trial_scores) > total - MAX_DECREASE:
                 motion, scores = trial, trial_scores
                 break
             step /= 2
@@ -352,7 +352,7 @@ def refined(receiver_bands: list[ReceiverBand], data: list[Complex], motion: Arr
 # ---------------- Likelihood of one motion by one receiver
 
 
-NOISE = np.logspace(-6, 1.5, 46)
+NOISE_CANDIDATES = np.logspace(-6, 1.5, 46)
 """Candidate variances of noise, as fractions of the mean power; the error of the covariance integral lies below them."""
 
 
@@ -389,7 +389,7 @@ def judged(receiver_band: ReceiverBand, response: Complex, motion: Array, free: 
     ]
     parts = [part for part in runs if part is not None]
     # 3. most likely level for each candidate variance of noise, then the most likely variance
-    noise = NOISE * power
+    noise = NOISE_CANDIDATES * power
     energy = sum(part.sign * (part.power[:, None] / (part.size[:, None] + noise)).sum(axis=0) for part in parts)
     positive = energy > 0  # the conditional energy may vanish where a motion does not fit at all
     level = np.where(positive, energy, 1.0) / response.size
@@ -405,7 +405,9 @@ def judged(receiver_band: ReceiverBand, response: Complex, motion: Array, free: 
         ]
         one, two = part.score(slopes, noise[best], float(level[best]))
         gradient, information = gradient + part.sign * one, information + part.sign * two
-    return MotionScore(float(likelihood[best]), turn.T @ gradient, turn.T @ information @ turn, float(NOISE[best]))
+    return MotionScore(
+        float(likelihood[best]), turn.T @ gradient, turn.T @ information @ turn, float(NOISE_CANDIDATES[best])
+    )
 
 
 @dataclass(frozen=True)
@@ -462,16 +464,16 @@ class _PingRuns:
 
 # ---------------- Coarse search over all motions
 
-FLOOR = 1e-2
+WHITENING_FLOOR = 1e-2
 """Fraction of the mean power below which a direction of responses is not used."""
 
-ALONG, ACROSS = 7.5, 1.9
+MOTIONS_ALONG, MOTIONS_ACROSS = 7.5, 1.9
 """Motions of the grid per wavelength, along the axis of a receiver and across."""
 
-FINE = 15.0
+CELLS_PER_WAVELENGTH = 15.0
 """Cells per wavelength of the map in which the scores of all receivers are added."""
 
-PEAKS = 40
+MAX_PEAKS = 40
 """Number of maxima of the map that are used."""
 
 
@@ -504,9 +506,9 @@ def single_receiver(sonar: ChannelSonar, receiver: Hydrophone) -> ChannelSonar:
 
 
 @lru_cache(maxsize=32)
-def response_covariance_of(alone: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> ResponseCovariance:
+def response_covariance_of(single: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> ResponseCovariance:
     """Return the response covariance of an instrument of one receiver, cached."""
-    return ResponseCovariance(alone, alone.receivers[0], height_m, interval_s, reach_m)
+    return ResponseCovariance(single, single.receivers[0], height_m, interval_s, reach_m)
 
 
 def receiver_bands_of(sonar: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> list[ReceiverBand]:
@@ -550,10 +552,10 @@ class CovarianceTable:
         # whiten the strong directions of a single ping
         single = law.covariance((0, 0, 0), 0)
         power = float(np.diag(single).real.mean())
-        size, vectors = np.linalg.eigh(single + FLOOR * power * np.eye(len(single)))
-        strong = size > 2 * FLOOR * power
+        size, vectors = np.linalg.eigh(single + WHITENING_FLOOR * power * np.eye(len(single)))
+        strong = size > 2 * WHITENING_FLOOR * power
         basis = (vectors[:, strong] / np.sqrt(size[strong])).conj().T
-        along, across = (_grid(law.reach_m, law.sonar.wavelength_m / parts) for parts in (ALONG, ACROSS))
+        along, across = (_grid(law.reach_m, law.sonar.wavelength_m / parts) for parts in (MOTIONS_ALONG, MOTIONS_ACROSS))
         # a receiver in the plane of its axis has equal covariances for motions to port and to starboard
         symmetric = law.receiver.position[0] == 0 and law.sonar.transmitter.shape == "all"
         shared = np.empty((len(along), len(across), len(basis), len(basis)), dtype=np.complex64)
@@ -579,8 +581,8 @@ def _grid(reach: float, step: float) -> Array:
 
 
 @lru_cache(maxsize=32)
-def _table_of(alone: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> CovarianceTable:
-    return CovarianceTable.from_covariance(response_covariance_of(alone, height_m, interval_s, reach_m))
+def _table_of(single: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> CovarianceTable:
+    return CovarianceTable.from_covariance(response_covariance_of(single, height_m, interval_s, reach_m))
 
 
 @dataclass(frozen=True)
@@ -600,7 +602,7 @@ class Search:
         cls, bands: list[Band], response: Complex, height_m: float, interval_s: float, reach_m: float, received: list[int]
     ) -> Self:
         """Score pings ``(pings, receivers, taps)`` by the receivers ``received``, for motions up to ``reach_m`` [m]."""
-        line = _grid(reach_m, min(band.sonar.wavelength_m for band in bands) / FINE)
+        line = _grid(reach_m, min(band.sonar.wavelength_m for band in bands) / CELLS_PER_WAVELENGTH)
         plane, scores = np.stack(np.meshgrid(line, line, indexing="ij")), []
         for band in bands:
             part = band.part_of(response)
@@ -618,7 +620,7 @@ class Search:
         """Return the motions ``(n, 2)`` [m] of the largest scores, best first."""
         total = self.scores.sum(axis=0)
         peaks = np.argwhere(total == maximum_filter(total, size=5))
-        return np.asarray(self.line[peaks[np.argsort(-total[tuple(peaks.T)])][:PEAKS]])
+        return np.asarray(self.line[peaks[np.argsort(-total[tuple(peaks.T)])][:MAX_PEAKS]])
 
     def along(self, receiver: int, motion: Array, axis: int) -> Array:
         """Return the scores of one receiver on the line through a motion along an axis ``(n,)``."""

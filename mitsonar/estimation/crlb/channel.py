@@ -93,15 +93,15 @@ def impulse_information(
 
 def _information(receiver_band: ReceiverBand, motion: Array, pings: int, noise: float, free: Sequence[int]) -> Array:
     """Return the information from one receiver."""
-    whole = _covariance(receiver_band.law, receiver_band.turn @ motion, pings)
-    power = float(np.diag(whole).real.mean())
-    inverse = np.linalg.inv(whole + noise * power * np.eye(len(whole)))
-    turned = []
+    covariance = _covariance(receiver_band.law, receiver_band.turn @ motion, pings)
+    power = float(np.diag(covariance).real.mean())
+    inverse = np.linalg.inv(covariance + noise * power * np.eye(len(covariance)))
+    whitened = []
     for number in free:
         step = receiver_band.turn[:, number] * STEP
         high, low = (_covariance(receiver_band.law, receiver_band.turn @ motion + sign * step, pings) for sign in (1, -1))
-        turned.append(inverse @ (high - low) / (2 * STEP))
-    return np.array([[float(np.sum(one * two.T).real) for two in turned] for one in turned])
+        whitened.append(inverse @ (high - low) / (2 * STEP))
+    return np.array([[float(np.sum(one * two.T).real) for two in whitened] for one in whitened])
 
 
 def _covariance(law: ResponseCovariance, motion: Array, pings: int) -> Complex:

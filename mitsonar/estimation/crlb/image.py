@@ -80,7 +80,7 @@ VARIABLES = {
 }
 """Variables for which a bound can be computed over many values, with their meaning and what remains constant."""
 
-MOVING = ("height_m", "pitch_deg", "azimuth_fov_deg", "elevation_fov_deg")
+FLOOR_MOVING_VARIABLES = ("height_m", "pitch_deg", "azimuth_fov_deg", "elevation_fov_deg")
 """Variables that move the floor out of the window."""
 
 
@@ -201,8 +201,8 @@ def bounds_at(
         poses: poses of the sonar ``(n, 6)``.
         noise: noise of the pixels.
         gain: gain of the frames.
-        pings: pings of each half of the derivatives; default: 8, then four times as many, twice, while images leave it
-            undecided whether an axis can be observed.
+        pings: pings of each half of the derivatives; default: 8, then 32 and 128 while it is undecided whether an
+            axis can be observed.
     """
     if simulator.sonar.model == "coherent":
         refuse_noise(noise, simulator.sonar)
@@ -249,8 +249,8 @@ def cramer_rao_bound(
             the model ``coherent``, ``ground``: the expected level is known, and the grain is new in each frame; ``grain``:
             the scatterers are known as well. Default: ``pixel``, or ``ground`` for the model ``coherent``.
         frames: number of noisy frames, 1 or 2.
-        pings: pings of each half of the derivatives; default: 8, then four times as many, twice, while images leave it
-            undecided whether an axis can be observed.
+        pings: pings of each half of the derivatives; default: 8, then 32 and 128 while it is undecided whether an
+            axis can be observed.
 
     Returns:
         Sideways, forward [m] and yaw [rad] ``(n, 3)``; 0 where only rounding separates a pixel from its level, inf where an
@@ -301,7 +301,9 @@ def varied(
         return sonar.replace(range_min=near, range_max=far), poses
     varied_poses, number = poses.copy(), float(value)  # type: ignore[arg-type]
     # change the variable itself
-    before = floor_ranges(sonar, float(heights.mean()), float(poses[:, 3].mean())) if name in MOVING else None
+    before = (
+        floor_ranges(sonar, float(heights.mean()), float(poses[:, 3].mean())) if name in FLOOR_MOVING_VARIABLES else None
+    )
     height, varied_sonar = heights, sonar
     if name == "height_m":
         if not number > 0:
@@ -346,7 +348,7 @@ def floor_ranges(sonar: Sonar, height_m: float, pitch_rad: float) -> tuple[float
 # ---------------- Fisher information and least covariance
 
 
-SURE = 3.0
+SIGNIFICANCE = 3.0
 """Number of standard errors that the information of an observable direction exceeds."""
 
 
@@ -378,12 +380,12 @@ class Bound:
         diagonal = np.diag(self.information)
         scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
         size, axes = np.linalg.eigh(self.information * np.outer(scale, scale))
-        known = size > np.maximum(SURE * self._error(axes * scale[:, None]), 1e-9)
+        known = size > np.maximum(SIGNIFICANCE * self._error(axes * scale[:, None]), 1e-9)
         inverse = (axes[:, known] / size[known]) @ axes[:, known].T * np.outer(scale, scale)
         # axes with a part in the other directions are unobservable
-        lost = (axes[:, ~known] ** 2).sum(axis=1) > 1e-3
-        inverse[lost, :] = inverse[:, lost] = 0
-        inverse[lost, lost] = np.inf
+        unobservable = (axes[:, ~known] ** 2).sum(axis=1) > 1e-3
+        inverse[unobservable, :] = inverse[:, unobservable] = 0
+        inverse[unobservable, unobservable] = np.inf
         return np.asarray(frames * inverse)
 
     def std(self, frames: int = 1) -> NDArray[np.float64]:
@@ -553,10 +555,10 @@ GRAIN_PINGS, GROUND_PINGS = 2, 4
 GRAIN_STEP = 1 / 8
 """Step of the grain's derivatives, as a fraction of a bin (forward) and of a beam (sideways, yaw): a tenth of the grain."""
 
-OTHER_RAYS: dict[str, Quality] = {"draft": "standard", "standard": "fine", "fine": "standard"}
+OTHER_HALF_QUALITY: dict[str, Quality] = {"draft": "standard", "standard": "fine", "fine": "standard"}
 """Quality of the rays of the other half."""
 
-AGREEING = 0.5
+MAX_RELATIVE_DEVIATION = 0.5
 """Relative deviation beyond which a value is left out.
 
 It applies to echoes on which two sets of rays disagree, such as sharp edges and thin tops of rocks, and to expected levels
@@ -594,7 +596,7 @@ class SpeckleBounds:
             raise MitsonarError(f"bounds of speckle are for the model coherent: got {simulator.sonar.model}")
         self.sonar, self.gain = simulator.sonar, gain
         self.imager = simulator.model.imager
-        self.halves = self.imager, self.imager.of_quality(OTHER_RAYS[self.sonar.quality])
+        self.halves = self.imager, self.imager.of_quality(OTHER_HALF_QUALITY[self.sonar.quality])
         mirrors = simulator.mirrors if self.sonar.bounces > 1 else None  # with one reflection a mirror has no expected level
         self.expected = Simulator(simulator.tracer.scene, expected_sonar(self.sonar), mirrors=mirrors)
         # noise of the receiver and of the volume, which beams correlate differently
@@ -634,7 +636,7 @@ class SpeckleBounds:
         # leave out clipped pixels and echoes on which the rays disagree; rounding adds variance
         scale = self.gain * self.imager.gain.astype(float)[:, None]
         slope = coding_slope(level * scale, self.sonar) * scale
-        used = (slope > 0) & (np.abs(echo - other_echo) < AGREEING * np.abs(echo + other_echo) / 2)
+        used = (slope > 0) & (np.abs(echo - other_echo) < MAX_RELATIVE_DEVIATION * np.abs(echo + other_echo) / 2)
         rounding = np.divide(1 / (12 * GREYS**2), slope**2, out=np.full_like(slope, np.inf), where=used)
         return CellScores(jacobian, *grain_law(echo, self.noise, self.noise_correlation, rounding))
 
@@ -652,7 +654,7 @@ class SpeckleBounds:
         gain = 0.01 / float(next(self.expected.pings(pose[None], first=first)).levels.max())
         (derivative,) = next(differentiate(self.expected, pose, gain, pings=pings or GROUND_PINGS, first=first))
         level = derivative.level + self.noise * self.imager.gain[:, None] * gain
-        known = (level > 0) & (derivative.variance < (AGREEING * level) ** 2)
+        known = (level > 0) & (derivative.variance < (MAX_RELATIVE_DEVIATION * level) ** 2)
         safe = np.where(known, level, 1)
         # fractions of speckle and noise, whose products give the covariance of the scores
         echo_share = np.where(known, derivative.level, 0) / safe

@@ -108,10 +108,10 @@ def bounds_report(source: str, subject: Subject, options: BoundOptions, progress
             row: PlainTable = {} if name is None else {name: value}
             row |= {"portion": portion, "data": kind, "law": law, "poses": len(bounds)}
             known = [one for one in bounds if one is not None]
-            for frames, words in ((1, "one_frame"), (2, "two_frames")):
+            for frames, key in ((1, "one_frame"), (2, "two_frames")):
                 each = np.array([one.std(frames) * UNITS for one in known])
-                row[words] = _numbers(overall(each)) if len(known) == len(bounds) else None
-                row[f"{words}_each"] = [_numbers(std) for std in each]
+                row[key] = _numbers(overall(each)) if len(known) == len(bounds) else None
+                row[f"{key}_each"] = [_numbers(std) for std in each]
             row["not_observable"] = sum(not np.isfinite(one.std()).all() for one in known)
             row["relative_error"] = _numbers(np.mean([one.relative_error for one in known], axis=0)) if known else None
             rows.append(row)
@@ -172,10 +172,19 @@ def report_lines(report: PlainTable) -> list[str]:
     cells = [titles]
     for row in report["rows"]:
         value = row.get(name)
-        text = "..".join(f"{v:g}" for v in value) if isinstance(value, tuple) else f"{value:g}" if name else ""
-        two = [_text(row[words]) for words in ("one_frame", "two_frames")]
-        lost = f", {row['not_observable']} not observable" if row["not_observable"] else ""
-        cells.append([*([text] if name else []), row["portion"], row["data"], row["law"], *two, f"{row['poses']}{lost}"])
+        value_text = "..".join(f"{v:g}" for v in value) if isinstance(value, tuple) else f"{value:g}" if name else ""
+        texts = [_text(row[words]) for words in ("one_frame", "two_frames")]
+        unobservable = f", {row['not_observable']} not observable" if row["not_observable"] else ""
+        cells.append(
+            [
+                *([value_text] if name else []),
+                row["portion"],
+                row["data"],
+                row["law"],
+                *texts,
+                f"{row['poses']}{unobservable}",
+            ]
+        )
     widths = [max(len(line[k]) for line in cells) for k in range(len(titles))]
     lines = ["  ".join(word.ljust(width) for word, width in zip(line, widths, strict=True)).rstrip() for line in cells]
     head = f"noise {report['noise']}: least standard deviation, sideways / forward / yaw (root of the mean variance)"

@@ -105,7 +105,7 @@ CLEARLY_FAR = 1.2
 FAR, FAR_RAD = 0.02, float(np.radians(1.5))
 """Motions beyond this fraction of the height, or this turn, are far: relief dominates, and ``phase`` finds missed ones."""
 
-GRAZING = 0.32
+ROCKY_FIELD_STEEPNESS = 0.32
 """Squared ratio of height to range over rocky fields. Relief moves less at more grazing angles, as on a plate at 0.3 m."""
 
 START_STD = np.array([0.05, 0.05, np.radians(1)])
@@ -115,10 +115,10 @@ Few beams hardly separate sideways motion from yaw. Without this prior, one pair
 off by 0.1 m.
 """
 
-NEARBY = np.array([0.05, 0.05, np.radians(1)])
+RELIEF_REACH = np.array([0.05, 0.05, np.radians(1)])
 """Largest distance from its start that the registration over relief reaches."""
 
-COVERED = 2.0
+LEVEL_REACH_STD = 2.0
 """Standard deviations of its smoothing that a level reaches."""
 
 LARGEST_STD = np.array([0.02, 0.02, np.radians(0.5)])
@@ -138,7 +138,7 @@ class _Task:
     def relief_m(self) -> float:
         """Height [m] from which relief would move as it does here if seen as steeply as on rocky fields."""
         middle_m = float(self.frames.range_m[[0, -1]].mean())
-        return max(self.attitude.height_m, GRAZING * middle_m**2 / self.attitude.height_m)
+        return max(self.attitude.height_m, ROCKY_FIELD_STEEPNESS * middle_m**2 / self.attitude.height_m)
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ class Direct:
                 return near
             far = self._over_relief(task, start, near.motion, start_name)
             return far if far.valid else near
-        if task.prior is not None and (3 * task.prior.std > NEARBY).any():
+        if task.prior is not None and (3 * task.prior.std > RELIEF_REACH).any():
             near = self._over_level(task, start, start_name)
             return self._over_relief(task, start, near.motion, start_name) if near.covariance is not None else near
         return self._over_relief(task, start, start, start_name)
@@ -268,7 +268,7 @@ class Direct:
         needed = [
             number
             for number, level in enumerate(levels)
-            if bins <= COVERED * level.smoothing[0] and beams <= COVERED * level.smoothing[1]
+            if bins <= LEVEL_REACH_STD * level.smoothing[0] and beams <= LEVEL_REACH_STD * level.smoothing[1]
         ]
         return levels[needed[-1] if needed else 0 :]
 
@@ -366,13 +366,13 @@ RELIEF_STD = 0.048
 ILLUMINATION = (12.0, 4.0)
 """Bins and beams beyond which brightness variations come from the sonar, which moves, and not from the ground."""
 
-CORRELATED = 20.0
+CORRELATED_RESIDUALS = 20.0
 """Residuals that count as one: those of a block err together where its ground deviates from the model."""
 
 SETTLED = np.array([3e-4, 3e-4, 6e-5])
 """Steps below which an iteration ends [m, m, rad]: a fifth of the error that remains over relief."""
 
-TALLEST_STEP = 0.06
+LARGEST_HEIGHT_STEP = 0.06
 """Largest change of a height in one iteration, as a fraction of the sonar's height."""
 
 DERIVATIVE_STEPS = (2e-3, 2e-3, 5e-4, 0.04)
@@ -497,7 +497,14 @@ class _ReliefLevel:
         correlation = correlation_of(first.before[first.inside], first.after[first.inside])
         normal, gradients = by_motion[:, :3].sum(axis=-1), by_motion[:, 3]
         return _Equations(
-            normal, cross, height[0], gradients, height[1], CORRELATED * first.scale**2, correlation, int(first.inside.sum())
+            normal,
+            cross,
+            height[0],
+            gradients,
+            height[1],
+            CORRELATED_RESIDUALS * first.scale**2,
+            correlation,
+            int(first.inside.sum()),
         )
 
     def gradients_by_lean(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -620,7 +627,7 @@ def registered_over_relief(
                 )
                 / height_normal
             )
-            largest_change = TALLEST_STEP * attitude.height_m
+            largest_change = LARGEST_HEIGHT_STEP * attitude.height_m
             v, heights = v + step, heights + np.clip(change, -largest_change, largest_change)
             converged = bool((np.abs(step) < SETTLED).all())
             if converged:

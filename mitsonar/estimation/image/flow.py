@@ -79,7 +79,7 @@ class FlowLevel(NamedTuple):
     rounds: int
 
 
-HIGHER = 0.02
+HEIGHT_STEP = 0.02
 """Step in height for the numerical derivative of the map, as a fraction of the height."""
 
 
@@ -137,8 +137,10 @@ class WindowGrid:
 
     @cached_property
     def _higher(self) -> tuple[GroundGeometry, GroundGeometry]:
-        """Geometry of both frames with the sonar raised by :data:`HIGHER` times the height of the first."""
-        ground, second = (replace(one, height_m=one.height_m + HIGHER * self.ground.height_m) for one in self._both_grounds)
+        """Geometry of both frames with the sonar raised by :data:`HEIGHT_STEP` times the height of the first."""
+        ground, second = (
+            replace(one, height_m=one.height_m + HEIGHT_STEP * self.ground.height_m) for one in self._both_grounds
+        )
         return ground, second
 
     @property
@@ -157,7 +159,7 @@ class WindowGrid:
     def by_height(self, v: Doubles) -> Doubles:
         """Return the derivative of the map by the relative height ``(n, m, 2, 1)``."""
         map_there = np.stack(self._higher[1].to_polar(moved(self._higher_points, v)), axis=-1) - self.home
-        return (np.nan_to_num(map_there - self.map(v)) / HIGHER)[..., None]
+        return (np.nan_to_num(map_there - self.map(v)) / HEIGHT_STEP)[..., None]
 
 
 @lru_cache(maxsize=16)
@@ -187,7 +189,7 @@ LEVELS = (
 LONGEST_STEP = np.array([0.06, 0.06, np.radians(1.2)])
 """Largest change in one round [m, m, rad]: wrong flow can be wrong without limit."""
 
-FAINT, QUIET = 1e-3, 0.1
+STRUCTURE_FLOOR, RESIDUAL_FLOOR = 1e-3, 0.1
 """Fractions of the mean structure and of the mean residual that are added to those of each window."""
 
 LEAST_CORRELATION = 0.25
@@ -331,7 +333,7 @@ def _flow(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid) -> Wi
         for product in (row * row, row * column, column * column, row * change, column * change, change * change)
     )
     # regularise faint windows, then solve for the displacement in cells
-    faint = FAINT * (rows + columns).mean() + TINY
+    faint = STRUCTURE_FLOOR * (rows + columns).mean() + TINY
     known = grid.derivative.any(axis=(2, 3)) & (rows + columns > faint)
     tensor = _symmetric(rows + faint, cross, columns + faint)
     cells = np.linalg.solve(tensor, np.stack([right_row, right_column], axis=-1)[..., None])[..., 0]
@@ -347,7 +349,7 @@ def _flow(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid) -> Wi
         )
     )
     # normalise by the residual of each window, and convert cells to metres and radians
-    per = known / (noise + QUIET * noise.mean() + TINY)
+    per = known / (noise + RESIDUAL_FLOOR * noise.mean() + TINY)
     scale = per[..., None, None] / (grid.spacing[..., :, None] * grid.spacing[..., None, :])
     return WindowFlow(cells * grid.spacing, _symmetric(rows, cross, columns) * scale, shared * scale)
 
@@ -409,11 +411,11 @@ def _rejection(fit: _Fit, blocks: float, unseen: float) -> str:
     if not fit.converged:
         return "the rounds of flow and match did not settle"
     if fit.correlation < LEAST_CORRELATION:
-        return f"the frames as matched correlate by {fit.correlation:.2f} only"
+        return f"the matched frames correlate by {fit.correlation:.2f} only"
     if blocks < FEWEST_BLOCKS:
-        return "what is seen fills too small a part of the frames"
+        return "the visible structure fills too small a part of the frames"
     if unseen > MOST_UNSEEN:
-        return "height and pitch put the ground where the sonar does not look"
+        return "height and pitch place the ground outside the field of view"
     if (std > LARGEST_STD).any():
         return f"standard deviations of {1e3 * std[0]:.1f}, {1e3 * std[1]:.1f} mm, {np.degrees(std[2]):.2f} deg"
     return ""
@@ -431,7 +433,7 @@ STILL = np.array([1e-4, 1e-4, 3e-5])
 CAUCHY = 8.0
 """Windows whose squared misfit is this many times the usual have half the weight."""
 
-SIZE = np.array([0.01, 0.01, 0.003])
+COMPARABLE_MOTION = np.array([0.01, 0.01, 0.003])
 """Motions of comparable effect [m, m, rad]."""
 
 BLOCK = 4
@@ -513,7 +515,7 @@ def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | N
         np.stack([np.stack([one, none, bearing_offset], axis=-1), np.stack([none, one, none], axis=-1)], axis=-2) / count
     )
     slope = (np.swapaxes(summary, -1, -2) @ grid.derivative).sum(axis=(0, 1))
-    if np.linalg.matrix_rank(slope * SIZE) < 3:
+    if np.linalg.matrix_rank(slope * COMPARABLE_MOTION) < 3:
         return None
     for _ in range(10):
         scores = _apply(summary, measured - grid.map(v))
@@ -545,7 +547,7 @@ def _regular(normal: Doubles) -> bool:
 
 
 def _covariance(normals: Doubles, scores: Doubles, prior: Doubles, height_std: float) -> Doubles | None:
-    """Return the covariance of the motion ``(3, 3)``; None where one block alone decides.
+    """Return the covariance of the motion ``(3, 3)``; None where a single block decides.
 
     It sums the changes when one block of windows is left out (jackknife) and the uncertainty of the assumed height.
     """

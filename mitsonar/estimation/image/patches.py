@@ -30,16 +30,16 @@ CELL = (26, 8)
 """Bins and beams of a grid cell in which one patch is chosen."""
 
 SHADOW = 0.3
-AROUND = (25, 61)
+SHADOW_SURROUNDINGS = (25, 61)
 """Level of a shadow, as a fraction of the mean level, and the surroundings [beams, bins] over which that mean is taken."""
 
-EDGE = (3, 7)
+SHADOW_MARGIN = (3, 7)
 """Beams and bins of the neighbourhood of a shadow that is left out."""
 
 LEAST_LIT = 0.5
 """Smallest fraction of a patch's weight outside shadows."""
 
-BEAM = 2.0
+BINS_PER_BEAM = 2.0
 """Number of bins that a beam counts as when slopes are compared to choose patches."""
 
 FAINTEST = 1e-6
@@ -99,8 +99,8 @@ class Alignment(NamedTuple):
 def patch_image(image: Floats) -> PatchImage:
     """Prepare a frame ``(bins, beams)`` for :func:`corners`, :func:`cut` and :func:`align`."""
     level = blurred(image, *SMOOTHING)
-    shadow = (level < SHADOW * cv2.blur(level, AROUND)).astype(np.uint8)
-    lit = 1 - cv2.dilate(shadow, np.ones(EDGE[::-1], np.uint8)).astype(np.float32)
+    shadow = (level < SHADOW * cv2.blur(level, SHADOW_SURROUNDINGS)).astype(np.uint8)
+    lit = 1 - cv2.dilate(shadow, np.ones(SHADOW_MARGIN[::-1], np.uint8)).astype(np.float32)
     return PatchImage(level, *central_differences(level), np.asarray(lit, dtype=np.float32))
 
 
@@ -115,7 +115,7 @@ def corners(image: PatchImage, taken: NDArray[np.bool_]) -> tuple[Index, Index]:
         Row and column of the patches' centres, each ``(n,)``.
     """
     # smaller eigenvalue of the structure tensor: large where a patch is distinct in both directions
-    by_bin, by_beam = image.by_bin * image.lit, image.by_beam * (image.lit / np.float32(BEAM))
+    by_bin, by_beam = image.by_bin * image.lit, image.by_beam * (image.lit / np.float32(BINS_PER_BEAM))
     size = (0.7 * REACH[0], 0.7 * REACH[1])
     by_bin_squared, mixed, by_beam_squared = (
         blurred(product, *size) for product in (by_bin**2, by_bin * by_beam, by_beam**2)

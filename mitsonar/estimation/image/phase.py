@@ -43,7 +43,7 @@ Below them lies the fan's outline, above them mostly noise.
 HIGHEST = 0.45
 """Highest usable frequency of any image, in cycles per pixel of that image."""
 
-LOW = 0.06
+LOW_PASS_STD = 0.06
 """Standard deviation of the frequencies whose phases are compared, in cycles per pixel of :data:`CELL_M`."""
 
 ROUNDS = 3
@@ -87,7 +87,10 @@ class Phase:
         window = _window(view.inside)
         fixed, motion = _windowed(first, window), Motion(0.0, 0.0, 0.0)
         larger = view.edge / CELL_M
-        turn, shift = _PhaseCorrelation(_spectrum_by_angle(fixed, larger), LOW), _PhaseCorrelation(fixed, LOW * larger)
+        turn, shift = (
+            _PhaseCorrelation(_spectrum_by_angle(fixed, larger), LOW_PASS_STD),
+            _PhaseCorrelation(fixed, LOW_PASS_STD * larger),
+        )
         for _ in range(ROUNDS):
             # rotation first, since the spectra's magnitudes do not depend on the translation
             _, rows = turn.offset(_spectrum_by_angle(_windowed(_warped_back(second, view, motion), window), larger))

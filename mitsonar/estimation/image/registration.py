@@ -47,16 +47,16 @@ __all__ = [
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
-STILL = np.array([3e-5, 3e-5, 6e-6])
+SETTLED = np.array([3e-5, 3e-5, 6e-6])
 """Steps below which an iteration ends [m, m, rad]."""
 
 CAUCHY = 3.0
 """Residuals of this many standard deviations have half the weight."""
 
-TOGETHER = (3, 2)
+CORRELATED_PATCHES = (3, 2)
 """Patches within which residuals are correlated: rocks and their shadows."""
 
-AROUND = (3, 3)
+SURROUNDING_PATCHES = (3, 3)
 """Patches along beams and bins around each patch that are assessed as one block."""
 
 BLOCK_CAUCHY = 4.0
@@ -65,16 +65,16 @@ BLOCK_CAUCHY = 4.0
 NEGLIGIBLE = 0.1
 """Standard deviations of the estimate below which a remaining step is lost in the noise."""
 
-ASIDE = 8
+DISPLACED_BEAMS = 8
 """Beams by which one frame is displaced to measure how distinct the match is."""
 
-COARSE = 10.0
+COARSE_STEP_FACTOR = 10.0
 """Factor on the step that ends the iteration of a level followed by a finer one."""
 
-REMEMBERED = 4
+REMEMBERED_STEPS = 4
 LEVER_M = 4.0
-LONGEST = 4.0
-NEAR_M = 0.002
+LONGEST_ACCELERATION = 4.0
+ACCELERATED_STEP_M = 0.002
 """Steps remembered for the acceleration; metres that a radian of turn counts as; largest lengthening of a step; and the
 largest step [m] that is accelerated."""
 
@@ -84,7 +84,7 @@ FEWEST_CELLS = 500
 FEWEST_ROWS = 24
 """Smallest number of rows of a level that is not the last."""
 
-SAMPLED = (5, 3)
+NOISE_STRIDE = (5, 3)
 """Stride in bins and beams of the cells from which the noise is measured."""
 
 
@@ -147,7 +147,7 @@ def register(
         The motion, and its fit at the finest level.
     """
     v, accelerate, converged = start.copy(), _AndersonAcceleration(), False
-    step_limit = STILL if last else COARSE * STILL
+    step_limit = SETTLED if last else COARSE_STEP_FACTOR * SETTLED
     linearisation, margins = None, np.zeros((2, 2))
     for _ in range(level.iterations):
         linearisation = _linearised(*pair, cells, v, level, margins, last=last)
@@ -230,7 +230,7 @@ def _linearised(
     counted = residuals[0][pairs[0][2]]
     if counted.size < FEWEST_CELLS:
         return None
-    scale = noise_of(counted[:: SAMPLED[0], :: SAMPLED[1]].ravel())
+    scale = noise_of(counted[:: NOISE_STRIDE[0], :: NOISE_STRIDE[1]].ravel())
     # weigh the residuals, then project the sums over patches onto the motion
     sides = [
         _weighted_pair(*pair, residual, cells, level, scale, last=last)
@@ -365,7 +365,7 @@ def _excess(side: _ResampledPair, cells: Cells) -> Excess:
     """Return how much more the frames correlate than when displaced across the beams."""
     before, after = side.before[side.inner], side.after[side.inner]
     inside = np.ones(before.shape, dtype=bool) if cells.seen is None else cells.seen[side.inner] > 0
-    return correlation_excess(before, after, inside, ASIDE)
+    return correlation_excess(before, after, inside, DISPLACED_BEAMS)
 
 
 def is_resolved(bins: int, level: DirectLevel) -> bool:
@@ -397,19 +397,19 @@ class _AndersonAcceleration:
     def __call__(self, place: Doubles, step: Doubles) -> Doubles:
         """Return an accelerated step; the given one if there are too few earlier steps."""
         lever = np.array([1, 1, LEVER_M, 1])[: len(step), None]
-        if np.linalg.norm(lever[:, 0] * step) > NEAR_M:  # long steps predict little
+        if np.linalg.norm(lever[:, 0] * step) > ACCELERATED_STEP_M:  # long steps predict little
             return step
         self.places.append(place)
         self.steps.append(step)
         if len(self.steps) < 2:
             return step
         # extrapolate to where the remembered steps would vanish
-        places, steps = (np.diff(np.array(values[-REMEMBERED:]), axis=0).T for values in (self.places, self.steps))
+        places, steps = (np.diff(np.array(values[-REMEMBERED_STEPS:]), axis=0).T for values in (self.places, self.steps))
         past, *_ = np.linalg.lstsq(lever * steps, lever[:, 0] * step, rcond=1e-3)
         accelerated = np.asarray(step - (places + steps) @ past)
         # limit the lengthening
         lengths = [float(np.linalg.norm(lever[:, 0] * one)) for one in (accelerated, step)]
-        return accelerated if lengths[0] < LONGEST * lengths[1] else step
+        return accelerated if lengths[0] < LONGEST_ACCELERATION * lengths[1] else step
 
 
 def _inner(displacement: Floats, usable: slice, margins: Doubles) -> tuple[slice, slice] | None:
@@ -459,7 +459,9 @@ def _patch_weight(sums: Doubles) -> Doubles:
     ``sums`` are those of slope by slope and slope by residual ``(5, rows, columns)``.
     """
     # sum over the surroundings of each patch
-    around = np.array([cv2.boxFilter(one, -1, AROUND, normalize=False, borderType=cv2.BORDER_CONSTANT) for one in sums])
+    around = np.array(
+        [cv2.boxFilter(one, -1, SURROUNDING_PATCHES, normalize=False, borderType=cv2.BORDER_CONSTANT) for one in sums]
+    )
     aa, ab, bb, gradient_a, gradient_b = around.reshape(5, -1)
     textured = aa + bb > 0
     if not textured.any():
@@ -473,7 +475,7 @@ def _patch_weight(sums: Doubles) -> Doubles:
 
 def _by_correlated_block(values: Doubles, cells: Cells) -> Doubles:
     """Sum values of patches ``(..., patches)`` over the blocks whose errors are correlated ``(..., blocks)``."""
-    return by_block(values.reshape(*values.shape[:-1], *cells.patches), TOGETHER)
+    return by_block(values.reshape(*values.shape[:-1], *cells.patches), CORRELATED_PATCHES)
 
 
 # ---------------- Cells of a level
@@ -839,12 +841,12 @@ def slopes_of(image: Floats, level: DirectLevel, scale: float) -> tuple[Floats, 
     return central_differences(smooth)
 
 
-HALVES = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
-ONE = np.ones(1, dtype=np.float32)
+DIFFERENCE_KERNEL = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
+UNIT_KERNEL = np.ones(1, dtype=np.float32)
 
 
 def central_differences(image: Floats) -> tuple[Floats, Floats]:
     """Return central differences over bins and over beams."""
-    by_bin = cv2.sepFilter2D(image, -1, ONE, HALVES, borderType=cv2.BORDER_REPLICATE)
-    by_beam = cv2.sepFilter2D(image, -1, HALVES, ONE, borderType=cv2.BORDER_REPLICATE)
+    by_bin = cv2.sepFilter2D(image, -1, UNIT_KERNEL, DIFFERENCE_KERNEL, borderType=cv2.BORDER_REPLICATE)
+    by_beam = cv2.sepFilter2D(image, -1, DIFFERENCE_KERNEL, UNIT_KERNEL, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(by_bin, dtype=np.float32), np.asarray(by_beam, dtype=np.float32)

@@ -113,7 +113,7 @@ def test_pictures_hold_nothing_but_the_fan(ground: NDArray[np.float64]) -> None:
     np.testing.assert_allclose(found.motion(cut), motion, atol=1e-6)
     assert found.estimate(cut).valid
     apart = cut + np.array([[0, 0, 0.6 * columns], [0, 0, 0]])
-    assert "do not overlap by half" in found.estimate(apart).reason
+    assert "overlap by less than half" in found.estimate(apart).reason
 
 
 # ---------------------------------------------------------------- anybody's class
