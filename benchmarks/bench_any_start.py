@@ -30,9 +30,9 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=60)
     parser.add_argument("--only", choices=SETS)
     parser.add_argument("--quick", action="store_true", help="two pairs of one set, kept nowhere: within a minute")
-    asked = parser.parse_args()
-    if not asked.quick:
-        return compare_all(asked.out, asked.pairs, [asked.only] if asked.only else list(SETS), "none,high")
+    arguments = parser.parse_args()
+    if not arguments.quick:
+        return compare_all(arguments.out, arguments.pairs, [arguments.only] if arguments.only else list(SETS), "none,high")
     with tempfile.TemporaryDirectory() as folder:
         compare_all(Path(folder), 2, ["narrow"], "none")
 

@@ -33,12 +33,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a small guide")
     parser.add_argument("--threads", type=int, default=1)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     ensure_variant()
-    use_threads(asked.threads)
+    use_threads(arguments.threads)
     import mitsuba as mi
 
-    half, pings = (3.0, 2) if asked.quick else (8.0, 12)
+    half, pings = (3.0, 2) if arguments.quick else (8.0, 12)
     place, bsdf = mi.ScalarTransform4f(), {"type": "diffuse"}
     seabed = {"type": "rectangle", "bsdf": bsdf, "to_world": place.scale(half)}
     flat = {"type": "rectangle", "bsdf": bsdf, "to_world": place.translate([0, 0, DEPTH]).scale(4 * half)}
@@ -65,13 +65,13 @@ def cost(scene: mi.Scene, bounces: int, pings: int) -> str:
     keys = {"range_max": 60.0, "frequency_step_hz": 5.0, "points_per_m2": 100.0, "carrier_hz": CARRIER}
     sonar = ChannelSonar(receivers=(receiver,), bounces=bounces, **keys)
     # both without roughness, so that the surface has no scatterers of its own
-    made = ChannelSimulator(scene, sonar, mirrors={"surface": (-1.0, 0.0), "seabed": (0.3, 0.003)})
-    list(made.pings(poses[:2]))
+    result = ChannelSimulator(scene, sonar, mirrors={"surface": (-1.0, 0.0), "seabed": (0.3, 0.003)})
+    list(result.pings(poses[:2]))
     begun = time.process_time()
-    parts = list(made.pings(poses))
+    parts = list(result.pings(poses))
     spent = 1e3 * (time.process_time() - begun) / pings
     echoes = int(np.concatenate([part.echoes for part in parts]).mean())
-    return f"{len(made.ways)} ways, {echoes:,} echoes, {spent:.1f} ms a response"
+    return f"{len(result.ways)} ways, {echoes:,} echoes, {spent:.1f} ms a response"
 
 
 if __name__ == "__main__":

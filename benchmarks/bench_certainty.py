@@ -86,12 +86,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--recordings", nargs="?", const="", help="folder; default: the variable MITSONAR_RECORDINGS")
     parser.add_argument("--quick", action="store_true", help="two pairs of one set, kept nowhere: within a minute")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     print(HEAD)
-    if not asked.quick:
-        return measure(asked)
+    if not arguments.quick:
+        return measure(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        measure_kind(Path(folder), "far29", KINDS["far29"]._replace(scenes=1, pairs=2), "none", ["direct"], asked.seed)
+        measure_kind(Path(folder), "far29", KINDS["far29"]._replace(scenes=1, pairs=2), "none", ["direct"], arguments.seed)
 
 
 HEAD = """| set | noise | method | pairs | invalid | RMSE (mm, mm, deg) | median | nees, mean (95 %) | median | reasons |
@@ -164,29 +164,29 @@ def measure_recordings(folder: Path, method: str) -> None:
         )
     source = opened(folder / CHAIN).with_contrast()
     numbers = np.arange(len(source))
-    found = [estimator.estimate(source.read([k, k + 1])) for k in numbers[:-1]]
-    closure = closure_of(source, estimator, numbers, found, LOOP)
-    refused = sum(not one.valid for one in found)
+    result = [estimator.estimate(source.read([k, k + 1])) for k in numbers[:-1]]
+    closure = closure_of(source, estimator, numbers, result, LOOP)
+    refused = sum(not one.valid for one in result)
     if closure is None:
-        print(f"| ARIS 3000, chain, loops | own | {method} | 0 | {refused} of {len(found)} | - | - | - | - | |", flush=True)
+        print(f"| ARIS 3000, chain, loops | own | {method} | 0 | {refused} of {len(result)} | - | - | - | - | |", flush=True)
         return
     rmse, median = (
         np.sqrt((in_units(closure.residuals) ** 2).mean(axis=0)),
         np.median(np.abs(in_units(closure.residuals)), 0),
     )
-    words = f"{len(closure.residuals)} | {refused} of {len(found)} | {triple(rmse)} | {triple(median)}"
+    words = f"{len(closure.residuals)} | {refused} of {len(result)} | {triple(rmse)} | {triple(median)}"
     print(f"| ARIS 3000, chain, loops | own | {method} | {words} | {closure.factor:.2f} at least 1 | - | |", flush=True)
 
 
 def report(name: str, noise: str, method: str, each: Pairs, estimator: AnyEstimator) -> None:
     """Estimate pairs and print their row."""
     cv2.setNumThreads(1)
-    truth, scene, found = [], [], []
+    truth, scene, result = [], [], []
     for frames, motion, number in each:
         truth.append(motion)
         scene.append(number)
-        found.append(estimator.estimate(frames))
-    print(f"| {name} | {noise} | {method} | {row(np.array(truth), np.array(scene), found)} |", flush=True)
+        result.append(estimator.estimate(frames))
+    print(f"| {name} | {noise} | {method} | {row(np.array(truth), np.array(scene), result)} |", flush=True)
 
 
 def row(truth: Array, scene: NDArray[np.int64], found: list[Estimate]) -> str:

@@ -62,15 +62,15 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a small seabed, each once: within a minute")
     parser.add_argument("--presets", action="store_true", help="a ping of each preset, and its figure")
     parser.add_argument("--variant", help="Mitsuba variant, e.g. cuda_ad_mono")
-    asked = parser.parse_args()
-    ensure_variant(asked.variant)
-    if asked.presets:
+    arguments = parser.parse_args()
+    ensure_variant(arguments.variant)
+    if arguments.presets:
         of_presets = {"machine": machine(), "rows": [preset_row(name, 3) for name in named_sonars()]}
-        print(json.dumps(of_presets, indent=2) if asked.json else preset_table(of_presets))
+        print(json.dumps(of_presets, indent=2) if arguments.json else preset_table(of_presets))
         return
-    rows = [measured(case, 1 if asked.quick else 15) for case in cases(asked.quick)]
+    rows = [measured(case, 1 if arguments.quick else 15) for case in cases(arguments.quick)]
     result = {"machine": machine(), "rows": rows}
-    print(json.dumps(result, indent=2) if asked.json else table(result))
+    print(json.dumps(result, indent=2) if arguments.json else table(result))
 
 
 def preset_row(name: str, repeats: int) -> dict[str, Any]:
@@ -137,8 +137,8 @@ def measured(case: Case, repeats: int) -> dict[str, Any]:
     for name, simulator in simulators.items():
         work[name] = partial(rendered, simulator, case)
     counts = imager.image(case.pose(0)[0], 0)[1]
-    found = {"case": case.name, "rays": imager.tracer.fan.rays, "points": counts.points}
-    return found | {name: dict(zip(("cpu", "wall"), ms, strict=True)) for name, ms in turns(work, repeats).items()}
+    result = {"case": case.name, "rays": imager.tracer.fan.rays, "points": counts.points}
+    return result | {name: dict(zip(("cpu", "wall"), ms, strict=True)) for name, ms in turns(work, repeats).items()}
 
 
 def rendered(simulator: Simulator, case: Case, ping: int) -> object:

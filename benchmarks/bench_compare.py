@@ -39,12 +39,12 @@ def main() -> None:
     parser.add_argument("--perturbed", type=int, default=200, help="pairs of the perturbed rows; 0: none")
     parser.add_argument("--only", choices=SETS)
     parser.add_argument("--quick", action="store_true", help="two pairs of one set, kept nowhere: within a minute")
-    asked = parser.parse_args()
-    if not asked.quick:
-        return compare_all(asked)
+    arguments = parser.parse_args()
+    if not arguments.quick:
+        return compare_all(arguments)
     with tempfile.TemporaryDirectory() as folder:
         few = {"out": Path(folder), "pairs": 2, "perturbed": 2, "only": "rocky-field"}
-        compare_all(argparse.Namespace(**{**vars(asked), **few}))
+        compare_all(argparse.Namespace(**{**vars(arguments), **few}))
 
 
 def compare_all(asked: argparse.Namespace) -> None:

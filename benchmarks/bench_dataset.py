@@ -109,7 +109,7 @@ def main() -> None:
     quick = ("--quick",) if args.quick else ()
     result: Row = {"machine": machine(), "make": [], "rendered": [], "read": []}
     with tempfile.TemporaryDirectory(prefix="bench-dataset-") as folder:
-        made = Path(folder) / "read.zarr"
+        built = Path(folder) / "read.zarr"
         for recipe, workers in size.crews if "make" in parts else ():
             result["make"].append(note(making(recipe, workers, size, Path(folder))))
         for recipe, workers in size.crews if "rendered" in parts else ():
@@ -117,8 +117,8 @@ def main() -> None:
             words = ("--rendered", recipe, str(crew), str(size.samples))
             result["rendered"].append(note(in_a_process(*quick, *words)))
         if "read" in parts:
-            command(["dataset", "make", "rocky-field", *changed(size), "--sequences", str(size.stored), "-o", str(made)])
-            result["read"] = [note(row) for row in reading(made, size)]
+            command(["dataset", "make", "rocky-field", *changed(size), "--sequences", str(size.stored), "-o", str(built)])
+            result["read"] = [note(row) for row in reading(built, size)]
         if "field" in parts:
             result["field"] = note(in_a_process(*quick, "--field", str(Path(folder) / "field")))
     print(json.dumps(result, indent=2) if args.json else tables(result))

@@ -45,11 +45,11 @@ def main() -> None:
     parser.add_argument("--flights", default=",".join(FLIGHTS))
     parser.add_argument("--worlds", type=int, default=12)
     parser.add_argument("--quick", action="store_true", help="two pairs of one sonar, kept nowhere: within a minute")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     cv2.setNumThreads(1)
     print(f"| sonar | texture | flight | pairs | {' | NEES | '.join(KNOWN)} | NEES |\n{'|---' * (4 + 2 * len(KNOWN))}|")
-    if not asked.quick:
-        return measure(asked.out, asked.sonars.split(","), asked.flights.split(","), asked.worlds, PLACES)
+    if not arguments.quick:
+        return measure(arguments.out, arguments.sonars.split(","), arguments.flights.split(","), arguments.worlds, PLACES)
     with tempfile.TemporaryDirectory() as folder:
         measure(Path(folder), ["didson300"], ["gentle"], 1, 2)
 
@@ -59,8 +59,8 @@ def measure(out: Path, sonars: list[str], flights: list[str], worlds: int, place
     for preset in sonars:
         for flight in flights:
             for texture in TEXTURES:
-                found = errors_of(out, SETS[f"dive-{preset}-{flight}-3"], texture, worlds, places)
-                cells = (f"{triple(one)} | {one.nees:.2f}" for one in found)
+                result = errors_of(out, SETS[f"dive-{preset}-{flight}-3"], texture, worlds, places)
+                cells = (f"{triple(one)} | {one.nees:.2f}" for one in result)
                 print(f"| {preset} | {texture} | {flight} | {worlds * places} | {' | '.join(cells)} |", flush=True)
 
 
@@ -108,7 +108,7 @@ def vehicle(dive: SimulatedSet, places: int) -> Array:
     assert dive.flight is not None
     rng = np.random.default_rng(7 * dive.seed)
     course = dive_course(600, DIVE_HZ, dive.seed, FLIGHTS[dive.flight])
-    found = []
+    result = []
     for _ in range(places):
         at = int(rng.integers(0, len(course) - 2))
         pair, heading, place = course[at : at + 2].copy(), rng.uniform(0, 2 * np.pi), rng.uniform(-NEAR_M, NEAR_M, 2)
@@ -117,8 +117,8 @@ def vehicle(dive: SimulatedSet, places: int) -> Array:
         pair[:, :2] = place + (pair[:, :2] - pair[0, :2]) @ turned.T
         pair[:, 2] += dive.height_m
         pair[:, 5] += turn
-        found.append(pair)
-    return np.concatenate(found)
+        result.append(pair)
+    return np.concatenate(result)
 
 
 def told(frames: SonarFrames, known: str) -> SonarFrames:

@@ -89,10 +89,10 @@ def benchmark(out: Path, scale: Scale) -> None:
         rendered(trajectory_job("forward", "physical", scale.rendered, scale.coarse)).save(file)
     way = SonarFrames.load(file)
     long, short = (to_and_fro(way, frames, out / f"run-{frames}") for frames in (scale.frames, scale.killed))
-    found = out / f"found-{scale.frames}"
-    log = finished(watched(long, found))
+    result = out / f"found-{scale.frames}"
+    log = finished(watched(long, result))
     print("\n" + "\n".join(table(log, scale)), flush=True)
-    whole = found
+    whole = result
     if scale.killed != scale.frames:
         whole = out / f"found-{scale.killed}"
         finished(watched(short, whole))
@@ -188,8 +188,8 @@ def table(log: Array, scale: Scale) -> Iterator[str]:
         cells = []
         for begin, stop in ((first, min(first + step, pairs)), (pairs + first, pairs + first + step)):
             start, over = np.interp([begin, stop], log[:, 1], log[:, 0])
-            held = log[(log[:, 1] > begin) & (log[:, 1] <= stop), 2].max()
-            cells += [f"{1e3 * (over - start) / (stop - begin):.1f}", f"{held:.0f}"]
+            stored = log[(log[:, 1] > begin) & (log[:, 1] <= stop), 2].max()
+            cells += [f"{1e3 * (over - start) / (stop - begin):.1f}", f"{stored:.0f}"]
         yield f"| {first:,} to {first + step:,} | {' | '.join(cells)} |"
     yield f"\nPose graph and files: {after[-1, 0] - log[-1, 0]:.1f} s, at most {after[-1, 2]:.0f} MiB"
 

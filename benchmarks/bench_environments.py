@@ -34,8 +34,8 @@ def main() -> None:
     parser.add_argument("--envs", type=int, default=64)
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--quick", action="store_true", help="8 environments, 2 steps")
-    asked = parser.parse_args()
-    envs, steps = (8, 2) if asked.quick else (asked.envs, asked.steps)
+    arguments = parser.parse_args()
+    envs, steps = (8, 2) if arguments.quick else (arguments.envs, arguments.steps)
     print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, {ensure_variant()}, scene objects, {envs} environments\n")
     print("| sonar, physical, draft | together frames/s | one by one frames/s | ratio |\n|---|---|---|---|")
     small = Sonar(model="physical", beams=64, range_bins=128, range_min=1, range_max=8, quality="draft")
@@ -56,8 +56,8 @@ def row(name: str, sonar: Sonar, envs: int, steps: int) -> str:
         begun = time.perf_counter()
         many.step(action)
         middle = time.perf_counter()
-        for own in action:
-            one.step(own)
+        for local in action:
+            one.step(local)
         took.append((middle - begun, time.perf_counter() - middle))
     together, single = envs / np.median(took[WARM:], axis=0)
     return f"| {name} | {together:.0f} | {single:.0f} | {together / single:.1f} |"

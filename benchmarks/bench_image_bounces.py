@@ -56,11 +56,11 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print for programs")
     parser.add_argument("--quick", action="store_true", help="each once: within a minute")
     parser.add_argument("--variant", help="Mitsuba variant, e.g. cuda_ad_mono")
-    asked = parser.parse_args()
-    ensure_variant(asked.variant)
-    rows = [measured(case, model, 1 if asked.quick else 15) for case in cases() for model in ("physical", "coherent")]
+    arguments = parser.parse_args()
+    ensure_variant(arguments.variant)
+    rows = [measured(case, model, 1 if arguments.quick else 15) for case in cases() for model in ("physical", "coherent")]
     result = {"machine": machine(), "rows": rows}
-    print(json.dumps(result, indent=2) if asked.json else table(result))
+    print(json.dumps(result, indent=2) if arguments.json else table(result))
 
 
 def cases() -> list[Case]:

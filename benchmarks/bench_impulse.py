@@ -65,17 +65,17 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=100, help="of the leak test")
     parser.add_argument("--rays", type=int, default=50_000, help="a receiver, of the leak test in the model rays")
     parser.add_argument("--quick", action="store_true", help="both, small: within a minute")
-    asked = parser.parse_args()
-    if asked.what is None and not asked.quick:
+    arguments = parser.parse_args()
+    if arguments.what is None and not arguments.quick:
         parser.error("say what: speed, leak, or --quick")
     ensure_variant()
-    use_threads(asked.threads)
-    print(f"{cpu()}, {asked.threads} threads, {time.strftime('%Y-%m-%d')}")
-    size = QUICK if asked.quick else FULL
-    samples, rays = (5, 2000) if asked.quick else (asked.samples, asked.rays)
-    if asked.quick or asked.what == "speed":
+    use_threads(arguments.threads)
+    print(f"{cpu()}, {arguments.threads} threads, {time.strftime('%Y-%m-%d')}")
+    size = QUICK if arguments.quick else FULL
+    samples, rays = (5, 2000) if arguments.quick else (arguments.samples, arguments.rays)
+    if arguments.quick or arguments.what == "speed":
         speed(size)
-    if asked.quick or asked.what == "leak":
+    if arguments.quick or arguments.what == "leak":
         for model in ("rays", "scatterers"):
             leak(ChannelSonar(model=model, rays=rays), samples, size)
 
@@ -114,8 +114,8 @@ def speed(size: Size) -> None:
         simulator = ChannelSimulator(scene, sonar)
         ready = time.perf_counter() - begun
         poses, velocity = flights(size.pings[0], 2)
-        made = [rate_of(simulator, poses, velocity) for _ in range(size.repeats)][1:]
-        rate, echoes = float(np.median([one[0] for one in made])), made[0][1]
+        result = [rate_of(simulator, poses, velocity) for _ in range(size.repeats)][1:]
+        rate, echoes = float(np.median([one[0] for one in result])), result[0][1]
         print(
             f"{model}: {rate:.0f} responses/s of {sonar.taps} taps from {echoes:,.0f} echoes each; scene ready in "
             f"{ready:.1f} s"
@@ -184,14 +184,14 @@ def memory_after(simulator: ChannelSimulator, pings: int) -> float:
 def leak(sonar: ChannelSonar, samples: int, size: Size) -> None:
     """Errors of velocities read from one response alone, as displacements in 50 ms."""
     templates, tried = templates_of(sonar, size.steps)
-    true, found = [], []
+    true, result = [], []
     for seed in range(5):
         simulator = ChannelSimulator(field_of(10 + seed, size), sonar)
         poses, velocity = flights(samples // 5, 100 + seed)
         response = np.concatenate([part.response for part in simulator.pings(poses, velocity)])
-        found += [most_alike(one, templates, tried) for one in response]
+        result += [most_alike(one, templates, tried) for one in response]
         true += list(velocity[:, :2])
-    error = 1e3 * APART_S * (np.array(found) - np.array(true))
+    error = 1e3 * APART_S * (np.array(result) - np.array(true))
     zero = 1e3 * APART_S * np.array(true)
     rmse, still = (np.sqrt((values**2).mean(axis=0)) for values in (error, zero))
     median = np.median(np.abs(error), axis=0)
@@ -221,11 +221,11 @@ def most_alike(
 ) -> NDArray[np.float64]:
     """Return the velocity whose template best correlates with a response ``(receivers, taps)``, with a parabola."""
     steps = round(len(tried) ** 0.5)
-    alike = (np.abs(np.einsum("vrt,rt->vr", templates.conj(), response)) ** 2).sum(axis=1).reshape(steps, steps)
-    best = np.array(np.unravel_index(alike.argmax(), alike.shape))
+    similar = (np.abs(np.einsum("vrt,rt->vr", templates.conj(), response)) ** 2).sum(axis=1).reshape(steps, steps)
+    best = np.array(np.unravel_index(similar.argmax(), similar.shape))
     answer = []
     for axis in (0, 1):
-        line = alike[:, best[1]] if axis == 0 else alike[best[0]]
+        line = similar[:, best[1]] if axis == 0 else similar[best[0]]
         peak = int(np.clip(best[axis], 1, steps - 2))
         low, mid, high = line[peak - 1 : peak + 2]
         curve = low - 2 * mid + high

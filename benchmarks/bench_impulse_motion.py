@@ -114,23 +114,23 @@ def main() -> None:
     parser.add_argument("--rays", type=int, nargs="+", default=[12_500, 50_000], help="of regressors: in each field of view")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--quick", action="store_true", help="all four, small, kept nowhere: within a minute")
-    asked = parser.parse_args()
-    if asked.what is None and not asked.quick:
+    arguments = parser.parse_args()
+    if arguments.what is None and not arguments.quick:
         parser.error(f"say what: {', '.join(PARTS)}, or --quick")
     os.environ["OMP_NUM_THREADS"] = "1"
-    print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, model {asked.model}", flush=True)
-    if not asked.quick:
-        asked.out.mkdir(parents=True, exist_ok=True)
-        with workers(asked.processes) as asked.pool:
-            return PARTS[asked.what](asked)
-    with tempfile.TemporaryDirectory() as folder, workers(1) as asked.pool:
-        asked.out, asked.samples, asked.pings, asked.processes = Path(folder), SCENES, 2, 1
+    print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, model {arguments.model}", flush=True)
+    if not arguments.quick:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        with workers(arguments.processes) as arguments.pool:
+            return PARTS[arguments.what](arguments)
+    with tempfile.TemporaryDirectory() as folder, workers(1) as arguments.pool:
+        arguments.out, arguments.samples, arguments.pings, arguments.processes = Path(folder), SCENES, 2, 1
         for part, only in (("rows", "impulse-two-receivers"), ("noise", "impulse-standard"), ("courses", "sinusoid")):
-            asked.only = [only]
-            asked.estimators = "zero,correlation,likelihood" if part == "rows" else "correlation"
-            PARTS[part](asked)
-        regressors(asked)
-        figure(asked)
+            arguments.only = [only]
+            arguments.estimators = "zero,correlation,likelihood" if part == "rows" else "correlation"
+            PARTS[part](arguments)
+        regressors(arguments)
+        figure(arguments)
 
 
 def workers(processes: int) -> AbstractContextManager[Pool]:
@@ -202,11 +202,11 @@ def estimate_of(work: tuple[str, dict[str, bool], ImpulseResponses]) -> list[flo
     name, options, responses = work
     begun = time.perf_counter()
     try:
-        found = create_estimator(name, **options).estimate(responses)
+        result = create_estimator(name, **options).estimate(responses)
     except MitsonarError:
         return [0.0] * 6 + [0.0, time.perf_counter() - begun]
-    spread = np.full(3, np.nan) if found.covariance is None else np.sqrt(np.abs(np.diag(found.covariance)))
-    return [*found.motion, *spread, float(found.valid), time.perf_counter() - begun]
+    spread = np.full(3, np.nan) if result.covariance is None else np.sqrt(np.abs(np.diag(result.covariance)))
+    return [*result.motion, *spread, float(result.valid), time.perf_counter() - begun]
 
 
 def estimates(
@@ -379,8 +379,8 @@ def driven(asked: argparse.Namespace, label: str, name: str, responses: ImpulseR
     are bridged. The last column is the validity."""
     path = asked.out / f"{label}-{file_name(name)}.json"
     if not path.exists():
-        found = odometry(ResponseSource(label, responses), create_estimator(name), OdometryOptions(workers=asked.processes))
-        rows = np.column_stack([found.series.motions, np.zeros((len(found.series), 3)), found.valid])
+        result = odometry(ResponseSource(label, responses), create_estimator(name), OdometryOptions(workers=asked.processes))
+        rows = np.column_stack([result.series.motions, np.zeros((len(result.series), 3)), result.valid])
         path.write_text(json.dumps(rows.tolist()))
     return np.array(json.loads(path.read_text()))
 
@@ -448,13 +448,13 @@ def place_cells(name: str, simulator: ChannelSimulator, samples: int) -> str:
         pair = path_of(motion[None], Pose(x, y, 10.0, 0.0, 0.0, heading), np.array([0.0, 1 / 180]))
         responses = simulator.responses(pair, velocities(pair))
         begun = time.process_time()
-        found = create_estimator(name).estimate(responses)
+        result = create_estimator(name).estimate(responses)
         ms.append(1e3 * (time.process_time() - begun))
-        error = (np.array(found.motion) - motion)[:2]
+        error = (np.array(result.motion) - motion)[:2]
         errors.append(1e3 * error)
-        valid.append(found.valid)
-        if found.covariance is not None:
-            nees.append(error @ np.linalg.solve(found.covariance[:2, :2], error) / 2)
+        valid.append(result.valid)
+        if result.covariance is not None:
+            nees.append(error @ np.linalg.solve(result.covariance[:2, :2], error) / 2)
     rmse = " / ".join(f"{value:.3f}" for value in np.sqrt(np.square(errors).mean(axis=0)))
     distance = np.median(np.hypot(*np.transpose(errors)))
     known = f"{np.median(nees):.2f}" if nees else "-"

@@ -38,11 +38,11 @@ def main() -> None:
     parser.add_argument("--scene", default="objects")
     parser.add_argument("--sonar", default="oculus-m750d-750khz")
     parser.add_argument("--json", type=Path, help="also write the figures there")
-    asked = parser.parse_args()
-    beams, bins = (64, 100) if asked.quick else (512, 500)
-    pings, cases = (5, CASES[:1]) if asked.quick else (asked.pings, CASES)
-    rows = [measured(asked.scene, asked.sonar, beams, bins, pings, *case) for case in cases]
-    print(f"{asked.scene}, {asked.sonar}, {beams} beams x {bins} bins, {len(os.sched_getaffinity(0))} cores")
+    arguments = parser.parse_args()
+    beams, bins = (64, 100) if arguments.quick else (512, 500)
+    pings, cases = (5, CASES[:1]) if arguments.quick else (arguments.pings, CASES)
+    rows = [measured(arguments.scene, arguments.sonar, beams, bins, pings, *case) for case in cases]
+    print(f"{arguments.scene}, {arguments.sonar}, {beams} beams x {bins} bins, {len(os.sched_getaffinity(0))} cores")
     latency = ("latency, median [ms]", "95 %", "worst")
     columns = ("model", "quality", "rate [Hz]", *latency, "rendering [ms]", "processor [ms]", "fan [px]")
     print(f"| {' | '.join(columns)} |")
@@ -52,8 +52,8 @@ def main() -> None:
             "| {model} | {quality} | {rate_hz:.1f} | {median_ms:.0f} | {p95_ms:.0f} | {worst_ms:.0f} | {render_ms:.0f} | "
             "{cpu_ms:.0f} | {columns} x {rows} |".format(**row)
         )
-    if asked.json is not None:
-        asked.json.write_text(json.dumps(rows, indent=2) + "\n")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
 
 
 def measured(scene: str, sonar: str, beams: int, bins: int, pings: int, model: str, quality: str) -> dict[str, Any]:
@@ -63,9 +63,9 @@ def measured(scene: str, sonar: str, beams: int, bins: int, pings: int, model: s
     process = subprocess.Popen([*command, "--trajectory", "shipped"], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
-        found = re.search(r"ws://127\.0\.0\.1:\d+", process.stdout.readline())
-        assert found is not None, "the server did not start"
-        with LiveClient(found[0], ("/sonar/fan", "/sonar/timing")) as client:
+        result = re.search(r"ws://127\.0\.0\.1:\d+", process.stdout.readline())
+        assert result is not None, "the server did not start"
+        with LiveClient(result[0], ("/sonar/fan", "/sonar/timing")) as client:
             return rounds(client, scene, pings, process.pid) | {"model": model, "quality": quality}
     finally:
         process.terminate()
@@ -92,18 +92,18 @@ def rounds(client: LiveClient, scene: str, pings: int, server: int) -> dict[str,
             if message.topic == "/sonar/fan":
                 fan, came = message.content, time.perf_counter()
                 continue
-            told = json.loads(message.content)
-            if told["id"] == number:
+            report = json.loads(message.content)
+            if report["id"] == number:
                 break
         picture = image_of(fan)
         if number >= warm:
             latency.append(1e3 * (came - sent))
-            render.append(told["render_ms"])
+            render.append(report["render_ms"])
     seconds, cpu_ms = time.perf_counter() - begun, (processor_ms(server) - worked) / pings
     columns, rows = Image.open(io.BytesIO(picture)).size
     median, p95, worst = np.percentile(latency, (50, 95, 100))
-    found = {"rate_hz": pings / seconds, "median_ms": median, "p95_ms": p95, "worst_ms": worst, "cpu_ms": cpu_ms}
-    return {**found, "render_ms": float(np.median(render)), "columns": columns, "rows": rows, "pings": pings}
+    result = {"rate_hz": pings / seconds, "median_ms": median, "p95_ms": p95, "worst_ms": worst, "cpu_ms": cpu_ms}
+    return {**result, "render_ms": float(np.median(render)), "columns": columns, "rows": rows, "pings": pings}
 
 
 def processor_ms(process: int) -> float:

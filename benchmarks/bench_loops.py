@@ -110,8 +110,8 @@ def rendered(path: Trajectory, *, coarse: bool) -> SonarFrames:
         simulator = Simulator(load_scene(world, **parameters), sonar)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MitsonarWarning)  # the window of the recipe drops farther echoes, with a warning
-        made = simulator.render(path, seed=1)
-    return replace(made, image=to_uint8(made.image))
+        result = simulator.render(path, seed=1)
+    return replace(result, image=to_uint8(result.image))
 
 
 def rows(source: FrameSource, noise: str, seeds: int) -> Iterator[str]:
@@ -141,17 +141,17 @@ def row(names: list[str], runs: list[Odometry], seconds: float) -> str:
         true = one.true_at_frames
         assert true is not None
         assert one.pose_covariances is not None
-        found = {name: value for name, value, _ in one.rows()}
+        result = {name: value for name, value, _ in one.rows()}
         each = normalised_errors(one.path, one.pose_covariances, true)
-        told = 1e3 * float(np.sqrt(np.trace(one.pose_covariances[-1, :2, :2])))
+        message = 1e3 * float(np.sqrt(np.trace(one.pose_covariances[-1, :2, :2])))
         errors = (
             "end-point error",
             "end-point drift",
             "absolute error RMSE, first pose aligned",
             "heading error at the end",
         )
-        counts = [found.get("loops", 0.0), found.get("loops rejected", 0.0)]
-        cells.append([*counts, *(found[name] for name in errors), told, float(each.mean()), float(each[-1])])
+        counts = [result.get("loops", 0.0), result.get("loops rejected", 0.0)]
+        cells.append([*counts, *(result[name] for name in errors), message, float(each.mean()), float(each[-1])])
     table = np.array(cells)
     rms = np.sqrt((table[:, 2:6] ** 2).mean(axis=0))
     loops, mean = table[:, :2].mean(axis=0), table[:, 6:].mean(axis=0)

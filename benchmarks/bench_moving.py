@@ -41,14 +41,14 @@ def main() -> None:
     parser.add_argument("--triangles", type=int, default=1_000_000)
     parser.add_argument("--pings", type=int, default=9)
     parser.add_argument("--quick", action="store_true", help="20,000 triangles, 3 pings")
-    asked = parser.parse_args()
-    triangles, pings = (20_000, 3) if asked.quick else (asked.triangles, asked.pings)
+    arguments = parser.parse_args()
+    triangles, pings = (20_000, 3) if arguments.quick else (arguments.triangles, arguments.pings)
     print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, {ensure_variant()}, {triangles:,} triangles still and as many that move\n")
     print("| model | still ms | moving ms | ratio | 8 ping groups ms | ratio |\n|---|---|---|---|---|---|")
     for name, changes in MODELS.items():
         print(row(name, changes, triangles, pings), flush=True)
     print("\n| triangles that deform | ms a ping | still body ms |\n|---|---|---|")
-    for count in (1_000, 10_000) if asked.quick else (1_000, 10_000, 100_000):
+    for count in (1_000, 10_000) if arguments.quick else (1_000, 10_000, 100_000):
         print(deforming_row(count, pings), flush=True)
 
 

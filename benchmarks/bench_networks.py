@@ -48,13 +48,13 @@ def main() -> None:
     parser.add_argument("--elsewhere", type=int, default=200, help="pairs of other geometries; 0: none")
     parser.add_argument("--only", choices=[*HOME, *ELSEWHERE])
     parser.add_argument("--quick", action="store_true", help="two pairs of two sets, kept nowhere: within a minute")
-    asked = parser.parse_args()
-    if not asked.quick:
-        return compare_all(asked)
+    arguments = parser.parse_args()
+    if not arguments.quick:
+        return compare_all(arguments)
     with tempfile.TemporaryDirectory() as folder:
         few = {"out": Path(folder), "pairs": 2, "perturbed": 0, "elsewhere": 2}
         for name in (HOME[0], "height-1.5"):
-            compare_all(argparse.Namespace(**{**vars(asked), **few, "only": name}))
+            compare_all(argparse.Namespace(**{**vars(arguments), **few, "only": name}))
 
 
 def compare_all(asked: argparse.Namespace) -> None:

@@ -38,20 +38,20 @@ def main() -> None:
     parser.add_argument("--recordings")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--quick", action="store_true", help="six frames of one set, four methods: within a minute")
-    asked = parser.parse_args()
-    if asked.quick:
+    arguments = parser.parse_args()
+    if arguments.quick:
         with tempfile.TemporaryDirectory() as scratch:
             few = [word for name in ("zero", "ecc", "flow", "direct") for word in ("--method", name)]
             return run(Path(scratch), "--set", "hull", "--texture", "still", "--frames", 6, "--bound", 1, *few)
-    levels = [word for level in asked.noise.split(",") for word in ("--noise", level)]
-    run(asked.out / "simulated", *levels, "--workers", asked.workers)
-    folder = recordings_folder(asked.recordings)
+    levels = [word for level in arguments.noise.split(",") for word in ("--noise", level)]
+    run(arguments.out / "simulated", *levels, "--workers", arguments.workers)
+    folder = recordings_folder(arguments.recordings)
     if folder is None:
         print(f"no recordings: give --recordings or the variable {FOLDER}")
         return None
     for name in RECORDED:
-        told = GEOMETRIES / f"{Path(name).stem.removesuffix('_first30')}.yaml"
-        run(asked.out / "recorded", "--set", folder / name, *(["--geometry", told] if told.exists() else []))
+        message = GEOMETRIES / f"{Path(name).stem.removesuffix('_first30')}.yaml"
+        run(arguments.out / "recorded", "--set", folder / name, *(["--geometry", message] if message.exists() else []))
     return None
 
 

@@ -52,10 +52,12 @@ def main() -> None:
 def row(frames: int) -> str:
     """Solve a chain; return the row of its time and memory."""
     measured, sensors = drawn(frames)
-    held, begun = peak_mib(), time.process_time()
-    found = graph_path(measured, Pose(0, 0, 2), start_known=True, sensors=sensors, search=None, source=None)
+    stored, begun = peak_mib(), time.process_time()
+    result = graph_path(measured, Pose(0, 0, 2), start_known=True, sensors=sensors, search=None, source=None)
     seconds = time.process_time() - begun
-    return f"| {frames:,} | {seconds:.1f} | {1e3 * seconds / frames:.2f} | {peak_mib() - held:.0f} | {found.end_std_m:.6f} |"
+    return (
+        f"| {frames:,} | {seconds:.1f} | {1e3 * seconds / frames:.2f} | {peak_mib() - stored:.0f} | {result.end_std_m:.6f} |"
+    )
 
 
 def drawn(frames: int) -> tuple[MotionSeries, VehicleSensors]:

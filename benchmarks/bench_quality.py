@@ -124,8 +124,8 @@ class Ground:
     def levels(self, scene: mi.Scene, over: int, across: int, pings: range) -> Levels:
         """Levels ``(pings, bins, beams)`` with so many rays a beam."""
         simulator = mitsonar.Simulator(scene, self.sonar.replace(rays_per_beam=over, rays_across=across))
-        found = [next(simulator.pings(self.pose, first=ping)).levels[0] for ping in pings]
-        return np.asarray(found, dtype=np.float64)
+        result = [next(simulator.pings(self.pose, first=ping)).levels[0] for ping in pings]
+        return np.asarray(result, dtype=np.float64)
 
     @property
     def pose(self) -> list[list[float]]:
@@ -135,12 +135,12 @@ class Ground:
     def errors(self, over: int, across: int, pings: int) -> tuple[float, float, float]:
         """Relative rms errors of single pings on plain and on textured ground; correlation of pings on the textured."""
         pings = max(pings, 2)
-        found = []
+        result = []
         for scene, truth in zip(self.scenes, (self.plain, self.textured), strict=True):
             seen = self.levels(scene, over, across, range(pings))[:, self.inside] / self.plain[self.inside]
-            found.append(float(np.sqrt(np.mean((seen - truth[self.inside] / self.plain[self.inside]) ** 2))))
+            result.append(float(np.sqrt(np.mean((seen - truth[self.inside] / self.plain[self.inside]) ** 2))))
         still = np.corrcoef(seen)[np.triu_indices(pings, 1)].mean()
-        return found[0], found[1], float(still)
+        return result[0], result[1], float(still)
 
     def seconds(self, sonar: mitsonar.Sonar, repeats: int) -> float:
         """Time of the fastest ping of the whole sonar over textured ground."""
@@ -204,8 +204,8 @@ def write(rows: dict[str, dict[str, dict[str, float]]]) -> None:
     for name, by_quality in rows.items():
         lines.append(f"  {name}:")
         for quality, row in by_quality.items():
-            said = yaml.safe_dump(row, default_flow_style=True, sort_keys=False, width=200).strip()
-            lines.append(f"    {quality}: {said}")
+            output = yaml.safe_dump(row, default_flow_style=True, sort_keys=False, width=200).strip()
+            lines.append(f"    {quality}: {output}")
     write_whole(TABLE, ("\n".join(lines) + "\n").encode())
 
 

@@ -63,25 +63,25 @@ def main() -> None:
     parser.add_argument("--only", default="", help="only recordings whose name contains this")
     parser.add_argument("--order", type=int, default=20, help="seed of the order of the sheet")
     parser.add_argument("--quick", action="store_true", help="two frames of one recording")
-    asked = parser.parse_args()
-    folder = recordings_folder(asked.recordings)
+    arguments = parser.parse_args()
+    folder = recordings_folder(arguments.recordings)
     if folder is None:
         return print(f"no recordings: name their folder by --recordings or {FOLDER}; nothing is compared")
     warnings.simplefilter("ignore", MitsonarWarning)
-    names = [name for name in RECORDINGS if asked.only in name]
+    names = [name for name in RECORDINGS if arguments.only in name]
     drawn: dict[str, tuple[SonarFrames, SonarFrames]] = {}
-    for name in ["ARIS 3000 tyre"] if asked.quick else names:
+    for name in ["ARIS 3000 tyre"] if arguments.quick else names:
         real = RECORDINGS[name](folder)
-        if asked.quick:
+        if arguments.quick:
             real = real.select(slice(2))
         fit = fit_sonar(real, **STAGES[name].sonar)
         simulated = simulate(STAGES[name], fit, len(real), folder)
         print(f"\n{name}, fitted:\n" + "\n".join(f"    {line}" for line in [*fit.lines(), *fit.notes]), flush=True)
         drawn[name] = real, simulated
     print("\n" + table({name: compare(*pair) for name, pair in drawn.items()}))
-    if asked.out is not None:
-        asked.out.mkdir(parents=True, exist_ok=True)
-        draw(drawn, asked.out, asked.order)
+    if arguments.out is not None:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        draw(drawn, arguments.out, arguments.order)
 
 
 # ---------------------------------------------------------------- simulation
@@ -93,8 +93,8 @@ def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFra
     poses = stage.start + np.arange(frames)[:, None] * stage.step
     poses[:, :3] += np.random.default_rng(SEED).normal(0, stage.sway_m, (frames, 3))
     sonar = fit.sonar.replace(**stage.sonar, speckle_nu=None)  # the fitted one counts objects and edges
-    with tempfile.TemporaryDirectory() as made:
-        scene = stage.build(Path(made))
+    with tempfile.TemporaryDirectory() as result:
+        scene = stage.build(Path(result))
         if sonar.volume_db is not None and sonar.noise_level_db is not None:
             scale_db = (sonar.volume_db if stage.volume_db is None else stage.volume_db) - sonar.volume_db
             sonar = sonar.replace(volume_db=sonar.volume_db + scale_db, noise_level_db=sonar.noise_level_db + scale_db)
@@ -135,8 +135,8 @@ def levels(frames: SonarFrames) -> NDArray[np.float64]:
 
 def compare(real: SonarFrames, simulated: SonarFrames) -> list[Row]:
     """Return all statistics of both."""
-    one, other = measured(real), measured(simulated)
-    return [Row(name, band, one[name][0], other[name][0]) for name, (_, band) in one.items()]
+    one, second = measured(real), measured(simulated)
+    return [Row(name, band, one[name][0], second[name][0]) for name, (_, band) in one.items()]
 
 
 def table(found: dict[str, list[Row]]) -> str:
@@ -159,7 +159,7 @@ def measured(frames: SonarFrames) -> dict[str, tuple[float, float | None]]:
     glow = statistics.near_glow_db(level)
     profile = statistics.range_profile_db(level)
     third = [float(part.mean() - profile.max()) for part in np.array_split(profile, 3)]
-    found: dict[str, tuple[float, float | None]] = {
+    result: dict[str, tuple[float, float | None]] = {
         "span 1..99.9 %, dB": (statistics.percentile_span_db(level), 6.0),
         "exact zeros, %": (100 * statistics.zero_share(frames.image), None),
         "local std, dB": (statistics.local_std_db(level), 0.7),
@@ -179,7 +179,7 @@ def measured(frames: SonarFrames) -> dict[str, tuple[float, float | None]]:
         "steepest rise in 5 % of range, dB": (rise, None),
         "steepest fall in 5 % of range, dB": (fall, None),
     }
-    return found | {f"profile, third {k + 1}, below its top, dB": (value, None) for k, value in enumerate(third)}
+    return result | {f"profile, third {k + 1}, below its top, dB": (value, None) for k, value in enumerate(third)}
 
 
 # ---------------------------------------------------------------- pictures

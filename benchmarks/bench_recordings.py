@@ -52,8 +52,8 @@ def opened(path: Path) -> FrameSource:
     """Open a recording as `mitsonar odometry` does."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        told = GEOMETRIES / f"{path.stem.removesuffix('_first30')}.yaml"
-        return with_assumed_plane(open_frames(path, geometry=told if told.exists() else None))
+        message = GEOMETRIES / f"{path.stem.removesuffix('_first30')}.yaml"
+        return with_assumed_plane(open_frames(path, geometry=message if message.exists() else None))
 
 
 def bin_m(source: FrameSource) -> float:
@@ -141,12 +141,12 @@ def chain(source: FrameSource, reference: Array | None, estimators: list[str]) -
     for moving in (False, True):
         seen = source.with_contrast(moving=moving)
         for word in estimators:
-            found = odometry(seen, create_estimator(word), OdometryOptions(closure=LOOP))
-            total = found.series.motions.sum(axis=0) / unit
-            loops = "" if found.closure is None else " / ".join(f"{value:.3f}" for value in found.closure.rms / unit)
+            result = odometry(seen, create_estimator(word), OdometryOptions(closure=LOOP))
+            total = result.series.motions.sum(axis=0) / unit
+            loops = "" if result.closure is None else " / ".join(f"{value:.3f}" for value in result.closure.rms / unit)
             kind = "moving" if moving else "local"
             sums = " / ".join(f"{value:.2f}" for value in total)
-            print(f"| {kind} | {word} | {sums} | {loops} | {int(found.valid.sum())} of {len(found.estimates)} |")
+            print(f"| {kind} | {word} | {sums} | {loops} | {int(result.valid.sum())} of {len(result.estimates)} |")
     if reference is not None:
         print(f"reference: forward {reference[:, 2].sum():.1f} px, yaw {-reference[:, 0].sum():.2f} deg, without truth")
 

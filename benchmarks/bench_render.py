@@ -103,12 +103,12 @@ def machine() -> Row:
     import os
 
     names = [line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
-    found = backend()
+    result = backend()
     return {
         "cpu": names[0] if names else platform.machine(),
         "cores": os.cpu_count(),
-        "variant": found.variant,
-        "llvm": found.llvm and ".".join(map(str, found.llvm)),
+        "variant": result.variant,
+        "llvm": result.llvm and ".".join(map(str, result.llvm)),
         "mitsuba": __import__("mitsuba").__version__,
         "date": date.today().isoformat(),
     }
@@ -257,7 +257,7 @@ def one_percent(size: Size) -> Row:
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100.0)}
     scene = mi.load_dict({"type": "scene", "floor": floor | {"bsdf": {"type": "diffuse", "reflectance": 0.5}}})
     pose = np.array([[0, 0, 2.5, np.radians(35), 0, 0]])
-    found: Row = {}
+    result: Row = {}
     for name, changes in (
         ("thesis, points", {"model": "thesis"}),
         ("physical, footprints, jittered", {}),
@@ -272,8 +272,8 @@ def one_percent(size: Size) -> Row:
         else:
             raise SystemExit(f"{name}: the bins of a flat floor err by {error:.1%} rms with {rays} rays a beam")
         seconds = medians({"ping": lambda simulator=simulator: next(simulator.pings(pose))}, 3 * size.repeats)  # type: ignore[misc]
-        found[name] = {"rays a beam": rays, "rms error": error, "ms": 1000 * seconds["ping"]}
-    return found
+        result[name] = {"rays a beam": rays, "rms error": error, "ms": 1000 * seconds["ping"]}
+    return result
 
 
 def bin_error(levels: np.ndarray, simulator: mitsonar.Simulator, rays: int) -> float:

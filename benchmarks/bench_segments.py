@@ -69,14 +69,14 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--quick", action="store_true", help="all parts, a few coarse pairs, kept nowhere: within a minute")
-    asked = parser.parse_args()
-    if asked.what is None and not asked.quick:
+    arguments = parser.parse_args()
+    if arguments.what is None and not arguments.quick:
         parser.error(f"say what: {', '.join(PARTS)}, or --quick")
-    print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, {asked.threads} threads", flush=True)
-    if asked.quick:
-        return quick(asked)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    PARTS[asked.what](asked)
+    print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, {arguments.threads} threads", flush=True)
+    if arguments.quick:
+        return quick(arguments)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    PARTS[arguments.what](arguments)
 
 
 def quick(asked: argparse.Namespace) -> None:
@@ -169,13 +169,13 @@ def row(
     run = asked.out / "runs" / name
     checkpoint = train(TrainOptions(recipe, learnt, run, resume=run.exists(), minutes=asked.minutes, threads=asked.threads))
     for what, (where, part) in judged.items():
-        kept = asked.out / f"{name}-{what.replace(' ', '-')}.json"
-        if not kept.exists():
+        stored = asked.out / f"{name}-{what.replace(' ', '-')}.json"
+        if not stored.exists():
             report = evaluate(checkpoint, where, part=part, noise=["none", "high"])
-            kept.write_text(json.dumps(report))
-        report = json.loads(kept.read_text())
+            stored.write_text(json.dumps(report))
+        report = json.loads(stored.read_text())
         mine = [table["rows"][0] for table in report["tables"]]
-        said = [" / ".join(f"{v:.3g}" for v in one["rmse"]) for one in mine]
+        output = [" / ".join(f"{v:.3g}" for v in one["rmse"]) for one in mine]
         ends = zip(mine[0]["rmse_low"], mine[0]["rmse_high"], strict=True)
         interval = " / ".join(f"{low:.2g}..{high:.2g}" for low, high in ends)
         zero, slopes = (" / ".join(f"{v:.3g}" for v in mine[0][key]) for key in ("zero", "slope"))
@@ -183,7 +183,7 @@ def row(
         pairs = json.loads((run / "run.json").read_text())["epoch_samples"]
         where_said = f"{what} ({report['pairs']} pairs)"
         print(
-            f"| {name} | {split} | {pairs:,} | {where_said} | {said[0]} | {interval} | {slopes} | {said[1]} | {zero} | "
+            f"| {name} | {split} | {pairs:,} | {where_said} | {output[0]} | {interval} | {slopes} | {output[1]} | {zero} | "
             f"{mine[0]['ms']:.2g} |",
             flush=True,
         )
@@ -239,17 +239,17 @@ def ours(asked: argparse.Namespace) -> None:
     print(HEAD)
     everything = ["whole", "starboard", *QUADRANTS, *CONES]
     for name in asked.rows.split(",") if asked.rows else OURS:
-        made = OURS[name]
+        result = OURS[name]
         words = {
-            "input.views": made.views,
-            "input.range_levels": made.levels,
-            "network.lags": int(np.clip(made.levels // 128, 2, 6)),
-            "noise": made.noise,
-            "epochs": asked.epochs * made.times,
+            "input.views": result.views,
+            "input.range_levels": result.levels,
+            "network.lags": int(np.clip(result.levels // 128, 2, 6)),
+            "noise": result.noise,
+            "epochs": asked.epochs * result.times,
             "split": {"by": "scene", "train": 0.95, "validation": 0.05},
             **({"batch": 4} if asked.quick else {}),
         }
-        if made.model == "physical":
+        if result.model == "physical":
             learnt, judged = physical(asked), {"unseen scenes": (unseen(asked, "unseenp10", 300, **PHYSICAL), "all")}
         else:
             learnt = many(asked)
@@ -315,13 +315,13 @@ def paths(asked: argparse.Namespace) -> None:
         for number, name in enumerate((("sideways_50", "sideways_54") * 2)[: 1 if asked.quick else None]):
             source = open_views(str(path), network.views, network.kind, sequence=number)
             out = asked.out / "paths" / f"{Path(run).name}-{number}"
-            found = run_odometry(source, run, network, out, overwrite=True)
-            texts = dict((label, value) for label, value, _ in found.rows())
+            result = run_odometry(source, run, network, out, overwrite=True)
+            texts = dict((label, value) for label, value, _ in result.rows())
             rmse = " / ".join(f"{value:.3g}" for label, value in texts.items() if label.startswith("motion error RMSE"))
-            off = np.linalg.norm(found.path.poses[-1][:2] - source.poses[-1, :2])
+            off = np.linalg.norm(result.path.poses[-1][:2] - source.poses[-1, :2])
             length = np.linalg.norm(np.diff(source.poses[:, :2], axis=0), axis=1).sum()
             print(
-                f"| {Path(run).name} | {name}, scene {number // 2} | {len(found.estimates)} | {int(found.valid.sum())} | "
+                f"| {Path(run).name} | {name}, scene {number // 2} | {len(result.estimates)} | {int(result.valid.sum())} | "
                 f"{rmse} | {1e3 * off:.0f} ({100 * off / length:.1f} %) |",
                 flush=True,
             )
@@ -336,10 +336,10 @@ def halves(asked: argparse.Namespace) -> None:
     learnt = asked.out / "hulls.zarr"
     hull = coarse(asked, {**COARSE_HULL, "scenes": [{"count": 2, "sequences": 4}]})
     make_dataset(load_recipe("ship-hull", hull), str(learnt), sequences=8 if asked.quick else 300, workers=asked.workers)
-    other = asked.out / "hulls-unseen.zarr"
+    second = asked.out / "hulls-unseen.zarr"
     gain = DataStore.open(str(learnt)).about["gain"]  # one sonar
     words = {**hull, "seed": 7919, "name": "hulls-unseen", "gain": gain}
-    make_dataset(load_recipe("ship-hull", words), str(other), sequences=2 if asked.quick else 100, workers=asked.workers)
+    make_dataset(load_recipe("ship-hull", words), str(second), sequences=2 if asked.quick else 100, workers=asked.workers)
     noise = "0.04,0.02,0.04"
     given = {
         "input": {"kind": "vector", "halves": True},
@@ -354,7 +354,7 @@ def halves(asked: argparse.Namespace) -> None:
         ("halves-posenetvec", load_training_recipe("portion-circular-vector", {**given, "network.width": asked.width})),
         ("halves-profilenet", load_training_recipe("profilenet-quadrants", {"epochs": 60, **given})),
     ):
-        row(asked, name, recipe, learnt, {"unseen scenes": (other, "all")})
+        row(asked, name, recipe, learnt, {"unseen scenes": (second, "all")})
         if asked.frames is not None:
             network = create_estimator(f"{asked.out / 'runs' / name}:force=1")
             frames = lamprey(asked.frames)

@@ -58,12 +58,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--poses", type=int, default=0, help="for the limit of the motion; 0: none")
     parser.add_argument("--quick", action="store_true", help="of four frames of its own: within a minute")
-    asked = parser.parse_args()
-    if asked.quick:
-        return quick(asked.noise)
-    if asked.data is None:
+    arguments = parser.parse_args()
+    if arguments.quick:
+        return quick(arguments.noise)
+    if arguments.data is None:
         parser.error("a data set is missing: give DATA.zarr, or --quick")
-    both(asked.data, asked.noise, asked.frames, asked.poses)
+    both(arguments.data, arguments.noise, arguments.frames, arguments.poses)
 
 
 def quick(noise: str) -> None:
@@ -109,11 +109,11 @@ def shifts(store: DataStore, noise: NoiseModel, frames: int) -> None:
 def motions(data: str, noise: NoiseModel, poses: int) -> None:
     """Compute the bound of the motion between two frames of an unknown scene, at the first poses of some pairs."""
     pairs = SonarPairs(data, part="all")
-    wanted = pairs.first[np.linspace(0, len(pairs) - 1, poses).astype(int)]
+    expected = pairs.first[np.linspace(0, len(pairs) - 1, poses).astype(int)]
     gain = float(pairs.store.about["gain"])
-    found: dict[str, list[NDArray[np.float64]]] = {"oracle, pixels (rays)": [], "scene known": [], "scene unknown": []}
+    result: dict[str, list[NDArray[np.float64]]] = {"oracle, pixels (rays)": [], "scene known": [], "scene unknown": []}
     for scene in scenes_of(pairs.recipe, pairs.recipe.sequences):
-        frames = wanted[pairs.scene[wanted] == scene.number]
+        frames = expected[pairs.scene[expected] == scene.number]
         if not len(frames):
             continue
         simulator = jittered(SceneRenderer(pairs.recipe, scene).simulator)
@@ -123,10 +123,10 @@ def motions(data: str, noise: NoiseModel, poses: int) -> None:
             height = float(pairs.store.read("height_m", int(frame)))
             signal, level = spectra_of(seen, noise)
             moving = derivative_of(pairs.recipe.instrument, Pose.from_row(pairs.pose[frame]), height)
-            found["oracle, pixels (rays)"].append(oracle.std(2))
-            found["scene known"].append(least(signal / (2 * level), moving))
-            found["scene unknown"].append(least(signal**2 / (level**2 + 2 * signal * level), moving))
-    for name, stds in found.items():
+            result["oracle, pixels (rays)"].append(oracle.std(2))
+            result["scene known"].append(least(signal / (2 * level), moving))
+            result["scene unknown"].append(least(signal**2 / (level**2 + 2 * signal * level), moving))
+    for name, stds in result.items():
         print(f"{name}: " + " / ".join(f"{value:.3g}" for value in in_units(overall(stds))) + " mm, mm, deg")
 
 
@@ -138,9 +138,9 @@ def spectra_of(seen: Derivative, noise: NoiseModel) -> tuple[NDArray[np.float64]
     spectra, levels = np.zeros((len(rows), len(columns), TILE, TILE)), np.zeros((len(rows), len(columns), 1, 1))
     for i, row in enumerate(rows):
         for j, column in enumerate(columns):
-            own = slice(row, row + TILE), slice(column, column + TILE)
-            spectra[i, j] = spectrum(seen.level[own])
-            levels[i, j] = (pixels[own] * WINDOW**2).mean()
+            local = slice(row, row + TILE), slice(column, column + TILE)
+            spectra[i, j] = spectrum(seen.level[local])
+            levels[i, j] = (pixels[local] * WINDOW**2).mean()
     return uniform_filter(spectra, (3, 3, 1, 1), mode="nearest"), levels
 
 

@@ -123,8 +123,8 @@ def benchmark(args: argparse.Namespace, parts: list[str], table: Table) -> None:
     models = args.models.split(",")
     methods = args.methods.split(",")
     listed = jobs(parts, args.frames, args.every, table, args.quick, methods)
-    wanted = [job for job in listed if job.part == "table21" or job.model in models]
-    results = run_all(wanted, args.out)
+    expected = [job for job in listed if job.part == "table21" or job.model in models]
+    results = run_all(expected, args.out)
     pictures = args.pictures or args.out
     if "trajectories" in parts and set(models) == set(RECIPES):
         draw(args.out, pictures, args.frames)
@@ -132,7 +132,7 @@ def benchmark(args: argparse.Namespace, parts: list[str], table: Table) -> None:
         if method != "direct" and "thesis" in models:
             draw_network(args.out, pictures, args.frames, method)
     if "table21" in parts:
-        draw_errors(args.out, pictures, next(job for job in wanted if job.part == "table21" and job.run == "diagonal"))
+        draw_errors(args.out, pictures, next(job for job in expected if job.part == "table21" and job.run == "diagonal"))
     print(machine(args.frames, args.every))
     if "table21" in parts:
         print("\n" + "\n".join(table21([row for row in results if row["part"] == "table21"], args.every, table)))
@@ -214,21 +214,21 @@ def run_table21(job: Job, out: Path) -> Result:
     if job.frames:
         chosen = mine[np.unique(np.linspace(0, len(mine) - 1, job.frames).astype(int))]
     looked = (pairs.sonar_frames(int(index)) for index in chosen)
-    found, each = estimates_of(job.method, looked)
+    result, each = estimates_of(job.method, looked)
     true = np.array([pairs.target(int(index)) for index in chosen])
-    keep(job, out, found, true)
-    return scores(found, true) | {"ms": each}
+    keep(job, out, result, true)
+    return scores(result, true) | {"ms": each}
 
 
 def estimates_of(method: str, pairs: Iterable[SonarFrames]) -> tuple[list[Estimate], float]:
     """Estimate the motions of pairs of frames, and the median milliseconds a pair."""
     estimator = create_estimator(method)
-    found, taken = [], []
+    result, taken = [], []
     for frames in pairs:
         start = time.perf_counter()
-        found.append(estimator.estimate(frames))
+        result.append(estimator.estimate(frames))
         taken.append(time.perf_counter() - start)
-    return found, 1e3 * float(np.median(taken))
+    return result, 1e3 * float(np.median(taken))
 
 
 def scores(found: list[Estimate], true: Array) -> Result:
@@ -328,8 +328,8 @@ def rendered(job: Job) -> SonarFrames:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MitsonarWarning)  # the window of the recipes drops farther echoes, with a warning
         path = driven(job.run, sonar.frame_rate_hz, job.frames)
-        made = simulator.render(path, noise=NOISE_MODELS[job.noise], seed=1)
-    return replace(made, image=to_uint8(made.image))
+        result = simulator.render(path, noise=NOISE_MODELS[job.noise], seed=1)
+    return replace(result, image=to_uint8(result.image))
 
 
 def run_trajectory(job: Job, out: Path) -> Result:
@@ -337,17 +337,17 @@ def run_trajectory(job: Job, out: Path) -> Result:
     frames = rendered(job)
     assert frames.poses is not None
     true = Trajectory(frames.poses, frames.time_s)
-    found, each = estimates_of(job.method, (frames.select(slice(k, k + 2)) for k in range(len(frames) - 1)))
+    result, each = estimates_of(job.method, (frames.select(slice(k, k + 2)) for k in range(len(frames) - 1)))
     moved = motions(frames.poses)
-    keep(job, out, found, moved)
-    row = scores(found, moved) | {"ms": each, "paths": {}}
+    keep(job, out, result, moved)
+    row = scores(result, moved) | {"ms": each, "paths": {}}
     start = Pose.from_row(frames.poses[0])
-    for name, series in smoothed(found, frames.time_s).items():
+    for name, series in smoothed(result, frames.time_s).items():
         path = path_of(series.motions, start, series.time_s)
         path.save_tum(out / f"{job.name}-{name}.tum")
         row["paths"][name] = path_errors(path, true, None if series.covariances is None else pose_covariances(series, start))
     if job.method == "direct":
-        row["paths"] |= mapped_paths(job, frames, found)
+        row["paths"] |= mapped_paths(job, frames, result)
     if job.method == "direct" or not (out / f"{trajectory_job(job.run, job.model, job.frames).name}-frames.npz").exists():
         frames.save(out / f"{trajectory_job(job.run, job.model, job.frames).name}-frames.npz")
     return row

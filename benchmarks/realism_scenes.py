@@ -82,8 +82,8 @@ def ground(size: tuple[float, float], step: float, rms: float, longest: float, s
     vertices = np.stack([x, y, height / height.std() * rms + shape(x, y)], axis=-1).reshape(-1, 3)
     corner = (np.arange(across - 1)[:, None] * ahead + np.arange(ahead - 1)).ravel()
     one = np.stack([corner, corner + ahead, corner + ahead + 1], axis=1)
-    other = np.stack([corner, corner + ahead + 1, corner + 1], axis=1)
-    return trimesh.Trimesh(vertices, np.concatenate([one, other]), process=False)
+    second = np.stack([corner, corner + ahead + 1, corner + 1], axis=1)
+    return trimesh.Trimesh(vertices, np.concatenate([one, second]), process=False)
 
 
 def beside(x: NDArray[np.float64], y: NDArray[np.float64], half: float, wander: float, seed: int) -> NDArray[np.float64]:
@@ -95,10 +95,10 @@ def beside(x: NDArray[np.float64], y: NDArray[np.float64], half: float, wander: 
 
 def hull(points: NDArray[np.float64]) -> trimesh.Trimesh:
     """Make the convex hull of points."""
-    found = ConvexHull(points)
-    one, other = (points[found.simplices[:, k]] - points[found.simplices[:, 0]] for k in (1, 2))
-    outward = (np.cross(one, other) * found.equations[:, :3]).sum(axis=1) > 0
-    faces = np.where(outward[:, None], found.simplices, found.simplices[:, ::-1])
+    result = ConvexHull(points)
+    one, second = (points[result.simplices[:, k]] - points[result.simplices[:, 0]] for k in (1, 2))
+    outward = (np.cross(one, second) * result.equations[:, :3]).sum(axis=1) > 0
+    faces = np.where(outward[:, None], result.simplices, result.simplices[:, ::-1])
     return trimesh.Trimesh(points, faces, process=False)
 
 
@@ -106,13 +106,13 @@ def stones(
     count: int, across: float, ahead: tuple[float, float], size: tuple[float, float], seed: int, shape: Shape
 ) -> trimesh.Trimesh:
     """Make stones that lie on a shape: convex bodies of random points, more small ones than large ones."""
-    rng, made = np.random.default_rng(seed), []
+    rng, result = np.random.default_rng(seed), []
     for _ in range(count):
         edge = size[0] * (size[1] / size[0]) ** (rng.random() ** 2)
         body = hull(rng.normal(size=(24, 3)) * edge / 3 * [1, 1, 0.6])
         x, y = rng.uniform(-across / 2, across / 2), rng.uniform(*ahead)
-        made.append(placed(body, (x, y, float(shape(np.array(x), np.array(y)))), (0, 0, 360 * rng.random())))
-    return merged(made)
+        result.append(placed(body, (x, y, float(shape(np.array(x), np.array(y)))), (0, 0, 360 * rng.random())))
+    return merged(result)
 
 
 Paint = float | dict[str, Any]
@@ -140,9 +140,9 @@ def parted(body: trimesh.Trimesh, outside: Shape, soft: float = 0.0) -> tuple[tr
     mixed = soft * np.random.default_rng(len(middle)).logistic(size=len(middle))
     beyond = outside(middle[:, 0], middle[:, 1]) + mixed > 0
     both = (trimesh.Trimesh(body.vertices, body.faces[part], process=False) for part in (~beyond, beyond))
-    for one in (kept := list(both)):
+    for one in (stored := list(both)):
         one.remove_unreferenced_vertices()
-    return kept[0], kept[1]
+    return stored[0], stored[1]
 
 
 def rough(body: trimesh.Trimesh, rms: float, longest: float, edge: float, seed: int) -> trimesh.Trimesh:
@@ -214,8 +214,8 @@ def sparse_bottom(folder: Path) -> mi.Scene:
     def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         y = y + 0.2 * np.sin(2.1 * x + 1) + 0.1 * np.sin(5.3 * x)
         one = np.exp(-(((y - 15.0 + 0.9 * x) / 0.2) ** 2)) * (x < 1.8)
-        other = np.exp(-(((y - 16.6 - 0.6 * x) / 0.2) ** 2)) * (x > -1.0) * (x < 0.3)
-        return np.asarray(0.08 * (one + other))
+        second = np.exp(-(((y - 16.6 - 0.6 * x) / 0.2) ** 2)) * (x > -1.0) * (x < 0.3)
+        return np.asarray(0.08 * (one + second))
 
     def low(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(0.03 - shape(x, y))

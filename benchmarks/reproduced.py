@@ -55,14 +55,14 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="*", help="folders of `mitsonar reproduce`; of curve: of trainings")
     parser.add_argument("--quick", action="store_true", help="train two steps of a row of each chapter, and check the page")
     parser.add_argument("--every-row", action="store_true", help="with --quick: of each recipe, ten minutes")
-    asked = parser.parse_args()
-    if asked.quick:
-        return quick(asked.every_row)
-    if asked.what == "curve":
-        for run in asked.runs:
+    arguments = parser.parse_args()
+    if arguments.quick:
+        return quick(arguments.every_row)
+    if arguments.what == "curve":
+        for run in arguments.runs:
             print(curve(run))
         return None
-    for run in asked.runs if asked.what == "add" else []:
+    for run in arguments.runs if arguments.what == "add" else []:
         add(run)
     write_whole(PAGE, page(results()).encode())
     print(PAGE)
@@ -83,9 +83,9 @@ def quick(every_row: bool) -> None:
             if not rows or not (every_row or number in QUICK_TABLES):
                 continue
             names = list(rows.values())[: None if every_row else 1]
-            found = reproduce(number, Path(folder) / "tables", Effort(quick=True), rows=names, workers=1)
+            result = reproduce(number, Path(folder) / "tables", Effort(quick=True), rows=names, workers=1)
             left = [
-                row["name"] for row in found["tables"][number]["rows"] if row["name"] in names and row["status"] != "done"
+                row["name"] for row in result["tables"][number]["rows"] if row["name"] in names and row["status"] != "done"
             ]
             if left:
                 raise SystemExit(f"rows of table {number} were not trained: {', '.join(left)}")
@@ -107,8 +107,8 @@ def add(run: Path) -> None:
     effort = json.loads((run / "run.json").read_text(encoding="utf-8"))["asked"]
     RESULTS.mkdir(parents=True, exist_ok=True)
     for path in rows:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        table = {"command": command(path.stem, effort), **Found(**found).model_dump(mode="json")}
+        result = json.loads(path.read_text(encoding="utf-8"))
+        table = {"command": command(path.stem, effort), **Found(**result).model_dump(mode="json")}
         write_whole(RESULTS / path.name, (json.dumps(table, indent=1) + "\n").encode())
 
 
@@ -128,12 +128,12 @@ def command(row: str, effort: dict[str, object]) -> str:
 def results() -> dict[str, Texts]:
     """Load what was reached for each row, as the cells of the page and its command."""
     rows = {row.name: row for table in load_tables().values() for row in table.rows}
-    found: dict[str, Texts] = json.loads((RESULTS / EARLIER).read_text(encoding="utf-8"))
+    result: dict[str, Texts] = json.loads((RESULTS / EARLIER).read_text(encoding="utf-8"))
     for path in sorted(RESULTS.glob("*.json")):
         if path.name != EARLIER:
             fields = json.loads(path.read_text(encoding="utf-8"))
-            found[path.stem] = texts_of(rows[path.stem], fields.pop("command"), Found(**fields))
-    return found
+            result[path.stem] = texts_of(rows[path.stem], fields.pop("command"), Found(**fields))
+    return result
 
 
 def texts_of(row: TableRow, words: str, ours: Found) -> Texts:

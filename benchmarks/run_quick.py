@@ -35,19 +35,20 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=600, help="seconds after which a script has failed")
     parser.add_argument("--together", type=int, default=os.cpu_count() or 1, help="scripts that run at a time")
     parser.add_argument("--quick", action="store_true", help="only list the scripts: this script is one of them")
-    asked = parser.parse_args()
-    wanted = [path for path in scripts(ROOT) if not asked.names or any(name in str(path) for name in asked.names)]
-    if asked.quick:
-        return print("\n".join(str(path.relative_to(ROOT)) for path in wanted))
+    arguments = parser.parse_args()
+    expected = [path for path in scripts(ROOT) if not arguments.names or any(name in str(path) for name in arguments.names)]
+    if arguments.quick:
+        return print("\n".join(str(path.relative_to(ROOT)) for path in expected))
     os.environ |= {"OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
     FORKS.set_forkserver_preload(LIBRARIES)
-    with ThreadPoolExecutor(max(1, asked.together)) as pool:
-        passed = list(pool.map(partial(passes, limit_s=asked.limit), wanted))
-    failed = [path.name for path, well in zip(wanted, passed, strict=True) if not well]
+    with ThreadPoolExecutor(max(1, arguments.together)) as pool:
+        passed = list(pool.map(partial(passes, limit_s=arguments.limit), expected))
+    failed = [path.name for path, well in zip(expected, passed, strict=True) if not well]
     print(
-        f"{len(wanted) - len(failed)} of {len(wanted)} scripts end well" + (f"; not {', '.join(failed)}" if failed else "")
+        f"{len(expected) - len(failed)} of {len(expected)} scripts end well"
+        + (f"; not {', '.join(failed)}" if failed else "")
     )
-    if failed or not wanted:
+    if failed or not expected:
         raise SystemExit(1)
 
 
@@ -75,11 +76,11 @@ def passes(path: Path, limit_s: float) -> bool:
         if late:
             os.killpg(process.pid or 0, signal.SIGKILL)
             process.join()
-        said = output.read() + (f"\nnot done after {limit_s:g} s" if late else "")
+        text = output.read() + (f"\nnot done after {limit_s:g} s" if late else "")
     well = process.exitcode == 0
     lines = [f"{time.perf_counter() - begun:6.1f} s  {'ok    ' if well else 'FAILED'} {path.relative_to(ROOT)}"]
     if not well:
-        lines += [f"    {line}" for line in said.splitlines()[-30:]]
+        lines += [f"    {line}" for line in text.splitlines()[-30:]]
     print("\n".join(lines), flush=True)
     return well
 

@@ -60,13 +60,13 @@ def main() -> None:
     parser.add_argument("--house", type=Path, default=Path(__file__).resolve().parents[1], help="a checkout of mitsonar")
     parser.add_argument("--quick", action="store_true", help="only the first two ways")
     parser.add_argument("--child", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    house = asked.house.resolve()
-    if asked.child:
-        return traced(house, Path(asked.child[0]), asked.child[1:])
+    arguments = parser.parse_args()
+    house = arguments.house.resolve()
+    if arguments.child:
+        return traced(house, Path(arguments.child[0]), arguments.child[1:])
     exceeded: list[str] = []
     print(f"| path | files entered | of these {MUCH} lines or more | lines run |\n|---|---|---|---|")
-    for name, lines in paths(house, 2 if asked.quick else len(PATHS)):
+    for name, lines in paths(house, 2 if arguments.quick else len(PATHS)):
         much = sum(count >= MUCH for count in lines.values())
         print(f"| {name} | {len(lines)} | {much} | {sum(lines.values()):,} |", flush=True)
         exceeded += [name] if exceeds_budget(name, lines) else []
@@ -154,8 +154,8 @@ def counts(house: Path) -> Iterable[tuple[str, str]]:
     yield "basenames twice", repeated(path.name for path in package if path.name != "__init__.py")
     yield "public class names twice", repeated(classes)
     for name, parts in (("mitsonar and plugins", PACKAGE), *((part, (part,)) for part in EVERYTHING[3:])):
-        own = [text for path, text in sources.items() if path.relative_to(house).parts[0] in parts]
-        yield f"lines, {name}", f"{sum(text.count(chr(10)) for text in own):,} in {len(own)} files"
+        local = [text for path, text in sources.items() if path.relative_to(house).parts[0] in parts]
+        yield f"lines, {name}", f"{sum(text.count(chr(10)) for text in local):,} in {len(local)} files"
     yield "files over 400 lines", str(sum(text.count("\n") > 400 for text in package.values()))
     yield "functions over 50 lines", str(len(long))
 
@@ -167,8 +167,8 @@ def files_of(folder: Path) -> list[Path]:
 
 def named_any(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     """How often `Any` stands in a signature."""
-    own = function.args
-    words = [*own.posonlyargs, *own.args, *own.kwonlyargs, *filter(None, (own.vararg, own.kwarg))]
+    local = function.args
+    words = [*local.posonlyargs, *local.args, *local.kwonlyargs, *filter(None, (local.vararg, local.kwarg))]
     hints = [word.annotation for word in words] + [function.returns]
     return sum(isinstance(n, ast.Name) and n.id == "Any" for hint in hints if hint for n in ast.walk(hint))
 
@@ -176,8 +176,8 @@ def named_any(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 def late_imports(tree: ast.Module) -> int:
     """How many lines within functions import mitsonar."""
     inner = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
-    found = {node for function in inner for node in ast.walk(function) if isinstance(node, ast.Import | ast.ImportFrom)}
-    names = [node.module or "" if isinstance(node, ast.ImportFrom) else node.names[0].name for node in found]
+    result = {node for function in inner for node in ast.walk(function) if isinstance(node, ast.Import | ast.ImportFrom)}
+    names = [node.module or "" if isinstance(node, ast.ImportFrom) else node.names[0].name for node in result]
     return sum(name.partition(".")[0] == "mitsonar" for name in names)
 
 

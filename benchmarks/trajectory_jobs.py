@@ -109,8 +109,8 @@ def jobs(
             yield from (trajectory_job(run, SPECKLE, frames, coarse) for run in quiet)
     if "table21" in parts:
         for setting in table.settings:
-            own = setting._replace(every=setting.every * every)
-            yield from (Job("table21", run, texture, *own, frames, coarse) for texture in table.textures for run in RUNS)
+            local = setting._replace(every=setting.every * every)
+            yield from (Job("table21", run, texture, *local, frames, coarse) for texture in table.textures for run in RUNS)
 
 
 def trajectory_job(run: str, model: str, frames: int, coarse: bool = False, method: str = "direct") -> Job:

@@ -66,8 +66,8 @@ def draw_network(out: Path, pictures: Path, frames: int, method: str) -> None:
     name = ""
     for panel, run in zip(axes, ("sideways", "forward", "braking"), strict=True):
         job = trajectory_job(run, "thesis", frames, method=method)
-        made, paths = paths_of(out, job, "raw")
-        show(panel, mosaic_along(made, paths["estimated"], "centre"), paths)  # of 24 beams, as in figure 3.7
+        result, paths = paths_of(out, job, "raw")
+        show(panel, mosaic_along(result, paths["estimated"], "centre"), paths)  # of 24 beams, as in figure 3.7
         end = np.linalg.norm(paths["estimated"].poses[-1, :2] - paths["true"].poses[-1, :2])
         length = np.linalg.norm(np.diff(paths["true"].poses[:, :2], axis=0), axis=1).sum()
         panel.set_title(f"{run}, {length:.1f} m:\nends {end:.2f} m off, {100 * end / length:.1f} %")
@@ -100,12 +100,12 @@ def pattern_figure(out: Path, model: str, frames: int) -> Figure:
     figure = Figure(figsize=(12.5, 12.0), layout="constrained")
     for row, run in enumerate(("diagonal", "legs")):
         maps = {}
-        made, paths = paths_of(out, trajectory_job(run, model, frames), "Kalman")
-        maps["true poses"] = made, {"true": paths["true"]}, paths["true"]
-        maps["direct, Kalman"] = made, paths, paths["estimated"]
-        for column, (name, (made, paths, path)) in enumerate(maps.items()):
+        result, paths = paths_of(out, trajectory_job(run, model, frames), "Kalman")
+        maps["true poses"] = result, {"true": paths["true"]}, paths["true"]
+        maps["direct, Kalman"] = result, paths, paths["estimated"]
+        for column, (name, (result, paths, path)) in enumerate(maps.items()):
             axes = figure.add_subplot(2, 2, 2 * row + column + 1)
-            show(axes, mosaic_along(made, path), paths)
+            show(axes, mosaic_along(result, path), paths)
             axes.set(xlim=(-4.0, 4.5), ylim=(-5.2, 2.8), title=f"{run}: {name}")
     figure.suptitle(f"{model} model, Gaussian seabed, noise of chapter 2")
     return figure
@@ -120,9 +120,9 @@ def rocky_figure(out: Path, frames: int) -> Figure:
     panels = [("sideways", "true", grid[0, 0]), ("sideways", "estimated", grid[1, 0])]
     panels += [("forward", "estimated", grid[:, 1]), ("braking", "estimated", grid[:, 2])]
     for run, name, cell in panels:
-        made, paths = paths_of(out, trajectory_job(run, "thesis", frames), "raw")
+        result, paths = paths_of(out, trajectory_job(run, "thesis", frames), "raw")
         axes = figure.add_subplot(cell)
-        show(axes, mosaic_along(made, paths[name]), paths)
+        show(axes, mosaic_along(result, paths[name]), paths)
         axes.set_title(f"{run}, {name} poses")
     figure.suptitle("rocky field, model `thesis`, no noise; direct, frame by frame")
     return figure

@@ -43,16 +43,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=Path, help="folder of the recordings")
     parser.add_argument("--quick", action="store_true", help="coarse, without a recording, and kept nowhere")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     warnings.simplefilter("ignore", mitsonar.MitsonarWarning)
-    if asked.quick:
+    if arguments.quick:
         with tempfile.TemporaryDirectory() as folder:
             return draw({"simulated": simulated(COARSE)}, Path(folder) / "picture.png")
-    if asked.recordings is None:
+    if arguments.recordings is None:
         return print("no recording: name their folder by --recordings; nothing is drawn")
     pair = {
         "simulated: a sunken ship, 750 kHz": simulated({}),
-        "real: an Oculus, 2.1 MHz, in a tank": recorded(asked.recordings),
+        "real: an Oculus, 2.1 MHz, in a tank": recorded(arguments.recordings),
     }
     draw(pair, DOCS / "simulated_and_real.png")
 
@@ -60,9 +60,9 @@ def main() -> None:
 def simulated(changes: Mapping[str, object]) -> mitsonar.SonarFrames:
     """Render the frame of `make demo`, with changes of its sonar."""
     scene = mitsonar.load_scene("sunken_ship")
-    found = sonar_in(scene)
-    assert found is not None
-    sonar, pose = found
+    result = sonar_in(scene)
+    assert result is not None
+    sonar, pose = result
     return mitsonar.Simulator(scene, sonar.replace(**changes)).render([pose])
 
 

@@ -70,9 +70,9 @@ def draw(out: Path, coarse: Mapping[str, object]) -> None:
     figure, axes = plt.subplots(2, len(SHOWN), figsize=(10.6, 8.6), layout="constrained", width_ratios=[1.5, 1])
     for column, shown in zip(axes.T, SHOWN, strict=True):
         scene = mitsonar.load_scene(shown.scene, **shown.parameters)
-        found = sonar_in(scene)
-        assert found is not None
-        sonar, pose = found
+        result = sonar_in(scene)
+        assert result is not None
+        sonar, pose = result
         changes = {**shown.sonar, **coarse, "coding": "dB", "coding_db": 90.0}
         models: dict[str, Mapping[str, object]] = {
             "physical": {"model": "physical", "pattern": "box", "coding": "linear"},

@@ -82,8 +82,8 @@ def panel(axis: Axes, convention: Convention) -> None:
     pitch, roll, around = np.degrees(convention.angles_from_ours(np.array([POSE[3:]])))[0] + 0.0
     x, y, z = position[0]
     axis.set_title(TITLES[convention.name], fontsize=12)
-    said = f"x {x:.1f}  y {y:.1f}  z {z:.1f} m\nroll {roll:.0f}  pitch {pitch:.0f}  {convention.turn[0]} {around:.0f} deg"
-    axis.text(0.5, -0.02, said, transform=axis.transAxes, ha="center", va="top", fontsize=11, family="monospace")
+    output = f"x {x:.1f}  y {y:.1f}  z {z:.1f} m\nroll {roll:.0f}  pitch {pitch:.0f}  {convention.turn[0]} {around:.0f} deg"
+    axis.text(0.5, -0.02, output, transform=axis.transAxes, ha="center", va="top", fontsize=11, family="monospace")
     axis.set(aspect="equal", xlim=(-0.7, 6.0), ylim=(-1.6, 2.9))
     axis.axis("off")
 

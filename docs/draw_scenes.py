@@ -63,9 +63,9 @@ def draw(folder: Path, coarse: Mapping[str, object]) -> None:
     warnings.simplefilter("ignore", mitsonar.MitsonarWarning)
     for name, shown in SHOWN.items():
         scene = mitsonar.load_scene(name, **shown.parameters)
-        found = sonar_in(scene)
-        assert found is not None
-        sonar, pose = found
+        result = sonar_in(scene)
+        assert result is not None
+        sonar, pose = result
         frames = mitsonar.Simulator(scene, sonar.replace(coding_db=SPAN_DB, **coarse)).render([shown.pose or pose])
         picture = io.BytesIO()
         fan_figure(frames, title=f"{name}, {sonar.name}, {sonar.model}").savefig(picture, dpi=85)

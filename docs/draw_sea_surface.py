@@ -107,7 +107,7 @@ def ball_levels(sea: SeaSurface, sonar: mitsonar.Sonar, seas: int) -> list[NDArr
 
     dark, bright = ({"type": "diffuse", "reflectance": value} for value in (0.0, 0.3))
     ball = {"type": "sphere", "center": [0, 4.4, 9.2], "radius": 0.05, "bsdf": bright}
-    found = []
+    result = []
     for seed in range(seas):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "surface.ply"
@@ -116,8 +116,8 @@ def ball_levels(sea: SeaSurface, sonar: mitsonar.Sonar, seas: int) -> list[NDArr
             scene = mi.load_dict({"type": "scene", "surface": surface, "ball": ball}, optimize=False)
         assert isinstance(scene, mi.Scene)
         (ping,) = mitsonar.Simulator(scene, sonar, mirrors={"surface": (-1.0, 0.0)}).pings(np.array([0, 0, 9.2, 0, 0, 0]))
-        found.append(np.asarray(ping.levels[0], dtype=float).sum(axis=1))
-    return found
+        result.append(np.asarray(ping.levels[0], dtype=float).sum(axis=1))
+    return result
 
 
 def below(sea: SeaSurface, folder: Path) -> mi.Scene:
@@ -191,8 +191,8 @@ def periodogram(sea: SeaSurface, seeds: int, count: int) -> tuple[NDArray[np.flo
     k = np.hypot(axis[:, None], axis)
     edges = np.geomspace(0.4, 10, 28)
     rings = [(k >= low) & (k < high) for low, high in itertools.pairwise(edges)]
-    found = [(k[ring].mean(), (total * k)[ring].mean() * 2 * np.pi) for ring in rings if ring.any()]
-    wave, power = np.array(found).T
+    result = [(k[ring].mean(), (total * k)[ring].mean() * 2 * np.pi) for ring in rings if ring.any()]
+    wave, power = np.array(result).T
     return wave, power
 
 
@@ -210,13 +210,13 @@ def lloyd(
     mirrors = {"surface": (-1.0, sea.state.roughness_m)}
     levels = []
     for depth in depths:
-        heard = ChannelSimulator(scene, instrument(float(depth)), mirrors=mirrors).paths(pose)
-        parts = [heard.by(name) for name in ("direct", "surface")]
+        received = ChannelSimulator(scene, instrument(float(depth)), mirrors=mirrors).paths(pose)
+        parts = [received.by(name) for name in ("direct", "surface")]
         total = sum((part.amplitude * np.exp(-2j * np.pi * CARRIER * part.delay_s)).sum() for part in parts)
         levels.append(20 * math.log10(abs(total)))
     sonar = instrument(10.0)
-    heard = ChannelSimulator(scene, sonar, mirrors=mirrors).paths(pose)
-    parts = [heard.by(name) for name in ("direct", "surface")]
+    received = ChannelSimulator(scene, sonar, mirrors=mirrors).paths(pose)
+    parts = [received.by(name) for name in ("direct", "surface")]
     delay, amplitude = (np.concatenate([getattr(part, key) for part in parts]) for key in ("delay_s", "amplitude"))
     return np.array(levels), impulse_response(delay, amplitude, sonar), sonar
 

@@ -102,9 +102,9 @@ def draw(out: Path, pixels: int, spp: int) -> None:
         with tempfile.TemporaryDirectory() as folder:
             world = create_family(name, **options).build(1)
             scene = mitsonar.load_scene(world.write(Path(folder) / "world"))
-        found = sonar_in(scene)
-        assert found is not None
-        sonar, pose = found
+        result = sonar_in(scene)
+        assert result is not None
+        sonar, pose = result
         frames = mitsonar.Simulator(scene, sonar.replace(coding_db=SPAN_DB)).render([pose])
         x, y = footprint_outline(sonar, pose)
         middle = (float(x.mean()), float(y.mean())) if half_m < 6 else (0.0, 0.0)

@@ -50,7 +50,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Lead links between files of the repository to their pages."""
     place = page.file.src_uri
-    return relinked(markdown, next((source for source, made in PAGES.items() if made == place), f"docs/{place}"), place)
+    return relinked(markdown, next((source for source, result in PAGES.items() if result == place), f"docs/{place}"), place)
 
 
 def on_page_content(content: str, **_: object) -> str:

@@ -98,10 +98,10 @@ def compare() -> None:
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder))
         for name in TRAJECTORIES:
-            made, had = (np.loadtxt(path / f"{name}.tum") for path in (Path(folder), shipped))
-            if made.shape != had.shape or not np.allclose(made, had, atol=1e-6):
+            result, had = (np.loadtxt(path / f"{name}.tum") for path in (Path(folder), shipped))
+            if result.shape != had.shape or not np.allclose(result, had, atol=1e-6):
                 raise SystemExit(f"{name}.tum is not what is made now: run `python trajectories.py .`")
-            print(f"{name}.tum: {len(made)} poses, as shipped")
+            print(f"{name}.tum: {len(result)} poses, as shipped")
 
 
 if __name__ == "__main__":

@@ -163,11 +163,11 @@ def decoded(path: Path) -> dict[str, list[RosObject]]:
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    found = defaultdict(list)
+    result = defaultdict(list)
     with path.open("rb") as file:
         for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
-            found[channel.topic].append(message)
-    return dict(found)
+            result[channel.topic].append(message)
+    return dict(result)
 
 
 # ---------------------------------------------------------------- pings

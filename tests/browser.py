@@ -132,8 +132,8 @@ def _port_of(profile: Path, browser: subprocess.Popen[bytes]) -> int:
     """The browser writes its port into its profile."""
     end = time.monotonic() + 60
     while time.monotonic() < end and browser.poll() is None:
-        told = profile / "DevToolsActivePort"
-        if told.is_file() and (words := told.read_text().split()):
+        message = profile / "DevToolsActivePort"
+        if message.is_file() and (words := message.read_text().split()):
             return int(words[0])
         time.sleep(0.1)
     raise TimeoutError(f"the browser does not answer; it ended with {browser.poll()}")

@@ -372,9 +372,9 @@ def read_checkpoint(folder: Path) -> None:
     from mitsonar.estimation.learned import answer_of
     from mitsonar.networks.checkpoint import Checkpoint
 
-    found = Checkpoint.load(folder / "network.ckpt")
-    network = found.build()
-    found.rows(), found.coder, found.sonars, found.rmse, found.fixed
+    result = Checkpoint.load(folder / "network.ckpt")
+    network = result.build()
+    result.rows(), result.coder, result.sonars, result.rmse, result.fixed
     answer_of(network, torch.zeros(1, 1, 40, 24))
 
 
@@ -390,15 +390,15 @@ def make_meshes(folder: Path) -> None:
 
 
 def _exported(mesh: Any, kind: str) -> bytes:
-    made = mesh.export(file_type=kind)
-    return made.encode() if isinstance(made, str) else bytes(made)
+    result = mesh.export(file_type=kind)
+    return result.encode() if isinstance(result, str) else bytes(result)
 
 
 def serialized(corners: Any, faces: Any, **counts: int) -> bytes:
     """A file of Mitsuba's own format with one mesh, version 4."""
     head = struct.pack("<I", 0x1000) + b"mesh\0"
-    told = struct.pack("<QQ", counts.get("vertices", len(corners)), counts.get("triangles", len(faces)))
-    packed = zlib.compress(head + told + np.asarray(corners, "<f4").tobytes() + np.asarray(faces, "<u4").tobytes())
+    message = struct.pack("<QQ", counts.get("vertices", len(corners)), counts.get("triangles", len(faces)))
+    packed = zlib.compress(head + message + np.asarray(corners, "<f4").tobytes() + np.asarray(faces, "<u4").tobytes())
     return struct.pack("<HH", 0x041C, 4) + packed + struct.pack("<QI", 0, 1)
 
 
@@ -489,9 +489,9 @@ def make_tum(folder: Path) -> None:
 def read_tum(folder: Path) -> None:
     from mitsonar.motion.trajectory import Trajectory
 
-    found = Trajectory.load_tum(folder / "path.tum")
-    assert np.isfinite(found.poses).all()
-    assert (np.diff(found.time_s) > 0).all()
+    result = Trajectory.load_tum(folder / "path.tum")
+    assert np.isfinite(result.poses).all()
+    assert (np.diff(result.time_s) > 0).all()
 
 
 def make_exr(folder: Path) -> None:
@@ -553,19 +553,19 @@ def attack(name: str, folder: Path, count: int, first: int = 0, readers: Mapping
     reader.make(good)
     content = {path.relative_to(good): path.read_bytes() for path in sorted(good.rglob("*")) if path.is_file()}
     assert outcome(lambda: reader.read(_copied(content, bad))) == "read", "the good file is refused"
-    found = {"read": 0, "refused": 0}
+    result = {"read": 0, "refused": 0}
     for seed in range(first, first + count):
         _copied(content, bad)
         reader.spoil(np.random.default_rng([seed, *name.encode()]), bad)
         try:
-            found[outcome(lambda: reader.read(bad))] += 1
+            result[outcome(lambda: reader.read(bad))] += 1
         except BaseException as error:
-            kept = folder / f"mutant_{seed}"
-            shutil.copytree(bad, kept)
+            stored = folder / f"mutant_{seed}"
+            shutil.copytree(bad, stored)
             raise AssertionError(
-                f"{name}, mutant {seed}: {type(error).__name__}: {str(error)[:300]}; kept in {kept}"
+                f"{name}, mutant {seed}: {type(error).__name__}: {str(error)[:300]}; kept in {stored}"
             ) from error
-    return found
+    return result
 
 
 def _copied(content: dict[Path, bytes], folder: Path) -> Path:

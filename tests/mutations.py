@@ -53,26 +53,26 @@ TEXTS += [
 
 def changed_bytes(rng: Rng, content: bytes) -> bytes:
     """Some bytes of a file changed, removed, doubled or cut off."""
-    made = bytearray(content)
+    result = bytearray(content)
     for _ in range(1 if rng.random() < 0.7 else 3):
-        place = int(rng.integers(len(made) + 1))
+        place = int(rng.integers(len(result) + 1))
         length = int(rng.integers(1, 9))
         match int(rng.choice([0, 0, 0, 1, 2, 2, 3, 4, 5])):
             case 0:
-                made[place : place + 1] = bytes([int(rng.integers(256))])
+                result[place : place + 1] = bytes([int(rng.integers(256))])
             case 1:
-                made[place : place + length] = bytes(rng.integers(0, 256, length, dtype=np.uint8))
+                result[place : place + length] = bytes(rng.integers(0, 256, length, dtype=np.uint8))
             case 2:
-                made[place : place + 4] = int(rng.choice([0, 1, 10**8, 2 * 10**9, 2**31 - 1, 2**32 - 1])).to_bytes(
+                result[place : place + 4] = int(rng.choice([0, 1, 10**8, 2 * 10**9, 2**31 - 1, 2**32 - 1])).to_bytes(
                     4, "little"
                 )
             case 3:
-                del made[place : place + length]
+                del result[place : place + length]
             case 4:
-                made[place:place] = made[place : place + length]
+                result[place:place] = result[place : place + length]
             case _:
-                del made[place:]
-    return bytes(made)
+                del result[place:]
+    return bytes(result)
 
 
 def changed_text(rng: Rng, content: bytes) -> bytes:
@@ -110,7 +110,7 @@ def changed_scene(rng: Rng, content: bytes) -> bytes:
         parent = parents[int(rng.integers(len(parents)))]
         one = parent[int(rng.integers(len(parent)))]
         others = list(root.iter())
-        other = others[int(rng.integers(len(others)))]
+        second = others[int(rng.integers(len(others)))]
         match int(rng.choice([0, 0, 1, 1, 1, 1, 2, 3, 4, 5, 6])):
             case 0 if one.tag in PLUGINS:
                 one.set("type", str(rng.choice(PLUGINS[one.tag].split())))
@@ -122,18 +122,18 @@ def changed_scene(rng: Rng, content: bytes) -> bytes:
                 values = NUMBERS if numeric else WORDS
                 one.set(key, values[int(rng.integers(len(values)))])
             case 2:
-                made = copy.deepcopy(one)
-                for inner in made.iter():
+                result = copy.deepcopy(one)
+                for inner in result.iter():
                     inner.attrib.pop("id", None) if inner.tag != "ref" else None
-                parent.append(made)
+                parent.append(result)
             case 3:
                 parent.remove(one)
             case 4:
-                other.append(copy.deepcopy(one))
-            case 5 if one.get("name") and other.get("name"):
-                one.set("name", str(other.get("name")))
-            case _ if one.get("value") and other.get("value"):
-                one.set("value", str(other.get("value")))
+                second.append(copy.deepcopy(one))
+            case 5 if one.get("name") and second.get("name"):
+                one.set("name", str(second.get("name")))
+            case _ if one.get("value") and second.get("value"):
+                one.set("value", str(second.get("value")))
             case _:
                 pass
     return ElementTree.tostring(root)
@@ -141,12 +141,12 @@ def changed_scene(rng: Rng, content: bytes) -> bytes:
 
 def changed_value(rng: Rng, value: Any) -> Any:
     """A value as JSON holds it, with one or two of its parts replaced, removed or added."""
-    made = copy.deepcopy(value)
+    result = copy.deepcopy(value)
     for _ in range(int(rng.integers(1, 3))):
-        path = _some_path(rng, made)
+        path = _some_path(rng, result)
         if not path:
             return _strange(rng)
-        inner = made
+        inner = result
         for key in path[:-1]:
             inner = inner[key]
         choice = rng.random()
@@ -156,7 +156,7 @@ def changed_value(rng: Rng, value: Any) -> Any:
             inner["more"] = _strange(rng)
         else:
             inner[path[-1]] = _strange(rng)
-    return made
+    return result
 
 
 def _strange(rng: Rng) -> Any:
@@ -191,15 +191,15 @@ def changed_json(rng: Rng, content: bytes) -> bytes:
 
 def changed_arrays(rng: Rng, table: dict[str, Any]) -> dict[str, Any]:
     """Arrays with other types, shapes and values; texts of JSON with other values."""
-    made = dict(table)
+    result = dict(table)
     for _ in range(int(rng.integers(1, 3))):
-        if not made:
+        if not result:
             break
-        name = str(rng.choice(sorted(made)))
-        made[name] = _changed_array(rng, np.asarray(made[name]))
+        name = str(rng.choice(sorted(result)))
+        result[name] = _changed_array(rng, np.asarray(result[name]))
         if rng.random() < 0.1:
-            del made[name]
-    return made
+            del result[name]
+    return result
 
 
 def _changed_array(rng: Rng, values: np.ndarray) -> np.ndarray:
@@ -208,7 +208,7 @@ def _changed_array(rng: Rng, values: np.ndarray) -> np.ndarray:
         if content[:1] == b"{":
             return np.array(_changed_table(rng, content).decode("utf-8", "replace"))
         return np.array(str(_strange(rng)))
-    made = np.array(values)
+    result = np.array(values)
     match int(rng.integers(8)):
         case 0:
             return np.array(rng.choice(np.array([0.0, -1.0, np.nan, np.inf, 1e300])))
@@ -217,19 +217,21 @@ def _changed_array(rng: Rng, values: np.ndarray) -> np.ndarray:
         case 2:
             with np.errstate(all="ignore"):
                 kind = str(rng.choice(["f2", "f4", "f8", "i8", "u1", "c8", "?", "U3"]))
-                return made.astype(kind) if made.dtype.kind not in "Uc" else np.zeros(made.shape, kind)
+                return result.astype(kind) if result.dtype.kind not in "Uc" else np.zeros(result.shape, kind)
         case 3:
-            return made[..., None]
+            return result[..., None]
         case 4:
-            return made[1:] if made.ndim else made.reshape(1)
+            return result[1:] if result.ndim else result.reshape(1)
         case 5:
-            return made.reshape(-1) if made.ndim else np.array([])
+            return result.reshape(-1) if result.ndim else np.array([])
         case 6:
-            return made[::-1] if made.ndim else made
+            return result[::-1] if result.ndim else result
         case _:
-            if made.dtype.kind in "fc" and made.size:
-                made.reshape(-1)[int(rng.integers(made.size))] = rng.choice(np.array([np.nan, np.inf, -1e30, 1e300, -1.0]))
-            return made
+            if result.dtype.kind in "fc" and result.size:
+                result.reshape(-1)[int(rng.integers(result.size))] = rng.choice(
+                    np.array([np.nan, np.inf, -1e30, 1e300, -1.0])
+                )
+            return result
 
 
 def _changed_table(rng: Rng, content: bytes) -> bytes:
@@ -268,11 +270,11 @@ def limits() -> Iterator[None]:
         raise AssertionError(f"a reader takes more than {LONGEST_S} s")
 
     with open("/proc/self/statm", encoding="ascii") as file:
-        now = int(file.read().split()[0]) * resource.getpagesize()
+        current = int(file.read().split()[0]) * resource.getpagesize()
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     before = signal.signal(signal.SIGALRM, hangs)
     signal.alarm(LONGEST_S)
-    resource.setrlimit(resource.RLIMIT_AS, (now + MOST_MEMORY, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (current + MOST_MEMORY, hard))
     try:
         yield
     finally:
@@ -287,9 +289,9 @@ def outcome(read: Callable[[], Any]) -> str:
         try:
             read()
         except MitsonarError as error:
-            said = str(error)
-            assert said.strip(), "a refusal says nothing"
-            assert "Traceback" not in said
-            assert len(said) < 2000, f"a refusal is {len(said)} letters long: {said[:200]}"
+            output = str(error)
+            assert output.strip(), "a refusal says nothing"
+            assert "Traceback" not in output
+            assert len(output) < 2000, f"a refusal is {len(output)} letters long: {output[:200]}"
             return "refused"
     return "read"

@@ -54,7 +54,7 @@ def ping(
     """
     turn = np.stack(axes(pose))
     place, speed = np.array(pose[:3]), np.asarray(velocity, dtype=float)
-    found = []
+    result = []
     for number, receiver in enumerate(sonar.receivers):
         of = slice(None) if keep is None or len(keep) <= number else keep[number]
         points, strength, zeta = ground.points[of], ground.strength[of], ground.zeta[of]
@@ -75,8 +75,8 @@ def ping(
             delay = tau + np.linalg.norm(received[on] - delay[:, None] * speed, axis=1) / sonar.sound_speed
         cosines = -sent[on, 2] / there[on] * -received[on, 2] / back[on]
         amplitude = gain[on] * np.sqrt(strength[on] * cosines) / (there[on] * back[on] if sonar.spreads else 1.0)
-        found.append(_response(sonar, amplitude * zeta[on], delay))
-    return np.array(found, dtype=np.complex64)
+        result.append(_response(sonar, amplitude * zeta[on], delay))
+    return np.array(result, dtype=np.complex64)
 
 
 def _response(sonar: ChannelSonar, amplitude: NDArray[np.complex128], delay: Array) -> NDArray[np.complex128]:

@@ -33,12 +33,12 @@ def oculus_ping(
     angles, image = bearings.astype("<i2").tobytes(), rows.tobytes()
     head = np.zeros(1, kind)
     offset = kind.itemsize + len(angles) + 6  # a gap, as the sonar leaves one
-    told = {
+    message = {
         "mode": 2, "gamma": 127, "flags": 0x09 | (0 if gains is None else 4), "gain_percent": 50.0, "number": 7,
         "frequency": 2.1e6, "sound_speed": 1490.0, "resolution": 0.003, "ranges": ranges, "beams": beams,
         "width": width - 1, "image": offset, "image_size": len(image), "size": offset + len(image),
     }  # fmt: skip
-    for name, value in (told | fields).items():
+    for name, value in (message | fields).items():
         head[name] = value
     body = (head.tobytes()[16:] + angles).ljust(offset - 16, b"\0") + image
     return struct.pack("<HHHHHIH", 0x4F53, 1, 0, 0x23, version, len(body), 0) + body
@@ -51,12 +51,12 @@ def other_message(kind: int = 0x15, size: int = 20) -> bytes:
 
 def oculus_log(messages: list[bytes], times: list[float], *, packed: bool, header: int = 48, item: int = 40) -> bytes:
     """A log: its header, and an item with each message; with headers that are longer than needed where that is asked."""
-    made = struct.pack("<II16sHH4xqd", 0x11223344, header, b"Oculus", 1, 0, 0, times[0]).ljust(header, b"\0")
+    result = struct.pack("<II16sHH4xqd", 0x11223344, header, b"Oculus", 1, 0, 0, times[0]).ljust(header, b"\0")
     for message, time_s in zip(messages, times, strict=True):
         body = struct.pack(">I", len(message)) + zlib.compress(message) if packed else message
         head = struct.pack("<IIHH4xdH2xII", 0xAABBCCDD, item, 10, 0, time_s, int(packed), len(message), len(body))
-        made += head.ljust(item, b"\0") + body
-    return made
+        result += head.ljust(item, b"\0") + body
+    return result
 
 
 def some_pings(count: int = 3, version: int = 0, **fields: Any) -> list[bytes]:
@@ -89,20 +89,20 @@ def didson_file(
     frames, samples, beams = images.shape
     mark = b"DDF" + bytes([version])
     first = np.zeros(1, FILE)
-    told = {
+    message = {
         "signature": mark, "frames": frames, "frame_rate_hz": 8, "high_frequency": int(beams == 96), "beams": beams,
         "sample_rate_hz": samples * 1500 / (2 * 10.0), "samples": samples, "length_code": 3 if beams == 96 else 1,
         "serial": 200,
     }  # fmt: skip
-    for name, value in (told | (file or {})).items():
+    for name, value in (message | (file or {})).items():
         first[name] = value
     head = np.zeros(frames, FRAME_HEADER[version])
-    told = {
+    message = {
         "index": np.arange(frames), "signature": mark, "year": 2010, "month": 6, "day": 3, "hour": 23, "minute": 59,
         "second": 58 + np.arange(frames) // 8, "hundredth": np.arange(frames) % 8 * 12, "start_code": 4,
         "length_code": first["length_code"][0],
     }  # fmt: skip
-    for name, value in (told | changed).items():
+    for name, value in (message | changed).items():
         head[name] = value
     size = header or {3: 512, 4: 1024}[version]
     pairs = zip(head, images.astype(np.uint8), strict=True)

@@ -62,7 +62,7 @@ class Block(NamedTuple):
 def blocks_of(path: Path) -> list[Block]:
     """All fenced blocks of a page that could run."""
     text = path.read_text(encoding="utf-8")
-    return [Block(found["kind"], found["text"], found["reason"]) for found in BLOCK.finditer(text)]
+    return [Block(result["kind"], result["text"], result["reason"]) for result in BLOCK.finditer(text)]
 
 
 def pages() -> list[str]:
@@ -139,9 +139,9 @@ def test_page_runs(page: str, tmp_path: Path, mitsonar: Command, shared: Callabl
     """All blocks of a page in their order, in a folder that holds the scenes, as a checkout does."""
     shutil.copytree(ROOT / "scenes", tmp_path / "scenes")
     (tmp_path / "out").mkdir()
-    made = re.findall(r"-o (out/\S+)", "".join(block.text for block in blocks_of(DOCS / page) if block.reason is None))
+    result = re.findall(r"-o (out/\S+)", "".join(block.text for block in blocks_of(DOCS / page) if block.reason is None))
     for name in {name for uses in USES.findall((DOCS / page).read_text()) for name in uses.split(", ")}:
-        if name not in made:
+        if name not in result:
             (tmp_path / name).symlink_to(shared(name))
     for block in blocks_of(DOCS / page):
         if block.reason is not None:
@@ -198,12 +198,12 @@ def test_the_reference_follows_from_the_code(name: str) -> None:
     assert spec.loader is not None
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
-    made = {"command-line.md": script.command_page, "python.md": script.python_page}[name]()
-    assert (DOCS / "reference" / name).read_text(encoding="utf-8") == made
+    result = {"command-line.md": script.command_page, "python.md": script.python_page}[name]()
+    assert (DOCS / "reference" / name).read_text(encoding="utf-8") == result
     if name == "python.md":
         import mitsonar
 
-        assert all(f"::: mitsonar.{public}\n" in made for public in mitsonar.__all__)
+        assert all(f"::: mitsonar.{public}\n" in result for public in mitsonar.__all__)
 
 
 def test_every_page_is_in_the_menu() -> None:

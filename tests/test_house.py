@@ -55,13 +55,13 @@ def folder_of(package: str) -> Path:
 
 def modules() -> dict[str, Path]:
     """All modules by their name within mitsonar; a package is its ``__init__``, and mitsonar itself the empty name."""
-    found = {}
+    result = {}
     for package in SETUPTOOLS["packages"]:
         within = package.removeprefix("mitsonar").removeprefix(".")
         for path in sorted(folder_of(package).glob("*.py")):
             name = within if path.stem == "__init__" else f"{within}.{path.stem}".lstrip(".")
-            found[name] = path
-    return found
+            result[name] = path
+    return result
 
 
 MODULES = modules()
@@ -73,8 +73,8 @@ def imports(tree: ast.AST, types: bool = True) -> Iterator[str]:
     """What a module imports, also within functions, and with ``types`` for type checking: ``mitsonar.errors.EXTRAS``."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING" and not types:
-            for other in node.orelse:
-                yield from imports(other, types)
+            for second in node.orelse:
+                yield from imports(second, types)
         elif isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -87,14 +87,14 @@ def imports(tree: ast.AST, types: bool = True) -> Iterator[str]:
 @cache
 def imported(path: Path, types: bool = True) -> frozenset[str]:
     """Modules of mitsonar that a file imports; a name in a module counts as the module."""
-    found = set()
+    result = set()
     for full in imports(parsed(path), types):
         if full.split(".")[0] == "mitsonar":
             name = full.removeprefix("mitsonar").removeprefix(".")
             while name not in MODULES:
                 name = name.rpartition(".")[0]
-            found.add(name)
-    return frozenset(found)
+            result.add(name)
+    return frozenset(result)
 
 
 def room(name: str) -> str:
@@ -119,22 +119,22 @@ def test_every_module_has_its_room() -> None:
 
 @pytest.mark.parametrize("name", HOUSE)
 def test_modules_import_from_their_own_and_earlier_rooms_only(name: str) -> None:
-    for other in imported(HOUSE[name]) - set(DATA):
-        assert other, f"{name} imports from mitsonar itself: import from the module that holds the name"
+    for second in imported(HOUSE[name]) - set(DATA):
+        assert second, f"{name} imports from mitsonar itself: import from the module that holds the name"
         command = room(name) in ("cli", "__main__")
-        assert other not in PACKAGES or command, f"{name} imports the package {other}: import from its modules"
-        assert ROOMS.index(room(other)) <= ROOMS.index(room(name)), f"{name} imports from {other}, a later room"
+        assert second not in PACKAGES or command, f"{name} imports the package {second}: import from its modules"
+        assert ROOMS.index(room(second)) <= ROOMS.index(room(name)), f"{name} imports from {second}, a later room"
 
 
 def test_objects_of_mitsuba_are_created_where_no_foreign_library_is_loaded() -> None:
     """Mitsuba runs ``plugins/NAME.so`` of the scene's folder and of the current one: see ``plugins/native_plugins.py``."""
     creating = {"load_dict", "load_file", "load_string", "instantiate", "create_object", "plugin_type"}
-    found = set()
+    result = set()
     for name, path in HOUSE.items():
         for node in ast.walk(parsed(path)):
             if isinstance(node, ast.Attribute) and node.attr in creating:
-                found.add((name, node.attr))
-    assert found == {("plugins.native_plugins", "load_dict"), ("simulation.scene", "instantiate")}
+                result.add((name, node.attr))
+    assert result == {("plugins.native_plugins", "load_dict"), ("simulation.scene", "instantiate")}
 
 
 def test_no_circles_within_a_room() -> None:
@@ -147,8 +147,8 @@ def test_no_circles_within_a_room() -> None:
 
 def test_packages_import_nothing_but_the_register_of_plugins() -> None:
     allowed = {"": {"errors", "plugins"}, "networks": {"networks.create"}}
-    found = {name: imported(MODULES[name], types=False) for name in PACKAGES if name != "cli"}
-    assert found == {name: allowed.get(name, set()) for name in found}
+    result = {name: imported(MODULES[name], types=False) for name in PACKAGES if name != "cli"}
+    assert result == {name: allowed.get(name, set()) for name in result}
 
 
 def test_only_plugins_and_the_simulation_speak_mitsuba() -> None:
@@ -302,10 +302,10 @@ def test_a_command_names_the_extra_that_it_lacks(tmp_path: Path) -> None:
         except SystemExit as end:
             assert end.code == 2, end.code
     """
-    said = run_python(script % (tmp_path / "rocks"), block=("trimesh",))
+    output = run_python(script % (tmp_path / "rocks"), block=("trimesh",))
     assert not (tmp_path / "rocks").exists()
-    assert "trimesh" in said
-    assert "pip install 'mitsonar[data,meshes]'" in said
+    assert "trimesh" in output
+    assert "pip install 'mitsonar[data,meshes]'" in output
 
 
 DISTRIBUTIONS = {

@@ -96,8 +96,8 @@ def test_every_public_class_is_printed_by_a_test() -> None:
 
 @pytest.mark.parametrize("name", MADE)
 def test_public_objects_print_a_few_lines_that_name_them(name: str, tiny_data: Path) -> None:
-    made = MADE[name](tiny_data)
-    for shown in (str(made), repr(made)):
+    result = MADE[name](tiny_data)
+    for shown in (str(result), repr(result)):
         assert shown.startswith(name), shown
         assert len(shown) < LONGEST + len(str(tiny_data)), shown
         assert "np.float" not in shown
@@ -177,13 +177,13 @@ def a_folder_so_named(folder: Path, ending: str) -> Path:
 @pytest.mark.parametrize("name", OPENERS)
 def test_a_wrong_path_is_one_sentence(name: str, wrong: Callable[[Path, str], Path], tmp_path: Path) -> None:
     path = wrong(tmp_path, OPENERS[name].ending)
-    with pytest.raises(mitsonar.MitsonarError) as found:
+    with pytest.raises(mitsonar.MitsonarError) as result:
         OPENERS[name].read(path)
-    said = str(found.value)
-    assert path.name in said
-    assert "\n" not in said
-    assert len(said) < 900
-    assert not [word for word in FOREIGN if word in said], said
+    output = str(result.value)
+    assert path.name in output
+    assert "\n" not in output
+    assert len(output) < 900
+    assert not [word for word in FOREIGN if word in output], output
 
 
 def test_every_public_name_that_opens_files_is_tried() -> None:
@@ -193,9 +193,9 @@ def test_every_public_name_that_opens_files_is_tried() -> None:
     """
     public = {name for name in mitsonar.__all__ if name.startswith(("load_", "open_"))} - {"load_tables"}  # shipped ones
     for name in CLASSES:
-        own = vars(getattr(mitsonar, name))
-        public |= {f"{name}.{method}" for method in own if method == "open" or method.split("_")[0] == "load"}
-        assert "load" in own or "save" not in own or name == "SeaSurface", f"{name}.save has no load"
+        local = vars(getattr(mitsonar, name))
+        public |= {f"{name}.{method}" for method in local if method == "open" or method.split("_")[0] == "load"}
+        assert "load" in local or "save" not in local or name == "SeaSurface", f"{name}.save has no load"
     assert public == set(OPENERS)
 
 
@@ -232,10 +232,10 @@ def reached(target: str, holder: Any) -> bool:
     parts = target.split(".")
     for count in range(len(parts), 0, -1):
         try:
-            found = importlib.import_module(".".join(parts[:count]))
+            result = importlib.import_module(".".join(parts[:count]))
         except ImportError:
             continue
-        return _has(found, parts[count:])
+        return _has(result, parts[count:])
     return False
 
 
@@ -279,8 +279,8 @@ OTHERS = {"torch", "gymnasium", "mi", "np", "dr", "DataLoader", "NextStep", "est
 def test_names_in_backticks_of_docstrings_lead_somewhere() -> None:
     lost = []
     for name, holder, text in docstrings():
-        for target in (next(filter(None, found)) for found in NAMED.findall(text)):
-            own = target.removeprefix("mitsonar.")
-            if own.split(".")[0] not in OTHERS and not (_has(holder, own.split(".")) or reached(own, holder)):
+        for target in (next(filter(None, result)) for result in NAMED.findall(text)):
+            local = target.removeprefix("mitsonar.")
+            if local.split(".")[0] not in OTHERS and not (_has(holder, local.split(".")) or reached(local, holder)):
                 lost.append(f"{name}: {target}")
     assert not lost, "\n".join(lost)

@@ -44,23 +44,23 @@ def main() -> None:
         "--no-embree", action="store_true", help="Mitsuba for CUDA only: nothing can be compared with the CPU"
     )
     parser.add_argument("--quick", action="store_true", help="a small wheel of its own, no network")
-    asked = parser.parse_args()
-    if asked.quick:
+    arguments = parser.parse_args()
+    if arguments.quick:
         return quick()
-    if asked.out is None:
+    if arguments.out is None:
         parser.error("a folder is missing: give OUT, or --quick")
-    if asked.out.exists():
-        parser.error(f"{asked.out} is there already: remove it, or choose another OUT")
-    chosen = {"needed": True, "often there": asked.all, "CUDA 12": asked.cufinufft}
-    wanted = [one for section, wheels in listed().items() if chosen[section] for one in wheels]
+    if arguments.out.exists():
+        parser.error(f"{arguments.out} is there already: remove it, or choose another OUT")
+    chosen = {"needed": True, "often there": arguments.all, "CUDA 12": arguments.cufinufft}
+    expected = [one for section, wheels in listed().items() if chosen[section] for one in wheels]
     with tempfile.TemporaryDirectory() as folder:
         fetched = Path(folder)
-        fetch(wanted, fetched)
+        fetch(expected, fetched)
         build(fetched)
         for wheel in fetched.glob("mitsuba-*.whl"):
-            slim(wheel, (*UNUSED, "libembree") if asked.no_embree else UNUSED)
-        loads(fetched, asked.out, int(asked.load_mib * MIB), int(asked.part_mib * MIB))
-    print(told(asked.out))
+            slim(wheel, (*UNUSED, "libembree") if arguments.no_embree else UNUSED)
+        loads(fetched, arguments.out, int(arguments.load_mib * MIB), int(arguments.part_mib * MIB))
+    print(told(arguments.out))
 
 
 def quick() -> None:
@@ -88,14 +88,14 @@ def quick() -> None:
 
 def listed(path: Path = HERE / "wheels.txt") -> dict[str, list[str]]:
     """Read the requirements `name==version` of each section of the list."""
-    found: dict[str, list[str]] = {}
+    result: dict[str, list[str]] = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         words = line.partition("#")[0].strip()
         if words.startswith("["):
-            own = found.setdefault(words.strip("[]"), [])
+            local = result.setdefault(words.strip("[]"), [])
         elif words:
-            own.append(words)
-    return found
+            local.append(words)
+    return result
 
 
 def fetch(wanted: list[str], out: Path) -> None:
@@ -120,13 +120,13 @@ def slim(wheel: Path, unused: Iterable[str]) -> None:
     def kept(name: str) -> bool:
         return not name.endswith((".so", ".coeff")) or not any(word in Path(name).name for word in unused)
 
-    made = wheel.with_suffix(".slim")
-    with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as new:
+    result = wheel.with_suffix(".slim")
+    with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(result, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as new:
         for item in old.infolist():
             if kept(item.filename):
                 data = old.read(item)
                 new.writestr(item.filename, without_rows(data, kept) if item.filename.endswith("/RECORD") else data)
-    made.replace(wheel)
+    result.replace(wheel)
 
 
 def without_rows(record: bytes, kept: Callable[[str], bool]) -> bytes:
@@ -170,11 +170,11 @@ def put_together(folders: Iterable[Path], out: Path) -> list[Path]:
     Raises:
         SystemExit: a part is missing, or a file is not what it was.
     """
-    found = sorted((path for folder in folders for path in folder.iterdir()), key=lambda path: path.name)
+    result = sorted((path for folder in folders for path in folder.iterdir()), key=lambda path: path.name)
     parts: dict[str, list[Path]] = {}
-    for path in found:
+    for path in result:
         parts.setdefault(path.name.partition("-part-")[0], []).append(path)
-    made = []
+    built = []
     for name, mine in parts.items():
         data = b"".join(path.read_bytes() for path in mine)
         if "-part-" in mine[0].name:
@@ -186,8 +186,8 @@ def put_together(folders: Iterable[Path], out: Path) -> list[Path]:
                 raise SystemExit(f"{name} is damaged: carry its parts again")
         out.mkdir(parents=True, exist_ok=True)
         (out / name).write_bytes(data)
-        made.append(out / name)
-    return made
+        built.append(out / name)
+    return built
 
 
 def told(out: Path) -> str:

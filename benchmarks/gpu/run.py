@@ -109,17 +109,24 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="steps that failed, too")
     parser.add_argument("--site", type=Path, default=Path("out/site"), help="of install: where to")
     parser.add_argument("--quick", action="store_true", help="--all --scale 0.001 --device cpu, kept nowhere")
-    asked = parser.parse_args()
-    if asked.step == "install":
-        return install(asked.loads, asked.site)
-    if not 0 < asked.scale <= 1:
-        parser.error(f"--scale must be above 0 and at most 1: got {asked.scale:g}")
-    if asked.quick:
+    arguments = parser.parse_args()
+    if arguments.step == "install":
+        return install(arguments.loads, arguments.site)
+    if not 0 < arguments.scale <= 1:
+        parser.error(f"--scale must be above 0 and at most 1: got {arguments.scale:g}")
+    if arguments.quick:
         return quick()
-    if not asked.all and asked.step is None:
+    if not arguments.all and arguments.step is None:
         parser.error(f"say which step, or --all: {', '.join(STEPS)}")
-    names = list(STEPS) if asked.all else [asked.step]
-    states = go(names, asked.out, asked.scale, asked.device, asked.minutes, again=asked.again or not asked.all)
+    names = list(STEPS) if arguments.all else [arguments.step]
+    states = go(
+        names,
+        arguments.out,
+        arguments.scale,
+        arguments.device,
+        arguments.minutes,
+        again=arguments.again or not arguments.all,
+    )
     raise SystemExit(1 if "failed" in states.values() else 0)
 
 
@@ -173,10 +180,10 @@ def tried(name: str, asked: Asked) -> Plain:
     if asked.small and name not in IN_SMALL:
         return {"state": "left out", "found": {"why": f"below a scale of {SMALL:g} one row of each table is tried"}}
     try:
-        found = STEPS[name](asked)
+        result = STEPS[name](asked)
     except Exception as error:  # no step may stop the others
         return {"state": "failed", "found": {type(error).__name__: str(error)}}
-    return {"state": "done" if found.done else "open", "found": found.said}
+    return {"state": "done" if result.done else "open", "found": result.said}
 
 
 def opened(out: Path, about: Plain) -> Plain:
@@ -263,10 +270,10 @@ def mitsonar(*words: object) -> list[str]:
 
 def look(asked: Asked) -> Found:
     """Describe the machine, and list the missing wheels."""
-    wanted = [one.partition("==")[0] for wheels in pack.listed().values() for one in wheels]
-    said: Plain = {"python": platform.python_version(), "cores": os.cpu_count()}
-    said["missing"] = ", ".join(name for name in wanted if version_of(name) is None) or "nothing"
-    said |= {name: version_of(name) for name in ("mitsonar", "mitsuba", "drjit", "torch", "lightning", "cufinufft")}
+    expected = [one.partition("==")[0] for wheels in pack.listed().values() for one in wheels]
+    output: Plain = {"python": platform.python_version(), "cores": os.cpu_count()}
+    output["missing"] = ", ".join(name for name in expected if version_of(name) is None) or "nothing"
+    output |= {name: version_of(name) for name in ("mitsonar", "mitsuba", "drjit", "torch", "lightning", "cufinufft")}
     for name, words in {
         "gpu": ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"],
         "torch on CUDA": [sys.executable, "-c", "import torch; print(torch.version.cuda, torch.cuda.is_available())"],
@@ -277,8 +284,8 @@ def look(asked: Asked) -> Found:
         "cufinufft loads": [sys.executable, "-c", "import torch, cufinufft; print(cufinufft.__version__)"],
         "doctor": [sys.executable, *mitsonar("doctor")],
     }.items():
-        said[name] = answer(words, asked)
-    return Found(said)
+        output[name] = answer(words, asked)
+    return Found(output)
 
 
 def version_of(name: str) -> str | None:
@@ -311,7 +318,7 @@ RENDERS = {
 
 def same(asked: Asked) -> Found:
     """Render scenes twice on the device, with equal bits, and once on the CPU, equal within `ALIKE`."""
-    said, wrong = {}, []
+    output, wrong = {}, []
     for name in ("thesis", "scatterers") if asked.small else RENDERS:
         first, second, cpu = (made(asked, name, run) for run in ("first", "second", "cpu"))
         for key in sorted(first):
@@ -319,12 +326,12 @@ def same(asked: Asked) -> Found:
                 wrong.append(f"{name}.{key} twice on {asked.device}: {differ(first[key], second[key]):.2g} rms")
             error = differ(first[key], cpu[key])
             equal = float(np.mean(first[key] == cpu[key])) if first[key].shape == cpu[key].shape else 0.0
-            said[f"{name}.{key}"] = f"{error:.2g} rms from the CPU, {equal:.2%} of the values equal"
+            output[f"{name}.{key}"] = f"{error:.2g} rms from the CPU, {equal:.2%} of the values equal"
             if not error <= ALIKE:
                 wrong.append(f"{name}.{key}: {error:.2g} rms from the CPU, more than {ALIKE:g}")
     if wrong:
-        raise Failed(f"{'; '.join(wrong)}; found: {said}")
-    return Found(said)
+        raise Failed(f"{'; '.join(wrong)}; found: {output}")
+    return Found(output)
 
 
 def made(asked: Asked, name: str, run: str) -> dict[str, np.ndarray]:
@@ -334,10 +341,10 @@ def made(asked: Asked, name: str, run: str) -> dict[str, np.ndarray]:
     command(asked, "same", mitsonar(*RENDERS[name], "--overwrite", "-o", out), MITSONAR_VARIANT=variant)
     kinds = {"image", "response", "elevation", "elevation_rad", "shadow"}
     with np.load(next(out.glob("*.npz"))) as table:
-        found = {key: table[key] for key in table.files if key in kinds}
-    if not found:
+        result = {key: table[key] for key in table.files if key in kinds}
+    if not result:
         raise Failed(f"{out} holds neither images nor responses")
-    return found
+    return result
 
 
 def differ(one: np.ndarray, other: np.ndarray) -> float:
@@ -430,7 +437,7 @@ def weights(asked: Asked) -> Found:
     """Save the networks of finished rows in OUT/weights, in bf16 and files below 16 MiB. `together` reads them."""
     import torch
 
-    said: Plain = {}
+    output: Plain = {}
     for path in sorted(asked.out.glob("table-*/runs/*/network.ckpt")):
         folder = asked.out / "weights" / path.parent.name
         folder.mkdir(parents=True, exist_ok=True)
@@ -444,11 +451,11 @@ def weights(asked: Asked) -> Found:
         back = together(folder)
         if {key for key in back} != {key for key in torch.load(path, map_location="cpu", weights_only=True)}:
             raise Failed(f"{folder} does not hold what {path} holds")
-        said[path.parent.name] = (
+        output[path.parent.name] = (
             f"{len(list(folder.iterdir()))} files, {sum(p.stat().st_size for p in folder.iterdir()):,} bytes"
         )
     finished = all((asked.out / "table-3.2" / "rows" / f"{name}.json").exists() for name in TABLE_32[:1])
-    return Found(said or {"networks": "none yet"}, done=finished and bool(said))
+    return Found(output or {"networks": "none yet"}, done=finished and bool(output))
 
 
 def halved(value: Saved) -> Saved:

@@ -69,10 +69,10 @@ def convert_box() -> None:
     """
     box = trimesh.creation.box((1, 2, 3))
     with tempfile.TemporaryDirectory() as folder:
-        source, made = Path(folder, "box.dae"), Path(folder, "box.ply")
+        source, result = Path(folder, "box.dae"), Path(folder, "box.ply")
         source.write_bytes(trimesh.exchange.dae.export_collada(box))  # type: ignore[no-untyped-call]  # trimesh has no types here
-        save(made, *load(source))
-        back = trimesh.load_mesh(made)
+        save(result, *load(source))
+        back = trimesh.load_mesh(result)
     if back.faces.shape != (12, 3) or not np.allclose(back.bounds, box.bounds) or not np.isclose(back.volume, 6):
         raise SystemExit(f"a box of 12 faces and 6 m3 came back as {len(back.faces)} faces and {back.volume:g} m3")
     print("box.ply: 12 faces, 6 m3, as it went in")

@@ -45,9 +45,9 @@ def main() -> None:
         parser.error("a folder is missing: give OUT, or --quick")
     vertices, faces = rocks(np.random.default_rng(5))
     with tempfile.TemporaryDirectory() as folder:
-        made = (arguments.out or Path(folder)) / "rocks.ply"
-        save(made, vertices, faces)
-        if arguments.quick and made.read_bytes() != (Path(__file__).resolve().parent / "rocks.ply").read_bytes():
+        result = (arguments.out or Path(folder)) / "rocks.ply"
+        save(result, vertices, faces)
+        if arguments.quick and result.read_bytes() != (Path(__file__).resolve().parent / "rocks.ply").read_bytes():
             raise SystemExit("rocks.ply is not what is made now: run `python rocks.py .`")
     print(f"rocks.ply: {len(faces)} faces, {vertices.min(axis=0)} to {vertices.max(axis=0)}")
 

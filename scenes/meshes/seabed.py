@@ -54,9 +54,9 @@ def main() -> None:
         parser.error("a folder is missing: give OUT, or --quick")
     vertices, faces = seabed(np.random.default_rng(6))
     with tempfile.TemporaryDirectory() as folder:
-        made = (arguments.out or Path(folder)) / "seabed.ply"
-        save(made, vertices, faces)
-        if arguments.quick and made.read_bytes() != (Path(__file__).resolve().parent / "seabed.ply").read_bytes():
+        result = (arguments.out or Path(folder)) / "seabed.ply"
+        save(result, vertices, faces)
+        if arguments.quick and result.read_bytes() != (Path(__file__).resolve().parent / "seabed.ply").read_bytes():
             raise SystemExit("seabed.ply is not what is made now: run `python seabed.py .`")
     print(f"seabed.ply: {len(faces)} faces, {vertices.min(axis=0)} to {vertices.max(axis=0)}")
 

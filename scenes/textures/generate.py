@@ -50,12 +50,12 @@ def periodic(delta: Field) -> Field:
 
 def scatter(rng: np.random.Generator, radii: Field, gap: float) -> tuple[Field, Field]:
     """Throw discs, largest first, keeping those that clear the others; return the centres and radii kept."""
-    centres, kept = np.empty((0, 2)), np.empty(0)
+    centres, stored = np.empty((0, 2)), np.empty(0)
     for radius in np.sort(radii)[::-1]:
         point = rng.uniform(0, SIZE, 2)
-        if np.all(np.hypot(*periodic(centres - point).T) > gap * (kept + radius)):
-            centres, kept = np.vstack([centres, point]), np.append(kept, radius)
-    return centres, kept
+        if np.all(np.hypot(*periodic(centres - point).T) > gap * (stored + radius)):
+            centres, stored = np.vstack([centres, point]), np.append(stored, radius)
+    return centres, stored
 
 
 def cells(
@@ -153,13 +153,13 @@ def compare(name: str) -> None:
     """
     with tempfile.TemporaryDirectory() as folder:
         save(Path(folder, f"{name}.png"), TEXTURES[name]())
-        made, had = (
+        result, had = (
             np.asarray(Image.open(path / f"{name}.png"), dtype=int)
             for path in (Path(folder), Path(__file__).resolve().parent)
         )
-    if made.shape != had.shape or np.abs(made - had).max() > 1:
+    if result.shape != had.shape or np.abs(result - had).max() > 1:
         raise SystemExit(f"{name}.png is not what is made now: run `python generate.py .`")
-    print(f"{name}.png: {made.shape[0]} x {made.shape[1]} pixels, as shipped")
+    print(f"{name}.png: {result.shape[0]} x {result.shape[1]} pixels, as shipped")
 
 
 if __name__ == "__main__":

@@ -36,8 +36,8 @@ def test_physical_is_spread_by_the_square_of_the_range(exponent: int) -> None:
     """C cos(theta) dOmega / R^2 times R^g."""
     sonar = Sonar(gain_exponent=exponent)
     got = echoes(sonar)
-    wanted = got.reflectivity * got.cosine * got.solid_angle_sr * got.range_m ** (exponent - 2.0)
-    np.testing.assert_allclose(level(got, sonar, np.where), wanted, rtol=1e-14)
+    expected = got.reflectivity * got.cosine * got.solid_angle_sr * got.range_m ** (exponent - 2.0)
+    np.testing.assert_allclose(level(got, sonar, np.where), expected, rtol=1e-14)
 
 
 @pytest.mark.parametrize("window", [(0.0, 2.0), (0.3, 0.9), (3.2, 5.6), (2.0, 100.0)])
@@ -47,11 +47,11 @@ def test_no_echo_exceeds_the_bound(exponent: int, window: tuple[float, float]) -
     within the window it is not far from what can be."""
     sonar = Sonar(gain_exponent=exponent, range_min=window[0], range_max=window[1])
     bound = largest_level(sonar, 1e-5)
-    found = echoes(sonar)
-    assert bound / 17 <= level(found, sonar, np.where).max() <= bound * (1 + 1e-12)
+    result = echoes(sonar)
+    assert bound / 17 <= level(result, sonar, np.where).max() <= bound * (1 + 1e-12)
     for factor in (0.0, 1e-3, 2.0, 4.0, 1e3):
-        found.range_m[:] = factor * window[1]
-        assert level(found, sonar, np.where).max() <= bound * (1 + 1e-12)
+        result.range_m[:] = factor * window[1]
+        assert level(result, sonar, np.where).max() <= bound * (1 + 1e-12)
 
 
 def test_far_beyond_the_window_the_law_is_held() -> None:

@@ -80,10 +80,10 @@ def test_a_lambert_sphere() -> None:
 
 def test_between_whole_degrees_the_table_is_a_line() -> None:
     degrees = np.linspace(0, 90, 1803).reshape(3, -1)
-    found = sigma_at(Material(mu=0.3), np.sin(np.radians(degrees)), 1e6)
-    assert found.shape == degrees.shape
-    np.testing.assert_allclose(found, 0.3 * np.sin(np.radians(degrees)) ** 2, atol=0.3e-4)
-    np.testing.assert_allclose(found, np.interp(degrees, GRAZING_DEG, 0.3 * SINE**2), atol=1e-9)
+    result = sigma_at(Material(mu=0.3), np.sin(np.radians(degrees)), 1e6)
+    assert result.shape == degrees.shape
+    np.testing.assert_allclose(result, 0.3 * np.sin(np.radians(degrees)) ** 2, atol=0.3e-4)
+    np.testing.assert_allclose(result, np.interp(degrees, GRAZING_DEG, 0.3 * SINE**2), atol=1e-9)
     assert sigma_at(Material(mu=0.3), 1.0, 1e6) == pytest.approx(0.3)
     np.testing.assert_array_equal(sigma_at(Material(mu=0.3), np.array([-0.5, 0.0, 1.5]), 1e6), [0, 0, 0.3])
     assert sigma_at(Material(mu=0.3), np.zeros(0), 1e6).shape == (0,)
@@ -166,8 +166,8 @@ def test_straight_down_it_is_kirchhoff_in_closed_form() -> None:
     slope = 2 ** (1 - 2 * alpha) * structure_constant(SAND) * k ** (2 - 2 * alpha)
     facing = np.array([math.pi / 2])
     spread = math.gamma(1 / alpha) / (2 * alpha) * slope ** (-1 / alpha)
-    wanted = abs(reflection(SAND, facing)[0]) ** 2 / (8 * math.pi) * spread
-    assert roughness_sigma(SAND, facing, k)[0] == pytest.approx(wanted, rel=1e-6)
+    expected = abs(reflection(SAND, facing)[0]) ** 2 / (8 * math.pi) * spread
+    assert roughness_sigma(SAND, facing, k)[0] == pytest.approx(expected, rel=1e-6)
 
 
 def test_reflection_straight_down() -> None:
@@ -193,8 +193,8 @@ def test_strengths_of_sea_floors() -> None:
     """In dB at 30 kHz, 20 and 45 deg: -40..-10, and harder ones stronger."""
     floors = ("mud", "sand", "gravel", "rock")
     strengths = {name: 10 * np.log10(sigma_table(material(name), 30e3)[[20, 45]]) for name in floors}
-    for found in strengths.values():
-        assert ((found > -40) & (found < -10)).all(), strengths
+    for result in strengths.values():
+        assert ((result > -40) & (result < -10)).all(), strengths
     assert strengths["mud"][1] < strengths["sand"][1] < strengths["gravel"][1] < strengths["rock"][1]
 
 
@@ -246,8 +246,8 @@ def test_sediments_are_those_of_their_grain_size(phi: float, name: str) -> None:
 
 
 def test_tables_of_rough_fluids_are_those_of_their_module() -> None:
-    wanted = rough_fluid_sigma(SAND, np.radians(GRAZING_DEG), 2 * math.pi * 50e3 / 1480)
-    np.testing.assert_array_equal(sigma_table(material("sand"), 50e3, 1480.0), wanted)
+    expected = rough_fluid_sigma(SAND, np.radians(GRAZING_DEG), 2 * math.pi * 50e3 / 1480)
+    np.testing.assert_array_equal(sigma_table(material("sand"), 50e3, 1480.0), expected)
 
 
 # ---------------------------------------------------------------- libraries
@@ -261,10 +261,10 @@ def test_torch_gives_the_numbers_of_numpy(name: str) -> None:
 
     cosine = np.linspace(-0.1, 1.1, 1001).reshape(7, -1)
     for function in (sigma_at, mirror_amplitude):
-        wanted = function(material(name), cosine, 80e3)
-        found = function(material(name), torch.asarray(cosine), 80e3)
-        assert found.dtype == torch.float64
-        np.testing.assert_allclose(found.numpy(), wanted, rtol=1e-11, atol=1e-16)
+        expected = function(material(name), cosine, 80e3)
+        result = function(material(name), torch.asarray(cosine), 80e3)
+        assert result.dtype == torch.float64
+        np.testing.assert_allclose(result.numpy(), expected, rtol=1e-11, atol=1e-16)
 
 
 # ---------------------------------------------------------------- files
@@ -273,8 +273,8 @@ def test_torch_gives_the_numbers_of_numpy(name: str) -> None:
 def test_a_file_changes_a_named_material(tmp_path: Path) -> None:
     path = tmp_path / "soft.yaml"
     path.write_text("material: mud\nloss: 0.01\n")
-    found = material(path)
-    assert (found.name, found.loss, found.volume) == ("soft", 0.01, material("mud").volume)
+    result = material(path)
+    assert (result.name, result.loss, result.volume) == ("soft", 0.01, material("mud").volume)
     path.write_text("material: mud\nlaw: lambert\nmu: 0.002\nname: other\n")
     assert material(str(path)).model_dump(exclude_none=True).keys() >= {"mu", "frequency_max_hz"}
     assert (material(path).name, material(path).density_ratio) == ("other", None)
@@ -428,18 +428,18 @@ JACKSON = {  # density, speed, loss, spectral strength in the project hyo2_openb
 
 @pytest.mark.parametrize("phi", JACKSON)
 def test_the_regressions_meet_numbers_of_another_source(phi: float) -> None:
-    made, wanted = sediment_of(phi), JACKSON[phi]
-    assert (made.density_ratio, made.sound_speed_ratio) == pytest.approx(wanted[:2], abs=6e-4)
-    assert made.loss == pytest.approx(wanted[2], rel=2e-3)
-    assert made.spectral_strength == pytest.approx(wanted[3], rel=5e-3)
+    result, expected = sediment_of(phi), JACKSON[phi]
+    assert (result.density_ratio, result.sound_speed_ratio) == pytest.approx(expected[:2], abs=6e-4)
+    assert result.loss == pytest.approx(expected[2], rel=2e-3)
+    assert result.spectral_strength == pytest.approx(expected[3], rel=5e-3)
 
 
 @pytest.mark.parametrize("name", ["sand", "mud"])
 def test_named_materials_lie_on_them(name: str) -> None:
     phi = {"sand": 1.5, "mud": 6.0}[name]
-    own, made = material(name), sediment_of(phi)
-    for key, value in made._asdict().items():
-        assert getattr(own, key) == pytest.approx(value, rel=5e-3), key
+    local, result = material(name), sediment_of(phi)
+    for key, value in result._asdict().items():
+        assert getattr(local, key) == pytest.approx(value, rel=5e-3), key
 
 
 def test_joints_of_the_regressions_are_small() -> None:
@@ -452,20 +452,20 @@ def test_joints_of_the_regressions_are_small() -> None:
 
 def test_coarser_grains_reflect_more() -> None:
     facing = np.array([math.pi / 2])
-    found = [abs(reflection(sediment_of(phi), facing)[0]) for phi in SEDIMENTS.values()]
-    assert np.all(np.diff(found) < 1e-3)
-    assert 0.3 < found[2] < 0.55
-    assert found[-1] < 0.1
+    result = [abs(reflection(sediment_of(phi), facing)[0]) for phi in SEDIMENTS.values()]
+    assert np.all(np.diff(result) < 1e-3)
+    assert 0.3 < result[2] < 0.55
+    assert result[-1] < 0.1
 
 
 def test_a_file_names_the_grain_size(tmp_path: Path) -> None:
     path = tmp_path / "fine.yaml"
     path.write_text("grain_size_phi: 2.5\n")
-    made = material(path)
-    assert (made.law, made.name) == ("rough-fluid", "fine")
-    assert (made.loss, made.spectral_exponent) == (sediment_of(2.5).loss, 3.25)
-    assert made.band_hz == (10e3, 100e3)
-    assert np.isfinite(sigma_table(made, 50e3)).all()
+    result = material(path)
+    assert (result.law, result.name) == ("rough-fluid", "fine")
+    assert (result.loss, result.spectral_exponent) == (sediment_of(2.5).loss, 3.25)
+    assert result.band_hz == (10e3, 100e3)
+    assert np.isfinite(sigma_table(result, 50e3)).all()
     path.write_text("grain_size_phi: 2.5\nloss: 0.02\n")
     assert material(path).loss == 0.02
     assert material(path).density_ratio == sediment_of(2.5).density_ratio

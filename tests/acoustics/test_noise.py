@@ -152,11 +152,11 @@ def test_torch_draws_the_same(name: str) -> None:
     rng = np.random.default_rng(7)
     image = rng.random((4, 64, 48), dtype=np.float32) * (rng.random((4, 64, 48)) > 0.3)
     image = image.astype(np.float32)
-    wanted = NOISE_MODELS[name].apply(image, seed=2**45 + 3, frames=np.array([0, 7, 8, 2**20]))
+    expected = NOISE_MODELS[name].apply(image, seed=2**45 + 3, frames=np.array([0, 7, 8, 2**20]))
     got = NOISE_MODELS[name].apply(torch.from_numpy(image), seed=2**45 + 3, frames=torch.tensor([0, 7, 8, 2**20]))
     assert isinstance(got, torch.Tensor)
     assert got.dtype == torch.float32
-    np.testing.assert_array_equal(got.numpy(), wanted)
+    np.testing.assert_array_equal(got.numpy(), expected)
 
 
 # ---------------------------------------------------------------- sums over the beams
@@ -186,10 +186,10 @@ def test_torch_draws_the_same_sums() -> None:
 
     rng = np.random.default_rng(7)
     vector, nonzero, order = rng.random((4, 64), dtype=np.float32) * 20, rng.integers(0, 97, (4, 64)), np.arange(4)
-    wanted = HIGH.apply_sum(vector, nonzero, 96, seed=5, frames=order)
+    expected = HIGH.apply_sum(vector, nonzero, 96, seed=5, frames=order)
     got = HIGH.apply_sum(torch.from_numpy(vector), torch.from_numpy(nonzero), 96, seed=5, frames=torch.from_numpy(order))
-    np.testing.assert_array_equal(got.numpy(), wanted)
-    assert wanted.dtype == np.float32
+    np.testing.assert_array_equal(got.numpy(), expected)
+    assert expected.dtype == np.float32
     np.testing.assert_array_equal(NOISE_MODELS["none"].apply_sum(vector, nonzero, 96, seed=5, frames=order), vector)
 
 

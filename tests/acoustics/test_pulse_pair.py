@@ -29,8 +29,8 @@ def test_the_preset_of_the_a50_has_the_noise_of_pulse_pairs() -> None:
 def test_the_phase_of_correlated_pairs_varies_as_the_bound_says() -> None:
     """2,000 estimates from 200 pairs each of complex normal samples."""
     generator = np.random.default_rng(5)
-    first, other = (generator.normal(size=(2000, 200, 2)) @ [1, 1j] for _ in range(2))
-    second = 0.93 * first + math.sqrt(1 - 0.93**2) * other
+    first, another = (generator.normal(size=(2000, 200, 2)) @ [1, 1j] for _ in range(2))
+    second = 0.93 * first + math.sqrt(1 - 0.93**2) * another
     phase = np.angle((second * first.conj()).sum(axis=1))
     rate = 1500 * phase / (4 * math.pi * 1e6 * 0.25e-3)
     assert rate.std() == pytest.approx(pulse_pair_std(1e6, 0.25e-3, 200, 0.93), rel=0.06)

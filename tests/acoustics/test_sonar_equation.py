@@ -87,8 +87,8 @@ def test_a_lambert_floor_below() -> None:
 
 def test_volume_reverberation_falls_with_the_square_of_the_range() -> None:
     """SL + Sv + 10 log(Omega c tau / 2) - 20 log R - 2 alpha R."""
-    found = volume_reverberation_db(200.0, RANGE, 0.2, -70.0, solid_angle_sr=1e-3, extent_m=0.01)
-    np.testing.assert_allclose(found, 200 - 70 - 50 - 20 * np.log10(RANGE) - 0.4 * RANGE, atol=1e-9)
+    result = volume_reverberation_db(200.0, RANGE, 0.2, -70.0, solid_angle_sr=1e-3, extent_m=0.01)
+    np.testing.assert_allclose(result, 200 - 70 - 50 - 20 * np.log10(RANGE) - 0.4 * RANGE, atol=1e-9)
 
 
 # ---------------------------------------------------------------- gain
@@ -181,17 +181,17 @@ def test_torch_gives_the_numbers_of_numpy() -> None:
         lambda r: ambient_noise_db(r * 1e3, wind_m_s=4.0),
     )
     for function in functions:
-        found = function(there)
-        assert found.dtype == torch.float64
-        np.testing.assert_allclose(found.numpy(), function(RANGE), rtol=1e-13, atol=1e-12)
+        result = function(there)
+        assert result.dtype == torch.float64
+        np.testing.assert_allclose(result.numpy(), function(RANGE), rtol=1e-13, atol=1e-12)
 
 
 def test_the_factor_in_dr_jit(variant: str) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    found = np.asarray(two_way_amplitude(mi.Float64(RANGE), 0.3, exp=dr.exp))
-    np.testing.assert_allclose(found, two_way_amplitude(RANGE, 0.3), rtol=1e-13)
+    result = np.asarray(two_way_amplitude(mi.Float64(RANGE), 0.3, exp=dr.exp))
+    np.testing.assert_allclose(result, two_way_amplitude(RANGE, 0.3), rtol=1e-13)
 
 
 @pytest.mark.parametrize(

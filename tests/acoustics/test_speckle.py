@@ -53,8 +53,8 @@ def test_information_is_the_integral_of_the_squared_score(q: float, noise: float
         density = 2 * x * np.exp(-((x - np.sqrt(q)) ** 2)) * special.i0e(2 * x * np.sqrt(q))
         return float(density * score(amplitude, power, noise) ** 2)
 
-    wanted = integrate.quad(integrand, max(0, np.sqrt(q) - 9), np.sqrt(q) + 9, epsrel=1e-9, limit=400)[0]
-    np.testing.assert_allclose(rician_information(power, noise), wanted, rtol=2e-3)
+    expected = integrate.quad(integrand, max(0, np.sqrt(q) - 9), np.sqrt(q) + 9, epsrel=1e-9, limit=400)[0]
+    np.testing.assert_allclose(rician_information(power, noise), expected, rtol=2e-3)
 
 
 def test_limits_of_weak_and_strong_echoes() -> None:
@@ -69,12 +69,12 @@ def test_limits_of_weak_and_strong_echoes() -> None:
 def test_scores_of_cells_that_share_noise(q: float) -> None:
     """Two cells, echoes turned by 0.7 rad, noise of correlation 0.6: covariance of a million drawn scores."""
     rng, turned, common = np.random.default_rng(5), 0.7, 0.6
-    first, other = (rng.normal(size=(2, 1_000_000, 2)) @ [1, 1j]) / np.sqrt(2)
-    second = common * first + np.sqrt(1 - common**2) * other
+    first, another = (rng.normal(size=(2, 1_000_000, 2)) @ [1, 1j]) / np.sqrt(2)
+    second = common * first + np.sqrt(1 - common**2) * another
     echoes = np.sqrt(q), np.sqrt(q) * np.exp(1j * turned)
     scores = [score(np.abs(echo + noise), q, 1.0) for echo, noise in zip(echoes, (first, second), strict=True)]
-    found = float(np.mean(scores[0] * scores[1]) / rician_information(q, 1.0))
+    result = float(np.mean(scores[0] * scores[1]) / rician_information(q, 1.0))
     part = score_shares(q, 1.0)
-    wanted = part.linear**2 * common * np.cos(turned) + (part.power**2 + part.double**2 * np.cos(2 * turned)) * common**2
-    assert found == pytest.approx(float(wanted), abs=0.01)
+    expected = part.linear**2 * common * np.cos(turned) + (part.power**2 + part.double**2 * np.cos(2 * turned)) * common**2
+    assert result == pytest.approx(float(expected), abs=0.01)
     assert 0.95 < float(part.linear**2 + part.power**2 + part.double**2) <= 1 + 1e-6

@@ -37,8 +37,8 @@ def ramp() -> Array:
 def test_levels_of_exponential_intensities() -> None:
     """The quantile of p is -ln(1 - p)."""
     level = decibels(intensity((10, 400, 100)))
-    wanted = 10 * np.log10(np.log(1000) / -np.log(0.99))
-    assert statistics.percentile_span_db(level) == pytest.approx(wanted, abs=0.2)
+    expected = 10 * np.log10(np.log(1000) / -np.log(0.99))
+    assert statistics.percentile_span_db(level) == pytest.approx(expected, abs=0.2)
     assert statistics.bright_over_median_db(level) == pytest.approx(10 * np.log10(np.log(1000) / np.log(2)), abs=0.1)
     assert statistics.zero_share([[0.0, 1.0], [2.0, 0.0]]) == 0.5
     assert decibels([0.0, 1.0, 100.0], -60).tolist() == [-60, 0, 20]
@@ -56,8 +56,8 @@ def test_grain_is_what_the_picture_is_not() -> None:
 @pytest.mark.parametrize("looks", [1, 2, 4])
 def test_contrast_of_looks(looks: int) -> None:
     """The mean of n exponential intensities has the contrast 1 / sqrt(n)."""
-    made = np.mean([intensity(seed=k) for k in range(looks)], axis=0)
-    assert np.median(statistics.intensity_contrast(made)) == pytest.approx(looks**-0.5, rel=0.03)
+    result = np.mean([intensity(seed=k) for k in range(looks)], axis=0)
+    assert np.median(statistics.intensity_contrast(result)) == pytest.approx(looks**-0.5, rel=0.03)
 
 
 def test_windows_hold_each_cell_once() -> None:
@@ -75,12 +75,12 @@ def test_correlation_of_frames_by_level() -> None:
     """The bright half keeps its field but for a part, the dark half is new: Li2(c^2) / (pi^2 / 6), and 0."""
     still, coherence = field((1, *SHAPE[1:])), 0.8
     moving = coherence * still + np.sqrt(1 - coherence**2) * field(SHAPE, 1)
-    made = np.where(np.arange(SHAPE[1])[:, None] < 124, moving, field(SHAPE, 2))
-    level = decibels(np.abs(made) ** 2) + ramp()
-    at, found = statistics.correlation_by_level(level, parts=2)
+    built = np.where(np.arange(SHAPE[1])[:, None] < 124, moving, field(SHAPE, 2))
+    level = decibels(np.abs(built) ** 2) + ramp()
+    at, result = statistics.correlation_by_level(level, parts=2)
     pairs = special.spence(1 - coherence**4) / (np.pi**2 / 6)  # of two frames: both differ from what stands still
     assert at[1] - at[0] == pytest.approx(15, abs=1)
-    assert found == pytest.approx([0, pairs], abs=0.04)
+    assert result == pytest.approx([0, pairs], abs=0.04)
     assert statistics.frame_correlation(level) > 0.7  # the picture
     assert statistics.frame_correlation(statistics.detrended(level[:, :124])) == pytest.approx(pairs, abs=0.03)
     assert np.isnan(statistics.frame_correlation(level[:1]))
@@ -89,12 +89,12 @@ def test_correlation_of_frames_by_level() -> None:
 @pytest.mark.parametrize(("axis", "along"), [(1, 0.7), (2, 0.6)])
 def test_autocorrelation_of_a_known_process(axis: int, along: float) -> None:
     """An AR(1) field of coherence a^lag: its levels correlate by the dilogarithm of a^(2 lag)."""
-    made = np.moveaxis(field((6, 400, 120)), axis, 0).copy()
-    for k in range(1, len(made)):
-        made[k] = along * made[k - 1] + np.sqrt(1 - along**2) * made[k]
-    level = decibels(np.abs(np.moveaxis(made, 0, axis)) ** 2)
-    wanted = [special.spence(1 - along ** (2 * lag)) / (np.pi**2 / 6) for lag in (1, 2)]
-    assert statistics.autocorrelation(level, axis) == pytest.approx(wanted, abs=0.04)  # the local mean takes a part
+    result = np.moveaxis(field((6, 400, 120)), axis, 0).copy()
+    for k in range(1, len(result)):
+        result[k] = along * result[k - 1] + np.sqrt(1 - along**2) * result[k]
+    level = decibels(np.abs(np.moveaxis(result, 0, axis)) ** 2)
+    expected = [special.spence(1 - along ** (2 * lag)) / (np.pi**2 / 6) for lag in (1, 2)]
+    assert statistics.autocorrelation(level, axis) == pytest.approx(expected, abs=0.04)  # the local mean takes a part
     assert statistics.autocorrelation(level, 3 - axis) == pytest.approx([0, 0], abs=0.02)
 
 
@@ -119,20 +119,20 @@ def test_profile_glow_and_edges() -> None:
     assert rise == pytest.approx(0.5 * 19, rel=0.05)
     assert fall == pytest.approx(0.25 * 19, rel=0.05)
     glow = 20 * np.exp(-np.arange(400) / 4) - 0.02 * np.arange(400)
-    found = statistics.near_glow_db(glow[None, :, None] + np.zeros((2, 1, 30)))
-    assert found[:10] == pytest.approx(20 * np.exp(-np.arange(10) / 4), abs=0.3)
+    result = statistics.near_glow_db(glow[None, :, None] + np.zeros((2, 1, 30)))
+    assert result[:10] == pytest.approx(20 * np.exp(-np.arange(10) / 4), abs=0.3)
     np.testing.assert_allclose(statistics.range_profile_db(slow), slow[0, :, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("leak_db", [-60.0, -50.0])
 def test_smear_of_targets(leak_db: float) -> None:
     """Every beam gets a part of the sum of all: in noise 80 dB below the targets the part is found."""
-    made = 1e-4 * field((4, 400, 96), 5)
+    result = 1e-4 * field((4, 400, 96), 5)
     for bin_, beam in ((100, 20), (210, 60), (330, 40)):
         peak = np.exp(-((np.arange(-3, 4) / 1.2) ** 2))
-        made[:, bin_ - 3 : bin_ + 4, beam] += 1.0 * peak
-    made = made + 10 ** (leak_db / 20) * made.sum(axis=2, keepdims=True)
-    power = np.abs(made) ** 2
+        result[:, bin_ - 3 : bin_ + 4, beam] += 1.0 * peak
+    result = result + 10 ** (leak_db / 20) * result.sum(axis=2, keepdims=True)
+    power = np.abs(result) ** 2
     assert 10 * np.log10(statistics.leak_power(power)) == pytest.approx(leak_db, abs=1.0)
     steady = 80 + leak_db + 2.51 - statistics.MEDIAN_ABOVE_MEAN_DB  # a wave over the mean dB of noise
     assert statistics.smear_db(decibels(power)) == pytest.approx(steady, abs=0.7)
@@ -144,6 +144,6 @@ def test_smear_of_targets(leak_db: float) -> None:
 
 def test_smoothing_adds_memory_only() -> None:
     """A moving mean of three lines correlates by 2/3 and 1/3 in the field."""
-    made = ndimage.uniform_filter1d(field((6, 400, 120)), 3, axis=1)
-    wanted = [special.spence(1 - (k / 3) ** 2) / (np.pi**2 / 6) for k in (2, 1)]
-    assert statistics.autocorrelation(decibels(np.abs(made) ** 2), 1) == pytest.approx(wanted, abs=0.03)
+    result = ndimage.uniform_filter1d(field((6, 400, 120)), 3, axis=1)
+    expected = [special.spence(1 - (k / 3) ** 2) / (np.pi**2 / 6) for k in (2, 1)]
+    assert statistics.autocorrelation(decibels(np.abs(result) ** 2), 1) == pytest.approx(expected, abs=0.03)

@@ -75,16 +75,16 @@ def test_torch_gives_the_bits_of_numpy(formula: Formula) -> None:
     import torch
 
     frequency = np.geomspace(100, 5e6, 1001)
-    found = absorption_db_per_m(torch.asarray(frequency), SEA, formula)
-    np.testing.assert_array_equal(found.numpy(), absorption_db_per_m(frequency, SEA, formula))
+    result = absorption_db_per_m(torch.asarray(frequency), SEA, formula)
+    np.testing.assert_array_equal(result.numpy(), absorption_db_per_m(frequency, SEA, formula))
 
 
 def test_dr_jit_gives_the_bits_of_numpy(variant: str) -> None:
     import mitsuba as mi
 
     frequency = np.geomspace(100, 5e6, 1001)
-    found = absorption_db_per_m(mi.Float64(frequency), SEA)
-    np.testing.assert_array_equal(np.asarray(found), absorption_db_per_m(frequency, SEA))
+    result = absorption_db_per_m(mi.Float64(frequency), SEA)
+    np.testing.assert_array_equal(np.asarray(result), absorption_db_per_m(frequency, SEA))
 
 
 # ---------------------------------------------------------------- speed
@@ -141,8 +141,8 @@ def test_speed_in_fresh_water() -> None:
 def test_what_lies_outside_a_band_is_said(
     frequency: float, fields: dict[str, float], formula: Formula, said: str | None
 ) -> None:
-    found = absorption_warning(frequency, Water(**fields), formula)
-    assert found is None if said is None else (said in str(found)), found
+    result = absorption_warning(frequency, Water(**fields), formula)
+    assert result is None if said is None else (said in str(result)), result
 
 
 def test_band_of_the_speed() -> None:

@@ -53,9 +53,9 @@ def needs(names: list[str]) -> Iterator[str]:
         seen.add(name)
         yield name
         for text in importlib.metadata.requires(name) or []:
-            wanted = Requirement(text)
-            if wanted.marker is None or wanted.marker.evaluate(world):
-                names.append(wanted.name)
+            expected = Requirement(text)
+            if expected.marker is None or expected.marker.evaluate(world):
+                names.append(expected.name)
 
 
 def test_versions_are_those_of_the_constraints_or_stated() -> None:
@@ -74,8 +74,8 @@ def test_the_list_holds_all_that_rendering_and_training_need() -> None:
     pytest.importorskip("lightning")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [one for name in ("data", "odometry", "learn", "cuda") for one in project["optional-dependencies"][name]]
-    wanted = [Requirement(one).name for one in project["dependencies"] + extras]
-    here = [name for name in wanted if name not in ("cufinufft", "mitsonar")]
+    expected = [Requirement(one).name for one in project["dependencies"] + extras]
+    here = [name for name in expected if name not in ("cufinufft", "mitsonar")]
     missing = set(needs(here)) - set(needs(list(GIVEN))) - set(listed())
     assert missing == set()
 
@@ -113,8 +113,8 @@ def test_loads_are_small_and_come_together_again(tmp_path: Path) -> None:
     for folder in folders:
         assert sum(path.stat().st_size for path in folder.iterdir()) <= 4000
         assert all(path.stat().st_size <= 2000 for path in folder.iterdir())
-    made = pack.put_together(folders, tmp_path / "back")
-    assert {path.name: path.read_bytes() for path in made} == contents
+    result = pack.put_together(folders, tmp_path / "back")
+    assert {path.name: path.read_bytes() for path in result} == contents
 
 
 def test_a_part_that_is_missing_or_damaged_is_told(tmp_path: Path) -> None:
@@ -238,8 +238,8 @@ def test_weights_come_back_in_small_files_of_half_the_bytes(tmp_path: Path, monk
     monkeypatch.setattr(pack, "MIB", 2**10)
     folder = tmp_path / "table-3.2" / "runs" / "posenet-normx10"
     folder.mkdir(parents=True)
-    held: dict[str, Any] = {"weights": {"a": torch.randn(9000), "steps": torch.tensor(7)}, "about": ["x", 1.5]}
-    torch.save(held, folder / "network.ckpt")
+    stored: dict[str, Any] = {"weights": {"a": torch.randn(9000), "steps": torch.tensor(7)}, "about": ["x", 1.5]}
+    torch.save(stored, folder / "network.ckpt")
     assert not run.weights(asked_of(tmp_path, 60)).done  # its row is not evaluated yet
     out = tmp_path / "weights" / "posenet-normx10"
     sizes = [path.stat().st_size for path in out.iterdir()]
@@ -247,9 +247,9 @@ def test_weights_come_back_in_small_files_of_half_the_bytes(tmp_path: Path, monk
     assert max(sizes) <= 15 * 2**10
     assert sum(sizes) < 0.6 * (folder / "network.ckpt").stat().st_size
     back = run.together(out)
-    assert back["about"] == held["about"]
+    assert back["about"] == stored["about"]
     assert int(back["weights"]["steps"]) == 7
-    assert torch.allclose(back["weights"]["a"], held["weights"]["a"], rtol=2**-8)
+    assert torch.allclose(back["weights"]["a"], stored["weights"]["a"], rtol=2**-8)
     assert back["weights"]["a"].dtype == torch.float32
 
 

@@ -43,9 +43,9 @@ def test_the_runner_tells_what_fails(
     monkeypatch.setattr(run_quick, "ROOT", tmp_path)
     assert run_quick.is_script(script)
     assert run_quick.passes(script, 60) is well
-    said = capsys.readouterr().out
-    assert ("ok" in said, "FAILED" in said) == (well, not well)
-    assert well or "no tracer" in said or "ZeroDivisionError" in said
+    output = capsys.readouterr().out
+    assert ("ok" in output, "FAILED" in output) == (well, not well)
+    assert well or "no tracer" in output or "ZeroDivisionError" in output
 
 
 def test_a_script_that_hangs_has_failed(
@@ -55,6 +55,6 @@ def test_a_script_that_hangs_has_failed(
     script.write_text('import time\n\nif __name__ == "__main__":\n    print("begun", flush=True)\n    time.sleep(60)\n')
     monkeypatch.setattr(run_quick, "ROOT", tmp_path)
     assert not run_quick.passes(script, 0.7)
-    said = capsys.readouterr().out
-    assert "begun" in said
-    assert "not done after 0.7 s" in said
+    output = capsys.readouterr().out
+    assert "begun" in output
+    assert "not done after 0.7 s" in output

@@ -92,27 +92,27 @@ def test_coco_reads_boxes_masks_and_classes(
     for number in range(FRAMES):
         part_of, coco = next((part, coco) for part, coco in parts.items() if number + 1 in coco.getImgIds())
         assert {one["name"]: one["id"] for one in coco.loadCats(coco.getCatIds())} == {"wall": 1, "barrels": 2}
-        told = coco.loadImgs([number + 1])[0]
-        pixels = np.asarray(Image.open(out / "images" / part_of / told["file_name"]))
-        assert pixels.shape == (told["height"], told["width"])
+        message = coco.loadImgs([number + 1])[0]
+        pixels = np.asarray(Image.open(out / "images" / part_of / message["file_name"]))
+        assert pixels.shape == (message["height"], message["width"])
         shape, part = frames.shape_id[number], frames.object_id[number]  # type: ignore[index]
         wanted_pixels = to_uint8(frames.image[number])
         if picture == "fan":
             shape, part = nearest_cells(fans.fan, shape, -1), nearest_cells(fans.fan, part, -1)
             wanted_pixels = fans.picture(frames.image[number])
         np.testing.assert_array_equal(pixels, wanted_pixels)
-        found = coco.loadAnns(coco.getAnnIds(imgIds=[number + 1]))
-        assert {(one["category_id"], one["attributes"]["object_name"]) for one in found} == {
+        result = coco.loadAnns(coco.getAnnIds(imgIds=[number + 1]))
+        assert {(one["category_id"], one["attributes"]["object_name"]) for one in result} == {
             (1, ""),
             (2, "barrels 1"),
             (2, "barrels 2"),
         }
-        for one in found:
+        for one in result:
             mask = coco.annToMask(one).astype(bool)
-            wanted = (shape == one["category_id"]) & (part == one["attributes"]["object"])
-            np.testing.assert_array_equal(mask, wanted)
-            assert one["area"] == wanted.sum() == mask.sum()
-            rows, columns = np.nonzero(wanted)
+            expected = (shape == one["category_id"]) & (part == one["attributes"]["object"])
+            np.testing.assert_array_equal(mask, expected)
+            assert one["area"] == expected.sum() == mask.sum()
+            rows, columns = np.nonzero(expected)
             x, y, width, height = one["bbox"]
             assert (x, y, x + width, y + height) == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
 
@@ -132,9 +132,9 @@ def test_yolo_has_a_line_an_object(mitsonar: Command, run: Path, frames: SonarFr
     out = tmp_path / "yolo"
     words = ("frames", "export", run, "--to", "yolo", "--without", "sand")
     assert mitsonar(*words, "-o", out).returncode == 0
-    told = yaml.safe_load((out / "data.yaml").read_text())
+    message = yaml.safe_load((out / "data.yaml").read_text())
     places = {"train": "images/train", "val": "images/val", "test": "images/test"}
-    assert told == {**places, "names": {0: "wall", 1: "barrels"}}
+    assert message == {**places, "names": {0: "wall", 1: "barrels"}}
     for number, part in enumerate(["train", "train", "train", "val", "test"]):
         assert Image.open(out / "images" / part / f"{number:06d}.png").size == (BEAMS, BINS)
         rows = np.loadtxt(out / "labels" / part / f"{number:06d}.txt", ndmin=2)
@@ -244,9 +244,9 @@ def test_kitti_poses_are_relative_to_the_first_frame(
 def test_points_of_neusis_lie_where_ours_do(mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path) -> None:
     """A pixel's point by the formulas of neusis (x forward, bearing growing with the column), against ours."""
     assert mitsonar("frames", "export", run, "--to", "neusis", "-o", tmp_path / "views").returncode == 0
-    told = json.loads((tmp_path / "views" / "Config.json").read_text())["agents"][0]["sensors"][0]
-    assert told["sensor_type"] == "ImagingSonar"
-    angles = told["configuration"]
+    message = json.loads((tmp_path / "views" / "Config.json").read_text())["agents"][0]["sensors"][0]
+    assert message["sensor_type"] == "ImagingSonar"
+    angles = message["configuration"]
     across = np.radians(angles["Azimuth"])
     for number in range(FRAMES):
         state = pickle.loads((tmp_path / "views" / "Data" / f"{number:06d}.pkl").read_bytes())
@@ -295,8 +295,8 @@ def test_a_long_run_on_disk_gives_the_same_files(frames: SonarFrames, run: Path,
     ours, theirs = files_of(tmp_path / "of_zarr"), files_of(tmp_path / "of_npz")
     for table in (ours, theirs):
         for part in [name for name in table if name.endswith(".json")]:
-            told = json.loads(table.pop(part))
-            table[part] = json.dumps([told["images"], told["annotations"], told["categories"]]).encode()
+            message = json.loads(table.pop(part))
+            table[part] = json.dumps([message["images"], message["annotations"], message["categories"]]).encode()
     assert ours == theirs
 
 
@@ -364,8 +364,8 @@ def test_few_frames_are_read_at_a_time(frames: SonarFrames, run: Path, monkeypat
 def test_small_regions_are_left_out(frames: SonarFrames) -> None:
     few = LabelledPictures(frames, least=19)
     assert [(one.kind, one.number) for one in few.regions(frames, 0)] == [(0, 0), (2, 1), (2, 2)]
-    found: list[Any] = LabelledPictures(frames).regions(frames, 0)
-    assert len(found) == 4
+    result: list[Any] = LabelledPictures(frames).regions(frames, 0)
+    assert len(result) == 4
 
 
 # ---------------------------------------------------------------- classes, and what stands above the noise
@@ -373,8 +373,8 @@ def test_small_regions_are_left_out(frames: SonarFrames) -> None:
 
 def test_names_that_differ_by_a_number_are_one_class_and_globs_decide_first(frames: SonarFrames) -> None:
     def classes_of(names: tuple[str, ...], rules: str = "") -> tuple[list[str], list[str]]:
-        made = LabelledPictures(replace(frames, shape_names=names), classes=class_rules(rules))
-        return made.classes, made.left_out
+        result = LabelledPictures(replace(frames, shape_names=names), classes=class_rules(rules))
+        return result.classes, result.left_out
 
     assert classes_of(("seabed", "pillar0", "pillar1")) == (["seabed", "pillar"], [])
     assert classes_of(("mk82", "pot_1", "pot_02")) == (["mk82", "pot"], [])
@@ -397,10 +397,10 @@ def test_boxes_around_pure_noise_are_left_out(raised_db: float) -> None:
     image = np.clip(expected * rng.exponential(size=expected.shape) / scale, 0, 1).astype(np.float32)[None]
     words: dict[str, Any] = {"level": "linear", "level_scale": scale, "shape_names": ("barrel", "wall")}
     one = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.zeros(1), sonar, shape_id=shape, **words)
-    made = LabelledPictures(one)
-    assert [region.shape for region in made.regions(one, 0, raised_db)] == [0]
-    assert made.faint == 1
-    ratios = made.snr_db(one, 0, raised_db)
+    result = LabelledPictures(one)
+    assert [region.shape for region in result.regions(one, 0, raised_db)] == [0]
+    assert result.faint == 1
+    ratios = result.snr_db(one, 0, raised_db)
     assert ratios[0, 0] == pytest.approx(6, abs=1)
     assert ratios[1, 0] < 0
     assert len(LabelledPictures(one, least_snr_db=-np.inf).regions(one, 0)) == 2
@@ -443,9 +443,9 @@ def test_a_data_set_of_ones_own_scene_has_the_names_of_its_shapes(mitsonar: Comm
     out = tmp_path / "yolo"
     done = mitsonar("dataset", "export", tmp_path / "own.zarr", "--to", "yolo", "--without", "seabed", "-o", out)
     assert done.returncode == 0, done.stderr
-    told = yaml.safe_load((out / "data.yaml").read_text())
-    assert told["names"] == {0: "pillar", 1: "sphere", 2: "amphora"}
-    pictures = {part: {path.name for path in (out / told[part]).iterdir()} for part in ("train", "val", "test")}
+    message = yaml.safe_load((out / "data.yaml").read_text())
+    assert message["names"] == {0: "pillar", 1: "sphere", 2: "amphora"}
+    pictures = {part: {path.name for path in (out / message[part]).iterdir()} for part in ("train", "val", "test")}
     assert sum(map(len, pictures.values())) == len(set().union(*pictures.values())) == 8 * recipe.flight.pings
     for part in pictures:
         for path in (out / "labels" / part).iterdir():
@@ -502,20 +502,20 @@ def test_one_command_makes_a_detectors_data_set(mitsonar: Command, tmp_path: Pat
     done = mitsonar(*words, "--to", "yolo", "--picture", "fan", "-o", tmp_path / "yolo")
     assert done.returncode == 0, done.stderr
     assert "ground, without a class: seabed" in done.stdout
-    told = yaml.safe_load((tmp_path / "yolo" / "data.yaml").read_text())
-    assert told["names"] == {0: "pillar", 1: "sphere", 2: "amphora"}
+    message = yaml.safe_load((tmp_path / "yolo" / "data.yaml").read_text())
+    assert message["names"] == {0: "pillar", 1: "sphere", 2: "amphora"}
     pictures = {
-        part: {path.name for path in (tmp_path / "yolo" / told[part]).iterdir()} for part in ("train", "val", "test")
+        part: {path.name for path in (tmp_path / "yolo" / message[part]).iterdir()} for part in ("train", "val", "test")
     }
     assert {part: len(names) for part, names in pictures.items()} == {"train": 6, "val": 3, "test": 3}
     assert len(set().union(*pictures.values())) == 12
     sizes = set()
     for part, names in pictures.items():
         for name in names:
-            sizes.add(Image.open(tmp_path / "yolo" / told[part] / name).size)
+            sizes.add(Image.open(tmp_path / "yolo" / message[part] / name).size)
             label = (tmp_path / "yolo" / "labels" / part / name).with_suffix(".txt")
             rows = np.array(label.read_text().split(), float).reshape(-1, 5)
-            assert set(rows[:, 0]) <= set(told["names"])
+            assert set(rows[:, 0]) <= set(message["names"])
             assert (rows[:, 1:3] - rows[:, 3:] / 2 >= -1e-6).all()
             assert (rows[:, 1:3] + rows[:, 3:] / 2 <= 1 + 1e-6).all()
     assert len(sizes) == 1

@@ -94,13 +94,13 @@ def mailbox_pose(mailbox: PoseMailbox) -> None:
 
 def ping_of(client: LiveClient, mark: str) -> dict[str, Any]:
     """The messages of the ping that a marked pose asked for, by topic."""
-    kept: dict[int, dict[str, bytes]] = {}
+    stored: dict[int, dict[str, bytes]] = {}
     while True:
         message = client.receive()
-        kept.setdefault(message.time_ns, {})[message.topic] = message.content
-        told = json.loads(kept[message.time_ns].get("/sonar/timing", b"{}"))
-        if told.get("id") == mark and len(kept[message.time_ns]) == 3:
-            return {**kept[message.time_ns], "/sonar/timing": told}
+        stored.setdefault(message.time_ns, {})[message.topic] = message.content
+        report = json.loads(stored[message.time_ns].get("/sonar/timing", b"{}"))
+        if report.get("id") == mark and len(stored[message.time_ns]) == 3:
+            return {**stored[message.time_ns], "/sonar/timing": report}
 
 
 @pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
@@ -113,15 +113,15 @@ def test_a_pose_becomes_the_image_that_the_simulator_makes(live: Live) -> None:
     got = ping_of(client, "first")
     ping = next(one for one in live.pings if one.request_id == "first")
     np.testing.assert_allclose(ping.frames.poses, [[-3.4, -4.0, 2.2, np.radians(25), 0, np.radians(10)]])
-    wanted = ping.frames.image[0]
-    assert wanted.max() > 0.1
+    expected = ping.frames.image[0]
+    assert expected.max() > 0.1
     picture = Image.open(io.BytesIO(image_of(got["/sonar/fan"])))
-    plain = FanPictures(ping.frames).picture(wanted)
+    plain = FanPictures(ping.frames).picture(expected)
     assert (picture.format, picture.size) == ("JPEG", plain.shape[::-1])
     assert np.abs(np.asarray(picture, float) - plain).mean() < 3
     polar = decoded(decoder, client.channels["/sonar/image"], got["/sonar/image"])
     values = np.frombuffer(bytes(polar.image.data), np.uint8).reshape(60, 24)
-    np.testing.assert_array_equal(values, to_uint8(wanted))
+    np.testing.assert_array_equal(values, to_uint8(expected))
     np.testing.assert_allclose(np.array(polar.ranges), ping.frames.range_m, rtol=1e-6)
     bearing = [np.arctan2(one.y, one.z) for one in polar.beam_directions]
     np.testing.assert_allclose(bearing, ping.frames.bearing_rad, atol=1e-12)
@@ -138,9 +138,9 @@ def decoded(decoder: Any, channel: dict[str, Any], content: bytes) -> Any:
 
     assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg")
     schema = Schema(id=1, name=channel["schemaName"], encoding="ros2msg", data=channel["schema"].encode())
-    made = decoder.DecoderFactory().decoder_for("cdr", schema)
-    assert made is not None
-    return made(content)
+    result = decoder.DecoderFactory().decoder_for("cdr", schema)
+    assert result is not None
+    return result(content)
 
 
 @pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
@@ -171,9 +171,9 @@ def test_bad_poses_are_refused_with_one_sentence_each_and_the_next_is_rendered(l
 
 
 def test_another_topic_or_encoding_is_refused_with_one_sentence(live: Live) -> None:
-    for words, wanted in (({"pose_topic": "/move"}, "'/move'"), ({"encoding": "ros1"}, "'ros1'")):
+    for words, expected in (({"pose_topic": "/move"}, "'/move'"), ({"encoding": "ros1"}, "'ros1'")):
         client = client_of(live.port, TOPICS, **words)
-        assert wanted in client.wait_for_status()
+        assert expected in client.wait_for_status()
         client.publish({"x": 1})
         client.close()
     time.sleep(0.2)
@@ -188,8 +188,8 @@ def test_poses_of_ros_are_understood(live: Live) -> None:
     turn = {"x": 0.0, "y": np.sin(half), "z": 0.0, "w": np.cos(half)}
     pose = {"position": {"x": -4.0, "y": 1.0, "z": 2.2}, "orientation": turn}
     client.publish({"header": {"frame_id": "world"}, "pose": pose, "id": "ros"})
-    told = ping_of(client, "ros")["/sonar/timing"]
-    got = [told[key] for key in ("x", "y", "z", "pitch", "roll", "heading")]
+    message = ping_of(client, "ros")["/sonar/timing"]
+    got = [message[key] for key in ("x", "y", "z", "pitch", "roll", "heading")]
     np.testing.assert_allclose(got, [-4, 1, 2.2, 25, 0, 90], atol=1e-9)
     client.close()
 
@@ -221,9 +221,9 @@ def started(*words: str) -> tuple[subprocess.Popen[str], int]:
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
     assert process.stdout is not None
     line = process.stdout.readline()
-    found = re.search(r"ws://127\.0\.0\.1:(\d+)", line)
-    assert found, line + (process.communicate(timeout=20)[1] if process.poll() is not None else "")
-    return process, int(found[1])
+    result = re.search(r"ws://127\.0\.0\.1:(\d+)", line)
+    assert result, line + (process.communicate(timeout=20)[1] if process.poll() is not None else "")
+    return process, int(result[1])
 
 
 @pytest.mark.e2e
@@ -231,14 +231,14 @@ def started(*words: str) -> tuple[subprocess.Popen[str], int]:
 def test_a_path_is_played_and_a_signal_ends_the_server_cleanly(number: signal.Signals) -> None:
     process, port = started("--trajectory", "shipped", "--rate", "20")
     client = client_of(port, ["/sonar/timing"])
-    told = [json.loads(client.receive().content) for _ in range(3)]
-    assert [one["number"] for one in told] == list(range(told[0]["number"], told[0]["number"] + 3))
-    assert {one["source"] for one in told} == {"path"}
-    assert [told[0][key] for key in ("x", "y", "heading")] != [told[1][key] for key in ("x", "y", "heading")]
+    message = [json.loads(client.receive().content) for _ in range(3)]
+    assert [one["number"] for one in message] == list(range(message[0]["number"], message[0]["number"] + 3))
+    assert {one["source"] for one in message} == {"path"}
+    assert [message[0][key] for key in ("x", "y", "heading")] != [message[1][key] for key in ("x", "y", "heading")]
     process.send_signal(number)
-    said, complained = process.communicate(timeout=20)
+    output, complained = process.communicate(timeout=20)
     assert process.returncode == 0, complained
-    assert re.search(r"^\d+ pings$", said, re.MULTILINE)
+    assert re.search(r"^\d+ pings$", output, re.MULTILINE)
     assert "Traceback" not in complained
 
 
@@ -306,8 +306,8 @@ def test_the_newest_pose_wins_and_the_path_goes_on_after_a_pause() -> None:
 
     for place in (7.0, 8.0, 9.0):
         mailbox.put(PoseRequest(Pose(place, 0, 2), request_id=place))
-    asked = next(pings)
-    assert (asked.request_id, asked.dropped, asked.source, asked.number) == (9.0, 2, "client", 5)
+    arguments = next(pings)
+    assert (arguments.request_id, arguments.dropped, arguments.source, arguments.number) == (9.0, 2, "client", 5)
     begun = time.monotonic()
     resumed = next(pings)
     assert time.monotonic() - begun > 0.15

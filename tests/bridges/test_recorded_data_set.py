@@ -59,8 +59,8 @@ def true_poses(frames: SonarFrames) -> Array:
 
 
 def written(out: Path, *files: Path, **words: Any) -> DataStore:
-    made = write_recorded([frames_with_poses(str(file), **words) for file in files], out)
-    assert made.path == out
+    result = write_recorded([frames_with_poses(str(file), **words) for file in files], out)
+    assert result.path == out
     return DataStore.open(out)
 
 
@@ -120,8 +120,8 @@ def test_what_the_user_should_know_is_said(places: dict[str, Path], frames: Sona
     replace(frames, level_scale=0.5, height_m=None).save(tmp_path / "quiet.npz")
     Trajectory(true_poses(frames)[:20], frames.time_s[:20]).save_tum(tmp_path / "short.tum")
     quiet = frames_with_poses(str(tmp_path / "quiet.npz"), path=tmp_path / "short.tum")
-    made = write_recorded([frames_with_poses(str(places["npz"])), quiet], tmp_path / "data.zarr")
-    left, gains, heights = made.notes
+    result = write_recorded([frames_with_poses(str(places["npz"])), quiet], tmp_path / "data.zarr")
+    left, gains, heights = result.notes
     assert "quiet.npz: left out: 4 frames" in left
     assert "the gains of the files differ (levels of a pixel of 1 from 0.5 to 1)" in gains
     assert "give --height" in heights
@@ -141,8 +141,8 @@ def test_of_a_recording_that_changes_its_window_one_geometry_is_taken(frames: So
     joined = replace(recording, parts=(recording.parts[0], *others))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mitsonar.bridges.export_source.recording_at", lambda where, geometry: joined)
-        found = frames_with_poses("dive.aris")
-    assert ([len(one) for one in found.stretches], found.left_out) == ([10, 14], 4)
+        result = frames_with_poses("dive.aris")
+    assert ([len(one) for one in result.stretches], result.left_out) == ([10, 14], 4)
 
 
 # ---------------------------------------------------------------- poses
@@ -151,10 +151,10 @@ def test_of_a_recording_that_changes_its_window_one_geometry_is_taken(frames: So
 def test_poses_are_interpolated_within_a_path(frames: SonarFrames) -> None:
     poses, time = true_poses(frames), frames.time_s
     path = Trajectory(poses[::2], time[::2])
-    found, known = poses_at(path, time, "frames")
+    result, known = poses_at(path, time, "frames")
     assert known.tolist() == [True] * 23 + [False]
-    assert np.array_equal(found[:-1:2], poses[:-1:2])
-    assert np.allclose(found[:-1], poses[:-1], atol=2e-3)
+    assert np.array_equal(result[:-1:2], poses[:-1:2])
+    assert np.allclose(result[:-1], poses[:-1], atol=2e-3)
     gap = Trajectory(poses[[0, 1, -2, -1]], time[[0, 1, -2, -1]])
     assert poses_at(gap, time, "frames")[1].tolist() == [True] * 2 + [False] * 20 + [True] * 2
     with pytest.raises(MitsonarError, match="no pose for the frames of dive"):
@@ -165,11 +165,11 @@ def test_poses_are_interpolated_within_a_path(frames: SonarFrames) -> None:
 
 def test_pitch_of_a_planar_path_is_that_of_the_frames(frames: SonarFrames) -> None:
     flat = true_poses(frames) * [1, 1, 1, 0, 0, 1]
-    told = np.tile([0.3, 0.02, np.nan], (24, 1))
-    told[3] = np.nan
-    found, _ = poses_at(Trajectory(flat, frames.time_s), frames.time_s, "frames", told)
-    assert np.allclose(found[:, 3], [0.3] * 3 + [0] + [0.3] * 20)
-    assert np.allclose(found[:, 4], [0.02] * 3 + [0] + [0.02] * 20)
+    message = np.tile([0.3, 0.02, np.nan], (24, 1))
+    message[3] = np.nan
+    result, _ = poses_at(Trajectory(flat, frames.time_s), frames.time_s, "frames", message)
+    assert np.allclose(result[:, 3], [0.3] * 3 + [0] + [0.3] * 20)
+    assert np.allclose(result[:, 4], [0.02] * 3 + [0] + [0.02] * 20)
 
 
 def test_stretches_end_at_pauses_and_where_poses_are_missing() -> None:
@@ -191,9 +191,9 @@ def test_compare_gives_the_errors_of_the_estimator_on_the_run(
     truth = motions(true_poses(frames))
     direct = create_estimator("direct")
     pairs = [frames.select(slice(number, number + 2)) for number in range(len(truth))]
-    found = np.array([direct.estimate(pair).motion for pair in pairs])
-    wanted = np.sqrt((in_units(found - truth) ** 2).mean(axis=0))
-    assert np.allclose(rows["direct"]["rmse"], wanted, rtol=1e-6)
+    result = np.array([direct.estimate(pair).motion for pair in pairs])
+    expected = np.sqrt((in_units(result - truth) ** 2).mean(axis=0))
+    assert np.allclose(rows["direct"]["rmse"], expected, rtol=1e-6)
     assert (np.array(rows["direct"]["rmse"]) < 0.2 * np.array(rows["zero"]["rmse"])).all()
     with pytest.raises(MitsonarError, match="have no world"):
         compare(tmp_path / "data.zarr", "zero", ComparisonOptions(part="all", perturb=True))
@@ -255,8 +255,8 @@ def test_refusals_say_what_to_give(mitsonar: Command, places: dict[str, Path], f
     unknown = replace(frames, height_m=None, poses=true_poses(frames) * [1, 1, 0, 1, 1, 1])
     unknown.save(tmp_path / "low.npz")
     refused(mitsonar("dataset", "from-frames", tmp_path / "low.npz", "-o", out), "give --height")
-    other = over_ground(sway(3), SONAR.replace(range_max=5.0))
-    other.save(tmp_path / "other.npz")
+    second = over_ground(sway(3), SONAR.replace(range_max=5.0))
+    second.save(tmp_path / "other.npz")
     both = (places["npz"], tmp_path / "other.npz")
     refused(mitsonar("dataset", "from-frames", *both, "-o", out), "another sonar", "range_max 5.0, not 5.4")
     refused(mitsonar("dataset", "from-frames", places["npz"], places["npz"], "-o", out), "given twice")
@@ -293,11 +293,11 @@ def test_axes_that_no_sonar_has_are_refused_or_kept(frames: SonarFrames) -> None
     with pytest.raises(MitsonarError, match="contrast"):
         axes_of(replace(frames, level="contrast"), "dive")
     bent = frames.bearing_rad + 0.01 * np.sin(7 * frames.bearing_rad)
-    found = axes_of(replace(frames, bearing_rad=bent), "dive")
-    assert found.bearing_rad is not None
-    assert np.array_equal(found.bearing_rad, bent)
+    result = axes_of(replace(frames, bearing_rad=bent), "dive")
+    assert result.bearing_rad is not None
+    assert np.array_equal(result.bearing_rad, bent)
     assert axes_of(frames, "dive").bearing_rad is None
-    assert "bearings" in found.differences_from(axes_of(frames, "dive"))[-1]
+    assert "bearings" in result.differences_from(axes_of(frames, "dive"))[-1]
 
 
 def test_nothing_is_rendered_of_recorded_frames(places: dict[str, Path], tmp_path: Path) -> None:

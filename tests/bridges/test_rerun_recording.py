@@ -40,12 +40,12 @@ def rows_of(path: Path) -> dict[str, dict[str, list[Any]]]:
     """All values of a recording by entity and component."""
     from rerun.chunk import RrdReader
 
-    found: dict[str, dict[str, list[Any]]] = {}
+    result: dict[str, dict[str, list[Any]]] = {}
     for chunk in RrdReader(path).stream():
         table = chunk.to_record_batch().to_pydict()
         for name, values in table.items():
-            found.setdefault(chunk.entity_path, {}).setdefault(name, []).extend(values)
-    return found
+            result.setdefault(chunk.entity_path, {}).setdefault(name, []).extend(values)
+    return result
 
 
 @pytest.mark.e2e
@@ -164,9 +164,9 @@ def test_shapes_become_triangles_that_fill_their_boxes(variant: str) -> None:
     import mitsuba as mi
 
     shapes = {"floor": floor(), "block": box((1, 2, 3), (0.5, 1, 2)), "ball": sphere((4, 0, 1), 0.7)}
-    made = mi.load_dict({"type": "scene", **shapes}, optimize=False)  # merged meshes keep the box of the first
-    assert isinstance(made, mi.Scene)
-    for one, shape in zip(triangles_in(made), made.shapes(), strict=True):
+    result = mi.load_dict({"type": "scene", **shapes}, optimize=False)  # merged meshes keep the box of the first
+    assert isinstance(result, mi.Scene)
+    for one, shape in zip(triangles_in(result), result.shapes(), strict=True):
         extent = shape.bbox()
         low, high = np.array(extent.min).reshape(3), np.array(extent.max).reshape(3)
         np.testing.assert_allclose(one.vertices.min(axis=0), low, atol=0.02)

@@ -56,21 +56,21 @@ class Ros:
 
 @pytest.fixture
 def ros(monkeypatch: pytest.MonkeyPatch) -> Ros:
-    made = Ros()
+    result = Ros()
 
     def module(name: str, **names: Any) -> None:
         one = ModuleType(name)
         one.__dict__.update(names)
         monkeypatch.setitem(sys.modules, name, one)
 
-    module("rclpy", init=lambda args: None, create_node=lambda name: made, spin=lambda node: made.down.wait(20))
-    sys.modules["rclpy"].__dict__.update(ok=lambda: True, try_shutdown=made.down.set)
-    module("tf2_ros", TransformBroadcaster=lambda node: SimpleNamespace(sendTransform=made.moved.append))
+    module("rclpy", init=lambda args: None, create_node=lambda name: result, spin=lambda node: result.down.wait(20))
+    sys.modules["rclpy"].__dict__.update(ok=lambda: True, try_shutdown=result.down.set)
+    module("tf2_ros", TransformBroadcaster=lambda node: SimpleNamespace(sendTransform=result.moved.append))
     names = {"geometry": ("PoseStamped", "TransformStamped"), "sensor": ("CompressedImage",), "std": ("String",)}
     for package, kinds in names.items():
         module(f"{package}_msgs")
         module(f"{package}_msgs.msg", **dict.fromkeys(kinds, Message))
-    return made
+    return result
 
 
 def ping() -> LivePing:

@@ -30,8 +30,8 @@ def test_the_checker_of_gymnasium_finds_nothing() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         named: dict[str, Any] = {"scene": "flat_floor", "sonar": SONAR, "start": START}
-        made = gymnasium.make("mitsonar/Sonar-v0", observe=("image", "altitude", "pose"), render_mode="rgb_array", **named)
-        check_env(made.unwrapped)
+        result = gymnasium.make("mitsonar/Sonar-v0", observe=("image", "altitude", "pose"), render_mode="rgb_array", **named)
+        check_env(result.unwrapped)
 
 
 def test_vehicles_stepped_together_see_what_each_sees_alone(simulator: Simulator) -> None:
@@ -40,10 +40,10 @@ def test_vehicles_stepped_together_see_what_each_sees_alone(simulator: Simulator
     together = [many.reset(seed=5)[0], *(many.step(action)[0] for action in actions)]
     for place in range(0, 64, 7):
         alone = [one.reset(seed=5 + place)[0], *(one.step(action[place])[0] for action in actions)]
-        for all_of_them, own in zip(together, alone, strict=True):
+        for all_of_them, local in zip(together, alone, strict=True):
             assert isinstance(all_of_them, np.ndarray)
-            assert isinstance(own, np.ndarray)
-            np.testing.assert_array_equal(all_of_them[place], own)
+            assert isinstance(local, np.ndarray)
+            np.testing.assert_array_equal(all_of_them[place], local)
     first = together[0]
     assert isinstance(first, np.ndarray)
     assert first.max() > 100
@@ -171,10 +171,10 @@ def test_a_reward_may_be_one_number_and_a_wrong_one_is_shown(simulator: Simulato
     alone = SonarEnv(simulator, start=START, reward=lambda step: 1.0)
     alone.reset(seed=0)
     assert alone.step(np.zeros(4))[1] == 1.0
-    for reward, said in ((lambda step: [0, np.nan], r"got nan at \[1\]"), (lambda step: np.zeros(3), r"the shape \(3,\)")):
+    for reward, output in ((lambda step: [0, np.nan], r"got nan at \[1\]"), (lambda step: np.zeros(3), r"the shape \(3,\)")):
         bad = SonarVectorEnv(simulator, num_envs=2, start=START, reward=reward)
         bad.reset(seed=0)
-        with pytest.raises(MitsonarError, match=said):
+        with pytest.raises(MitsonarError, match=output):
             bad.step(np.zeros((2, 4)))
 
 

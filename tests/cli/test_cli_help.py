@@ -25,7 +25,7 @@ def commands(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[
 def in_brackets(command: Any) -> list[str]:
     """What stands in brackets in the texts of a command and its options, without the escapes."""
     texts = [command.help, *(getattr(parameter, "help", None) for parameter in command.params)]
-    return [found for text in texts if text for found in re.findall(r"\[[^\]]+\]", text.replace("\\[", "["))]
+    return [result for text in texts if text for result in re.findall(r"\[[^\]]+\]", text.replace("\\[", "["))]
 
 
 TREE = dict(commands(typer.main.get_command(application())))
@@ -62,9 +62,9 @@ def test_a_group_that_is_made_at_once_is_escaped_as_a_whole() -> None:
     inner.command("again")(measure)
     app.add_typer(inner, name="group")
     app.command("one")(measure)
-    made: Any = with_plain_brackets(typer.main.get_command(app))
-    group = made.commands["group"]
+    result: Any = with_plain_brackets(typer.main.get_command(app))
+    group = result.commands["group"]
     assert group.help == r"A group \[s]."
-    for command in (made.commands["one"], group.commands["measure"]):
+    for command in (result.commands["one"], group.commands["measure"]):
         assert command.help == r"Tell a height \[m]."
         assert command.params[0].help == r"Over the ground \[m]."

@@ -63,12 +63,12 @@ def test_it_writes_responses_and_figures(mitsonar: Command, scene: Path, tmp_pat
 
 @pytest.mark.thorough
 def test_killed_and_resumed_it_is_the_unbroken_one(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
-    asked = ["impulse", scene, "--velocity", "1,-0.5,3", "--frames", 400]
-    whole = mitsonar(*asked, "-o", tmp_path / "whole")
+    arguments = ["impulse", scene, "--velocity", "1,-0.5,3", "--frames", 400]
+    whole = mitsonar(*arguments, "-o", tmp_path / "whole")
     assert whole.returncode == 0, whole.stderr
     out = tmp_path / "broken"
     process = subprocess.Popen(
-        [*PROGRAM, *map(str, asked), "-o", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*PROGRAM, *map(str, arguments), "-o", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     state, deadline = out / "run.json", time.monotonic() + 150
     while time.monotonic() < deadline and process.poll() is None:
@@ -80,7 +80,7 @@ def test_killed_and_resumed_it_is_the_unbroken_one(mitsonar: Command, scene: Pat
     done = int(json.loads((out / "run.json").read_text())["frames_done"])
     assert 0 < done < 400
     assert not (out / "responses.npz").exists()
-    assert mitsonar(*asked, "-o", out, "--resume").returncode == 0
+    assert mitsonar(*arguments, "-o", out, "--resume").returncode == 0
     first, second = (ImpulseResponses.load(folder) for folder in (tmp_path / "whole", out))
     assert np.array_equal(first.response, second.response)
 
@@ -181,10 +181,10 @@ SEA = """<scene version="3.0.0">
 @pytest.mark.thorough
 def test_a_sea_surface_is_a_mirror_of_ones_own_scene(mitsonar: Command, tmp_path: Path) -> None:
     """`world sea-surface`, then its material (--mirrors) or numbers of one's own (--mirror) give the same bits."""
-    made = mitsonar("world", "sea-surface", "--wind-m-s", 2, "--size-m", 8, "--step-m", 0.1, "-o", tmp_path / "sea")
-    assert made.returncode == 0, made.stderr
+    result = mitsonar("world", "sea-surface", "--wind-m-s", 2, "--size-m", 8, "--step-m", 0.1, "-o", tmp_path / "sea")
+    assert result.returncode == 0, result.stderr
     height = SeaSurface(wind_m_s=2.0, size_m=8.0, step_m=0.1).state.roughness_m
-    assert f"waves below 0.4 m are its roughness, rms {height:.3g} m" in made.stdout
+    assert f"waves below 0.4 m are its roughness, rms {height:.3g} m" in result.stdout
     scene = tmp_path / "mine.xml"
     scene.write_text(SEA)
     runs = {}

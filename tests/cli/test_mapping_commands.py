@@ -91,10 +91,10 @@ def test_a_rendered_run_becomes_its_path_and_its_map(mitsonar: Command, rendered
     assert done.returncode == 0, done
     assert "11 motions by direct (pitch; height where no first echoes show), 0 invalid and bridged" in done.stdout
     assert "end-point error" in done.stdout
-    found = table(out)
-    assert found["path length"] == pytest.approx(np.linalg.norm(DRIVEN[:, :2], axis=1).sum(), rel=1e-6)
-    assert found["end-point error"] < 4, "mm"
-    assert abs(found["heading error at the end"]) < 0.2, "deg"
+    result = table(out)
+    assert result["path length"] == pytest.approx(np.linalg.norm(DRIVEN[:, :2], axis=1).sum(), rel=1e-6)
+    assert result["end-point error"] < 4, "mm"
+    assert abs(result["heading error at the end"]) < 0.2, "deg"
     estimated, true = (Trajectory.load_tum(out / f"{name}.tum") for name in ("estimated", "true"))
     np.testing.assert_allclose(motions(true.poses), DRIVEN, atol=1e-7)
     assert np.abs(motions(estimated.poses) - DRIVEN).max() < 2e-3
@@ -106,13 +106,13 @@ def test_a_rendered_run_becomes_its_path_and_its_map(mitsonar: Command, rendered
     back = path_of(-DRIVEN, Pose(*true.poses[0]), true.time_s)
     back.save_tum(tmp_path / "back.tum")
     assert mitsonar("mosaic", rendered, tmp_path / "back.tum", "-o", tmp_path / "d.tif", "--cell-mm", 20).returncode == 0
-    alike = {}
+    similar = {}
     for name in ("a", "d"):
-        one, other = in_common(tmp_path / f"{name}.tif", tmp_path / "b.tif")
-        alike[name] = np.corrcoef(one, other)[0, 1], np.sqrt(np.mean((one - other) ** 2)) / other.std()
-    assert alike["a"][0] > 0.9, alike
-    assert alike["a"][1] < 0.4, alike
-    assert alike["d"][0] < 0.7, alike
+        one, second = in_common(tmp_path / f"{name}.tif", tmp_path / "b.tif")
+        similar[name] = np.corrcoef(one, second)[0, 1], np.sqrt(np.mean((one - second) ** 2)) / second.std()
+    assert similar["a"][0] > 0.9, similar
+    assert similar["a"][1] < 0.4, similar
+    assert similar["d"][0] < 0.7, similar
 
 
 @pytest.mark.thorough
@@ -135,10 +135,10 @@ def test_sensors_and_loops_make_a_graph(mitsonar: Command, drawn: Path, tmp_path
     done = mitsonar(*command)
     assert done.returncode == 0, done
     assert "sensors: gyroscope" in done.stdout
-    found = table(tmp_path / "out")
-    assert found["loops"] == 0
-    assert abs(found["heading error at the end"]) < 0.05
-    assert found["estimated standard deviation of the end"] > 0
+    result = table(tmp_path / "out")
+    assert result["loops"] == 0
+    assert abs(result["heading error at the end"]) < 0.05
+    assert result["estimated standard deviation of the end"] > 0
     assert (tmp_path / "out" / "loops.csv").exists()
     (tmp_path / "bad.csv").write_text("time_s,yaw_rate\n0,1\n")
     refused(mitsonar("odometry", drawn, "-o", tmp_path / "no", "--sensors", tmp_path / "bad.csv"), "yaw_rate_deg_s")
@@ -154,15 +154,15 @@ def test_frames_without_geometry_are_told_it(mitsonar: Command, tmp_path: Path) 
     frames.save(tmp_path / "known.npz")
     frames.poses = frames.height_m = None
     frames.save(tmp_path / "bare.npz")
-    told = ["--height", 2.5, "--pitch-deg", 35]
+    message = ["--height", 2.5, "--pitch-deg", 35]
     assert mitsonar("odometry", tmp_path / "known.npz", "-o", tmp_path / "known").returncode == 0
-    done = mitsonar("odometry", tmp_path / "bare.npz", "-o", tmp_path / "bare", *told, "--from", "1,-2,2.5,35,0,40")
+    done = mitsonar("odometry", tmp_path / "bare.npz", "-o", tmp_path / "bare", *message, "--from", "1,-2,2.5,35,0,40")
     assert done.returncode == 0, done
     assert not (tmp_path / "bare" / "true.tum").exists()
     same = [(tmp_path / name / "estimated.tum").read_bytes() for name in ("known", "bare")]
     assert same[0] == same[1]
     maps: list[NDArray[np.float32]] = []
-    for name, options in (("known", []), ("bare", []), ("bare", told)):
+    for name, options in (("known", []), ("bare", []), ("bare", message)):
         out = tmp_path / f"{len(maps)}.tif"
         done = mitsonar("mosaic", tmp_path / f"{name}.npz", tmp_path / name, "-o", out, "--cell-mm", 20, *options)
         assert done.returncode == 0, done
@@ -336,9 +336,9 @@ def test_odometry_and_mosaic_speak_the_convention_that_is_named(mitsonar: Comman
         )
         assert done.returncode == 0, done.stderr
     for ending in (".tif", "-true.tif"):
-        wanted, _ = bands(tmp_path / f"mitsonar{ending}")
+        expected, _ = bands(tmp_path / f"mitsonar{ending}")
         for frame in ("ros-enu", "ned"):
-            np.testing.assert_allclose(bands(tmp_path / f"{frame}{ending}")[0], wanted, atol=1e-3)
+            np.testing.assert_allclose(bands(tmp_path / f"{frame}{ending}")[0], expected, atol=1e-3)
     refused(
         mitsonar("mosaic", drawn, tmp_path / "ned" / "true.tum", "-o", tmp_path / "x.tif"),
         "is in the convention ned, but --frame is mitsonar",

@@ -95,9 +95,9 @@ def test_the_nearest_name_of_trained_things(mitsonar: Command, tmp_path: Path, t
 def test_commands_and_options_have_neighbours_too(mitsonar: Command, typed: str) -> None:
     done = mitsonar(*typed.split())
     assert done.returncode == 2
-    said = " ".join(done.stderr.replace("│", " ").split())
+    output = " ".join(done.stderr.replace("│", " ").split())
     assert any(
-        words in said
+        words in output
         for words in ("Did you mean 'render'?", "Did you mean 'make'?", "Did you mean 'rocky-field'", "--sonar")
     )
 
@@ -188,9 +188,9 @@ def test_printed_commands_can_be_pasted(mitsonar: Command, tmp_path: Path) -> No
 
 @pytest.mark.thorough
 def test_a_data_sets_command_is_quoted(mitsonar: Command, tmp_path: Path) -> None:
-    told = ["--sequences", 1, "--workers", 1, "--set", "sonar.beams=4", "--set", "sonar.range_bins=16"]
-    told += ["--set", "world={family: flat-objects, size_m: 20}", "--set", "flight.jump_m=null"]
-    done = mitsonar("dataset", "make", "rocky-field", "-o", tmp_path / "a b.zarr", *told)
+    message = ["--sequences", 1, "--workers", 1, "--set", "sonar.beams=4", "--set", "sonar.range_bins=16"]
+    message += ["--set", "world={family: flat-objects, size_m: 20}", "--set", "flight.jump_m=null"]
+    done = mitsonar("dataset", "make", "rocky-field", "-o", tmp_path / "a b.zarr", *message)
     assert done.returncode == 0, done.stderr
     assert shlex.split(done.stdout.partition("show it: ")[2]) == [
         "mitsonar",
@@ -283,9 +283,9 @@ def test_a_signal_ends_a_rendering_that_goes_on(number: signal.Signals, mitsonar
         while not list((tmp_path / "run").glob("frames.zarr/zarr.json")) and time.monotonic() < end:
             time.sleep(0.01)
         process.send_signal(number)
-        _, said = process.communicate(timeout=30)
+        _, output = process.communicate(timeout=30)
     assert process.returncode == 128 + number
-    assert said.splitlines()[-1] == f"stopped: {STAYS} with --resume continues"
+    assert output.splitlines()[-1] == f"stopped: {STAYS} with --resume continues"
     assert mitsonar(*words, "--resume", cwd=tmp_path).returncode == 0
 
 

@@ -36,8 +36,8 @@ def test_the_path_of_a_recording_is_that_of_its_sonar(recording: Path, mitsonar:
     done = mitsonar("odometry", recording, "-o", tmp_path / "path", "--height", 2.5, "--pitch-deg", 35, "--closure", 8)
     assert done.returncode == 0, done.stderr
     assert "closure over 8 motions, rms, forward" in done.stdout
-    found = Trajectory.load(tmp_path / "path" / "estimated.tum")
-    errors = motions(found.poses) - motions(sway(20).poses)
+    result = Trajectory.load(tmp_path / "path" / "estimated.tum")
+    errors = motions(result.poses) - motions(sway(20).poses)
     assert np.sqrt((errors**2).mean(axis=0))[:2].max() < 0.002
     assert np.degrees(np.sqrt((errors[:, 2] ** 2).mean())) < 0.05
     laid = mitsonar("mosaic", recording, tmp_path / "path", "-o", tmp_path / "map.png")

@@ -39,16 +39,16 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.thorough
 def test_a_folder_of_fans_becomes_a_path_and_a_mosaic(mitsonar: Command, pictures: Path, tmp_path: Path) -> None:
-    told = ["--geometry", str(pictures / "fan.yaml")]
-    made = mitsonar("odometry", pictures / "pictures", "-o", tmp_path / "path", "--estimator", "direct", *told)
-    assert made.returncode == 0, made.stderr
-    assert "warning" not in made.stdout + made.stderr
+    message = ["--geometry", str(pictures / "fan.yaml")]
+    built = mitsonar("odometry", pictures / "pictures", "-o", tmp_path / "path", "--estimator", "direct", *message)
+    assert built.returncode == 0, built.stderr
+    assert "warning" not in built.stdout + built.stderr
     rows = list(csv.DictReader((tmp_path / "path/motions.csv").open()))
-    found = np.array([[float(row[name]) for name in ("sideways_mm", "forward_mm", "yaw_deg")] for row in rows])
+    result = np.array([[float(row[name]) for name in ("sideways_mm", "forward_mm", "yaw_deg")] for row in rows])
     step = np.diff(sway(10).poses, axis=0)
-    assert np.degrees(step[:, 5]) == pytest.approx(found[:, 2], abs=0.02)
-    assert np.hypot(*step[:, :2].T) * 1e3 == pytest.approx(np.hypot(*found[:, :2].T), abs=1.0)
-    laid = mitsonar("mosaic", pictures / "pictures", tmp_path / "path", "-o", tmp_path / "map.png", *told)
+    assert np.degrees(step[:, 5]) == pytest.approx(result[:, 2], abs=0.02)
+    assert np.hypot(*step[:, :2].T) * 1e3 == pytest.approx(np.hypot(*result[:, :2].T), abs=1.0)
+    laid = mitsonar("mosaic", pictures / "pictures", tmp_path / "path", "-o", tmp_path / "map.png", *message)
     assert laid.returncode == 0, laid.stderr
     assert (tmp_path / "map.png").stat().st_size > 1000
 
@@ -57,7 +57,7 @@ def test_faults_are_one_sentence(mitsonar: Command, pictures: Path, tmp_path: Pa
     refused(mitsonar("odometry", pictures / "pictures", "-o", tmp_path / "a"), "give a geometry file", "--geometry FILE")
     bad = tmp_path / "bad.yaml"
     bad.write_text("layout: fan\nkx: 1.24\n")
-    told = ["--geometry", bad]
-    refused(mitsonar("odometry", pictures / "pictures", "-o", tmp_path / "a", *told), "unknown geometry key kx")
-    refused(mitsonar("mosaic", pictures, "true", "-o", tmp_path / "a.png", *told), "is not a recording of pictures")
+    message = ["--geometry", bad]
+    refused(mitsonar("odometry", pictures / "pictures", "-o", tmp_path / "a", *message), "unknown geometry key kx")
+    refused(mitsonar("mosaic", pictures, "true", "-o", tmp_path / "a.png", *message), "is not a recording of pictures")
     assert not (tmp_path / "a").exists()

@@ -45,17 +45,17 @@ def test_a_crop_keeps_bins_and_beams_with_their_axes(
         "recording", "convert", places[kind], "-o", tmp_path / "c", "--crop-bins", "20,84", "--crop-beams", "8,40"
     )
     assert done.returncode == 0, done
-    found, rows, columns = SonarFrames.load(tmp_path / "c" / "frames.npz"), slice(20, 84), slice(8, 40)
-    np.testing.assert_array_equal(found.image, frames.image[:, rows, columns])
-    np.testing.assert_allclose(found.range_m, frames.range_m[rows])
-    np.testing.assert_allclose(found.bearing_rad, frames.bearing_rad[columns], atol=1e-7)
-    assert (found.sonar.range_bins, found.sonar.beams) == (64, 32)
-    assert found.sonar.range_min == pytest.approx(frames.range_m[20] - 0.5 * np.diff(frames.range_m)[0], abs=1e-6)
+    result, rows, columns = SonarFrames.load(tmp_path / "c" / "frames.npz"), slice(20, 84), slice(8, 40)
+    np.testing.assert_array_equal(result.image, frames.image[:, rows, columns])
+    np.testing.assert_allclose(result.range_m, frames.range_m[rows])
+    np.testing.assert_allclose(result.bearing_rad, frames.bearing_rad[columns], atol=1e-7)
+    assert (result.sonar.range_bins, result.sonar.beams) == (64, 32)
+    assert result.sonar.range_min == pytest.approx(frames.range_m[20] - 0.5 * np.diff(frames.range_m)[0], abs=1e-6)
     if kind == "npz":
-        assert found.elevation_rad is not None
-        assert found.elevation_rad.shape == found.image.shape
-    other = ("recording", "convert", places[kind], "-o", tmp_path / "c", "--crop-bins", "20,84", "--crop-beams", "9,41")
-    refused(mitsonar(*other, "--resume"), "beams 8,40", "beams 9,41")
+        assert result.elevation_rad is not None
+        assert result.elevation_rad.shape == result.image.shape
+    second = ("recording", "convert", places[kind], "-o", tmp_path / "c", "--crop-bins", "20,84", "--crop-beams", "9,41")
+    refused(mitsonar(*second, "--resume"), "beams 8,40", "beams 9,41")
     whole = mitsonar("recording", "convert", places[kind], "-o", tmp_path / "w", "--crop-beams", "0,96")
     assert whole.returncode == 0
     assert SonarFrames.load(tmp_path / "w" / "frames.npz").sonar.azimuth_fov_deg <= frames.sonar.azimuth_fov_deg
@@ -65,9 +65,9 @@ def test_a_crop_keeps_bins_and_beams_with_their_axes(
 def test_info_of_any_frames(mitsonar: Command, places: dict[str, Path], frames: SonarFrames, kind: str) -> None:
     done = mitsonar("recording", "info", places[kind], "--json")
     assert done.returncode == 0, done
-    found = json.loads(done.stdout)
-    (part,) = found["parts"]
-    assert (found["frames"], part["bins"], part["beams"], part["samples"]) == (6, 128, 96, "float32")
+    result = json.loads(done.stdout)
+    (part,) = result["parts"]
+    assert (result["frames"], part["bins"], part["beams"], part["samples"]) == (6, 128, 96, "float32")
     assert part["window_m"] == [3.6, 5.4]
     assert part["rate_hz"] == pytest.approx(1 / np.median(np.diff(frames.time_s)))
     assert part["bearing_deg"] == pytest.approx(np.degrees(frames.bearing_rad[[0, -1]]))
@@ -159,8 +159,8 @@ def test_a_topic_is_chosen(mitsonar: Command, tmp_path: Path) -> None:
             sent.append((topic, time, maker.ping(image, time, bearing, distance)))
     path = write_bag(tmp_path / "two.bag", maker, sent)
     refused(mitsonar("recording", "info", path), "choose one of the topics /port, /starboard", "--topic")
-    found = json.loads(mitsonar("recording", "info", path, "--topic", "/starboard", "--json").stdout)
-    assert found["facts"]["topic"] == "/starboard"
+    result = json.loads(mitsonar("recording", "info", path, "--topic", "/starboard", "--json").stdout)
+    assert result["facts"]["topic"] == "/starboard"
 
 
 @pytest.mark.parametrize(

@@ -90,12 +90,12 @@ def test_without_options_one_frame_from_the_pose_in_the_scene(mitsonar: Command,
     done = mitsonar("render", scene, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     frames = SonarFrames.load(tmp_path / "out" / "floor")
-    found = sonar_in(load_scene(scene))
-    assert found is not None
+    result = sonar_in(load_scene(scene))
+    assert result is not None
     assert len(frames) == 1
     assert frames.poses is not None
-    np.testing.assert_allclose(frames.poses[0], np.array(found[1]))
-    same = Simulator(load_scene(scene)).render([found[1]])
+    np.testing.assert_allclose(frames.poses[0], np.array(result[1]))
+    same = Simulator(load_scene(scene)).render([result[1]])
     np.testing.assert_array_equal(frames.image, same.image)
     assert frames.level_scale == same.level_scale
 
@@ -127,13 +127,13 @@ def test_quality_and_numbers_of_rays_are_chosen_on_the_command_line(mitsonar: Co
         assert sonar is not None
         return sonar.quality, sonar.rays_per_beam, sonar.rays_across
 
-    told = rays()  # the scene's own numbers
+    message = rays()  # the scene's own numbers
     draft = Sonar(beams=16, quality="draft")
-    assert rays("--quality", "draft") == ("draft", draft.rays_per_beam, draft.rays_across) != told
+    assert rays("--quality", "draft") == ("draft", draft.rays_per_beam, draft.rays_across) != message
     assert rays("--set", "quality=draft") == rays("--quality", "draft")
     assert rays("--quality", "draft", "--set", "rays_per_beam=20") == ("draft", 20, draft.rays_across)
     assert rays("--set", "rays_per_beam=20", "--set", "rays_across=3")[1:] == (20, 3)
-    assert rays("--model", "thesis")[1:] == told[1:]
+    assert rays("--model", "thesis")[1:] == message[1:]
     refused(mitsonar("render", scene, "--quality", "fien"), "unknown quality 'fien': did you mean fine?")
     refused(mitsonar("render", scene, "--quality", "fine", "--model", "thesis"), "quality applies to the model physical")
     refused(mitsonar("render", scene, "--set", "rays_per_bem=20"), "did you mean rays_per_beam")
@@ -309,14 +309,14 @@ def test_scenes_that_take_long_are_hit_along_their_trajectory(name: str) -> None
     import mitsuba as mi
 
     scene, path = load_scene(name), Trajectory.load_tum(shipped_trajectory(name))
-    found = sonar_in(scene)
-    assert found is not None
-    poses = np.vstack([found[1], path.poses])
+    result = sonar_in(scene)
+    assert result is not None
+    poses = np.vstack([result[1], path.poses])
     ahead = to_world_matrices(poses)[:, :3, 2]
     rays = mi.Ray3f(mi.Point3f(*poses[:, :3].T.astype(np.float32)), mi.Vector3f(*ahead.T.astype(np.float32)))
     hits = scene.ray_intersect_preliminary(rays)
     away = np.where(np.array(hits.is_valid()), np.array(hits.t), np.inf)
-    assert ((away > found[0].range_min) & (away < found[0].range_max)).mean() > 0.9, away
+    assert ((away > result[0].range_min) & (away < result[0].range_max)).mean() > 0.9, away
 
 
 @pytest.mark.parametrize(
@@ -329,9 +329,9 @@ def test_scenes_that_take_long_are_hit_along_their_trajectory(name: str) -> None
 def test_shipped_scenes_render_and_have_a_trajectory_to_fly(name: str) -> None:
     path = Trajectory.load_tum(shipped_trajectory(name))
     scene = load_scene(name)
-    found = sonar_in(scene)
-    assert found is not None
-    frames = Simulator(scene).render([found[1], path.poses[len(path) // 2]], labels=True)
+    result = sonar_in(scene)
+    assert result is not None
+    frames = Simulator(scene).render([result[1], path.poses[len(path) // 2]], labels=True)
     assert frames.shape_id is not None
     lit = (frames.shape_id >= 0).mean(axis=(1, 2))  # noise and side lobes fill every pixel of a coherent image
     assert (lit > 0.05).all(), lit
@@ -343,11 +343,11 @@ def test_texture_parameter_of_the_pattern() -> None:
     images = []
     for texture in ("gaussian", "perlin_high", "perlin_low", "photo_sand", "photo_gravel", "photo_rock"):
         scene = load_scene("pattern", texture=texture)
-        found = sonar_in(scene)
-        assert found is not None
-        images.append(Simulator(scene, found[0].replace(rays_per_beam=100)).render([found[1]]).image)
+        result = sonar_in(scene)
+        assert result is not None
+        images.append(Simulator(scene, result[0].replace(rays_per_beam=100)).render([result[1]]).image)
     for index, image in enumerate(images):
-        assert all(not np.array_equal(image, other) for other in images[index + 1 :])
+        assert all(not np.array_equal(image, second) for second in images[index + 1 :])
     with pytest.raises(MitsonarError, match="mud"):
         load_scene("pattern", texture="mud")
 
@@ -395,10 +395,10 @@ def test_a_damaged_state_is_not_gone_on_with(scene: Path, tmp_path: Path) -> Non
     with pytest.raises(KeyboardInterrupt):
         run(simulator, path, options, Destination(tmp_path / "run", progress=killed))
     file = tmp_path / "run" / "run.json"
-    kept = file.read_text()
-    state = json.loads(kept)
+    stored = file.read_text()
+    state = json.loads(stored)
     assert 0 < state["frames_done"] < 3
-    for damage, said in (
+    for damage, output in (
         ({"frames_done": 4}, r"frames_done must be a whole number in 0\.\.3: got 4"),
         ({"frames_done": "1"}, "run frames_done: input should be a valid integer, got '1'"),
         ({"gain": 0.0}, "gain must be a finite number above 0"),
@@ -407,9 +407,9 @@ def test_a_damaged_state_is_not_gone_on_with(scene: Path, tmp_path: Path) -> Non
         ({"tally": None}, r"damaged \(run tally: input should be a valid dictionary, got None"),
     ):
         file.write_text(json.dumps(state | damage))
-        with pytest.raises(MitsonarError, match=said):
+        with pytest.raises(MitsonarError, match=output):
             run(simulator, path, options, Destination(tmp_path / "run", resume=True))
-    file.write_text(kept)
+    file.write_text(stored)
     run(simulator, path, options, Destination(tmp_path / "run", resume=True))
     run(simulator, path, options, Destination(tmp_path / "whole"))
     np.testing.assert_array_equal(SonarFrames.load(tmp_path / "run").image, SonarFrames.load(tmp_path / "whole").image)
@@ -419,13 +419,13 @@ def test_all_sensors_of_a_scene_in_one_run(mitsonar: Command, tmp_path: Path) ->
     """Each has its folder; a finished run is resumed for nothing; wrong pairs of options are one sentence."""
     second = SENSOR.replace('type="imaging_sonar"', 'type="imaging_sonar" id="down"').replace("0,3.57,0", "0,2,0")
     (tmp_path / "two.xml").write_text(f'<scene version="3.0.0">{DEFAULT}{SENSOR}{second}{FLOOR}</scene>')
-    asked = ("render", tmp_path / "two.xml", "--all-sensors", "--frames", 2, "-o", tmp_path / "out")
-    done = mitsonar(*asked)
+    arguments = ("render", tmp_path / "two.xml", "--all-sensors", "--frames", 2, "-o", tmp_path / "out")
+    done = mitsonar(*arguments)
     assert done.returncode == 0, done.stderr
     assert len(SonarFrames.load(tmp_path / "out" / "down")) == len(SonarFrames.load(tmp_path / "out" / "sensor0")) == 2
-    assert mitsonar(*asked, "--resume").returncode == 0
-    refused(mitsonar(*asked), "kept as it is")
-    refused(mitsonar(*asked, "--sonar", "didson300", "--overwrite"), "--sonar names one sonar")
+    assert mitsonar(*arguments, "--resume").returncode == 0
+    refused(mitsonar(*arguments), "kept as it is")
+    refused(mitsonar(*arguments, "--sonar", "didson300", "--overwrite"), "--sonar names one sonar")
 
 
 # ---------------------------------------------------------------- how fast, and how often
@@ -446,10 +446,21 @@ def test_speed_and_sweeps_are_as_asked_and_haste_is_told(mitsonar: Command, tmp_
 
 
 def test_pings_that_overlap_are_told(mitsonar: Command, tmp_path: Path) -> None:
-    asked = ("--sonar", "didson300", "--from", "0,0,2,30,0,0", "--frames", 2, "--model", "physical", "--quality", "draft")
-    done = mitsonar("render", "flat_floor", *asked, "--set", "ping_groups=8", "-o", tmp_path / "o")
+    arguments = (
+        "--sonar",
+        "didson300",
+        "--from",
+        "0,0,2,30,0,0",
+        "--frames",
+        2,
+        "--model",
+        "physical",
+        "--quality",
+        "draft",
+    )
+    done = mitsonar("render", "flat_floor", *arguments, "--set", "ping_groups=8", "-o", tmp_path / "o")
     assert "they overlap, which no instrument can do; lower frame_rate_hz to 16.7" in done.stderr
-    kept = mitsonar("render", "flat_floor", *asked, "--set", "ping_groups=8", "-o", tmp_path / "o", "--resume")
-    assert "they overlap" in kept.stderr
+    stored = mitsonar("render", "flat_floor", *arguments, "--set", "ping_groups=8", "-o", tmp_path / "o", "--resume")
+    assert "they overlap" in stored.stderr
     slower = ("--set", "ping_groups=8", "--set", "frame_rate_hz=16")
-    assert "overlap" not in mitsonar("render", "flat_floor", *asked, *slower, "-o", tmp_path / "p").stderr
+    assert "overlap" not in mitsonar("render", "flat_floor", *arguments, *slower, "-o", tmp_path / "p").stderr

@@ -30,9 +30,9 @@ def test_each_instrument_writes_what_it_promises(mitsonar: Command, tmp_path: Pa
     done = mitsonar("sound", "flat_floor", "--instrument", instrument, *PATH, "-o", out)
     assert done.returncode == 0, done.stderr
     assert {one.name for one in out.iterdir()} == FILES[instrument] | {"run.json"}
-    found = Soundings.load(out / "soundings.npz")
-    assert len(found) == 4
-    assert found.found.any()
+    result = Soundings.load(out / "soundings.npz")
+    assert len(result) == 4
+    assert result.found.any()
     if instrument in ("sidescan", "altimeter"):
         assert Echogram.load(out / "echogram.npz").levels.max() > 0
     if instrument == "dvl":
@@ -41,11 +41,11 @@ def test_each_instrument_writes_what_it_promises(mitsonar: Command, tmp_path: Pa
 
 def test_a_finished_run_is_kept(mitsonar: Command, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    asked = ("sound", "flat_floor", "--instrument", "altimeter", *PATH, "-o", out)
-    assert mitsonar(*asked).returncode == 0
+    arguments = ("sound", "flat_floor", "--instrument", "altimeter", *PATH, "-o", out)
+    assert mitsonar(*arguments).returncode == 0
     before = (out / "soundings.npz").read_bytes()
-    refused(mitsonar(*asked), "exists")
-    again = mitsonar(*asked, "--resume")
+    refused(mitsonar(*arguments), "exists")
+    again = mitsonar(*arguments, "--resume")
     assert again.returncode == 0, again.stderr
     assert (out / "soundings.npz").read_bytes() == before
 
@@ -76,8 +76,8 @@ def test_a_body_moves_and_a_run_tells_where(mitsonar: Command, tmp_path: Path) -
     )
     poses = np.array([[-0.5, 3.5, 0.4, 0, 0, 0], [0.5, 3.5, 0.4, 0, 0, 0]], dtype=float)
     Trajectory(poses, np.array([0.0, 0.4])).save(tmp_path / "ball.tum")
-    asked = ("render", scene, "--frames", 5, "--labels", "--moving", f"ball={tmp_path / 'ball.tum'}", "-o", out)
-    done = mitsonar(*asked)
+    arguments = ("render", scene, "--frames", 5, "--labels", "--moving", f"ball={tmp_path / 'ball.tum'}", "-o", out)
+    done = mitsonar(*arguments)
     assert done.returncode == 0, done.stderr
     frames = SonarFrames.load(out)
     assert frames.body_names == ("ball",)
@@ -94,15 +94,26 @@ def test_a_body_moves_and_a_run_tells_where(mitsonar: Command, tmp_path: Path) -
 def test_frames_that_take_time_are_read_and_followed(mitsonar: Command, tmp_path: Path) -> None:
     """The file keeps a time and a pose for each beam; odometry and conversions take the middle of each frame."""
     run, out = tmp_path / "run", tmp_path / "path"
-    asked = ("--trajectory", "shipped", "--frames", 3, "--model", "physical", "--quality", "draft", "--set", "ping_groups=8")
-    assert mitsonar("render", "flat_floor", *asked, "-o", run).returncode == 0
-    kept = SonarFrames.load(run)
-    assert kept.time_s.shape == (3, 96)
-    assert kept.beam_poses is not None
-    assert kept.beam_poses.shape == (3, 96, 6)
+    arguments = (
+        "--trajectory",
+        "shipped",
+        "--frames",
+        3,
+        "--model",
+        "physical",
+        "--quality",
+        "draft",
+        "--set",
+        "ping_groups=8",
+    )
+    assert mitsonar("render", "flat_floor", *arguments, "-o", run).returncode == 0
+    stored = SonarFrames.load(run)
+    assert stored.time_s.shape == (3, 96)
+    assert stored.beam_poses is not None
+    assert stored.beam_poses.shape == (3, 96, 6)
     read = load_frames(run)
-    np.testing.assert_allclose(read.time_s, kept.time_s.mean(axis=1))
-    np.testing.assert_array_equal(read.image, kept.image)
+    np.testing.assert_allclose(read.time_s, stored.time_s.mean(axis=1))
+    np.testing.assert_array_equal(read.image, stored.image)
     done = mitsonar("odometry", run, "--estimator", "zero", "-o", out)
     assert done.returncode == 0, done.stderr
     done = mitsonar("recording", "convert", run, "-o", tmp_path / "again")

@@ -14,10 +14,10 @@ from mitsonar.motion.bodies import BodyMotion, files_of, read_motions
 def test_a_path_or_keys(tmp_path: Path) -> None:
     file = tmp_path / "moving.yaml"
     file.write_text("fish: fish.tum\nray: {path: ray.tum, meshes: ray/*.ply, rate_hz: 5, loop: false}\nhull: vehicle\n")
-    found = read_motions(file)
-    assert found["fish"] == BodyMotion(path="fish.tum")
-    assert found["ray"] == BodyMotion(path="ray.tum", meshes="ray/*.ply", rate_hz=5, loop=False)
-    assert found["hull"].path == "vehicle"
+    result = read_motions(file)
+    assert result["fish"] == BodyMotion(path="fish.tum")
+    assert result["ray"] == BodyMotion(path="ray.tum", meshes="ray/*.ply", rate_hz=5, loop=False)
+    assert result["hull"].path == "vehicle"
 
 
 def test_patterns_are_in_the_order_of_names(tmp_path: Path) -> None:

@@ -57,10 +57,10 @@ def test_shipped_recipes_hold_the_thesis_s_numbers(name: str) -> None:
         assert recipe.mount.pitch_deg == 35
         assert flight.heights == (2.5, 2.5)
         assert (sonar.range_min, sonar.range_max) == (3.2, 5.6)
-    own = next((model for model in ("physical", "coherent") if name.endswith(model)), None)
-    assert sonar.model == (own or "thesis")
-    assert (recipe.split.by == "scene") == (own is not None)
-    if own == "physical":
+    local = next((model for model in ("physical", "coherent") if name.endswith(model)), None)
+    assert sonar.model == (local or "thesis")
+    assert (recipe.split.by == "scene") == (local is not None)
+    if local == "physical":
         assert sonar.jittered
         assert sonar.rays_across > 1
         assert sonar.beam_width_rad == sonar.beam_spacing_rad

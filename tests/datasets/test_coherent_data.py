@@ -25,8 +25,8 @@ SONAR = {
 
 def coherent_recipe() -> Recipe:
     """A few pings over two scenes of rocks."""
-    made: Recipe = tiny_recipe(sonar=SONAR)
-    return made
+    result: Recipe = tiny_recipe(sonar=SONAR)
+    return result
 
 
 @pytest.mark.thorough

@@ -63,15 +63,15 @@ def test_impulse_responses_are_refused_likewise(tmp_path: Path) -> None:
 def test_empty_frames_are_warned_of_and_are_faults(tmp_path: Path, kind: str) -> None:
     """Two balls far away: that the ground between them is small is not known before it is rendered."""
     recipe = own_scene(scene_file(tmp_path, 3.0, -20.0, 20.0), 40.0, gain=1.0, store=kind)
-    made = make_dataset(recipe, str(tmp_path / "x.zarr"))
+    result = make_dataset(recipe, str(tmp_path / "x.zarr"))
     store = DataStore.open(tmp_path / "x.zarr")
     names = {"images": ["image"], "vectors": ["vector"], "both": ["image", "vector"]}[kind]
     empty = np.all([~store.read(name).reshape(24, -1).any(axis=1) for name in names], axis=0)
     assert 0 < empty.sum() <= 24
-    wanted = f"{empty.sum()} of 24 frames are empty, without a single echo ({np.flatnonzero(empty)[0]}"
-    assert sum(sentence.startswith(wanted) for sentence in made.warnings) == 1
-    assert "check world.size_m" in next(sentence for sentence in made.warnings if sentence.startswith(wanted))
-    assert [fault.startswith(wanted) for fault in check(store)] == [True]
+    expected = f"{empty.sum()} of 24 frames are empty, without a single echo ({np.flatnonzero(empty)[0]}"
+    assert sum(sentence.startswith(expected) for sentence in result.warnings) == 1
+    assert "check world.size_m" in next(sentence for sentence in result.warnings if sentence.startswith(expected))
+    assert [fault.startswith(expected) for fault in check(store)] == [True]
 
 
 def test_the_command_line_says_so(mitsonar: Command, tmp_path: Path) -> None:
@@ -99,6 +99,6 @@ def test_a_recipe_that_states_its_window_means_it(stated: bool, share: float, wa
     recipe = tiny_recipe(sonar={**TINY["sonar"], **window})
     rays = recipe.instrument.rays
     table = {"dropped": np.full(4, round(share * rays)), "saturated": np.zeros(4, dtype=int)}
-    found = ImageModality(recipe).warnings(lambda name: table[name])
-    assert bool(found) == bool(warned)
-    assert all(warned in text and "set sonar.range_min" in text for text in found)
+    result = ImageModality(recipe).warnings(lambda name: table[name])
+    assert bool(result) == bool(warned)
+    assert all(warned in text and "set sonar.range_min" in text for text in result)

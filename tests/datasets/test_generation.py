@@ -175,8 +175,8 @@ def test_every_kind_of_data_set_is_made_and_checks(name: str, tmp_path: Path) ->
             assert np.abs(np.degrees(arrays["elevation_rad"][filled])).max() <= 7
             assert (arrays["object_id"][filled] > 0).any()
         case "vectors":
-            other = tiny_recipe(scenes=[{"count": 1, "sequences": 10}], pixel="float32")
-            make_dataset(other, str(tmp_path / "images.zarr"))
+            second = tiny_recipe(scenes=[{"count": 1, "sequences": 10}], pixel="float32")
+            make_dataset(second, str(tmp_path / "images.zarr"))
             image = DataStore.open(tmp_path / "images.zarr").read("image")
             np.testing.assert_allclose(arrays["vector"], image.sum(axis=2, dtype=float), rtol=1e-6)
             np.testing.assert_array_equal(arrays["nonzero"], np.count_nonzero(image, axis=2))
@@ -327,15 +327,15 @@ def test_nothing_stays_of_what_cannot_be_made(tmp_path: Path) -> None:
 
 def test_what_only_looks_right_is_warned_of(tmp_path: Path) -> None:
     """Metres given as millimetres; a split without a training part is none of it."""
-    made = make_dataset(
+    result = make_dataset(
         tiny_recipe(
             flight__sideways_mm=0.02, flight__forward_mm=0.02, split={"by": "scene", "train": 0, "validation": 0, "test": 1}
         ),
         str(tmp_path / "still.zarr"),
         sequences=2,
     )
-    assert [sentence for sentence in made.warnings if "in millimetres" in sentence]
-    assert not [sentence for sentence in made.warnings if "split" in sentence]
+    assert [sentence for sentence in result.warnings if "in millimetres" in sentence]
+    assert not [sentence for sentence in result.warnings if "split" in sentence]
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3, 7])
@@ -345,13 +345,13 @@ def test_workers_go_on_where_they_are(workers: int) -> None:
     rng = np.random.default_rng(workers)
     speed = rng.uniform(0.5, 2, workers)
     ready = np.zeros(workers)
-    made: dict[str, list[int]] = {str(number): [] for number in range(workers)}
+    result: dict[str, list[int]] = {str(number): [] for number in range(workers)}
     while queue:
         number = int(ready.argmin())
-        made[str(number)].append(queue.next(str(number)))
+        result[str(number)].append(queue.next(str(number)))
         ready[number] += rng.uniform(0.8, 1.2) / speed[number]
-    assert sorted(shard for mine in made.values() for shard in mine) == list(range(100))
-    moves = sum(int((np.diff(mine) != 1).sum()) for mine in made.values())
+    assert sorted(shard for mine in result.values() for shard in mine) == list(range(100))
+    moves = sum(int((np.diff(mine) != 1).sum()) for mine in result.values())
     assert moves <= 4 * (workers - 1)
 
 
@@ -409,8 +409,8 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
         )
         _wait(lambda: any((tmp_path / "tiny.zarr" / "seal" / "c").glob("*/*/*")), 150)
         workers[0].kill()
-        _, said = making.communicate(timeout=180)
-        assert making.returncode == 0, said
+        _, output = making.communicate(timeout=180)
+        assert making.returncode == 0, output
     finally:
         for process in [*workers, scheduler]:
             process.kill()
@@ -464,20 +464,20 @@ def test_killed_at_ten_random_moments_and_finished_it_is_the_unbroken_one(made: 
     """kill -9, whatever it is doing; then the same command is repeated until it finishes."""
     rng = np.random.default_rng(int(os.environ.get("MITSONAR_KILL_SEED", "1")))
     arguments, url = command(tmp_path, "--workers", 1), tmp_path / "tiny.zarr"
-    kept: list[dict[str, float]] = []
+    stored: list[dict[str, float]] = []
     for moment in rng.uniform(0.8, 3.2, 10):
         process = subprocess.Popen([*PROGRAM, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(moment)
         process.send_signal(signal.SIGKILL)
         process.wait()
-        kept.append({str(path): path.stat().st_mtime_ns for path in url.glob("seal/c/*/*/*")})
+        stored.append({str(path): path.stat().st_mtime_ns for path in url.glob("seal/c/*/*/*")})
     done = by_itself(*arguments)
     assert done.returncode == 0, done.stderr
     assert files_of(url) == files_of(made)
-    for before, after in zip(kept, [*kept[1:], kept[-1]], strict=True):
+    for before, after in zip(stored, [*stored[1:], stored[-1]], strict=True):
         assert before.items() <= after.items()  # nothing whole is made twice
     last = {str(path): path.stat().st_mtime_ns for path in url.glob("seal/c/*/*/*")}
-    assert kept[-1].items() <= last.items()
+    assert stored[-1].items() <= last.items()
 
 
 def test_stopped_between_the_last_file_and_its_seal(made: Path, tmp_path: Path) -> None:
@@ -788,12 +788,12 @@ def test_a_writer_that_was_taken_over_stops(bucket: str, monkeypatch: pytest.Mon
     place = Storage(f"{bucket}/stalled.zarr")
     with place.locked() as still_ours:
         still_ours()
-        other = json.dumps({"owner": "other 1 x", "time": time.time()}).encode()
-        place.write("writer.json", other)
+        second = json.dumps({"owner": "other 1 x", "time": time.time()}).encode()
+        place.write("writer.json", second)
         time.sleep(1.0)
         with pytest.raises(MitsonarError, match="has taken over"):
             still_ours()
-    assert place.read("writer.json") == other
+    assert place.read("writer.json") == second
     place.remove("writer.json")
 
 
@@ -853,11 +853,11 @@ def test_commands_answer_mistakes(mitsonar: Command, made: Path, tmp_path: Path)
 
 @pytest.mark.thorough
 def test_worlds_from_the_command_line(mitsonar: Command, tmp_path: Path) -> None:
-    made = mitsonar(
+    result = mitsonar(
         "world", "rocky-field", "--size-m", 4, "--a-side", "2,3", "--rotation-deg", "-10,10", "-o", tmp_path / "w"
     )
-    assert made.returncode == 0, made.stderr
-    assert "triangles in" in made.stdout
+    assert result.returncode == 0, result.stderr
+    assert "triangles in" in result.stdout
     rendered = mitsonar("render", tmp_path / "w" / "scene.xml", "-o", tmp_path / "run")
     assert rendered.returncode == 0, rendered.stderr
     refused(mitsonar("world", "rocky-field", "-o", tmp_path / "w"), "kept as it is")

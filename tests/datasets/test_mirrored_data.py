@@ -48,8 +48,8 @@ MODELS: dict[str, dict[str, Any]] = {
 
 def mirrored_recipe(model: str, **changes: Any) -> Recipe:
     """A few pings of ground and surface."""
-    made: Recipe = tiny_recipe(**{**SEEN, **MODELS[model], **changes})
-    return made
+    result: Recipe = tiny_recipe(**{**SEEN, **MODELS[model], **changes})
+    return result
 
 
 def simulator_of(store: DataStore, folder: Path, **options: Any) -> Simulator:
@@ -82,17 +82,17 @@ def test_re_rendering_and_bounds_use_the_mirrors_of_the_data_set(tmp_path: Path)
     subject = subject_of_data(url, 1, part="all")
     noise = load_noise("low")
     options = BoundOptions(noise="low", pings=2)
-    (found,) = bounds_of_subject(subject, options, None, lambda poses: None)["image", "image", "pixel"]
+    (result,) = bounds_of_subject(subject, options, None, lambda poses: None)["image", "image", "pixel"]
     place = next(subject.places())
     for mirrors, same in ((subject.mirrors, True), (None, False)):
         simulator = Simulator(place.scene, subject.sonar, mirrors=mirrors)
         gain = subject.gain
         assert gain is not None
         (bounds,) = bounds_at(simulator, place.poses, noise, gain, pings=2)
-        other = bounds["image", "image", "pixel"]
-        assert found is not None
-        assert other is not None
-        assert np.array_equal(found.information, other.information) == same
+        second = bounds["image", "image", "pixel"]
+        assert result is not None
+        assert second is not None
+        assert np.array_equal(result.information, second.information) == same
 
 
 def test_frames_that_are_rendered_in_training_have_mirrors() -> None:
@@ -119,8 +119,8 @@ def test_responses_are_those_of_the_simulator_with_mirrors(direct: bool, tmp_pat
     path, _ = recipe.family(scene.group).prepare(scene.seed, tmp_path / "world")
     simulator = ChannelSimulator(load_scene(path), recipe.channel_sonar, mirrors={"surface": (-1.0, 1e-4)})
     assert "surface-scatterer" in simulator.ways
-    made = list(simulator.pings(store.read("pose"), store.read("velocity")))
-    np.testing.assert_array_equal(store.read("response"), np.concatenate([part.response for part in made]))
+    result = list(simulator.pings(store.read("pose"), store.read("velocity")))
+    np.testing.assert_array_equal(store.read("response"), np.concatenate([part.response for part in result]))
 
 
 @pytest.mark.parametrize(

@@ -46,13 +46,13 @@ def moving_recipe(folder: Path, **changes: Any) -> Recipe:
     for name, places in (("fish", (begin, begin + 10 * SPEED)), ("buoy", ([3, 3, 1], [3, 3, 1]))):
         rows = [",".join(map(str, (time, *place, 0, 0, 0))) for time, place in zip((0, 10), places, strict=True)]
         (folder / f"{name}.csv").write_text("\n".join(["time_s,x_m,y_m,z_m,pitch_deg,roll_deg,heading_deg", *rows]))
-    made: Recipe = tiny_recipe(
+    result: Recipe = tiny_recipe(
         world={"family": "scene", "file": str(folder / "tank.xml"), "size_m": 12.0},
         scenes=[{"count": 1, "sequences": 12}],
         labels=["shape_id", "object_id"],
         **{**SEEN, **changes},
     )
-    return made
+    return result
 
 
 def test_bodies_are_where_their_trajectories_say(tmp_path: Path) -> None:

@@ -110,13 +110,13 @@ def test_a_small_data_set_is_the_beginning_of_each_scene_of_a_large_one() -> Non
 
 def test_sequences_are_spread_in_proportion() -> None:
     recipe = load_recipe("rocky-field")
-    for wanted, scenes in ((40_000, 30), (400, 30), (200, 20), (25, 2), (7, 1), (1, 1)):
-        found = scenes_of(recipe, wanted)
-        assert sum(scene.sequences for scene in found) == wanted
-        assert len(found) == scenes
-        own = [1000 if scene.number < 10 else 1500 for scene in found]
-        share = wanted * np.array(own) / sum(own)
-        assert np.abs([scene.sequences for scene in found] - share).max() <= 1
+    for expected, scenes in ((40_000, 30), (400, 30), (200, 20), (25, 2), (7, 1), (1, 1)):
+        result = scenes_of(recipe, expected)
+        assert sum(scene.sequences for scene in result) == expected
+        assert len(result) == scenes
+        local = [1000 if scene.number < 10 else 1500 for scene in result]
+        share = expected * np.array(local) / sum(local)
+        assert np.abs([scene.sequences for scene in result] - share).max() <= 1
     assert len({scene.seed for scene in scenes_of(recipe, 40_000)}) == 30
     for wrong in (0, 40_001):
         with pytest.raises(MitsonarError, match="40,000 sequences"):
@@ -146,8 +146,8 @@ def test_runs_over_the_pattern() -> None:
     legs, diagonal, turn = (run_poses(name, 2.5) for name in ("legs", "diagonal", "turn"))
     assert (len(legs), len(diagonal), len(turn)) == (950, 300, 300)
     ends = legs[[0, 249, 349, 599, 699, 949], :2]
-    wanted = np.array([[5, 0], [0, 1.2], [-5, 0], [0, 1.1], [5, 0]])
-    np.testing.assert_allclose(np.diff(ends, axis=0), wanted, atol=1e-9)
+    expected = np.array([[5, 0], [0, 1.2], [-5, 0], [0, 1.1], [5, 0]])
+    np.testing.assert_allclose(np.diff(ends, axis=0), expected, atol=1e-9)
     steps = np.linalg.norm(np.diff(legs[:, :2], axis=0), axis=1)
     assert steps.max() < 0.0202
     np.testing.assert_allclose(diagonal[-1] - diagonal[0], [5, 2.3, 0, 0, 0, 0], atol=1e-9)

@@ -118,9 +118,9 @@ def test_receivers_that_hear_nothing_and_echoes_from_too_far_are_told(tmp_path: 
         channel={"receivers": [{"name": "low", "field": {"tilt_deg": 40.0}}, up], "range_max": 4.5},
         split={"by": "sequence"},
     )
-    said = " ".join(make_dataset(recipe, str(tmp_path / "data.zarr")).warnings)
-    assert "receiver up records no echo in 3 of 3 pings" in said
-    assert re.search(r"came from beyond range_max 4\.5 m", said)
+    output = " ".join(make_dataset(recipe, str(tmp_path / "data.zarr")).warnings)
+    assert "receiver up records no echo in 3 of 3 pings" in output
+    assert re.search(r"came from beyond range_max 4\.5 m", output)
 
 
 # ---------------------------------------------------------------- the plan
@@ -226,10 +226,10 @@ def test_recipes_are_the_rows_of_the_table() -> None:
         turning = load_recipe(name)
         assert turning.flight.yaw_deg * (turning.flight.pings - 1) == pytest.approx(0.45)
         assert turning.channel_sonar.model == "scatterers"  # ours
-        own = {"flight": 0, "name": 0, "about": 0, "channel": 0}
-        other = load_recipe(still, {"channel.model": "scatterers"})
-        assert {**turning.model_dump(), **own} == {**other.model_dump(), **own}
-        assert turning.channel_sonar.model_dump(exclude={"name"}) == other.channel_sonar.model_dump(exclude={"name"})
+        local = {"flight": 0, "name": 0, "about": 0, "channel": 0}
+        second = load_recipe(still, {"channel.model": "scatterers"})
+        assert {**turning.model_dump(), **local} == {**second.model_dump(), **local}
+        assert turning.channel_sonar.model_dump(exclude={"name"}) == second.channel_sonar.model_dump(exclude={"name"})
 
 
 @pytest.mark.parametrize(
@@ -334,8 +334,8 @@ def test_noise_belongs_to_seed_and_ping(made: Path) -> None:
     np.testing.assert_array_equal(samples.responses(3).response, samples.responses(3).response)
     parts = {part.tobytes() for part in noise.reshape(12, -1)}
     assert len(parts) == 12
-    other = ImpulseSamples(made, part="all", noise="10 dB", seed=5).responses(3).response
-    assert not np.array_equal(other, samples.responses(3).response)
+    second = ImpulseSamples(made, part="all", noise="10 dB", seed=5).responses(3).response
+    assert not np.array_equal(second, samples.responses(3).response)
     levels = Packing(("a",), (None, 0.0))
     one = np.ones((2, 1, 9), np.complex64)
     changed = [not np.array_equal(levels.received(one, [number, number + 1], 0), one) for number in range(60)]
@@ -394,10 +394,10 @@ def test_estimators_are_compared_on_its_samples(mitsonar: Command, straight: Pat
     for table in tables:
         samples = ImpulseSamples(straight, part="all", noise=table["noise"], seed=3, one_a_sequence=True)
         answers = [create_estimator("correlation").estimate(samples.responses(k)) for k in range(len(samples))]
-        said = np.array([one.motion[:2] if one.valid else (0, 0) for one in answers])
-        wanted = 1e3 * np.sqrt(((said - samples.targets()) ** 2).mean(axis=0))
+        output = np.array([one.motion[:2] if one.valid else (0, 0) for one in answers])
+        expected = 1e3 * np.sqrt(((output - samples.targets()) ** 2).mean(axis=0))
         row = next(row for row in table["rows"] if row["method"] == "correlation")
-        np.testing.assert_allclose(row["rmse"][:2], wanted, rtol=1e-9)
+        np.testing.assert_allclose(row["rmse"][:2], expected, rtol=1e-9)
     refused(mitsonar("compare", straight, "--part", "all", "--perturb"), "for data sets of images")
     refused(mitsonar("odometry", straight, "-o", tmp_path / "path", "--estimator", "correlation"), "of impulse responses")
 
@@ -430,9 +430,9 @@ def test_turned_features_keep_distances() -> None:
     rng = np.random.default_rng(6)
     train, test = rng.normal(size=(9, 40)) + 3, rng.normal(size=(4, 40))
     turned = Turned().fit(train)
-    one, other = turned.transform(train), turned.transform(test)
+    one, second = turned.transform(train), turned.transform(test)
     assert one.shape == (9, 10)
-    for a, b, wide_a, wide_b in ((one, one, train, train), (other, one, test, train)):
+    for a, b, wide_a, wide_b in ((one, one, train, train), (second, one, test, train)):
         near, far = (np.linalg.norm(x[:, None] - y[None], axis=2) for x, y in ((a, b), (wide_a, wide_b)))
         np.testing.assert_allclose(near, far, atol=1e-6)
 

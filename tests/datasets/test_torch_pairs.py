@@ -64,8 +64,8 @@ def test_a_sample_is_consecutive_frames_and_the_motion_between_them(made: Path) 
         here, there = Pose(*pose[first]), Pose(*pose[first + 1])
         east, north = there.x - here.x, there.y - here.y
         sin, cos = np.sin(there.heading), np.cos(there.heading)
-        wanted = [east * cos - north * sin, east * sin + north * cos, there.heading - here.heading]
-        np.testing.assert_allclose(label, np.array(wanted, dtype=np.float32), atol=1e-8)
+        expected = [east * cos - north * sin, east * sin + north * cos, there.heading - here.heading]
+        np.testing.assert_allclose(label, np.array(expected, dtype=np.float32), atol=1e-8)
 
 
 def test_three_frames_have_the_mean_motion_and_one_its_height(made: Path) -> None:
@@ -102,8 +102,8 @@ def test_shapes_of_almanza_medina(frames: int, kind: str) -> None:
     (view,) = recipe.views
 
     def shape(**words: Any) -> tuple[Any, ...]:
-        made = arrangement_of(recipe, **words)({view.name: batch}, order, 0)
-        return tuple(part.shape for part in made) if isinstance(made, tuple) else tuple(made.shape)
+        result = arrangement_of(recipe, **words)({view.name: batch}, order, 0)
+        return tuple(part.shape for part in result) if isinstance(result, tuple) else tuple(result.shape)
 
     assert shape() == (4, 1, 512, 96 * frames)
     assert shape(layout="stack") == (4, 1, 512 * frames, 96)
@@ -125,8 +125,8 @@ def test_cartesian_is_the_scan_conversion_of_geometry(made: Path) -> None:
     (polar, fan), _ = SonarPairs(made, part="all", coordinates="both", layout="channels", cartesian_rows=60)[11]
     sonar = tiny_recipe().instrument
     for q in range(2):
-        wanted = to_cartesian(polar[q].numpy(), sonar.range_m, sonar.bearing_rad, rows=60).image
-        np.testing.assert_allclose(fan[q], np.nan_to_num(wanted), atol=1e-6)
+        expected = to_cartesian(polar[q].numpy(), sonar.range_m, sonar.bearing_rad, rows=60).image
+        np.testing.assert_allclose(fan[q], np.nan_to_num(expected), atol=1e-6)
     assert fan.max() > 0.1
 
 
@@ -235,9 +235,9 @@ def test_no_image_and_by_scene_no_world_is_in_two_parts(made: Path, by: str) -> 
     assert set.union(*numbers.values()) == frames_in(SonarPairs(made, part="all"))
     images = SonarPairs(made, part="all").store.read("image")
     seen = {part: {images[number].tobytes() for number in mine} for part, mine in numbers.items()}
-    for one, other in itertools.combinations(parts, 2):
-        assert not seen[one] & seen[other], f"{one} and {other} share an image"
-        shared = set(parts[one].scene[parts[one].first]) & set(parts[other].scene[parts[other].first])
+    for one, second in itertools.combinations(parts, 2):
+        assert not seen[one] & seen[second], f"{one} and {second} share an image"
+        shared = set(parts[one].scene[parts[one].first]) & set(parts[second].scene[parts[second].first])
         assert bool(shared) == (by == "sequence")
     assert len({scene.seed for scene in parts["train"].store.scenes.values()}) == 3
     if by == "sequence":
@@ -270,9 +270,9 @@ def test_scenes_of_one_world_stay_together(tmp_path: Path) -> None:
     )
     make_dataset(recipe, str(tmp_path / "photo.zarr"))
     split = Split(by="scene", train=0.5, validation=0.3, test=0.2)
-    found = [set(pairs.scene[pairs.first]) for pairs in parts_of(tmp_path / "photo.zarr", split)]
-    assert sorted(map(len, found)) == [1, 1, 2]
-    assert {0, 1} in found
+    result = [set(pairs.scene[pairs.first]) for pairs in parts_of(tmp_path / "photo.zarr", split)]
+    assert sorted(map(len, result)) == [1, 1, 2]
+    assert {0, 1} in result
     one = make_dataset(tiny_recipe(world=world, split={"by": "scene"}), str(tmp_path / "one.zarr"))
     assert any("too few for train 95%" in sentence for sentence in one.warnings)
     with pytest.raises(MitsonarError, match="1 different scene, too few"):
@@ -290,9 +290,9 @@ def test_parts_do_not_depend_on_the_seed_of_noise_and_order(made: Path) -> None:
         np.testing.assert_array_equal(
             SonarPairs(made, split="scene", seed=seed).first, SonarPairs(made, split="scene").first
         )
-    other = Split(by="sequence", train=0.5, validation=0.5, seed=3)
+    second = Split(by="sequence", train=0.5, validation=0.5, seed=3)
     same = Split(by="sequence", train=0.5, validation=0.5)
-    assert not np.array_equal(SonarPairs(made, split=other).first, SonarPairs(made, split=same).first)
+    assert not np.array_equal(SonarPairs(made, split=second).first, SonarPairs(made, split=same).first)
 
 
 def test_parts_that_are_not_there_are_refused(made: Path) -> None:

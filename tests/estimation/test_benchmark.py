@@ -107,7 +107,7 @@ def test_all_methods_get_the_same_pairs_and_failures_count(pairs: SonarPairs) ->
 
 
 def test_what_is_told_wrongly_is_what_the_row_says(pairs: SonarPairs) -> None:
-    told = {number: frames for number, frames in frames_of(pairs, [0, 1], "as told")}
+    message = {number: frames for number, frames in frames_of(pairs, [0, 1], "as told")}
     changes: dict[str, Callable[[SonarFrames], np.float64]] = {
         "height 5 %": lambda f: np.asarray(f.height_m)[0],
         "pitch 1 deg": lambda f: np.degrees(np.asarray(f.poses)[0, 3]),
@@ -116,11 +116,11 @@ def test_what_is_told_wrongly_is_what_the_row_says(pairs: SonarPairs) -> None:
     }
     for variation, change in changes.items():
         for number, frames in frames_of(pairs, [0, 1], variation):
-            was, became = change(told[number]), change(frames)
+            was, became = change(message[number]), change(frames)
             size = became / was - 1 if "%" in variation else became - was
-            wanted = (1 if number % 2 == 0 else -1) * (float(variation.split()[-2]) / (100 if "%" in variation else 1))
-            assert size == pytest.approx(wanted), variation
-            assert (frames.image == told[number].image).all()
+            expected = (1 if number % 2 == 0 else -1) * (float(variation.split()[-2]) / (100 if "%" in variation else 1))
+            assert size == pytest.approx(expected), variation
+            assert (frames.image == message[number].image).all()
     assert {"heave 5 mm", "jitter", "as told"} < set(VARIATIONS)
 
 
@@ -129,19 +129,19 @@ def test_compare_in_python_is_the_table_of_the_command(
 ) -> None:
     """Estimators of one's own, by an object and by name; rows, CSV and columns hold what the table holds."""
     oracle = Oracle(pairs)
-    found = compare(
+    result = compare(
         made, {"oracle": oracle, "zero": "zero", "again": Zero}, ComparisonOptions(part="all", noise="none,low", limit=0)
     )
-    rows = found.rows
+    rows = result.rows
     assert [(row["noise"], row["method"]) for row in rows] == [
         (noise, name) for noise in ("none", "low") for name in ("oracle", "zero", "again")
     ]
     assert rows[0]["rmse_sideways_mm"] < rows[1]["rmse_sideways_mm"] == rows[1]["zero_sideways_mm"]
-    assert rows[0]["rmse_yaw_deg"] == found.report["tables"][0]["rows"][0]["rmse"][2]
-    assert found.columns()["method"] == ["oracle", "zero", "again"] * 2
-    text = found.to_csv(tmp_path / "table.csv")
+    assert rows[0]["rmse_yaw_deg"] == result.report["tables"][0]["rows"][0]["rmse"][2]
+    assert result.columns()["method"] == ["oracle", "zero", "again"] * 2
+    text = result.to_csv(tmp_path / "table.csv")
     assert (tmp_path / "table.csv").read_text() == text
-    assert [row["method"] for row in csv.DictReader(text.splitlines())] == found.columns()["method"]
+    assert [row["method"] for row in csv.DictReader(text.splitlines())] == result.columns()["method"]
     assert text.count("\n") == 7
     plain = compare(made, ["zero"], ComparisonOptions(part="all", limit=0, pairs=4))
     done = mitsonar("compare", made, "--estimators", "zero", "--part", "all", "--limit", "0", "--pairs", "4")
@@ -162,12 +162,12 @@ def test_a_network_gets_the_input_of_its_training(pairs: SonarPairs) -> None:
             self.seen = images
             return torch.tensor([[10.0, -10.0, 0.0]])
 
-    own = SonarPairs(pairs.store.place.url, part="all", labels="normx10", noise="high")
-    estimator: Any = create_estimator(Sums(), samples=own)
-    found = estimator.estimate(pairs.sonar_frames(3))
-    assert found.motion == pytest.approx([own.labels.high[0], own.labels.low[1], 0.0])
-    wanted = torch.cat([*torch.from_numpy(pairs.sonar_frames(3).image)], dim=1)
-    assert torch.equal(estimator._made._network.seen[0, 0], wanted)
+    local = SonarPairs(pairs.store.place.url, part="all", labels="normx10", noise="high")
+    estimator: Any = create_estimator(Sums(), samples=local)
+    result = estimator.estimate(pairs.sonar_frames(3))
+    assert result.motion == pytest.approx([local.labels.high[0], local.labels.low[1], 0.0])
+    expected = torch.cat([*torch.from_numpy(pairs.sonar_frames(3).image)], dim=1)
+    assert torch.equal(estimator._made._network.seen[0, 0], expected)
     assert list(_methods([estimator])) == ["Sums"], "the row of a table is named after the network, not after what wraps it"
 
 
@@ -194,23 +194,23 @@ def test_a_prior_shrinks_what_is_unsure_and_leaves_what_is_sure() -> None:
     answers = Answers.unasked(2)
     answers.motion[:] = 0.01
     answers.covariance[0], answers.covariance[1] = np.eye(3) * 1e-12, np.eye(3) * 1.0
-    found = with_prior(answers, np.full(3, 0.02)).motion
-    assert np.allclose(found[0], 0.01, rtol=1e-6)
-    assert (np.abs(found[1]) < 1e-5).all()
+    result = with_prior(answers, np.full(3, 0.02)).motion
+    assert np.allclose(result[0], 0.01, rtol=1e-6)
+    assert (np.abs(result[1]) < 1e-5).all()
 
 
 @pytest.mark.thorough
 def test_limits_are_below_what_is_reached(pairs: SonarPairs) -> None:
     """The bound by the rays' own noise at high noise is positive, and below direct's errors."""
     loud = SonarPairs(pairs.store.place.url, part="all", frames=2, one_a_sequence=True, noise="high")
-    found = bounds_of_pairs(loud, [6], NOISE_MODELS["high"])
-    assert (found["pixel"] > 0).all()
-    assert (found["pixel"] < found["gaussian"]).all()
-    assert (found["gaussian"] < found["rays"]).all()
+    result = bounds_of_pairs(loud, [6], NOISE_MODELS["high"])
+    assert (result["pixel"] > 0).all()
+    assert (result["pixel"] < result["gaussian"]).all()
+    assert (result["gaussian"] < result["rays"]).all()
     numbers = list(range(len(loud)))
     answers = answers_of({"direct": Direct()}, loud, numbers)["direct"]
     errors = answers.motion - np.array([loud.target(k) for k in numbers])
-    assert (np.sqrt((errors**2).mean(axis=0)) > found["pixel"]).all()
+    assert (np.sqrt((errors**2).mean(axis=0)) > result["pixel"]).all()
 
 
 def test_command_prints_a_table_and_goes_on(mitsonar: Command, made: Path, tmp_path: Path) -> None:
@@ -226,8 +226,8 @@ def test_command_prints_a_table_and_goes_on(mitsonar: Command, made: Path, tmp_p
     assert by_name["direct"]["rmse"][0] < 0.4 * by_name["zero"]["rmse"][0]
     # broken off: half of the answers have gone
     (path,) = (tmp_path / "out").glob("answers-high-*-as-told.npz")
-    with np.load(path) as kept:
-        arrays = {name: kept[name].copy() for name in kept.files}
+    with np.load(path) as stored:
+        arrays = {name: stored[name].copy() for name in stored.files}
     arrays["direct/ms"][6:] = np.nan
     arrays["direct/motion"][6:] = 99
     np.savez(path, **arrays)

@@ -16,7 +16,7 @@ def images(share: float, lighting: float = 0.0) -> tuple[np.ndarray, np.ndarray,
     rng = np.random.default_rng(5)
     common, *noise = rng.standard_normal((3, *SIZE))
     light = lighting * np.linspace(-1, 1, SIZE[0])[:, None]
-    first, second = (np.sqrt(share) * common + np.sqrt(1 - share) * own + light for own in noise)
+    first, second = (np.sqrt(share) * common + np.sqrt(1 - share) * local + light for local in noise)
     return first, second, np.ones(SIZE, dtype=bool)
 
 
@@ -34,11 +34,11 @@ def test_excess_is_the_share_in_common_whatever_the_lighting(share: float) -> No
 def test_a_low_correlation_counts_where_it_stands_out() -> None:
     """0.1 of 19,200 cells is 14 standard deviations; without anything in common nothing is matched."""
     cells = float(np.prod(SIZE))
-    for share, said in ((0.1, False), (0.0, True)):
+    for share, output in ((0.1, False), (0.0, True)):
         first, second, inside = images(share)
         excess = correlation_excess(first, second, inside, aside=8)
         correlation = correlation_of(first, second)
-        assert bool(correlation_rejection(correlation, cells, excess)) is said
+        assert bool(correlation_rejection(correlation, cells, excess)) is output
         assert correlation_rejection(correlation, cells), "without the comparison it is too low"
     assert not correlation_rejection(0.5, cells)
 

@@ -25,11 +25,11 @@ def frames_of(sonar: Sonar) -> SonarFrames:
 @pytest.mark.parametrize("layout", ["even", "sine"])
 def test_the_axes_of_a_sonar_come_back(layout: str) -> None:
     real = Sonar.create(beams=64, azimuth_fov_deg=80, beam_layout=layout, range_min=0.5, range_max=4, range_bins=200)
-    told = replace(frames_of(real), sonar=Sonar(beams=64, range_bins=200))
-    found, notes = as_instrument(told)
-    assert found.sonar.beam_layout == layout
-    np.testing.assert_allclose(found.sonar.bearing_rad, real.bearing_rad, atol=1e-12)
-    np.testing.assert_allclose(found.sonar.range_m, real.range_m, atol=1e-12)
+    message = replace(frames_of(real), sonar=Sonar(beams=64, range_bins=200))
+    result, notes = as_instrument(message)
+    assert result.sonar.beam_layout == layout
+    np.testing.assert_allclose(result.sonar.bearing_rad, real.bearing_rad, atol=1e-12)
+    np.testing.assert_allclose(result.sonar.range_m, real.range_m, atol=1e-12)
     assert not notes
 
 
@@ -42,9 +42,9 @@ def test_beams_that_are_neither_are_told_by_how_much() -> None:
 
 def test_a_fan_off_the_axis_is_told() -> None:
     frames = frames_of(Sonar(beams=64))
-    found, (note,) = as_instrument(replace(frames, bearing_rad=frames.bearing_rad + np.radians(2)))
+    result, (note,) = as_instrument(replace(frames, bearing_rad=frames.bearing_rad + np.radians(2)))
     assert "centred on 2 deg" in note
-    np.testing.assert_allclose(found.sonar.bearing_rad, frames.sonar.bearing_rad, atol=1e-12)
+    np.testing.assert_allclose(result.sonar.bearing_rad, frames.sonar.bearing_rad, atol=1e-12)
 
 
 @pytest.mark.skipif(not OCULUS.exists(), reason="needs the recordings of ../shared/data/real")
@@ -52,13 +52,13 @@ def test_an_oculus_becomes_a_sonar_and_its_noise(mitsonar: Command, tmp_path: Pa
     sonar, noise = tmp_path / "sonar.yaml", tmp_path / "noise.yaml"
     done = mitsonar("sonar", "from-recording", OCULUS, "-o", sonar, "--noise", noise)
     assert done.returncode == 0, done.stderr
-    made = load_sonar(sonar)
-    assert (made.beams, made.range_bins, made.beam_layout, made.model) == (256, 703, "sine", "coherent")
-    assert np.degrees(made.bearing_rad[[0, -1]]) == pytest.approx([-30, 30], abs=0.01)
-    assert made.noise_level_db is None
+    result = load_sonar(sonar)
+    assert (result.beams, result.range_bins, result.beam_layout, result.model) == (256, 703, "sine", "coherent")
+    assert np.degrees(result.bearing_rad[[0, -1]]) == pytest.approx([-30, 30], abs=0.01)
+    assert result.noise_level_db is None
     together = load_sonar(f"{sonar},{noise}")
     assert together.noise_level_db == pytest.approx(-108, abs=2)
-    fields = {name for name, value in together.model_dump().items() if value != getattr(made, name)}
+    fields = {name for name, value in together.model_dump().items() if value != getattr(result, name)}
     assert fields <= set(NOISE_FIELDS)
     over = load_sonar(f"didson300,{noise}")
     assert (over.noise_level_db, over.beams, over.name) == (together.noise_level_db, 96, "didson300")

@@ -64,8 +64,8 @@ def stripes(sonar: Sonar, spread: float) -> float:
 
 @pytest.mark.parametrize("name", essence(TRUE, "dB"))
 def test_what_was_put_in_comes_out(recordings: dict[str, SonarFrames], name: str) -> None:
-    found, true = fit_sonar(recordings[name]), TRUE[name]
-    sonar = found.sonar
+    result, true = fit_sonar(recordings[name]), TRUE[name]
+    sonar = result.sonar
     assert sonar.noise_level_db == pytest.approx(true["noise_level_db"], abs=1.0)
     assert sonar.stripes_db == pytest.approx(stripes(sonar, true.get("stripes_db", 0.0)), abs=0.15)
     if "crosstalk_db" in true:
@@ -78,11 +78,11 @@ def test_what_was_put_in_comes_out(recordings: dict[str, SonarFrames], name: str
         assert sonar.speckle_nu is None or sonar.speckle_nu > 20
     assert sonar.near_glow_db == 0
     assert sonar.volume_db is None
-    assert np.abs(found.glow_db[2:]).max() < 4
-    assert found.bright_db == pytest.approx(10 * math.log10(0.9), abs=0.5)
-    assert found.noise_db is not None
-    assert -50 < found.noise_db < -25
-    assert found.notes == []
+    assert np.abs(result.glow_db[2:]).max() < 4
+    assert result.bright_db == pytest.approx(10 * math.log10(0.9), abs=0.5)
+    assert result.noise_db is not None
+    assert -50 < result.noise_db < -25
+    assert result.notes == []
 
 
 @pytest.mark.thorough
@@ -104,18 +104,18 @@ def test_eight_bit_and_a_named_sonar_do(recordings: dict[str, SonarFrames]) -> N
     """Counts of uint8; what the frames do not tell comes from the preset, the window from the frames."""
     frames = recordings["dB"].select(slice(None))
     frames.image = np.rint(frames.image * 255).astype(np.uint8)
-    found = fit_sonar(frames, load_sonar("aris3000"), frequency_hz=3e6, beam_width_deg=0.3)
-    assert found.sonar.frequency_hz == 3e6
-    assert (found.sonar.beams, found.sonar.range_min, found.sonar.name) == (96, 1.4, "aris3000")
-    assert found.sonar.noise_level_db == pytest.approx(-98, abs=1.0)
+    result = fit_sonar(frames, load_sonar("aris3000"), frequency_hz=3e6, beam_width_deg=0.3)
+    assert result.sonar.frequency_hz == 3e6
+    assert (result.sonar.beams, result.sonar.range_min, result.sonar.name) == (96, 1.4, "aris3000")
+    assert result.sonar.noise_level_db == pytest.approx(-98, abs=1.0)
 
 
 def test_a_recording_without_scale_gets_one(recordings: dict[str, SonarFrames]) -> None:
     frames = recordings["dB"].select(slice(None))
     frames.level_scale = 1.0
-    found = fit_sonar(frames)
-    assert "levels have no scale" in found.notes[0]
-    assert found.sonar.noise_level_db == pytest.approx(-98, abs=15)  # a reflectivity is assumed
+    result = fit_sonar(frames)
+    assert "levels have no scale" in result.notes[0]
+    assert result.sonar.noise_level_db == pytest.approx(-98, abs=15)  # a reflectivity is assumed
 
 
 def test_noise_that_does_not_show_is_not_invented(recordings: dict[str, SonarFrames]) -> None:

@@ -52,19 +52,19 @@ def test_a_glow_comes_back(deep: mi.Scene, glow: float, gone: float) -> None:
 @pytest.mark.thorough
 def test_what_beams_glow_and_what_stays_comes_back(deep: mi.Scene) -> None:
     fields: dict[str, Any] = {"near_glow_db": 60.0, "near_glow_m": 1.8, "near_glow_edge_db": 15.0}
-    made = recorded(deep, 3.0, **fields, near_glow_spread_db=4.0, near_glow_still=0.8)
-    found = fit_sonar(made).sonar
-    assert found.near_glow_db == pytest.approx(60, rel=0.1)
-    assert found.near_glow_edge_db == pytest.approx(15, abs=3)
-    assert found.near_glow_spread_db == pytest.approx(4, abs=1.2)
-    assert found.near_glow_still == pytest.approx(0.8, abs=0.05)
+    built = recorded(deep, 3.0, **fields, near_glow_spread_db=4.0, near_glow_still=0.8)
+    result = fit_sonar(built).sonar
+    assert result.near_glow_db == pytest.approx(60, rel=0.1)
+    assert result.near_glow_edge_db == pytest.approx(15, abs=3)
+    assert result.near_glow_spread_db == pytest.approx(4, abs=1.2)
+    assert result.near_glow_still == pytest.approx(0.8, abs=0.05)
 
 
 def test_an_even_new_glow_has_no_structure(deep: mi.Scene) -> None:
-    found = fit_sonar(recorded(deep, 3.0, near_glow_db=60.0, near_glow_m=1.8)).sonar
-    assert abs(found.near_glow_edge_db) < 1
-    assert found.near_glow_spread_db < 0.8
-    assert found.near_glow_still < 0.15
+    result = fit_sonar(recorded(deep, 3.0, near_glow_db=60.0, near_glow_m=1.8)).sonar
+    assert abs(result.near_glow_edge_db) < 1
+    assert result.near_glow_spread_db < 0.8
+    assert result.near_glow_still < 0.15
 
 
 def test_a_glow_of_few_bins_tells_no_beams() -> None:
@@ -81,10 +81,10 @@ def test_a_glow_far_out_keeps_its_height_where_it_is_seen() -> None:
 
     at: Array = np.linspace(2, 5.99, 400)
     excess: Array = np.maximum(0, 60 - 200 * (at - 2))
-    found = near_glow(np.broadcast_to(10 ** (excess / 10)[None, :, None] * math.log(2), (1, 400, 8)), 1.0, at)
-    assert found is not None
-    assert found[0] == 120
-    assert found[0] * (1 - 2.15 / found[1]) == pytest.approx(30, abs=3)
+    result = near_glow(np.broadcast_to(10 ** (excess / 10)[None, :, None] * math.log(2), (1, 400, 8)), 1.0, at)
+    assert result is not None
+    assert result[0] == 120
+    assert result[0] * (1 - 2.15 / result[1]) == pytest.approx(30, abs=3)
 
 
 def test_a_glow_may_begin_behind_the_first_bins() -> None:
@@ -93,17 +93,17 @@ def test_a_glow_may_begin_behind_the_first_bins() -> None:
 
     at: Array = np.linspace(1, 4.99, 400)
     excess: Array = np.where(np.arange(400) < 8, 10.0, np.maximum(0, 60 * (1 - at / 1.5)))
-    found = near_glow(np.broadcast_to(10 ** (excess / 10)[None, :, None] * math.log(2), (1, 400, 8)), 1.0, at)
-    assert found == pytest.approx((60, 1.5), rel=0.02)
+    result = near_glow(np.broadcast_to(10 ** (excess / 10)[None, :, None] * math.log(2), (1, 400, 8)), 1.0, at)
+    assert result == pytest.approx((60, 1.5), rel=0.02)
 
 
 def test_volume_comes_back(deep: mi.Scene) -> None:
     """The bottom lies beyond the window."""
-    found = fit_sonar(recorded(deep, 40.0, volume_db=-25.0, noise_level_db=-85.0))
-    assert found.sonar.volume_db == pytest.approx(-25, abs=0.5)
-    assert found.sonar.noise_level_db == pytest.approx(-85, abs=1)
-    assert found.sonar.near_glow_db == 0
-    assert any("new in every frame" in note for note in found.notes)
+    result = fit_sonar(recorded(deep, 40.0, volume_db=-25.0, noise_level_db=-85.0))
+    assert result.sonar.volume_db == pytest.approx(-25, abs=0.5)
+    assert result.sonar.noise_level_db == pytest.approx(-85, abs=1)
+    assert result.sonar.near_glow_db == 0
+    assert any("new in every frame" in note for note in result.notes)
 
 
 @pytest.mark.thorough

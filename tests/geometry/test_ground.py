@@ -50,25 +50,25 @@ def weighed(first_m: float) -> float:
 
 def test_level_ground_has_the_height_of_the_first_echoes() -> None:
     frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
-    found = attitude_of(frames, "a test", None, None)
-    assert found.height_m == pytest.approx(HEIGHT_M, abs=TOLERANCE_M)
-    assert found.first is not None
-    assert found.height_m == pytest.approx(weighed(found.first.height_m))
-    assert found.height_std_m == pytest.approx(STD_BOTH * HEIGHT_M, rel=0.01)
-    assert abs(found.tops_m) < TOLERANCE_M
-    assert found.even
-    assert not found.reason
+    result = attitude_of(frames, "a test", None, None)
+    assert result.height_m == pytest.approx(HEIGHT_M, abs=TOLERANCE_M)
+    assert result.first is not None
+    assert result.height_m == pytest.approx(weighed(result.first.height_m))
+    assert result.height_std_m == pytest.approx(STD_BOTH * HEIGHT_M, rel=0.01)
+    assert abs(result.tops_m) < TOLERANCE_M
+    assert result.even
+    assert not result.reason
 
 
 def test_rising_ground_has_the_mean_height_of_both_ends() -> None:
     """10 deg: the light ends 0.2 m higher than it begins; the height may be any between both, a uniform distribution."""
     frames, near, far = lit_plane(SONAR, HEIGHT_M, PITCH_RAD, 10.0)
-    found = attitude_of(replace(frames, height_m=None), "a test", None, None)
+    result = attitude_of(replace(frames, height_m=None), "a test", None, None)
     apart = near.mean() - far.mean()
-    assert found.first is not None
-    assert found.first.height_m == pytest.approx(near.mean(), abs=TOLERANCE_M)
-    assert found.height_m == pytest.approx((near.mean() + far.mean()) / 2, abs=TOLERANCE_M)
-    assert found.height_std_m == pytest.approx(np.hypot(STD_MEASURED * found.height_m, apart / np.sqrt(12)), rel=0.12)
+    assert result.first is not None
+    assert result.first.height_m == pytest.approx(near.mean(), abs=TOLERANCE_M)
+    assert result.height_m == pytest.approx((near.mean() + far.mean()) / 2, abs=TOLERANCE_M)
+    assert result.height_std_m == pytest.approx(np.hypot(STD_MEASURED * result.height_m, apart / np.sqrt(12)), rel=0.12)
     # whoever gives the relief means level ground
     given = attitude_of(frames, "a test", HEIGHT_M, None, relief_m=0.1)
     assert given.height_m == pytest.approx(HEIGHT_M - 0.1)
@@ -101,27 +101,27 @@ def test_rocks_on_level_ground_are_no_slope() -> None:
     assert shadows.even
     assert shadows.height_std_m == pytest.approx(STD_BOTH * shadows.height_m, rel=0.02)
     image[..., :32] = rocks.image[..., :32]
-    found = attitude_of(replace(frames, image=image), "a test", None, None)
-    assert not found.even
-    assert found.height_std_m == pytest.approx(STD_BOTH * found.height_m, rel=0.02)
+    result = attitude_of(replace(frames, image=image), "a test", None, None)
+    assert not result.even
+    assert result.height_std_m == pytest.approx(STD_BOTH * result.height_m, rel=0.02)
 
 
 def test_ground_that_falls_is_taken_for_level() -> None:
     """Its light ends beyond most windows: only the first echoes count."""
     frames, near, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD, -5.0)
-    found = attitude_of(frames, "a test", None, None)
-    assert found.height_m == pytest.approx(weighed(near.mean() - found.tops_m), abs=TOLERANCE_M)
-    assert found.height_std_m == pytest.approx(STD_BOTH * found.height_m, rel=0.02)
+    result = attitude_of(frames, "a test", None, None)
+    assert result.height_m == pytest.approx(weighed(near.mean() - result.tops_m), abs=TOLERANCE_M)
+    assert result.height_std_m == pytest.approx(STD_BOTH * result.height_m, rel=0.02)
 
 
 def test_a_given_height_is_not_overruled() -> None:
     """First echoes that contradict it by more than both know are reported, and do not count."""
     frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
-    found = attitude_of(replace(frames, height_m=np.full(2, 3.2)), "a test", None, None)
-    assert found.height_m == 3.2
-    assert found.height_std_m == pytest.approx(np.hypot(STD_GIVEN * 3.2, 3.2 - HEIGHT_M), rel=0.02)
-    assert not found.reason
-    assert found.doubt == "first echoes give a height of 2.19 m, not 3.20 m"
+    result = attitude_of(replace(frames, height_m=np.full(2, 3.2)), "a test", None, None)
+    assert result.height_m == 3.2
+    assert result.height_std_m == pytest.approx(np.hypot(STD_GIVEN * 3.2, 3.2 - HEIGHT_M), rel=0.02)
+    assert not result.reason
+    assert result.doubt == "first echoes give a height of 2.19 m, not 3.20 m"
     near = attitude_of(replace(frames, height_m=np.full(2, 2.4)), "a test", None, None)
     assert not near.doubt
     assert HEIGHT_M < near.height_m < 2.25
@@ -131,22 +131,22 @@ def test_each_frame_has_its_own_height_pitch_and_roll() -> None:
     frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
     assert attitude_of(frames, "a test", None, None).apart == ()
     poses = np.array([[0, 0, 2.0, 0.60, 0.02, 0], [0, 0, 2.02, 0.62, -0.02, 0]])
-    found = attitude_of(replace(frames, poses=poses), "a test", None, None)
-    mean = np.array([found.height_m, found.pitch_rad, found.roll_rad])
+    result = attitude_of(replace(frames, poses=poses), "a test", None, None)
+    mean = np.array([result.height_m, result.pitch_rad, result.roll_rad])
     np.testing.assert_allclose(
-        np.array([found.of_frame(k) for k in range(2)]) - mean, poses[:, 2:5] - poses[:, 2:5].mean(axis=0)
+        np.array([result.of_frame(k) for k in range(2)]) - mean, poses[:, 2:5] - poses[:, 2:5].mean(axis=0)
     )
-    assert found.ground(frames, 1).pitch_rad == pytest.approx(0.62)
-    assert found.ground(frames).pitch_rad == pytest.approx(0.61)
+    assert result.ground(frames, 1).pitch_rad == pytest.approx(0.62)
+    assert result.ground(frames).pitch_rad == pytest.approx(0.61)
 
 
 @pytest.mark.parametrize(("given_m", "told"), [(2500.0, True), (0.5, True), (HEIGHT_M, False), (None, False)])
 def test_a_height_beyond_both_ends_of_rising_ground_is_told(given_m: float | None, told: bool) -> None:
     """A height in millimetres, say: the ends of the light count, and the contradiction is reported."""
     frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD, 10.0)
-    found = attitude_of(frames, "a test", given_m, PITCH_RAD)
-    assert ("the ground rises" in found.doubt) == told
-    assert found.height_m == pytest.approx(attitude_of(frames, "a test", None, PITCH_RAD).height_m)
+    result = attitude_of(frames, "a test", given_m, PITCH_RAD)
+    assert ("the ground rises" in result.doubt) == told
+    assert result.height_m == pytest.approx(attitude_of(frames, "a test", None, PITCH_RAD).height_m)
 
 
 @pytest.mark.parametrize(("axis", "change"), [(2, 0.006), (3, np.radians(0.4)), (4, np.radians(0.4))])
@@ -190,13 +190,13 @@ def test_what_is_known_does_not_widen() -> None:
     frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
     frames = replace(frames, time_s=np.array([0.0, 0.1]))
     poses = np.tile([0.0, 0.0, HEIGHT_M, PITCH_RAD, 0.0, 0.0], (2, 1))
-    told = poses * [0, 0, np.nan, 1, 1, 0]
-    by_sensors = told + np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0.001, 0, 0]])
+    message = poses * [0, 0, np.nan, 1, 1, 0]
+    by_sensors = message + np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0.001, 0, 0]])
     heave, pitch, roll = (0.1 * rate for rate in UNKNOWN_PER_S)
-    for table, unsure in ((poses, (0, 0, 0)), (by_sensors, (heave, 0, 0)), (told, (heave, pitch, roll))):
-        found = attitude_of(replace(frames, poses=table), "a test", None, None)
-        assert found.unsure == pytest.approx(unsure)
-    slow = attitude_of(replace(frames, poses=told, time_s=np.array([0.0, 9.0])), "a test", None, None)
+    for table, unsure in ((poses, (0, 0, 0)), (by_sensors, (heave, 0, 0)), (message, (heave, pitch, roll))):
+        result = attitude_of(replace(frames, poses=table), "a test", None, None)
+        assert result.unsure == pytest.approx(unsure)
+    slow = attitude_of(replace(frames, poses=message, time_s=np.array([0.0, 9.0])), "a test", None, None)
     assert slow.unsure == UNKNOWN_MOST
 
 
@@ -258,9 +258,9 @@ def test_torch_converts_the_same() -> None:
     fans = conversion.apply(images)
     np.testing.assert_array_equal(conversion.apply(torch.from_numpy(images)).numpy(), fans)
     for one in range(3):
-        wanted = to_cartesian(images[one, 1], sonar.range_m, sonar.bearing_rad, rows=50)
-        np.testing.assert_allclose(fans[one, 1], np.nan_to_num(wanted.image), atol=1e-6)
-        assert wanted.extent == conversion.extent
+        expected = to_cartesian(images[one, 1], sonar.range_m, sonar.bearing_rad, rows=50)
+        np.testing.assert_allclose(fans[one, 1], np.nan_to_num(expected.image), atol=1e-6)
+        assert expected.extent == conversion.extent
 
 
 # ---------------------------------------------------------------- ground
@@ -285,8 +285,8 @@ def test_cells_are_seen_where_they_lie(bearing: str, tilt: tuple[float, float]) 
     pose = Pose(0, 0, 2.5, pitch, roll, 0.0)
     level = np.concatenate([ground.points, np.full((*radius.shape, 1), -2.5)], axis=-1).reshape(-1, 3)
     s, f, _ = vehicle_rotation(pose).inv().apply(level).T
-    wanted = np.arctan2(s, f) if bearing == "azimuth" else np.arcsin(s / np.linalg.norm(level, axis=1))
-    np.testing.assert_allclose(b.ravel(), wanted, atol=1e-12)
+    expected = np.arctan2(s, f) if bearing == "azimuth" else np.arcsin(s / np.linalg.norm(level, axis=1))
+    np.testing.assert_allclose(b.ravel(), expected, atol=1e-12)
 
 
 def test_axis_beam_over_a_level_floor() -> None:
@@ -329,8 +329,8 @@ def test_the_sonar_s_own_sensors_tell_pitch_and_roll_where_poses_do_not() -> Non
     lean = np.radians(np.array([[30, 2, 90], [32, 4, np.nan]]))
     image, time, height = np.ones((2, 64, 24), np.float32), np.arange(2.0), np.full(2, 2.5)
     frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, time, sonar, attitude_rad=lean, height_m=height)
-    told = attitude_of(frames, "a test", None, None)
-    assert np.degrees([told.pitch_rad, told.roll_rad]) == pytest.approx([31, 3])
+    message = attitude_of(frames, "a test", None, None)
+    assert np.degrees([message.pitch_rad, message.roll_rad]) == pytest.approx([31, 3])
 
 
 # ---------------------------------------------------------------- the outline of the light: where it lies, and where it mus
@@ -363,9 +363,9 @@ def test_light_begins_where_the_steepest_rays_meet_the_ground() -> None:
 
 def test_the_outline_lies_on_the_floor_and_not_on_the_tubes() -> None:
     """Tubes of 40 mm answer first: over them the light seems to begin 0.2 m nearer, and its outline would be matched."""
-    hidden, told = first_lit_m(*grazing(height_m=0.28)), first_lit_m(*grazing(given_m=0.32, height_m=0.28))
-    assert told == pytest.approx(0.32 / np.sin(np.radians(10.3)), abs=0.01)
-    assert told - hidden == pytest.approx(0.04 / np.sin(np.radians(10.3)), abs=0.01)
+    hidden, message = first_lit_m(*grazing(height_m=0.28)), first_lit_m(*grazing(given_m=0.32, height_m=0.28))
+    assert message == pytest.approx(0.32 / np.sin(np.radians(10.3)), abs=0.01)
+    assert message - hidden == pytest.approx(0.04 / np.sin(np.radians(10.3)), abs=0.01)
     rock_below = first_lit_m(*grazing(given_m=0.25, height_m=0.28))
     assert rock_below == hidden, "a rock straight below tells too small a height"
 
@@ -388,14 +388,14 @@ def test_rocks_keep_the_outline_even_ground_and_dark_windows_do_not() -> None:
 @pytest.mark.parametrize("slope_deg", [0.0, 5.0, 10.0])
 def test_both_ends_of_the_light_lie_on_the_plane(slope_deg: float) -> None:
     frames, near, far = lit_plane(SONAR, HEIGHT_M, PITCH_RAD, slope_deg)
-    found = echo_heights(frames, PITCH_RAD, 0.0)
-    assert found.first is not None
-    assert found.first.height_m + found.first.tops_m == pytest.approx(near.mean(), abs=TOLERANCE_M)
-    assert found.last_m == pytest.approx(far.mean(), abs=TOLERANCE_M)
-    assert found.ends_m == pytest.approx((near.mean() + far.mean()) / 2, abs=TOLERANCE_M)
+    result = echo_heights(frames, PITCH_RAD, 0.0)
+    assert result.first is not None
+    assert result.first.height_m + result.first.tops_m == pytest.approx(near.mean(), abs=TOLERANCE_M)
+    assert result.last_m == pytest.approx(far.mean(), abs=TOLERANCE_M)
+    assert result.ends_m == pytest.approx((near.mean() + far.mean()) / 2, abs=TOLERANCE_M)
     if not slope_deg:
-        assert found.first.even
-        assert found.last_m == pytest.approx(HEIGHT_M, abs=TOLERANCE_M)
+        assert result.first.even
+        assert result.last_m == pytest.approx(HEIGHT_M, abs=TOLERANCE_M)
 
 
 def test_contrast_lies_above_the_mean_of_the_first_echoes() -> None:
@@ -404,11 +404,11 @@ def test_contrast_lies_above_the_mean_of_the_first_echoes() -> None:
     rocks, _, _ = lit_plane(SONAR, HEIGHT_M - 0.4, PITCH_RAD)
     image = frames.image.copy()
     image[..., :32] = rocks.image[..., :32]
-    found = echo_heights(replace(frames, image=image), PITCH_RAD, 0.0)
-    assert found.first is not None
-    assert not found.first.even
-    assert found.first.tops_m == pytest.approx(TOPS * 0.4 / 3, abs=TOLERANCE_M)
-    assert found.first.height_m == pytest.approx(HEIGHT_M - 0.4 / 3 - found.first.tops_m, abs=TOLERANCE_M)
+    result = echo_heights(replace(frames, image=image), PITCH_RAD, 0.0)
+    assert result.first is not None
+    assert not result.first.even
+    assert result.first.tops_m == pytest.approx(TOPS * 0.4 / 3, abs=TOLERANCE_M)
+    assert result.first.height_m == pytest.approx(HEIGHT_M - 0.4 / 3 - result.first.tops_m, abs=TOLERANCE_M)
 
 
 def test_a_window_that_cuts_an_end_does_not_show_it() -> None:
@@ -458,9 +458,9 @@ def test_a_skirt_of_the_light_does_not_lower_the_height(
     )[0]
     image = np.tile(level[:, None] / level.max(), (2, 1, sonar.beams)).astype(np.float32)
     frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar)
-    found = echo_heights(frames, np.radians(pitch_deg), 0.0)
-    assert found.first is not None
-    at_the_middle = found.first.height_m / np.cos(sonar.bearing_rad).mean()  # the cone's beams aside go down less
+    result = echo_heights(frames, np.radians(pitch_deg), 0.0)
+    assert result.first is not None
+    at_the_middle = result.first.height_m / np.cos(sonar.bearing_rad).mean()  # the cone's beams aside go down less
     assert at_the_middle == pytest.approx(height_m, rel=0.01)
 
 

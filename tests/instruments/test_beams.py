@@ -25,9 +25,9 @@ def test_side_lobes_and_width(shading: Shading, two_way: bool) -> None:
 
 def test_taylor_is_scipys() -> None:
     x = (np.arange(4096) + 0.5) / 4096 - 0.5
-    own = 1 + sum(2 * part * np.cos(2 * np.pi * m * x) for m, part in enumerate(series("taylor"), 1))
+    local = 1 + sum(2 * part * np.cos(2 * np.pi * m * x) for m, part in enumerate(series("taylor"), 1))
     window = taylor(4096, 4, 30, norm=False)
-    np.testing.assert_allclose(own, window / window.mean(), atol=1e-9)
+    np.testing.assert_allclose(local, window / window.mean(), atol=1e-9)
 
 
 @pytest.mark.parametrize("shading", SHADINGS)

@@ -202,8 +202,10 @@ def test_the_widest_beam_that_is_told_would_do(model: str, shading: str) -> None
     fields: dict[str, Any] = {"model": model, "frequency_hz": 1e6, "pattern": "two_way", "shading": shading, "beams": 1}
     with pytest.raises(MitsonarError, match=r"takes 0\.\d+; give beam_width_deg below ([\d.]+)") as caught:
         Sonar.create(**fields, azimuth_fov_deg=160.0, beam_width_deg=160.0)
-    told = float(str(caught.value).split("below ")[1].split()[0].rstrip("."))
-    assert Sonar.create(**fields, azimuth_fov_deg=100.0, beam_width_deg=told).aperture.length == pytest.approx(0.5, rel=0.01)
+    message = float(str(caught.value).split("below ")[1].split()[0].rstrip("."))
+    assert Sonar.create(**fields, azimuth_fov_deg=100.0, beam_width_deg=message).aperture.length == pytest.approx(
+        0.5, rel=0.01
+    )
     assert Sonar.create(**{**fields, "model": "thesis"}, azimuth_fov_deg=160.0).beam_pattern == "box"
 
 

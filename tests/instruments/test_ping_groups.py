@@ -70,9 +70,9 @@ def test_a_named_head_takes_seconds_a_sweep() -> None:
     for range_max, turn in ((50.0, 35.0), (2.0, 9.0)):
         assert frame_period_s(head.replace(range_max=range_max)) == pytest.approx(turn, rel=0.03)
     assert frame_period_s(head) == pytest.approx(1 / head.frame_rate_hz, rel=2e-3)
-    made = scanned(one_beam(head), overhead_s=0.02)
-    assert made == head.replace(
-        frame_rate_hz=made.frame_rate_hz, beam_width_deg=made.beam_width_deg, **made.model_dump(include={*RAYS})
+    result = scanned(one_beam(head), overhead_s=0.02)
+    assert result == head.replace(
+        frame_rate_hz=result.frame_rate_hz, beam_width_deg=result.beam_width_deg, **result.model_dump(include={*RAYS})
     )
     assert frame_period_s(Sonar(frame_rate_hz=8)) == 1 / 8
 

@@ -104,11 +104,11 @@ def test_pings_of_a_resting_sonar_differ_as_much_as_is_printed(variant: str, qua
     pose = [[0, 0, height, FAR_GRAZING_RAD + np.radians(sonar.elevation_fov_deg) / 2, 0, 0]]
     plain = floor_levels(sonar, height, pose[0][3], 0.5)
     lit = plain > 0.2 * plain.max()
-    for jitter, wanted in ((True, measured_errors()[1]["didson300"][quality].still_correlation), (False, 1.0)):
+    for jitter, expected in ((True, measured_errors()[1]["didson300"][quality].still_correlation), (False, 1.0)):
         simulator = Simulator(rough, sonar.replace(jitter=jitter))
         pings = [next(simulator.pings(pose, first=ping)).levels[0][lit] / plain[lit] for ping in range(PINGS)]
-        found = np.corrcoef(pings)[np.triu_indices(PINGS, 1)].mean()
-        assert found == pytest.approx(wanted, abs=0.05)
+        result = np.corrcoef(pings)[np.triu_indices(PINGS, 1)].mean()
+        assert result == pytest.approx(expected, abs=0.05)
 
 
 @pytest.mark.thorough

@@ -128,17 +128,17 @@ def test_a_lone_carriage_return_in_a_path_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", cases())
 def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
     count = FEW if name in OWN or "zarr" in name or name == "data set" else FOREIGN
-    found = attack(name, tmp_path, count)
-    assert found["read"] + found["refused"] == count
-    assert found["refused"] > 0
+    result = attack(name, tmp_path, count)
+    assert result["read"] + result["refused"] == count
+    assert result["refused"] > 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", cases())
 def test_ten_thousand_mutants(name: str, tmp_path: Path) -> None:
-    found = attack(name, tmp_path, 10_000, first=FOREIGN)
-    print(f"\n{name}: {found['read']:,} read, {found['refused']:,} refused")
-    assert min(found.values()) > 0
+    result = attack(name, tmp_path, 10_000, first=FOREIGN)
+    print(f"\n{name}: {result['read']:,} read, {result['refused']:,} refused")
+    assert min(result.values()) > 0
 
 
 def test_the_harness_sees_what_it_looks_for() -> None:
@@ -152,8 +152,8 @@ def test_the_harness_sees_what_it_looks_for() -> None:
 
 def test_a_text_that_was_spoilt_is_spoilt_again() -> None:
     """The second change of a text of JSON finds no JSON there."""
-    made = [changed_arrays(np.random.default_rng(seed), {"sonar": np.array('{"beams": 4,')}) for seed in range(30)]
-    assert any(str(one.get("sonar", "")).startswith('{"be') for one in made)
+    result = [changed_arrays(np.random.default_rng(seed), {"sonar": np.array('{"beams": 4,')}) for seed in range(30)]
+    assert any(str(one.get("sonar", "")).startswith('{"be') for one in result)
 
 
 # ---------------------------------------------------------------- hypothesis
@@ -346,9 +346,9 @@ def test_a_ply_must_hold_what_it_promises(content: bytes, words: str, tmp_path: 
     from mitsonar.worlds.scene_check import check_mesh
 
     (tmp_path / "a.ply").write_bytes(content)
-    said = refusal(lambda: check_mesh(tmp_path / "a.ply", "ply"))
-    assert words in said
-    assert "a.ply is damaged" in said
+    output = refusal(lambda: check_mesh(tmp_path / "a.ply", "ply"))
+    assert words in output
+    assert "a.ply is damaged" in output
 
 
 def test_other_meshes_must_hold_what_they_promise(tmp_path: Path) -> None:
@@ -877,8 +877,8 @@ def test_what_is_no_finite_number_is_refused(value: Any) -> None:
 
     assert refusal(lambda: finite_number(value, "gain")).startswith("gain must be a finite number: got ")
     for number in (0, 2.0):
-        said = refusal(lambda number=number: finite_number(number, "gain", above=0, below=2))  # type: ignore[misc]
-        assert said == f"gain must be a finite number above 0 below 2: got {number}"
+        output = refusal(lambda number=number: finite_number(number, "gain", above=0, below=2))  # type: ignore[misc]
+        assert output == f"gain must be a finite number above 0 below 2: got {number}"
     assert finite_number(1, "gain", above=0, below=2) == 1.0
 
 
@@ -922,9 +922,9 @@ def test_a_run_that_cannot_go_on(name: str, tmp_path: Path) -> None:
     make_run(tmp_path)
     read_run(tmp_path)
     changed_run(tmp_path, **BAD_STATES[name])
-    said = refusal(lambda: read_run(tmp_path))
-    assert "damaged" in said
-    assert "--overwrite" in said
+    output = refusal(lambda: read_run(tmp_path))
+    assert "damaged" in output
+    assert "--overwrite" in output
 
 
 def test_a_run_without_gain_cannot_be_resumed(tmp_path: Path) -> None:
@@ -940,9 +940,9 @@ def test_what_differs_is_said_in_one_short_line(tmp_path: Path) -> None:
     """Keys and values are a stranger's: of any length, with ends of lines."""
     make_run(tmp_path)
     changed_run(tmp_path, asked={**ASKED, "k" * 9000: 1, "line\nline": "a\nb"})
-    said = refusal(lambda: read_run(tmp_path))
-    assert "line line a b, not None" in said
-    assert len(said) < 1000
+    output = refusal(lambda: read_run(tmp_path))
+    assert "line line a b, not None" in output
+    assert len(output) < 1000
 
 
 def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:

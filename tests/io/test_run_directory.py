@@ -52,8 +52,8 @@ def begun(path: Path, asked: dict[str, object] = ASKED, *, resume: bool = False,
 
 def rewritten(path: Path, **values: Any) -> None:
     """The run's file with other values; None removes one."""
-    told = json.loads((path / RUN_FILE).read_text()) | values
-    (path / RUN_FILE).write_text(json.dumps({key: value for key, value in told.items() if value is not None}))
+    message = json.loads((path / RUN_FILE).read_text()) | values
+    (path / RUN_FILE).write_text(json.dumps({key: value for key, value in message.items() if value is not None}))
 
 
 # ---------------------------------------------------------------- begin, go on, replace
@@ -63,11 +63,11 @@ def test_beginning_writes_nothing_and_starting_says_what_was_asked(tmp_path: Pat
     run = RunDirectory.begin(tmp_path / "a" / "run", KIND, ASKED)
     assert not (tmp_path / "a").exists()
     run.start(done=0)
-    told = json.loads((tmp_path / "a" / "run" / RUN_FILE).read_text())
-    assert told["kind"] == "experiment"
-    assert told["asked"] == {"sonar": {"beams": 16, "window": [1.0, 2.5]}, "path": "a/b", "poses": [0, 1, 2]}
-    assert told["versions"] == {"numpy": np.__version__, "no-such-package": "not installed as a package"}
-    assert (told["finished"], told["done"]) == (False, 0)
+    message = json.loads((tmp_path / "a" / "run" / RUN_FILE).read_text())
+    assert message["kind"] == "experiment"
+    assert message["asked"] == {"sonar": {"beams": 16, "window": [1.0, 2.5]}, "path": "a/b", "poses": [0, 1, 2]}
+    assert message["versions"] == {"numpy": np.__version__, "no-such-package": "not installed as a package"}
+    assert (message["finished"], message["done"]) == (False, 0)
 
 
 def test_a_resumed_run_keeps_notes_and_outputs(tmp_path: Path) -> None:
@@ -146,8 +146,8 @@ def test_other_things_are_kept(tmp_path: Path) -> None:
 
 
 def test_runs_of_another_kind_are_kept(tmp_path: Path) -> None:
-    other = RunDirectory.begin(tmp_path, RunKind("odometry", outputs=("table.md",), notes={}), {})
-    other.start()
+    second = RunDirectory.begin(tmp_path, RunKind("odometry", outputs=("table.md",), notes={}), {})
+    second.start()
     before = (tmp_path / RUN_FILE).read_bytes()
     for resume, overwrite in WAYS:
         with pytest.raises(MitsonarError, match="holds no experiment of mitsonar and is kept as it is"):
@@ -222,10 +222,10 @@ def test_values_of_another_type_are_named(tmp_path: Path, values: dict[str, Any]
 def test_a_count_beyond_what_is_possible_is_named(tmp_path: Path) -> None:
     run = begun(tmp_path)
     run.note(done=7)
-    said = r"run\.json is damaged \(done must be a whole number in 0\.\.5: got 7\): begin anew with --overwrite, or choose"
+    output = r"run\.json is damaged \(done must be a whole number in 0\.\.5: got 7\): begin anew with --overwrite, or choose"
     with pytest.raises(
         MitsonarError,
-        match=said,
+        match=output,
     ):
         run.count("done", 5)
     assert run.count("lacking", 5) == 0
@@ -265,9 +265,9 @@ def test_mutated_files_are_refused_or_read(tmp_path: Path, count: int, monkeypat
 
 
 def test_differences_name_both_values() -> None:
-    had, asked = {"a": 1, "b": {"c": [1, 2], "d": None}, "old": "x" * 100}, {"a": 1.0, "b": {"c": [1, 3], "d": None}}
-    assert differences(had, asked) == ["b.c [1, 2], not [1, 3]", f"old {'x' * 60}..., not None"]
-    assert differences(asked, asked) == []
+    had, arguments = {"a": 1, "b": {"c": [1, 2], "d": None}, "old": "x" * 100}, {"a": 1.0, "b": {"c": [1, 3], "d": None}}
+    assert differences(had, arguments) == ["b.c [1, 2], not [1, 3]", f"old {'x' * 60}..., not None"]
+    assert differences(arguments, arguments) == []
     with pytest.raises(
         MitsonarError, match=r"^here was begun with a 0, not 1; .*; and 2 more: request the same settings \(so\), or"
     ):

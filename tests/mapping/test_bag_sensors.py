@@ -42,27 +42,27 @@ def test_a_bag_tells_a_gyroscope_and_velocities(name: str, tmp_path: Path) -> No
     maker = Maker(name.endswith(".bag"))
     sent: list[Sent] = [("/imu", t, imu(maker, t, 0.2, 1e-4)) for t in TIMES]
     sent += [("/dvl", t, twist(maker, t, (0.5, 0.1), (4e-4, 9e-4))) for t in TIMES]
-    found = open_sensors(write_bag(tmp_path / name, maker, sent))
-    assert found.names == ["gyroscope", "DVL"]
-    assert found.yaw_rate is not None
-    assert found.sideways is not None
-    assert found.forward is not None
-    np.testing.assert_allclose(found.yaw_rate.time_s, TIMES, atol=1e-6)
-    np.testing.assert_allclose(found.yaw_rate.values, -0.2)
-    np.testing.assert_allclose(found.yaw_rate.std, 1e-2 * np.sqrt(0.1), rtol=1e-5)
-    np.testing.assert_allclose(found.sideways.values, -0.1)
-    np.testing.assert_allclose([found.sideways.std[0], found.forward.std[0]], [0.03, 0.02])
-    np.testing.assert_allclose(found.forward.values, 0.5)
+    result = open_sensors(write_bag(tmp_path / name, maker, sent))
+    assert result.names == ["gyroscope", "DVL"]
+    assert result.yaw_rate is not None
+    assert result.sideways is not None
+    assert result.forward is not None
+    np.testing.assert_allclose(result.yaw_rate.time_s, TIMES, atol=1e-6)
+    np.testing.assert_allclose(result.yaw_rate.values, -0.2)
+    np.testing.assert_allclose(result.yaw_rate.std, 1e-2 * np.sqrt(0.1), rtol=1e-5)
+    np.testing.assert_allclose(result.sideways.values, -0.1)
+    np.testing.assert_allclose([result.sideways.std[0], result.forward.std[0]], [0.03, 0.02])
+    np.testing.assert_allclose(result.forward.values, 0.5)
 
 
 def test_axes_that_point_down_have_the_other_sign_and_readings_without_noise_are_left_out(tmp_path: Path) -> None:
     maker = Maker(ros1=True)
     variances = [1e-4] * 5 + [0.0, -1.0, np.nan] + [1e-4] * 12
     sent: list[Sent] = [("/imu", t, imu(maker, t, 0.2, v, "imu_frd")) for t, v in zip(TIMES, variances, strict=True)]
-    found = open_sensors(write_bag(tmp_path / "down.bag", maker, sent))
-    assert found.yaw_rate is not None
-    assert len(found.yaw_rate.values) == 17
-    np.testing.assert_allclose(found.yaw_rate.values, 0.2)
+    result = open_sensors(write_bag(tmp_path / "down.bag", maker, sent))
+    assert result.yaw_rate is not None
+    assert len(result.yaw_rate.values) == 17
+    np.testing.assert_allclose(result.yaw_rate.values, 0.2)
 
 
 def test_bags_that_tell_no_sensor_are_refused(tmp_path: Path) -> None:

@@ -43,9 +43,9 @@ def observed(poses: Array, points: Array, bearing: Bearing, noise: float = 0.0, 
 def solved(poses: Array, points: Array, seen: Observations, bearing: Bearing) -> Adjusted:
     """Adjust until nothing moves."""
     for _ in range(6):
-        found = adjusted(poses, 1, poses[1:, 2:5], STD, points, seen, bearing, 0.2)
-        poses, points = found.poses, found.points
-    return found
+        result = adjusted(poses, 1, poses[1:, 2:5], STD, points, seen, bearing, 0.2)
+        poses, points = result.poses, result.points
+    return result
 
 
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
@@ -55,12 +55,12 @@ def test_exact_observations_give_the_truth(bearing: Bearing) -> None:
     start = true.copy()
     start[1:, [0, 1]] += rng.normal(0, 0.02, (9, 2))
     start[1:, 5] += rng.normal(0, 0.005, 9)
-    found = solved(start, points + rng.normal(0, 0.03, points.shape), observed(true, points, bearing), bearing)
-    np.testing.assert_allclose(found.poses[:, 0], true[:, 0], atol=1e-3)
-    np.testing.assert_allclose(found.poses[:, 5], true[:, 5], atol=5e-4)
+    result = solved(start, points + rng.normal(0, 0.03, points.shape), observed(true, points, bearing), bearing)
+    np.testing.assert_allclose(result.poses[:, 0], true[:, 0], atol=1e-3)
+    np.testing.assert_allclose(result.poses[:, 5], true[:, 5], atol=5e-4)
     # the law of heights holds the scale, to half a percent where few views tell heights
-    assert found.poses[-1, 1] / true[-1, 1] == pytest.approx(1, abs=0.005)
-    assert np.median(np.abs(found.points - points)) < 0.02
+    assert result.poses[-1, 1] / true[-1, 1] == pytest.approx(1, abs=0.005)
+    assert np.median(np.abs(result.points - points)) < 0.02
 
 
 def test_the_ground_gives_the_scale_that_bearings_and_ranges_leave_open() -> None:
@@ -68,8 +68,8 @@ def test_the_ground_gives_the_scale_that_bearings_and_ranges_leave_open() -> Non
     start = true.copy()
     start[:, 1] *= 1.03
     seen = observed(true, points, "cone", noise=1.0)
-    found = solved(start, points, seen, "cone")
-    assert found.poses[-1, 1] / true[-1, 1] == pytest.approx(1, abs=0.01)
+    result = solved(start, points, seen, "cone")
+    assert result.poses[-1, 1] / true[-1, 1] == pytest.approx(1, abs=0.01)
 
 
 @pytest.mark.thorough
@@ -77,9 +77,9 @@ def test_covariance_of_the_last_pose_is_that_of_repeated_noise() -> None:
     true, points = path(8), ground(80)
     errors, promised = [], []
     for seed in range(30):
-        found = solved(true, points, observed(true, points, "cone", 1.0, seed), "cone")
-        errors.append((found.poses - true)[-1, [0, 1, 5]])
-        promised.append(found.last_covariance)
+        result = solved(true, points, observed(true, points, "cone", 1.0, seed), "cone")
+        errors.append((result.poses - true)[-1, [0, 1, 5]])
+        promised.append(result.last_covariance)
     ratio = np.var(errors, axis=0) / np.diagonal(np.mean(promised, axis=0))
     assert ratio.min() > 0.3
     assert ratio.max() < 2.5
@@ -90,6 +90,6 @@ def test_landmarks_that_move_with_a_shadow_do_not_pull() -> None:
     seen = observed(true, points, "cone", noise=1.0)
     moving = seen.landmark < 30
     seen.polar[moving, 0] += 0.004 * seen.view[moving]
-    found, plain = solved(true, points, seen, "cone"), solved(true, points, observed(true, points, "cone", 1.0), "cone")
-    assert np.abs((found.poses - plain.poses)[:, :2]).max() < 2e-3, "they are left out"
-    assert np.median(found.faults[:30]) > 5 * np.median(found.faults[30:])
+    result, plain = solved(true, points, seen, "cone"), solved(true, points, observed(true, points, "cone", 1.0), "cone")
+    assert np.abs((result.poses - plain.poses)[:, :2]).max() < 2e-3, "they are left out"
+    assert np.median(result.faults[:30]) > 5 * np.median(result.faults[30:])

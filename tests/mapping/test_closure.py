@@ -56,54 +56,54 @@ class Known:
 def closed(estimator: Known, frames: SonarFrames) -> tuple[Closure, list[Estimate]]:
     source, numbers = FrameSource.of(frames), np.arange(len(frames))
     estimates = estimate_motions(source, estimator, numbers)
-    found = closure_of(source, estimator, numbers, estimates, STEPS)
-    assert found is not None
-    return found, estimates
+    result = closure_of(source, estimator, numbers, estimates, STEPS)
+    assert result is not None
+    return result, estimates
 
 
 def test_exact_motions_close() -> None:
     frames = numbered(FRAMES)
     assert frames.poses is not None
-    found, _ = closed(Known(frames.poses, np.zeros(3), STD), frames)
-    assert found.residuals.shape == (16, 3)
-    np.testing.assert_allclose(found.residuals, 0, atol=1e-12)
-    assert found.factor == 1
+    result, _ = closed(Known(frames.poses, np.zeros(3), STD), frames)
+    assert result.residuals.shape == (16, 3)
+    np.testing.assert_allclose(result.residuals, 0, atol=1e-12)
+    assert result.factor == 1
 
 
 def test_residuals_have_the_variance_of_nine_motions_and_true_covariances_stay() -> None:
     frames = numbered(1601)
     assert frames.poses is not None
-    found, estimates = closed(Known(frames.poses, STD, STD), frames)
+    result, estimates = closed(Known(frames.poses, STD, STD), frames)
     # 200 loops: the rms scatters by 5 %; turns of a degree mix the axes by less
-    np.testing.assert_allclose(found.rms, 3 * STD, rtol=0.2)
-    assert found.factor == pytest.approx(1, abs=0.25)
-    inflated = found.inflate_covariances(estimates)
-    np.testing.assert_allclose(np.asarray(inflated[0].covariance), np.diag(STD**2) * found.factor)
+    np.testing.assert_allclose(result.rms, 3 * STD, rtol=0.2)
+    assert result.factor == pytest.approx(1, abs=0.25)
+    inflated = result.inflate_covariances(estimates)
+    np.testing.assert_allclose(np.asarray(inflated[0].covariance), np.diag(STD**2) * result.factor)
 
 
 @pytest.mark.parametrize("told", [STD / 5, None])
 def test_covariances_that_are_too_small_or_missing_are_made_honest(told: NDArray[np.float64] | None) -> None:
     frames = numbered(1601)
     assert frames.poses is not None
-    found, estimates = closed(Known(frames.poses, STD, told), frames)
-    covariance = np.asarray(found.inflate_covariances(estimates)[3].covariance)
+    result, estimates = closed(Known(frames.poses, STD, told), frames)
+    covariance = np.asarray(result.inflate_covariances(estimates)[3].covariance)
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), STD, rtol=0.2)
 
 
 def test_a_pull_towards_rest_shows_in_the_mean() -> None:
     frames = numbered(FRAMES)
     assert frames.poses is not None
-    found, _ = closed(Known(frames.poses, np.zeros(3), STD / 100, pull=0.1), frames)
+    result, _ = closed(Known(frames.poses, np.zeros(3), STD / 100, pull=0.1), frames)
     true = motions(frames.poses)
-    assert found.mean[1] == pytest.approx(-0.1 * STEPS * true[:128, 1].mean(), rel=0.05)
-    assert found.factor > 100
+    assert result.mean[1] == pytest.approx(-0.1 * STEPS * true[:128, 1].mean(), rel=0.05)
+    assert result.factor > 100
 
 
 def test_loops_with_invalid_motions_are_left_out_and_one_loop_is_none() -> None:
     frames = numbered(FRAMES)
     assert frames.poses is not None
-    found, _ = closed(Known(frames.poses, np.zeros(3), STD, lost=(3, 50)), frames)
-    assert len(found.residuals) == 14
+    result, _ = closed(Known(frames.poses, np.zeros(3), STD, lost=(3, 50)), frames)
+    assert len(result.residuals) == 14
     short = numbered(STEPS + 1)
     assert short.poses is not None
     source, numbers = FrameSource.of(short), np.arange(STEPS + 1)

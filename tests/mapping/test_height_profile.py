@@ -35,8 +35,8 @@ def source() -> FrameSource:
 def profile_of(source: FrameSource, *heights: float | None, depth: bool = False) -> HeightProfile:
     """The profile along the true path; of each pair a height by first echoes, or None."""
     still = Motion(0.0, 0.0, 0.0)
-    told = [{} if one is None else {"height_m": one, "height_std_m": 0.02 * one} for one in heights]
-    estimates = [Estimate(still, about=one) for one in told]
+    message = [{} if one is None else {"height_m": one, "height_std_m": 0.02 * one} for one in heights]
+    estimates = [Estimate(still, about=one) for one in message]
     path = source.true
     assert path is not None
     sensors = simulated_sensors(path, SensorNoise(depth_m=1e-9), seed=0) if depth else None
@@ -46,30 +46,30 @@ def profile_of(source: FrameSource, *heights: float | None, depth: bool = False)
 def test_first_echoes_come_before_an_altimeter_and_lie_ahead(source: FrameSource) -> None:
     assert source.poses is not None
     assert source.height_m is not None
-    found = profile_of(source, 2.0, None, None, 2.2, 2.4)
-    np.testing.assert_allclose(found.height_m, [2.0, 2.0, source.height_m[2], 2.2, 2.3, 2.4])
-    np.testing.assert_allclose(found.std_m, [0.04, 0.04, np.nan, 0.044, 0.046, 0.048])
-    assert found.by.tolist() == [FIRST_ECHOES] * 2 + [ALTIMETER] + [FIRST_ECHOES] * 3
-    np.testing.assert_allclose(found.ground_z_m, source.poses[:, 2] - found.height_m)
+    result = profile_of(source, 2.0, None, None, 2.2, 2.4)
+    np.testing.assert_allclose(result.height_m, [2.0, 2.0, source.height_m[2], 2.2, 2.3, 2.4])
+    np.testing.assert_allclose(result.std_m, [0.04, 0.04, np.nan, 0.044, 0.046, 0.048])
+    assert result.by.tolist() == [FIRST_ECHOES] * 2 + [ALTIMETER] + [FIRST_ECHOES] * 3
+    np.testing.assert_allclose(result.ground_z_m, source.poses[:, 2] - result.height_m)
     steepest = source.poses[0, 3] + np.radians(source.like.sonar.elevation_fov_deg) / 2
-    ahead = np.linalg.norm(found.places - source.poses[:, :2], axis=1)
+    ahead = np.linalg.norm(result.places - source.poses[:, :2], axis=1)
     assert ahead[2] == 0
     assert ahead[0] == pytest.approx(2.0 / np.tan(steepest), rel=0.1)
-    assert np.isnan(found.ground_depth_m).all()
+    assert np.isnan(result.ground_depth_m).all()
 
 
 def test_a_depth_sensor_tells_the_depth_of_the_ground(source: FrameSource) -> None:
     assert source.poses is not None
-    found = profile_of(source, *[2.0] * 5, depth=True)
-    np.testing.assert_allclose(found.ground_depth_m, 2.0 - source.poses[:, 2], atol=1e-6)
+    result = profile_of(source, *[2.0] * 5, depth=True)
+    np.testing.assert_allclose(result.ground_depth_m, 2.0 - source.poses[:, 2], atol=1e-6)
 
 
 def test_a_height_that_is_given_is_no_measurement(source: FrameSource) -> None:
     bare = replace(source, height_m=None)
     for one in (bare, bare.with_geometry(2.5), replace(source, assumed_height=True)):
-        found = profile_of(one, *[None] * 5)
-        assert np.isnan(found.height_m).all()
-        assert set(found.by) == {""}
+        result = profile_of(one, *[None] * 5)
+        assert np.isnan(result.height_m).all()
+        assert set(result.by) == {""}
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,9 @@ def test_a_slope_shows_at_constant_depth(tmp_path: Path, variant: str) -> None:
     vehicle[:, 1], vehicle[:, 2] = 0.04 * np.arange(20) - 5.2, 1.7  # its first echoes come from before the blocks
     poses = mounted(vehicle, Pose.from_degrees([0, 0, 0, 35, 0, 0]))
     frames = Simulator(load_scene(tmp_path / "world/scene.xml"), sonar).render(Trajectory(poses, np.arange(20) / 10), seed=1)
-    found = odometry(frames, create_estimator("direct")).heights
-    assert set(found.by) == {FIRST_ECHOES}
-    off = (found.ground_z_m - np.tan(np.radians(10)) * found.places[:, 1]) / found.std_m
+    result = odometry(frames, create_estimator("direct")).heights
+    assert set(result.by) == {FIRST_ECHOES}
+    off = (result.ground_z_m - np.tan(np.radians(10)) * result.places[:, 1]) / result.std_m
     assert np.sqrt(np.mean(off**2)) < 1, off
-    rise = np.polyfit(found.places[:, 1], found.ground_z_m, 1)[0]
+    rise = np.polyfit(result.places[:, 1], result.ground_z_m, 1)[0]
     assert np.degrees(np.arctan(rise)) == pytest.approx(10, abs=1)

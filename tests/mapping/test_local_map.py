@@ -84,9 +84,9 @@ def wrong_estimates() -> list[Estimate]:
 
 def test_the_map_takes_out_what_pairs_of_frames_get_wrong() -> None:
     frames = run()
-    found = mapped(FrameSource.of(frames), np.arange(FRAMES), wrong_estimates())
-    assert all(one.about["map"] == "used" for one in found)
-    series = series_of(found, frames.time_s)
+    result = mapped(FrameSource.of(frames), np.arange(FRAMES), wrong_estimates())
+    assert all(one.about["map"] == "used" for one in result)
+    series = series_of(result, frames.time_s)
     assert frames.poses is not None
     start = Pose(*frames.poses[0])
     path, before = (
@@ -110,8 +110,8 @@ def test_heave_that_no_sensor_tells_is_estimated(monkeypatch: pytest.MonkeyPatch
     errors = []
     for std in (local_map.ROUGH_STD, local_map.ATTITUDE_STD):
         monkeypatch.setattr(local_map, "ROUGH_STD", std)
-        found = mapped(blind, np.arange(FRAMES), wrong_estimates())
-        errors.append(abs(sum(one.motion.forward for one in found) - STEP_M * (FRAMES - 1)))
+        result = mapped(blind, np.arange(FRAMES), wrong_estimates())
+        errors.append(abs(sum(one.motion.forward for one in result) - STEP_M * (FRAMES - 1)))
     assert errors[0] < 0.5 * errors[1], "heave changes the length of the path where it is not estimated"
 
 
@@ -137,10 +137,10 @@ def test_frames_that_show_nothing_keep_the_motion_of_the_pair() -> None:
     dark = frames.image.copy()
     dark[6:] = 0
     estimates = wrong_estimates()[:11]
-    found = mapped(FrameSource.of(replace(frames, image=dark)), np.arange(12), estimates)
-    assert [one.about["map"] == "used" for one in found[:5]] == [True] * 5
-    assert all("landmarks" in one.about["map"] for one in found[5:])
-    assert found[8].motion == estimates[8].motion
+    result = mapped(FrameSource.of(replace(frames, image=dark)), np.arange(12), estimates)
+    assert [one.about["map"] == "used" for one in result[:5]] == [True] * 5
+    assert all("landmarks" in one.about["map"] for one in result[5:])
+    assert result[8].motion == estimates[8].motion
 
 
 def test_frames_without_a_height_are_refused() -> None:
@@ -152,12 +152,12 @@ def test_frames_without_a_height_are_refused() -> None:
 def test_odometry_tells_what_the_map_did() -> None:
     frames = run().select(slice(0, 16))
     known, options = EstimateStore(dict(enumerate(wrong_estimates()[:15]))), OdometryOptions(local_map=True)
-    found = odometry(frames, Zero(), options, store=known)
-    assert ("motions by the local map", 15, "") in found.rows()
-    assert found.warnings() == []
+    result = odometry(frames, Zero(), options, store=known)
+    assert ("motions by the local map", 15, "") in result.rows()
+    assert result.warnings() == []
     plain = odometry(frames, Zero(), store=known)
     assert frames.poses is not None
-    errors = [np.linalg.norm((one.path.poses - frames.poses)[-1, :2]) for one in (found, plain)]
+    errors = [np.linalg.norm((one.path.poses - frames.poses)[-1, :2]) for one in (result, plain)]
     assert errors[0] < 0.5 * errors[1]
     dark = frames.image.copy()
     dark[4:] = 0

@@ -159,9 +159,9 @@ def test_places_beyond_the_path_s_covariance_are_not_taken_for_one_another() -> 
     assert first is not None
     assert second is not None
     assert likenesses(first, second, np.zeros(1), np.zeros(2), np.full(2, 0.3))[0].correlation > 0.95
-    found = odometry(frames, Drifting(path, period=14.0), LOOPS)
-    assert found.graph is not None
-    assert len(kept_loops(found).first) == 0
+    result = odometry(frames, Drifting(path, period=14.0), LOOPS)
+    assert result.graph is not None
+    assert len(kept_loops(result).first) == 0
 
 
 @pytest.mark.thorough
@@ -176,11 +176,11 @@ def test_a_floor_that_repeats_within_the_covariance_is_ambiguous(round_trip: tup
         def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
             return replace(super().estimate(frames), covariance=np.diag(loose**2))
 
-    found = odometry(frames, Loose(path), LOOPS)
-    assert found.graph is not None
-    assert found.graph.search is not None
-    assert found.graph.search.rejected["two places look similar"] > 0
-    assert len(kept_loops(found).first) == 0
+    result = odometry(frames, Loose(path), LOOPS)
+    assert result.graph is not None
+    assert result.graph.search is not None
+    assert result.graph.search.rejected["two places look similar"] > 0
+    assert len(kept_loops(result).first) == 0
 
 
 @pytest.mark.thorough
@@ -217,13 +217,13 @@ def test_a_gyroscope_lowers_the_error_of_the_end(round_trip: tuple[SonarFrames, 
     frames, estimator = round_trip
     plain = odometry(frames, estimator)
     gyro = simulated_sensors(estimator.path, SensorNoise(gyro_deg_rth=0.1, depth_m=1e-4), 4)
-    found = odometry(frames, estimator, OdometryOptions(sensors=gyro))
-    assert found.graph is not None
-    assert found.graph.sensors == ("gyroscope", "depth")
-    errors = [np.abs(one.path.poses[-1, 5] - estimator.path.poses[-1, 5]) for one in (plain, found)]
+    result = odometry(frames, estimator, OdometryOptions(sensors=gyro))
+    assert result.graph is not None
+    assert result.graph.sensors == ("gyroscope", "depth")
+    errors = [np.abs(one.path.poses[-1, 5] - estimator.path.poses[-1, 5]) for one in (plain, result)]
     assert errors[1] < 0.2 * errors[0]
-    np.testing.assert_allclose(found.path.poses[:, 2], 2.5, atol=1e-3)
-    assert found.graph.covariances[-1, 2, 2] < 1e-5
+    np.testing.assert_allclose(result.path.poses[:, 2], 2.5, atol=1e-3)
+    assert result.graph.covariances[-1, 2, 2] < 1e-5
 
 
 def test_motions_without_an_estimate_are_those_of_the_sensors(round_trip: tuple[SonarFrames, Drifting]) -> None:
@@ -236,20 +236,20 @@ def test_motions_without_an_estimate_are_those_of_the_sensors(round_trip: tuple[
             return right if frames.time_s[0] % 40 < 20 else replace(right, valid=False, reason="blind")
 
     sensors = simulated_sensors(estimator.path, SensorNoise(gyro_deg_rth=0.1, velocity_m_s=1e-3), 4)
-    found = odometry(frames, Blind(estimator.path), OdometryOptions(sensors=sensors))
-    assert (~found.valid).sum() >= 60
-    off = found.series.motions - motions(estimator.path.poses)
-    assert np.abs(off[~found.valid]).max() < 3e-3
+    result = odometry(frames, Blind(estimator.path), OdometryOptions(sensors=sensors))
+    assert (~result.valid).sum() >= 60
+    off = result.series.motions - motions(estimator.path.poses)
+    assert np.abs(off[~result.valid]).max() < 3e-3
 
 
 def test_a_compass_tells_the_first_heading_where_nothing_else_does(round_trip: tuple[SonarFrames, Drifting]) -> None:
     frames, estimator = round_trip
     blind = FrameSource.of(replace(frames, poses=None)).with_geometry(pitch_rad=float(np.radians(35)))
     sensors = simulated_sensors(estimator.path, SensorNoise(compass_deg=2.0, rate_hz=1.0), 5)
-    found = odometry(blind, estimator, OdometryOptions(sensors=sensors))
-    assert found.graph is not None
-    assert np.degrees(found.path.poses[0, 5]) == pytest.approx(40, abs=2)
-    assert np.degrees(np.sqrt(found.graph.covariances[0, 2, 2])) < 1
+    result = odometry(blind, estimator, OdometryOptions(sensors=sensors))
+    assert result.graph is not None
+    assert np.degrees(result.path.poses[0, 5]) == pytest.approx(40, abs=2)
+    assert np.degrees(np.sqrt(result.graph.covariances[0, 2, 2])) < 1
 
 
 @pytest.mark.thorough
@@ -275,13 +275,13 @@ def test_a_run_s_folder_keeps_registrations_and_resumes_to_the_same_bits(
     @dataclass(frozen=True)
     class Counting(Drifting):
         def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
-            asked.append(float(np.ptp(frames.time_s)))
+            arguments.append(float(np.ptp(frames.time_s)))
             return super().estimate(frames)
 
-    asked: list[float] = []
+    arguments: list[float] = []
     run_odometry(source, "drifting", Counting(estimator.path), tmp_path / "out", options, resume=True)
-    assert len(asked) == len(lines) - 1
-    assert min(asked) > 2
+    assert len(arguments) == len(lines) - 1
+    assert min(arguments) > 2
     assert {name: (tmp_path / "out" / name).read_bytes() for name in files} == bits
     (tmp_path / "out" / "loops.jsonl").write_bytes(b'{"first": 1, "motion": [0, 0, 0]}\n')
     with pytest.raises(MitsonarError, match=r"loops.jsonl, line 1 is damaged"):

@@ -40,8 +40,10 @@ def ground(sonar: Sonar, pose: Pose, height: float = HEIGHT) -> tuple[Array, Arr
     b = np.broadcast_to(sonar.bearing_rad, level.shape[:2])
     half = np.radians(sonar.elevation_fov_deg) / 2
     # lit cells lie, in the sonar's own axes, along a direction of an elevation within the field of view
-    own = (vehicle_rotation(Pose(0, 0, 0, pose.pitch, pose.roll, 0)).inv().apply(level.reshape(-1, 3))).reshape(level.shape)
-    unit = own / np.linalg.norm(own, axis=-1, keepdims=True)
+    local = (vehicle_rotation(Pose(0, 0, 0, pose.pitch, pose.roll, 0)).inv().apply(level.reshape(-1, 3))).reshape(
+        level.shape
+    )
+    unit = local / np.linalg.norm(local, axis=-1, keepdims=True)
     nearest = np.max(
         [np.einsum("...i,...i", unit, directions(sonar.bearing, b, e)) for e in np.linspace(-half, half, 61)], 0
     )
@@ -303,13 +305,13 @@ def test_order_does_not_matter() -> None:
         mosaic = Mosaic(MosaicOptions(0.02))
         mosaic.add(frames.select(order))
         maps.append(mosaic)
-    for other in maps[1:]:
-        assert other.extent == maps[0].extent
-        np.testing.assert_array_equal(other.count, maps[0].count)
-        np.testing.assert_allclose(other.mean, maps[0].mean, atol=2e-6)
-        both = np.isfinite(other.std) & np.isfinite(maps[0].std)  # a cell at the limit may be known in one order only
-        assert (np.isfinite(other.std) != np.isfinite(maps[0].std)).sum() <= 3
-        np.testing.assert_allclose(other.std[both], maps[0].std[both], atol=5e-5)
+    for second in maps[1:]:
+        assert second.extent == maps[0].extent
+        np.testing.assert_array_equal(second.count, maps[0].count)
+        np.testing.assert_allclose(second.mean, maps[0].mean, atol=2e-6)
+        both = np.isfinite(second.std) & np.isfinite(maps[0].std)  # a cell at the limit may be known in one order only
+        assert (np.isfinite(second.std) != np.isfinite(maps[0].std)).sum() <= 3
+        np.testing.assert_allclose(second.std[both], maps[0].std[both], atol=5e-5)
 
 
 @pytest.mark.thorough
@@ -319,13 +321,13 @@ def test_illumination_is_taken_out() -> None:
     pattern = (3.5 / SONAR.range_m[:, None]) ** 3 * np.cos(2.5 * SONAR.bearing_rad) ** 2
     shaded = frames_of(waves, poses)
     shaded.image *= pattern.astype(np.float32)
-    found = illumination(shaded)
+    result = illumination(shaded)
     _, lit = ground(SONAR, poses[0])
-    ratio = (found / pattern)[lit]
+    ratio = (result / pattern)[lit]
     assert ratio.std() / ratio.mean() < 0.06
-    assert found[lit].mean() == pytest.approx(1, abs=0.02)
+    assert result[lit].mean() == pytest.approx(1, abs=0.02)
     results = {}
-    for name, use in (("with", found), ("without", None)):
+    for name, use in (("with", result), ("without", None)):
         mosaic = build_mosaic(shaded, options=MosaicOptions(cell_m=0.02), illumination=use)
         many = mosaic.count >= 5
         level = waves(*centres(mosaic))
@@ -367,15 +369,15 @@ def test_memory_is_the_map_s() -> None:
     mosaic = Mosaic(MosaicOptions(0.05))
     one = blank([looking(0)])
     mosaic.add(one)
-    held = mosaic.state_bytes
+    stored = mosaic.state_bytes
     for _ in range(30):
         mosaic.add(one)
-    assert mosaic.state_bytes == held
+    assert mosaic.state_bytes == stored
     assert mosaic.frames == 31
     rows, columns = mosaic.mean.shape
-    assert rows * columns * 20 <= held < 4 * rows * columns * 20
+    assert rows * columns * 20 <= stored < 4 * rows * columns * 20
     arrays = [value for value in vars(mosaic).values() if isinstance(value, np.ndarray)]
-    assert sum(array.nbytes for array in arrays) == held
+    assert sum(array.nbytes for array in arrays) == stored
 
 
 def test_a_map_grows_in_every_direction() -> None:
@@ -383,9 +385,9 @@ def test_a_map_grows_in_every_direction() -> None:
     reserved = Mosaic(MosaicOptions(0.05))
     frames = frames_of(waves, poses)
     reserved.reserve(frames, poses, HEIGHT)
-    held = reserved.state_bytes
+    stored = reserved.state_bytes
     reserved.add(frames)
-    assert reserved.state_bytes == held, "room was made before"
+    assert reserved.state_bytes == stored, "room was made before"
     grown = Mosaic(MosaicOptions(0.05))
     for k in range(5):
         grown.add(frames.select(np.array([k])))
@@ -395,9 +397,9 @@ def test_a_map_grows_in_every_direction() -> None:
 
 def test_too_large_a_map_names_a_cell_that_fits() -> None:
     poses = np.array([looking(0), looking(0, x=200, y=100)])
-    with pytest.raises(MitsonarError, match=r"at most 1,000,000 are allowed: use cells of ([\d.]+) mm") as found:
+    with pytest.raises(MitsonarError, match=r"at most 1,000,000 are allowed: use cells of ([\d.]+) mm") as result:
         build_mosaic(blank(poses), poses, HEIGHT, MosaicOptions(most_cells=1_000_000))
-    cell = float(str(found.value).split("use cells of ")[1].split(" mm")[0]) / 1e3
+    cell = float(str(result.value).split("use cells of ")[1].split(" mm")[0]) / 1e3
     assert 0.14 < cell < 0.17
     fits = build_mosaic(blank(poses), poses, HEIGHT, MosaicOptions(cell_m=cell, most_cells=1_000_000))
     assert fits.frames_without_ground == 0
@@ -496,8 +498,8 @@ def test_geotiff_says_where_its_cells_are(tmp_path: Path) -> None:
         bands = page.asarray()
         tags = {tag.code: tag.value for tag in page.tags.values()}
     assert bands.dtype == np.float32
-    for band, wanted in zip(bands, (mosaic.mean, mosaic.std, mosaic.count), strict=True):
-        np.testing.assert_array_equal(band, wanted)
+    for band, expected in zip(bands, (mosaic.mean, mosaic.std, mosaic.count), strict=True):
+        np.testing.assert_array_equal(band, expected)
     assert tags[42113] == "nan"
     i, j, _, x, y, _ = tags[33922]
     step_x, step_y, _ = tags[33550]
@@ -544,9 +546,9 @@ def test_a_map_is_drawn_where_it_lies_with_a_true_scale_bar() -> None:
     np.testing.assert_allclose([np.asarray(arrows.U)[-1], np.asarray(arrows.V)[-1]], [1, 0], atol=1e-12)
     bar, label = axes.patches[0], axes.texts[0].get_text()
     assert label.endswith(" cm") or label.endswith(" m")
-    said = float(label.split()[0]) * (0.01 if label.endswith(" cm") else 1)
+    output = float(label.split()[0]) * (0.01 if label.endswith(" cm") else 1)
     assert isinstance(bar, Rectangle)
-    assert bar.get_width() == pytest.approx(said)
+    assert bar.get_width() == pytest.approx(output)
 
 
 def test_path_figures_show_motions_along_the_new_heading() -> None:
@@ -556,8 +558,8 @@ def test_path_figures_show_motions_along_the_new_heading() -> None:
     labels = [axes.get_ylabel() for axes in figure.axes]
     assert labels[1:] == ["heading (deg)", "sideways (mm)", "forward (mm)", "yaw (deg)"]
     heading, sideways, forward, yaw = (np.asarray(axes.lines[0].get_ydata(), dtype=float) for axes in figure.axes[1:])
-    for values, wanted in ((heading, 90), (sideways, 0), (forward, 100), (yaw, 0)):
-        np.testing.assert_allclose(values, wanted, atol=1e-9)
+    for values, expected in ((heading, 90), (sideways, 0), (forward, 100), (yaw, 0)):
+        np.testing.assert_allclose(values, expected, atol=1e-9)
 
 
 def test_bands_are_two_standard_deviations() -> None:

@@ -91,10 +91,10 @@ def told(path: Trajectory, **options: Any) -> tuple[SonarFrames, Told]:
 
 def test_the_path_is_the_motions_composed_from_the_first_pose() -> None:
     path = sway(30)
-    found = odometry(*told(path))
-    np.testing.assert_allclose(found.path.poses, path.poses, atol=1e-12)
-    np.testing.assert_array_equal(found.path.time_s, path.time_s)
-    assert found.valid.all()
+    result = odometry(*told(path))
+    np.testing.assert_allclose(result.path.poses, path.poses, atol=1e-12)
+    np.testing.assert_array_equal(result.path.time_s, path.time_s)
+    assert result.valid.all()
     elsewhere = odometry(*told(path), OdometryOptions(start=Pose(5, 6, 7, 0.1, 0.2, 1.0)))
     assert elsewhere.path.poses[0].tolist() == [5, 6, 7, 0.1, 0.2, 1.0]
     np.testing.assert_allclose(motions(elsewhere.path.poses), motions(path.poses), atol=1e-12)
@@ -105,10 +105,10 @@ def test_without_poses_the_path_begins_at_the_origin_with_what_is_known() -> Non
     frames, estimator = told(path)
     frames.poses = None
     source = FrameSource.of(frames).with_geometry(pitch_rad=0.6)
-    found = odometry(source, estimator)
-    np.testing.assert_allclose(found.path.poses[0], [0, 0, 2.5, 0.6, 0, 0])
-    assert found.true is None
-    lengths = [(value, unit) for name, value, unit in found.rows() if name == "estimated path length"]
+    result = odometry(source, estimator)
+    np.testing.assert_allclose(result.path.poses[0], [0, 0, 2.5, 0.6, 0, 0])
+    assert result.true is None
+    lengths = [(value, unit) for name, value, unit in result.rows() if name == "estimated path length"]
     assert len(lengths) == 1
     assert lengths[0][0] == pytest.approx(float(np.linalg.norm(motions(path.poses)[:, :2], axis=1).sum()))
     assert lengths[0][1] == "m"
@@ -116,10 +116,10 @@ def test_without_poses_the_path_begins_at_the_origin_with_what_is_known() -> Non
 
 def test_every_third_frame() -> None:
     path = sway(30)
-    found = odometry(*told(path), OdometryOptions(every=3))
-    assert found.frames.tolist() == list(range(0, 30, 3))
-    np.testing.assert_allclose(found.path.poses, path.poses[::3], atol=1e-12)
-    rows = {name: value for name, value, _ in found.rows()}
+    result = odometry(*told(path), OdometryOptions(every=3))
+    assert result.frames.tolist() == list(range(0, 30, 3))
+    np.testing.assert_allclose(result.path.poses, path.poses[::3], atol=1e-12)
+    rows = {name: value for name, value, _ in result.rows()}
     assert rows["poses compared"] == 10
     assert rows["end-point error"] < 1e-6
 
@@ -136,30 +136,30 @@ def test_estimators_do_not_see_where_the_sonar_was() -> None:
 
 def test_direct_finds_the_path_over_a_drawn_floor() -> None:
     path = sway(16)
-    found = odometry(over_ground(path), Direct())
-    errors = motions(found.path.poses) - motions(path.poses)
-    assert found.valid.all()
+    result = odometry(over_ground(path), Direct())
+    errors = motions(result.path.poses) - motions(path.poses)
+    assert result.valid.all()
     rmse = np.sqrt((errors**2).mean(axis=0))
     assert (rmse < [6e-4, 3e-4, 3e-4]).all(), rmse
-    assert found.pose_covariances is not None
-    assert found.pose_covariances.shape == (16, 3, 3)
+    assert result.pose_covariances is not None
+    assert result.pose_covariances.shape == (16, 3, 3)
 
 
 def test_errors_over_relief_are_alike_and_those_over_even_ground_are_not() -> None:
     """First echoes tell; where they do not, relief is assumed. A smoothed path counts errors as independent."""
-    found = odometry(over_ground(sway(16)), Direct())
-    assert found.correlated is not None
-    assert found.correlated.share == 0.9
+    result = odometry(over_ground(sway(16)), Direct())
+    assert result.correlated is not None
+    assert result.correlated.share == 0.9
     even, _, _ = lit_plane(Sonar(range_min=2.0, range_max=7.0), 2.5, np.radians(35))
     canvas = Canvas.of(even.select(np.array([0])))
     assert canvas is not None
-    apart = replace(found, correlated=errors_along(found.series.motions, canvas))
+    apart = replace(result, correlated=errors_along(result.series.motions, canvas))
     assert apart.correlated is not None
     assert apart.correlated.share == 0.0
-    staying, told = found.pose_covariances, apart.pose_covariances
+    staying, message = result.pose_covariances, apart.pose_covariances
     assert staying is not None
-    assert told is not None
-    assert np.trace(staying[-1]) > 2 * np.trace(told[-1])
+    assert message is not None
+    assert np.trace(staying[-1]) > 2 * np.trace(message[-1])
     assert odometry(over_ground(sway(16)), Direct(), OdometryOptions(smooth="kalman")).correlated is None
 
 
@@ -181,14 +181,14 @@ def test_a_gyroscope_over_even_ground_mends_the_heading_and_leaves_the_rest() ->
     moved = motions(poses) + rng.standard_normal((count - 1, 3)) @ mixed.T
     known = {k: Estimate(Motion(*one.tolist()), mixed @ mixed.T, True, "", {}) for k, one in enumerate(moved)}
     gyroscope = simulated_sensors(path, SensorNoise(gyro_deg_rth=1.0), seed=0)
-    found = odometry(seen, Direct(), OdometryOptions(sensors=gyroscope), store=EstimateStore(known))
-    off = found.path.poses[-1, :2] - poses[-1, :2]
-    assert found.pose_covariances is not None
-    told = np.sqrt(np.trace(found.pose_covariances[-1, :2, :2]))
+    result = odometry(seen, Direct(), OdometryOptions(sensors=gyroscope), store=EstimateStore(known))
+    off = result.path.poses[-1, :2] - poses[-1, :2]
+    assert result.pose_covariances is not None
+    message = np.sqrt(np.trace(result.pose_covariances[-1, :2, :2]))
     slope, length = 0.006, 0.02 * (count - 1)
     independent = np.sqrt(2 * (count - 1) * 1e-3**2 + 2 * (slope * length) ** 2)
-    assert told == pytest.approx(independent, rel=0.25)
-    assert np.hypot(*off) < 3 * told
+    assert message == pytest.approx(independent, rel=0.25)
+    assert np.hypot(*off) < 3 * message
 
 
 @pytest.mark.thorough
@@ -219,18 +219,18 @@ def test_what_is_not_believed_is_bridged_and_the_rest_left_as_it_is(covariance: 
     speed = np.array([0.02, 0.1, 0.01])
     even = path_of(speed * np.diff(path.time_s)[:, None], START, path.time_s)
     lost = (0, 7, 8, 9, 28)
-    found = odometry(*told(even, lost=lost, covariance=covariance))
-    assert np.flatnonzero(~found.valid).tolist() == list(lost)
-    np.testing.assert_allclose(found.path.poses, even.poses, atol=1e-6)
-    kept = found.valid
-    np.testing.assert_array_equal(found.series.motions[kept], np.array([e.motion for e in found.estimates])[kept])
+    result = odometry(*told(even, lost=lost, covariance=covariance))
+    assert np.flatnonzero(~result.valid).tolist() == list(lost)
+    np.testing.assert_allclose(result.path.poses, even.poses, atol=1e-6)
+    stored = result.valid
+    np.testing.assert_array_equal(result.series.motions[stored], np.array([e.motion for e in result.estimates])[stored])
     if covariance is None:
-        assert found.series.covariances is None
-        assert found.pose_covariances is None
+        assert result.series.covariances is None
+        assert result.pose_covariances is None
     else:
-        assert found.series.covariances is not None
-        np.testing.assert_array_equal(found.series.covariances[kept], np.tile(covariance, (kept.sum(), 1, 1)))
-        assert found.pose_covariances is not None
+        assert result.series.covariances is not None
+        np.testing.assert_array_equal(result.series.covariances[stored], np.tile(covariance, (stored.sum(), 1, 1)))
+        assert result.pose_covariances is not None
 
 
 def test_a_bridge_s_covariance_grows_with_its_length() -> None:
@@ -251,8 +251,8 @@ def test_a_bridge_s_covariance_grows_with_its_length() -> None:
 @pytest.mark.parametrize("covariance", [None, np.diag(STD**2)])
 def test_one_believed_motion_is_enough(covariance: Array | None) -> None:
     path = path_of(np.tile([0, 0.01, 0.0], (5, 1)), START, np.arange(6.0))
-    found = odometry(*told(path, lost=(0, 1, 3, 4), covariance=covariance))
-    np.testing.assert_allclose(found.path.poses, path.poses, atol=1e-12)
+    result = odometry(*told(path, lost=(0, 1, 3, 4), covariance=covariance))
+    np.testing.assert_allclose(result.path.poses, path.poses, atol=1e-12)
 
 
 def test_many_that_are_not_believed_are_warned_of_and_all_is_an_error() -> None:
@@ -273,13 +273,13 @@ def test_scale_fits_what_was_shrunk() -> None:
     path = sway(30)
     shrunk = motions(path.poses) * (np.array([1 / 2, 1 / 3, 2]) - 1)
     words = {"off": np.vstack([shrunk, np.zeros(3)]), "covariance": np.diag(STD**2)}
-    found = odometry(*told(path, lost=(4,), **words), OdometryOptions(scale="fit"))
-    np.testing.assert_allclose(found.factors, [2, 3, 0.5], rtol=1e-9)
-    kept = found.valid
-    np.testing.assert_allclose(found.series.motions[kept], motions(path.poses)[kept], atol=1e-12)
-    assert found.series.covariances is not None
-    np.testing.assert_allclose(np.sqrt(np.diag(found.series.covariances[0])), STD * [2, 3, 0.5])
-    rows = {name: value for name, value, _ in found.rows()}
+    result = odometry(*told(path, lost=(4,), **words), OdometryOptions(scale="fit"))
+    np.testing.assert_allclose(result.factors, [2, 3, 0.5], rtol=1e-9)
+    stored = result.valid
+    np.testing.assert_allclose(result.series.motions[stored], motions(path.poses)[stored], atol=1e-12)
+    assert result.series.covariances is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(result.series.covariances[0])), STD * [2, 3, 0.5])
+    rows = {name: value for name, value, _ in result.rows()}
     assert rows["scale of forward, fitted to the true path"] == pytest.approx(3)
     given = odometry(*told(path, **words), OdometryOptions(scale=[2, 3, 0.5]))
     np.testing.assert_allclose(given.path.poses, path.poses, atol=1e-9)
@@ -295,8 +295,8 @@ def test_smoothing_takes_noise_from_motions_and_hardly_changes_the_end() -> None
         off = STD * np.random.default_rng(seed).normal(size=(200, 3))
         for smooth in end:
             options = OdometryOptions(smooth=smooth)  # type: ignore[arg-type]
-            found = odometry(*told(path, off=off, covariance=np.diag(STD**2)), options)
-            rows = {name: value for name, value, _ in found.rows()}
+            result = odometry(*told(path, off=off, covariance=np.diag(STD**2)), options)
+            rows = {name: value for name, value, _ in result.rows()}
             end[smooth].append(rows["end-point error"])
             each[smooth].append(rows["motion error RMSE, sideways"])
     rms = {smooth: np.sqrt(np.mean(np.square(values))) for smooth, values in end.items()}
@@ -309,8 +309,8 @@ def test_smoothing_takes_noise_from_motions_and_hardly_changes_the_end() -> None
 def test_the_table_tells_what_a_hand_finds() -> None:
     path = sway(41)
     off = STD * np.random.default_rng(5).normal(size=(41, 3))
-    found = odometry(*told(path, off=off, covariance=np.diag(STD**2)))
-    rows = {name: (value, unit) for name, value, unit in found.rows()}
+    result = odometry(*told(path, off=off, covariance=np.diag(STD**2)))
+    rows = {name: (value, unit) for name, value, unit in result.rows()}
     driven = motions(path.poses)
     for k, (name, scale, unit) in enumerate((("sideways", 1e3, "mm"), ("forward", 1e3, "mm"), ("yaw", 57.29578, "deg"))):
         value, its_unit = rows[f"motion error RMSE, {name}"]
@@ -324,10 +324,10 @@ def test_the_table_tells_what_a_hand_finds() -> None:
         assert rows[f"slope over the true {name}"][0] == pytest.approx(slope)
     nees = ((off[:40] / STD) ** 2).sum(axis=1).mean() / 3
     assert rows["NEES (ideally 1)"][0] == pytest.approx(nees)
-    end = np.linalg.norm(found.path.poses[-1, :2] - path.poses[-1, :2])
+    end = np.linalg.norm(result.path.poses[-1, :2] - path.poses[-1, :2])
     assert rows["end-point error"][0] == pytest.approx(1e3 * end)
     assert rows["end-point error"][1] == "mm"
-    lines = table_lines(found.rows())
+    lines = table_lines(result.rows())
     assert lines[0].split("|")[2].strip() == "value"
     assert len({len(line) for line in lines}) == 1
 
@@ -489,9 +489,9 @@ def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> Non
     assert index.tolist() == [2, 4, 6, 8]
     np.testing.assert_array_equal(poses[:, 3], frames.poses[some, 3])
     np.testing.assert_array_equal(poses[:, [0, 1, 2, 5]], path.poses[some][:, [0, 1, 2, 5]])
-    own = path.poses.copy()
-    own[:, 3] = np.linspace(0.3, 0.5, 10)
-    np.testing.assert_array_equal(source.along(Trajectory(own, path.time_s))[1], own)
+    local = path.poses.copy()
+    local[:, 3] = np.linspace(0.3, 0.5, 10)
+    np.testing.assert_array_equal(source.along(Trajectory(local, path.time_s))[1], local)
     with pytest.raises(MitsonarError, match=r"no pose is within 0.01 s of a frame: give the path of this run"):
         source.along(Trajectory(path.poses, path.time_s + 100))
 
@@ -641,9 +641,9 @@ def test_path_options_may_change_when_it_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "out"
     before = run(out, path, first)
     options = OdometryOptions(smooth="kalman", scale="fit")
-    wanted = run(tmp_path / "new", path, first, options)
+    expected = run(tmp_path / "new", path, first, options)
     again = run(out, path, first, options, resume=True)
-    assert again == wanted
+    assert again == expected
     assert again["estimates.jsonl"] == before["estimates.jsonl"]
     assert again["motions.csv"] != before["motions.csv"]
 

@@ -49,11 +49,11 @@ def told() -> list[MotionPrior]:
 def test_each_pair_gets_its_own_prior(workers: int) -> None:
     """Also where pairs of an earlier run are left out, so that batches do not begin where the table does."""
     known = {0: rejected("known"), 5: rejected("known")}
-    found = estimate_motions(
+    result = estimate_motions(
         numbered(), Believer(), np.arange(FRAMES), workers=workers, priors=told(), store=EstimateStore(known)
     )
-    assert {k for k, one in enumerate(found) if one.reason == "known"} == {0, 5}
-    for k, one in enumerate(found):
+    assert {k for k, one in enumerate(result) if one.reason == "known"} == {0, 5}
+    for k, one in enumerate(result):
         if k not in known:
             assert one.motion == Motion(1e-3 * k, 0.0, float(k))
             assert one.covariance is not None

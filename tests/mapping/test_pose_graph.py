@@ -56,24 +56,24 @@ def test_motions_alone_give_their_composition_and_its_covariance() -> None:
     """Two routes to one number: the graph's marginals and the covariances that are carried along a path."""
     moved = square() + STD * np.random.default_rng(0).normal(size=(44, 3))
     graph = graph_of(moved)
-    found = solved(replace(graph, start=graph.start + [0, 0, 0.01] * (np.arange(45) > 0)[:, None]))
-    np.testing.assert_allclose(found.poses, graph.start, atol=1e-9)
-    own, following = found.covariances()
+    result = solved(replace(graph, start=graph.start + [0, 0, 0.01] * (np.arange(45) > 0)[:, None]))
+    np.testing.assert_allclose(result.poses, graph.start, atol=1e-9)
+    local, following = result.covariances()
     series = MotionSeries(moved, np.arange(45.0), graph.chain.covariances)
-    np.testing.assert_allclose(own, pose_covariances(series, Pose(0, 0, 0)), rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(found.motion_covariances(own, following), graph.chain.covariances, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(local, pose_covariances(series, Pose(0, 0, 0)), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(result.motion_covariances(local, following), graph.chain.covariances, rtol=1e-6, atol=1e-12)
 
 
 def test_errors_that_are_alike_give_the_covariances_of_the_path_that_the_graph_has() -> None:
     """Two routes to one number, with errors that wander and slopes; a path whose errors are alike drifts by far more."""
     moved = square()
     correlated = ErrorCorrelation().along(moved, 3.0)
-    own, _ = solved(replace(graph_of(moved), correlated=correlated)).covariances()
+    local, _ = solved(replace(graph_of(moved), correlated=correlated)).covariances()
     series = MotionSeries(moved, np.arange(45.0), graph_of(moved).chain.covariances)
-    told = pose_covariances(series, Pose(0, 0, 0), correlated=correlated)
-    np.testing.assert_allclose(told, own, rtol=1e-5, atol=1e-12)
+    message = pose_covariances(series, Pose(0, 0, 0), correlated=correlated)
+    np.testing.assert_allclose(message, local, rtol=1e-5, atol=1e-12)
     independent = pose_covariances(series, Pose(0, 0, 0))
-    assert np.trace(told[-1]) > 4 * np.trace(independent[-1])
+    assert np.trace(message[-1]) > 4 * np.trace(independent[-1])
     alone = pose_covariances(series, Pose(0, 0, 0), correlated=correlated, alone=np.ones(44, dtype=bool))
     np.testing.assert_allclose(alone, independent, rtol=1e-9, atol=1e-15)
 
@@ -84,9 +84,9 @@ def test_one_biased_edge_of_a_closed_square_is_shared_out_by_variance() -> None:
     biased = moved.copy()
     biased[4, 1] += 0.02
     graph = replace(graph_of(biased), loops=edge(0, 9, np.array([0, 1.8, 0.0])))
-    found = solved(replace(graph, loops=graph.loops._replace(covariances=np.diag((10 * STD) ** 2)[None])))
+    result = solved(replace(graph, loops=graph.loops._replace(covariances=np.diag((10 * STD) ** 2)[None])))
     # the loop has 100 times the variance of each of 9 motions: it takes 100/109 of the error
-    assert found.poses[9, 1] == pytest.approx(1.8 + 0.02 * 100 / 109, abs=1e-6)
+    assert result.poses[9, 1] == pytest.approx(1.8 + 0.02 * 100 / 109, abs=1e-6)
     one = graph_of(square())
     turned = square()
     turned[10, 2] += 0.01  # the first corner
@@ -102,10 +102,10 @@ def test_headings_join_with_motions_by_variance() -> None:
     graph = replace(
         graph_of(np.tile([0.0, 0.1, 0.0], (4, 1))), headings=Headings(np.array([4]), np.array([0.03]), np.array([2e-3]))
     )
-    found = solved(graph)
-    assert found.poses[4, 2] == pytest.approx(0.03 / 2)
-    own, _ = found.covariances()
-    assert own[4, 2, 2] == pytest.approx(2e-6)
+    result = solved(graph)
+    assert result.poses[4, 2] == pytest.approx(0.03 / 2)
+    local, _ = result.covariances()
+    assert local[4, 2, 2] == pytest.approx(2e-6)
     unknown = np.diag([0, 0, 1.0])
     loose = solved(replace(graph, at_start=unknown))
     assert loose.poses[0, 2] == pytest.approx(0.03, abs=1e-6)
@@ -118,11 +118,11 @@ def test_a_bias_of_a_sensor_is_found_by_a_heading_and_counts_in_the_covariance()
     turning = still + np.array([0, 0, 0.01])
     graph = replace(graph_of(still, loose), others=PoseEdges.chain(turning, np.tile(np.diag(loose**2 * 1e-6), (4, 1, 1))))
     graph = replace(graph, bias=np.tile([0, 0, 0.02], (4, 1)))
-    own, _ = solved(graph).covariances()
+    local, _ = solved(graph).covariances()
     # four independent errors of 1e-3, and four times a common one of 0.02
-    assert own[4, 2, 2] == pytest.approx(4e-6 + (4 * 0.02) ** 2, rel=5e-3)
-    found = solved(replace(graph, headings=Headings(np.array([4]), np.zeros(1), np.array([1e-4]))))
-    np.testing.assert_allclose(found.poses[:, 2], 0, atol=1e-4)
+    assert local[4, 2, 2] == pytest.approx(4e-6 + (4 * 0.02) ** 2, rel=5e-3)
+    result = solved(replace(graph, headings=Headings(np.array([4]), np.zeros(1), np.array([1e-4]))))
+    np.testing.assert_allclose(result.poses[:, 2], 0, atol=1e-4)
     with pytest.raises(MitsonarError, match="for each of 4 motions"):
         replace(graph, bias=np.zeros((3, 3)))
 
@@ -134,11 +134,11 @@ def test_a_wrong_loop_is_left_out_and_right_ones_are_kept() -> None:
     pairs = [(0, 44), (1, 43), (3, 44), (2, 43)]
     right = [edge(i, j, relative_motions(true, [i], [j])[0] + STD * rng.normal(size=3)) for i, j in pairs]
     wrong = [edge(5, 26, np.zeros(3)), edge(0, 20, np.array([0.5, 0, 0]))]
-    found = solved(replace(graph_of(moved), loops=joined(*right, *wrong)))
-    assert found.accepted.tolist() == [True] * 4 + [False] * 2
-    assert (found.squared[4:] > 100).all()
+    result = solved(replace(graph_of(moved), loops=joined(*right, *wrong)))
+    assert result.accepted.tolist() == [True] * 4 + [False] * 2
+    assert (result.squared[4:] > 100).all()
     only = solved(replace(graph_of(moved), loops=joined(*right)))
-    np.testing.assert_allclose(found.poses, only.poses, atol=1e-9)
+    np.testing.assert_allclose(result.poses, only.poses, atol=1e-9)
 
 
 # ---------------------------------------------------------------- marginals
@@ -167,19 +167,19 @@ def tangled(rng: np.random.Generator, share: float = 0.8, slope: float = 0.01) -
 
 def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
     graph, _ = tangled(np.random.default_rng(2))
-    found = solved(graph)
-    size = found.normal.shape[0]
-    dense = found.factor.solve(np.eye(size))
+    result = solved(graph)
+    size = result.normal.shape[0]
+    dense = result.factor.solve(np.eye(size))
     normal = np.linalg.inv(dense)
     np.testing.assert_allclose(normal @ dense, np.eye(size), atol=1e-5)
-    own, following = found.covariances()
-    assert not own[0].any()
+    local, following = result.covariances()
+    assert not local[0].any()
     for pose in (1, 17, 44):
-        place = found.states[3 * pose : 3 * pose + 3]
-        np.testing.assert_allclose(own[pose], dense[np.ix_(place, place)], rtol=1e-6, atol=1e-15)
-    there = found.states[3 * 17 : 3 * 19]
+        place = result.states[3 * pose : 3 * pose + 3]
+        np.testing.assert_allclose(local[pose], dense[np.ix_(place, place)], rtol=1e-6, atol=1e-15)
+    there = result.states[3 * 17 : 3 * 19]
     np.testing.assert_allclose(following[17], dense[np.ix_(there[:3], there[3:])], rtol=1e-6, atol=1e-15)
-    np.testing.assert_allclose(found.columns([18])[17, :, 0], following[17], rtol=1e-9)
+    np.testing.assert_allclose(result.columns([18])[17, :, 0], following[17], rtol=1e-9)
 
 
 @pytest.mark.parametrize("looped", [False, True])
@@ -195,17 +195,17 @@ def test_marginals_of_a_long_path_are_those_of_columns(monkeypatch: pytest.Monke
         loops = joined(*(edge(i, j, relative_motions(graph.start, [i], [j])[0]) for i, j in pairs))
         graph = replace(graph, loops=loops)
     short = solved(graph)
-    own, following = short.covariances()
+    local, following = short.covariances()
     monkeypatch.setattr(pose_graph, "LONG", 100)
     monkeypatch.setattr(pose_graph, "STRETCH", stretch)
     long = solved(graph)
     np.testing.assert_allclose(long.poses, short.poses, atol=1e-9)
-    found, onward = long.covariances()
-    scale = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
-    assert (np.abs(found - own) <= 1e-5 * scale[:, :, None] * scale[:, None]).all()
+    result, onward = long.covariances()
+    scale = np.sqrt(np.diagonal(local, axis1=1, axis2=2))
+    assert (np.abs(result - local) <= 1e-5 * scale[:, :, None] * scale[:, None]).all()
     assert (np.abs(onward - following) <= 1e-5 * scale[:-1, :, None] * scale[1:, None]).all()
-    assert (np.linalg.eigvalsh(found[1:]) > 0).all()
-    of_long, of_short = long.motion_covariances(found, onward), short.motion_covariances(own, following)
+    assert (np.linalg.eigvalsh(result[1:]) > 0).all()
+    of_long, of_short = long.motion_covariances(result, onward), short.motion_covariances(local, following)
     np.testing.assert_allclose(of_long, of_short, rtol=1e-4, atol=1e-10)
 
 
@@ -215,10 +215,10 @@ def test_errors_over_covariances_are_one_by_draws() -> None:
     normalised = []
     for seed in range(60):
         graph, true = tangled(np.random.default_rng([3, seed]))
-        found = solved(replace(graph, loops=graph.loops))
-        off = found.poses - true
-        own, _ = found.covariances()
-        normalised.append([off[k] @ np.linalg.solve(own[k], off[k]) / 3 for k in (10, 22, 44)])
+        result = solved(replace(graph, loops=graph.loops))
+        off = result.poses - true
+        local, _ = result.covariances()
+        normalised.append([off[k] @ np.linalg.solve(local[k], off[k]) / 3 for k in (10, 22, 44)])
     assert np.mean(normalised, axis=0) == pytest.approx(np.ones(3), abs=0.35)
 
 
@@ -227,13 +227,13 @@ def test_correlated_errors_make_a_long_path_s_covariance_larger_than_independent
     graph = graph_of(moved)
     alone = solved(graph).covariances()[0][-1]
     model = ErrorCorrelation(share=0.9, length=0.2, slope=1e-6)
-    alike = solved(replace(graph, correlated=model.along(moved, REACH_M))).covariances()[0][-1]
+    similar = solved(replace(graph, correlated=model.along(moved, REACH_M))).covariances()[0][-1]
     # a chain of correlation r sums to (1 + r)/(1 - r) times the variance of independent ones, up to its ends
     r = np.exp(-0.01 / 0.7)
     n = 200
     expected = 0.1 + 0.9 * ((1 + r) / (1 - r) - 2 * r * (1 - r**n) / (n * (1 - r) ** 2))
-    assert alike[2, 2] / alone[2, 2] == pytest.approx(expected, rel=1e-6)
-    assert alike[1, 1] / alone[1, 1] == pytest.approx(expected, rel=1e-3)
+    assert similar[2, 2] / alone[2, 2] == pytest.approx(expected, rel=1e-6)
+    assert similar[1, 1] / alone[1, 1] == pytest.approx(expected, rel=1e-3)
 
 
 # ---------------------------------------------------------------- faults and gtsam
@@ -285,15 +285,15 @@ def by_gtsam(graph: PoseGraph) -> tuple[Array, Array]:
 def test_gtsam_finds_the_same_poses_and_marginals() -> None:
     graph, _ = tangled(np.random.default_rng(4), share=0.0, slope=1e-9)
     plain = replace(graph, correlated=None, headings=Headings.none())
-    found = solved(plain)
-    assert found.accepted.all()
-    own, _ = found.covariances()
+    result = solved(plain)
+    assert result.accepted.all()
+    local, _ = result.covariances()
     poses, covariances = by_gtsam(plain)
-    off = found.poses - poses
+    off = result.poses - poses
     off[:, 2] -= 2 * np.pi * np.rint(off[:, 2] / (2 * np.pi))
-    std = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    std = np.sqrt(np.diagonal(local, axis1=1, axis2=2))
     assert (np.abs(off) <= 0.02 * std + 1e-9).all()
-    np.testing.assert_allclose(covariances[1:], own[1:], rtol=0.02, atol=1e-9)
+    np.testing.assert_allclose(covariances[1:], local[1:], rtol=0.02, atol=1e-9)
 
 
 def test_motions_of_the_graph_are_those_of_paths() -> None:
@@ -304,8 +304,8 @@ def test_motions_of_the_graph_are_those_of_paths() -> None:
 
 
 def test_a_solution_answers_for_known_poses() -> None:
-    found: GraphSolution = solved(graph_of(square()))
-    assert not found.columns([0]).any()
+    result: GraphSolution = solved(graph_of(square()))
+    assert not result.columns([0]).any()
 
 
 def test_errors_of_the_map_say_nothing_of_those_of_two_frames() -> None:
@@ -325,8 +325,8 @@ def test_errors_of_the_map_say_nothing_of_those_of_two_frames() -> None:
     graph = partial(graph_path, start_known=True, sensors=gyroscope, search=None, source=None)
     start = Pose(*true.poses[0])
     apart = graph(measured, start, by_map=by_map)
-    alike = graph(measured, start)
-    off, before = (abs(one.path.poses[-1, 0] - true.poses[-1, 0]) for one in (apart, alike))
+    similar = graph(measured, start)
+    off, before = (abs(one.path.poses[-1, 0] - true.poses[-1, 0]) for one in (apart, similar))
     assert off < before / 2
 
 
@@ -337,8 +337,10 @@ def by_least_squares(model: ErrorCorrelation, covariance: Array, moved: Array, y
     """What yaw errors, known but for a gyroscope's noise, tell of the errors of motions along a straight line ``(n, 3)``."""
     count, slope = len(moved), model.along(moved, REACH_M).slope_std
     way = np.cumsum(np.hypot(moved[:, 0], moved[:, 1]))
-    alike = model.share * np.exp(-np.abs(way[:, None] - way) / (model.length * REACH_M)) + (1 - model.share) * np.eye(count)
-    joint = np.einsum("kl,ab->kalb", alike, covariance)
+    similar = model.share * np.exp(-np.abs(way[:, None] - way) / (model.length * REACH_M)) + (1 - model.share) * np.eye(
+        count
+    )
+    joint = np.einsum("kl,ab->kalb", similar, covariance)
     joint += np.einsum("kl,ab->kalb", np.ones((count, count)), np.diag((slope * moved[0] * slope * moved[0]).sum(axis=1)))
     of_yaw = joint[:, 2, :, 2] + gyro_std**2 * np.eye(count)
     return np.asarray(np.einsum("kal,l->ka", joint[:, :, :, 2], np.linalg.solve(of_yaw, yaw_errors)))
@@ -358,9 +360,9 @@ def test_a_gyroscope_mends_what_errors_share_with_the_yaw_as_least_squares_do(di
     chain = PoseEdges.chain(measured, np.tile(covariance, (count, 1, 1)))
     graph = PoseGraph(composed(measured), chain, gyro, correlated=model.along(measured, REACH_M))
     expected = composed(measured - by_least_squares(model, covariance, moved, measured[:, 2] - gyro.motions[:, 2], gyro_std))
-    found = solved(graph)
-    np.testing.assert_allclose(found.poses[-1, :2], expected[-1, :2], atol=1e-3)
-    assert np.hypot(*(found.poses - composed(moved))[-1, :2]) < 5e-3
+    result = solved(graph)
+    np.testing.assert_allclose(result.poses[-1, :2], expected[-1, :2], atol=1e-3)
+    assert np.hypot(*(result.poses - composed(moved))[-1, :2]) < 5e-3
 
 
 def test_what_slopes_are_over_adds_up_to_the_path() -> None:

@@ -190,11 +190,11 @@ def test_the_period_is_halved() -> None:
     frames = 2000
     time = np.arange(frames) / 20
     middle = (time[1:] + time[:-1]) / 2
-    for period, kept in ((2.0, 1 / 2), (4.0, 1 / (1 + 2.0**-4)), (1.0, 1 / (1 + 2.0**4))):
+    for period, stored in ((2.0, 1 / 2), (4.0, 1 / (1 + 2.0**-4)), (1.0, 1 / (1 + 2.0**4))):
         swing = np.sin(2 * np.pi * middle / period)
         smooth = spline_smoothed(MotionSeries(np.column_stack([swing] * 3) / 20, time), 2.0).motions * 20
         inside = slice(400, -400)
-        np.testing.assert_allclose(smooth[inside, 1] @ swing[inside] / (swing[inside] @ swing[inside]), kept, rtol=2e-3)
+        np.testing.assert_allclose(smooth[inside, 1] @ swing[inside] / (swing[inside] @ swing[inside]), stored, rtol=2e-3)
 
 
 def test_the_period_minimises_generalised_cross_validation() -> None:
@@ -216,8 +216,8 @@ def test_the_period_minimises_generalised_cross_validation() -> None:
             return float(n * (w * (y - hat @ y) ** 2).sum() / (n - np.trace(hat)) ** 2)
 
         best = np.log(chosen[axis])
-        found = minimize_scalar(score, bounds=(best - 0.5, best + 0.5), method="bounded", options={"xatol": 1e-3})
-        assert abs(found.x - best) < 3e-3, f"period {np.exp(found.x):.4f} s, chosen {chosen[axis]:.4f} s"
+        result = minimize_scalar(score, bounds=(best - 0.5, best + 0.5), method="bounded", options={"xatol": 1e-3})
+        assert abs(result.x - best) < 3e-3, f"period {np.exp(result.x):.4f} s, chosen {chosen[axis]:.4f} s"
 
 
 def test_the_period_is_in_seconds() -> None:
@@ -245,8 +245,8 @@ def test_estimates_that_are_not_believed_are_bridged(smooth: Smoother) -> None:
     valid[:4] = valid[60:70] = valid[-3:] = False
     wild = np.where(valid[:, None], measured.motions, np.nan)
     one = smooth(replace(measured, valid=valid))
-    other = smooth(replace(measured, motions=wild, valid=valid))
-    np.testing.assert_array_equal(one.motions, other.motions)
+    second = smooth(replace(measured, motions=wild, valid=valid))
+    np.testing.assert_array_equal(one.motions, second.motions)
     np.testing.assert_allclose(one.motions[60:70], true[60:70], atol=6 * STD.max())
     velocity = one.velocity
     np.testing.assert_allclose(velocity[:4], np.tile(velocity[4], (4, 1)), rtol=1e-9)
@@ -258,8 +258,8 @@ def test_few_motions_are_joined_by_straight_lines() -> None:
     driven = np.array([[1.0, 0, 2]] * 5) * np.diff(time)[:, None] * [[1], [9], [9], [9], [3]]
     series = MotionSeries(driven, time, valid=np.array([True, False, False, False, True]))
     # velocities 1 at 0.5 s and 3 at 6 s
-    wanted = np.interp(series.middle_s, [0.5, 6], [1, 3])[:, None] * [1, 0, 2] * series.step_s[:, None]
-    np.testing.assert_allclose(spline_smoothed(series).motions, wanted, atol=1e-14)
+    expected = np.interp(series.middle_s, [0.5, 6], [1, 3])[:, None] * [1, 0, 2] * series.step_s[:, None]
+    np.testing.assert_allclose(spline_smoothed(series).motions, expected, atol=1e-14)
     with pytest.raises(MitsonarError, match="needs 5 valid motions: got 2"):
         spline_period(series)
 
@@ -334,8 +334,8 @@ def test_the_smoother_is_the_least_squares_solution(frames: int, gaps: bool) -> 
     for k in range(n):
         np.testing.assert_allclose(smooth.covariances[k], blocks[k, :, k] * step[k] ** 2, rtol=1e-7, atol=1e-16)
         if k < n - 1:
-            wanted = blocks[k, :, k + 1] * step[k] * step[k + 1]
-            np.testing.assert_allclose(smooth.with_next[k], wanted, rtol=1e-7, atol=1e-16)
+            expected = blocks[k, :, k + 1] * step[k] * step[k + 1]
+            np.testing.assert_allclose(smooth.with_next[k], expected, rtol=1e-7, atol=1e-16)
 
 
 def test_smoothed_covariances_are_symmetric_and_positive() -> None:
@@ -376,8 +376,8 @@ def test_errors_are_as_large_as_the_covariances_say() -> None:
         assert smooth.covariances is not None
         middle += float(miss @ np.linalg.solve(smooth.covariances[13], miss))
         start = Pose(0, 0, 2)
-        pose, wanted = (path_of(m, start, measured.time_s).poses[-1, [0, 1, 5]] for m in (smooth.motions, true))
-        miss = pose - wanted
+        pose, expected = (path_of(m, start, measured.time_s).poses[-1, [0, 1, 5]] for m in (smooth.motions, true))
+        miss = pose - expected
         end += float(miss @ np.linalg.solve(pose_covariances(smooth, start)[-1], miss))
         careless += float(miss @ np.linalg.solve(pose_covariances(replace(smooth, with_next=None), start)[-1], miss))
     low, high = chi2.ppf([0.0005, 0.9995], 3 * runs) / runs
@@ -404,8 +404,8 @@ def test_wander_has_the_greatest_likelihood() -> None:
             law = difference @ np.diag(noise) @ difference.T + np.exp(2 * log_wander) * np.diag(gap)
             return -float(multivariate_normal.logpdf(seen, cov=law))
 
-        found = minimize_scalar(unlikely, bounds=(np.log(1e-3), np.log(1.0)), method="bounded", options={"xatol": 1e-6})
-        assert abs(found.x - np.log(got[axis])) < 2e-3, f"{np.exp(found.x)} and {got[axis]}"
+        result = minimize_scalar(unlikely, bounds=(np.log(1e-3), np.log(1.0)), method="bounded", options={"xatol": 1e-6})
+        assert abs(result.x - np.log(got[axis])) < 2e-3, f"{np.exp(result.x)} and {got[axis]}"
 
 
 def test_wander_and_noise_are_found_again() -> None:
@@ -500,9 +500,9 @@ def test_pose_covariance_against_monte_carlo(smoothed: bool) -> None:
         path_of(series.motions + error, START._replace(x=x, y=y, heading=3 + turn), series.time_s).poses[-1, [0, 1, 5]]
         for error, (x, y, turn) in zip(errors, starts, strict=True)
     ]
-    told = pose_covariances(series, START._replace(x=0, y=0), at_start)
-    np.testing.assert_array_equal(told[0], at_start)
-    whiten = np.linalg.inv(np.linalg.cholesky(told[-1]))
+    message = pose_covariances(series, START._replace(x=0, y=0), at_start)
+    np.testing.assert_array_equal(message[0], at_start)
+    whiten = np.linalg.inv(np.linalg.cholesky(message[-1]))
     np.testing.assert_allclose(whiten @ np.cov(np.transpose(ends)) @ whiten.T, np.eye(3), atol=5 * np.sqrt(2 / draws))
 
 

@@ -45,8 +45,8 @@ def test_exact_readings_give_the_true_motions() -> None:
     risen = sensors.rises(path.time_s)
     assert risen is not None
     np.testing.assert_allclose(risen, 0, atol=1e-5)
-    told = sensors.headings(path.time_s)
-    off = told.heading - path.poses[told.pose, 5]
+    message = sensors.headings(path.time_s)
+    off = message.heading - path.poses[message.pose, 5]
     np.testing.assert_allclose(off - 2 * np.pi * np.rint(off / (2 * np.pi)), 0, atol=1e-3)
 
 
@@ -93,10 +93,10 @@ def test_gaps_and_ends_are_not_bridged() -> None:
     time = np.concatenate([np.arange(0, 5, 0.1), np.arange(10, 15, 0.1)])
     gyro = VehicleSensors(yaw_rate=readings(time, np.ones(len(time)), 1e-3))
     frames = np.arange(-2.0, 20.0)
-    (told,) = gyro.motions(frames)
-    covered = [(frames[k], frames[k + 1]) for k in told.pair]
+    (message,) = gyro.motions(frames)
+    covered = [(frames[k], frames[k + 1]) for k in message.pair]
     assert covered == [(float(t), float(t + 1)) for t in (0, 1, 2, 3, 10, 11, 12, 13)]
-    np.testing.assert_allclose(told.motions[:, 2], 1, rtol=1e-6)
+    np.testing.assert_allclose(message.motions[:, 2], 1, rtol=1e-6)
     with pytest.raises(MitsonarError, match="no reading between 50 and 52 s"):
         gyro.motions(np.array([50.0, 51, 52]))
 
@@ -104,9 +104,9 @@ def test_gaps_and_ends_are_not_bridged() -> None:
 def test_no_compass_reading_counts_for_two_frames() -> None:
     compass = VehicleSensors(heading=readings(np.arange(0, 10, 1.0), np.linspace(6.1, 6.5, 10), 0.02))
     frames = np.arange(0, 9, 0.1)
-    told = compass.headings(frames)
-    assert told.pose.tolist() == [*range(0, 90, 10), 89]
-    np.testing.assert_allclose(np.unwrap(told.heading)[:9], np.linspace(6.1, 6.5, 10)[:9] - 2 * np.pi, atol=1e-9)
+    message = compass.headings(frames)
+    assert message.pose.tolist() == [*range(0, 90, 10), 89]
+    np.testing.assert_allclose(np.unwrap(message.heading)[:9], np.linspace(6.1, 6.5, 10)[:9] - 2 * np.pi, atol=1e-9)
     assert compass.priors(frames) is None
 
 
@@ -116,9 +116,9 @@ def test_priors_join_sensors_by_their_information() -> None:
         readings(time, np.full(100, value), std) for value, std in ((0.2, 0.01), (0.5, 0.1), (0.0, 0.1))
     )
     both = VehicleSensors(yaw_rate, none, forward)
-    told = both.priors(np.array([2.0, 3.0]))
-    assert told is not None
-    (one,) = told
+    message = both.priors(np.array([2.0, 3.0]))
+    assert message is not None
+    (one,) = message
     np.testing.assert_allclose(one.motion[2], 0.2, rtol=1e-3)
     np.testing.assert_allclose(one.motion[:2], [-0.5 * np.sin(0.1), 0.5 * np.cos(0.1)], rtol=2e-3)
     assert one.std[2] == pytest.approx(0.01, rel=1e-3)
@@ -237,9 +237,9 @@ def test_a_trajectory_with_sensors_is_read_without_them(tmp_path: Path) -> None:
 
 def test_true_poses_beside_readings_are_never_read(tmp_path: Path) -> None:
     read = load_sensors(flown(tmp_path))
-    other = tmp_path / "other.csv"
-    other.write_text(flown(tmp_path).read_text().replace(",5,", ",-55,").replace(",90,", ",17,"))
-    assert load_sensors(other).digest() == read.digest()
+    second = tmp_path / "other.csv"
+    second.write_text(flown(tmp_path).read_text().replace(",5,", ",-55,").replace(",90,", ",17,"))
+    assert load_sensors(second).digest() == read.digest()
 
 
 def test_a_heading_with_a_deviation_beside_poses_is_no_compass(tmp_path: Path) -> None:

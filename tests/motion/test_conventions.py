@@ -96,8 +96,8 @@ def test_angles_are_those_of_the_rotation(frame: str) -> None:
     theirs = Rotation.from_euler("ZYX", angles[:, [2, 0, 1]])
     ours = np.column_stack([np.zeros((50, 3)), convention.angles_to_ours(angles)])
     _, rotation = convention.to_ours(np.zeros((50, 3)), theirs)
-    wanted = np.stack([np.array(axes(Pose(*row))).T for row in ours])
-    np.testing.assert_allclose(rotation.as_matrix(), wanted, atol=1e-12)
+    expected = np.stack([np.array(axes(Pose(*row))).T for row in ours])
+    np.testing.assert_allclose(rotation.as_matrix(), expected, atol=1e-12)
     np.testing.assert_allclose(convention.angles_from_ours(ours[:, 3:]), angles, atol=1e-12)
 
 
@@ -112,9 +112,9 @@ def test_the_case_that_was_misread(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.degrees(right.poses[:, 3:]), np.tile([18, 0, -4], (8, 1)), atol=1e-9)
     wrong = quietly(tmp_path / "ros.tum", "mitsonar")
     np.testing.assert_allclose(np.abs(np.degrees(wrong.poses[0, 3:])), [0, 18, 94], atol=1e-9)
-    (said,) = warned(tmp_path / "ros.tum", "mitsonar")
-    assert "looks sideways or at the sky in 8 of 8 frames" in said
-    assert "read as ros-enu it would not: name the file's convention by --frame" in said
+    (output,) = warned(tmp_path / "ros.tum", "mitsonar")
+    assert "looks sideways or at the sky in 8 of 8 frames" in output
+    assert "read as ros-enu it would not: name the file's convention by --frame" in output
     assert not warned(tmp_path / "ros.tum", "ros-enu")
 
 
@@ -155,9 +155,9 @@ def test_all_conventions_and_files_give_the_same_picture(variant: str, tmp_path:
     from mitsonar.simulation.simulator import Simulator
 
     loaded = load_scene("flat_floor")
-    found = sonar_in(loaded)
-    assert found is not None
-    simulator = Simulator(loaded, found[0].replace(beams=16, range_bins=64, rays_per_beam=100))
+    result = sonar_in(loaded)
+    assert result is not None
+    simulator = Simulator(loaded, result[0].replace(beams=16, range_bins=64, rays_per_beam=100))
     flown = Trajectory.load_tum(shipped_trajectory("flat_floor")).resample(3)
     images = []
     for frame in FRAMES:
@@ -166,8 +166,8 @@ def test_all_conventions_and_files_give_the_same_picture(variant: str, tmp_path:
             poses = Trajectory.load(tmp_path / f"{frame}.{ending}", frame).poses
             images.append(simulator.render(np.round(poses, 7)).image)
     assert images[0].any()
-    for other in images[1:]:
-        np.testing.assert_allclose(other, images[0], atol=1e-4)
+    for second in images[1:]:
+        np.testing.assert_allclose(second, images[0], atol=1e-4)
 
 
 # ---------------------------------------------------------------- what is warned of

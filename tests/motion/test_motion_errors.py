@@ -14,24 +14,24 @@ def test_errors_of_a_method_that_shrinks_and_leans() -> None:
     rng = np.random.default_rng(1)
     truth = rng.uniform(-1, 1, (4000, 3)) * [0.02, 0.02, 0.008]
     truth -= truth.mean(axis=0)
-    found = motion_errors(0.9 * truth + [1e-3, 0, 0], truth, np.ones(4000, dtype=bool))
+    result = motion_errors(0.9 * truth + [1e-3, 0, 0], truth, np.ones(4000, dtype=bool))
     spread = in_units(truth).std(axis=0)
-    assert np.allclose(found.slope, 0.9, atol=2e-3)
-    assert np.allclose(found.bias, [1, 0, 0], atol=1e-9)
-    assert np.allclose(found.rmse, np.hypot(0.1 * spread, [1, 0, 0]))
-    assert np.allclose(found.zero, spread)
-    assert np.allclose(found.skill, 1 - found.rmse / spread)
-    assert (found.large > found.rmse)[1:].all()
-    assert np.isnan(found.nees)
+    assert np.allclose(result.slope, 0.9, atol=2e-3)
+    assert np.allclose(result.bias, [1, 0, 0], atol=1e-9)
+    assert np.allclose(result.rmse, np.hypot(0.1 * spread, [1, 0, 0]))
+    assert np.allclose(result.zero, spread)
+    assert np.allclose(result.skill, 1 - result.rmse / spread)
+    assert (result.large > result.rmse)[1:].all()
+    assert np.isnan(result.nees)
 
 
 def test_percentiles_and_large_motions() -> None:
     """Errors of 0 to 100 mm; and 1 mm for motions beyond half the largest only."""
     truth = np.zeros((101, 3))
-    found = motion_errors(np.arange(101)[:, None] * np.full(3, 1e-3), truth, np.ones(101, bool))
-    assert np.allclose(found.median[:2], 50)
-    assert np.allclose(found.p95[:2], 95)
-    assert np.isnan(found.large).all(), "there is no large motion"
+    result = motion_errors(np.arange(101)[:, None] * np.full(3, 1e-3), truth, np.ones(101, bool))
+    assert np.allclose(result.median[:2], 50)
+    assert np.allclose(result.p95[:2], 95)
+    assert np.isnan(result.large).all(), "there is no large motion"
     truth = np.linspace(-0.02, 0.02, 41)[:, None] * np.ones(3)
     large = np.abs(truth) > 0.01 + 1e-9
     assert np.allclose(motion_errors(truth + 1e-3 * large, truth, np.ones(41, bool)).large[:2], 1)
@@ -41,11 +41,11 @@ def test_failures_count_as_zero_motion() -> None:
     truth = np.full((4, 3), 0.01)
     wild = np.where(np.arange(4)[:, None] == 2, 5.0, truth)
     valid = np.arange(4) != 2
-    found = motion_errors(wild, truth, valid)
-    assert found.failures == 1
-    assert np.allclose(found.rmse[:2], 10 / 2)  # one of four is off by 10 mm
-    assert np.allclose(found.believed, 0)
-    assert np.allclose(found.median, 0)
+    result = motion_errors(wild, truth, valid)
+    assert result.failures == 1
+    assert np.allclose(result.rmse[:2], 10 / 2)  # one of four is off by 10 mm
+    assert np.allclose(result.believed, 0)
+    assert np.allclose(result.median, 0)
 
 
 def test_honest_covariances_have_a_nees_of_one() -> None:
@@ -62,18 +62,18 @@ def test_honest_covariances_have_a_nees_of_one() -> None:
 def test_clustered_intervals_cover_where_plain_ones_do_not() -> None:
     """Scenes with errors of their own: intervals by scene hold the true RMSE far more often than plain ones."""
     rng = np.random.default_rng(3)
-    held = {"clustered": 0, "plain": 0}
+    stored = {"clustered": 0, "plain": 0}
     trials, scene = 40, np.repeat(np.arange(40), 10)
     for trial in range(trials):
         size = np.exp(0.6 * rng.standard_normal(40))[scene]  # errors differ from scene to scene
         error = size[:, None] * rng.standard_normal((400, 3)) * 1e-3
-        wanted = np.exp(0.6**2)  # root of the mean of exp(2 * 0.6 n), in mm
+        expected = np.exp(0.6**2)  # root of the mean of exp(2 * 0.6 n), in mm
         for name, groups in (("clustered", scene), ("plain", np.arange(400))):
             table = cluster_resamples(groups, count=200, seed=trial)
-            found = motion_errors(error, np.zeros((400, 3)), np.ones(400, bool), None, table)
-            held[name] += int(found.rmse_low[0] <= wanted <= found.rmse_high[0])
-    assert held["clustered"] > 0.8 * trials
-    assert held["plain"] < held["clustered"] - 0.1 * trials
+            result = motion_errors(error, np.zeros((400, 3)), np.ones(400, bool), None, table)
+            stored[name] += int(result.rmse_low[0] <= expected <= result.rmse_high[0])
+    assert stored["clustered"] > 0.8 * trials
+    assert stored["plain"] < stored["clustered"] - 0.1 * trials
 
 
 def test_resamples_keep_scenes_together() -> None:

@@ -15,9 +15,9 @@ def test_velocities_are_those_of_the_path_beside_each_time() -> None:
     """1 m/s to the north for 2 s, then 2 m/s to the east with a turn of 0.3 rad/s to starboard: about -z."""
     poses = np.array([[0, 0, 1, 0, 0, 0], [0, 2, 1, 0, 0, 0], [2, 2, 1, 0, 0, 0.3]], dtype=float)
     bodies = MovingBodies.of({"fish": Trajectory(poses, np.array([0.0, 2.0, 3.0]))})
-    found = bodies.velocities([-1, 0, 1, 2.5, 3, 4])[:, 0]
+    result = bodies.velocities([-1, 0, 1, 2.5, 3, 4])[:, 0]
     north, east, still = (0, 1, 0, 0, 0, 0), (2, 0, 0, 0, 0, -0.3), (0,) * 6
-    np.testing.assert_allclose(found, [still, north, north, east, east, still], atol=1e-9)
+    np.testing.assert_allclose(result, [still, north, north, east, east, still], atol=1e-9)
 
 
 def test_what_follows_the_vehicle_has_its_path() -> None:

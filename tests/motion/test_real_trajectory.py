@@ -34,10 +34,10 @@ def path_of(place: NDArray[np.float64], angle: NDArray[np.float64], time_s: NDAr
 def test_errors_after_rigid_alignment_are_those_of_the_readme(keys: tuple[str, str, str], error_m: float) -> None:
     """Almost every keyframe has a fix of the DGPS within 0.2 s, which is 0.1 m."""
     (time,), truth = column("groundtruth.csv", "time").T, column("groundtruth.csv", "x", "y", "theta")
-    kept = np.diff(time, prepend=-np.inf) > 0
-    true = path_of(truth[kept, :2], COMPASS_RAD - truth[kept, 2], time[kept])
+    stored = np.diff(time, prepend=-np.inf) > 0
+    true = path_of(truth[stored, :2], COMPASS_RAD - truth[stored, 2], time[stored])
     (keyframes,), poses = column("trajectory.csv", "time").T, column("trajectory.csv", *keys)
-    found = assess(path_of(poses[:, :2], poses[:, 2], keyframes), true, align="plane", tolerance_s=0.2)
-    assert found.frames > 600
-    assert found.absolute_rmse_m == pytest.approx(error_m, abs=0.05)
-    assert found.path_m == pytest.approx(626, rel=0.05)
+    result = assess(path_of(poses[:, :2], poses[:, 2], keyframes), true, align="plane", tolerance_s=0.2)
+    assert result.frames > 600
+    assert result.absolute_rmse_m == pytest.approx(error_m, abs=0.05)
+    assert result.path_m == pytest.approx(626, rel=0.05)

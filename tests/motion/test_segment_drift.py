@@ -63,7 +63,7 @@ def kitti(estimated: Trajectory, true: Trajectory, lengths: tuple[float, ...]) -
     """`calcSequenceErrors` of KITTI's development kit, a segment from every frame: translation and rotation errors."""
     there, here = (to_world_matrices(path.poses) for path in (true, estimated))
     distance = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(there[:, :3, 3], axis=0), axis=1))])
-    found = []
+    result = []
     for length in lengths:
         for first in range(len(there)):
             beyond = np.flatnonzero(distance > distance[first] + length)
@@ -73,18 +73,18 @@ def kitti(estimated: Trajectory, true: Trajectory, lengths: tuple[float, ...]) -
             moved, took = (np.linalg.inv(path[first]) @ path[last] for path in (there, here))
             error = np.linalg.inv(took) @ moved
             angle = np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))
-            found.append([np.linalg.norm(error[:3, 3]) / length, angle / length])
-    return np.array(found)
+            result.append([np.linalg.norm(error[:3, 3]) / length, angle / length])
+    return np.array(result)
 
 
 def test_errors_are_those_of_the_development_kit_of_kitti() -> None:
     estimated, true = strays()
     drift = segment_drift(estimated, true, (1, 2, 5))
     assert drift is not None
-    wanted = kitti(estimated, true, (1, 2, 5))
-    np.testing.assert_allclose(drift.translation, wanted[:, 0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(drift.rotation_rad_per_m, wanted[:, 1], rtol=0, atol=1e-7)
-    assert drift.percent == pytest.approx(100 * wanted[:, 0].mean())
+    expected = kitti(estimated, true, (1, 2, 5))
+    np.testing.assert_allclose(drift.translation, expected[:, 0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(drift.rotation_rad_per_m, expected[:, 1], rtol=0, atol=1e-7)
+    assert drift.percent == pytest.approx(100 * expected[:, 0].mean())
 
 
 def test_intervals_hold_the_drift_and_widen_with_fewer_blocks() -> None:

@@ -90,11 +90,11 @@ def test_a_yaw_bias_is_heading_drift() -> None:
     assert table["heading drift"] == (50.0, "deg per 100 m")
     assert table["heading error at the end"] == (5.0, "deg")
     assert table["relative attitude error RMSE over 1 frame"] == (0.05, "deg")
-    other = assess(straight(yaw=np.radians(-5)), straight())
-    np.testing.assert_allclose(np.degrees(other.end_heading_rad), -500)
+    second = assess(straight(yaw=np.radians(-5)), straight())
+    np.testing.assert_allclose(np.degrees(second.end_heading_rad), -500)
     wrapped = straight(yaw=np.radians(-5))
     wrapped.poses[:, 5] = (wrapped.poses[:, 5] + np.pi) % (2 * np.pi) - np.pi
-    np.testing.assert_allclose(assess(wrapped, straight()).end_heading_rad, other.end_heading_rad)
+    np.testing.assert_allclose(assess(wrapped, straight()).end_heading_rad, second.end_heading_rad)
 
 
 def test_a_loop_that_does_not_close() -> None:
@@ -287,18 +287,18 @@ def test_absolute_errors_are_those_of_evo(
     recorded: tuple[Path, Trajectory, Trajectory], align: Alignment, options: list[str]
 ) -> None:
     folder, estimated, true = recorded
-    wanted = evo(folder, "evo_ape", *options)
+    expected = evo(folder, "evo_ape", *options)
     distance, _ = absolute_errors(estimated, true, align)
-    np.testing.assert_allclose(distance, wanted, rtol=0, atol=1e-9)
-    assert wanted.size == 150
-    assert wanted.max() > 0.01
+    np.testing.assert_allclose(distance, expected, rtol=0, atol=1e-9)
+    assert expected.size == 150
+    assert expected.max() > 0.01
 
 
 def test_absolute_angles_are_those_of_evo(recorded: tuple[Path, Trajectory, Trajectory]) -> None:
     folder, estimated, true = recorded
-    wanted = evo(folder, "evo_ape", "--align", "-r", "angle_deg")
+    expected = evo(folder, "evo_ape", "--align", "-r", "angle_deg")
     _, angle = absolute_errors(estimated, true, "space")
-    np.testing.assert_allclose(np.degrees(angle), wanted, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.degrees(angle), expected, rtol=0, atol=1e-6)
 
 
 def test_errors_aligned_in_the_plane_are_those_of_evo(tmp_path: Path) -> None:
@@ -332,8 +332,8 @@ def test_relative_errors_are_those_of_evo(
 def test_relative_angles_are_those_of_evo(recorded: tuple[Path, Trajectory, Trajectory]) -> None:
     folder, estimated, true = recorded
     _, angle = relative_errors(estimated, true)
-    wanted = evo(folder, "evo_rpe", "-r", "angle_deg")
-    np.testing.assert_allclose(np.degrees(angle), wanted, rtol=0, atol=1e-6)
+    expected = evo(folder, "evo_rpe", "-r", "angle_deg")
+    np.testing.assert_allclose(np.degrees(angle), expected, rtol=0, atol=1e-6)
     np.testing.assert_allclose(
-        np.degrees(assess(estimated, true).relative_angle_rmse_rad), np.sqrt(np.mean(wanted**2)), rtol=1e-6
+        np.degrees(assess(estimated, true).relative_angle_rmse_rad), np.sqrt(np.mean(expected**2)), rtol=1e-6
     )

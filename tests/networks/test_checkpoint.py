@@ -36,15 +36,15 @@ def test_what_is_saved_comes_back(checkpoint: Checkpoint, tmp_path: Path) -> Non
     network = tiny_network().eval()
     checkpoint.save(tmp_path / FILE)
     state = torch.get_rng_state()
-    for found in (Checkpoint.load(tmp_path), Checkpoint.load(tmp_path / FILE)):
-        kept = {one.name: getattr(found, one.name) for one in dataclasses.fields(found) if one.name != "weights"}
-        assert kept == {name: getattr(checkpoint, name) for name in kept}
+    for result in (Checkpoint.load(tmp_path), Checkpoint.load(tmp_path / FILE)):
+        stored = {one.name: getattr(result, one.name) for one in dataclasses.fields(result) if one.name != "weights"}
+        assert stored == {name: getattr(checkpoint, name) for name in stored}
         image = torch.rand(2, 1, 40, 24, generator=torch.Generator().manual_seed(1))
-        assert torch.equal(found.build()(image), network(image))
-        assert found.digest == checkpoint.digest
+        assert torch.equal(result.build()(image), network(image))
+        assert result.digest == checkpoint.digest
     assert torch.equal(torch.get_rng_state(), state), "building must not disturb what is drawn"
     assert Checkpoint.of(tiny_network(1), tiny_samples()).digest != checkpoint.digest
-    assert not found.build().training
+    assert not result.build().training
     assert list(tmp_path.iterdir()) == [tmp_path / FILE]
 
 
@@ -89,16 +89,16 @@ def test_answers_become_motions(checkpoint: Checkpoint) -> None:
     motions, spread = checkpoint.decode(torch.tensor([[10.0, -10.0, 5.0]]))
     assert np.allclose(motions, [[0.02, -0.02, np.radians(0.225)]])
     assert spread is None
-    said = GaussianHead(torch.full((2, 3), 0.25), torch.eye(3).expand(2, 3, 3))
-    motions, spread = checkpoint.decode(said)
+    output = GaussianHead(torch.full((2, 3), 0.25), torch.eye(3).expand(2, 3, 3))
+    motions, spread = checkpoint.decode(output)
     assert motions.shape == (2, 3)
     assert spread is not None
     assert (spread == np.eye(3)).all()
     # the noise of training was not validated: the mean over the levels that were
-    wanted = np.diag([(3e-3**2 + 6e-3**2) / 2, 2e-3**2, np.radians(1) ** 2 * (0.1**2 + 0.2**2) / 2])
+    expected = np.diag([(3e-3**2 + 6e-3**2) / 2, 2e-3**2, np.radians(1) ** 2 * (0.1**2 + 0.2**2) / 2])
     covariance = checkpoint.covariance
     assert covariance is not None
-    assert np.allclose(covariance, wanted, rtol=1e-12, atol=0)
+    assert np.allclose(covariance, expected, rtol=1e-12, atol=0)
     at_home = dataclasses.replace(checkpoint, noise="high").covariance
     assert at_home is not None
     assert np.allclose(np.sqrt(np.diag(at_home)), [6e-3, 2e-3, np.radians(0.2)])
@@ -110,10 +110,10 @@ def test_only_our_networks_and_plain_values(checkpoint: Checkpoint) -> None:
         Checkpoint.of(torch.nn.Linear(2, 3), tiny_samples())
     with pytest.raises(MitsonarError, match="only numbers, strings, lists and dictionaries"):
         Checkpoint.of(tiny_network(), tiny_samples(), trained={"when": object()})
-    held = Checkpoint.of(
+    stored = Checkpoint.of(
         tiny_network(), tiny_samples(), trained={"rate": np.float32(0.5), "folder": Path("a") / "b", "steps": (1, 2)}
     )
-    assert held.trained == {"rate": 0.5, "folder": "a/b", "steps": [1, 2]}
+    assert stored.trained == {"rate": 0.5, "folder": "a/b", "steps": [1, 2]}
 
 
 # ---------------------------------------------------------------- hostile files
@@ -181,10 +181,10 @@ def test_files_that_are_no_checkpoints(checkpoint: Checkpoint, tmp_path: Path) -
 
 
 def test_a_later_format_is_named(checkpoint: Checkpoint) -> None:
-    said = refusal(packed({**unpacked(checkpoint), "format": 7, "version": "3.2.1", "news": 1}))
-    assert "format 7" in said
-    assert "mitsonar 3.2.1" in said
-    assert "use the version that wrote it" in said
+    output = refusal(packed({**unpacked(checkpoint), "format": 7, "version": "3.2.1", "news": 1}))
+    assert "format 7" in output
+    assert "mitsonar 3.2.1" in output
+    assert "use the version that wrote it" in output
 
 
 @pytest.mark.parametrize(

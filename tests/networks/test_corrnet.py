@@ -67,7 +67,7 @@ def seen_pair(motion: NDArray[np.float64], noise: float = 0.0, bearing: Bearing 
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 def test_displacements_are_those_of_the_exact_geometry(bearing: Bearing) -> None:
     ground = batch(bearing)
-    found = warp_grid.displacement(ground, torch.tensor(MOTION[None], dtype=torch.float32))[0].numpy()
+    result = warp_grid.displacement(ground, torch.tensor(MOTION[None], dtype=torch.float32))[0].numpy()
     nodes = [
         np.interp(np.linspace(0, len(a) - 1, n), np.arange(len(a)), a) for a, n in zip((RANGE, BEARING), NODES, strict=True)
     ]
@@ -77,8 +77,8 @@ def test_displacements_are_those_of_the_exact_geometry(bearing: Bearing) -> None
     beams = (angle - nodes[1]) / (BEARING[1] - BEARING[0])
     assert np.abs(bins).max() > 1
     assert np.abs(beams).max() > 1
-    assert found[0] == pytest.approx(bins, abs=2e-3)
-    assert found[1] == pytest.approx(beams, abs=2e-3)
+    assert result[0] == pytest.approx(bins, abs=2e-3)
+    assert result[1] == pytest.approx(beams, abs=2e-3)
 
 
 def test_cells_have_the_geometry_of_their_middles() -> None:
@@ -105,9 +105,9 @@ def test_weights_of_nodes_draw_straight_lines_exactly() -> None:
 def test_relief_moves_as_lower_height_does() -> None:
     ground = batch()
     lower = ground_at(RANGE, BEARING, "azimuth", **(STAND | {"height_m": 0.97 * STAND["height_m"]}))["derivative"]
-    found = ground["derivative"][0].numpy() + 0.03 * ground["by_relief"][0].numpy()
+    result = ground["derivative"][0].numpy() + 0.03 * ground["by_relief"][0].numpy()
     before = np.abs(ground["derivative"][0].numpy() - lower).max(axis=(2, 3))
-    assert (np.abs(found - lower).max(axis=(2, 3)) <= 0.15 * before + 1e-3).all()
+    assert (np.abs(result - lower).max(axis=(2, 3)) <= 0.15 * before + 1e-3).all()
 
 
 # ---------------------------------------------------------------- parts
@@ -119,9 +119,9 @@ def test_the_derivative_of_correlations_is_torchs() -> None:
     wide = torch.rand(2, 3, 6, 9, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(matching._Correlations.apply, (one, wide))
     weight = torch.rand(2, 15, 4, 5, dtype=torch.float64)
-    own = torch.autograd.grad((matching._Correlations.apply(one, wide) * weight).sum(), (one, wide))
-    other = torch.autograd.grad((matching._correlations(one, wide) * weight).sum(), (one, wide))
-    for a, b in zip(own, other, strict=True):
+    local = torch.autograd.grad((matching._Correlations.apply(one, wide) * weight).sum(), (one, wide))
+    second = torch.autograd.grad((matching._correlations(one, wide) * weight).sum(), (one, wide))
+    for a, b in zip(local, second, strict=True):
         assert torch.allclose(a, b)
 
 
@@ -129,11 +129,11 @@ def test_the_derivative_of_correlations_is_torchs() -> None:
 def test_slopes_of_quartics_are_exact(axis: int) -> None:
     x = torch.arange(-6, 7, dtype=torch.float64)
     frame = (0.3 * x**4 - x**3 + 2 * x).expand(1, 1, 5, 13)
-    wanted = 1.2 * x**3 - 3 * x**2 + 2
+    expected = 1.2 * x**3 - 3 * x**2 + 2
     if axis == 2:
         frame = frame.mT
-    found = slopes._slope(frame.contiguous(), axis)
-    assert torch.allclose(found.movedim(axis, -1)[0, 0, :, 2:-2], wanted[2:-2])
+    result = slopes._slope(frame.contiguous(), axis)
+    assert torch.allclose(result.movedim(axis, -1)[0, 0, :, 2:-2], expected[2:-2])
 
 
 def test_what_lies_between_cells_keeps_its_fineness() -> None:
@@ -152,20 +152,20 @@ def test_what_lies_between_cells_keeps_its_fineness() -> None:
     for shift in (0.25, 0.5, 0.8):
         places = [(index + shift) / (size - 1) * 2 - 1 for index, size in ((column, columns), (row, rows))]
         grid = torch.tensor(np.stack(places, axis=-1), dtype=torch.float32)[None]
-        wanted = wave(row + shift, column + shift)[inner, inner]
+        expected = wave(row + shift, column + shift)[inner, inner]
         for drawn, least, most in ((finer, 0.8, 1.05), (frame, 0.0, 0.75)):
-            found = torch.nn.functional.grid_sample(drawn, grid, align_corners=True)[0, 0].numpy()[inner, inner]
-            kept = (found * wanted).sum() / (wanted * wanted).sum()
-            assert least < kept < most, (shift, kept)
+            result = torch.nn.functional.grid_sample(drawn, grid, align_corners=True)[0, 0].numpy()[inner, inner]
+            stored = (result * expected).sum() / (expected * expected).sum()
+            assert least < stored < most, (shift, stored)
 
 
 def test_later_iterations_count_more() -> None:
-    said = head.GaussianHead(torch.zeros(2, 1, 3), torch.eye(3).expand(2, 1, 3, 3) * 1e-6)
-    wrong = said.mean.clone()
+    output = head.GaussianHead(torch.zeros(2, 1, 3), torch.eye(3).expand(2, 1, 3, 3) * 1e-6)
+    wrong = output.mean.clone()
     wrong[0] = 1e-3
-    early = head.likelihood(head.GaussianHead(wrong, said.covariance), torch.zeros(1, 3))
-    late = head.likelihood(head.GaussianHead(wrong.flip(0), said.covariance), torch.zeros(1, 3))
-    assert float(late) > float(early) > float(head.likelihood(said, torch.zeros(1, 3)))
+    early = head.likelihood(head.GaussianHead(wrong, output.covariance), torch.zeros(1, 3))
+    late = head.likelihood(head.GaussianHead(wrong.flip(0), output.covariance), torch.zeros(1, 3))
+    assert float(late) > float(early) > float(head.likelihood(output, torch.zeros(1, 3)))
 
 
 # ---------------------------------------------------------------- the network
@@ -185,8 +185,8 @@ def test_levels_do_not_matter_and_covariances_are_covariances() -> None:
     torch.manual_seed(1)
     network, images = create_network("corrnet").eval(), seen_pair(MOTION, noise=0.1)
     with torch.no_grad():
-        one, other = network(images, batch()), network(0.5 * images, batch())
-    assert torch.allclose(one.mean, other.mean, atol=1e-6)
+        one, second = network(images, batch()), network(0.5 * images, batch())
+    assert torch.allclose(one.mean, second.mean, atol=1e-6)
     assert torch.allclose(one.covariance, one.covariance.mT)
     assert (torch.linalg.eigvalsh(one.covariance.double()) > 0).all()
 

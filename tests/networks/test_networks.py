@@ -51,11 +51,11 @@ def inputs_of(network: Any, batch: int, device: str = "cpu") -> tuple[Tensor, ..
 
 def shapes(network: nn.Module, among: nn.Module, batch: int = 1) -> dict[str, tuple[int, ...]]:
     """Channels, rows and columns that leave each child of a module, without computing (on the meta device)."""
-    found = {}
+    result = {}
     for name, child in among.named_children():
-        child.register_forward_hook(lambda _, __, out, name=name: found.update({name: tuple(out.shape[1:])}))
+        child.register_forward_hook(lambda _, __, out, name=name: result.update({name: tuple(out.shape[1:])}))
     network.to("meta").eval()(*inputs_of(network, batch, "meta"))
-    return found
+    return result
 
 
 def parameters(network: nn.Module) -> int:
@@ -194,9 +194,9 @@ def test_cnn4posenet_is_as_the_text_says() -> None:
     fully_connected = (1024 * 1 * 1 + 1) * 1024 + (32 * (128 // 5) * (48 // 5) + 1) * 1024
     assert parameters(network) == 4 * (convolutions + fully_connected) + (8 * 1024 + 1) * 3
     for quarter in network.quarters:
-        found = shapes(network, quarter)
-        assert (found["first"], found["early"]) == ((32, 128, 48), (32, 25, 9))
-        assert (found["others"], found["from_last"], found["from_first"]) == ((1024, 1, 1), (1024,), (1024,))
+        result = shapes(network, quarter)
+        assert (result["first"], result["early"]) == ((32, 128, 48), (32, 25, 9))
+        assert (result["others"], result["from_last"], result["from_first"]) == ((1024, 1, 1), (1024,), (1024,))
 
 
 def test_posenet_dual_is_two_posenets() -> None:
@@ -361,9 +361,9 @@ def test_polar_and_cartesian_inputs_settle_both_sizes() -> None:
 def test_both_branches_of_the_dual_are_heard() -> None:
     network = tiny("posenet_dual").eval()
     polar, cartesian = inputs_of(network, 1)
-    said = network(polar, cartesian)
-    assert not torch.equal(network(polar + 0.1, cartesian), said)
-    assert not torch.equal(network(polar, cartesian + 0.1), said)
+    output = network(polar, cartesian)
+    assert not torch.equal(network(polar + 0.1, cartesian), output)
+    assert not torch.equal(network(polar, cartesian + 0.1), output)
 
 
 def test_another_size_than_it_was_made_for_is_refused() -> None:

@@ -46,13 +46,13 @@ def test_a_pixel_at_a_cell_s_centre_has_its_level() -> None:
 
 def test_labels_are_never_mixed() -> None:
     frames = drawn()
-    found = FanPictures(frames).labels(frames, 0)
-    assert sorted(found) == ["shadow", "shape"]
-    assert found["shape"].dtype == np.uint16
-    assert set(np.unique(found["shape"])) == {0, 4, 10}  # outside, 3 + 1, 9 + 1; never anything between
-    rows, columns = found["shape"].shape
-    assert (found["shape"][rows // 2, : columns // 2 - 1] != 10).all()
-    assert (found["shape"][rows // 2, columns // 2 + 1 :] != 4).all()
+    result = FanPictures(frames).labels(frames, 0)
+    assert sorted(result) == ["shadow", "shape"]
+    assert result["shape"].dtype == np.uint16
+    assert set(np.unique(result["shape"])) == {0, 4, 10}  # outside, 3 + 1, 9 + 1; never anything between
+    rows, columns = result["shape"].shape
+    assert (result["shape"][rows // 2, : columns // 2 - 1] != 10).all()
+    assert (result["shape"][rows // 2, columns // 2 + 1 :] != 4).all()
 
 
 @pytest.mark.usefixtures("variant")
@@ -82,9 +82,9 @@ def test_a_run_writes_them_and_says_the_names(mitsonar: Command, tmp_path: Path)
     words = ("--set", "range_bins=64", "--set", "beams=16", "--quality", "draft", "-o", tmp_path / "run")
     done = mitsonar("render", "flat_floor", "--fan", "--labels", "--label-floor", "0.01", *words)
     assert done.returncode == 0, done.stderr
-    told = json.loads((tmp_path / "run" / "run.json").read_text())
+    message = json.loads((tmp_path / "run" / "run.json").read_text())
     frames = SonarFrames.load(tmp_path / "run")
-    assert told["shape_names"] == list(frames.shape_names) != []
+    assert message["shape_names"] == list(frames.shape_names) != []
     picture = np.array(Image.open(tmp_path / "run" / "fan" / "000000.png"))
     shapes = np.array(Image.open(tmp_path / "run" / "fan" / "000000.shape.png"))
     assert picture.shape == shapes.shape

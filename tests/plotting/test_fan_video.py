@@ -22,9 +22,11 @@ def test_each_frame_is_a_picture_of_the_video(tmp_path: Path, ending: str) -> No
     for number in range(5):
         frames.image[number, :, 10 + 16 * number : 18 + 16 * number] = 1  # a ray that goes from port to starboard
     path = tmp_path / f"a{ending}"
-    told: list[int] = []
-    done = write_fan_video([frames.select(slice(3)), frames.select(slice(3, 5))], path, 8.0, rows=240, progress=told.append)
-    assert (done, sum(told)) == (5, 5)
+    message: list[int] = []
+    done = write_fan_video(
+        [frames.select(slice(3)), frames.select(slice(3, 5))], path, 8.0, rows=240, progress=message.append
+    )
+    assert (done, sum(message)) == (5, 5)
     video = cv2.VideoCapture(str(path))
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(8)
     middles = []

@@ -89,13 +89,13 @@ def test_coherent_pings_return_the_same(steep: Path, degrees: int) -> None:
     poses = np.array([0, 0, height, pitch, 0, 0]) + shifts
 
     def energy(bsdf: MitsubaDict, sonar: Sonar = sonar) -> float:
-        found = Simulator(scene(floor=floor(bsdf)), sonar).pings(poses)
-        return float(np.mean([pings.levels.sum(axis=(1, 2)) for pings in found]))
+        result = Simulator(scene(floor=floor(bsdf)), sonar).pings(poses)
+        return float(np.mean([pings.levels.sum(axis=(1, 2)) for pings in result]))
 
-    wanted = float(mu_at(mu_table(material(steep), 1e6), math.cos(math.radians(degrees))))
-    got = energy(made_of(steep)) / energy(diffuse(wanted))
+    expected = float(mu_at(mu_table(material(steep), 1e6), math.cos(math.radians(degrees))))
+    got = energy(made_of(steep)) / energy(diffuse(expected))
     smooth = energy(made_of(steep), sonar.replace(model="physical")) / energy(
-        diffuse(wanted), sonar.replace(model="physical")
+        diffuse(expected), sonar.replace(model="physical")
     )
     assert 10 * math.log10(got) == pytest.approx(0, abs=0.3)
     assert 10 * math.log10(got / smooth) == pytest.approx(0, abs=0.1)
@@ -107,8 +107,8 @@ def test_rays_read_the_law_at_their_angle(name: str) -> None:
     for shape in (floor(made_of(name)), flat_box):
         loaded = scene(floor=shape)
         got = reflectivity(loaded, down(500, 1.54))
-        wanted = mu_at(mu_table(material(name), 3e5), np.cos(np.linspace(0, 1.54, 500)))
-        np.testing.assert_allclose(got, wanted, rtol=3e-3)
+        expected = mu_at(mu_table(material(name), 3e5), np.cos(np.linspace(0, 1.54, 500)))
+        np.testing.assert_allclose(got, expected, rtol=3e-3)
 
 
 def test_lambert_equals_diffuse_to_the_bit(tmp_path: Path) -> None:
@@ -120,9 +120,9 @@ def test_lambert_equals_diffuse_to_the_bit(tmp_path: Path) -> None:
         pose = np.array([0, 0, 3, math.radians(40), 0, 0])
 
         def levels(bsdf: MitsubaDict, sonar: Sonar = sonar, pose: np.ndarray = pose) -> np.ndarray:
-            found = next(iter(Simulator(scene(floor=floor(bsdf, 20)), sonar).pings(pose)))
-            assert found.levels.any()
-            return found.levels
+            result = next(iter(Simulator(scene(floor=floor(bsdf, 20)), sonar).pings(pose)))
+            assert result.levels.any()
+            return result.levels
 
         np.testing.assert_array_equal(levels(made_of(tmp_path / "matt.yaml")), levels(diffuse(0.15)))
         varied = levels(made_of(tmp_path / "matt.yaml", reflectance=noise, reflectance_mean=0.15))
@@ -166,8 +166,8 @@ def test_only_the_relative_variation_counts() -> None:
     noise = {"type": "cell_noise", "cells": 60}
     plain = reflectivity(scene(f=floor(made_of("sand"), 3)), down(4000, 0.9))
     varied = reflectivity(scene(f=floor(made_of("sand", reflectance=noise), 3)), down(4000, 0.9))
-    own = reflectivity(scene(f=floor(diffuse(noise), 3)), down(4000, 0.9))
-    np.testing.assert_allclose(varied / plain, own / 0.5, rtol=1e-4)
+    local = reflectivity(scene(f=floor(diffuse(noise), 3)), down(4000, 0.9))
+    np.testing.assert_allclose(varied / plain, local / 0.5, rtol=1e-4)
     dark = reflectivity(scene(f=floor(made_of("sand", reflectance=0.05), 3)), down(4000, 0.9))
     np.testing.assert_allclose(dark, plain, rtol=1e-6)
 
@@ -295,8 +295,8 @@ def test_shipped_scenes_have_materials_that_hold_at_their_carrier(name: str, sha
     loaded = load_scene(name)
     simulator = Simulator(loaded)
     assert simulator.notes == []
-    found = {shape.id(): shape.bsdf() for shape in loaded.shapes()}
-    assert {key: found[key].material.name for key in shapes} == shapes
+    result = {shape.id(): shape.bsdf() for shape in loaded.shapes()}
+    assert {key: result[key].material.name for key in shapes} == shapes
 
 
 @pytest.mark.parametrize("name", ["flat_floor", "pattern", "objects"])
@@ -304,8 +304,8 @@ def test_floors_of_measured_scenes_take_a_material_on_demand(name: str) -> None:
     """Unasked they are what they were: a diffuse BSDF."""
     shape = load_scene(name).shapes()
     assert not any(type(one.bsdf()).__name__ == "AcousticMaterial" for one in shape)
-    asked = [one.bsdf() for one in load_scene(name, floor_material="gravel").shapes()]
-    assert [one.material.name for one in asked if type(one).__name__ == "AcousticMaterial"] == ["gravel"]
+    arguments = [one.bsdf() for one in load_scene(name, floor_material="gravel").shapes()]
+    assert [one.material.name for one in arguments if type(one).__name__ == "AcousticMaterial"] == ["gravel"]
 
 
 @pytest.mark.thorough

@@ -31,8 +31,8 @@ def test_raised_cosine_and_pulse_are_one(rolloff: float) -> None:
     assert shape[np.abs(frequency) > (1 + rolloff) * 2e3].max(initial=0) == 0
     if rolloff:
         assert shape[np.abs(np.abs(frequency) - 2e3) < 1e-9] == pytest.approx(0.5)
-    wanted = np.fft.ifft(shape)[:200].real
-    assert np.abs(wanted - sonar.pulse(np.arange(200) / 8000)).max() < (1e-8 if rolloff else 1e-4)
+    expected = np.fft.ifft(shape)[:200].real
+    assert np.abs(expected - sonar.pulse(np.arange(200) / 8000)).max() < (1e-8 if rolloff else 1e-4)
 
 
 def test_four_receivers_look_away_from_the_transmitter() -> None:

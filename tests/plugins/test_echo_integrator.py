@@ -206,12 +206,12 @@ def test_an_edge_on_another_surface_is_not_followed() -> None:
 @pytest.mark.thorough
 def test_a_receiver_hears_a_whole_floor_too() -> None:
     """Half of the path by way of the edge: against ten times the rays, no gaps beyond R = 50 h."""
-    found = []
+    result = []
     for rays in (700, 7000):
         sonar = low_sonar(rays_per_beam=rays, rays_across=8, beam_width_deg=None, range_min=26.0, range_bins=400)
         receiver = Receiver(sonar, sonar, Pose(0, 0, 0.3), "b")
         simulator = Simulator(scene(floor=floor(half=2000.0)), sonar, views=[receiver])
-        found.append(next(simulator.render_views([[0, 0, LOW, 0.1, 0, 0]]))[0].levels[0].astype(float))
-    few, many = found
+        result.append(next(simulator.render_views([[0, 0, LOW, 0.1, 0, 0]]))[0].levels[0].astype(float))
+    few, many = result
     assert (few > 0).all()
     assert np.percentile(np.abs(10 * np.log10(few / many)), 95) < 0.5

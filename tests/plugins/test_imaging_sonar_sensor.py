@@ -172,8 +172,8 @@ def place_in_cell(source: ImagingSonar) -> tuple[np.ndarray, np.ndarray]:
     """Where each ray is in its cell, 0..1 across and along, ``(rays over elevation, rays across)``."""
     sonar = source.sonar
     size = (sonar.beam_width_rad / sonar.across, np.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam)
-    found = zip(angles(sonar, local(rays(source)[1])), cells(sonar), size, strict=True)
-    across, along = ((got - middle) / step + 0.5 for got, middle, step in found)
+    result = zip(angles(sonar, local(rays(source)[1])), cells(sonar), size, strict=True)
+    across, along = ((got - middle) / step + 0.5 for got, middle, step in result)
     shape = (sonar.rays_per_beam, sonar.columns)
     return across.reshape(shape), along.reshape(shape)
 
@@ -206,8 +206,8 @@ def test_jitter_is_another_draw_each_ping_and_repeats_with_the_seed() -> None:
     first = drawn(seed=3, ping=5)
     np.testing.assert_array_equal(drawn(seed=3, ping=5), first)
     still = drawn(jitter=False)
-    for other in (drawn(seed=3, ping=6), drawn(seed=4, ping=5), still):
-        assert (np.abs(other - first).max(axis=1) > 0).mean() > 0.99
+    for second in (drawn(seed=3, ping=6), drawn(seed=4, ping=5), still):
+        assert (np.abs(second - first).max(axis=1) > 0).mean() > 0.99
     a, b = (drawn(seed=3, ping=ping, rays_per_beam=300) - drawn(jitter=False, rays_per_beam=300) for ping in (0, 1))
     for axis in range(3):  # and an independent one
         assert abs(np.corrcoef(a[:, axis], b[:, axis])[0, 1]) * np.sqrt(len(a)) < 4.5

@@ -145,9 +145,9 @@ def snippet(name: str) -> str:
         tree = ast.parse(file.read())
     assert (ast.get_docstring(tree) or "").startswith(("The sensor", "The integrator", "The texture", "The BSDF"))
     docs = [ast.get_docstring(node) or "" for node in tree.body if isinstance(node, ast.ClassDef)]
-    found = re.findall(r"\.\. code-block:: xml\n\n((?:    .*\n?|\n)+)", "\n".join(docs))
-    assert len(found) == 1, f"{name} needs one scene snippet in its docstring"
-    return textwrap.dedent(found[0])
+    result = re.findall(r"\.\. code-block:: xml\n\n((?:    .*\n?|\n)+)", "\n".join(docs))
+    assert len(result) == 1, f"{name} needs one scene snippet in its docstring"
+    return textwrap.dedent(result[0])
 
 
 def test_every_module_that_registers_is_known() -> None:
@@ -198,13 +198,13 @@ def test_every_plugin_is_known_by_its_kind() -> None:
     assert spec is not None
     assert spec.submodule_search_locations is not None
     texts = [path.read_text() for path in Path(spec.submodule_search_locations[0]).glob("*.py")]
-    found = {pair for text in texts for pair in re.findall(r'^mi\.register_(\w+)\("(\w+)"', text, flags=re.MULTILINE)}
-    assert found == {(kind, name) for kind, names in KINDS.items() for name in names}
+    result = {pair for text in texts for pair in re.findall(r'^mi\.register_(\w+)\("(\w+)"', text, flags=re.MULTILINE)}
+    assert result == {(kind, name) for kind, names in KINDS.items() for name in names}
 
 
 def test_scalar_variants_name_the_variant_that_is_needed() -> None:
     """In Mitsuba's own loader, for each plugin; in load_scene, which leaves the user's variant as it is."""
-    said = run_python("""
+    output = run_python("""
         import mitsonar
         import mitsuba as mi
         from mitsonar.plugins.scalar_variants import KINDS
@@ -225,8 +225,8 @@ def test_scalar_variants_name_the_variant_that_is_needed() -> None:
         mi.set_variant("llvm_ad_mono")
         mitsonar.load_scene("flat_floor")
     """)
-    assert "the Mitsuba variant scalar_rgb is set" in said
-    assert "mi.set_variant(" in said
+    assert "the Mitsuba variant scalar_rgb is set" in output
+    assert "mi.set_variant(" in output
 
 
 @pytest.mark.usefixtures("variant")

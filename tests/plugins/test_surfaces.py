@@ -35,14 +35,14 @@ def assert_same_as_mitsuba(loaded: mi.Scene, ray: mi.Ray3f | None = None, least:
     """Distance, normal, reflectivity and shape against ``ray_intersect`` and ``eval_diffuse_reflectance``."""
     ray = rays_down() if ray is None else ray
     hit, si = surfaces(loaded).hit(loaded, ray), loaded.ray_intersect(ray)
-    own = np.array(si.bsdf().eval_diffuse_reflectance(si)[0])
+    local = np.array(si.bsdf().eval_diffuse_reflectance(si)[0])
     valid = np.array(si.is_valid())
     assert valid.mean() > least
     np.testing.assert_array_equal(np.array(hit.valid), valid)
     np.testing.assert_allclose(np.array(hit.t)[valid], np.array(si.t)[valid], rtol=1e-6)
     np.testing.assert_allclose(np.array(hit.n).T[valid], np.array(si.n).T[valid], atol=1e-6)
     reflectivity = np.array(hit.reflectivity)[valid]
-    np.testing.assert_allclose(reflectivity, np.clip(own[valid], 0, 1), atol=1e-6)
+    np.testing.assert_allclose(reflectivity, np.clip(local[valid], 0, 1), atol=1e-6)
     for number, shape in enumerate(loaded.shapes()):
         if shape.bsdf() is not None:
             seen = np.array(si.shape == mi.ShapePtr(shape)) & valid
@@ -77,19 +77,19 @@ def test_reflectivity_of_every_kind_of_bsdf(mesh: bool) -> None:
         at = mi.ScalarTransform4f().translate([3 * k, 0, 0])
         shapes[name.replace(" ", "_")] = {"type": "cube" if mesh else "rectangle", "to_world": at, "bsdf": bsdf}
     loaded = scene(**shapes)
-    found = surfaces(loaded)
+    result = surfaces(loaded)
     ray = mi.Ray3f(mi.Point3f(3 * dr.arange(mi.Float, len(RULE)), 0.1, 5), mi.Vector3f(0.01, 0, -1))
-    hit = found.hit(loaded, ray)
+    hit = result.hit(loaded, ray)
     got = dict(zip(RULE, np.array(hit.reflectivity), strict=True))
     assert got == pytest.approx({name: value for name, (_, value, _) in RULE.items()}, abs=1e-6)
     assert [loaded.shapes()[k].id() for k in np.array(hit.shape_id)] == list(shapes)
     notes = {"approximated": "is not diffuse", "without": "has no diffuse reflectance: reflectivity 0.5 is used"}
     for kind, words in notes.items():
-        note = [text for text in found.notes if words in text]
+        note = [text for text in result.notes if words in text]
         assert len(note) == 1
         names = note[0].split("the BSDF of ")[1].split(" is " if kind == "approximated" else " has ")[0].split(", ")
         assert sorted(names) == sorted(name.replace(" ", "_") for name, rule in RULE.items() if rule[2] == kind)
-    assert len(found.notes) == 2
+    assert len(result.notes) == 2
 
 
 def test_diffuse_scenes_need_no_note() -> None:
@@ -125,8 +125,8 @@ def test_textured_meshes() -> None:
     loaded = scene(
         **{name: box((0.8 * k - 1.6, 0, 0), (0.35, 1.5, 0.5), bsdf) for k, (name, bsdf) in enumerate(bsdfs.items())}
     )
-    found = assert_same_as_mitsuba(loaded)
-    assert len(np.unique(found)) > 1000
+    result = assert_same_as_mitsuba(loaded)
+    assert len(np.unique(result)) > 1000
 
 
 def sheet(attribute: str, centre: float = 0.0) -> mi.Mesh:
@@ -184,12 +184,12 @@ def test_instances() -> None:
         floor=floor(diffuse(0.3), 3.0),
         second={"type": "instance", "to_world": turn, "ref": {"type": "ref", "id": "group"}},
     )
-    found = assert_same_as_mitsuba(loaded)
-    assert {0.8, 0.6} <= {round(float(value), 6) for value in found}
+    result = assert_same_as_mitsuba(loaded)
+    assert {0.8, 0.6} <= {round(float(value), 6) for value in result}
     ray = mi.Ray3f(mi.Point3f([0, 1, -2], [0, 0.5, 2], 5), mi.Vector3f(0, 0, -1))
     hit = surfaces(loaded).hit(loaded, ray)
-    wanted = [place_of(loaded, name) for name in ("first", "second", "floor")]
-    assert np.array(hit.shape_id).tolist() == wanted
+    expected = [place_of(loaded, name) for name in ("first", "second", "floor")]
+    assert np.array(hit.shape_id).tolist() == expected
 
 
 def test_mixed_scene_keeps_its_shapes_apart() -> None:

@@ -115,8 +115,8 @@ def test_seeds_are_independent(kind: str) -> None:
     first, *others = (
         at(texture(kind, cells=200, octaves=1, seed=seed), uv=where) for seed in (0, 1, 2, 1 << 20, (1 << 20) + 1)
     )
-    for other in others:
-        assert abs(correlation(first, other)) < Z
+    for second in others:
+        assert abs(correlation(first, second)) < Z
     np.testing.assert_array_equal(at(texture(kind, cells=200, octaves=1, seed=0), uv=where), first)
 
 
@@ -144,9 +144,9 @@ def test_octaves_add_grids_of_half_the_cell_and_half_the_weight() -> None:
     for octave, block, weight in ((values[1], 4, 1), (second, 2, 0.5), (third, 1, 0.25)):
         cells = octave.reshape(256 // block, block, 256 // block, block)
         np.testing.assert_allclose(cells, np.broadcast_to(cells[:, :1, :, :1], cells.shape), atol=1e-6)
-        own = cells[:, 0, :, 0] / weight
-        assert 0 <= own.min() < own.max() <= 1 + 1e-6
-        assert abs(own.var() - 1 / 12) / np.sqrt((1 / 80 - 1 / 144) / own.size) < Z
+        local = cells[:, 0, :, 0] / weight
+        assert 0 <= local.min() < local.max() <= 1 + 1e-6
+        assert abs(local.var() - 1 / 12) / np.sqrt((1 / 80 - 1 / 144) / local.size) < Z
     assert abs(correlation(values[1], second)) < Z * 4  # 4 x 4 points share a cell
 
 
@@ -154,14 +154,14 @@ def test_octaves_add_grids_of_half_the_cell_and_half_the_weight() -> None:
 def test_to_uv_moves_the_grid(kind: str) -> None:
     """As in Mitsuba's own textures: uv is transformed, here 2 uv + (1/2, 1/4), exactly so in float32."""
     where = (np.random.default_rng(2).integers(0, 1024, (1000, 2)) + 0.5) / 1024
-    wanted = at(texture(kind, cells=16), uv=2 * where + [0.5, 0.25])
+    expected = at(texture(kind, cells=16), uv=2 * where + [0.5, 0.25])
     given = f'''<texture version="3.0.0" type="{kind}">
         <float name="cells" value="16"/>
         <transform name="to_uv"> <scale value="2"/> <translate x="0.5" y="0.25"/> </transform>
     </texture>'''
-    np.testing.assert_allclose(at(mi.load_string(given), uv=where), wanted, atol=1e-6)
+    np.testing.assert_allclose(at(mi.load_string(given), uv=where), expected, atol=1e-6)
     to_uv = mi.ScalarTransform4f().translate([0.5, 0.25, 0]).scale([2, 2, 1])
-    np.testing.assert_allclose(at(texture(kind, cells=16, to_uv=to_uv), uv=where), wanted, atol=1e-6)
+    np.testing.assert_allclose(at(texture(kind, cells=16, to_uv=to_uv), uv=where), expected, atol=1e-6)
 
 
 # ---------------------------------------------------------------- perlin

@@ -152,8 +152,8 @@ def test_other_files_are_refused_in_one_sentence(tmp_path: Path, content: bytes,
 
 
 def test_times_that_are_nan_are_left_out() -> None:
-    kept, notes = in_time_order([2.0, np.nan, 1.0])
-    assert kept.tolist() == [2, 0]
+    stored, notes = in_time_order([2.0, np.nan, 1.0])
+    assert stored.tolist() == [2, 0]
     assert notes[0].startswith("left out: 1 frame without a valid time")
 
 

@@ -48,17 +48,17 @@ def test_the_sample_comes_back_bit_for_bit(tmp_path: Path) -> None:
     written = write_aris(tmp_path / "a.aris", part.chunks())
     assert written.notes == ()
     again = open_recording(tmp_path / "a.aris")
-    one, other = part.read(np.arange(6)), again.part().read(np.arange(6))
-    assert (one.image == other.image).all()
-    assert (one.range_m == other.range_m).all()
-    assert (one.bearing_rad == other.bearing_rad).all()
-    assert (one.time_s == other.time_s).all()
+    one, second = part.read(np.arange(6)), again.part().read(np.arange(6))
+    assert (one.image == second.image).all()
+    assert (one.range_m == second.range_m).all()
+    assert (one.bearing_rad == second.bearing_rad).all()
+    assert (one.time_s == second.time_s).all()
     assert one.attitude_rad is not None
-    assert other.attitude_rad == pytest.approx(one.attitude_rad, abs=1e-7)
-    assert one.sonar.model_dump() == other.sonar.model_dump()
-    raw, made = (np.fromfile(path, np.uint8)[1024:].reshape(6, -1) for path in (ARIS, tmp_path / "a.aris"))
-    assert (raw[:, 1024:] == made[:, 1024:]).all()
-    heads = [np.frombuffer(content[:, :1024].tobytes(), FRAME) for content in (raw, made)]
+    assert second.attitude_rad == pytest.approx(one.attitude_rad, abs=1e-7)
+    assert one.sonar.model_dump() == second.sonar.model_dump()
+    raw, result = (np.fromfile(path, np.uint8)[1024:].reshape(6, -1) for path in (ARIS, tmp_path / "a.aris"))
+    assert (raw[:, 1024:] == result[:, 1024:]).all()
+    heads = [np.frombuffer(content[:, :1024].tobytes(), FRAME) for content in (raw, result)]
     same = ("index", "time_us", "ping_mode", "high_frequency", "sample_period_us", "start_delay_us", "samples", "large_lens")
     for name in (*same, "system", "sound_speed", "heading_deg", "reordered"):
         assert heads[0][name] == pytest.approx(heads[1][name], abs=1e-4), name
@@ -72,12 +72,12 @@ def test_frames_of_every_table_come_back_bit_for_bit(tmp_path: Path, kind: str, 
     written = write_aris(tmp_path / "a.aris", frames)
     again = open_recording(tmp_path / "a.aris")
     assert (written.frames, written.notes) == (3, ())
-    made = again.part().read([0, 1, 2])
-    assert (made.image == frames.image).all()
-    assert made.bearing_rad == pytest.approx(frames.bearing_rad)
-    assert made.range_m == pytest.approx(frames.range_m)
-    assert made.time_s == pytest.approx(frames.time_s, abs=1e-9)
-    assert made.sonar.name == name
+    result = again.part().read([0, 1, 2])
+    assert (result.image == frames.image).all()
+    assert result.bearing_rad == pytest.approx(frames.bearing_rad)
+    assert result.range_m == pytest.approx(frames.range_m)
+    assert result.time_s == pytest.approx(frames.time_s, abs=1e-9)
+    assert result.sonar.name == name
     assert again.facts["large_lens"] == int(kind == "telephoto")
 
 
@@ -93,8 +93,8 @@ def test_other_codings_go_through_their_levels(tmp_path: Path, level: str) -> No
     values = np.random.default_rng(1).uniform(0.3, 1, (3, 50, 128)).astype(np.float32)
     frames = drawn(image=values, level=level, coding_db=60.0)
     write_aris(tmp_path / "a.aris", frames)
-    made = open_recording(tmp_path / "a.aris").part().read([0, 1, 2]).to_linear()
-    error = 10 * np.log10(made.image / frames.to_linear().image)
+    result = open_recording(tmp_path / "a.aris").part().read([0, 1, 2]).to_linear()
+    error = 10 * np.log10(result.image / frames.to_linear().image)
     assert np.abs(error).max() < 80 / 255 / 2 + 0.01
 
 
@@ -122,12 +122,12 @@ def test_attitude_path_height_and_speed_come_back(tmp_path: Path) -> None:
 
 
 def test_the_sensors_attitude_comes_before_that_of_the_path(tmp_path: Path) -> None:
-    told = np.array([[0.1, 0.2, -0.3], [np.nan, 0.2, 0.3], [0.1, 0.2, 6.2]])
-    write_aris(tmp_path / "a.aris", drawn(poses=np.full((3, 6), 0.5), attitude_rad=told))
+    message = np.array([[0.1, 0.2, -0.3], [np.nan, 0.2, 0.3], [0.1, 0.2, 6.2]])
+    write_aris(tmp_path / "a.aris", drawn(poses=np.full((3, 6), 0.5), attitude_rad=message))
     attitude = open_recording(tmp_path / "a.aris").part().attitude_rad
     assert attitude is not None
-    assert attitude[:, :2] == pytest.approx(told[:, :2], abs=1e-6, nan_ok=True)
-    assert np.cos(attitude[:, 2] - told[:, 2]) == pytest.approx(1)
+    assert attitude[:, :2] == pytest.approx(message[:, :2], abs=1e-6, nan_ok=True)
+    assert np.cos(attitude[:, 2] - message[:, 2]) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("step_m", [0.0047, 0.0123])
@@ -137,13 +137,13 @@ def test_other_range_axes_are_interpolated(tmp_path: Path, step_m: float) -> Non
     frames = drawn(step_m=step_m, image=np.ascontiguousarray(ramp))
     written = write_aris(tmp_path / "a.aris", frames)
     assert "whole microseconds" in written.notes[0]
-    made = open_recording(tmp_path / "a.aris").part().read([0])
-    step = made.range_m[1] - made.range_m[0]
+    result = open_recording(tmp_path / "a.aris").part().read([0])
+    step = result.range_m[1] - result.range_m[0]
     assert 0.5 * step_m < step <= step_m
-    assert made.range_m[0] == pytest.approx(1.5, abs=4e-4)
-    assert made.range_m[-1] == pytest.approx(frames.range_m[-1], abs=step)
-    expected = np.clip((made.range_m - 1.5) / step_m * 5, 0, 245)
-    assert np.abs(made.image[0].astype(float) - expected[:, None]).max() <= 0.5 + 1e-3
+    assert result.range_m[0] == pytest.approx(1.5, abs=4e-4)
+    assert result.range_m[-1] == pytest.approx(frames.range_m[-1], abs=step)
+    expected = np.clip((result.range_m - 1.5) / step_m * 5, 0, 245)
+    assert np.abs(result.image[0].astype(float) - expected[:, None]).max() <= 0.5 + 1e-3
 
 
 def test_beams_that_fit_no_table_are_refused_or_interpolated(tmp_path: Path) -> None:
@@ -157,20 +157,20 @@ def test_beams_that_fit_no_table_are_refused_or_interpolated(tmp_path: Path) -> 
     frames.image = np.broadcast_to(np.rint(slope).astype(np.uint8), (3, 50, 96)).copy()
     written = write_aris(tmp_path / "a.aris", frames, beams=128)
     assert "96 beams interpolated to 128" in written.notes[0]
-    made = open_recording(tmp_path / "a.aris").part().read([0])
-    inside = np.abs(made.bearing_rad) < frames.bearing_rad[-1]
-    expected = np.degrees(made.bearing_rad) * 5 + 100
-    assert np.abs(made.image[0, 0][inside] - expected[inside]).max() <= 1.001
+    result = open_recording(tmp_path / "a.aris").part().read([0])
+    inside = np.abs(result.bearing_rad) < frames.bearing_rad[-1]
+    expected = np.degrees(result.bearing_rad) * 5 + 100
+    assert np.abs(result.image[0, 0][inside] - expected[inside]).max() <= 1.001
     assert inside.sum() >= 124
 
 
 def test_a_narrow_fan_is_zero_outside(tmp_path: Path) -> None:
     narrow = drawn(beams=48, bearing_rad=np.radians(np.linspace(-5, 5, 48)), image=np.full((3, 50, 48), 200, np.uint8))
     write_aris(tmp_path / "a.aris", narrow, beams=128)
-    made = open_recording(tmp_path / "a.aris").part().read([0])
-    degrees = np.abs(np.degrees(made.bearing_rad))
-    assert (made.image[0][:, degrees < 5] == 200).all()
-    assert not made.image[0][:, degrees > 5.2].any()
+    result = open_recording(tmp_path / "a.aris").part().read([0])
+    degrees = np.abs(np.degrees(result.bearing_rad))
+    assert (result.image[0][:, degrees < 5] == 200).all()
+    assert not result.image[0][:, degrees > 5.2].any()
 
 
 @with_samples
@@ -179,11 +179,11 @@ def test_an_oculus_recording_becomes_an_aris_file(tmp_path: Path) -> None:
     part = open_recording(OCULUS).part()
     written = write_aris(tmp_path / "a.aris", part.chunks(), beams=128)
     assert written.frames == 3
-    one, other = part.read([0]).to_linear(), open_recording(tmp_path / "a.aris").part().read([0]).to_linear()
-    assert other.sonar.sound_speed == pytest.approx(one.sonar.sound_speed)
-    near = np.abs(one.bearing_rad[:, None] - other.bearing_rad).argmin(axis=0)
-    rows = np.abs(one.range_m[:, None] - other.range_m).argmin(axis=0)
-    levels = [np.log10(np.maximum(image, 1e-8)) for image in (one.image[0][np.ix_(rows, near)], other.image[0])]
+    one, second = part.read([0]).to_linear(), open_recording(tmp_path / "a.aris").part().read([0]).to_linear()
+    assert second.sonar.sound_speed == pytest.approx(one.sonar.sound_speed)
+    near = np.abs(one.bearing_rad[:, None] - second.bearing_rad).argmin(axis=0)
+    rows = np.abs(one.range_m[:, None] - second.range_m).argmin(axis=0)
+    levels = [np.log10(np.maximum(image, 1e-8)) for image in (one.image[0][np.ix_(rows, near)], second.image[0])]
     assert np.corrcoef(levels[0].ravel(), levels[1].ravel())[0, 1] > 0.95
 
 
@@ -194,11 +194,11 @@ def test_the_motion_in_frames_is_that_in_their_file(tmp_path: Path) -> None:
     )
     frames = over_ground(sway(8), sonar)
     write_aris(tmp_path / "a.aris", frames)
-    made = open_recording(tmp_path / "a.aris").part().read(np.arange(8))
-    made.height_m = frames.height_m
+    result = open_recording(tmp_path / "a.aris").part().read(np.arange(8))
+    result.height_m = frames.height_m
     for one in range(7):
         pair = slice(one, one + 2)
-        before, after = (Direct().estimate(each.select(pair)).motion for each in (frames, made))
+        before, after = (Direct().estimate(each.select(pair)).motion for each in (frames, result))
         assert after[:2] == pytest.approx(before[:2], abs=2e-3)
         assert after[2] == pytest.approx(before[2], abs=np.radians(0.1))
 

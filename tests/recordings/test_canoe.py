@@ -59,9 +59,9 @@ def with_poses(path: Path, axes: Array, *, inverse: bool = False, frames: int = 
         sensor = body * Rotation.from_matrix(axes).inv()
         product = sensor.inv() if inverse else sensor
         angles = -product.as_euler("XYZ")
-        own = axes @ [0.02, 1.4, 0]
-        world = sensor.apply(own)
-        numbers = [*position[k], *angles, *world, 0, 0, 0, *own]
+        local = axes @ [0.02, 1.4, 0]
+        world = sensor.apply(local)
+        numbers = [*position[k], *angles, *world, 0, 0, 0, *local]
         if k != skip:
             lines.append(f"{START + k * 70_000}," + ",".join(f"{one:.9f}" for one in numbers))
     (path / "novatel/sonar_poses.csv").write_text("\n".join(lines) + "\n")

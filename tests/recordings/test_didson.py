@@ -115,9 +115,9 @@ def test_a_sample_rate_that_is_missing_or_strange_is_said(tmp_path: Path) -> Non
 def test_beams_of_the_lens_are_uneven_as_those_of_the_aris_1800(beams: int, steps: tuple[float, float]) -> None:
     bearings = np.degrees(didson_bearings(beams))
     assert bearings == pytest.approx(-bearings[::-1], abs=1e-3)
-    found = np.diff(bearings)
-    assert (found[0], found[beams // 2]) == pytest.approx(steps, abs=2e-3)
-    assert bearings[-1] + found[-1] / 2 == pytest.approx(14.4, abs=0.15)
+    result = np.diff(bearings)
+    assert (result[0], result[beams // 2]) == pytest.approx(steps, abs=2e-3)
+    assert bearings[-1] + result[-1] / 2 == pytest.approx(14.4, abs=0.15)
     measured = np.degrees(aris_bearings("1800", beams))
     scale = measured[-1] / bearings[-1]
     even = (np.arange(beams) - (beams - 1) / 2) * 2 * measured[-1] / (beams - 1)

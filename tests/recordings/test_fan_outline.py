@@ -25,21 +25,21 @@ def speckled(radius: Array, bearing: Array) -> Array:
 
 @pytest.mark.parametrize("stretch", [1.0, 1.24, 0.85])
 def test_the_outline_of_a_drawn_fan_tells_its_geometry(stretch: float) -> None:
-    found = outline_of(drawn(speckled, stretch=stretch))
-    assert found is not None
-    assert found.stretch == pytest.approx(stretch, rel=0.03)
-    assert found.half_angle_deg == pytest.approx(28, abs=0.6)
-    assert found.apex_px == pytest.approx((119.5, 210.25), abs=2.5)
-    assert found.far_px == pytest.approx(200, abs=2.5)
+    result = outline_of(drawn(speckled, stretch=stretch))
+    assert result is not None
+    assert result.stretch == pytest.approx(stretch, rel=0.03)
+    assert result.half_angle_deg == pytest.approx(28, abs=0.6)
+    assert result.apex_px == pytest.approx((119.5, 210.25), abs=2.5)
+    assert result.far_px == pytest.approx(200, abs=2.5)
 
 
 def test_squeezed_pictures_are_doubted_and_the_stretch_is_told() -> None:
     squeezed = drawn(speckled, stretch=1.24)
-    told = PictureGeometry.create(**FAN, range_max=10)
-    assert "circle with stretch 1.2" in doubts(told, squeezed)[0]
+    message = PictureGeometry.create(**FAN, range_max=10)
+    assert "circle with stretch 1.2" in doubts(message, squeezed)[0]
     assert doubts(PictureGeometry.create(**FAN, range_max=10, stretch=1.24), squeezed) == []
-    assert doubts(told, drawn(speckled)) == []
-    assert doubts(told, np.flipud(drawn(speckled)))[0].startswith("the pictures show no outline")
+    assert doubts(message, drawn(speckled)) == []
+    assert doubts(message, np.flipud(drawn(speckled)))[0].startswith("the pictures show no outline")
 
 
 def test_other_apexes_angles_and_arcs_are_doubted() -> None:
@@ -72,12 +72,12 @@ def test_the_outline_of_real_fans_is_as_measured(
     name: str, stretch: float, half: float, apex: tuple[float, float], far: float
 ) -> None:
     frames = np.load(REAL / f"{name}.npz")["frames"]
-    found = outline_of(frames[::2].max(axis=0))
-    assert found is not None
-    assert found.stretch == pytest.approx(stretch, rel=0.01)
-    assert found.half_angle_deg == pytest.approx(half, abs=0.1)
-    assert found.apex_px == pytest.approx(apex, abs=2.5)
-    assert found.far_px == pytest.approx(far, abs=2.5)
+    result = outline_of(frames[::2].max(axis=0))
+    assert result is not None
+    assert result.stretch == pytest.approx(stretch, rel=0.01)
+    assert result.half_angle_deg == pytest.approx(half, abs=0.1)
+    assert result.apex_px == pytest.approx(apex, abs=2.5)
+    assert result.far_px == pytest.approx(far, abs=2.5)
 
 
 @with_samples

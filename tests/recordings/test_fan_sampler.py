@@ -39,27 +39,27 @@ def test_each_cell_holds_the_value_of_its_place(changed: dict[str, Any]) -> None
     geometry = PictureGeometry.create(**{**FAN, "apex_px": apex}, range_max=10, **keys)
     sampler = FanSampler.from_geometry(geometry, *picture.shape)
     assert sampler.bins == 140
-    found = sampler.apply(picture)
-    wanted = smooth(*axes(sampler.bins, sampler.beams))
+    result = sampler.apply(picture)
+    expected = smooth(*axes(sampler.bins, sampler.beams))
     inner = (slice(3, -3), slice(4, -4))  # cells at the border mix with the dark outside
-    assert np.abs(found - wanted)[inner].max() < 0.02
-    assert np.abs(found - wanted)[inner].mean() < 0.003
+    assert np.abs(result - expected)[inner].max() < 0.02
+    assert np.abs(result - expected)[inner].mean() < 0.003
 
 
 def test_a_cell_wider_than_pixels_is_the_mean_of_its_area() -> None:
     rng = np.random.default_rng(2)
     noise = rng.random((200, 240)).astype(np.float32)
     geometry = PictureGeometry.create(**FAN, range_max=10, bins=14, beams=7)
-    found = FanSampler.from_geometry(geometry, 200, 240).apply(noise)
+    result = FanSampler.from_geometry(geometry, 200, 240).apply(noise)
     v, u = np.indices((200, 240), dtype=float)
     radius, bearing = np.hypot(u - 119.5, 210.25 - v), np.arctan2(u - 119.5, 210.25 - v)
     row, column = ((radius - 60) / 10).astype(int), ((np.degrees(bearing) + 28) / 8).astype(int)
     inside = (radius >= 60) & (radius < 200) & (np.abs(np.degrees(bearing)) < 28)
     count = np.bincount((row * 7 + column)[inside], minlength=98)
     mean = np.bincount((row * 7 + column)[inside], noise[inside], 98) / count
-    cut = found[1:-1].ravel() - mean.reshape(14, 7)[1:-1].ravel()
+    cut = result[1:-1].ravel() - mean.reshape(14, 7)[1:-1].ravel()
     assert cut.std() < 0.5 * (0.2887 / np.sqrt(np.median(count)))  # nearer to the mean than its own standard deviation
-    assert found.std() == pytest.approx(mean.std(), rel=0.25)
+    assert result.std() == pytest.approx(mean.std(), rel=0.25)
 
 
 def test_there_and_back_through_scan_conversion() -> None:
@@ -78,11 +78,11 @@ def test_there_and_back_through_scan_conversion() -> None:
         bins=200,
         beams=90,
     )
-    found = FanSampler.from_geometry(geometry, *fan.image.shape).apply(np.nan_to_num(fan.image))
+    result = FanSampler.from_geometry(geometry, *fan.image.shape).apply(np.nan_to_num(fan.image))
     at_range = 2 + (np.arange(200) + 0.5) * 6 / 200
     at_bearing = np.radians(-25 + (np.arange(90) + 0.5) * 50 / 90)
-    wanted = 0.5 + 0.3 * np.sin(at_range * 5)[:, None] * np.cos(at_bearing * 15)[None, :]
-    assert np.abs(found - wanted)[4:-4, 2:-2].max() < 0.02
+    expected = 0.5 + 0.3 * np.sin(at_range * 5)[:, None] * np.cos(at_bearing * 15)[None, :]
+    assert np.abs(result - expected)[4:-4, 2:-2].max() < 0.02
 
 
 def test_bytes_and_floats_agree() -> None:

@@ -46,12 +46,12 @@ def same(path: Path, frames: SonarFrames) -> None:
 
 
 def test_a_short_recording_becomes_frames_npz(frames: SonarFrames, tmp_path: Path) -> None:
-    told: list[int] = []
-    made = write_frames(of(frames), None, tmp_path / "run", progress=told.append)
-    assert made == tmp_path / "run/frames.npz"
-    same(made, frames)
-    assert sum(told) == COUNT
-    assert SonarFrames.load(made).about["format"] == "drawn frames"
+    message: list[int] = []
+    result = write_frames(of(frames), None, tmp_path / "run", progress=message.append)
+    assert result == tmp_path / "run/frames.npz"
+    same(result, frames)
+    assert sum(message) == COUNT
+    assert SonarFrames.load(result).about["format"] == "drawn frames"
     back = load_frames(tmp_path / "run")
     for name in ("image", "poses", "attitude_rad", "height_m"):
         assert (getattr(back, name) == getattr(frames, name)).all(), name
@@ -72,14 +72,14 @@ def test_a_stopped_copy_goes_on_and_gives_the_same(
     with pytest.raises(MitsonarError, match="--resume continues it"):
         write_frames(of(frames), None, folder)
     read: list[int] = []
-    made = write_frames(of(frames), None, folder, resume=True, progress=read.append)
+    result = write_frames(of(frames), None, folder, resume=True, progress=read.append)
     assert read == [4, 2, 1]
-    assert made.name == ("frames.zarr" if longest_npz < COUNT else "frames.npz")
-    same(made, frames)
+    assert result.name == ("frames.zarr" if longest_npz < COUNT else "frames.npz")
+    same(result, frames)
     monkeypatch.setattr(time, "time", lambda: 1e9)
     whole = write_frames(of(frames), None, tmp_path / "whole")
-    assert files_of(made) == files_of(whole)
-    assert write_frames(of(frames, stops_at=0), None, folder, resume=True) == made  # nothing is read again
+    assert files_of(result) == files_of(whole)
+    assert write_frames(of(frames, stops_at=0), None, folder, resume=True) == result  # nothing is read again
 
 
 def files_of(made: Path) -> dict[str, bytes]:
@@ -96,8 +96,8 @@ def test_another_recording_is_not_resumed_and_other_things_are_kept(frames: Sona
     write_frames(of(frames), None, tmp_path / "run")
     with pytest.raises(MitsonarError, match="frames"):
         write_frames(of(frames.select(slice(3))), None, tmp_path / "run", resume=True)
-    made = write_frames(of(frames.select(slice(3))), None, tmp_path / "run", overwrite=True)
-    same(made, frames.select(slice(3)))
+    result = write_frames(of(frames.select(slice(3))), None, tmp_path / "run", overwrite=True)
+    same(result, frames.select(slice(3)))
     (tmp_path / "other").mkdir()
     (tmp_path / "other/notes.txt").write_text("mine")
     with pytest.raises(MitsonarError, match="contains other files"):

@@ -39,19 +39,19 @@ def turning(frames: int, rate_deg: float, sideways: float = 0.0) -> Trajectory:
 
 @pytest.mark.parametrize(("mirrored", "verdict", "sign"), [(False, "agree", 1), (True, "mirrored", -1)])
 def test_drawn_frames_of_a_path_that_sways(mirrored: bool, verdict: str, sign: int) -> None:
-    found = handedness_of(part_of(over_ground(sway(60)), mirrored=mirrored))
-    assert found.verdict == verdict
-    assert found.correlation * sign > 0.9
-    assert 0.6 < found.slope * sign < 1.2
+    result = handedness_of(part_of(over_ground(sway(60)), mirrored=mirrored))
+    assert result.verdict == verdict
+    assert result.correlation * sign > 0.9
+    assert 0.6 < result.slope * sign < 1.2
 
 
 @pytest.mark.parametrize("rate_deg", [0.6, -0.6])
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_an_even_turn_that_the_user_tells(rate_deg: float, mirrored: bool) -> None:
     part = replace(part_of(over_ground(turning(30, rate_deg)), mirrored=mirrored), poses=None)
-    told = np.radians(rate_deg * 29)
-    assert handedness_of(part, told).verdict == ("mirrored" if mirrored else "agree")
-    assert handedness_of(part, -told).verdict == ("agree" if mirrored else "mirrored")
+    message = np.radians(rate_deg * 29)
+    assert handedness_of(part, message).verdict == ("mirrored" if mirrored else "agree")
+    assert handedness_of(part, -message).verdict == ("agree" if mirrored else "mirrored")
     assert handedness_of(part).verdict == "unknown"
     assert "the headings are unknown" in handedness_of(part).reason
 
@@ -78,13 +78,13 @@ def test_uneven_bearings_and_pictures_in_db() -> None:
 
 def test_pictures_that_do_not_turn_tell_nothing() -> None:
     straight = over_ground(turning(40, 0.0))
-    found = handedness_of(part_of(straight))
-    assert (found.verdict, found.pairs) == ("unknown", 0)
-    assert "turn by" in found.reason
+    result = handedness_of(part_of(straight))
+    assert (result.verdict, result.pairs) == ("unknown", 0)
+    assert "turn by" in result.reason
     noise = np.random.default_rng(5).normal(0, np.radians(1), 40)  # a compass that trembles on a sonar that does not
-    found = handedness_of(replace(part_of(straight), poses=None), noise)
-    assert found.verdict == "unknown"
-    assert abs(found.correlation) < 0.4 or found.pairs < 60
+    result = handedness_of(replace(part_of(straight), poses=None), noise)
+    assert result.verdict == "unknown"
+    assert abs(result.correlation) < 0.4 or result.pairs < 60
 
 
 def test_pictures_of_noise_alone_tell_nothing() -> None:

@@ -96,7 +96,7 @@ def attacked(name: str, folder: Path, seeds: range) -> dict[str, int]:
     good.mkdir()
     WRITERS[name](good / "a")
     read(good)
-    found = {"read": 0, "refused": 0}
+    result = {"read": 0, "refused": 0}
     for seed in seeds:
         shutil.rmtree(bad, ignore_errors=True)
         shutil.copytree(good, bad)
@@ -104,10 +104,10 @@ def attacked(name: str, folder: Path, seeds: range) -> dict[str, int]:
         if not any(bad.iterdir()):
             continue
         try:
-            found[outcome(lambda: read(bad))] += 1
+            result[outcome(lambda: read(bad))] += 1
         except BaseException as error:
             raise AssertionError(f"{name}, mutant {seed}: {type(error).__name__}: {str(error)[:300]}") from error
-    return found
+    return result
 
 
 @pytest.mark.parametrize("seeds", essence([range(FIRST), range(FIRST, USUAL)], range(FIRST)))

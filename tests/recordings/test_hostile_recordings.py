@@ -114,12 +114,12 @@ def spoil(rng: Rng, folder: Path) -> None:
 
 def changed_numbers(rng: Rng, content: bytes) -> bytes:
     """Up to four fields replaced by strange numbers, half of them near the begin, where headers are."""
-    made = bytearray(content)
+    result = bytearray(content)
     for _ in range(int(rng.integers(1, 5))):
-        place = int(rng.integers(min(len(made), 1600) if rng.random() < 0.5 else len(made))) if made else 0
+        place = int(rng.integers(min(len(result), 1600) if rng.random() < 0.5 else len(result))) if result else 0
         value = NUMBERS[int(rng.integers(len(NUMBERS)))]
-        made[place : place + len(value)] = value
-    return bytes(made)
+        result[place : place + len(value)] = value
+    return bytes(result)
 
 
 def read(folder: Path) -> None:
@@ -132,9 +132,9 @@ def read(folder: Path) -> None:
             warnings.simplefilter("error", RuntimeWarning)
             read_recording(path)
     except MitsonarError as error:
-        said = str(error)
-        assert "\n" not in said, f"a refusal is not one line: {said[:300]}"
-        assert len(said) < 700, f"a refusal is {len(said)} letters long: {said[:300]}"
+        output = str(error)
+        assert "\n" not in output, f"a refusal is not one line: {output[:300]}"
+        assert len(output) < 700, f"a refusal is {len(output)} letters long: {output[:300]}"
         raise
     finally:
         most = tracemalloc.get_traced_memory()[1]
@@ -149,18 +149,18 @@ READERS = {name: Reader(lambda folder, write=write: write(folder), spoil, read) 
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_mutants_are_read_or_refused(name: str, first: int, tmp_path: Path) -> None:
     count = USUAL - FIRST if first else FEWER if "bag" in name or "mcap" in name else FIRST
-    found = attack(name, tmp_path, count, first, READERS)
-    assert found["read"] + found["refused"] == count
-    assert found["refused"] > 0
-    assert found["read"] > 0 or name == "mcap of a run"  # whose every byte has a checksum
+    result = attack(name, tmp_path, count, first, READERS)
+    assert result["read"] + result["refused"] == count
+    assert result["refused"] > 0
+    assert result["read"] > 0 or name == "mcap of a run"  # whose every byte has a checksum
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_ten_thousand_mutants(name: str, tmp_path: Path) -> None:
-    found = attack(name, tmp_path, MANY, first=USUAL, readers=READERS)
-    print(f"\n{name}: {found['read']:,} read, {found['refused']:,} refused")
-    assert min(found.values()) > 0
+    result = attack(name, tmp_path, MANY, first=USUAL, readers=READERS)
+    print(f"\n{name}: {result['read']:,} read, {result['refused']:,} refused")
+    assert min(result.values()) > 0
 
 
 def test_nothing_but_zeros_behind_each_signature(tmp_path: Path) -> None:
@@ -198,9 +198,9 @@ def test_a_log_that_says_that_it_unpacks_to_much_is_left_out(tmp_path: Path) -> 
 
 def _longer(head: bytes, packed: bytes) -> bytes:
     """A log of one item with other packed bytes."""
-    made = bytearray(head + packed)
-    made[48 + 32 : 48 + 36] = struct.pack("<I", 4 + len(packed))
-    return bytes(made)
+    result = bytearray(head + packed)
+    result[48 + 32 : 48 + 36] = struct.pack("<I", 4 + len(packed))
+    return bytes(result)
 
 
 def test_many_marks_of_messages_do_not_take_long(tmp_path: Path) -> None:

@@ -46,11 +46,11 @@ def written(frames: SonarFrames, folder: Path, **options: Any) -> Path:
 def by_rosbags(path: Path) -> dict[str, list[Any]]:
     from rosbags.highlevel import AnyReader
 
-    found = defaultdict(list)
+    result = defaultdict(list)
     with AnyReader([path]) as reader:
         for connection, _, raw in reader.messages():
-            found[connection.topic].append(reader.deserialize(raw, connection.msgtype))
-    return dict(found)
+            result[connection.topic].append(reader.deserialize(raw, connection.msgtype))
+    return dict(result)
 
 
 def plain(message: Any) -> Any:
@@ -76,8 +76,8 @@ def test_two_readers_agree_on_every_message(rendered: SonarFrames, tmp_path: Pat
     }
     for topic, messages in first.items():
         assert len(messages) == (1 if topic == "/tf_static" else len(rendered)), topic
-        for one, other in zip(messages, second[topic], strict=True):
-            assert plain(one) == plain(other), topic
+        for one, another in zip(messages, second[topic], strict=True):
+            assert plain(one) == plain(another), topic
             assert set(plain(one)) >= ({"transforms"} if topic.startswith("/tf") else {"header"})
 
 
@@ -100,16 +100,16 @@ def test_samples_are_8_bit_by_default_and_levels_come_back(rendered: SonarFrames
     image = np.where(rendered.image > 0.9, 0, rendered.image)  # some cells without an echo
     frames = replace(rendered, image=image, level=level)
     path = written(frames, tmp_path, full=False)
-    found = decoded(path)
-    assert "/sonar/points" not in found
-    assert {one.image.dtype for one in found["/sonar/image"]} == {0}
-    assert set(by_rosbags(path)) == set(found)
+    result = decoded(path)
+    assert "/sonar/points" not in result
+    assert {one.image.dtype for one in result["/sonar/image"]} == {0}
+    assert set(by_rosbags(path)) == set(result)
     back = open_recording(path).part().read(np.arange(len(frames)))
     assert (back.sonar, back.level, back.level_scale) == (frames.sonar, level, frames.level_scale)
     assert ((back.image > 0) == (frames.image > 0)).all()
     if level == "linear":
-        kept = frames.image > 10 ** (-SPAN_DB / 10)
-        error_db = 10 * np.log10(back.image[kept] / frames.image[kept])
+        stored = frames.image > 10 ** (-SPAN_DB / 10)
+        error_db = 10 * np.log10(back.image[stored] / frames.image[stored])
         assert np.abs(error_db).max() <= SPAN_DB / 255 / 2 + 1e-4
         write_mcap([back], tmp_path / "again.mcap")
         again = open_recording(tmp_path / "again.mcap").part().read(np.arange(len(frames)))
@@ -159,8 +159,8 @@ def test_beams_are_where_the_driver_of_the_oculus_puts_them(rendered: SonarFrame
 
 def test_points_lie_on_the_floor_of_the_world(rendered: SonarFrames, tmp_path: Path) -> None:
     """Points turned by the transform of their frame have the height 0: labels, axes and poses fit together."""
-    found = decoded(written(rendered, tmp_path))
-    for cloud, tree in zip(found["/sonar/points"], found["/tf"], strict=True):
+    result = decoded(written(rendered, tmp_path))
+    for cloud, tree in zip(result["/sonar/points"], result["/tf"], strict=True):
         where = tree.transforms[0]
         assert (where.header.frame_id, where.child_frame_id, cloud.header.frame_id) == ("map", "sonar_link", "sonar_link")
         names = [one.name for one in cloud.fields]

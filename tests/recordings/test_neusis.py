@@ -97,10 +97,10 @@ def test_calls_in_pickles_are_refused(tmp_path: Path, call: Any, protocol: int) 
 def test_other_pickles_are_refused_or_hold_nothing(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.pkl").write_bytes(content)
     try:
-        found = read_pickled_arrays(tmp_path / "a.pkl")
+        result = read_pickled_arrays(tmp_path / "a.pkl")
     except MitsonarError:
         return
-    assert found == {}
+    assert result == {}
 
 
 def test_sizes_of_arrays_are_checked_against_their_bytes(tmp_path: Path) -> None:
@@ -137,11 +137,11 @@ def attacked(folder: Path, seeds: range) -> dict[str, int]:
     written(folder)
     path = folder / "Data/5.pkl"
     good = path.read_bytes()
-    found = {"read": 0, "refused": 0}
+    result = {"read": 0, "refused": 0}
     for seed in seeds:
         path.write_bytes(changed_bytes(np.random.default_rng(seed), good))
-        found[outcome(lambda: read_pickled_arrays(path))] += 1
-    return found
+        result[outcome(lambda: read_pickled_arrays(path))] += 1
+    return result
 
 
 def test_mutants_are_read_or_refused(tmp_path: Path) -> None:

@@ -61,10 +61,10 @@ def test_the_sonar_of_the_sample_is_estimated_to_stand_still() -> None:
     with pytest.warns(MitsonarWarning, match="no times in a known unit"):
         source = open_frames(SAMPLE).with_geometry(height_m=0.6, pitch_rad=np.radians(25)).with_contrast()
     for pair in ([0, 1], [1, 2]):
-        found = Direct().estimate(source.read(pair))
-        assert found.valid
-        assert np.abs(found.motion[:2]).max() < 1e-3
-        assert abs(found.motion[2]) < np.radians(0.05)
+        result = Direct().estimate(source.read(pair))
+        assert result.valid
+        assert np.abs(result.motion[:2]).max() < 1e-3
+        assert abs(result.motion[2]) < np.radians(0.05)
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -79,11 +79,11 @@ def test_a_log_holds_what_the_dump_holds(tmp_path: Path, packed: bool, longer: i
     assert log.format == "Oculus log (.oculus)"
     assert not log.notes
     every = np.arange(4)
-    one, other = dump.part().read(every), log.part().read(every)
-    assert (one.image == other.image).all()
-    assert (one.range_m == other.range_m).all()
-    assert (one.bearing_rad == other.bearing_rad).all()
-    assert other.time_s == pytest.approx(times, abs=1e-6)
+    one, second = dump.part().read(every), log.part().read(every)
+    assert (one.image == second.image).all()
+    assert (one.range_m == second.range_m).all()
+    assert (one.bearing_rad == second.bearing_rad).all()
+    assert second.time_s == pytest.approx(times, abs=1e-6)
     assert one.time_s == pytest.approx(np.array([0, 1, 2, 3]) / 10)
     assert "in a known unit" in dump.notes[0]
 

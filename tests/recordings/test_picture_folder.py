@@ -64,9 +64,9 @@ def test_pictures_are_read_in_natural_order(tmp_path: Path) -> None:
     ],
 )
 def test_names_that_look_like_times_are_times(names: list[str], times: list[float]) -> None:
-    found = times_in_names(names)
-    assert found is not None
-    assert found == pytest.approx(times, abs=1e-6, rel=0)
+    result = times_in_names(names)
+    assert result is not None
+    assert result == pytest.approx(times, abs=1e-6, rel=0)
 
 
 @pytest.mark.parametrize("names", [["frame0001.png", "frame0002.png"], ["1692633600.png", "f1.png"], ["9999999999.png"], []])

@@ -67,9 +67,9 @@ def test_a_fish_before_a_sonar_at_rest_is_no_motion(name: str) -> None:
         warnings.simplefilter("ignore", MitsonarWarning)  # of metres that are not known
         source = open_frames(path, geometry=geometry).with_geometry(2.0, np.radians(15))
     estimator = create_estimator("direct")
-    found = [estimator.estimate(source.read([k, k + 1])) for k in range(0, 29, 4)]
-    assert all(one.valid for one in found)
-    motions = np.array([one.motion for one in found])
+    result = [estimator.estimate(source.read([k, k + 1])) for k in range(0, 29, 4)]
+    assert all(one.valid for one in result)
+    motions = np.array([one.motion for one in result])
     assert (np.sqrt((motions**2).mean(axis=0)) < [0.01, 0.002, np.radians(0.08)]).all()
 
 

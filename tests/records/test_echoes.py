@@ -39,12 +39,12 @@ def test_channels_are_the_fields() -> None:
 
 
 def test_round_trip_is_exact(tmp_path: Path) -> None:
-    wanted = echoes()
-    wanted.range_m[:4] = 123.456, 1e-30, 16_777_217, 0
-    save_exr(tmp_path / "e.exr", wanted, SONAR)
+    expected = echoes()
+    expected.range_m[:4] = 123.456, 1e-30, 16_777_217, 0
+    save_exr(tmp_path / "e.exr", expected, SONAR)
     got = load_exr(tmp_path / "e.exr", SONAR)
     for name in CHANNELS:
-        np.testing.assert_array_equal(getattr(got, name), getattr(wanted, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name), err_msg=name)
         assert getattr(got, name).dtype == np.float32
 
 

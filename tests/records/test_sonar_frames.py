@@ -41,12 +41,12 @@ def frames(**changed: Any) -> SonarFrames:
 def assert_same(got: SonarFrames, wanted: SonarFrames) -> None:
     """Every field equal, types included."""
     for name, value in vars(wanted).items():
-        other = getattr(got, name)
+        second = getattr(got, name)
         if isinstance(value, np.ndarray):
-            np.testing.assert_array_equal(other, value, err_msg=name)
-            assert other.dtype == value.dtype, name
+            np.testing.assert_array_equal(second, value, err_msg=name)
+            assert second.dtype == value.dtype, name
         else:
-            assert other == value, name
+            assert second == value, name
 
 
 @pytest.mark.parametrize(
@@ -60,24 +60,24 @@ def assert_same(got: SonarFrames, wanted: SonarFrames) -> None:
     ids=["full", "bare", "uint8", "beam times"],
 )
 def test_npz_round_trip(tmp_path: Path, changed: dict[str, Any]) -> None:
-    wanted = frames(**changed)
-    wanted.save(tmp_path / "frames.npz")
-    assert_same(SonarFrames.load(tmp_path / "frames.npz"), wanted)
-    assert_same(SonarFrames.load(tmp_path), wanted)  # the folder of a run
+    expected = frames(**changed)
+    expected.save(tmp_path / "frames.npz")
+    assert_same(SonarFrames.load(tmp_path / "frames.npz"), expected)
+    assert_same(SonarFrames.load(tmp_path), expected)  # the folder of a run
 
 
 def test_zarr_group_reads_like_npz(tmp_path: Path) -> None:
     import zarr
 
-    wanted = frames()
+    expected = frames()
     group = zarr.open_group(tmp_path / "frames.zarr", mode="w")
-    for name, array in wanted.arrays().items():
+    for name, array in expected.arrays().items():
         if array.ndim:
             group.create_array(name, data=array)
         else:
             group.attrs[name] = array.item()
-    assert_same(SonarFrames.load(tmp_path / "frames.zarr"), wanted)
-    assert_same(SonarFrames.load(tmp_path), wanted)
+    assert_same(SonarFrames.load(tmp_path / "frames.zarr"), expected)
+    assert_same(SonarFrames.load(tmp_path), expected)
 
 
 def test_file_holds_plain_arrays_only(tmp_path: Path) -> None:
@@ -186,5 +186,5 @@ def test_bytes_never_map_an_echo_to_zero() -> None:
 def test_bytes_are_the_nearest_level() -> None:
     image = np.random.default_rng(0).random(10_000, dtype=np.float32)
     assert np.abs(to_uint8(image) / 255 - image).max() <= 1 / 255
-    kept = image > 1 / 255
-    assert np.abs(to_uint8(image)[kept] / 255 - image[kept]).max() <= 0.5001 / 255
+    stored = image > 1 / 255
+    assert np.abs(to_uint8(image)[stored] / 255 - image[stored]).max() <= 0.5001 / 255

@@ -112,10 +112,14 @@ def test_a_dive_moves_as_on_a_calm_day() -> None:
 def test_a_dive_has_its_presets_own_settings() -> None:
     for name, one in SETS.items():
         if one.flight is not None:
-            kept = load_sonar(one.preset)
-            made = one.sonar("speckle", "preset")
-            assert (made.model, made.quality, made.noise_level_db) == ("coherent", kept.quality, kept.noise_level_db), name
-            assert made.coding == kept.coding
+            stored = load_sonar(one.preset)
+            result = one.sonar("speckle", "preset")
+            assert (result.model, result.quality, result.noise_level_db) == (
+                "coherent",
+                stored.quality,
+                stored.noise_level_db,
+            ), name
+            assert result.coding == stored.coding
 
 
 def test_dives_are_a_table_over_their_worlds() -> None:
@@ -179,9 +183,9 @@ def test_the_ground_of_the_slope_rises_forward(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setitem(odometry_benchmark.TEXTURES, "still", {"model": "physical", "rays_per_beam": 20, "rays_across": 1})
     source = RenderedSet("slope", "still", "none", 12, tmp_path).source(lambda what, count: _Quiet())
     assert source.poses is not None
-    wanted = source.poses[:, 2] - np.tan(np.radians(10)) * source.poses[:, 1]
+    expected = source.poses[:, 2] - np.tan(np.radians(10)) * source.poses[:, 1]
     assert source.height_m is not None
-    np.testing.assert_allclose(source.height_m, wanted, atol=0.04)  # an anode is 0.03 m high
+    np.testing.assert_allclose(source.height_m, expected, atol=0.04)  # an anode is 0.03 m high
 
 
 class _Quiet:
@@ -267,19 +271,19 @@ def table_of(folder: Path) -> list[Row]:
 
 
 def test_a_killed_benchmark_goes_on_to_the_same_bits(run_of: Path, tmp_path: Path) -> None:
-    wanted = Wanted((str(run_of),), methods=("zero", "direct", "flow"))
-    benchmark_odometry(wanted, tmp_path / "whole")
+    expected = Wanted((str(run_of),), methods=("zero", "direct", "flow"))
+    benchmark_odometry(expected, tmp_path / "whole")
     broken = tmp_path / "broken"
-    benchmark_odometry(replace(wanted, methods=("zero", "direct")), broken)
+    benchmark_odometry(replace(expected, methods=("zero", "direct")), broken)
     journal = broken / "rows.jsonl"
     lines = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(lines[0] + lines[1][:40])  # killed while the second row was written
     estimates = next((broken / "paths").glob("*direct")) / "estimates.jsonl"
-    kept = estimates.read_bytes().splitlines(keepends=True)
-    estimates.write_bytes(b"".join(kept[:7]) + kept[7][:20])
-    benchmark_odometry(wanted, broken, resume=True)
+    stored = estimates.read_bytes().splitlines(keepends=True)
+    estimates.write_bytes(b"".join(stored[:7]) + stored[7][:20])
+    benchmark_odometry(expected, broken, resume=True)
     assert table_of(broken) == table_of(tmp_path / "whole")
-    assert estimates.read_bytes() == b"".join(kept)
+    assert estimates.read_bytes() == b"".join(stored)
 
 
 def test_rows_come_one_by_one_and_are_not_made_again(run_of: Path, tmp_path: Path, monkeypatch: Any) -> None:
@@ -302,8 +306,8 @@ def test_what_is_assumed_of_a_recording_is_told_once(tmp_path: Path, frames: Son
     sonar = frames.sonar.replace(coding="dB", coding_db=80.0, frequency_hz=1.8e6, azimuth_fov_deg=28)
     blind = replace(frames, image=decibels, level="dB", poses=None, height_m=None, sonar=sonar)
     write_aris(tmp_path / "dive.aris", blind, beams=96)
-    wanted = Wanted((str(tmp_path / "dive.aris"),), methods=("zero", "flow"), frames=4)
-    report = benchmark_odometry(wanted, tmp_path / "bench")
+    expected = Wanted((str(tmp_path / "dive.aris"),), methods=("zero", "flow"), frames=4)
+    report = benchmark_odometry(expected, tmp_path / "bench")
     assert [row["frames"] for row in report["rows"]] == [4, 4]
     assert sum("has no height over the ground" in note for note in report["notes"]) == 1
 
@@ -345,20 +349,20 @@ def test_what_cannot_be_made_is_one_sentence(mitsonar: Command, options: list[st
 
 
 def test_a_word_before_a_hyphen_means_all_such_sets(tmp_path: Path, monkeypatch: Any) -> None:
-    asked: list[str] = []
+    arguments: list[str] = []
 
     def measured(self: Any, case: Case, *_: Any) -> Row:
-        asked.append(case.name)
+        arguments.append(case.name)
         raise MitsonarError("not rendered")
 
     monkeypatch.setattr(odometry_benchmark._Bench, "measure", measured)
     benchmark_odometry(Wanted(("dive-gemini-720is",), ("still",), methods=("zero",)), tmp_path / "few")
     flown = [f"dive-gemini-720is-{flight}-{seed}" for flight in ("level", "gentle") for seed in (3, 11, 20)]
-    assert asked == flown
-    asked.clear()
+    assert arguments == flown
+    arguments.clear()
     benchmark_odometry(Wanted(methods=("zero",)), tmp_path / "all")
-    assert len(asked) == 2 * (36 + 3)
-    assert {"rocks", *flown} < set(asked)
+    assert len(arguments) == 2 * (36 + 3)
+    assert {"rocks", *flown} < set(arguments)
 
 
 def small_hull(self: ShipHull, seed: int) -> World:

@@ -85,8 +85,8 @@ def test_every_row_has_a_recipe_and_every_network_of_the_document_its_rows() -> 
     for table in TABLES.values():  # the same network has the same numbers wherever it is printed
         for row in table.rows:
             others = [(TABLES[name], rows_named(TABLES[name], [row.name])[0]) for name in tables_with(row.name)]
-            keys = {(str(table.set), str(other.set), table.unseen, str(table.noises)) for table, other in others}
-            assert all(other.printed == row.printed for _, other in others)
+            keys = {(str(table.set), str(second.set), table.unseen, str(table.noises)) for table, second in others}
+            assert all(second.printed == row.printed for _, second in others)
             assert len(keys) == 1, row.name  # trained once and judged once for all of them
             load_training_recipe(row.recipe, {**table.set, **row.set})
 
@@ -129,7 +129,7 @@ def test_an_effort_changes_data_beside_what_a_recipe_changes() -> None:
 
 def test_the_numbers_are_those_of_the_reference() -> None:
     """The numbers are typed from the document, not from the tables."""
-    wanted = {
+    expected = {
         ("3.1", "sfmnet-quantised"): "4.86 / 2.36 / .084 | 5.43 / 3.05 / .098",
         ("3.1", "posenet-quantised"): "2.81 / 1.44 / .049 | 11.32 / 6.42 / .199",
         ("3.1", "cnn1b-quantised"): "7.63 / 4.63 / .172 | 13.67 / 10.60 / .266",
@@ -151,7 +151,7 @@ def test_the_numbers_are_those_of_the_reference() -> None:
         ("5.2", "impulse-wideband-19200"): "1.9 / 2.4",
         ("5.2", "impulse-ten-320khz"): "1.53 / 1.27",
     }
-    for (table, recipe), text in wanted.items():
+    for (table, recipe), text in expected.items():
         (row,) = rows_named(TABLES[table], [recipe])
         halves = [tuple(float(word) for word in half.split("/")) for half in text.split("|")]
         assert list(row.printed.values()) == halves, (table, recipe)
@@ -162,8 +162,8 @@ def test_the_numbers_are_those_of_the_reference() -> None:
 def test_recipes_say_what_the_text_says() -> None:
     for name in RECIPES:
         recipe = load_training_recipe(name)
-        told = (recipe.batch, recipe.optimiser.kind, recipe.optimiser.rate, recipe.optimiser.halve_every, recipe.epochs)
-        assert told == (4, "adam", 1e-4, 12, 32), name
+        message = (recipe.batch, recipe.optimiser.kind, recipe.optimiser.rate, recipe.optimiser.halve_every, recipe.epochs)
+        assert message == (4, "adam", 1e-4, 12, 32), name
         assert recipe.split == "sequence"  # tables deal pairs out as Almanza-Medina does, who trains for oneself does not
         assert set(NOISES) - {LOUD} <= set(recipe.validation.noise)
         assert recipe.noise == ("low" if "low-noise" in name else "high" if "high-noise" in name else "none")
@@ -244,38 +244,38 @@ def test_a_table_shows_all_rows_and_the_scale_of_each() -> None:
     table = table_named("3.7")
     halves = {"none": score(5.0), "high": score(7.0)}
     fresh = {"none": score(6.0), "high": score(8.0)}
-    found = {"posenet-cartesian": Found(recipe="posenet-cartesian", validation=halves, unseen=fresh, reached=REACHED)}
-    text = "\n".join(table_lines(table, found))
+    result = {"posenet-cartesian": Found(recipe="posenet-cartesian", validation=halves, unseen=fresh, reached=REACHED)}
+    text = "\n".join(table_lines(table, result))
     (line,) = [line for line in text.splitlines() if line.startswith("| Cartesian") and "posenet" not in line]
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     assert cells == [
         *("Cartesian", "3.36 / 1.08 / 0.051", "5.00 / 2.50 / 0.100", "6.00 / 3.00 / 0.120"),
         *("9.75 / 3.33 / 0.111", "7.00 / 3.50 / 0.140", "8.00 / 4.00 / 0.160"),
     ]
-    other = {"none": score(5.5), "high": score(7.5)}  # of sequences that training has not seen
-    three = found | {"posenet-cartesian": found["posenet-cartesian"].model_copy(update={"test": other})}
+    second = {"none": score(5.5), "high": score(7.5)}  # of sequences that training has not seen
+    three = result | {"posenet-cartesian": result["posenet-cartesian"].model_copy(update={"test": second})}
     wide = table_lines(table, three)
     (line,) = [line for line in wide if line.startswith("| Cartesian") and "posenet" not in line]
     assert [cell.strip() for cell in line.strip("|").split("|")][2:5] == [
         *("5.00 / 2.50 / 0.100", "5.50 / 2.75 / 0.110", "6.00 / 3.00 / 0.120"),
     ]
     loud = {"none": score(5.0), "high": score(7.0), LOUD: score(5.2)}  # echoes of five times the gain
-    gained = {"posenet-cartesian": found["posenet-cartesian"].model_copy(update={"validation": loud})}
+    gained = {"posenet-cartesian": result["posenet-cartesian"].model_copy(update={"validation": loud})}
     (line,) = [line for line in table_lines(table, gained) if line.startswith("| Cartesian") and "posenet" not in line]
     assert [cell.strip() for cell in line.strip("|").split("|")][7:] == ["5.20 / 2.60 / 0.104", "-"]
     assert len(table_figure(table, gained).axes) == 9
-    assert len(table_figure(table, three).axes[0].patches) == len(table_figure(table, found).axes[0].patches) + 1
+    assert len(table_figure(table, three).axes[0].patches) == len(table_figure(table, result).axes[0].patches) + 1
     (line,) = [line for line in text.splitlines() if line.startswith("| *always answering no motion*")]
     assert line.count("11.55 / 11.55 / 0.260") == 2
     assert line.count("11.00 / 12.00 / 0.250") == 4
     assert len([line for line in text.splitlines() if "2.60 / 1.07 / 0.047" in line and "not trained yet" in line]) == 1
     (line,) = [line for line in text.splitlines() if "posenet-cartesian" in line]
-    told = ("3,040", "18,000 (16,000)", "5.92 of 32", "30.0", "16, 0.0002, 32-true", "40, 40 (30)", "2026-11-21")
-    for word in (*told, "threads: 2", "a processor"):
+    message = ("3,040", "18,000 (16,000)", "5.92 of 32", "30.0", "16, 0.0002, 32-true", "40, 40 (30)", "2026-11-21")
+    for word in (*message, "threads: 2", "a processor"):
         assert f" {word}" in line, word
     (line,) = [line for line in text.splitlines() if "posenet-normx10" in line]
     assert "3.2, 3.3, 3.4, 3.6" in line  # one training for five tables
-    figure = table_figure(table, found)
+    figure = table_figure(table, result)
     assert isinstance(figure, Figure)
     bars = [bar.get_width() for bar in figure.axes[0].patches if isinstance(bar, Rectangle)]
     assert sorted(bars) == pytest.approx(sorted([2.84, 3.36, 2.60, 5.0, 6.0]))
@@ -290,15 +290,15 @@ def test_a_table_of_heights_says_them_in_cm_and_of_their_interval() -> None:
 
     halves = {"none": errors(90.0), "high": errors(180.0)}
     name = "height-rocky-vector"
-    found = {name: Found(recipe=name, validation=halves, unseen=halves, reached=REACHED)}
-    lines = table_lines(table_named("4.5"), found)
+    result = {name: Found(recipe=name, validation=halves, unseen=halves, reached=REACHED)}
+    lines = table_lines(table_named("4.5"), result)
     (line,) = [line for line in lines if line.startswith("| rocky field, vectors") and "height" not in line]
     assert [cell.strip() for cell in line.strip("|").split("|")] == [
         *("rocky field, vectors", "12.17 cm (1.35 %)", "9.00 cm (1.00 %)", "9.00 cm (1.00 %)"),
         *("-", "18.00 cm (2.00 %)", "18.00 cm (2.00 %)"),
     ]
     assert not any("always answering no motion" in line for line in lines[:8])
-    figure = table_figure(table_named("4.5"), found)  # percent, since one interval is 26 times the other
+    figure = table_figure(table_named("4.5"), result)  # percent, since one interval is 26 times the other
     widths = [bar.get_width() for bar in figure.axes[0].patches if isinstance(bar, Rectangle)]
     np.testing.assert_allclose(sorted(w for w in widths if np.isfinite(w)), [1, 1, 119.1 / 90, 121.7 / 90, 24 / 7, 24 / 7])
 
@@ -317,8 +317,8 @@ def test_a_table_with_times_shows_them_beside_those_printed() -> None:
 
 def test_unseen_scenes_of_a_table_that_says_how_many() -> None:
     data = load_recipe("looking-down", {"store": "vectors"})
-    other, wanted = unseen_recipe(data, 250, 1000, 2)
-    assert (wanted, other.sequences, other.flight.pings, other.seed) == (1000, 1000, 2, 7919)
+    second, expected = unseen_recipe(data, 250, 1000, 2)
+    assert (expected, second.sequences, second.flight.pings, second.seed) == (1000, 1000, 2, 7919)
     same, some = unseen_recipe(data, 250, None, 2)
     assert (some, same.sequences, same.flight.pings) == (100, 250, 5)
 
@@ -396,12 +396,12 @@ def test_a_table_from_nothing(whole: Path) -> None:
         }
         assert (ours["validation"]["none"]["pairs"], ours["test"]["none"]["pairs"]) == (3, 1)
         assert (ours["unseen"]["high"]["pairs"], ours["unseen"]["high"]["scenes"]) == (16, 2)
-        kept = Checkpoint.load(whole / "runs" / name)
-        assert kept.options["width"] == 1 / 16
-        assert kept.recipe["loss"]["penalty"] == (100 if name == "posenet-penalty" else 0)
+        stored = Checkpoint.load(whole / "runs" / name)
+        assert stored.options["width"] == 1 / 16
+        assert stored.recipe["loss"]["penalty"] == (100 if name == "posenet-penalty" else 0)
     text = (whole / "table.md").read_text()
-    said = "scale 1 of the recipes' data; all epochs; recipes changed, except for keys that a row sets: network.width "
-    assert said + "0.0625" in text
+    output = "scale 1 of the recipes' data; all epochs; recipes changed, except for keys that a row sets: network.width "
+    assert output + "0.0625" in text
     assert "not trained yet" not in text
     assert (whole / "table-3.6.png").stat().st_size > 10_000
 
@@ -426,10 +426,10 @@ def test_unseen_scenes_are_evaluated_as_the_network_says(whole: Path) -> None:
     assert not set(map(tuple, pairs.pose)) & set(map(tuple, before.pose))
     network = Checkpoint.load(whole / "runs" / ROWS[0]).build()
     with torch.inference_mode():
-        said = [pairs.labels.decode(network(pairs[k][0][None]))[0] for k in range(len(pairs))]
-    error = in_units(np.array(said) - [pairs.target(k) for k in range(len(pairs))])
-    wanted = told(whole)[ROWS[0]]["ours"]["unseen"]["none"]["rmse"]
-    np.testing.assert_allclose(np.sqrt((error**2).mean(axis=0)), wanted, rtol=1e-4)
+        output = [pairs.labels.decode(network(pairs[k][0][None]))[0] for k in range(len(pairs))]
+    error = in_units(np.array(output) - [pairs.target(k) for k in range(len(pairs))])
+    expected = told(whole)[ROWS[0]]["ours"]["unseen"]["none"]["rmse"]
+    np.testing.assert_allclose(np.sqrt((error**2).mean(axis=0)), expected, rtol=1e-4)
 
 
 SCRIPT = """
@@ -533,19 +533,19 @@ def test_a_folder_keeps_to_what_it_was_begun_with(whole: Path, tmp_path: Path) -
     with pytest.raises(MitsonarError, match=r"was begun with changes\.steps 12, not 13"):
         tiny(whole, changes={**TINY, "steps": 13})
     about = whole / "run.json"
-    kept = about.read_text()
-    about.write_text(kept.replace('"penalty": 100.0', '"penalty": 50.0'))  # as if the recipe's file had changed
+    stored = about.read_text()
+    about.write_text(stored.replace('"penalty": 100.0', '"penalty": 50.0'))  # as if the recipe's file had changed
     with pytest.raises(MitsonarError, match=r"was begun with row\.posenet-penalty\.loss\.penalty 50\.0, not 100\.0"):
         tiny(whole)
-    for damaged, said in (
-        (kept[:-40], "cannot read"),
+    for damaged, output in (
+        (stored[:-40], "cannot read"),
         ("{}", "no tables of mitsonar"),
-        (kept.replace('"scale"', '"scala"'), "scala"),
+        (stored.replace('"scale"', '"scala"'), "scala"),
     ):
         about.write_text(damaged)
-        with pytest.raises(MitsonarError, match=said):
+        with pytest.raises(MitsonarError, match=output):
             tiny(whole)
-    about.write_text(kept)
+    about.write_text(stored)
     row = whole / "rows" / f"{ROWS[0]}.json"
     fine = row.read_text()
     row.write_text(fine.replace('"validation"', '"valid"'))

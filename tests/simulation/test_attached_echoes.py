@@ -26,8 +26,8 @@ def totals(loaded: mi.Scene, pose: Any) -> tuple[Any, Any]:
     import drjit as dr
     from attached_echoes import attached_echoes
 
-    found = attached_echoes(loaded, SONAR, pose)
-    return dr.mean(found.range_m), dr.sum(found.level)
+    result = attached_echoes(loaded, SONAR, pose)
+    return dr.mean(result.range_m), dr.sum(result.level)
 
 
 def slopes(loaded: mi.Scene, which: int, by: int, step: float) -> float:

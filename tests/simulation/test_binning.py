@@ -79,8 +79,10 @@ def bin_in_numpy(echoes: Echoes, sonar: Sonar) -> tuple[np.ndarray, dict[str, np
         amount = (value * unit).astype(np.uint64)
         np.add.at(sums, (place[inside].astype(int), beam[inside]), amount[inside])
     else:
-        held = np.clip(e["range_m"], max(sonar.range_min, sonar.bin_m), 4 * sonar.range_max)
-        spreading = {0: 1 / (held * held), 1: 1 / held, 2: held * 0 + 1, 3: held, 4: held * held}[sonar.gain_exponent]
+        stored = np.clip(e["range_m"], max(sonar.range_min, sonar.bin_m), 4 * sonar.range_max)
+        spreading = {0: 1 / (stored * stored), 1: 1 / stored, 2: stored * 0 + 1, 3: stored, 4: stored * stored}[
+            sonar.gain_exponent
+        ]
         value = value * e["solid_angle_sr"] * spreading * unit
         a, b = ((e[name] - sonar.range_min) * (1 / sonar.bin_m) for name in ("near_m", "far_m"))
         short, middle = b - a <= 1 / 64, (a + b) * 0.5
@@ -113,9 +115,9 @@ def test_fused_image_equals_numpy_on_the_stored_echoes(world: mi.Scene, tmp_path
         levels, counts = bin_in_numpy(load_exr(tmp_path / "echoes.exr", sonar), sonar)
         assert levels.max() > 0
         np.testing.assert_array_equal(pings.levels[k], levels)
-        for what, wanted in counts.items():
-            assert wanted.sum() > 0, f"no ray is {what}: the scene tests nothing"
-            np.testing.assert_array_equal(getattr(pings.counts, what)[k], wanted, err_msg=what)
+        for what, expected in counts.items():
+            assert expected.sum() > 0, f"no ray is {what}: the scene tests nothing"
+            np.testing.assert_array_equal(getattr(pings.counts, what)[k], expected, err_msg=what)
 
 
 def assert_same_pings(got: Sequence[RenderedPings], wanted: Sequence[RenderedPings]) -> None:
@@ -154,11 +156,11 @@ def threads() -> Iterator[None]:
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("name", ["physical", "thesis"])
 def test_one_thread_or_two(world: mi.Scene, name: str) -> None:
-    found = []
+    result = []
     for count in (1, 2):
         dr.set_thread_count(count)
-        found.append(list(Simulator(world, SONARS[name]).pings(FLIGHT.poses, labels=True)))
-    assert_same_pings(*found)
+        result.append(list(Simulator(world, SONARS[name]).pings(FLIGHT.poses, labels=True)))
+    assert_same_pings(*result)
 
 
 def test_threads_may_change_between_launches() -> None:
@@ -184,8 +186,8 @@ def test_threads_may_change_between_launches() -> None:
 def test_again_gives_the_same(world: mi.Scene) -> None:
     first, second = (list(Simulator(world, SONARS["physical"]).pings(FLIGHT.poses, labels=True)) for _ in range(2))
     assert_same_pings(first, second)
-    other = list(Simulator(world, SONARS["physical"].replace(seed=1)).pings(FLIGHT.poses))
-    assert (other[0].levels != first[0].levels).mean() > 0.3  # another seed, another draw
+    another = list(Simulator(world, SONARS["physical"].replace(seed=1)).pings(FLIGHT.poses))
+    assert (another[0].levels != first[0].levels).mean() > 0.3  # another seed, another draw
 
 
 @pytest.mark.parametrize("name", SONARS)
@@ -209,10 +211,10 @@ def test_all_rays_at_the_largest_level_in_one_bin(radius: float) -> None:
     for sonar in (Sonar(beams=4), Sonar(beams=4, model="thesis")):
         levels = next(Simulator(loaded, sonar).pings([Pose(*AROUND)])).levels[0]
         if sonar.model == "thesis":
-            wanted = 700.0
+            expected = 700.0
         else:  # the solid angle of a beam over R^2
-            wanted = 2 * np.sin(np.radians(7)) * sonar.beam_width_rad / (radius + 1e-4) ** 2
-        np.testing.assert_allclose(levels.sum(axis=0), wanted, rtol=1e-5)
+            expected = 2 * np.sin(np.radians(7)) * sonar.beam_width_rad / (radius + 1e-4) ** 2
+        np.testing.assert_allclose(levels.sum(axis=0), expected, rtol=1e-5)
         assert (levels > 0).sum() <= 2 * sonar.beams  # in one bin, or on the border of two
 
 

@@ -37,8 +37,8 @@ def under_surface(depth: float, place: Array, tilt_deg: float = 0.0) -> tuple[mi
 def profile(loaded: mi.Scene, sonar: Sonar, depth: float, mirrors: dict[str, tuple[float, float]], pings: int = 8) -> Array:
     """The mean of some pings, summed over beams ``(bins,)``."""
     poses = np.tile([0, 0, -depth, 0, 0, 0], (pings, 1))
-    found = Simulator(loaded, sonar, mirrors=mirrors).pings(poses)
-    return np.asarray(sum(part.levels.sum(axis=(0, 2), dtype=float) for part in found) / pings)
+    result = Simulator(loaded, sonar, mirrors=mirrors).pings(poses)
+    return np.asarray(sum(part.levels.sum(axis=(0, 2), dtype=float) for part in result) / pings)
 
 
 def ball(first: Array, second: Array) -> float:
@@ -60,20 +60,20 @@ def test_ghosts_lie_where_image_sources_say(depth: float, place: tuple[float, fl
     """Ranges within one bin and levels within 5 %; a flat surface keeps the bearing, so both ways arrive in one beam."""
     at = np.array(place)
     loaded, image = under_surface(depth, at, tilt)
-    ways = at - [0, 0, -depth], at - image
-    near, far = (float(np.linalg.norm(way)) for way in ways)
-    units = [way / length for way, length in zip(ways, (near, far), strict=True)]
-    wanted = {
+    paths = at - [0, 0, -depth], at - image
+    near, far = (float(np.linalg.norm(way)) for way in paths)
+    units = [way / length for way, length in zip(paths, (near, far), strict=True)]
+    expected = {
         (near + far) / 2: 4 * MU * RADIUS**2 * ball(*units) / (near * far) ** 2,
         far: MU * RADIUS**2 * ball(units[0], units[0]) / far**4,
     }
-    for bounces, ranges in ((2, list(wanted)[:1]), (3, list(wanted))):
+    for bounces, ranges in ((2, list(expected)[:1]), (3, list(expected))):
         seen = profile(loaded, SONAR.replace(bounces=bounces), depth, {"top": (-1.0, 0.0)})
         for range_m in ranges:
             inside = np.abs(SONAR.range_m - (range_m - RADIUS / 2)) < RADIUS
             middle = np.average(SONAR.range_m[inside], weights=seen[inside])  # of a ball: 3/4 of its radius before its own
             assert middle == pytest.approx(range_m - 0.75 * RADIUS, abs=SONAR.bin_m), (bounces, range_m)
-            assert seen[inside].sum() == pytest.approx(wanted[range_m], rel=0.05)
+            assert seen[inside].sum() == pytest.approx(expected[range_m], rel=0.05)
 
 
 def test_a_far_ghost_does_not_depend_on_where_the_window_begins() -> None:
@@ -81,13 +81,13 @@ def test_a_far_ghost_does_not_depend_on_where_the_window_begins() -> None:
     ball_far = sphere((0.0, 60.0, -4.0), 1.0, diffuse(MU))
     loaded = scene(top=plate((0, 0, 0), np.array([0.0, 0, -1]), half=500.0, bsdf=diffuse(0.0)), ball=ball_far)
     far = SONAR.replace(gain_exponent=0, elevation_fov_deg=30.0, range_max=80.0, rays_per_beam=200)
-    found = []
+    result = []
     for begin, bins in ((0.1, 799), (40.0, 400)):
         two = far.replace(range_min=begin, range_bins=bins, bounces=2)
         whole = profile(loaded, two, 4.0, {"top": (-1.0, 0.0)}, 2)
-        found.append(whole.sum() - profile(loaded, two.replace(bounces=1), 4.0, {}, 2).sum())
-    assert found[0] > 0
-    assert found[0] == pytest.approx(found[1], rel=1e-3)
+        result.append(whole.sum() - profile(loaded, two.replace(bounces=1), 4.0, {}, 2).sum())
+    assert result[0] > 0
+    assert result[0] == pytest.approx(result[1], rel=1e-3)
 
 
 def test_a_rough_surface_loses_by_its_height() -> None:
@@ -114,19 +114,23 @@ def test_a_ghost_of_another_bearing_is_heard_by_arrays_that_only_receive() -> No
     near, far = 5.0, math.hypot(5, 2)
     sonar = SONAR.replace(bounces=2, azimuth_fov_deg=57.6)
     inside = np.abs(sonar.range_m - (near + far) / 2) < 0.06
-    heard = {}
+    received = {}
     for pattern in ("box", "receive", "two_way"):
-        own = sonar.replace(pattern=pattern, elevation_pattern="box")
+        local = sonar.replace(pattern=pattern, elevation_pattern="box")
         seen = (
-            next(iter(Simulator(loaded, own, mirrors={"wall": (1.0, 0.0)}).pings(np.zeros(6)))).levels[0][inside].sum(axis=0)
+            next(iter(Simulator(loaded, local, mirrors={"wall": (1.0, 0.0)}).pings(np.zeros(6))))
+            .levels[0][inside]
+            .sum(axis=0)
         )
-        heard[pattern] = seen
+        received[pattern] = seen
     for pattern in ("box", "receive"):
-        brightest = set(np.sort(np.argsort(heard[pattern])[-2:]).tolist()) | set(np.argsort(heard[pattern])[-4:].tolist())
+        brightest = set(np.sort(np.argsort(received[pattern])[-2:]).tolist()) | set(
+            np.argsort(received[pattern])[-4:].tolist()
+        )
         bearings = sonar.bearing_rad[sorted(brightest)]
         assert np.abs(bearings).min() < sonar.beam_spacing_rad
         assert np.abs(bearings - math.atan2(2, 5)).min() < sonar.beam_spacing_rad
-    assert heard["two_way"].sum() < 1e-3 * heard["receive"].sum()
+    assert received["two_way"].sum() < 1e-3 * received["receive"].sum()
 
 
 @pytest.mark.parametrize("layout", ["even", "sine"])
@@ -146,10 +150,10 @@ def test_beams_narrower_than_their_spacing_hear_their_width(layout: str) -> None
 def test_labels_are_those_of_one_reflection() -> None:
     loaded = scene(ground=floor(diffuse(0.2)), wall=plate((0, 5, 0), (0, -1, 0), half=3.0, bsdf=diffuse(0.2)))
     pose = np.array([0, 0, 2.0, math.radians(25), 0, 0])
-    found = [next(iter(Simulator(loaded, SONAR.replace(bounces=n)).pings(pose, labels=True))) for n in (1, 3)]
-    for name, values in found[0].labels.items():
-        np.testing.assert_array_equal(values, found[1].labels[name], err_msg=name)
-    assert (found[1].levels != found[0].levels).any()
+    result = [next(iter(Simulator(loaded, SONAR.replace(bounces=n)).pings(pose, labels=True))) for n in (1, 3)]
+    for name, values in result[0].labels.items():
+        np.testing.assert_array_equal(values, result[1].labels[name], err_msg=name)
+    assert (result[1].levels != result[0].levels).any()
 
 
 @pytest.mark.parametrize("pattern", ["box", "receive"])

@@ -44,9 +44,9 @@ def test_the_inside_of_a_sphere_multiplies_by_its_albedo(mu: float) -> None:
     # a chord is shorter than c with probability c^2 / 4 a^2, and the path is a + c + a
     nearer = np.cumsum((two - one).sum(axis=1)) / second
     edge = ALL_ROUND.range_min + (np.arange(ALL_ROUND.range_bins) + 1) * ALL_ROUND.bin_m
-    wanted = np.clip((edge - radius) / radius, 0, 1) ** 2
+    expected = np.clip((edge - radius) / radius, 0, 1) ** 2
     # what is heard in one beam twice has other chords: 1 part in 37
-    assert np.abs(nearer - wanted)[edge > radius + 0.05].max() < 0.025
+    assert np.abs(nearer - expected)[edge > radius + 0.05].max() < 0.025
 
 
 def between_plates(first: tuple[Array, Array, Array], second: tuple[Array, Array, Array], mu: float) -> float:
@@ -57,9 +57,9 @@ def between_plates(first: tuple[Array, Array, Array], second: tuple[Array, Array
     n = 40
     step = (np.arange(n) + 0.5) / n
     places, normals, areas = [], [], []
-    for corner, one, other in (first, second):
-        grid = corner + step[:, None, None] * one + step[None, :, None] * other
-        cross = np.cross(one, other)
+    for corner, one, another in (first, second):
+        grid = corner + step[:, None, None] * one + step[None, :, None] * another
+        cross = np.cross(one, another)
         places.append(grid.reshape(-1, 3))
         normals.append(cross / np.linalg.norm(cross))
         areas.append(np.linalg.norm(cross) / n**2)
@@ -104,14 +104,14 @@ def test_threads_and_batches_do_not_change_bits() -> None:
     loaded = scene(ball=sphere((0, 0, 0), 2.0, diffuse(0.2)))
     sonar = ALL_ROUND.replace(bounces=3, rays_per_beam=50)
     poses = np.zeros((3, 6))
-    before, found = dr.thread_count(), []
+    before, result = dr.thread_count(), []
     try:
         for count, rays in ((1, 2**23), (3, 2**23), (2, sonar.rays)):
             dr.set_thread_count(count)
             parts = Simulator(loaded, sonar, rays_per_launch=rays).pings(poses)
-            found.append(np.concatenate([part.levels for part in parts]))
+            result.append(np.concatenate([part.levels for part in parts]))
     finally:
         dr.set_thread_count(before)
-    np.testing.assert_array_equal(found[0], found[1])
-    np.testing.assert_array_equal(found[0], found[2])
-    assert (found[0][0] != found[0][1]).any()  # each ping draws its own directions
+    np.testing.assert_array_equal(result[0], result[1])
+    np.testing.assert_array_equal(result[0], result[2])
+    assert (result[0][0] != result[0][1]).any()  # each ping draws its own directions

@@ -39,39 +39,39 @@ def one_response(
 
 def test_one_plate_is_one_pulse_of_known_delay_magnitude_and_phase() -> None:
     sonar = ChannelSonar(receivers=(received_from((0.3, 0.1, 0)),), points_per_m2=1e4)
-    made = simulator(sonar, plate=plate((1, 7, 2), (-1, -7, 8), half=0.005))
-    (place,) = points(made)
+    built = simulator(sonar, plate=plate((1, 7, 2), (-1, -7, 8), half=0.005))
+    (place,) = points(built)
     sent, back = np.array(LEVEL[:3]), np.add(LEVEL[:3], (0.3, 0.1, 0))
     r_a, r_b = np.linalg.norm(place - sent), np.linalg.norm(place - back)
     normal = np.array([-1, -7, 8]) / np.linalg.norm([-1, -7, 8])
     cosines = abs(normal @ (place - sent)) / r_a * abs(normal @ (place - back)) / r_b
-    (strength,), (phase,) = scatterers_of(made).strength, scatterers_of(made).phase  # the point's own, drawn once
+    (strength,), (phase,) = scatterers_of(built).strength, scatterers_of(built).phase  # the point's own, drawn once
     amplitude = np.sqrt(strength * cosines) * np.exp(1j * phase) / (r_a * r_b)
     delay = (r_a + r_b) / C
-    wanted = amplitude * sonar.pulse(sonar.delay_s - delay) * np.exp(-2j * np.pi * sonar.carrier_hz * delay)
-    found = one_response(made)[0]
-    assert np.abs(found - wanted).max() < 1e-5 * np.abs(wanted).max()
-    assert np.abs(found).argmax() == round(delay * sonar.sampling_hz)
+    expected = amplitude * sonar.pulse(sonar.delay_s - delay) * np.exp(-2j * np.pi * sonar.carrier_hz * delay)
+    result = one_response(built)[0]
+    assert np.abs(result - expected).max() < 1e-5 * np.abs(expected).max()
+    assert np.abs(result).argmax() == round(delay * sonar.sampling_hz)
 
 
 def test_two_receivers_differ_in_phase_as_their_ways_do() -> None:
     sonar = ChannelSonar(
         receivers=(received_from(), received_from((0.12, 0, 0)).model_copy(update={"name": "two"})), points_per_m2=1e4
     )
-    made = simulator(sonar, plate=plate((6.005, 7.005, 0), (0, 0, 1), half=0.005))
-    (place,) = points(made)
+    result = simulator(sonar, plate=plate((6.005, 7.005, 0), (0, 0, 1), half=0.005))
+    (place,) = points(result)
     way = [np.linalg.norm(place - np.array(LEVEL[:3]) - offset) for offset in sonar.offsets]
-    first, second = one_response(made)
+    first, second = one_response(result)
     peak = np.abs(first).argmax()
-    wanted = -2 * np.pi * sonar.carrier_hz * (way[1] - way[0]) / C
-    difference = np.angle(second[peak] / first[peak]) - wanted
+    expected = -2 * np.pi * sonar.carrier_hz * (way[1] - way[0]) / C
+    difference = np.angle(second[peak] / first[peak]) - expected
     assert abs(np.angle(np.exp(1j * difference))) < 1e-4
 
 
 def test_a_moving_vehicle_receives_later_or_sooner() -> None:
     sonar = ChannelSonar(receivers=(received_from(),), points_per_m2=1e4)
-    made = simulator(sonar, plate=plate((0, 7, 0), (0, 0, 1), half=0.005))
-    still, moving = made.paths(LEVEL), made.paths(LEVEL, [0, 2, 0, 0])
+    result = simulator(sonar, plate=plate((0, 7, 0), (0, 0, 1), half=0.005))
+    still, moving = result.paths(LEVEL), result.paths(LEVEL, [0, 2, 0, 0])
     forward = 7 / np.hypot(7, 10)
     assert (still.delay_s - moving.delay_s)[0] == pytest.approx(2 * forward * still.delay_s[0] / C, rel=1e-2)
     assert moving.doppler_hz[0] == pytest.approx(2 * 2 * forward / sonar.wavelength_m, rel=1e-2)
@@ -79,13 +79,13 @@ def test_a_moving_vehicle_receives_later_or_sooner() -> None:
 
 def test_turning_swings_receivers_around() -> None:
     """A receiver 0.5 m to starboard of a vehicle that turns to starboard moves back."""
-    made = simulator(
+    result = simulator(
         ChannelSonar(receivers=(received_from((0.5, 0, 0)),), points_per_m2=1e4),
         plate=plate((0, 9, 10), (0, -1, 0), half=0.005),
     )
-    turned, straight = made.paths(LEVEL, [0, 0, 0, 0.8]), made.paths(LEVEL, [0, -0.4, 0, 0])
+    turned, straight = result.paths(LEVEL, [0, 0, 0, 0.8]), result.paths(LEVEL, [0, -0.4, 0, 0])
     assert turned.delay_s[0] == pytest.approx(straight.delay_s[0], abs=1e-12)
-    assert turned.delay_s[0] > made.paths(LEVEL).delay_s[0]
+    assert turned.delay_s[0] > result.paths(LEVEL).delay_s[0]
 
 
 # ---------------------------------------------------------------- from ping to ping
@@ -135,9 +135,9 @@ def correlations(
 def test_correlation_from_ping_to_ping_is_that_of_the_points() -> None:
     """On a rough floor, 0.1 to 5 mm apart: phase within 2 % of a direct sum over the anchored points, written down here."""
     sonar = ChannelSonar(range_max=20.0)
-    made = simulator(sonar, floor=rough_floor())
-    found = correlations(made, STEPS_M)[0]
-    echo = scatterers_of(made)
+    built = simulator(sonar, floor=rough_floor())
+    result = correlations(built, STEPS_M)[0]
+    echo = scatterers_of(built)
     field = sonar.receivers[0].field
     responses = []
     for ahead in (0.0, *STEPS_M):
@@ -153,9 +153,9 @@ def test_correlation_from_ping_to_ping_is_that_of_the_points() -> None:
         responses.append(impulse_response((r_a + r_b)[loud] / C, amplitude[loud] * zeta, sonar))
     here, *there = responses
     direct = np.array([np.vdot(here, one) / np.linalg.norm(here) / np.linalg.norm(one) for one in there])
-    assert np.abs(np.angle(found) / np.angle(direct) - 1)[1:].max() < 0.02
-    assert np.abs(np.abs(found) - np.abs(direct)).max() < 0.02
-    assert np.angle(found)[2] > 0.1  # going towards what it sees, the way gets shorter
+    assert np.abs(np.angle(result) / np.angle(direct) - 1)[1:].max() < 0.02
+    assert np.abs(np.abs(result) - np.abs(direct)).max() < 0.02
+    assert np.angle(result)[2] > 0.1  # going towards what it sees, the way gets shorter
 
 
 def test_rays_of_the_vehicle_do_not_feel_its_motion() -> None:
@@ -172,11 +172,11 @@ def test_rays_of_the_vehicle_do_not_feel_its_motion() -> None:
 def test_doppler_of_every_echo() -> None:
     """2 v cos / lambda, against the phase of the same points from a place that is really farther on."""
     sonar = ChannelSonar(receivers=(received_from(),), points_per_m2=200.0)
-    made = simulator(sonar, floor=rough_floor())
-    here, there = made.paths(LEVEL), made.paths(Pose(0, 2e-5, 10))
+    result = simulator(sonar, floor=rough_floor())
+    here, there = result.paths(LEVEL), result.paths(Pose(0, 2e-5, 10))
     rate = (here.delay_s - there.delay_s) * sonar.carrier_hz / 1e-5
-    doppler = made.paths(LEVEL, [0, 2, 0, 0]).doppler_hz
-    ahead = points(made)[made.tracer.trace(np.array(LEVEL), np.zeros(4), 0, ("counts",))["counts"]] - np.array(LEVEL[:3])
+    doppler = result.paths(LEVEL, [0, 2, 0, 0]).doppler_hz
+    ahead = points(result)[result.tracer.trace(np.array(LEVEL), np.zeros(4), 0, ("counts",))["counts"]] - np.array(LEVEL[:3])
     cosine = ahead[:, 1] / np.linalg.norm(ahead, axis=1)
     steep = np.abs(cosine) > 0.1
     assert np.abs(doppler / (2 * 2 * cosine / sonar.wavelength_m) - 1)[steep].max() < 1e-5
@@ -188,14 +188,14 @@ def test_doppler_in_a_turn_is_the_slope_of_the_delay(velocity: tuple[float, ...]
     """-f d tau / dt of exact delays 2 ms apart, a receiver 0.5 m to starboard of the axis of the turn. What is left out is
     of second order: twice (v / c)^2 of the carrier, and the turning of the receiver's velocity while sound travels."""
     sonar = ChannelSonar(receivers=(received_from((0.5, 0, 0)),), points_per_m2=20.0)
-    made = simulator(sonar, floor=floor(diffuse(0.5), 5.0))
+    result = simulator(sonar, floor=floor(diffuse(0.5), 5.0))
     apart, turn = 1e-3, velocity[3]
     start, ahead = Pose(0.3, -0.2, 10, heading=0.7), np.array([np.sin(0.7), np.cos(0.7)])
     over_ground = [velocity[0] * ahead[1] + velocity[1] * ahead[0], velocity[1] * ahead[1] - velocity[0] * ahead[0]]
     rate = np.array([*over_ground, velocity[2], 0, 0, turn])
-    before, after = (made.paths(Pose(*(start + sign * apart * rate)), velocity).delay_s for sign in (-1, 1))
+    before, after = (result.paths(Pose(*(start + sign * apart * rate)), velocity).delay_s for sign in (-1, 1))
     slope = -sonar.carrier_hz * (after - before) / (2 * apart)
-    here = made.paths(start, velocity)
+    here = result.paths(start, velocity)
     fastest = np.linalg.norm(velocity[:3]) + abs(turn) * 0.5
     second_order = 3 * (fastest / C) ** 2 + abs(turn) * fastest * here.delay_s.max() / C
     assert np.ptp(slope) > 2
@@ -209,14 +209,14 @@ def test_doppler_of_an_angle(tilt: float) -> None:
     ground changes which points it holds: the narrower, the more places are needed.)"""
     field = FieldOfView(shape="circular", tilt_deg=tilt, across_deg=4.0, taper=1.0)
     sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=field),), points_per_m2=2500.0)
-    made = simulator(sonar, floor=rough_floor(half=18.0, rms=0.01))
+    result = simulator(sonar, floor=rough_floor(half=18.0, rms=0.01))
     speed, apart, places = 2.0, 2e-5, 100
     rng = np.random.default_rng(2)
     first = np.zeros((places, 6))
     first[:, :2], first[:, 2], first[:, 5] = rng.uniform(-3, 3, (places, 2)), 8.0, rng.uniform(0, 6, places)
     second = first.copy()
     second[:, :2] += np.stack([np.sin(first[:, 5]), np.cos(first[:, 5])], axis=1) * speed * apart
-    here, there = (np.concatenate([part.response for part in made.pings(poses)]) for poses in (first, second))
+    here, there = (np.concatenate([part.response for part in result.pings(poses)]) for poses in (first, second))
     doppler = np.angle(np.vdot(here.astype(np.complex128), there.astype(np.complex128))) / (2 * np.pi * apart)
     assert doppler == pytest.approx(2 * speed * np.sin(np.radians(tilt)) / sonar.wavelength_m, rel=0.005)
 
@@ -227,21 +227,21 @@ def test_correlation_does_not_depend_on_the_density_of_points() -> None:
     steps, places = np.linspace(0.5e-3, 20e-3, 12), np.random.default_rng(5).uniform(-2, 2, (8, 2))
     curves = []
     for density in (1000.0, 2000.0):
-        made = simulator(ChannelSonar(range_max=20.0, points_per_m2=density), floor=rough_floor(half=12.0, cells=200))
-        curves.append(correlations(made, steps, places))
-    alike = abs(np.vdot(*curves)) / np.linalg.norm(curves[0]) / np.linalg.norm(curves[1])
-    assert alike > 0.99
+        result = simulator(ChannelSonar(range_max=20.0, points_per_m2=density), floor=rough_floor(half=12.0, cells=200))
+        curves.append(correlations(result, steps, places))
+    similar = abs(np.vdot(*curves)) / np.linalg.norm(curves[0]) / np.linalg.norm(curves[1])
+    assert similar > 0.99
 
 
 # ---------------------------------------------------------------- reports and refusals
 
 
 def test_the_same_bits_however_many_pings_are_asked_for() -> None:
-    made = simulator(ChannelSonar(), floor=cells_floor())
+    result = simulator(ChannelSonar(), floor=cells_floor())
     flown, velocity = steady(LEVEL, (1.0, -0.5, 0.2), 20, 20.0)
-    together = made.responses(flown, velocity).response
+    together = result.responses(flown, velocity).response
     for first in (0, 7, 19):
-        (alone,) = made.pings(flown.poses[first : first + 1], velocity[first : first + 1])
+        (alone,) = result.pings(flown.poses[first : first + 1], velocity[first : first + 1])
         assert np.array_equal(alone.response[0], together[first])
     repeated = simulator(ChannelSonar(), floor=cells_floor()).responses(flown, velocity).response
     assert np.array_equal(repeated, together)
@@ -283,9 +283,9 @@ def test_velocities_that_cannot_be(velocity: list[list[float]]) -> None:
 
 
 def test_responses_are_saved_whole(tmp_path: Path) -> None:
-    made = simulator(ChannelSonar(receivers=four_receivers(across_deg=20.0)[:2]), floor=cells_floor(cells=64.0))
+    result = simulator(ChannelSonar(receivers=four_receivers(across_deg=20.0)[:2]), floor=cells_floor(cells=64.0))
     flown, velocity = steady(LEVEL, (1.0, -0.5, 0.2), 3, 20.0)
-    responses = made.responses(flown, velocity)
+    responses = result.responses(flown, velocity)
     for name in ("responses.npz", "responses.zarr"):
         responses.save(tmp_path / name)
         back = ImpulseResponses.load(tmp_path / name)
@@ -298,25 +298,25 @@ def test_responses_are_saved_whole(tmp_path: Path) -> None:
 
 
 def test_paths_add_up_to_the_response() -> None:
-    made = simulator(ChannelSonar(), floor=cells_floor())
-    (part,) = made.pings([LEVEL], [[1.0, 2.0, 0.0, 0.0]])
+    result = simulator(ChannelSonar(), floor=cells_floor())
+    (part,) = result.pings([LEVEL], [[1.0, 2.0, 0.0, 0.0]])
     for receiver in range(4):
-        received: Paths = made.paths(LEVEL, [1.0, 2.0, 0.0, 0.0], receiver)
+        received: Paths = result.paths(LEVEL, [1.0, 2.0, 0.0, 0.0], receiver)
         assert len(received.delay_s) == part.echoes[0, receiver]
-        wanted = impulse_response(received.delay_s, received.amplitude, made.sonar)
-        assert np.abs(part.response[0, receiver] - wanted).max() < 2e-6 * np.abs(wanted).max()
+        expected = impulse_response(received.delay_s, received.amplitude, result.sonar)
+        assert np.abs(part.response[0, receiver] - expected).max() < 2e-6 * np.abs(expected).max()
 
 
 def test_another_instrument_may_use_the_same_scatterers() -> None:
     ground, sonar = scene(floor=cells_floor()), ChannelSonar()
-    first, other = ChannelSimulator(ground, sonar), sonar.replace(carrier_hz=40e3)
-    shared = ChannelSimulator(ground, other, like=first)
+    first, second = ChannelSimulator(ground, sonar), sonar.replace(carrier_hz=40e3)
+    shared = ChannelSimulator(ground, second, like=first)
     assert scatterers_of(shared) is scatterers_of(first)
-    assert np.array_equal(one_response(shared), one_response(ChannelSimulator(ground, other)))
+    assert np.array_equal(one_response(shared), one_response(ChannelSimulator(ground, second)))
     assert scatterers_of(ChannelSimulator(ground, sonar.replace(seed=3), like=first)) is not scatterers_of(first)
 
 
 def test_a_trajectory_alone_is_at_rest() -> None:
-    made = simulator(ChannelSonar(), floor=cells_floor(cells=64.0))
+    result = simulator(ChannelSonar(), floor=cells_floor(cells=64.0))
     flown = Trajectory(np.array([LEVEL]), np.zeros(1))
-    assert np.array_equal(made.responses(flown).response, made.responses(flown, np.zeros((1, 4))).response)
+    assert np.array_equal(result.responses(flown).response, result.responses(flown, np.zeros((1, 4))).response)

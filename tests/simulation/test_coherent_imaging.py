@@ -62,20 +62,20 @@ def expected(sonar: Sonar, reflectivity: float = 0.5) -> Array:
 
 def test_energy_is_that_of_the_physical_model(flat: mi.Scene) -> None:
     """16 places: 0.1 dB."""
-    made = np.abs(images(imager(flat), 16)) ** 2
+    result = np.abs(images(imager(flat), 16)) ** 2
     truth = next(iter(Simulator(flat, BOXES).pings(POSE))).levels[0]
-    assert 10 * np.log10(made.sum(axis=(1, 2)).mean() / truth.sum()) == pytest.approx(0, abs=0.1)
-    middle = made[:, :, 20:28].mean(axis=(0, 2)).reshape(-1, 16).mean(axis=1)
-    wanted = expected(SONAR).reshape(-1, 16).mean(axis=1)
-    assert np.abs(10 * np.log10(middle / wanted)).max() < 0.6  # of some 500 independent cells each: 0.2 dB
+    assert 10 * np.log10(result.sum(axis=(1, 2)).mean() / truth.sum()) == pytest.approx(0, abs=0.1)
+    middle = result[:, :, 20:28].mean(axis=(0, 2)).reshape(-1, 16).mean(axis=1)
+    target = expected(SONAR).reshape(-1, 16).mean(axis=1)
+    assert np.abs(10 * np.log10(middle / target)).max() < 0.6  # of some 500 independent cells each: 0.2 dB
 
 
 def test_speckle_is_exponential(flat: mi.Scene) -> None:
     """Complex Gaussian: contrast 1, skewness 2, and Kolmogorov and Smirnov's test of thinned pixels."""
-    made = np.abs(images(imager(flat), 12)) ** 2 / expected(SONAR)[:, None]
-    assert made.std() / made.mean() == pytest.approx(1, abs=0.03)
-    assert stats.skew(made.ravel()) == pytest.approx(2, abs=0.25)
-    thinned = made[:, ::4, ::4].ravel()
+    result = np.abs(images(imager(flat), 12)) ** 2 / expected(SONAR)[:, None]
+    assert result.std() / result.mean() == pytest.approx(1, abs=0.03)
+    assert stats.skew(result.ravel()) == pytest.approx(2, abs=0.25)
+    thinned = result[:, ::4, ::4].ravel()
     assert len(thinned) > 5000
     assert stats.kstest(thinned / thinned.mean(), "expon").pvalue > 0.01
 
@@ -83,9 +83,9 @@ def test_speckle_is_exponential(flat: mi.Scene) -> None:
 @pytest.mark.parametrize("nu", essence([1.0, 4.0], 1.0))
 def test_patches_make_speckle_heavier(flat: mi.Scene, nu: float) -> None:
     source = imager(flat, SONAR.replace(speckle_nu=nu, speckle_patch_m=0.15))
-    made = np.abs(images(source, 40, apart=1.3)) ** 2 / expected(SONAR)[:, None]
-    assert made.std() / made.mean() == pytest.approx(contrast(nu), rel=0.1)
-    assert made.mean() == pytest.approx(1, abs=0.12)
+    result = np.abs(images(source, 40, apart=1.3)) ** 2 / expected(SONAR)[:, None]
+    assert result.std() / result.mean() == pytest.approx(contrast(nu), rel=0.1)
+    assert result.mean() == pytest.approx(1, abs=0.12)
 
 
 @pytest.mark.thorough
@@ -95,52 +95,52 @@ def test_patches_go_softly_over_into_one_another(flat: mi.Scene) -> None:
     At half a patch, one, one and a half and two patches, along the range over the floor: 0.72, 0.25, 0.03, 0.
     """
     nu, side = 1.0, 0.15
-    made = np.abs(images(imager(flat, SONAR.replace(speckle_nu=nu, speckle_patch_m=side)), 40, apart=1.3)) ** 2
-    made = made / expected(SONAR)[:, None] - 1
+    built = np.abs(images(imager(flat, SONAR.replace(speckle_nu=nu, speckle_patch_m=side)), 40, apart=1.3)) ** 2
+    built = built / expected(SONAR)[:, None] - 1
     ahead = np.sqrt(SONAR.range_m**2 - HEIGHT**2)
-    found = []
+    result = []
     for patches in (0.5, 1.0, 1.5, 2.0):
-        other = np.searchsorted(ahead, ahead + patches * side)
-        first = np.flatnonzero(other < len(ahead))
-        found.append((made[:, first] * made[:, other[first]]).mean() * nu)
+        second = np.searchsorted(ahead, ahead + patches * side)
+        first = np.flatnonzero(second < len(ahead))
+        result.append((built[:, first] * built[:, second[first]]).mean() * nu)
     spline = [2 / 3 - 0.25 + 0.0625, 1 / 6, 0.5**3 / 6, 0.0]
-    np.testing.assert_allclose(found, np.array(spline) / (2 / 3), atol=0.12)
+    np.testing.assert_allclose(result, np.array(spline) / (2 / 3), atol=0.12)
 
 
 @pytest.mark.thorough
 def test_density_changes_nothing(flat: mi.Scene) -> None:
     """Four times the points: the same energy within 0.1 dB, the same contrast."""
-    made = [np.abs(images(imager(flat, SONAR.replace(scatterers_per_cell=n)), 16)) ** 2 for n in (6, 24)]
-    assert 10 * np.log10(made[1].mean() / made[0].mean()) == pytest.approx(0, abs=0.1)
+    result = [np.abs(images(imager(flat, SONAR.replace(scatterers_per_cell=n)), 16)) ** 2 for n in (6, 24)]
+    assert 10 * np.log10(result[1].mean() / result[0].mean()) == pytest.approx(0, abs=0.1)
 
 
 @pytest.mark.thorough
 def test_rays_change_nothing_on_a_plane(flat: mi.Scene) -> None:
     """Each point counts once, whatever the rays; their rounding turns phases by 0.02."""
-    one, other = (imager(flat, SONAR.replace(quality=name)).image(POSE, 0)[0] for name in ("standard", "fine"))
-    assert np.linalg.norm(one - other) < 0.03 * np.linalg.norm(one)
-    assert np.corrcoef((np.abs(one) ** 2).ravel(), (np.abs(other) ** 2).ravel())[0, 1] > 0.999
+    one, second = (imager(flat, SONAR.replace(quality=name)).image(POSE, 0)[0] for name in ("standard", "fine"))
+    assert np.linalg.norm(one - second) < 0.03 * np.linalg.norm(one)
+    assert np.corrcoef((np.abs(one) ** 2).ravel(), (np.abs(second) ** 2).ravel())[0, 1] > 0.999
 
 
 @pytest.mark.thorough
 def test_rocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Silhouettes: twice the rays leave intensities correlated by 0.98, eight times by 0.97; energy as physical, 0.2 dB."""
     loaded = load_scene(RockyField(size_m=12, a_side=(24, 24)).build(3).write(tmp_path / "world"))
-    one, other = (
+    one, second = (
         np.abs(imager(loaded, SONAR.replace(quality=name)).image(POSE, 0)[0]) ** 2 for name in ("standard", "fine")
     )
-    assert np.corrcoef(one.ravel(), other.ravel())[0, 1] > 0.97
+    assert np.corrcoef(one.ravel(), second.ravel())[0, 1] > 0.97
     with monkeypatch.context() as patch:
         patch.setattr(beams, "COLUMNS_A_BEAM", {"standard": 8})
         twice = np.abs(imager(loaded).image(POSE, 0)[0]) ** 2
     assert np.corrcoef(one.ravel(), twice.ravel())[0, 1] > 0.98
     places = POSE + np.arange(8)[:, None] * np.array([0.2, 0.15, 0, 0, 0, 0])
-    made = sum(
+    result = sum(
         float((np.abs(imager(loaded, SONAR.replace(seed=seed)).image(pose, 0)[0]) ** 2).sum())
         for seed, pose in enumerate(places)
     )
     truth = sum(float(batch.levels.sum()) for batch in Simulator(loaded, BOXES).pings(places))
-    assert 10 * math.log10(made / truth) == pytest.approx(0, abs=0.2)
+    assert 10 * math.log10(result / truth) == pytest.approx(0, abs=0.2)
 
 
 @pytest.mark.thorough
@@ -148,9 +148,9 @@ def test_a_sphere_has_the_energy_of_lambert(variant: str) -> None:
     """Of a body that curves: 0.2 dB of the physical model, whose sphere is exact within 0.03 dB."""
     loaded = scene(ball=sphere((0, 4.4, 0), 0.3, diffuse(0.5)))
     pose = np.zeros(6)
-    made = np.mean([(np.abs(imager(loaded, SONAR.replace(seed=k)).image(pose, 0)[0]) ** 2).sum() for k in range(8)])
+    result = np.mean([(np.abs(imager(loaded, SONAR.replace(seed=k)).image(pose, 0)[0]) ** 2).sum() for k in range(8)])
     truth = next(iter(Simulator(loaded, BOXES).pings(pose))).levels.sum()
-    assert 10 * math.log10(float(made / truth)) == pytest.approx(0, abs=0.2)
+    assert 10 * math.log10(float(result / truth)) == pytest.approx(0, abs=0.2)
 
 
 def test_far_from_the_origin_is_warned_of(flat: mi.Scene) -> None:
@@ -165,21 +165,21 @@ def test_rays_that_miss_points_are_told_with_the_pitch_that_would_do(flat: mi.Sc
     sonar = SONAR.replace(beams=8, azimuth_fov_deg=2.4, elevation_fov_deg=2.0, range_max=12.0, scatterer_spacing_m=0.004)
     with pytest.warns(MitsonarWarning, match="scatterer_spacing_m of") as caught:
         Simulator(flat, sonar).render([low, low], labels=True)
-    (told,) = [str(one.message) for one in caught if "scatterer_spacing_m of" in str(one.message)]
-    rays, enough = re.match(r"([\d,]+) rays .* scatterer_spacing_m of ([\d.]+) m is enough", told).groups()  # type: ignore[union-attr]
+    (message,) = [str(one.message) for one in caught if "scatterer_spacing_m of" in str(one.message)]
+    rays, enough = re.match(r"([\d,]+) rays .* scatterer_spacing_m of ([\d.]+) m is enough", message).groups()  # type: ignore[union-attr]
     assert int(rays.replace(",", "")) == 2 * imager(flat, sonar).image(np.array(low), 0)[1].cut > 0
-    found = imager(flat, sonar.replace(scatterer_spacing_m=float(enough))).image(np.array(low), 0)[1]
-    assert found.cut == found.widest == 0
+    result = imager(flat, sonar.replace(scatterer_spacing_m=float(enough))).image(np.array(low), 0)[1]
+    assert result.cut == result.widest == 0
 
 
 def test_neighbours_correlate_as_pattern_and_pulse_say(flat: mi.Scene) -> None:
     """The field's correlation is the pattern's autocorrelation over beams and the pulse's over bins."""
-    made = images(imager(flat), 12)
+    result = images(imager(flat), 12)
     u = np.linspace(-0.1, 0.1, 200_001)
     r = np.linspace(-0.1, 0.1, 200_001)
     pattern, pulse = SONAR.aperture.pattern, imager(flat).former.pulse.shape
     for lag in (1, 2):
-        over = [(made[:, :, lag:], made[:, :, :-lag]), (made[:, lag:], made[:, :-lag])]
+        over = [(result[:, :, lag:], result[:, :, :-lag]), (result[:, lag:], result[:, :-lag])]
         away = lag * SONAR.beam_spacing_rad, lag * SONAR.bin_m
         shape = (pattern, u, away[0]), (pulse, r, away[1])
         for (a, b), (f, x, step) in zip(over, shape, strict=True):
@@ -275,9 +275,9 @@ def test_speckle_follows_a_motion_as_theory_says(before: tuple[CoherentImager, A
     bins, beams = (axis.ravel() for axis in CELLS)
     truth = np.array([[coherence(SONAR, POSE, POSE + motion, int(beam), int(bin_)) for beam in beams] for bin_ in bins])
     one = before[1]
-    other = np.stack([source.image(POSE + shift + motion, 0)[0][CELLS] for shift in SHIFTS])
-    top = float((one * np.conj(other) * np.exp(-1j * np.angle(truth))).sum().real)
-    bottom = math.sqrt(float((np.abs(one) ** 2).sum()) * float((np.abs(other) ** 2).sum()))
+    second = np.stack([source.image(POSE + shift + motion, 0)[0][CELLS] for shift in SHIFTS])
+    top = float((one * np.conj(second) * np.exp(-1j * np.angle(truth))).sum().real)
+    bottom = math.sqrt(float((np.abs(one) ** 2).sum()) * float((np.abs(second) ** 2).sum()))
     assert top / bottom == pytest.approx(np.abs(truth).mean(), abs=0.03)
 
 
@@ -313,8 +313,8 @@ def test_absorption_and_gain(flat: mi.Scene) -> None:
     lossy = SONAR.replace(absorption_db_per_m=0.6, gain_exponent=4)
     clear, dimmed = (imager(flat, one).levels(POSE, 0)[0] for one in (SONAR, lossy))
     change = 10 * np.log10(dimmed / clear)
-    wanted = 40 * np.log10(SONAR.range_m) - 2 * 0.6 * SONAR.range_m
-    np.testing.assert_allclose(change, np.broadcast_to(wanted[:, None], change.shape), atol=1e-3)
+    target = 40 * np.log10(SONAR.range_m) - 2 * 0.6 * SONAR.range_m
+    np.testing.assert_allclose(change, np.broadcast_to(target[:, None], change.shape), atol=1e-3)
     undone = imager(flat, lossy.replace(gain_absorption=True)).levels(POSE, 0)[0]
     np.testing.assert_allclose(10 * np.log10(undone / clear), 40 * np.log10(SONAR.range_m)[:, None] + 0 * change, atol=1e-3)
 
@@ -337,21 +337,21 @@ def test_volume_reverberation_has_its_level(flat: mi.Scene) -> None:
     """Sv + 10 log of the cell's volume - 40 log R - 2 alpha R; new in each ping."""
     sonar = SONAR.replace(volume_db=-60.0, absorption_db_per_m=0.5)
     source = imager(flat, sonar)
-    made = (np.abs(np.stack([source.receiver.volume(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2))
+    result = (np.abs(np.stack([source.receiver.volume(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2))
     r = sonar.range_m
     cell = r**2 * sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m
     truth = -60 + 10 * np.log10(cell) - 40 * np.log10(r) - 2 * 0.5 * r
-    assert np.abs(10 * np.log10(made) - truth).reshape(-1, 16).mean(axis=1).max() < 0.6
-    assert 10 * np.log10(made).mean() == pytest.approx(truth.mean(), abs=0.1)
+    assert np.abs(10 * np.log10(result) - truth).reshape(-1, 16).mean(axis=1).max() < 0.6
+    assert 10 * np.log10(result).mean() == pytest.approx(truth.mean(), abs=0.1)
     assert not np.array_equal(source.receiver.volume(0), source.receiver.volume(1))
 
 
 def test_near_glow_falls_evenly_in_decibels(flat: mi.Scene) -> None:
     sonar = SONAR.replace(range_min=0.2, range_max=1.1, noise_level_db=-120.0, near_glow_db=30.0, near_glow_m=0.8)
     source = imager(flat, sonar)
-    made = 10 * np.log10((np.abs(np.stack([source.receiver.noise(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2)))
+    result = 10 * np.log10((np.abs(np.stack([source.receiver.noise(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2)))
     truth = -120 + 30 * np.maximum(0, 1 - sonar.range_m / 0.8)
-    assert np.abs((made - truth).reshape(-1, 16).mean(axis=1)).max() < 0.3
+    assert np.abs((result - truth).reshape(-1, 16).mean(axis=1)).max() < 0.3
 
 
 GLOWING: dict[str, float] = {
@@ -368,16 +368,16 @@ def test_near_glow_falls_from_the_middle_beam_outwards(flat: mi.Scene) -> None:
     """As the square of the sine of the bearing; the median beam keeps the level; each beam has its own by the seed."""
     sonar = SONAR.replace(**GLOWING, near_glow_edge_db=20.0)
     seen = np.stack([imager(flat, sonar).receiver.noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
-    made = 10 * np.log10((np.abs(seen) ** 2).mean(axis=0))
+    result = 10 * np.log10((np.abs(seen) ** 2).mean(axis=0))
     line = -120 + 60 * (1 - sonar.range_m[sonar.range_m < 0.4] / 0.8)
     square = (np.sin(sonar.bearing_rad) / np.sin(sonar.bearing_rad[-1])) ** 2
-    np.testing.assert_allclose((made - line[:, None]).mean(axis=0), -20 * (square - 0.25), atol=0.4)
+    np.testing.assert_allclose((result - line[:, None]).mean(axis=0), -20 * (square - 0.25), atol=0.4)
     spread = sonar.replace(near_glow_spread_db=5.0)
-    other = np.stack([imager(flat, spread).receiver.noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
-    own = (10 * np.log10((np.abs(other) ** 2).mean(axis=0)) - made).mean(axis=0)
-    assert own.std() == pytest.approx(5, abs=1.2)
+    second = np.stack([imager(flat, spread).receiver.noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
+    local = (10 * np.log10((np.abs(second) ** 2).mean(axis=0)) - result).mean(axis=0)
+    assert local.std() == pytest.approx(5, abs=1.2)
     redrawn = imager(flat, spread.replace(seed=7)).receiver.noise(0)[sonar.range_m < 0.4]
-    assert np.corrcoef(np.log(np.abs(redrawn)).mean(axis=0), np.log(np.abs(other[0])).mean(axis=0))[0, 1] < 0.9
+    assert np.corrcoef(np.log(np.abs(redrawn)).mean(axis=0), np.log(np.abs(second[0])).mean(axis=0))[0, 1] < 0.9
 
 
 @pytest.mark.thorough
@@ -388,10 +388,10 @@ def test_a_part_of_the_near_glow_stays_and_its_power_is_kept(flat: mi.Scene) -> 
     for k, still in enumerate((0.0, 0.7)):
         draws = np.stack([imager(flat, sonar.replace(near_glow_still=still)).receiver.noise(ping) for ping in range(24)])
         power[k] = 10 * np.log10((np.abs(draws) ** 2).mean(axis=(0, 2)))
-        for part, wanted in ((sonar.range_m < 0.4, still), (sonar.range_m > 0.8, 0.0)):
+        for part, target in ((sonar.range_m < 0.4, still), (sonar.range_m > 0.8, 0.0)):
             grain = draws[:, part] / np.sqrt((np.abs(draws[:, part]) ** 2).mean(axis=(0, 2)))[None, :, None]
             shared = (grain[1:] * grain[:-1].conj()).mean()
-            assert abs(shared) == pytest.approx(wanted, abs=0.05)
+            assert abs(shared) == pytest.approx(target, abs=0.05)
     assert np.abs((power[1] - power[0]).reshape(-1, 16).mean(axis=1)).max() < 0.8
 
 
@@ -400,8 +400,8 @@ def test_bright_speckle_stays_and_noise_changes(flat: mi.Scene) -> None:
     level = 10 * math.log10(float(expected(SONAR).mean()))
     for above, low, high in ((30.0, 0.98, 1.0), (0.0, 0.15, 0.35)):
         source = imager(flat, SONAR.replace(noise_level_db=level - above))
-        one, other = (np.log10(np.abs(source.image(POSE, ping)[0]) ** 2) for ping in (0, 1))
-        assert low <= np.corrcoef(one.ravel(), other.ravel())[0, 1] <= high
+        one, second = (np.log10(np.abs(source.image(POSE, ping)[0]) ** 2) for ping in (0, 1))
+        assert low <= np.corrcoef(one.ravel(), second.ravel())[0, 1] <= high
 
 
 def test_crosstalk_and_stripes(flat: mi.Scene) -> None:
@@ -439,8 +439,8 @@ def test_frames_carry_decibels(flat: mi.Scene) -> None:
     assert frames.level == "dB"
     level = frames.decibels_of(0) + frames.image[0] * (frames.decibels_of(1) - frames.decibels_of(0))
     truth = 200 + 10 * np.log10(imager(flat, sonar).levels(POSE, 0)[0])
-    kept = (frames.image[0] > 0.01) & (frames.image[0] < 1)
-    np.testing.assert_allclose(level[kept], truth[kept], atol=1e-3)
+    stored = (frames.image[0] > 0.01) & (frames.image[0] < 1)
+    np.testing.assert_allclose(level[stored], truth[stored], atol=1e-3)
     assert frames.decibels_of(1) - frames.decibels_of(0) == pytest.approx(70)
 
 
@@ -462,7 +462,7 @@ def test_too_few_points_are_told_with_the_spacing_that_would_do(flat: mi.Scene) 
     """A resolution cell at 4 m is 4 m x 0.3 deg by one bin; four points in it take half the root of its area."""
     with pytest.warns(MitsonarWarning, match=r"holds 0\.25 points at 4 m.* scatterer_spacing_m of ([\d.]+) m is enough"):
         Simulator(flat, SONAR.replace(scatterer_spacing_m=0.02)).render([Pose(*POSE)])
-    (told,) = imager(flat, SONAR.replace(scatterer_spacing_m=0.02)).notes
-    enough = float(told.split(" m is enough")[0].rsplit(" ", 1)[1])
+    (message,) = imager(flat, SONAR.replace(scatterer_spacing_m=0.02)).notes
+    enough = float(message.split(" m is enough")[0].rsplit(" ", 1)[1])
     assert enough == pytest.approx(math.sqrt(4 * math.radians(0.3) * SONAR.bin_m) / 2, rel=0.05)
     assert not imager(flat, SONAR.replace(scatterer_spacing_m=0.97 * enough)).notes

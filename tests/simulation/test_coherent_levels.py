@@ -76,12 +76,12 @@ def test_the_sonar_equation_holds_for_every_preset(flat: mi.Scene, name: str) ->
     while height / 0.15 > max(1.0, 1.1 * sonar.range_min):
         poses = [[0.6 * k, 0.2 * k, height, math.radians(27), 0, 0] for k in range(pings)]
         lit = np.flatnonzero((r > 1.5 * height) & (r < height / 0.152) & (r > 1.0) & (r < 40.0))
-        wanted = 10 ** (floor_echo_db(sonar, height) / 10)
-        brightest = (wanted * gain_of(sonar))[r > 1.2 * height].max() * 10 ** (-SOURCE_DB / 10)
+        expected = 10 ** (floor_echo_db(sonar, height) / 10)
+        brightest = (expected * gain_of(sonar))[r > 1.2 * height].max() * 10 ** (-SOURCE_DB / 10)
         frames = simulator.render(np.array(poses), gain=1e-3 / brightest)  # so low that no pixel is at the maximum
         low, high = frames.decibels_of(0), frames.decibels_of(1)
         power = 10 ** ((low + frames.image.astype(float) * (high - low)) / 10) / gain_of(sonar)[:, None]
-        ratio = power / wanted[:, None]
+        ratio = power / expected[:, None]
         cells = len(lit) * pings * math.radians(12) / sonar.beam_width_rad * min(1.0, sonar.bin_m / sonar.resolution_m)
         for part in np.array_split(lit, max(1, min(10, round(cells / 1500)))) if len(lit) else []:
             error = 10 * np.log10(ratio[:, part].mean())
@@ -105,15 +105,15 @@ def test_detrended_correlation_by_level(flat: mi.Scene, above_db: float) -> None
     """
     level = 10 * math.log10(float((np.abs(imager(flat).image(POSE, 0)[0]) ** 2).mean()))
     source = imager(flat, SONAR.replace(noise_level_db=level - above_db))
-    found = []
+    result = []
     for step in range(6):
         pose = POSE + step * np.array([0.7, 0.2, 0, 0, 0, 0])
         power = [np.abs(source.image(pose, 2 * step + k)[0]).astype(float) ** 2 for k in (0, 1)]
         grain = [one / uniform_filter(one, (31, 9)) for one in power]
         logs = [np.log(one) for one in power]
         logs = [one - uniform_filter(one, (31, 9)) for one in logs]
-        found.append([np.corrcoef(*(one.ravel() for one in pair))[0, 1] for pair in (grain, logs)])
-    intensity, decibels = np.mean(found, axis=0)
+        result.append([np.corrcoef(*(one.ravel() for one in pair))[0, 1] for pair in (grain, logs)])
+    intensity, decibels = np.mean(result, axis=0)
     agreement = (1 + 10 ** (-above_db / 10)) ** -2
     assert intensity == pytest.approx(agreement, abs=0.03)
     assert decibels == pytest.approx(special.spence(1 - agreement) / (math.pi**2 / 6), abs=0.03)

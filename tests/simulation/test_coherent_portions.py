@@ -78,8 +78,8 @@ def test_a_quadrant_holds_what_lies_there(name: str, x: int, y: int) -> None:
     """Starboard is +x and ahead +y: only the quadrant above a plate shows it, but for the side lobes beside its beams."""
     plate = box([0.55 * x, 0.55 * y, 0], [0.2, 0.2, 0.01], bsdf=diffuse(0.8))
     names = ["q1", "q2", "q3", "q4"]
-    found = [float(view.sum()) for view in levels(simulator(scene(plate=plate), names), pose_at()[None])]
-    shares = np.array(found) / sum(found)
+    result = [float(view.sum()) for view in levels(simulator(scene(plate=plate), names), pose_at()[None])]
+    shares = np.array(result) / sum(result)
     assert shares[names.index(name)] > 0.999
 
 
@@ -92,9 +92,9 @@ def test_energies_are_those_of_the_model_physical() -> None:
     speckled = levels(simulator(loaded, names), poses)
     expected = levels(simulator(loaded, names, SONAR.replace(model="physical", pattern=None)), poses[:4])
     for coherent, physical in zip(speckled, expected, strict=True):
-        wanted, energy = physical.sum(axis=(1, 2)).mean(), coherent.sum(axis=(1, 2))
+        target, energy = physical.sum(axis=(1, 2)).mean(), coherent.sum(axis=(1, 2))
         error = energy.std(ddof=1) / np.sqrt(len(energy))
-        assert abs(energy.mean() - wanted) < 3 * error + 0.03 * wanted, (energy.mean() / wanted, error / wanted)
+        assert abs(energy.mean() - target) < 3 * error + 0.03 * target, (energy.mean() / target, error / target)
 
 
 def test_noise_is_of_each_side() -> None:

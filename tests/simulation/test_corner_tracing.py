@@ -85,10 +85,12 @@ CASES = [
 @pytest.mark.parametrize(("side", "range_m", "twist", "aside"), essence(CASES, CASES[3]))
 def test_trihedrals_have_the_strength_of_the_book(side: float, range_m: float, twist: float, aside: float) -> None:
     """10 log a^4 / 3 lambda^2 for triangular faces, 9 times that for square ones: 1 dB; two reflections miss it."""
-    wanted = 10 * math.log10(side**4 / (3 * WAVELENGTH**2))
-    assert strength("triangular", side, range_m, twist=twist, aside=aside) == pytest.approx(wanted, abs=1.0)
-    assert strength("square", side, range_m, twist=twist, aside=aside) == pytest.approx(wanted + 10 * math.log10(9), abs=1.0)
-    assert strength("triangular", side, range_m, twist=twist, aside=aside, bounces=2) < wanted - 10
+    expected = 10 * math.log10(side**4 / (3 * WAVELENGTH**2))
+    assert strength("triangular", side, range_m, twist=twist, aside=aside) == pytest.approx(expected, abs=1.0)
+    assert strength("square", side, range_m, twist=twist, aside=aside) == pytest.approx(
+        expected + 10 * math.log10(9), abs=1.0
+    )
+    assert strength("triangular", side, range_m, twist=twist, aside=aside, bounces=2) < expected - 10
 
 
 @pytest.mark.parametrize(
@@ -96,9 +98,9 @@ def test_trihedrals_have_the_strength_of_the_book(side: float, range_m: float, t
 )
 def test_a_dihedral_has_the_strength_of_the_book(side: float, range_m: float, twist: float) -> None:
     """10 log 2 a^2 b^2 / lambda^2 with two reflections: 1 dB. One reflection misses it."""
-    wanted = 10 * math.log10(2 * side**4 / WAVELENGTH**2)
-    assert strength("dihedral", side, range_m, twist=twist, bounces=2) == pytest.approx(wanted, abs=1.0)
-    assert strength("dihedral", side, range_m, twist=twist, bounces=1) < wanted - 10
+    expected = 10 * math.log10(2 * side**4 / WAVELENGTH**2)
+    assert strength("dihedral", side, range_m, twist=twist, bounces=2) == pytest.approx(expected, abs=1.0)
+    assert strength("dihedral", side, range_m, twist=twist, bounces=1) < expected - 10
 
 
 def test_a_near_corner_is_the_plate_of_its_aperture() -> None:
@@ -118,5 +120,5 @@ def test_a_near_corner_is_the_plate_of_its_aperture() -> None:
     k = 2 * math.pi / WAVELENGTH
     r = np.sqrt(range_m**2 + x[inside] ** 2 + y[inside] ** 2)
     plate = abs((k / (2 * math.pi) * np.exp(-2j * k * r) / r**2).sum()) * step**2
-    wanted = 20 * math.log10(plate) + 40 * math.log10(range_m)
-    assert strength("triangular", side, range_m) == pytest.approx(wanted, abs=0.7)
+    expected = 20 * math.log10(plate) + 40 * math.log10(range_m)
+    assert strength("triangular", side, range_m) == pytest.approx(expected, abs=0.7)

@@ -61,8 +61,8 @@ def test_a_ball_that_grows_comes_nearer(balls: list[Path], changes: dict[str, An
     scene = separate(ball={"type": "ply", "filename": str(balls[0])}, floor=floor(half=0.1))
     path = Trajectory(np.zeros((5, 6)), np.linspace(0, 2, 5))
     frames = Simulator(scene, sonar, moving={"ball": growing}).render(path, gain=1e3, labels=not changes).to_linear()
-    found = [first_range(image, frames.range_m) for image in frames.image]
-    np.testing.assert_allclose(found, AWAY_M - 0.5 - 0.5 * path.time_s, atol=tolerance)
+    result = [first_range(image, frames.range_m) for image in frames.image]
+    np.testing.assert_allclose(result, AWAY_M - 0.5 - 0.5 * path.time_s, atol=tolerance)
     if not changes:
         assert frames.object_id is not None
         assert (frames.object_id == frames.object_names.index("ball")).any(axis=(1, 2)).all()
@@ -73,13 +73,13 @@ def test_a_deformed_mesh_is_one_built_so(balls: list[Path]) -> None:
     still = fixed(Pose(0, AWAY_M, 0))
     deformed = separate(ball={"type": "ply", "filename": str(balls[0])}, floor=floor())
     moving = {"ball": Deforming(still, load_meshes(balls, 1.0))}
-    found = Simulator(deformed, SONAR, moving=moving).film_echoes(Pose(0, 0, 1), 0, time_s=2.0)
+    result = Simulator(deformed, SONAR, moving=moving).film_echoes(Pose(0, 0, 1), 0, time_s=2.0)
     built = separate(ball={"type": "ply", "filename": str(balls[2])}, floor=floor())
     want = Simulator(built, SONAR, moving={"ball": still}).film_echoes(Pose(0, 0, 1), 0)
-    same = np.abs(found.range_m - want.range_m) < 1e-4
+    same = np.abs(result.range_m - want.range_m) < 1e-4
     assert same.mean() > 0.999
     for name in ("nx", "ny", "nz", "cosine", "reflectivity"):
-        np.testing.assert_allclose(getattr(found, name)[same], getattr(want, name)[same], atol=2e-3)
+        np.testing.assert_allclose(getattr(result, name)[same], getattr(want, name)[same], atol=2e-3)
 
 
 def test_the_scene_itself_is_left_alone(balls: list[Path]) -> None:

@@ -53,5 +53,5 @@ def test_values_and_type_stay(count: int) -> None:
 @pytest.mark.parametrize("kind", [np.uint32, np.float32, np.float64])
 def test_copies_lie_alike(kind: type) -> None:
     """A frozen launch is recorded anew for each way in which its inputs lie: responses by mirrors took ten times as long."""
-    kept = [padded(np.arange(count, dtype=kind)) for count in range(1, 50)]
-    assert {values.ctypes.data % 64 for values in kept} == {0}
+    stored = [padded(np.arange(count, dtype=kind)) for count in range(1, 50)]
+    assert {values.ctypes.data % 64 for values in stored} == {0}

@@ -38,9 +38,9 @@ def test_the_mean_is_that_of_the_model_physical(basin: mi.Scene, pattern: str, b
     expected = sonar.replace(model="physical", coding="linear")
     means = []
     for count in (bounces, 1):
-        found = Simulator(basin, expected.replace(bounces=count)).pings(np.tile(POSE, (12, 1)))
-        means.append(sum(part.levels.sum(axis=0, dtype=float) for part in found) / 12)
-    wanted = (means[0] - means[1]).sum(axis=1)
+        result = Simulator(basin, expected.replace(bounces=count)).pings(np.tile(POSE, (12, 1)))
+        means.append(sum(part.levels.sum(axis=0, dtype=float) for part in result) / 12)
+    target = (means[0] - means[1]).sum(axis=1)
     got = np.zeros(sonar.range_bins)
     for seed in range(3):
         diffuse_part = CoherentImager(basin, sonar.replace(seed=seed)).diffuse
@@ -48,22 +48,22 @@ def test_the_mean_is_that_of_the_model_physical(basin: mi.Scene, pattern: str, b
         field = np.zeros((diffuse_part.former.sines, diffuse_part.former.ranges), np.complex64)
         diffuse_part.add(POSE, field)
         got += (np.abs(diffuse_part.former.beams(field)) ** 2).sum(axis=1) / 3
-    assert got.sum() == pytest.approx(wanted.sum(), rel=0.04)
+    assert got.sum() == pytest.approx(target.sum(), rel=0.04)
     parts = np.array_split(np.flatnonzero((sonar.range_m > 6.3) & (sonar.range_m < 7.4)), 4)
     for part in parts:
-        assert got[part].sum() == pytest.approx(wanted[part].sum(), rel=0.12)
+        assert got[part].sum() == pytest.approx(target[part].sum(), rel=0.12)
 
 
 def test_a_sonar_at_rest_sees_the_same_grain(basin: mi.Scene) -> None:
     import drjit as dr
 
     simulator = Simulator(basin, SONAR.replace(bounces=3))
-    before, found = dr.thread_count(), []
+    before, result = dr.thread_count(), []
     try:
         for count in (1, 3):
             dr.set_thread_count(count)
-            found += [part.levels for part in simulator.pings(np.tile(POSE, (2, 1)))]
+            result += [part.levels for part in simulator.pings(np.tile(POSE, (2, 1)))]
     finally:
         dr.set_thread_count(before)
-    for levels in found[1:]:
-        np.testing.assert_array_equal(levels, found[0])
+    for levels in result[1:]:
+        np.testing.assert_array_equal(levels, result[0])

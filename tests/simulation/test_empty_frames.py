@@ -35,25 +35,25 @@ def warned(loaded: mi.Scene, poses: ArrayLike, sonar: Sonar = SONAR) -> list[str
 def test_frames_that_look_over_the_ground_say_so() -> None:
     """Radians given where degrees are meant: pitch 0.61 deg; the floor is met beyond the window."""
     ground = scene(floor=floor(diffuse(0.5), 50))
-    (said,) = [text for text in warned(ground, [GOOD, Pose(0, 0, 2.5, np.radians(0.61))]) if "empty: " in text]
-    assert said.startswith("empty: 1 of 2 frames, frame 1 first: 0 % of its rays meet something within the window 1..5 m")
-    assert "farther (returns at" in said
-    assert "the sonar is at (0, 0, 2.5) m and looks 0.61 deg below the horizon, along (0.00, 1.00, -0.01)" in said
-    assert said.endswith("its pitch, roll, heading are only 0.61, 0, 0 deg: were radians given where degrees are meant?")
+    (output,) = [text for text in warned(ground, [GOOD, Pose(0, 0, 2.5, np.radians(0.61))]) if "empty: " in text]
+    assert output.startswith("empty: 1 of 2 frames, frame 1 first: 0 % of its rays meet something within the window 1..5 m")
+    assert "farther (returns at" in output
+    assert "the sonar is at (0, 0, 2.5) m and looks 0.61 deg below the horizon, along (0.00, 1.00, -0.01)" in output
+    assert output.endswith("its pitch, roll, heading are only 0.61, 0, 0 deg: were radians given where degrees are meant?")
 
 
 def test_all_rays_are_100_percent() -> None:
-    said = empty_frames(1, 1, (0, np.array([0, 0, 2.2, 0.4, 0, 0])), (0, 90_324, 0, 0), (80.0, 90.0), (4.1, 7.3))
-    assert "100 % nearer, 0 % farther (returns at 4.1..7.3 m)" in said
+    output = empty_frames(1, 1, (0, np.array([0, 0, 2.2, 0.4, 0, 0])), (0, 90_324, 0, 0), (80.0, 90.0), (4.1, 7.3))
+    assert "100 % nearer, 0 % farther (returns at 4.1..7.3 m)" in output
 
 
 @pytest.mark.usefixtures("variant")
 def test_frames_of_degrees_given_as_radians_say_so() -> None:
     """35 rad is 205 deg, into the sky."""
     ground = scene(floor=floor(diffuse(0.5), 50))
-    (said,) = warned(ground, [Pose.from_row((0, 0, 2.5, 35.0, 0, 0))])
-    assert said.startswith("no ray hit anything in 1 frame: check the pose (x, y, z in m; pitch > 0 looks down)")
-    assert "35, 0, 0 rad, more than a full turn: were degrees given where radians are meant?" in said
+    (output,) = warned(ground, [Pose.from_row((0, 0, 2.5, 35.0, 0, 0))])
+    assert output.startswith("no ray hit anything in 1 frame: check the pose (x, y, z in m; pitch > 0 looks down)")
+    assert "35, 0, 0 rad, more than a full turn: were degrees given where radians are meant?" in output
 
 
 @pytest.mark.usefixtures("variant")
@@ -102,9 +102,11 @@ def test_poses_below_the_ground_and_inside_objects_are_found() -> None:
     assert buried_in(bed, poses[:1]) is None
     assert buried_in(scene(hull=sphere((0, 0, 5), 2)), poses[:1]) is None
     assert buried_in(separate(surface=plate((0, 0, 9), (0, 0, 1))), poses[:1]) is None
-    (said,) = warned(separate(floor=floor()), [Pose(0, 0, -2.5, np.radians(35))])
-    assert said.startswith("no ray hit anything in 1 frame: ")
-    assert said.endswith("the sonar at (0, 0, -2.5) m is 2.5 m below the ground, the shape floor, at z = 0 m (z points up)")
+    (output,) = warned(separate(floor=floor()), [Pose(0, 0, -2.5, np.radians(35))])
+    assert output.startswith("no ray hit anything in 1 frame: ")
+    assert output.endswith(
+        "the sonar at (0, 0, -2.5) m is 2.5 m below the ground, the shape floor, at z = 0 m (z points up)"
+    )
 
 
 def test_a_path_below_the_ground_is_refused_and_leaves_no_folder(mitsonar: Command, tmp_path: Path) -> None:

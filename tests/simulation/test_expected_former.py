@@ -33,8 +33,8 @@ def flat(variant: str) -> mi.Scene:
 
 
 def levels(loaded: mi.Scene, sonar: Sonar, pose: Array = POSE) -> Array:
-    made: Array = next(iter(Simulator(loaded, sonar).pings(pose))).levels[0].astype(float)
-    return made
+    result: Array = next(iter(Simulator(loaded, sonar).pings(pose))).levels[0].astype(float)
+    return result
 
 
 @pytest.mark.parametrize("pattern", essence(["two_way", "receive"], "two_way"))
@@ -44,9 +44,9 @@ def test_it_is_the_mean_of_coherent_pings(flat: mi.Scene, pattern: str) -> None:
     expected = levels(flat, sonar).mean(axis=1)
     coherent = Simulator(flat, sonar.replace(model="coherent"))
     shifts = np.arange(16)[:, None] * np.array([0.7, 0.2, 0, 0, 0, 0])
-    made = np.mean([pings.levels[0] for pings in coherent.pings(POSE + shifts)], axis=(0, 2))
-    assert 10 * np.log10(made.sum() / expected.sum()) == pytest.approx(0, abs=0.1)
-    ratio = made.reshape(-1, 16).sum(axis=1) / expected.reshape(-1, 16).sum(axis=1)
+    result = np.mean([pings.levels[0] for pings in coherent.pings(POSE + shifts)], axis=(0, 2))
+    assert 10 * np.log10(result.sum() / expected.sum()) == pytest.approx(0, abs=0.1)
+    ratio = result.reshape(-1, 16).sum(axis=1) / expected.reshape(-1, 16).sum(axis=1)
     assert np.abs(10 * np.log10(ratio)).max() < 0.4
 
 
@@ -88,8 +88,8 @@ def test_absorption_follows_from_the_water() -> None:
 def test_all_effects_off_are_the_hard_boxes(flat: mi.Scene) -> None:
     """No pattern: the bits of a sonar that was never told of patterns."""
     plain = Sonar(bearing="cone", beams=16, range_bins=64)
-    told = plain.replace(frequency_hz=1.8e6, shading="taylor", source_level_db=200.0, speckle_nu=2.0, temperature_c=4.0)
-    np.testing.assert_array_equal(levels(flat, told), levels(flat, plain))
+    message = plain.replace(frequency_hz=1.8e6, shading="taylor", source_level_db=200.0, speckle_nu=2.0, temperature_c=4.0)
+    np.testing.assert_array_equal(levels(flat, message), levels(flat, plain))
 
 
 def test_labels_lie_where_the_boxes_are(flat: mi.Scene) -> None:

@@ -34,8 +34,8 @@ def echo(corners: NDArray[np.float64], height: float = 0.0, carrier: float = CAR
     from mitsonar.simulation.mirror_paths import facet_echoes
     from mitsonar.simulation.mirrors import MirrorFacets
 
-    found = facet_echoes(MirrorFacets("waves", corners, -1.0, height), SENT_FROM, HEARD_AT, STILL, carrier, C)
-    return complex((found.amplitude * np.exp(-2j * np.pi * carrier * found.delay)).sum()), found
+    result = facet_echoes(MirrorFacets("waves", corners, -1.0, height), SENT_FROM, HEARD_AT, STILL, carrier, C)
+    return complex((result.amplitude * np.exp(-2j * np.pi * carrier * result.delay)).sum()), result
 
 
 def test_the_mean_phase_of_a_triangle_is_that_of_a_fine_sum() -> None:
@@ -55,12 +55,12 @@ def test_the_mean_phase_of_a_triangle_is_that_of_a_fine_sum() -> None:
 
 def test_a_plane_of_facets_is_its_image_source() -> None:
     """-1 / r' at the image's delay: 0.3 dB and 0.05 rad; the rest is the diffraction of its edge."""
-    total, found = echo(facets(15.0, 150))
+    total, result = echo(facets(15.0, 150))
     length = np.linalg.norm(HEARD_AT * (1, 1, -1) - SENT_FROM)
-    wanted = -np.exp(-2j * np.pi * CARRIER * length / C) / length
-    assert abs(20 * np.log10(abs(total / wanted))) < 0.3
-    assert abs(np.angle(total / wanted)) < 0.05
-    assert found.lit.all()
+    expected = -np.exp(-2j * np.pi * CARRIER * length / C) / length
+    assert abs(20 * np.log10(abs(total / expected))) < 0.3
+    assert abs(np.angle(total / expected)) < 0.05
+    assert result.lit.all()
 
 
 def test_facets_may_be_of_any_size_below_the_fresnel_radius() -> None:

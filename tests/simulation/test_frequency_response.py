@@ -22,10 +22,10 @@ def test_frequency_response_is_the_direct_sum(carrier: float) -> None:
     """Eq. 5.15, double precision, relative error under 1e-6 (found: 1e-9)."""
     sonar = ChannelSonar(carrier_hz=carrier)
     delay, amplitude = echoes()
-    frequency, found = frequency_response(delay, amplitude, sonar)
+    frequency, result = frequency_response(delay, amplitude, sonar)
     direct = np.exp(-2j * np.pi * np.outer(sonar.carrier_hz + frequency, delay)) @ amplitude
     assert len(frequency) == 721
-    assert np.abs(found - direct).max() < 1e-8 * np.abs(direct).max()
+    assert np.abs(result - direct).max() < 1e-8 * np.abs(direct).max()
 
 
 @pytest.mark.gpu
@@ -46,8 +46,8 @@ def test_response_is_the_sum_of_pulses_and_nothing_wraps() -> None:
     delay, amplitude = echoes(200)
     delay[:3] = 1e-5, 4e-5, 3e-4
     pulses = sonar.pulse(sonar.delay_s[:, None] - delay) @ (amplitude * np.exp(-2j * np.pi * sonar.carrier_hz * delay))
-    found = impulse_response(delay, amplitude, sonar)
-    assert np.abs(found - pulses).max() < 2e-6 * np.abs(pulses).max()
+    result = impulse_response(delay, amplitude, sonar)
+    assert np.abs(result - pulses).max() < 2e-6 * np.abs(pulses).max()
     band = np.asarray(np.fft.fftfreq(800, 1 / 8000), np.float64)
     unpadded = np.fft.ifft(np.exp(-2j * np.pi * band * 1e-5) * sonar.raised_cosine(band))
     assert np.abs(unpadded[-20:]).max() > 1e-3  # what padding crops
@@ -62,8 +62,8 @@ def test_mean_energy_of_a_tap_is_that_of_its_echoes() -> None:
     draws = np.array(
         [np.abs(impulse_response(delay, amplitude * np.exp(2j * np.pi * rng.random(300)), sonar)) ** 2 for _ in range(400)]
     )
-    wanted = sonar.pulse(sonar.delay_s[:, None] - delay) ** 2 @ amplitude**2
+    expected = sonar.pulse(sonar.delay_s[:, None] - delay) ** 2 @ amplitude**2
     inside = slice(110, 180)
-    z = (draws.mean(axis=0) - wanted)[inside] / (draws.std(axis=0)[inside] / 20)
+    z = (draws.mean(axis=0) - expected)[inside] / (draws.std(axis=0)[inside] / 20)
     assert np.abs(z).max() < 4.5
     assert abs(z.mean()) < 4.5 / np.sqrt(10)  # neighbouring taps share echoes

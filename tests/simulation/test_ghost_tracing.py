@@ -28,23 +28,23 @@ def fields(mirror: tuple[float, float], sonar: Sonar) -> tuple[complex, complex,
     from mitsonar.simulation.models.coherent import CoherentImager
 
     _, fields, at = one_point()
-    own = sonar.replace(**fields)
+    local = sonar.replace(**fields)
     loaded = separate(
         target=plate((0, 4.4, 0), (0, -1, 0), half=0.01, bsdf=diffuse(0.5)),
         top=plate((0, 0, SURFACE), (0, 0, -1), half=50.0, bsdf=diffuse(0.0)),
     )
-    imager = CoherentImager(loaded, own, {"top": mirror})
+    imager = CoherentImager(loaded, local, {"top": mirror})
     direct = complex(imager.tracer.field(np.zeros(6))[0].astype(complex).sum())
-    found = []
+    result = []
     for bounces in (2, 3):
         from mitsonar.simulation.multipath_coherent import GhostTracer
 
         tracer = imager.tracer
-        tracer.sonar = own.replace(bounces=bounces)
+        tracer.sonar = local.replace(bounces=bounces)
         field = np.zeros((imager.former.sines, imager.former.ranges), np.complex64)
         GhostTracer(tracer).add(np.zeros(6), field)
-        found.append(complex(field.astype(complex).sum()))
-    return direct, found[0], found[1] - found[0], at
+        result.append(complex(field.astype(complex).sum()))
+    return direct, result[0], result[1] - result[0], at
 
 
 @pytest.mark.parametrize("pattern", essence(["two_way", "receive"], "receive"))
@@ -99,6 +99,6 @@ def test_mirrored_rays_see_the_image() -> None:
     from mitsonar.simulation.tracing import mirrored_lines
 
     lines = [[mi.Float64(float(i == j)) for j in range(4)] for i in range(3)]
-    found = mirrored_lines(lines, mi.Normal3f(0, 0, -1), mi.Point3f(7, 8, 1))
-    got = np.array([[float(np.array(value).ravel()[0]) for value in line] for line in found])
+    result = mirrored_lines(lines, mi.Normal3f(0, 0, -1), mi.Point3f(7, 8, 1))
+    got = np.array([[float(np.array(value).ravel()[0]) for value in line] for line in result])
     np.testing.assert_allclose(got, [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 2]], atol=1e-12)

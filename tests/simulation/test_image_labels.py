@@ -50,8 +50,8 @@ def test_labels_of_floor_and_box(model: str) -> None:
     assert (shape[:, 0] != place_of(loaded, "box")).all()
     # the floor's elevation in its range: sin(pitch - e) = height / range on the axis beam
     on_floor = shape[:, middle] == place_of(loaded, "floor")
-    wanted = PITCH - np.arcsin(HEIGHT / frames.range_m[on_floor])
-    np.testing.assert_allclose(elevation[on_floor, middle], wanted, atol=0.01)
+    expected = PITCH - np.arcsin(HEIGHT / frames.range_m[on_floor])
+    np.testing.assert_allclose(elevation[on_floor, middle], expected, atol=0.01)
 
 
 @pytest.mark.parametrize(("tall", "half"), [(0.5, 100.0), (1.6, 100.0), (1.6, 6.0)], ids=["low", "tall", "tall, floor ends"])

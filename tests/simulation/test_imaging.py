@@ -86,10 +86,10 @@ def test_levels_do_not_depend_on_the_number_of_rays(flat: mi.Scene, tmp_path: Pa
 def test_spreading_and_cosine_of_a_sphere_around(flat: mi.Scene) -> None:
     """Energy of a beam from a sphere of radius R around the sonar: C dOmega / R^2, whatever the bin."""
     sonar = Sonar(beams=4, range_min=1.0, range_max=20.0)
-    wanted = 0.5 * 2 * np.sin(np.radians(7)) * sonar.beam_width_rad
+    expected = 0.5 * 2 * np.sin(np.radians(7)) * sonar.beam_width_rad
     for radius in (2.0, 5.0, 17.0):
         got = levels(scene(ball=sphere(POSE[:3], radius)), sonar)[0].sum(axis=0, dtype=float)
-        np.testing.assert_allclose(got, wanted / radius**2, rtol=1e-5)
+        np.testing.assert_allclose(got, expected / radius**2, rtol=1e-5)
 
 
 # ---------------------------------------------------------------- convergence of Almanza-Medina's points
@@ -237,12 +237,12 @@ def test_warned_of_returns_outside_the_window(flat: mi.Scene) -> None:
         lost, total = lost + ranges.size, total + int(echoes.hit.sum())
         frames.append((ranges.size, number, ranges.min(), ranges.max()))
     _, worst, near, far = max(frames)
-    wanted = (
+    expected = (
         rf"{lost:,} of {total:,} returns \({100 * lost / total:.2g} %\) lie outside the window 3\.4\.\.5 m, "
         rf"in frame {worst} at {near:.2f}\.\.{far:.2f} m"
     )
     assert lost > 100
-    with pytest.warns(MitsonarWarning, match=wanted):
+    with pytest.warns(MitsonarWarning, match=expected):
         simulator.render(poses, gain=1e-3)
 
 
@@ -268,10 +268,10 @@ def test_warned_of_saturation(flat: mi.Scene) -> None:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             image = Simulator(flat, SMALL).render([POSE], gain=float(gain)).image
-        said = [str(warning.message) for warning in caught if issubclass(warning.category, MitsonarWarning)]
+        output = [str(warning.message) for warning in caught if issubclass(warning.category, MitsonarWarning)]
         assert ((image >= 1).mean() > 0.01) == warned
-        assert len(said) == warned
-        assert all("% of pixels are at the maximum (more than 1 %)" in text for text in said)
+        assert len(output) == warned
+        assert all("% of pixels are at the maximum (more than 1 %)" in text for text in output)
 
 
 def test_warned_of_too_few_rays_for_points(flat: mi.Scene) -> None:
@@ -386,11 +386,11 @@ def test_earlier_batches_outlive_later_launches(flat: mi.Scene) -> None:
     """Batches may be kept: what they hold is not memory that the next launch writes to."""
     simulator = Simulator(flat, SMALL, rays_per_launch=SMALL.rays)
     poses = descent(12).poses
-    kept, copies = [], []
+    stored, copies = [], []
     for batch in simulator.pings(poses):
-        kept.append(batch.levels)
+        stored.append(batch.levels)
         copies.append(batch.levels.copy())
-    for k, (view, copy) in enumerate(zip(kept, copies, strict=True)):
+    for k, (view, copy) in enumerate(zip(stored, copies, strict=True)):
         np.testing.assert_array_equal(view, copy, err_msg=f"ping {k}")
 
 

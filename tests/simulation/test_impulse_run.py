@@ -33,8 +33,8 @@ def test_receivers_that_look_ahead_and_back_do_not_spread_one_channel() -> None:
 @pytest.mark.usefixtures("variant")
 def test_four_receivers_at_one_metre_a_second() -> None:
     """Some 4.8 ms times 37 Hz where a receiver looks across the way, 62 Hz where it looks along; all together 138 Hz."""
-    made = simulator(ChannelSonar(), floor=cells_floor())
-    each = [made.paths(LEVEL, [1.0, 0.5, 0.0, 0.0], receiver) for receiver in range(4)]
+    result = simulator(ChannelSonar(), floor=cells_floor())
+    each = [result.paths(LEVEL, [1.0, 0.5, 0.0, 0.0], receiver) for receiver in range(4)]
     alone = [spread_of([path]) for path in each]
     assert [one.delay_s for one in alone] == pytest.approx([4.8e-3] * 4, rel=0.03)
     assert [one.doppler_hz for one in alone] == pytest.approx([37.0, 62.0, 37.0, 62.0], rel=0.04)

@@ -62,37 +62,37 @@ def test_each_cell_has_one_point_on_the_surface(name: str) -> None:
         "sphere": (sphere((0, 0, 0), 0.8), 4 * np.pi * 0.64),
     }
     body, area = bodies[name]
-    made = found(body)
-    side = PITCH**2 / np.abs(made.normal).max(axis=1)
+    result = found(body)
+    side = PITCH**2 / np.abs(result.normal).max(axis=1)
     assert side.sum() == pytest.approx(area, rel=0.01)
-    assert np.linalg.norm(made.normal, axis=1) == pytest.approx(np.ones(len(side)), abs=1e-5)
-    axis = np.abs(made.normal).argmax(axis=1)
+    assert np.linalg.norm(result.normal, axis=1) == pytest.approx(np.ones(len(side)), abs=1e-5)
+    axis = np.abs(result.normal).argmax(axis=1)
     for k in range(3):
         for sign in (-1, 1):
-            here = (axis == k) & (np.sign(np.take_along_axis(made.normal, axis[:, None], 1)[:, 0]) == sign)
-            cell = np.floor(np.delete(made.place[here], k, axis=1).astype(float) / PITCH + 1e-6).astype(int)
+            here = (axis == k) & (np.sign(np.take_along_axis(result.normal, axis[:, None], 1)[:, 0]) == sign)
+            cell = np.floor(np.delete(result.place[here], k, axis=1).astype(float) / PITCH + 1e-6).astype(int)
             assert len(np.unique(cell, axis=0)) == len(cell)
     if name == "sphere":
-        assert np.linalg.norm(made.place, axis=1) == pytest.approx(np.full(len(side), 0.8), abs=1e-5)
+        assert np.linalg.norm(result.place, axis=1) == pytest.approx(np.full(len(side), 0.8), abs=1e-5)
 
 
 @pytest.mark.thorough
 def test_points_follow_from_seed_and_shape() -> None:
     one, again = found(sphere((0, 0, 0), 0.3)), found(sphere((0, 0, 0), 0.3))
     assert all(np.array_equal(a, b) for a, b in zip(one, again, strict=True))
-    for other in (found(sphere((0, 0, 0), 0.3), seed=1), found(sphere((0, 0, 0), 0.3), number=1)):
-        assert len(set(other.phase) & set(one.phase)) < 10  # of numbers of 24 bits, a few are equal by chance
+    for second in (found(sphere((0, 0, 0), 0.3), seed=1), found(sphere((0, 0, 0), 0.3), number=1)):
+        assert len(set(second.phase) & set(one.phase)) < 10  # of numbers of 24 bits, a few are equal by chance
 
 
 def test_the_back_of_a_body_behind_its_front_is_found() -> None:
     """Rays go on behind what they hit. Mitsuba makes one shape of both sheets."""
     (both,) = scene(low=plate((0, 0, 0), (0, 0, 1), 1.0), high=plate((0, 0, 0.3), (0, 0, 1), 1.0)).shapes()
-    made, one = points_of(both), found(plate((0, 0, 0), (0, 0, 1), 1.0))
-    height = np.round(made.place[:, 2], 4)
+    result, one = points_of(both), found(plate((0, 0, 0), (0, 0, 1), 1.0))
+    height = np.round(result.place[:, 2], 4)
     assert set(height) == {np.float32(0), np.float32(0.3)}
     for low in (0, 0.3):
         here = np.isclose(height, low)
-        assert np.array_equal(np.sort(made.phase[here]), np.sort(one.phase))
+        assert np.array_equal(np.sort(result.phase[here]), np.sort(one.phase))
 
 
 def spread_over_grid(points: SurfacePoints, tracer: Any) -> NDArray[np.complex128]:
@@ -133,20 +133,22 @@ def test_images_and_impulse_responses_have_one_field(scenery: str) -> None:
     shapes = {"floor": {"floor": floor(diffuse(0.4), 8.0)}}
     shapes["corner"] = {"ground": shapes["floor"]["floor"], "wall": plate((1, 5.5, 0), (-0.2, -1, 0.1), 6.0, diffuse(0.3))}
     shapes["patches"] = shapes["floor"]
-    made = scene(**shapes[scenery])
+    result = scene(**shapes[scenery])
     texture: dict[str, Any] = {"speckle_nu": 0.7, "speckle_patch_m": 0.3} if scenery == "patches" else {}
     channel = ChannelSonar(scatterer_spacing_m=PITCH, receivers=(received_from(),), **texture)
-    stored = scatterers_of(ChannelSimulator(made, channel))
+    stored = scatterers_of(ChannelSimulator(result, channel))
     points = SurfacePoints(stored.place, stored.normal, stored.strength, stored.phase)
     if scenery == "corner":  # of what hides what, each point before the wall's plane and above the ground is in sight
         before = ((points.place - [1, 5.5, 0]) @ np.array([-0.2, -1, 0.1])) > -1e-4
         points = SurfacePoints(*(values[before & (points.place[:, 2] > -1e-4)] for values in points))
-    imager = Simulator(made, SONAR.replace(**texture)).model.imager
+    imager = Simulator(result, SONAR.replace(**texture)).model.imager
     assert imager is not None
     got = imager.tracer.field(np.array(POSE))[0].astype(complex)
-    wanted = spread_over_grid(points, imager.tracer)
+    expected = spread_over_grid(points, imager.tracer)
     # at the seam of two surfaces a ray's cell holds points of one of them
-    assert np.linalg.norm(got - wanted) < {"floor": 1e-3, "corner": 0.02, "patches": 1e-3}[scenery] * np.linalg.norm(wanted)
+    assert np.linalg.norm(got - expected) < {"floor": 1e-3, "corner": 0.02, "patches": 1e-3}[scenery] * np.linalg.norm(
+        expected
+    )
 
 
 def test_patches_vary_by_a_gamma_law() -> None:
@@ -166,12 +168,12 @@ def test_patches_vary_by_a_gamma_law() -> None:
 
 def test_a_texture_of_cells_joins_the_field() -> None:
     textured = floor(diffuse({**CELLS, "cells": 64.0}), 2.0)
-    own, joined = (
+    local, joined = (
         scatterers_of(simulator(ChannelSonar(scatterer_spacing_m=pitch), floor=textured)) for pitch in (None, PITCH)
     )
-    assert len(own) == 64**2
+    assert len(local) == 64**2
     assert len(joined) == pytest.approx((4 / PITCH) ** 2, rel=0.01)
-    assert joined.strength.sum() == pytest.approx(own.strength.sum(), rel=0.05)
+    assert joined.strength.sum() == pytest.approx(local.strength.sum(), rel=0.05)
 
 
 def test_too_fine_a_lattice_is_refused() -> None:

@@ -35,8 +35,8 @@ def test_what_a_simulator_has_compiled_goes_with_it(model: str) -> None:
     try:
         simulator = Simulator(load_scene("pattern"), sonar)
         simulator.render(np.array([[0.0, 0.0, 2.0, 0.5, 0.0, 0.0]]))
-        held = weakref.ref(simulator.tracer)
+        stored = weakref.ref(simulator.tracer)
         del simulator
-        assert held() is None
+        assert stored() is None
     finally:
         gc.enable()

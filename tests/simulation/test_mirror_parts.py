@@ -39,9 +39,9 @@ def imager(loaded: mi.Scene, sonar: Sonar = SONAR, **mirrors: tuple[float, float
 
 
 def tracer(loaded: mi.Scene, sonar: Sonar = SONAR, **mirrors: tuple[float, float]) -> MirrorTracer:
-    found = imager(loaded, sonar, **mirrors).glints
-    assert found is not None
-    return found
+    result = imager(loaded, sonar, **mirrors).glints
+    assert result is not None
+    return result
 
 
 def echo(source: MirrorTracer, pose: Array = STILL) -> complex:
@@ -86,9 +86,9 @@ def test_plates_are_those_of_the_integral(size: float) -> None:
 
 def test_a_mesh_is_the_plate_that_its_face_is() -> None:
     one = tracer(scene(target=plate([0, 0, 0], [0, -1, 0], half=0.1)), target=(1.0, 0.0))
-    other = tracer(scene(target=box([0, 0.05, 0], [0.1, 0.05, 0.1])), target=(1.0, 0.0))
+    second = tracer(scene(target=box([0, 0.05, 0], [0.1, 0.05, 0.1])), target=(1.0, 0.0))
     pose = tilted(0.25, "z")
-    assert decibels(echo(one, pose), echo(other, pose)) == pytest.approx(0, abs=0.1)
+    assert decibels(echo(one, pose), echo(second, pose)) == pytest.approx(0, abs=0.1)
 
 
 @pytest.mark.parametrize("range_m", [2.0, 5.0])
@@ -179,12 +179,12 @@ def test_roughness_takes_its_share() -> None:
 
 
 def test_a_material_gives_its_mirror_part() -> None:
-    made = Material.create(law="lambert", mu=0.1, reflection=0.7, roughness_m=5e-5)
+    result = Material.create(law="lambert", mu=0.1, reflection=0.7, roughness_m=5e-5)
     loaded = scene(target=plate([0, 5, 0], [0, -1, 0], half=0.05))
-    source = imager(loaded, target=made).glints
+    source = imager(loaded, target=result).glints
     assert source is not None
-    wanted = float(mirror_amplitude(made, 1.0, 1.8e6))
-    assert abs(echo(source) / echo(tracer(loaded, target=(1.0, 0.0)))) == pytest.approx(wanted, rel=2e-3)
+    expected = float(mirror_amplitude(result, 1.0, 1.8e6))
+    assert abs(echo(source) / echo(tracer(loaded, target=(1.0, 0.0)))) == pytest.approx(expected, rel=2e-3)
 
 
 @pytest.mark.thorough
@@ -248,9 +248,9 @@ def test_materials_bring_their_mirror_parts(variant: str) -> None:
 
     steel = {"type": "acoustic_material", "material": "steel"}
     loaded = scene(plate=plate((0, 5, 0), (0, -1, 0), half=0.05, bsdf=steel))
-    found = mirror_of(loaded, "materials")
-    assert found is not None
-    own = material("steel")
-    assert (found.reflection[0], found.roughness_m[0]) == (own.reflection, own.roughness_m)
+    result = mirror_of(loaded, "materials")
+    assert result is not None
+    local = material("steel")
+    assert (result.reflection[0], result.roughness_m[0]) == (local.reflection, local.roughness_m)
     with pytest.raises(MitsonarError, match="or `materials`"):
         mirror_of(loaded, "all")  # type: ignore[arg-type]  # a slip of the user's

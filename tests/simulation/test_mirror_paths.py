@@ -49,7 +49,7 @@ def guide(half: float = 200.0, **more: Any) -> mi.Scene:
 
 def images(reflections: int) -> list[tuple[str, float, float]]:
     """Name, height of the image and product of the coefficients, of up to so many reflections: written down by hand."""
-    found = []
+    result = []
     for count in range(reflections + 1):
         for way in itertools.product(("surface", "seabed"), repeat=count):
             if any(one == next_ for one, next_ in itertools.pairwise(way)):
@@ -57,8 +57,8 @@ def images(reflections: int) -> list[tuple[str, float, float]]:
             z, v = float(SENT_FROM.z), 1.0
             for name in way:
                 z, v = (2 * DEPTH - z, -v) if name == "surface" else (-z, BOTTOM * v)
-            found.append(("-".join(way) or "direct", z, v))
-    return found
+            result.append(("-".join(way) or "direct", z, v))
+    return result
 
 
 def expected(reflections: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -79,17 +79,17 @@ def named(paths: Paths) -> list[str]:
 @pytest.mark.parametrize("bounces", [1, 2, 3])
 def test_a_guide_has_the_arrivals_of_the_image_method(bounces: int) -> None:
     """Delays within 1 ns, levels within 0.001 dB, sign included: 1 us and 0.5 dB are asked."""
-    made = ChannelSimulator(guide(), instrument(bounces=bounces), mirrors=GUIDE)
-    paths = made.paths(SENT_FROM)
+    result = ChannelSimulator(guide(), instrument(bounces=bounces), mirrors=GUIDE)
+    paths = result.paths(SENT_FROM)
     delay, amplitude = expected(bounces)
     assert named(paths) == [name for name, *_ in images(bounces)]
     assert len(paths.delay_s) == 1 + 2 * bounces
     assert np.abs(paths.delay_s - delay).max() < 1e-9
     assert np.abs(decibels(paths.amplitude, amplitude)).max() < 1e-3
     assert np.abs(np.angle(paths.amplitude / amplitude)).max() < 1e-6
-    (part,) = made.pings([SENT_FROM])
-    wanted = impulse_response(delay, amplitude, made.sonar)
-    assert np.abs(part.response[0, 0] - wanted).max() < 1e-4 * np.abs(wanted).max()
+    (part,) = result.pings([SENT_FROM])
+    target = impulse_response(delay, amplitude, result.sonar)
+    assert np.abs(part.response[0, 0] - target).max() < 1e-4 * np.abs(target).max()
     assert part.echoes[0, 0] == len(delay)
 
 
@@ -102,10 +102,10 @@ def test_a_guide_has_the_arrivals_of_bellhop(tmp_path: Path) -> None:
         f"'guide'\n10000.0\n1\n'CVW'\n0 0.0 {DEPTH}\n0.0 {C} /\n{DEPTH} {C} /\n'A' 0.0\n{DEPTH} {C} 0.0 2.0 0.0 0.0 /\n"
         f"1\n{depths[0]} /\n1\n{depths[1]} /\n1\n{OFFSET[1] / 1000} /\n'A'\n6001\n-80.0 80.0 /\n0.0 {DEPTH + 1} 0.06\n"
     )
-    found = pelagic.bellhop.load(str(file)).run().arrivals
-    few = np.asarray(found.top_bounces) + np.asarray(found.bottom_bounces) <= 3
-    delay = np.asarray(found.travel_time_s)[few]
-    pressure = (np.asarray(found.amplitude) * np.exp(1j * np.asarray(found.phase_radians)))[few]
+    result = pelagic.bellhop.load(str(file)).run().arrivals
+    few = np.asarray(result.top_bounces) + np.asarray(result.bottom_bounces) <= 3
+    delay = np.asarray(result.travel_time_s)[few]
+    pressure = (np.asarray(result.amplitude) * np.exp(1j * np.asarray(result.phase_radians)))[few]
     ours = ChannelSimulator(guide(), instrument(), mirrors=GUIDE).paths(SENT_FROM)
     order, same = np.argsort(ours.delay_s), np.argsort(delay)
     assert len(same) == len(order) == 7
@@ -122,9 +122,9 @@ def test_a_hydrophone_pair_hears_its_surface_interfere() -> None:
     frequency, response = frequency_response(paths.delay_s, paths.amplitude, sonar)
     k = 2 * np.pi * (sonar.carrier_hz + frequency) / C
     straight, echo = np.hypot(50.0, 7.0), np.hypot(50.0, 17.0)
-    wanted = np.exp(-1j * k * straight) / straight - np.exp(-1j * k * echo) / echo
-    assert np.abs(response - wanted).max() < 1e-4 * np.abs(wanted).mean()
-    assert np.abs(wanted).max() / np.abs(wanted).min() > 5  # it does interfere
+    target = np.exp(-1j * k * straight) / straight - np.exp(-1j * k * echo) / echo
+    assert np.abs(response - target).max() < 1e-4 * np.abs(target).mean()
+    assert np.abs(target).max() / np.abs(target).min() > 5  # it does interfere
 
 
 def test_roughness_takes_what_rayleigh_says() -> None:
@@ -174,26 +174,26 @@ def test_turned_vehicles_have_the_same_water() -> None:
     pose = Pose(0, 0, 15, 0.3, -0.2, 1.1)
     back = vehicle_rotation(np.array(pose)).as_matrix()[0].T @ np.array(OFFSET)
     turned = instrument(receivers=(hydrophone(tuple(back.tolist())),))
-    one, other = (
+    one, second = (
         ChannelSimulator(guide(), sonar, mirrors=GUIDE).paths(at)
         for sonar, at in ((instrument(), SENT_FROM), (turned, pose))
     )
-    assert np.abs(one.delay_s - other.delay_s).max() < 1e-10
-    assert np.abs(one.amplitude / other.amplitude - 1).max() < 1e-5
+    assert np.abs(one.delay_s - second.delay_s).max() < 1e-10
+    assert np.abs(one.amplitude / second.amplitude - 1).max() < 1e-5
 
 
 @pytest.mark.parametrize("velocity", [(1.0, 2.0, -0.5, 0.0), (0.0, 0.0, 0.0, 0.4)])
 def test_doppler_is_the_slope_of_the_delay(velocity: tuple[float, ...]) -> None:
     """Finite difference of the delay over the vehicle's motion, a turn included, for every path."""
     sonar, step = instrument(), 1e-3
-    made = ChannelSimulator(guide(), sonar, mirrors=GUIDE)
+    result = ChannelSimulator(guide(), sonar, mirrors=GUIDE)
 
     def moved(time: float) -> Pose:
         vx, vy, vz, turn = (value * time for value in velocity)
         return Pose(vx, vy, 15 + vz, 0.0, 0.0, turn)
 
-    early, late = (made.paths(moved(time), velocity) for time in (-step / 2, step / 2))
-    here = made.paths(SENT_FROM, velocity)
+    early, late = (result.paths(moved(time), velocity) for time in (-step / 2, step / 2))
+    here = result.paths(SENT_FROM, velocity)
     slope = -sonar.carrier_hz * (late.delay_s - early.delay_s) / step
     assert np.abs(here.doppler_hz).max() > 5 or velocity[3]
     assert here.doppler_hz == pytest.approx(slope, abs=0.02 + 3e-3 * np.abs(slope).max())
@@ -227,27 +227,27 @@ def test_a_mesh_of_planes_is_a_tank() -> None:
     """A closed box as one shape: six planes, each single reflection as its own image has it."""
     tank = box((0, 0, 0), (3.0, 4.0, 2.0), diffuse(0.1))
     sonar = instrument(receivers=(hydrophone((0.5, 0.7, -0.3)),), bounces=2)
-    made = ChannelSimulator(unmerged(tank=tank), sonar, mirrors={"tank": (-0.8, 0.0)})
+    result = ChannelSimulator(unmerged(tank=tank), sonar, mirrors={"tank": (-0.8, 0.0)})
     start, end = np.array([0.2, -0.4, 0.5]), np.array([0.7, 0.3, 0.2])
-    paths = made.paths(Pose(*start))
-    wanted = {round(float(np.linalg.norm(end - start)), 6): 1.0}
+    paths = result.paths(Pose(*start))
+    target = {round(float(np.linalg.norm(end - start)), 6): 1.0}
     half = np.array([3.0, 4.0, 2.0])
     walls = [(axis, side) for axis in range(3) for side in (-1, 1)]
     for axis, side in walls:
         image = start.copy()
         image[axis] = 2 * side * half[axis] - image[axis]
-        wanted[round(float(np.linalg.norm(end - image)), 6)] = -0.8
-        for other, second in walls:
-            if (other, second) != (axis, side):
+        target[round(float(np.linalg.norm(end - image)), 6)] = -0.8
+        for another, second in walls:
+            if (another, second) != (axis, side):
                 twice = image.copy()
-                twice[other] = 2 * second * half[other] - twice[other]
+                twice[another] = 2 * second * half[another] - twice[another]
                 # two walls of two axes share an image in both orders: sound takes one of them
-                wanted[round(float(np.linalg.norm(end - twice)), 6)] = 0.64
-    assert len(paths.delay_s) == len(wanted) == 1 + 6 + 3 * 4 + 3 * 2
+                target[round(float(np.linalg.norm(end - twice)), 6)] = 0.64
+    assert len(paths.delay_s) == len(target) == 1 + 6 + 3 * 4 + 3 * 2
     order = np.argsort(paths.delay_s)
-    assert paths.delay_s[order] * C == pytest.approx(sorted(wanted), abs=2e-6)
-    lengths = np.array(sorted(wanted))
-    assert paths.amplitude[order] * lengths == pytest.approx([wanted[length] for length in sorted(wanted)], rel=1e-5)
+    assert paths.delay_s[order] * C == pytest.approx(sorted(target), abs=2e-6)
+    lengths = np.array(sorted(target))
+    assert paths.amplitude[order] * lengths == pytest.approx([target[length] for length in sorted(target)], rel=1e-5)
 
 
 def test_more_orders_of_planes_than_can_be_traced_are_refused() -> None:

@@ -59,16 +59,16 @@ def ridges(height: float, length: float) -> Mesh:
 
 def test_the_mean_plane_of_waves_has_their_rms_height(tmp_path: Path) -> None:
     """Of 0.1 m ridges 0.1 / sqrt 2, with the roughness in squares; every point lies within the slab."""
-    found = mirrors_of(unmerged(surface=loaded(ridges(0.1, 2.0), tmp_path)), -0.9, 0.02)
-    assert not found.planes
-    (mean,) = found.means
+    result = mirrors_of(unmerged(surface=loaded(ridges(0.1, 2.0), tmp_path)), -0.9, 0.02)
+    assert not result.planes
+    (mean,) = result.means
     assert np.abs(mean.normal) == pytest.approx([0, 0, 1], abs=2e-3)
     assert abs(mean.offset) == pytest.approx(10, abs=1e-3)
     assert mean.roughness_m == pytest.approx(np.hypot(0.1 / np.sqrt(2), 0.02), rel=0.01)
     assert mean.slab_m == pytest.approx(0.1, rel=0.15)
     assert (mean.name, mean.reflection) == ("surface", -0.9)
-    assert found.reflecting(1) == []
-    assert found.reflecting(2) == [mean]
+    assert result.reflecting(1) == []
+    assert result.reflecting(2) == [mean]
 
 
 def test_what_is_no_plane_with_waves_makes_no_ghosts(tmp_path: Path) -> None:
@@ -77,12 +77,12 @@ def test_what_is_no_plane_with_waves_makes_no_ghosts(tmp_path: Path) -> None:
 
     ball = trimesh.creation.icosphere(3, 2.0)
     scene = unmerged(surface=loaded(Mesh("surface", np.add(ball.vertices, (0, 0, 9)), ball.faces), tmp_path))
-    found = mirrors_of(scene)
-    assert found.means == []
-    assert found.notes_on(1) == []
-    assert found.notes_on(2) == ["the mirror surface is not a plane with waves: it reflects once and makes no ghosts"]
-    made = ChannelSimulator(scene, instrument(bounces=3), mirrors={"surface": (-1.0, 0.0)})
-    assert made.ways == ("scatterer", "surface")
+    result = mirrors_of(scene)
+    assert result.means == []
+    assert result.notes_on(1) == []
+    assert result.notes_on(2) == ["the mirror surface is not a plane with waves: it reflects once and makes no ghosts"]
+    built = ChannelSimulator(scene, instrument(bounces=3), mirrors={"surface": (-1.0, 0.0)})
+    assert built.ways == ("scatterer", "surface")
 
 
 @pytest.mark.parametrize("out", essence([True, False], True))
@@ -101,9 +101,9 @@ def test_ghosts_by_waves_are_those_of_their_mean_plane_with_the_loss_of_all_wave
     by_waves = ChannelSimulator(waves, sonar, mirrors={"surface": (-1.0, height)}).paths(POSE)
     by_plate = ChannelSimulator(flat, sonar, mirrors={"surface": (-1.0, mean.roughness_m)}).paths(POSE)
     for way in (name, "surface-scatterer-surface"):
-        one, other = strongest(by_waves.by(way)), strongest(by_plate.by(way))
-        assert one[0] == pytest.approx(other[0], abs=1e-9)
-        assert one[1] == pytest.approx(other[1], rel=1e-3)
+        one, second = strongest(by_waves.by(way)), strongest(by_plate.by(way))
+        assert one[0] == pytest.approx(second[0], abs=1e-9)
+        assert one[1] == pytest.approx(second[1], rel=1e-3)
     smooth = ChannelSimulator(flat, sonar, mirrors={"surface": (-1.0, 0.0)}).paths(POSE)
     assert abs(strongest(by_waves.by(name))[1]) < 0.8 * abs(strongest(smooth.by(name))[1])
 
@@ -120,19 +120,19 @@ def test_single_echoes_of_waves_are_kirchhoffs_integral(tmp_path: Path) -> None:
 
     scene = unmerged(surface=loaded(SEA.surface(5), tmp_path))
     roughness = SEA.state.roughness_m
-    made = ChannelSimulator(scene, instrument(), mirrors={"surface": (-1.0, roughness)})
-    paths = made.paths(POSE).by("surface")
-    (waves,) = made.tracer.flat.facets
+    built = ChannelSimulator(scene, instrument(), mirrors={"surface": (-1.0, roughness)})
+    paths = built.paths(POSE).by("surface")
+    (waves,) = built.tracer.flat.facets
     start, end = np.array(POSE[:3]), np.add(POSE[:3], OFFSET)
-    found = facet_echoes(waves, start, end, np.zeros(3), CARRIER, C)
-    assert len(paths.delay_s) == len(found.delay)  # straight above all facets are seen
+    result = facet_echoes(waves, start, end, np.zeros(3), CARRIER, C)
+    assert len(paths.delay_s) == len(result.delay)  # straight above all facets are seen
 
     def total(delay: NDArray[np.float64], amplitude: NDArray[np.complex128]) -> complex:
         return complex((amplitude * np.exp(-2j * np.pi * CARRIER * delay)).sum())
 
-    wanted = total(found.delay, found.amplitude)
-    assert total(paths.delay_s, paths.amplitude) == pytest.approx(wanted, rel=1e-4)
-    assert abs(wanted * 2 * 4.0 + np.exp(-2j * np.pi * CARRIER * 8.0 / C)) > 0.1  # no plane's
+    expected = total(result.delay, result.amplitude)
+    assert total(paths.delay_s, paths.amplitude) == pytest.approx(expected, rel=1e-4)
+    assert abs(expected * 2 * 4.0 + np.exp(-2j * np.pi * CARRIER * 8.0 / C)) > 0.1  # no plane's
 
 
 def test_crests_hide_facets_from_a_sonar_at_grazing(tmp_path: Path) -> None:
@@ -142,10 +142,10 @@ def test_crests_hide_facets_from_a_sonar_at_grazing(tmp_path: Path) -> None:
     height, length = 0.3, 3.0
     scene = unmerged(surface=loaded(ridges(height, length), tmp_path))
     one = received_from((0.0, 0.002, 0.0))
-    made = ChannelSimulator(scene, instrument(receivers=(one,)), mirrors={"surface": (-1.0, 0.0)})
-    (waves,) = made.tracer.flat.facets
+    result = ChannelSimulator(scene, instrument(receivers=(one,)), mirrors={"surface": (-1.0, 0.0)})
+    (waves,) = result.tracer.flat.facets
     place = Pose(0, -11.0, 8.8)
-    seen = made.without_scatterer._lit(waves, link_table(made.sonar, 0, np.array(place), np.zeros(4)))
+    seen = result.without_scatterer._lit(waves, link_table(result.sonar, 0, np.array(place), np.zeros(4)))
     some = slice(None, None, 23)
     middle, seen = waves.corners[some].mean(axis=1), seen[some]
     part = np.linspace(0.003, 0.997, 500)[:, None]
@@ -158,16 +158,16 @@ def test_crests_hide_facets_from_a_sonar_at_grazing(tmp_path: Path) -> None:
 def test_facets_that_are_too_large_are_told_of(tmp_path: Path) -> None:
     """0.28 m is less than half the Fresnel radius at 5 kHz, and more at 80 kHz."""
     scene = unmerged(surface=loaded(SEA.surface(5), tmp_path))
-    for carrier, told in ((5e3, False), (80e3, True)):
-        made = ChannelSimulator(scene, instrument(carrier_hz=carrier), mirrors={"surface": (-1.0, 0.0)})
-        made.paths(POSE)
-        assert bool(made.notes) == told
-    (note,) = made.notes
+    for carrier, message in ((5e3, False), (80e3, True)):
+        result = ChannelSimulator(scene, instrument(carrier_hz=carrier), mirrors={"surface": (-1.0, 0.0)})
+        result.paths(POSE)
+        assert bool(result.notes) == message
+    (note,) = result.notes
     assert note.startswith(
         "the facets of the mirror surface are 0.28 m long where its echo comes from, more than half the F"
     )
-    made.paths(POSE)
-    assert len(made.notes) == 1
+    result.paths(POSE)
+    assert len(result.notes) == 1
 
 
 def test_several_reflections_by_waves_are_told_of(tmp_path: Path) -> None:

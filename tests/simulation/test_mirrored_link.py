@@ -63,15 +63,15 @@ WAYS = [
 @pytest.mark.parametrize(("out", "back"), WAYS)
 def test_ghosts_are_where_images_are(out: tuple[str, ...], back: tuple[str, ...]) -> None:
     """Delay within 1 ns, amplitude within 0.01 dB and its phase: zeta sqrt(C dA cos cos) V ... / (r_A r_B)."""
-    made = ChannelSimulator(unmerged(**target()), instrument(), mirrors=MIRRORS)
-    (place,) = points(made)
-    (strength,), (phase,) = scatterers_of(made).strength, scatterers_of(made).phase
+    result = ChannelSimulator(unmerged(**target()), instrument(), mirrors=MIRRORS)
+    (place,) = points(result)
+    (strength,), (phase,) = scatterers_of(result).strength, scatterers_of(result).phase
     name = "-".join([*out, "scatterer", *reversed(back)])
-    path = made.paths(POSE).by(name)
-    sent, heard = mirrored(np.array(POSE[:3]), out), mirrored(np.add(POSE[:3], OFFSET), back)
-    ways = place - sent, place - heard
-    r_a, r_b = (np.linalg.norm(way) for way in ways)
-    cosines = (NORMAL @ ways[0] / r_a) * (NORMAL @ ways[1] / r_b)
+    path = result.paths(POSE).by(name)
+    sent, received = mirrored(np.array(POSE[:3]), out), mirrored(np.add(POSE[:3], OFFSET), back)
+    paths = place - sent, place - received
+    r_a, r_b = (np.linalg.norm(way) for way in paths)
+    cosines = (NORMAL @ paths[0] / r_a) * (NORMAL @ paths[1] / r_b)
     v = np.prod([MIRRORS[mirror][0] for mirror in (*out, *back)])
     assert path.delay_s == pytest.approx([(r_a + r_b) / C], abs=1e-9)
     assert path.amplitude == pytest.approx([v * np.exp(1j * phase) * np.sqrt(strength * cosines) / (r_a * r_b)], rel=1e-3)
@@ -117,12 +117,12 @@ def test_a_screen_hides_a_ghost_or_the_target() -> None:
 def test_points_of_a_mirror_have_no_ghost_in_itself() -> None:
     """A rough bottom scatters what its mirror loses, and is no ghost of its own; in the surface it has one."""
     shapes = unmerged(floor=plate((0, 0, 0), (0, 0, 1), half=1.0), surface=plate((0, 0, 10), (0, 0, -1), half=40.0))
-    made = ChannelSimulator(shapes, instrument(points_per_m2=400.0), mirrors={"floor": (0.5, 1e-3), "surface": SURFACE})
-    paths = made.paths(POSE)
+    result = ChannelSimulator(shapes, instrument(points_per_m2=400.0), mirrors={"floor": (0.5, 1e-3), "surface": SURFACE})
+    paths = result.paths(POSE)
     assert len(paths.by("floor-scatterer").delay_s) == len(paths.by("scatterer-floor").delay_s) == 0
-    assert len(paths.by("scatterer").delay_s) == len(paths.by("surface-scatterer").delay_s) == len(points(made))
+    assert len(paths.by("scatterer").delay_s) == len(paths.by("surface-scatterer").delay_s) == len(points(result))
     bare = ChannelSimulator(shapes, instrument(points_per_m2=400.0), mirrors={"surface": SURFACE}).paths(POSE)
-    place = points(made)
+    place = points(result)
     cosine = [(6 - 0) / np.linalg.norm(place - start, axis=1) for start in (POSE[:3], np.add(POSE[:3], OFFSET))]
     k = 2 * np.pi * 80e3 / C
     lost = np.sqrt(1 - np.exp(-((k * 1e-3 * (cosine[0] + cosine[1])) ** 2)))
@@ -141,15 +141,15 @@ def test_a_ghost_is_in_the_field_of_view_of_its_direction() -> None:
 
 @pytest.mark.parametrize("velocity", [(1.0, 2.0, -0.5, 0.0), (0.0, 0.0, 0.0, 0.4)])
 def test_doppler_of_ghosts_is_the_slope_of_their_delay(velocity: tuple[float, ...]) -> None:
-    made, step = ChannelSimulator(unmerged(**target()), instrument(), mirrors=MIRRORS), 1e-3
+    result, step = ChannelSimulator(unmerged(**target()), instrument(), mirrors=MIRRORS), 1e-3
 
     def moved(time: float) -> Pose:
         vx, vy, vz, turn = (value * time for value in velocity)
         return Pose(vx, vy, 6 + vz, 0.0, 0.0, turn)
 
-    early, late = (made.paths(moved(time), velocity) for time in (-step / 2, step / 2))
-    here = made.paths(POSE, velocity)
-    slope = -made.sonar.carrier_hz * (late.delay_s - early.delay_s) / step
+    early, late = (result.paths(moved(time), velocity) for time in (-step / 2, step / 2))
+    here = result.paths(POSE, velocity)
+    slope = -result.sonar.carrier_hz * (late.delay_s - early.delay_s) / step
     assert len(slope) > 9
     turning = 0.08 if velocity[3] else 0.0  # centripetal acceleration while sound travels: 0.4^2 / s^2 * 0.5 m * 15 ms
     assert here.doppler_hz == pytest.approx(slope, abs=0.02 + 3e-3 * np.abs(slope).max() + turning)
@@ -162,5 +162,5 @@ def test_shared_scatterers_keep_their_mirrors_apart() -> None:
     first = ChannelSimulator(shapes, instrument(bounces=2, **few), mirrors=MIRRORS)
     same = ChannelSimulator(shapes, instrument(bounces=3, **few), mirrors=MIRRORS, like=first)
     assert scatterers_of(first) is scatterers_of(same)
-    other = ChannelSimulator(shapes, instrument(bounces=1, **few), like=first)
-    assert len(scatterers_of(other)) > len(scatterers_of(first))  # surface and wall scatter where they are no mirrors
+    second = ChannelSimulator(shapes, instrument(bounces=1, **few), like=first)
+    assert len(scatterers_of(second)) > len(scatterers_of(first))  # surface and wall scatter where they are no mirrors

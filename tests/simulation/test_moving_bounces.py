@@ -96,8 +96,8 @@ def test_a_moving_point_has_the_ghosts_of_image_sources() -> None:
     poses = np.array([np.zeros(6), [*(4 * speed), 0.02, -0.1, 0.04]])
     path = Trajectory(poses, np.array([0.0, 4.0]))
     motion = motion_in(loaded, {"target": path})
-    own = COHERENT.replace(**changes)
-    imager = CoherentImager(loaded, own, {"top": (-1.0, 0.0)}, motion=motion)
+    local = COHERENT.replace(**changes)
+    imager = CoherentImager(loaded, local, {"top": (-1.0, 0.0)}, motion=motion)
     for time in (0.0, 0.5, 2.0):  # where a ray that meets the plate has the point in its cell
         turn = vehicle_rotation(path.at(time)).as_matrix()[0]
         place, normal = turn @ at + time * speed, turn @ [0, 1, 0]
@@ -107,7 +107,7 @@ def test_a_moving_point_has_the_ghosts_of_image_sources() -> None:
         scale = direct / (cosines[0] / near / near**2)
         sums = []
         for bounces in (2, 3):
-            imager.tracer.sonar = own.replace(bounces=bounces)
+            imager.tracer.sonar = local.replace(bounces=bounces)
             field = np.zeros((imager.former.sines, imager.former.ranges), np.complex64)
             GhostTracer(imager.tracer).add(np.zeros(6), field, time)
             sums.append(complex(field.astype(complex).sum()))

@@ -37,11 +37,11 @@ def along(*y: float, rate_hz: float = 1.0) -> Trajectory:
 def test_a_moved_wall_is_a_wall_built_there(changes: dict[str, Any]) -> None:
     sonar = SONAR.replace(**changes)
     moved = separate(floor=floor(), wall=plate((0, 0, 0), (0, -1, 0)))
-    found = Simulator(moved, sonar, moving={"wall": along(5, 7)}).render([HERE], gain=1.0)
+    result = Simulator(moved, sonar, moving={"wall": along(5, 7)}).render([HERE], gain=1.0)
     later = Simulator(moved, sonar, moving={"wall": along(5, 7)}).render(
         Trajectory(np.array([HERE]), np.array([0.5])), gain=1.0
     )
-    for image, y in ((found.image, 5.0), (later.image, 6.0)):
+    for image, y in ((result.image, 5.0), (later.image, 6.0)):
         built = Simulator(separate(floor=floor(), wall=plate((0, y, 0), (0, -1, 0))), sonar).render([HERE], gain=1.0)
         np.testing.assert_allclose(image, built.image, atol=2e-4 * built.image.max())
 
@@ -57,11 +57,11 @@ def test_a_turned_body_is_one_built_turned() -> None:
     built["to_world"] = built["to_world"] @ mi.ScalarTransform4f().scale([0.5, 0.9, 0.3])
     want = Simulator(separate(floor=floor(), crate=built), SONAR).film_echoes(HERE, 0)
     body = separate(floor=floor(), crate=box((0, 0, 0), (0.5, 0.9, 0.3)))
-    found = Simulator(body, SONAR, moving={"crate": fixed(pose)}).film_echoes(HERE, 0)
-    same = np.abs(found.range_m - want.range_m) < 1e-4
+    result = Simulator(body, SONAR, moving={"crate": fixed(pose)}).film_echoes(HERE, 0)
+    same = np.abs(result.range_m - want.range_m) < 1e-4
     assert same.mean() > 0.998  # rays at edges may fall on either side
     for name in ("nx", "ny", "nz", "cosine", "near_m", "far_m"):
-        np.testing.assert_allclose(getattr(found, name)[same], getattr(want, name)[same], atol=2e-3)
+        np.testing.assert_allclose(getattr(result, name)[same], getattr(want, name)[same], atol=2e-3)
 
 
 def test_speckle_rides_with_the_body() -> None:
@@ -96,10 +96,10 @@ def test_a_loop_over_copies_finds_what_bodies_one_by_one_do() -> None:
     rng = np.random.default_rng(3)
     poses = [Pose(*place) for place in rng.uniform((-0.6, 3, 0.3), (0.6, 6, 1.5), (6, 3))]
     one = separate(floor=floor(), ball=sphere((0, 0, 0), 0.2))
-    found = Simulator(one, SONAR, moving={"ball": [fixed(pose) for pose in poses]}).film_echoes(HERE, 0)
+    result = Simulator(one, SONAR, moving={"ball": [fixed(pose) for pose in poses]}).film_echoes(HERE, 0)
     built = {f"ball{k}": sphere(pose[:3], 0.2) for k, pose in enumerate(poses)}
     want = Simulator(separate(floor=floor(), **built), SONAR).film_echoes(HERE, 0)
-    assert (np.abs(found.range_m - want.range_m) < 1e-3).mean() > 0.998
+    assert (np.abs(result.range_m - want.range_m) < 1e-3).mean() > 0.998
 
 
 def test_height_is_over_what_stands_still() -> None:

@@ -30,22 +30,22 @@ def test_point_spread(shading: str, pattern: str) -> None:
     sonar = SONAR.replace(shading=shading, pattern=pattern, range_bins=256, pulse_m=0.02, elevation_pattern="box", **narrow)
     loaded, fields, _ = one_point()
     source = imager(loaded, sonar.replace(**fields))
-    made = np.abs(source.image(np.zeros(6), 0)[0]).astype(float)
+    result = np.abs(source.image(np.zeros(6), 0)[0]).astype(float)
     range_m = sonar.range_m
-    bin_, beam = np.unravel_index(made.argmax(), made.shape)
+    bin_, beam = np.unravel_index(result.argmax(), result.shape)
     for line, axis, shape in (
-        (made[bin_], np.sin(sonar.bearing_rad), sonar.aperture.pattern),
-        (made[:, beam], range_m, source.former.pulse.shape),
+        (result[bin_], np.sin(sonar.bearing_rad), sonar.aperture.pattern),
+        (result[:, beam], range_m, source.former.pulse.shape),
     ):
         truth = best_fit(line, axis, shape)
-        level, wanted = (20 * np.log10(np.maximum(v, 1e-9) / truth.max()) for v in (line, truth))
-        main = wanted > -35 if shading != "uniform" else wanted > -25
-        inner = main & (np.abs(np.arange(len(line)) - line.argmax()) < first_null(wanted))
-        assert np.abs(level - wanted)[inner].max() < 0.5
-        tops = side_lobes(wanted)[:2]
+        level, expected = (20 * np.log10(np.maximum(v, 1e-9) / truth.max()) for v in (line, truth))
+        main = expected > -35 if shading != "uniform" else expected > -25
+        inner = main & (np.abs(np.arange(len(line)) - line.argmax()) < first_null(expected))
+        assert np.abs(level - expected)[inner].max() < 0.5
+        tops = side_lobes(expected)[:2]
         assert len(tops) == (2 if pattern == "receive" or axis is range_m else 1)
         for part in (slice(max(0, top - 2), top + 3) for top in tops):
-            assert level[part].max() == pytest.approx(wanted[part].max(), abs=1.0)
+            assert level[part].max() == pytest.approx(expected[part].max(), abs=1.0)
 
 
 def best_fit(line: Array, axis: Array, shape: Shape) -> Array:
@@ -102,15 +102,15 @@ def test_spread_over_elevation(pattern: Pattern, ways: int, least_db: float) -> 
     source, nods = imager(loaded, sonar), np.radians(np.arange(-20.0, 20.1, 0.5))
     images = [np.abs(source.image(np.array([0, 0, 0, nod, 0, 0]), 0)[0]).astype(float) for nod in nods]
     brightest = np.unravel_index(images[len(nods) // 2].argmax(), images[0].shape)
-    made = np.array([image[brightest] for image in images])
+    result = np.array([image[brightest] for image in images])
     elevation = math.atan2(place[2], place[1]) + nods
     truth = upright_array(elevation, sonar.elevation_fov_deg / 2, ways)
-    truth *= made.max() / truth[made.argmax()]
-    level, wanted = (20 * np.log10(np.maximum(np.abs(v), 1e-12) / made.max()) for v in (made, truth))
-    seen = (wanted > least_db) & (np.abs(elevation) < elevation_end(sonar))
-    assert wanted[seen].min() < least_db + 8
-    assert np.abs(level - wanted)[seen].max() < 0.1
-    assert not made[np.abs(elevation) > elevation_end(sonar) + 0.005].any()
+    truth *= result.max() / truth[result.argmax()]
+    level, expected = (20 * np.log10(np.maximum(np.abs(v), 1e-12) / result.max()) for v in (result, truth))
+    seen = (expected > least_db) & (np.abs(elevation) < elevation_end(sonar))
+    assert expected[seen].min() < least_db + 8
+    assert np.abs(level - expected)[seen].max() < 0.1
+    assert not result[np.abs(elevation) > elevation_end(sonar) + 0.005].any()
 
 
 @pytest.mark.parametrize(("pattern", "ways"), [("receive", 1), ("two_way", 2)])
@@ -122,9 +122,9 @@ def test_law_over_elevation_to_the_second_side_lobe(pattern: Pattern, ways: int)
 
     sonar = SONAR.replace(elevation_pattern=pattern, elevation_fov_deg=6.0)
     angle = np.radians(np.linspace(-30, 30, 3001))
-    made = np.array(elevation_gain(sonar, mi.Float(np.tan(angle).astype(np.float32))), dtype=float)
-    np.testing.assert_allclose(made, upright_array(angle, 3.0, ways), atol=1e-4)
-    level = 20 * np.log10(np.maximum(np.abs(made), 1e-9))
+    result = np.array(elevation_gain(sonar, mi.Float(np.tan(angle).astype(np.float32))), dtype=float)
+    np.testing.assert_allclose(result, upright_array(angle, 3.0, ways), atol=1e-4)
+    level = 20 * np.log10(np.maximum(np.abs(result), 1e-9))
     tops = side_lobes(level)[:2]
     np.testing.assert_allclose(level[tops], ways * np.array([-13.26, -17.83]), atol=0.02)
 
@@ -173,11 +173,13 @@ def test_focus_against_exact_ways_to_the_elements(name: str, focus_m: float) -> 
                           **fields)  # fmt: skip
     images = [np.abs(imager(loaded, sonar.replace(focus_m=at)).image(np.zeros(6), 0)[0]) for at in (None, focus_m)]
     bin_ = np.unravel_index(images[0].argmax(), images[0].shape)[0]
-    sharp, made = (image[bin_].astype(float) for image in images)
+    sharp, result = (image[bin_].astype(float) for image in images)
     in_focus, truth = (focused_sum(sonar, place, at) for at in (float(np.linalg.norm(place)), focus_m))
-    level, wanted = (20 * np.log10(np.maximum(v, 1e-9) / top) for v, top in ((made, sharp.max()), (truth, in_focus.max())))
-    seen = wanted > -30
+    level, expected = (
+        20 * np.log10(np.maximum(v, 1e-9) / top) for v, top in ((result, sharp.max()), (truth, in_focus.max()))
+    )
+    seen = expected > -30
     assert seen.sum() > 8
-    assert np.abs(level - wanted)[seen].max() < 0.5
+    assert np.abs(level - expected)[seen].max() < 0.5
     if focus_m != 4.4:
-        assert wanted.max() < -0.5
+        assert expected.max() < -0.5

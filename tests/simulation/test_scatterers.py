@@ -20,16 +20,16 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def test_every_cell_has_one_point_inside_it_whoever_looks() -> None:
-    made = simulator(ChannelSonar(), floor=cells_floor(cells=64.0))
-    place = points(made)
+    result = simulator(ChannelSonar(), floor=cells_floor(cells=64.0))
+    place = points(result)
     assert len(place) == 64**2
     cell = np.floor((place[:, :2] / 28 + 0.5) * 64).astype(int)
     assert len(np.unique(cell, axis=0)) == 64**2
     within = (place[:, :2] / 28 + 0.5) * 64 - cell
     for axis in within.T:  # uniform in the cell: Kolmogorov's distance
         assert np.abs(np.sort(axis) - (np.arange(64**2) + 0.5) / 64**2).max() < 1.63 / 64
-    other = simulator(ChannelSonar(seed=8, range_max=20.0), floor=cells_floor(cells=64.0))
-    assert np.array_equal(points(other), place)
+    second = simulator(ChannelSonar(seed=8, range_max=20.0), floor=cells_floor(cells=64.0))
+    assert np.array_equal(points(second), place)
     different = simulator(ChannelSonar(), floor=floor(diffuse({**CELLS, "cells": 64.0, "seed": 6}), 14.0))
     assert not np.array_equal(points(different), place)
 
@@ -48,8 +48,8 @@ def test_strengths_add_up_to_reflectivity_times_area(shape: str) -> None:
 
 
 def test_a_textured_floor_has_the_strength_of_its_cells() -> None:
-    made = simulator(ChannelSonar(), floor=cells_floor())
-    assert scatterers_of(made).strength.sum() == pytest.approx(0.5 * 28**2, rel=0.01)
+    result = simulator(ChannelSonar(), floor=cells_floor())
+    assert scatterers_of(result).strength.sum() == pytest.approx(0.5 * 28**2, rel=0.01)
 
 
 def test_a_field_of_view_selects_all_that_it_receives() -> None:
@@ -60,10 +60,10 @@ def test_a_field_of_view_selects_all_that_it_receives() -> None:
         FieldOfView(tilt_deg=90.0, across_deg=100.0, along_deg=170.0),
     ):
         sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=one),))
-        made = simulator(sonar, floor=cells_floor(), body=box((3, 4, 1), (1, 1, 1)))
+        result = simulator(sonar, floor=cells_floor(), body=box((3, 4, 1), (1, 1, 1)))
         pose = np.array([1.0, -2.0, 6.0, 0.2, -0.1, 0.7])
-        stored = scatterers_of(made)
-        asked = made.tracer.candidates(pose, 0)
+        stored = scatterers_of(result)
+        arguments = result.tracer.candidates(pose, 0)
         from mitsonar.motion.pose import vehicle_rotation
 
         way = stored.place - pose[:3]
@@ -72,8 +72,8 @@ def test_a_field_of_view_selects_all_that_it_receives() -> None:
         front = np.einsum("pi,pi->p", stored.normal, unit) < 0
         receives = np.flatnonzero((one.sensitivity(*local.T) > 0) & front)
         assert len(receives) > 100
-        assert np.isin(receives, asked).all()
-        assert len(asked) < 0.8 * len(stored)
+        assert np.isin(receives, arguments).all()
+        assert len(arguments) < 0.8 * len(stored)
 
 
 def test_bodies_hide_what_is_behind_them() -> None:
@@ -96,8 +96,8 @@ def test_energy_is_that_of_the_imaging_sonar() -> None:
     field = FieldOfView(tilt_deg=40.0, across_deg=20.0, along_deg=30.0, taper=0.0)
     sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=field),), points_per_m2=2000.0)
     ground = scene(floor=floor(diffuse(0.5), 16.0))
-    made = ChannelSimulator(ground, sonar)
-    received = [made.paths(Pose(0, 0, 10, heading=heading)).amplitude for heading in np.linspace(0, 2 * np.pi, 12, False)]
+    result = ChannelSimulator(ground, sonar)
+    received = [result.paths(Pose(0, 0, 10, heading=heading)).amplitude for heading in np.linspace(0, 2 * np.pi, 12, False)]
     fan = Sonar(
         azimuth_fov_deg=20.0,
         elevation_fov_deg=30.0,
@@ -151,15 +151,15 @@ def test_a_level_floor_returns_the_incoherent_level_and_rayleigh_statistics(surf
     sonar = ChannelSonar(
         bandwidth_hz=19.2e3, sampling_hz=32e3, frequency_step_hz=80.0, range_max=4.0, receivers=LOOKS, points_per_m2=density
     )
-    made = simulator(sonar, floor=floor(diffuse(texture or 0.5), 6.0))
+    result = simulator(sonar, floor=floor(diffuse(texture or 0.5), 6.0))
     rng = np.random.default_rng(3)
     poses = np.zeros((600, 6))
     poses[:, :2], poses[:, 2], poses[:, 5] = rng.uniform(-4, 4, (600, 2)), HEIGHT, rng.uniform(0, 6, 600)
-    response = np.concatenate([part.response for part in made.pings(poses)]).astype(np.complex128)
+    response = np.concatenate([part.response for part in result.pings(poses)]).astype(np.complex128)
     power = np.abs(response) ** 2
     pulse = float((sonar.pulse(np.arange(-3000, 3000) / sonar.sampling_hz) ** 2).sum())
-    wanted = pulse * np.array([incoherent(look.field) for look in LOOKS])
-    level = 10 * np.log10(power.sum(axis=2).mean(axis=0) / wanted)
+    expected = pulse * np.array([incoherent(look.field) for look in LOOKS])
+    level = 10 * np.log10(power.sum(axis=2).mean(axis=0) / expected)
     assert np.abs(level).max() < 0.3, f"{level} dB"
     mean = power.mean(axis=0)
     loud = [np.flatnonzero(one > 0.3 * one.max())[::2] for one in mean]
@@ -191,10 +191,10 @@ def test_zeta_stays_with_its_point() -> None:
     ground = scene(floor=cells_floor(half=3.0, cells=40.0), block=box((1, 1, 0.5), (0.2, 0.2, 0.2)))
     one = ChannelSimulator(ground, ChannelSonar(receivers=(received_from(),)))
     two = ChannelSimulator(ground, ChannelSonar(receivers=(received_from((0.2, 0, 0)),), carrier_hz=40e3, range_max=24.0))
-    asked = np.arange(len(points(one)), dtype=np.uint32)
-    phase = one.tracer.trace(np.array(LEVEL), np.zeros(4), 0, ("phase",), asked)["phase"]
+    arguments = np.arange(len(points(one)), dtype=np.uint32)
+    phase = one.tracer.trace(np.array(LEVEL), np.zeros(4), 0, ("phase",), arguments)["phase"]
     moved = np.array([1.0, -2.0, 6.0, 0.2, -0.1, 0.7])
-    assert np.array_equal(two.tracer.trace(moved, np.array([1, 2, 0, 0.3]), 0, ("phase",), asked)["phase"], phase)
+    assert np.array_equal(two.tracer.trace(moved, np.array([1, 2, 0, 0.3]), 0, ("phase",), arguments)["phase"], phase)
     assert np.array_equal(scatterers_of(one).phase, phase)
     assert np.array_equal(scatterers_of(two).strength, scatterers_of(one).strength)
 
@@ -203,8 +203,8 @@ def test_zeta_is_of_the_seed_that_places_its_point() -> None:
     """Of a texture of cells its own, of other surfaces the sonar's."""
 
     def phases(seed: int, texture: float | dict[str, object]) -> set[float]:
-        made = simulator(ChannelSonar(seed=seed), floor=floor(diffuse(texture), 1.0))
-        return set(map(float, scatterers_of(made).phase))
+        result = simulator(ChannelSonar(seed=seed), floor=floor(diffuse(texture), 1.0))
+        return set(map(float, scatterers_of(result).phase))
 
     assert phases(1, {**CELLS, "cells": 30.0}) == phases(2, {**CELLS, "cells": 30.0})
     assert not phases(1, {**CELLS, "cells": 30.0}) & phases(1, {**CELLS, "cells": 30.0, "seed": 6})

@@ -106,11 +106,11 @@ def test_a_changed_scene_is_rendered_as_by_a_new_simulator(model: str) -> None:
     before = levels(simulator)
     for one in CHANGES:
         change(scene, one)
-        now = levels(simulator)
-        np.testing.assert_array_equal(now, levels(Simulator(scene, sonar)), err_msg=one.__name__)
-        assert (now != before).any() == (one is not _sand), one.__name__
-        np.testing.assert_array_equal(now, levels(simulator))
-        before = now
+        current = levels(simulator)
+        np.testing.assert_array_equal(current, levels(Simulator(scene, sonar)), err_msg=one.__name__)
+        assert (current != before).any() == (one is not _sand), one.__name__
+        np.testing.assert_array_equal(current, levels(simulator))
+        before = current
 
 
 def test_a_darker_floor_is_darker_at_the_next_step_of_a_loop() -> None:
@@ -166,10 +166,10 @@ def test_hydrophones_hear_the_scene_as_it_is(model: str) -> None:
     before = simulator.step(pose, rest).response
     for one in (_darker, _rolled, _tilted):
         change(scene, one)
-        now = simulator.step(pose, rest).response
-        np.testing.assert_array_equal(now, ChannelSimulator(scene, sonar, like=older).step(pose, rest).response)
-        assert (now != before).any(), one.__name__
-        before = now
+        current = simulator.step(pose, rest).response
+        np.testing.assert_array_equal(current, ChannelSimulator(scene, sonar, like=older).step(pose, rest).response)
+        assert (current != before).any(), one.__name__
+        before = current
 
 
 def test_sounders_follow() -> None:
@@ -196,9 +196,9 @@ def test_an_unchanged_scene_makes_nothing_anew(monkeypatch: pytest.MonkeyPatch) 
 
     scene = ground()
     simulator = Simulator(scene, SONAR)
-    made: list[str] = []
-    monkeypatch.setattr(Surfaces, "from_scene", lambda *_: made.append("anew"))
+    result: list[str] = []
+    monkeypatch.setattr(Surfaces, "from_scene", lambda *_: result.append("anew"))
     levels(simulator)
     change(scene, _rolled)
     levels(simulator)
-    assert made == []
+    assert result == []

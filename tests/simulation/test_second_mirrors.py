@@ -38,12 +38,12 @@ def test_a_ball_between_surface_and_wall_has_a_ghost_by_way_of_both(screened: bo
         shapes["screen"] = plate((1.0, 3.33, -2.3), (0, -1, 0), half=0.15, bsdf=diffuse(0.0))
     mirrors = {"top": (-0.9, 0.0), "wall": (0.8, 1e-4)}
     poses = np.tile([0, 0, -depth, 0, 0, 0], (6, 1))
-    found = Simulator(separate(**shapes), SONAR, mirrors=mirrors).pings(poses)
-    levels = sum(part.levels.sum(axis=0, dtype=float) for part in found) / 6
+    result = Simulator(separate(**shapes), SONAR, mirrors=mirrors).pings(poses)
+    levels = sum(part.levels.sum(axis=0, dtype=float) for part in result) / 6
     origin = np.array([0, 0, -depth])
-    ways = at - np.array([0, 0, depth]), at - np.array([2 * aside, 0, -depth])
-    first, second = (float(np.linalg.norm(way)) for way in ways)
-    units = [way / length for way, length in zip(ways, (first, second), strict=True)]
+    paths = at - np.array([0, 0, depth]), at - np.array([2 * aside, 0, -depth])
+    first, second = (float(np.linalg.norm(way)) for way in paths)
+    units = [way / length for way, length in zip(paths, (first, second), strict=True)]
     range_m = (first + second) / 2
     inside = np.abs(SONAR.range_m - (range_m - RADIUS / 2)) < RADIUS
     lossy = math.exp(-4 * (2 * math.pi * 9e5 / 1500 * 1e-4 * abs(units[1][0])) ** 2)
@@ -53,10 +53,10 @@ def test_a_ball_between_surface_and_wall_has_a_ghost_by_way_of_both(screened: bo
         return
     middle = np.average(SONAR.range_m[inside], weights=levels[inside].sum(axis=1))
     assert middle == pytest.approx(range_m - 0.75 * RADIUS, abs=SONAR.bin_m)
-    heard = levels[inside].sum(axis=0)
+    received = levels[inside].sum(axis=0)
     for bearing in (0.0, math.atan2(2 * aside, math.hypot(5.0, at[2] - origin[2]))):
-        beside = np.abs(SONAR.bearing_rad - bearing) < math.radians(3)
-        assert heard[beside].sum() == pytest.approx(each, rel=0.05), bearing
+        neighbours = np.abs(SONAR.bearing_rad - bearing) < math.radians(3)
+        assert received[neighbours].sum() == pytest.approx(each, rel=0.05), bearing
 
 
 @pytest.mark.parametrize(("pattern", "second"), [("receive", (0.45, 0, 0)), ("two_way", (0, 0, -0.7))])

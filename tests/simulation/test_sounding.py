@@ -39,18 +39,18 @@ def flown(pings: int = 2, speed: float = 0.5) -> Trajectory:
 def test_an_altimeter_measures_the_nearest_ground(slope_deg: float) -> None:
     """Within its cone of 25 deg the nearest point of a plane lies at height times the cosine of the slope."""
     sounder = load_sounder("altimeter").replace(model="physical", pattern="box", range_min=1, range_max=8, quality="draft")
-    found = SounderSimulator(floor(slope_deg), sounder).soundings(flown(1))
+    result = SounderSimulator(floor(slope_deg), sounder).soundings(flown(1))
     expected = HEIGHT * np.cos(np.radians(slope_deg))
-    assert abs(found.range_m.item() - expected) < 1.5 * sounder.fan.bin_m
+    assert abs(result.range_m.item() - expected) < 1.5 * sounder.fan.bin_m
 
 
 def test_soundings_of_a_plane_lie_on_it() -> None:
     """Half a bin, in beams within 40 deg of straight down."""
     sounder = load_sounder("profiler").replace(model="physical", pattern="box", range_min=2, range_max=10, quality="fine")
-    found = SounderSimulator(floor(), sounder).soundings(flown(1))
+    result = SounderSimulator(floor(), sounder).soundings(flown(1))
     steep = np.abs(sounder.fan.bearing_rad) < np.radians(40)
     assert steep.sum() > 20
-    off = found.points()[0, 0, steep, 2] * np.cos(sounder.fan.bearing_rad[steep])
+    off = result.points()[0, 0, steep, 2] * np.cos(sounder.fan.bearing_rad[steep])
     assert np.abs(off).max() < sounder.fan.bin_m / 2
 
 
@@ -63,10 +63,10 @@ def test_a_block_throws_the_shadow_of_its_height() -> None:
     }
     sounder = load_sounder("sidescan").replace(model="physical", pattern="box", range_min=3, range_max=14, quality="fine")
     echogram = SounderSimulator(floor(wall=wall), sounder).echogram(flown(1))
-    heard, range_m = echogram.channel("starboard")[0], echogram.range_m
+    received, range_m = echogram.channel("starboard")[0], echogram.range_m
     far_edge = (side + 0.2) * HEIGHT / (HEIGHT - block)  # the ray over the far upper edge
     begin, end = np.hypot(side, HEIGHT), np.hypot(far_edge, HEIGHT)  # from the foot of the wall on
-    dark = range_m[(heard == 0) & (range_m > 6.5)]
+    dark = range_m[(received == 0) & (range_m > 6.5)]
     assert abs(dark.min() - begin) < 2 * sounder.fan.bin_m
     assert abs(dark.max() - end) < 3 * sounder.fan.bin_m
     assert (echogram.channel("port")[0][range_m > 6.5] > 0).all()
@@ -104,8 +104,8 @@ def test_a_janus_has_the_errors_of_its_formula() -> None:
     azimuth = np.radians([45, 135, 225, 315])
     axes = np.column_stack([np.sin(tilt) * np.sin(azimuth), np.sin(tilt) * np.cos(azimuth), np.full(4, -np.cos(tilt))])
     velocity = np.array([[0.1, 0.6, -0.05]])
-    found, covariance = velocity_of(-velocity @ axes.T, axes, 0.01)
-    assert np.allclose(found, velocity)
+    result, covariance = velocity_of(-velocity @ axes.T, axes, 0.01)
+    assert np.allclose(result, velocity)
     expected = 0.01 / np.array([np.sqrt(2) * np.sin(tilt), np.sqrt(2) * np.sin(tilt), 2 * np.cos(tilt)])
     assert np.allclose(np.sqrt(covariance[0].diagonal()), expected)
 
@@ -115,9 +115,9 @@ def test_three_beams_suffice_and_two_do_not() -> None:
     velocity = np.array([0.1, 0.6, -0.05])
     rates = np.tile(-axes @ velocity, (2, 1))
     rates[0, 0], rates[1, :2] = np.nan, np.nan
-    found, _ = velocity_of(rates, axes, 0.01)
-    assert np.allclose(found[0], velocity)
-    assert np.isnan(found[1]).all()
+    result, _ = velocity_of(rates, axes, 0.01)
+    assert np.allclose(result[0], velocity)
+    assert np.isnan(result[1]).all()
 
 
 def test_a_dvl_out_of_reach_loses_the_bottom() -> None:
@@ -133,8 +133,8 @@ def test_a_range_image_is_that_of_a_wall() -> None:
     wall = {"type": "rectangle", "to_world": upright}
     preset = load_sounder("range-image").replace(model="physical", pattern="box", rows=8, beams=32, quality="draft")
     sounder = preset.replace(range_min=2, range_max=9)
-    found = SounderSimulator(floor(wall=wall), sounder).soundings(flown(1))
-    points = found.points()[0]
+    result = SounderSimulator(floor(wall=wall), sounder).soundings(flown(1))
+    points = result.points()[0]
     ahead = np.isfinite(points[..., 1])
     assert ahead.mean() > 0.9
     assert np.median(np.abs(points[ahead][:, 1] - 5)) < sounder.fan.bin_m

@@ -49,11 +49,11 @@ def assert_same(steps: list[SonarFrames], whole: SonarFrames) -> None:
     """Every array, bit for bit."""
     assert [len(frame) for frame in steps] == [1] * len(whole)
     for name in ("image", "time_s", "poses", "height_m", "elevation_rad", "shape_id", "object_id", "shadow"):
-        wanted = getattr(whole, name)
-        if wanted is None:
+        expected = getattr(whole, name)
+        if expected is None:
             assert all(getattr(frame, name) is None for frame in steps)
         else:
-            np.testing.assert_array_equal(np.concatenate([getattr(frame, name) for frame in steps]), wanted)
+            np.testing.assert_array_equal(np.concatenate([getattr(frame, name) for frame in steps]), expected)
     assert {frame.level_scale for frame in steps} == {whole.level_scale}
     for frame in steps:
         np.testing.assert_array_equal(frame.range_m, whole.range_m)
@@ -96,8 +96,8 @@ def test_pings_of_a_loop_differ_where_rendering_each_alone_repeats_itself(ground
 
 
 def test_rendering_in_between_does_not_disturb_a_loop(ground: mi.Scene) -> None:
-    simulator, wanted = Simulator(ground, SONAR), stepped(Simulator(ground, SONAR), noise=NOISE)
-    for pose, frame in zip(POSES, wanted, strict=True):
+    simulator, expected = Simulator(ground, SONAR), stepped(Simulator(ground, SONAR), noise=NOISE)
+    for pose, frame in zip(POSES, expected, strict=True):
         simulator.render(POSES[:2])
         np.testing.assert_array_equal(simulator.step(pose, noise=NOISE).image, frame.image)
 
@@ -105,14 +105,14 @@ def test_rendering_in_between_does_not_disturb_a_loop(ground: mi.Scene) -> None:
 def test_reset_begins_a_new_loop(ground: mi.Scene) -> None:
     simulator = Simulator(ground, SONAR)
     first = stepped(simulator, noise=NOISE)
-    kept = simulator.gain
+    stored = simulator.gain
     simulator.reset()
     assert simulator.gain is None
     again = stepped(simulator, noise=NOISE)
-    assert simulator.gain == kept
-    for one, other in zip(first, again, strict=True):
-        np.testing.assert_array_equal(one.image, other.image)
-        np.testing.assert_array_equal(one.time_s, other.time_s)
+    assert simulator.gain == stored
+    for one, second in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one.image, second.image)
+        np.testing.assert_array_equal(one.time_s, second.time_s)
 
 
 def test_a_loop_that_begins_in_empty_water_sets_its_gain_on_the_first_echoes(ground: mi.Scene) -> None:
@@ -147,9 +147,9 @@ def test_a_loop_warns_once_of_each_thing(ground: mi.Scene) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         stepped(simulator, [up] * 3)
-        said = [str(one.message) for one in caught if issubclass(one.category, MitsonarWarning)]
-        assert len(said) == 1
-        assert said[0].startswith("no ray hit anything in 1 frame")
+        output = [str(one.message) for one in caught if issubclass(one.category, MitsonarWarning)]
+        assert len(output) == 1
+        assert output[0].startswith("no ray hit anything in 1 frame")
         simulator.reset()
         simulator.step(up)
         assert len([one for one in caught if issubclass(one.category, MitsonarWarning)]) == 2

@@ -161,9 +161,9 @@ def test_mi_render_gives_the_same_bits(bearing: str) -> None:
         </shape>
     </scene>""")
     image = np.array(mi.render(loaded))[..., -len(CHANNELS) :].reshape(-1, len(CHANNELS))
-    found = sonar_in(loaded)
-    assert found is not None
-    own = Simulator(loaded).tracer.film_echoes(found[1], 0)
-    assert set(np.unique(own.shape_id)) == {-1, 0, 1, 2}
-    other = {name: np.abs(image[:, k] - getattr(own, name)).max() for k, name in enumerate(CHANNELS)}
-    assert not any(other.values()), {name: f"differs by up to {value:.1e}" for name, value in other.items() if value}
+    result = sonar_in(loaded)
+    assert result is not None
+    local = Simulator(loaded).tracer.film_echoes(result[1], 0)
+    assert set(np.unique(local.shape_id)) == {-1, 0, 1, 2}
+    second = {name: np.abs(image[:, k] - getattr(local, name)).max() for k, name in enumerate(CHANNELS)}
+    assert not any(second.values()), {name: f"differs by up to {value:.1e}" for name, value in second.items() if value}

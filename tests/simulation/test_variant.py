@@ -45,11 +45,11 @@ def test_environment_forces_a_variant_and_a_missing_llvm_is_named() -> None:
         except ValueError as error:
             print(type(error).__name__, error)
     """
-    said = run_python(script, MITSONAR_VARIANT="llvm_ad_rgb")
-    assert said.splitlines()[-1] == "llvm_ad_rgb"
-    said = run_python(script, MITSONAR_VARIANT="llvm_ad_rgb", DRJIT_LIBLLVM_PATH="/nonexistent/libLLVM.so")
-    assert "MitsonarError the library libLLVM was not found" in said
-    assert "apt-get install" in said
+    output = run_python(script, MITSONAR_VARIANT="llvm_ad_rgb")
+    assert output.splitlines()[-1] == "llvm_ad_rgb"
+    output = run_python(script, MITSONAR_VARIANT="llvm_ad_rgb", DRJIT_LIBLLVM_PATH="/nonexistent/libLLVM.so")
+    assert "MitsonarError the library libLLVM was not found" in output
+    assert "apt-get install" in output
 
 
 @pytest.mark.gpu

@@ -118,11 +118,11 @@ def test_a_run_goes_on_with_the_same_bits(tank: Path, tmp_path: Path) -> None:
 
 
 def test_motions_of_the_scene_and_of_a_file_are_the_same(tank: Path, tmp_path: Path) -> None:
-    said = motions_of(load_scene(tank))
+    output = motions_of(load_scene(tank))
     (tmp_path / "moving.yaml").write_text("fish: fish.tum\nskid: vehicle\n")
     read = load_motions(tmp_path / "moving.yaml")
-    assert said["skid"] == read["skid"] == "vehicle"
-    np.testing.assert_array_equal(said["fish"][0].poses, read["fish"][0].poses)
+    assert output["skid"] == read["skid"] == "vehicle"
+    np.testing.assert_array_equal(output["fish"][0].poses, read["fish"][0].poses)
     with pytest.raises(MitsonarError, match="skid follows the vehicle"):
         Simulator(load_scene(tank))
 
@@ -158,9 +158,9 @@ def test_a_sensor_that_cannot_follow_is_named_before_any_is_rendered(tank: Path,
     )
     simulator = VehicleSimulator(load_scene(tank), load_vehicle(tmp_path / "auv.yaml").sensors)
     calls: list[int] = []
-    for noise, said in (("none", r"sensor head: a sweep lasts 18\.67 s and the path 1 s"), ("low", "sensor head: ")):
+    for noise, output in (("none", r"sensor head: a sweep lasts 18\.67 s and the path 1 s"), ("low", "sensor head: ")):
         options = RenderOptions(NOISE_MODELS[noise])
-        with pytest.raises(MitsonarError, match=said):
+        with pytest.raises(MitsonarError, match=output):
             run_vehicle(simulator, PATH, options, Destination(tmp_path / "run", progress=calls.append))
     assert not calls
     assert not (tmp_path / "run").exists()

@@ -68,10 +68,10 @@ def test_quadrants_look_where_their_names_say(name: str, starboard: int, forward
     across, along, _ = axes(vehicle)
     place = np.array(vehicle[:3]) + 1.1 * (starboard * across + forward * along) - [0, 0, 2.3]
     world = scene(ball={"type": "sphere", "center": place.tolist(), "radius": 0.3, "bsdf": diffuse()})
-    got = levels(Simulator(world, sonar, views=[Segment(sonar, other) for other in SEGMENTS]), mounted(vehicle, DOWN))
-    for other, image in got.items():
-        same = other[1:] == name[1:] or other in ("whole", "starboard" if starboard > 0 else "port")
-        assert (image.sum() > 0) == same, other
+    got = levels(Simulator(world, sonar, views=[Segment(sonar, second) for second in SEGMENTS]), mounted(vehicle, DOWN))
+    for second, image in got.items():
+        same = second[1:] == name[1:] or second in ("whole", "starboard" if starboard > 0 else "port")
+        assert (image.sum() > 0) == same, second
 
 
 def test_circular_segments_are_the_largest_cone_in_their_quadrant() -> None:
@@ -121,10 +121,10 @@ def test_a_receiver_at_the_transmitter_is_the_monostatic_sonar(model: str, beari
     transmitter, receiver = pair(model, Pose(0, 0, 0), bearing=bearing)
     pose = [Pose.from_degrees([0, 0, 2.5, 35, 0, 5])]
     received = levels(Simulator(world, transmitter, views=[receiver]), pose)["b"]
-    own = next(Simulator(world, transmitter).pings(pose)).levels
+    local = next(Simulator(world, transmitter).pings(pose)).levels
     if model == "thesis":
-        own = own.reshape(1, 60, 24, 8).sum(axis=3)
-    error = np.abs(received - own).sum() / own.sum()
+        local = local.reshape(1, 60, 24, 8).sum(axis=3)
+    error = np.abs(received - local).sum() / local.sum()
     assert error < 2e-3, f"sum of differences {error:.1e} of the whole"
 
 
@@ -147,8 +147,8 @@ def test_a_single_point_is_heard_at_half_the_path_and_at_its_bearing(offset: tup
         assert sonar.range_min + (bin_ + 0.5) * sonar.bin_m == pytest.approx(half, abs=0.02)
         way = (point - b) / np.linalg.norm(point - b)
         across, ahead, above = way @ starboard, way @ forward, way @ up
-        wanted = np.arctan2(across, ahead) if bearing == "azimuth" else np.arctan2(across, np.hypot(ahead, above))
-        assert np.interp(beam, np.arange(24), sonar.bearing_rad) == pytest.approx(wanted, abs=np.radians(0.7))
+        expected = np.arctan2(across, ahead) if bearing == "azimuth" else np.arctan2(across, np.hypot(ahead, above))
+        assert np.interp(beam, np.arange(24), sonar.bearing_rad) == pytest.approx(expected, abs=np.radians(0.7))
 
 
 def test_energy_on_a_plate_follows_the_bistatic_law() -> None:
@@ -168,8 +168,8 @@ def test_energy_on_a_plate_follows_the_bistatic_law() -> None:
     to_a, to_b = -places, np.array(offset) - places
     r_a, r_b = np.linalg.norm(to_a, axis=-1), np.linalg.norm(to_b, axis=-1)
     value = 0.5 * np.abs(to_a @ normal) / r_a * np.abs(to_b @ normal) / r_b / (r_a * r_b) ** 2
-    wanted = (value * weight * weight[:, None]).sum() * half**2
-    assert image.sum(dtype=float) == pytest.approx(wanted, rel=2e-3)
+    expected = (value * weight * weight[:, None]).sum() * half**2
+    assert image.sum(dtype=float) == pytest.approx(expected, rel=2e-3)
 
 
 def test_footprints_fill_the_bins_of_a_floor_evenly() -> None:

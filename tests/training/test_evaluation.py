@@ -95,11 +95,11 @@ def pairs(made: Path) -> SonarPairs:
 def test_it_answers_what_the_network_says(checkpoint: Checkpoint, pairs: SonarPairs) -> None:
     estimator = ImageNetwork(checkpoint)
     for number in range(3):
-        found = estimator.estimate(pairs.sonar_frames(number))
-        assert found.valid, found.reason
-        assert np.allclose(found.motion, SAYS, atol=1e-7)
-        assert found.covariance is not None
-        assert np.allclose(np.sqrt(np.diag(found.covariance)), [3e-3, 2e-3, np.radians(0.1)])
+        result = estimator.estimate(pairs.sonar_frames(number))
+        assert result.valid, result.reason
+        assert np.allclose(result.motion, SAYS, atol=1e-7)
+        assert result.covariance is not None
+        assert np.allclose(np.sqrt(np.diag(result.covariance)), [3e-3, 2e-3, np.radians(0.1)])
     assert estimator.inputs == "nothing; height 2.5 m, pitch 35 deg fixed by training"
 
 
@@ -110,8 +110,8 @@ def test_it_sees_what_training_saw(pairs: SonarPairs, made: Path) -> None:
         "posenet_dual": {"coordinates": "both", "cartesian_rows": 64},
     }
     for name, words in arrangements.items():
-        own = SonarPairs(made, part="all", one_a_sequence=True, labels="quantised", **words)
-        inputs, label = own[0]
+        local = SonarPairs(made, part="all", one_a_sequence=True, labels="quantised", **words)
+        inputs, label = local[0]
         batch = tuple(part[None] for part in inputs) if isinstance(inputs, tuple) else inputs[None]
         torch.manual_seed(4)
         network: Any = create_network(name, width=1 / 16, **options_for(name, batch, label[None]))
@@ -119,11 +119,11 @@ def test_it_sees_what_training_saw(pairs: SonarPairs, made: Path) -> None:
             for layer in network.modules():
                 if isinstance(layer, torch.nn.Conv2d):
                     layer.weight.mul_(2)
-        trained = Checkpoint.of(network, own)
-        wanted, _ = predictions(trained, own, numbers=[2, 5])
-        found = [ImageNetwork(trained).estimate(pairs.sonar_frames(number)).motion for number in (2, 5)]
-        assert np.allclose(found, wanted, rtol=1e-4, atol=1e-7)
-        assert not np.allclose(found[0], found[1], rtol=1e-3), "it looks at the frames"
+        trained = Checkpoint.of(network, local)
+        expected, _ = predictions(trained, local, numbers=[2, 5])
+        result = [ImageNetwork(trained).estimate(pairs.sonar_frames(number)).motion for number in (2, 5)]
+        assert np.allclose(result, expected, rtol=1e-4, atol=1e-7)
+        assert not np.allclose(result[0], result[1], rtol=1e-3), "it looks at the frames"
 
 
 def test_another_process_gets_the_same(checkpoint: Checkpoint, pairs: SonarPairs) -> None:
@@ -159,9 +159,9 @@ def posed(frames: SonarFrames, column: int, value: float, **fields: Any) -> Sona
 def test_it_doubts(
     checkpoint: Checkpoint, pairs: SonarPairs, change: Callable[[SonarFrames], SonarFrames], words: str
 ) -> None:
-    found = ImageNetwork(checkpoint).estimate(change(pairs.sonar_frames(2)))
-    assert not found.valid
-    assert words in found.reason
+    result = ImageNetwork(checkpoint).estimate(change(pairs.sonar_frames(2)))
+    assert not result.valid
+    assert words in result.reason
 
 
 def test_what_it_does_not_doubt(checkpoint: Checkpoint, pairs: SonarPairs) -> None:
@@ -180,18 +180,18 @@ def test_what_it_does_not_doubt(checkpoint: Checkpoint, pairs: SonarPairs) -> No
 
 
 def test_answers_beyond_the_box_are_invalid(made: Path, pairs: SonarPairs) -> None:
-    own = SonarPairs(made, part="all")
+    local = SonarPairs(made, part="all")
     for size, valid in ((0.0235, True), (0.0245, False), (np.nan, False)):
-        trained = constant(own, [0.0, -size, 0.0])
+        trained = constant(local, [0.0, -size, 0.0])
         if np.isnan(size):
-            trained = replace(constant(own), weights={k: v * float("inf") for k, v in constant(own).weights.items()})
-        found = ImageNetwork(trained).estimate(pairs.sonar_frames(2))
-        assert found.valid == valid, found
-    assert "not finite" in found.reason
+            trained = replace(constant(local), weights={k: v * float("inf") for k, v in constant(local).weights.items()})
+        result = ImageNetwork(trained).estimate(pairs.sonar_frames(2))
+        assert result.valid == valid, result
+    assert "not finite" in result.reason
     assert "forward -24.5 mm is beyond the motions of training, -20..20 mm" in (
-        ImageNetwork(constant(own, [0.0, -0.0245, 0.0])).estimate(pairs.sonar_frames(2)).reason
+        ImageNetwork(constant(local, [0.0, -0.0245, 0.0])).estimate(pairs.sonar_frames(2)).reason
     )
-    network = ImageNetwork(constant(own))
+    network = ImageNetwork(constant(local))
     assert "forward 24.5 mm, counted from the start, is beyond" in (
         network._rejection_of_size(Motion(0.0, 0.1245, 0.0), Motion(0.0, 0.1, 0.0))
     )
@@ -199,9 +199,9 @@ def test_answers_beyond_the_box_are_invalid(made: Path, pairs: SonarPairs) -> No
 
 def test_another_sonar_is_refused_unless_forced(checkpoint: Checkpoint, pairs: SonarPairs) -> None:
     frames = pairs.sonar_frames(2)
-    other = frames.sonar.replace(name="mine", elevation_fov_deg=20, bearing="cone")
+    second = frames.sonar.replace(name="mine", elevation_fov_deg=20, bearing="cone")
     with pytest.raises(MitsonarError) as error:
-        ImageNetwork(checkpoint).estimate(changed(frames, sonar=other, range_m=frames.range_m + 0.5))
+        ImageNetwork(checkpoint).estimate(changed(frames, sonar=second, range_m=frames.range_m + 0.5))
     for words in (
         "DIDSON",
         "mine",
@@ -210,7 +210,7 @@ def test_another_sonar_is_refused_unless_forced(checkpoint: Checkpoint, pairs: S
         "window 3.7..6.1 m, not 3.2..5.6 m",
     ):
         assert words.lower() in str(error.value).lower()
-    assert ImageNetwork(checkpoint, force=True).estimate(changed(frames, sonar=other)).valid
+    assert ImageNetwork(checkpoint, force=True).estimate(changed(frames, sonar=second)).valid
     assert ImageNetwork(checkpoint).estimate(changed(frames, range_m=frames.range_m * 1.01)).valid, "sound speed errs"
     coarse = changed(frames, image=frames.image[:, ::2], range_m=frames.range_m[::2])
     with pytest.raises(MitsonarError, match="bins 128, not 256"):
@@ -235,8 +235,8 @@ def test_checkpoints_that_two_frames_cannot_serve(checkpoint: Checkpoint) -> Non
 def geometric(made: Path) -> Checkpoint:
     """A corrnet as it begins."""
     torch.manual_seed(1)
-    own = SonarPairs(made, part="all", ground=True, layout="channels")
-    return Checkpoint.of(create_network("corrnet", width=0.5), own)
+    local = SonarPairs(made, part="all", ground=True, layout="channels")
+    return Checkpoint.of(create_network("corrnet", width=0.5), local)
 
 
 def test_networks_that_know_the_geometry_are_given_it(
@@ -244,13 +244,13 @@ def test_networks_that_know_the_geometry_are_given_it(
 ) -> None:
     """As an estimator it says what it says of the data set's own samples; another sonar and height are welcome."""
     estimator = ImageNetwork(geometric)
-    wanted, laws = predictions(geometric, samples_for(geometric, made, part="all"), numbers=[2, 5])
+    expected, laws = predictions(geometric, samples_for(geometric, made, part="all"), numbers=[2, 5])
     assert laws is not None
     for place, number in enumerate((2, 5)):
-        found = estimator.estimate(pairs.sonar_frames(number))
-        assert np.allclose(found.motion, wanted[place], rtol=1e-3, atol=1e-7)
-        assert found.covariance is not None
-        assert np.allclose(found.covariance, laws[place], rtol=1e-3, atol=1e-12)
+        result = estimator.estimate(pairs.sonar_frames(number))
+        assert np.allclose(result.motion, expected[place], rtol=1e-3, atol=1e-7)
+        assert result.covariance is not None
+        assert np.allclose(result.covariance, laws[place], rtol=1e-3, atol=1e-12)
     frames = pairs.sonar_frames(2)
     assert estimator.inputs.startswith("pitch; height")
     assert geometric.sonar == {}
@@ -258,10 +258,10 @@ def test_networks_that_know_the_geometry_are_given_it(
     with pytest.raises(MitsonarError, match="corrnet needs height and pitch"):
         estimator.estimate(bare)
     geometric.save(tmp_path / "network.ckpt")
-    told = create_estimator(f"{tmp_path}:height_m=2.5:pitch_deg=35").estimate(bare)
-    assert np.allclose(told.motion, estimator.estimate(frames).motion, rtol=1e-3, atol=1e-7)
-    other = frames.sonar.replace(beams=40)
-    fewer = changed(frames, image=frames.image[:, :, 4:44], bearing_rad=frames.bearing_rad[4:44], sonar=other)
+    message = create_estimator(f"{tmp_path}:height_m=2.5:pitch_deg=35").estimate(bare)
+    assert np.allclose(message.motion, estimator.estimate(frames).motion, rtol=1e-3, atol=1e-7)
+    second = frames.sonar.replace(beams=40)
+    fewer = changed(frames, image=frames.image[:, :, 4:44], bearing_rad=frames.bearing_rad[4:44], sonar=second)
     assert np.isfinite(estimator.estimate(fewer).motion).all()
     wrong = estimator.estimate(changed(frames, height_m=np.full(2, 6.0)))
     assert not wrong.valid
@@ -286,10 +286,10 @@ def test_a_trained_corrnet_comes_along(mitsonar: Command, made: Path, pairs: Son
 
 def test_its_own_covariances_are_judged(geometric: Checkpoint, made: Path) -> None:
     row, _ = evaluate(geometric, made, noise=["none"], part="all")["tables"][0]["rows"]
-    own = samples_for(geometric, made, part="all")
-    said, laws = predictions(geometric, own)
+    local = samples_for(geometric, made, part="all")
+    output, laws = predictions(geometric, local)
     assert laws is not None
-    error = said - np.array([own.target(k) for k in range(len(own))])
+    error = output - np.array([local.target(k) for k in range(len(local))])
     nees = np.mean([e @ np.linalg.solve(law, e) for e, law in zip(error, laws, strict=True)]) / 3
     assert row["nees"] == pytest.approx(nees, rel=1e-6)
     assert row["inputs"].startswith("pitch; height")
@@ -320,7 +320,7 @@ def test_estimators_are_named_by_checkpoint_or_folder(
 
 @pytest.mark.thorough
 def test_without_torch_the_extra_is_named(run: Path) -> None:
-    said = run_python(
+    output = run_python(
         f"""
         from mitsonar.errors import MitsonarError
         from mitsonar.estimation.named import create_estimator
@@ -332,7 +332,7 @@ def test_without_torch_the_extra_is_named(run: Path) -> None:
         """,
         block=("torch",),
     )
-    assert "pip install 'mitsonar[learn]'" in said
+    assert "pip install 'mitsonar[learn]'" in output
 
 
 @pytest.mark.thorough
@@ -345,9 +345,9 @@ def test_odometry_and_compare_take_checkpoints(
     done = mitsonar("odometry", tmp_path / "frames.npz", "--estimator", run, "-o", tmp_path / "out1")
     assert done.returncode == 0, done.stderr
     assert "fixed by training" in done.stdout
-    told = [json.loads(line) for line in (tmp_path / "out1" / "estimates.jsonl").read_text().splitlines()]
-    assert len(told) == 11
-    assert all(np.allclose(one["motion"], SAYS, atol=1e-7) and one["valid"] for one in told)
+    message = [json.loads(line) for line in (tmp_path / "out1" / "estimates.jsonl").read_text().splitlines()]
+    assert len(message) == 11
+    assert all(np.allclose(one["motion"], SAYS, atol=1e-7) and one["valid"] for one in message)
     stated = json.loads((tmp_path / "out1" / "run.json").read_text())
     assert stated["asked"]["options"]["digest"] == checkpoint.digest
     table = ("compare", made, "--part", "all", "--limit", 0, "--estimators", f"zero,{run}")
@@ -388,13 +388,13 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: 
     """By default it takes the part that training left out; another split is told, with the number of pairs that it mixes."""
     by_scene = {"by": "scene", "train": 0.67, "validation": 0.33, "seed": 2}
     about: JsonObject = {"recipe": {"split": by_scene}, "metrics": {"none": {"rmse": [3.0, 2.0, 0.1]}}}
-    told = constant(SonarPairs(made, part="train", split=by_scene, labels="normx10"), **about)
-    told.save(tmp_path / "network.ckpt")
+    message = constant(SonarPairs(made, part="train", split=by_scene, labels="normx10"), **about)
+    message.save(tmp_path / "network.ckpt")
     taught = set(SonarPairs(made, part="train", split=by_scene).first)
-    found = compare(made, {"zero": "zero", "net": ImageNetwork(told)}, ComparisonOptions(limit=0))
-    assert (found.report["pairs"], found.report["split"]["by"]) == (6, "scene")
-    assert [row["learnt"] for row in found.rows] == [0, 0]
-    assert not any("was trained on" in sentence for sentence in found.notes)
+    result = compare(made, {"zero": "zero", "net": ImageNetwork(message)}, ComparisonOptions(limit=0))
+    assert (result.report["pairs"], result.report["split"]["by"]) == (6, "scene")
+    assert [row["learnt"] for row in result.rows] == [0, 0]
+    assert not any("was trained on" in sentence for sentence in result.notes)
     by_sequence = SonarPairs(made, part="train", split="sequence", one_a_sequence=True)
     mixed = sum(first in taught for first in by_sequence.first)
     assert 0 < mixed < len(by_sequence)
@@ -404,16 +404,18 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: 
     assert f"network.ckpt (learnt {mixed})" in done.stdout
     assert f"was trained on {mixed} of the {len(by_sequence)} pairs" in done.stderr
     refused(mitsonar("compare", made, "--split", "world"), "split must be sequence, scene")
-    other = constant(SonarPairs(made, part="all", labels="normx10"), recipe={"split": "sequence"})
+    second = constant(SonarPairs(made, part="all", labels="normx10"), recipe={"split": "sequence"})
     with pytest.raises(
         MitsonarError, match="trained on other parts of this data set: a by scene, b by sequence; choose split"
     ):
-        compare(made, {"a": ImageNetwork(told), "b": ImageNetwork(other)}, ComparisonOptions(limit=0))
+        compare(made, {"a": ImageNetwork(message), "b": ImageNetwork(second)}, ComparisonOptions(limit=0))
     both = compare(
-        made, {"both": HeightEnsemble([ImageNetwork(told), ImageNetwork(told)])}, ComparisonOptions(part="train", limit=0)
+        made,
+        {"both": HeightEnsemble([ImageNetwork(message), ImageNetwork(message)])},
+        ComparisonOptions(part="train", limit=0),
     )
     assert [row["learnt"] for row in both.rows] == [both.report["pairs"]]
-    rendered = replace(told, trained={"rendered": True})
+    rendered = replace(message, trained={"rendered": True})
     assert not rendered.learnt(by_sequence).any()
 
 
@@ -421,7 +423,7 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
     words = ("evaluate", run, made, "--part", "all", "--noise", "none,high")
     done = mitsonar(*words, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    for said in (
+    for output in (
         "18 samples of 3 scenes, thesis model",
         "noise high",
         "| posenet",
@@ -430,7 +432,7 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
         "trained on",
         "correlations of errors: sideways-forward ",
     ):
-        assert said in done.stdout
+        assert output in done.stdout
     assert "training has seen 17 of these 18 pairs: errors on unseen pairs may be larger" in done.stderr
     assert "3 scenes only" in done.stderr
     report = json.loads((tmp_path / "out" / "table.json").read_text())
@@ -495,21 +497,21 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     ),
 )
 def test_all_arrangements_are_evaluated(many: Callable[[str], Path], data: str, words: dict[str, Any]) -> None:
-    own = SonarPairs(many(data), part="all", labels="normx10", one_a_sequence=True, **words)
-    report = evaluate(constant(own), many(data), noise=["low"], part="all")
-    error = in_units(SAYS - np.array([own.target(k) for k in range(len(own))]))
+    local = SonarPairs(many(data), part="all", labels="normx10", one_a_sequence=True, **words)
+    report = evaluate(constant(local), many(data), noise=["low"], part="all")
+    error = in_units(SAYS - np.array([local.target(k) for k in range(len(local))]))
     assert np.allclose(report["tables"][0]["rows"][0]["rmse"], np.sqrt((error**2).mean(axis=0)), rtol=1e-5)
 
 
 def test_heights_are_evaluated_in_mm(many: Callable[[str], Path], mitsonar: Command, tmp_path: Path) -> None:
-    own = SonarPairs(many("high"), part="all", labels="normx10", frames=1, one_a_sequence=True)
-    trained = constant(own, [2.5])
+    local = SonarPairs(many("high"), part="all", labels="normx10", frames=1, one_a_sequence=True)
+    trained = constant(local, [2.5])
     trained.save(tmp_path / "network.ckpt")
     done = mitsonar("evaluate", tmp_path, many("high"), "--part", "all", "--noise", "none", "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "height mm" in done.stdout
     row, zero = json.loads((tmp_path / "out" / "table.json").read_text())["tables"][0]["rows"]
-    truth = np.array([own.target(k)[0] for k in range(len(own))])
+    truth = np.array([local.target(k)[0] for k in range(len(local))])
     assert row["rmse"] == pytest.approx([1e3 * np.sqrt(((2.5 - truth) ** 2).mean())], rel=1e-5)
     assert row["bias"] == pytest.approx([1e3 * (2.5 - truth).mean()], rel=1e-5)
     assert zero["rmse"] == pytest.approx([1e3 * np.sqrt(((2.6 - truth) ** 2).mean())], rel=1e-5)
@@ -523,14 +525,14 @@ def test_data_that_do_not_fit_are_refused(
     done = mitsonar("evaluate", run, many("other"))
     refused(done, "beams 16, not 48", "window 3.2..6 m, not 3.2..5.6 m", "--force", "didson300")
     # what any sonar may serve: the same network, made for sizes that fit
-    own = SonarPairs(many("other"), part="all", one_a_sequence=True)
-    other = replace(constant(own), sonar=checkpoint.sonar)
+    local = SonarPairs(many("other"), part="all", one_a_sequence=True)
+    second = replace(constant(local), sonar=checkpoint.sonar)
     with pytest.raises(MitsonarError, match="beams 16, not 48"):
-        evaluate(other, many("other"), part="all")
-    report = evaluate(other, many("other"), noise=["none"], part="all", force=True)
+        evaluate(second, many("other"), part="all")
+    report = evaluate(second, many("other"), noise=["none"], part="all", force=True)
     assert "beams 16, not 48" in report["notes"][0]
     elsewhere = evaluate(
-        replace(other, sonar={}, trained_at={**other.trained_at, "pitch_deg": 35.0}),
+        replace(second, sonar={}, trained_at={**second.trained_at, "pitch_deg": 35.0}),
         many("other"),
         noise=["none"],
         part="all",
@@ -558,8 +560,8 @@ def test_data_that_do_not_fit_are_refused(
 
 def test_the_split_is_that_of_the_training(made: Path, checkpoint: Checkpoint) -> None:
     by_scene = replace(checkpoint, recipe={"split": {"by": "scene", "train": 0.34, "validation": 0.33, "test": 0.33}})
-    found = samples_for(by_scene, made)
-    assert len(set(found.scene[found.first])) == 1
+    result = samples_for(by_scene, made)
+    assert len(set(result.scene[result.first])) == 1
     report = evaluate(by_scene, made, noise=["none"])
     assert (report["part"], report["split"], report["scenes"]) == ("test", "scene", 1)
 
@@ -585,10 +587,10 @@ def agrees(content: bytes, checkpoint: Checkpoint, batch: int) -> dict[str, str]
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     rng = np.random.default_rng(3)
     inputs = {one.name: rng.random((batch, *one.shape[1:]), dtype=np.float32) for one in session.get_inputs()}
-    wanted = checkpoint.build()(*(torch.from_numpy(values) for values in inputs.values())).numpy()
-    (found,) = session.run(["labels"], inputs)
-    assert found.shape == (batch, 3)
-    assert np.abs(found - wanted).max() < 1e-4 * np.abs(wanted).max()
+    expected = checkpoint.build()(*(torch.from_numpy(values) for values in inputs.values())).numpy()
+    (result,) = session.run(["labels"], inputs)
+    assert result.shape == (batch, 3)
+    assert np.abs(result - expected).max() < 1e-4 * np.abs(expected).max()
     about: dict[str, str] = session.get_modelmeta().custom_metadata_map
     return about
 
@@ -611,9 +613,9 @@ def test_a_checkpoint_of_half_size_says_nearly_the_same(mitsonar: Command, tmp_p
     sizes = [(tmp_path / name).stat().st_size for name in ("half.ckpt", "network.ckpt")]
     assert sizes[0] < 0.6 * sizes[1]
     image = torch.rand((4, 1, 64, 64), generator=torch.Generator().manual_seed(1))
-    found, wanted = small.build()(image), checkpoint.build()(image)
-    assert found.dtype == torch.float32
-    assert float((found - wanted).abs().max()) < 2e-3 * float(wanted.abs().max())
+    result, expected = small.build()(image), checkpoint.build()(image)
+    assert result.dtype == torch.float32
+    assert float((result - expected).abs().max()) < 2e-3 * float(expected.abs().max())
     assert (small.options, small.labels, small.trained) == (checkpoint.options, checkpoint.labels, checkpoint.trained)
     refused(mitsonar("export", tmp_path), "nothing to write: give --onnx FILE.onnx, --half FILE.ckpt, or both")
     refused(mitsonar("export", tmp_path, "--half", tmp_path / "half.ckpt"), "half.ckpt")
@@ -638,9 +640,9 @@ def test_the_geometry_goes_into_onnx(geometric: Checkpoint, made: Path) -> None:
         images, grounds = zip(*(samples[number][0] for number in numbers), strict=True)
         image, ground = torch.stack(images), {name: torch.stack([one[name] for one in grounds]) for name in grounds[0]}
         table = {name: values.numpy() for name, values in {"image": image, **ground}.items()}
-        found = session.run(["motion", "covariance"], {one.name: table[one.name] for one in session.get_inputs()})
-        wanted = geometric.build()(image, ground)
-        for got, want in zip(found, wanted, strict=True):
+        result = session.run(["motion", "covariance"], {one.name: table[one.name] for one in session.get_inputs()})
+        expected = geometric.build()(image, ground)
+        for got, want in zip(result, expected, strict=True):
             assert np.abs(got - want.numpy()).max() < 1e-4 * np.abs(want.numpy()).max()
 
 

@@ -175,8 +175,8 @@ def test_a_training_ends_in_a_checkpoint(made: Path, run: Path) -> None:
     assert "3 frames of front, left, back, right: response" in rows["input"]
     assert "80000 Hz, 4800 Hz wide, 200 taps" in rows["sonar"]
     samples = samples_for(checkpoint, made, part="validation", split={"train": 0.5, "validation": 0.5})
-    said, law = predictions(checkpoint, samples)
-    assert said.shape == (10, 2)
+    output, law = predictions(checkpoint, samples)
+    assert output.shape == (10, 2)
     assert law is None
     again = Checkpoint.from_bytes(checkpoint.to_bytes())
     assert again.digest == checkpoint.digest
@@ -259,13 +259,13 @@ def test_a_checkpoint_estimates_what_evaluation_scores(made: Path, run: Path) ->
     assert isinstance(estimator, ResponseNetwork)
     assert estimator.consumes is ImpulseResponses
     for index in range(3):
-        found = estimator.estimate(records(pairs, index))
-        np.testing.assert_allclose(found.motion[:2], expected[index], rtol=1e-4, atol=1e-7)
-        assert found.motion.yaw == 0
-        assert found.valid, found.reason
-        assert found.covariance is not None
+        result = estimator.estimate(records(pairs, index))
+        np.testing.assert_allclose(result.motion[:2], expected[index], rtol=1e-4, atol=1e-7)
+        assert result.motion.yaw == 0
+        assert result.valid, result.reason
+        assert result.covariance is not None
         promised = np.array(Checkpoint.load(run).rmse)
-        assert 1e3 * np.sqrt(np.diag(found.covariance))[:2] == pytest.approx(promised)
+        assert 1e3 * np.sqrt(np.diag(result.covariance))[:2] == pytest.approx(promised)
 
 
 def test_it_refuses_what_it_was_not_trained_for(made: Path, run: Path) -> None:

@@ -159,15 +159,21 @@ def test_recipes_say_what_they_leave_out(tmp_path: Path) -> None:
     """The training of Almanza-Medina, from three lines; keys changed with dots; and back from what a run keeps."""
     path = tmp_path / "mine.yaml"
     path.write_text("network: posenet\ndata: mine-data.yaml\nnoise: low\n")
-    told = load_training_recipe(path, {"network.width": 0.5, "validate.pairs": 7})
-    assert told.network == {"name": "posenet", "width": 0.5}
-    assert told.data == str(tmp_path / "mine-data.yaml")
-    assert (told.batch, told.epochs, told.steps, told.optimiser.rate, told.optimiser.halve_every) == (4, 32, None, 1e-4, 12)
+    message = load_training_recipe(path, {"network.width": 0.5, "validate.pairs": 7})
+    assert message.network == {"name": "posenet", "width": 0.5}
+    assert message.data == str(tmp_path / "mine-data.yaml")
+    assert (message.batch, message.epochs, message.steps, message.optimiser.rate, message.optimiser.halve_every) == (
+        4,
+        32,
+        None,
+        1e-4,
+        12,
+    )
     assert recipe(noise=["none", "high"]).noise_said == "none or high"
-    assert (told.labels, told.validation.pairs, told.length(38_000)) == ("normx10", 7, 32 * 38_000)
-    (tmp_path / "again.yaml").write_text(yaml.safe_dump(told.plain()))
-    assert load_training_recipe(tmp_path / "again.yaml") == told
-    assert differences(told.plain(), told.replace(seed=3).plain()) == ["seed 0, not 3"]
+    assert (message.labels, message.validation.pairs, message.length(38_000)) == ("normx10", 7, 32 * 38_000)
+    (tmp_path / "again.yaml").write_text(yaml.safe_dump(message.plain()))
+    assert load_training_recipe(tmp_path / "again.yaml") == message
+    assert differences(message.plain(), message.replace(seed=3).plain()) == ["seed 0, not 3"]
     assert recipe().length(10) == 20
     assert recipe(steps=None, epochs=2.5).length(10) == 25
 
@@ -246,8 +252,8 @@ def test_of_several_noise_levels_each_sample_draws_one(made: Path) -> None:
 @pytest.mark.thorough
 def test_batches_are_the_same_wherever_they_are_finished(made: Path) -> None:
     """Where they are read, as for a CPU, or on the device of the network: epoch and noise go with them."""
-    told = recipe()
-    material = material_of(told, made, render=False)
+    message = recipe()
+    material = material_of(message, made, render=False)
     assert material.numbers is not None
     order = Order(material.numbers, 8, 0, 12, 15, (0, 1))
     samples = material.samples
@@ -257,8 +263,8 @@ def test_batches_are_the_same_wherever_they_are_finished(made: Path) -> None:
     moved = [_Collation(samples, finish=False)(batch) for batch in rows]
     assert [batch["epoch"] for batch in read] == [1, 1, 1]
     samples.set_epoch(7)
-    for one, other, planned in zip(read, moved, order, strict=True):
-        inputs, label = finished(other, samples, torch.device("cpu"))
+    for one, second, planned in zip(read, moved, order, strict=True):
+        inputs, label = finished(second, samples, torch.device("cpu"))
         assert torch.equal(inputs, one["inputs"])
         assert torch.equal(label, one["label"])
         assert one["frames"].tolist() == samples.first[[number for _, number in planned]].tolist()
@@ -283,9 +289,9 @@ def test_rendered_samples_are_skipped_without_rendering_them(monkeypatch: pytest
     tail = list(itertools.islice(pairs.raw(skip=36), 10))
     assert worlds[0] >= 1
     assert worlds == list(range(worlds[0], 5))
-    for one, other in zip(tail, whole[36:], strict=True):
+    for one, second in zip(tail, whole[36:], strict=True):
         for name in one:
-            np.testing.assert_array_equal(one[name], other[name])
+            np.testing.assert_array_equal(one[name], second[name])
     batches = list(itertools.islice(iter(RawStream(pairs, batch_size=6, skip=6)), 10))
     assert [sample["frames"][0] for sample in batches] == [sample["frames"][0] for sample in tail]
 
@@ -301,19 +307,19 @@ def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_two_data_sets_are_learnt_from_as_one(made: Path, other: Path) -> None:
     """Every sample of both once an epoch, each as its own set stores it, under frame numbers of its own."""
-    told = recipe(noise="high", split={"train": 0.5, "validation": 0.5}, validate={"pairs": 15, "noise": ["none"]})
-    joined = material_of(told, [made, other], render=False)
-    alone = [material_of(told, one, render=False) for one in (made, other)]
+    message = recipe(noise="high", split={"train": 0.5, "validation": 0.5}, validate={"pairs": 15, "noise": ["none"]})
+    joined = material_of(message, [made, other], render=False)
+    alone = [material_of(message, one, render=False) for one in (made, other)]
     assert joined.epoch == sum(one.epoch for one in alone) == 60
     samples, sets = joined.samples, [one.samples for one in alone]
     assert isinstance(samples, JoinedPairs)
     assert isinstance(sets[0], SonarPairs)
     assert isinstance(sets[1], SonarPairs)
-    for index, own, offset in ((3, sets[0].raw(3), 0), (43, sets[1].raw(3), 100)):
-        found = samples.raw(index)
-        np.testing.assert_array_equal(found["image"], own["image"])
-        np.testing.assert_array_equal(found["label"], own["label"])
-        np.testing.assert_array_equal(found["frames"], own["frames"] + offset)
+    for index, local, offset in ((3, sets[0].raw(3), 0), (43, sets[1].raw(3), 100)):
+        result = samples.raw(index)
+        np.testing.assert_array_equal(result["image"], local["image"])
+        np.testing.assert_array_equal(result["label"], local["label"])
+        np.testing.assert_array_equal(result["frames"], local["frames"] + offset)
     clean, noisy = (sets[1][3][0], samples[43][0])
     assert not torch.equal(clean, noisy)  # its own noise, not that of the frame of the same number
     samples.arrange, sets[1].arrange = samples.at_noise("none"), sets[1].at_noise("none")
@@ -321,13 +327,13 @@ def test_two_data_sets_are_learnt_from_as_one(made: Path, other: Path) -> None:
     firsts = samples.first[numbers_of(joined.validation)]
     assert len(np.unique(samples.sequence[firsts])) == len(joined.validation) == 15  # one a sequence
     assert (joined.about["name"], joined.about["gain"]) == ("tiny and other", None)
-    assert joined.about["digest"] != material_of(told, [other, made], render=False).about["digest"]
+    assert joined.about["digest"] != material_of(message, [other, made], render=False).about["digest"]
 
 
 def test_a_network_of_two_models_names_both(made: Path, other: Path, tmp_path: Path) -> None:
-    kept = train(TrainOptions(recipe(steps=2), [made, other], tmp_path / "run", threads=1, workers=0))
-    assert (kept.model, kept.data) == ("thesis and physical", "tiny and other")
-    report = evaluate(kept, str(other), part="all", noise=["none"])
+    stored = train(TrainOptions(recipe(steps=2), [made, other], tmp_path / "run", threads=1, workers=0))
+    assert (stored.model, stored.data) == ("thesis and physical", "tiny and other")
+    report = evaluate(stored, str(other), part="all", noise=["none"])
     assert not [note for note in report["notes"] if "model" in note]
     with pytest.raises(MitsonarError, match="begun with data tiny and other, not tiny"):
         train(TrainOptions(recipe(steps=2), made, tmp_path / "run", resume=True, threads=1, workers=0))
@@ -414,16 +420,16 @@ def killed(told: Path, data: Path | str, out: Path, when: str, *, render: bool =
 @pytest.mark.e2e
 def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: Path) -> None:
     """Killed while it writes its state, and in the middle of its second epoch: weights, optimiser, log as if unbroken."""
-    told = tmp_path / "mine.yaml"
-    told.write_text(yaml.safe_dump(FIELDS))
-    killed(told, made, tmp_path / "broken", "writing")
+    message = tmp_path / "mine.yaml"
+    message.write_text(yaml.safe_dump(FIELDS))
+    killed(message, made, tmp_path / "broken", "writing")
     assert torch.load(tmp_path / "broken" / "last.ckpt", weights_only=True)["global_step"] == 8
-    killed(told, made, tmp_path / "broken", "step 14")
-    train(TrainOptions(told, made, tmp_path / "broken", resume=True, threads=1, workers=0))
+    killed(message, made, tmp_path / "broken", "step 14")
+    train(TrainOptions(message, made, tmp_path / "broken", resume=True, threads=1, workers=0))
     assert_same(weights(whole), weights(tmp_path / "broken"))
     logs = [list(csv.DictReader((out / "log.csv").open())) for out in (whole, tmp_path / "broken")]
-    for one, other in zip(*logs, strict=True):
-        assert {k: v for k, v in one.items() if k != "minutes"} == {k: v for k, v in other.items() if k != "minutes"}
+    for one, second in zip(*logs, strict=True):
+        assert {k: v for k, v in one.items() if k != "minutes"} == {k: v for k, v in second.items() if k != "minutes"}
     best = [Checkpoint.load(out) for out in (whole, tmp_path / "broken")]
     assert best[0].digest == best[1].digest
 
@@ -432,15 +438,15 @@ def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: P
 @pytest.mark.e2e
 def test_killed_runs_that_render_end_with_the_same_bits(tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump({**TINY, "scenes": [{"count": 1, "sequences": 4}]}))
-    told = tmp_path / "mine.yaml"
-    told.write_text(yaml.safe_dump({**FIELDS, "data": "tiny.yaml", "steps": 8}))
-    killed(told, "", tmp_path / "broken", "step 4", render=True)
+    message = tmp_path / "mine.yaml"
+    message.write_text(yaml.safe_dump({**FIELDS, "data": "tiny.yaml", "steps": 8}))
+    killed(message, "", tmp_path / "broken", "step 4", render=True)
     words: dict[str, Any] = {"render": True, "threads": 1, "workers": 0}
-    train(TrainOptions(told, None, tmp_path / "whole", **words))
-    made = train(TrainOptions(told, None, tmp_path / "broken", resume=True, **words))
+    train(TrainOptions(message, None, tmp_path / "whole", **words))
+    result = train(TrainOptions(message, None, tmp_path / "broken", resume=True, **words))
     assert_same(weights(tmp_path / "whole"), weights(tmp_path / "broken"))
-    assert made.data == "tiny"
-    assert made.metrics["none"]["pairs"] == 5
+    assert result.data == "tiny"
+    assert result.metrics["none"]["pairs"] == 5
 
 
 @pytest.mark.thorough
@@ -459,13 +465,13 @@ def test_validation_states_and_workers_do_not_touch_the_training(made: Path, who
 def test_the_network_kept_is_that_which_is_better_on_every_axis_alike() -> None:
     """A per cent of an axis that nobody tells does not outweigh the halving of another; levels of noise count alike."""
     zero = np.array([11.6, 11.6, 0.26])
-    told, moved = np.array([0.4, 0.5, 0.190]), np.array([0.8, 0.7, 0.185])
-    assert _score([told], zero) < _score([moved], zero)
-    assert _score([told, moved], zero) == pytest.approx(np.sqrt(_score([told], zero) * _score([moved], zero)))
+    message, moved = np.array([0.4, 0.5, 0.190]), np.array([0.8, 0.7, 0.185])
+    assert _score([message], zero) < _score([moved], zero)
+    assert _score([message, moved], zero) == pytest.approx(np.sqrt(_score([message], zero) * _score([moved], zero)))
     assert _score([zero], zero) == pytest.approx(1)
     still = np.array([11.6, 0.0, 0.26])  # no sample moves forward
-    assert _score([told], still) == pytest.approx(np.sqrt(0.4 / 11.6 * 0.190 / 0.26))
-    assert _score([told], np.zeros(3)) == pytest.approx(told.mean())
+    assert _score([message], still) == pytest.approx(np.sqrt(0.4 / 11.6 * 0.190 / 0.26))
+    assert _score([message], np.zeros(3)) == pytest.approx(message.mean())
 
 
 def test_a_run_keeps_what_it_promises(
@@ -476,9 +482,9 @@ def test_a_run_keeps_what_it_promises(
     reports: list[TrainingReport] = []
     labels: dict[str, Any] = {"labels": "quantised", "noise": "none", "optimiser": {"rate": 3e-3}, "steps": 60}
     labels |= {"split": {"train": 0.8, "validation": 0.2}, "validate": {"every_steps": 20, "pairs": None, "noise": ["low"]}}
-    told = recipe(**labels, network={"name": "posenet", "width": 0.06, "dropout": 0.0}, part_of_data=0.4)
+    message = recipe(**labels, network={"name": "posenet", "width": 0.06, "dropout": 0.0}, part_of_data=0.4)
     out = tmp_path / "run"
-    best = train(TrainOptions(told, made, out, threads=1), progress=reports.append)
+    best = train(TrainOptions(message, made, out, threads=1), progress=reports.append)
     rows = list(csv.DictReader((out / "log.csv").open()))
     assert [int(row["step"]) for row in rows] == [20, 40, 60]
     assert [report.step for report in reports] == list(range(1, 61))
@@ -486,70 +492,70 @@ def test_a_run_keeps_what_it_promises(
     assert reports[-1].rmse[0] < reports[5].rmse[0]
     pairs = SonarPairs(made, part="validation", split=labels["split"])
     truth = np.array([pairs.target(index) for index in range(len(pairs))])
-    kept = [index for index in range(len(pairs)) if pairs.first[index] + 2 <= 0.4 * 100]
+    stored = [index for index in range(len(pairs)) if pairs.first[index] + 2 <= 0.4 * 100]
     network = best.build()
     with torch.no_grad():
-        found = best.coder.decode(network(torch.stack([pairs[index][0] for index in kept])))
-    rmse = np.sqrt(((found - truth[kept]) ** 2).mean(axis=0)) * [1e3, 1e3, 180 / np.pi]
+        result = best.coder.decode(network(torch.stack([pairs[index][0] for index in stored])))
+    rmse = np.sqrt(((result - truth[stored]) ** 2).mean(axis=0)) * [1e3, 1e3, 180 / np.pi]
     np.testing.assert_allclose(best.metrics["none"]["rmse"], rmse, rtol=1e-5)
     row = next(row for row in rows if int(row["step"]) == best.trained["steps"])
     assert float(row["none sideways (mm)"]) == pytest.approx(rmse[0], rel=1e-4)
     assert float(row["low yaw (deg)"]) == pytest.approx(best.metrics["low"]["rmse"][2], rel=1e-4)
     assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
     assert (out / "curve.png").stat().st_size > 10_000
-    assert best.recipe == told.plain()
-    assert load_training_recipe(out / "recipe.yaml") == told
+    assert best.recipe == message.plain()
+    assert load_training_recipe(out / "recipe.yaml") == message
 
 
 def test_a_stop_leaves_a_network_and_a_row_of_the_log(made: Path, tmp_path: Path) -> None:
     """Even the first step's; a run without a network, which was killed, asks for more minutes."""
-    told = recipe(steps=3, validate={"every_steps": 100, "pairs": 4, "noise": ["none"]})
+    message = recipe(steps=3, validate={"every_steps": 100, "pairs": 4, "noise": ["none"]})
     with pytest.raises(KeyboardInterrupt):
-        train(TrainOptions(told, made, tmp_path / "run", threads=1), stop=lambda: True)
-    kept = Checkpoint.load(tmp_path / "run")
+        train(TrainOptions(message, made, tmp_path / "run", threads=1), stop=lambda: True)
+    stored = Checkpoint.load(tmp_path / "run")
     (row,) = csv.DictReader((tmp_path / "run" / "log.csv").open())
-    assert (kept.trained["steps"], int(row["step"])) == (1, 1)
-    assert float(row["none sideways (mm)"]) == pytest.approx(kept.metrics["none"]["rmse"][0], rel=1e-4)
+    assert (stored.trained["steps"], int(row["step"])) == (1, 1)
+    assert float(row["none sideways (mm)"]) == pytest.approx(stored.metrics["none"]["rmse"][0], rel=1e-4)
     (tmp_path / "run" / "network.ckpt").unlink()
     with pytest.raises(
         MitsonarError, match=r"stopped before it validated once, and has used its 1e-09 minutes .* resume it with more"
     ):
-        train(TrainOptions(told, made, tmp_path / "run", resume=True, minutes=1e-9))
-    assert train(TrainOptions(told, made, tmp_path / "run", resume=True, minutes=5)).trained["steps"] == 3
+        train(TrainOptions(message, made, tmp_path / "run", resume=True, minutes=1e-9))
+    assert train(TrainOptions(message, made, tmp_path / "run", resume=True, minutes=5)).trained["steps"] == 3
 
 
 def test_runs_that_are_there_are_kept(made: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    told = recipe(steps=2)
-    first = train(TrainOptions(told, made, out, threads=1))
+    message = recipe(steps=2)
+    first = train(TrainOptions(message, made, out, threads=1))
     with pytest.raises(MitsonarError, match="--resume continues it, --overwrite begins anew"):
-        train(TrainOptions(told, made, out))
+        train(TrainOptions(message, made, out))
     with pytest.raises(MitsonarError, match=r"begun with recipe\.optimiser\.rate 0\.001, not 0\.002"):
         train(TrainOptions(recipe(steps=2, optimiser={"rate": 2e-3}), made, out, resume=True))
-    other = tmp_path / "other.zarr"
-    make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 10}], seed=3), str(other))
+    second = tmp_path / "other.zarr"
+    make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 10}], seed=3), str(second))
     with pytest.raises(MitsonarError, match="begun with digest"):
-        train(TrainOptions(told, other, out, resume=True))
+        train(TrainOptions(message, second, out, resume=True))
     before = weights(out)
-    assert train(TrainOptions(told, made, out, resume=True, threads=1)).digest == first.digest  # nothing was left to do
+    assert train(TrainOptions(message, made, out, resume=True, threads=1)).digest == first.digest  # nothing was left to do
     assert_same(before, weights(out))
-    assert train(TrainOptions(told, made, out, overwrite=True, threads=1)).digest == first.digest
+    assert train(TrainOptions(message, made, out, overwrite=True, threads=1)).digest == first.digest
     (out / "last.ckpt").write_bytes((out / "last.ckpt").read_bytes()[:5000])
     with pytest.raises(MitsonarError, match=r"last\.ckpt is damaged"):
-        train(TrainOptions(told, made, out, resume=True))
+        train(TrainOptions(message, made, out, resume=True))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("all of it")
     for resume, overwrite in ((False, False), (True, False), (False, True)):
         with pytest.raises(MitsonarError, match=r"contains other files \(thesis\.txt\) and is kept"):
-            train(TrainOptions(told, made, tmp_path / "mine", resume=resume, overwrite=overwrite))
+            train(TrainOptions(message, made, tmp_path / "mine", resume=resume, overwrite=overwrite))
 
 
 def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
     """One pixel of a stored frame is not a number: its step is named, and the state on disk is that of the step before."""
     url = tmp_path / "spoilt.zarr"
     make_dataset(tiny_recipe(scenes=[{"count": 1, "sequences": 20}], pixel="float32"), str(url))
-    told = recipe(steps=9, noise="none")
-    learnt = material_of(told, url, render=False)
+    message = recipe(steps=9, noise="none")
+    learnt = material_of(message, url, render=False)
     assert learnt.numbers is not None
     assert isinstance(learnt.samples, SonarPairs)
     first = int(learnt.samples.first[learnt.numbers[20]])  # begins one sample and ends none, where a sequence begins
@@ -559,8 +565,8 @@ def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
     order = list(Order(learnt.numbers, 8, 0, 0, 9, (0, 1)))
     step = next(k for k, batch in enumerate(order) if frame in learnt.samples.first[[number for _, number in batch]])
     with pytest.raises(MitsonarError) as caught:
-        train(TrainOptions(told, url, tmp_path / "run", threads=1, state_minutes=0))
-    said = str(caught.value)
+        train(TrainOptions(message, url, tmp_path / "run", threads=1, state_minutes=0))
+    output = str(caught.value)
     for part in (
         "the loss became nan in epoch 1",
         f"step {step + 1} of 9 (step {step + 1} in all)",
@@ -568,8 +574,8 @@ def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
         f" {frame}",
         "lower optimiser.rate",
     ):
-        assert part in said
-    assert str(frame) in said.split("frames ")[1].split(":")[0].split(", ")
+        assert part in output
+    assert str(frame) in output.split("frames ")[1].split(":")[0].split(", ")
     state = torch.load(tmp_path / "run" / "last.ckpt", weights_only=True)
     assert state["global_step"] == step
     assert all(torch.isfinite(values).all() for values in state["state_dict"].values())
@@ -645,10 +651,10 @@ def run_command(*words: object) -> Any:
 @pytest.mark.thorough
 def test_the_command_line_trains_stops_in_time_and_goes_on(made: Path, tmp_path: Path) -> None:
     """Its own sentences, and nothing of Lightning's."""
-    told, out = tmp_path / "mine.yaml", tmp_path / "run"
-    told.write_text(yaml.safe_dump({**FIELDS, "steps": 100_000, "split": {"train": 0.8, "validation": 0.2}}))
+    message, out = tmp_path / "mine.yaml", tmp_path / "run"
+    message.write_text(yaml.safe_dump({**FIELDS, "steps": 100_000, "split": {"train": 0.8, "validation": 0.2}}))
     options = ["--data", made, "-o", out, "--threads", 1, "--set", "optimiser.rate=2e-3", "--scale", 0.9]
-    done = run_command(told, *options, "--minutes", 0.02)
+    done = run_command(message, *options, "--minutes", 0.02)
     assert done.exit_code == 0, done.output
     assert "RMSE, noise none" in done.stdout
     assert f"network: {out / 'network.ckpt'}" in done.stdout
@@ -656,13 +662,13 @@ def test_the_command_line_trains_stops_in_time_and_goes_on(made: Path, tmp_path:
     assert "; validation, noise none " in done.stderr
     state = torch.load(out / "last.ckpt", weights_only=True)["global_step"]
     assert 6 <= state < 2000
-    kept = load_training_recipe(out / "recipe.yaml")
-    assert (kept.optimiser.rate, kept.part_of_data) == (2e-3, 0.9)
+    stored = load_training_recipe(out / "recipe.yaml")
+    assert (stored.optimiser.rate, stored.part_of_data) == (2e-3, 0.9)
     spent = json.loads((out / "run.json").read_text())["minutes"]
-    again = run_command(told, *options, "--minutes", spent + 0.01, "--resume")
+    again = run_command(message, *options, "--minutes", spent + 0.01, "--resume")
     assert again.exit_code == 0, again.output
     assert torch.load(out / "last.ckpt", weights_only=True)["global_step"] > state
-    refused = run_command(told, *options)
+    refused = run_command(message, *options)
     assert refused.exit_code == 2
     assert refused.stderr.startswith("error: ")
     assert "--resume" in refused.stderr
@@ -677,10 +683,10 @@ def test_rows_of_the_log_between_validations_tell_the_errors_in_training(
 
     monkeypatch.setattr("mitsonar.training.journal.curve_figure", bare_curves)
     monkeypatch.setattr("mitsonar.training.journal.LOG_SECONDS", 0.0)
-    told, out = tmp_path / "mine.yaml", tmp_path / "run"
+    message, out = tmp_path / "mine.yaml", tmp_path / "run"
     validate = {"every_steps": 4, "pairs": 4, "noise": ["none"]}
-    told.write_text(yaml.safe_dump({**FIELDS, "steps": 6, "validate": validate}))
-    done = run_command(told, "--data", made, "-o", out, "--threads", 1)
+    message.write_text(yaml.safe_dump({**FIELDS, "steps": 6, "validate": validate}))
+    done = run_command(message, "--data", made, "-o", out, "--threads", 1)
     assert done.exit_code == 0, done.output
     rows = list(csv.DictReader((out / "log.csv").open()))
     assert [int(row["step"]) for row in rows] == [1, 2, 3, 4, 5, 6]
@@ -701,8 +707,8 @@ def test_rows_of_the_log_between_validations_tell_the_errors_in_training(
 @pytest.mark.thorough
 def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_path: Path) -> None:
     """And the run goes on to the same bits."""
-    told, out = tmp_path / "mine.yaml", tmp_path / "run"
-    told.write_text(yaml.safe_dump(FIELDS))
+    message, out = tmp_path / "mine.yaml", tmp_path / "run"
+    message.write_text(yaml.safe_dump(FIELDS))
 
     def interrupt(report: TrainingReport) -> None:
         if report.step == 9:
@@ -711,9 +717,9 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
     from mitsonar.cli.train import stop_on_signals
 
     with stop_on_signals() as stop, pytest.raises(KeyboardInterrupt):
-        train(TrainOptions(told, made, out, threads=1), progress=interrupt, stop=stop)
+        train(TrainOptions(message, made, out, threads=1), progress=interrupt, stop=stop)
     assert torch.load(out / "last.ckpt", weights_only=True)["global_step"] in (9, 10)
-    train(TrainOptions(told, made, out, resume=True, threads=1))
+    train(TrainOptions(message, made, out, resume=True, threads=1))
     assert_same(weights(out), weights(whole))
 
 
@@ -721,17 +727,17 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
 @pytest.mark.e2e
 def test_a_signal_to_all_processes_of_a_training_stops_it_after_its_step(made: Path, tmp_path: Path) -> None:
     """As a cluster sends it: the process that reads samples does not end before the one that trains."""
-    told, out = tmp_path / "mine.yaml", tmp_path / "run"
-    told.write_text(yaml.safe_dump({**FIELDS, "steps": 100_000, "validate": {"every_steps": 3, "pairs": 4}}))
-    words = ("train", told, "--data", made, "-o", out, "--threads", 1, "--workers", 1)
+    message, out = tmp_path / "mine.yaml", tmp_path / "run"
+    message.write_text(yaml.safe_dump({**FIELDS, "steps": 100_000, "validate": {"every_steps": 3, "pairs": 4}}))
+    words = ("train", message, "--data", made, "-o", out, "--threads", 1, "--workers", 1)
     call = [sys.executable, "-m", "mitsonar", *map(str, words)]
     with subprocess.Popen(call, stderr=subprocess.PIPE, text=True, start_new_session=True) as running:
         assert running.stderr is not None
         assert running.stderr.readline().startswith("epoch ")
         os.killpg(running.pid, signal.SIGTERM)
-        said = running.stderr.read()
-    assert running.returncode == 143, said
-    assert "Traceback" not in said
+        output = running.stderr.read()
+    assert running.returncode == 143, output
+    assert "Traceback" not in output
     steps = torch.load(out / "last.ckpt", weights_only=True)["global_step"]
     assert steps == int(list(csv.DictReader((out / "log.csv").open()))[-1]["step"])
 
@@ -740,8 +746,8 @@ def test_a_signal_to_all_processes_of_a_training_stops_it_after_its_step(made: P
 @pytest.mark.e2e
 def test_two_devices_share_a_training(made: Path, tmp_path: Path) -> None:
     """Two processes on this CPU; a batch is one batch, however many share it."""
-    told = tmp_path / "mine.yaml"
-    told.write_text(yaml.safe_dump(FIELDS))
+    message = tmp_path / "mine.yaml"
+    message.write_text(yaml.safe_dump(FIELDS))
     script = tmp_path / "two.py"
     script.write_text(
         textwrap.dedent("""
@@ -752,7 +758,7 @@ def test_two_devices_share_a_training(made: Path, tmp_path: Path) -> None:
             train(TrainOptions(*sys.argv[1:], accelerator="cpu", devices=2, strategy="ddp", threads=1))
         """)
     )
-    call = [sys.executable, str(script), str(told), str(made), str(tmp_path / "run")]
+    call = [sys.executable, str(script), str(message), str(made), str(tmp_path / "run")]
     done = subprocess.run(call, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert Checkpoint.load(tmp_path / "run").trained["pairs"] % 8 == 0
@@ -761,16 +767,16 @@ def test_two_devices_share_a_training(made: Path, tmp_path: Path) -> None:
 
 def test_a_training_begins_with_the_weights_that_it_is_told(made: Path, whole: Path, tmp_path: Path) -> None:
     """One step at no rate to speak of leaves them; those of another network are refused."""
-    kept = Checkpoint.load(whole).build().state_dict()
-    told = {"start": str(whole), "seed": 5, "steps": 1, "optimiser": {"rate": 1e-12}}
-    again = train(TrainOptions(recipe(**told), made, tmp_path / "again", threads=1, workers=0)).build().state_dict()
-    other = (
-        train(TrainOptions(recipe(**{**told, "start": None}), made, tmp_path / "other", threads=1, workers=0))
+    stored = Checkpoint.load(whole).build().state_dict()
+    message = {"start": str(whole), "seed": 5, "steps": 1, "optimiser": {"rate": 1e-12}}
+    again = train(TrainOptions(recipe(**message), made, tmp_path / "again", threads=1, workers=0)).build().state_dict()
+    second = (
+        train(TrainOptions(recipe(**{**message, "start": None}), made, tmp_path / "other", threads=1, workers=0))
         .build()
         .state_dict()
     )
-    learnt = [name for name in kept if "running" not in name and "num_batches" not in name]
-    assert all(torch.allclose(again[name], kept[name], atol=1e-9) for name in learnt)
-    assert not all(torch.allclose(other[name], kept[name], atol=1e-3) for name in learnt)
+    learnt = [name for name in stored if "running" not in name and "num_batches" not in name]
+    assert all(torch.allclose(again[name], stored[name], atol=1e-9) for name in learnt)
+    assert not all(torch.allclose(second[name], stored[name], atol=1e-3) for name in learnt)
     with pytest.raises(MitsonarError, match="start holds the weights of posenet"):
-        train(TrainOptions(recipe(**told, network={"name": "sfmnet", "width": 1 / 16}), made, tmp_path / "no"))
+        train(TrainOptions(recipe(**message, network={"name": "sfmnet", "width": 1 / 16}), made, tmp_path / "no"))

@@ -60,10 +60,10 @@ def outcome_of(path: Path) -> str:
 
     try:
         scene = load_scene(path)
-        found = sonar_in(scene)
+        result = sonar_in(scene)
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            frames = Simulator(scene).render(np.array([found[1] if found else np.zeros(6)], dtype=float))
+            frames = Simulator(scene).render(np.array([result[1] if result else np.zeros(6)], dtype=float))
         assert np.isfinite(frames.image).all(), "the picture is not finite"
     except MitsonarError as error:
         return "refused" if 0 < len(str(error)) < 2000 else f"a refusal of {len(str(error))} letters"
@@ -80,8 +80,8 @@ def main(folder: Path, first: int, count: int) -> None:
         (folder / "mutant.xml").write_bytes(content)
         print(json.dumps([seed, "began", 0]), flush=True)
         before = time.process_time()
-        found = outcome_of(folder / "mutant.xml")
-        print(json.dumps([seed, found, time.process_time() - before]), flush=True)
+        result = outcome_of(folder / "mutant.xml")
+        print(json.dumps([seed, result, time.process_time() - before]), flush=True)
 
 
 if __name__ == "__main__":

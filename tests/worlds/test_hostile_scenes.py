@@ -199,11 +199,11 @@ def test_scenes_whose_files_are_none_are_refused_at_once(tmp_path: Path) -> None
     assert done.returncode == 0, done.stdout + done.stderr
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [line[0] for line in lines] == list(FILES)
-    for name, seconds, said in lines:
-        assert said != "read", name
+    for name, seconds, output in lines:
+        assert output != "read", name
         assert seconds < 5, (name, seconds)
-        assert len(said) < 1000, said
-        assert "12345" not in said, said
+        assert len(output) < 1000, output
+        assert "12345" not in output, output
 
 
 def test_pictures_are_measured_by_their_headers(tmp_path: Path) -> None:

@@ -219,9 +219,9 @@ def test_models_elsewhere_need_the_search_path(tmp_path: Path) -> None:
         imported_world(tmp_path / "worlds" / "harbour.sdf")
     assert len(imported_world(tmp_path / "worlds" / "harbour.sdf", search=[tmp_path / "models"]).meshes) == 4
     (tmp_path / "models" / "buoy" / "ball.stl").unlink()
-    with pytest.raises(MitsonarError, match=r"ball\.stl', there is no such file within") as told:
+    with pytest.raises(MitsonarError, match=r"ball\.stl', there is no such file within") as message:
         imported_world(tmp_path / "worlds" / "harbour.sdf", search=[tmp_path / "models", tmp_path / "models"])
-    assert str(told.value).count(str(tmp_path / "models,")) + str(told.value).count(f"{tmp_path / 'models'}:") == 1
+    assert str(message.value).count(str(tmp_path / "models,")) + str(message.value).count(f"{tmp_path / 'models'}:") == 1
     with pytest.raises(MitsonarError, match="there is no folder"):
         imported_world(tmp_path / "worlds" / "harbour.sdf", search=[tmp_path / "none"])
 

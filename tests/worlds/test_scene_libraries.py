@@ -107,8 +107,8 @@ def test_a_strangers_run_loads_no_library(names: tuple[str, ...], library: Path,
     run = tmp_path / "run"
     spread(library, run, names)
     (run / "scene.xml").write_text(scene(SPHERE.format("diffuse" if "evil" not in names else "evil")))
-    told = {"asked": {"scene": str(run / "scene.xml"), "parameters": {}}}
-    (run / "run.json").write_text(json.dumps(told))
+    message = {"asked": {"scene": str(run / "scene.xml"), "parameters": {}}}
+    (run / "run.json").write_text(json.dumps(message))
     make = (
         "import sys; sys.path.insert(0, sys.argv[1]); from hostile_readers import frames; "
         "frames().save(sys.argv[2] + '/frames.npz')"

@@ -83,9 +83,9 @@ def test_the_scene_has_the_surface_as_a_mirror(wind: float, tmp_path: Path) -> N
     place = [shape.id() for shape in scene.shapes()].index("surface")
     assert mirrors.reflection[place] == -1
     assert mirrors.roughness_m[place] == pytest.approx(sea.state.roughness_m, rel=1e-3)
-    found = sonar_in(scene)
-    assert found is not None
-    sonar, pose = found
+    result = sonar_in(scene)
+    assert result is not None
+    sonar, pose = result
     (ping,) = Simulator(scene, Sonar.create(**{**sonar.model_dump(), "beams": 8, "model": "physical"})).pings([pose])
     assert (np.asarray(ping.levels).sum() > 0) == (wind > 0)
     assert len(SeaSurface(**SMALL, seabed_cells=0).build(0).xml().split("<shape")) == 2

@@ -152,8 +152,8 @@ def test_mutants_of_stages_are_read_or_refused(name: str, tmp_path: Path) -> Non
 @pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
 @pytest.mark.parametrize("name", USD)
 def test_three_hundred_mutants_of_stages(name: str, tmp_path: Path) -> None:
-    found = attack(name, tmp_path, 300, first=8, readers=USD)
-    assert min(found.values()) > 0
+    result = attack(name, tmp_path, 300, first=8, readers=USD)
+    assert min(result.values()) > 0
 
 
 def test_what_is_no_gprim_is_left_out_with_a_warning(tmp_path: Path) -> None:

@@ -66,8 +66,8 @@ def test_colours_become_reflectivity(kind: str, suffix: str, tmp_path: Path) -> 
     mesh_world(tmp_path / f"wall.{suffix}", reflectivity="red").write(tmp_path / "red")
     np.testing.assert_allclose(seen_reflectivity(tmp_path / "red"), [1, 0.2], atol=2e-3)
     mesh_world(tmp_path / f"wall.{suffix}", reflectivity="luminance").write(tmp_path / "luminance")
-    wanted = [0.2126 + (0.7152 + 0.0722) * LINEAR[0], 0.2126 * LINEAR[1]]
-    np.testing.assert_allclose(seen_reflectivity(tmp_path / "luminance"), wanted, atol=2e-3)
+    expected = [0.2126 + (0.7152 + 0.0722) * LINEAR[0], 0.2126 * LINEAR[1]]
+    np.testing.assert_allclose(seen_reflectivity(tmp_path / "luminance"), expected, atol=2e-3)
     mesh_world(tmp_path / f"wall.{suffix}", reflectivity=0.3).write(tmp_path / "number")
     np.testing.assert_allclose(seen_reflectivity(tmp_path / "number"), [0.3, 0.3], atol=1e-6)
 
@@ -155,10 +155,10 @@ def real_models() -> list[Path]:
 @pytest.mark.parametrize("path", real_models(), ids=lambda path: path.stem)
 def test_real_models_render(path: Path, tmp_path: Path) -> None:
     scene = load_scene(mesh_world(path).write(tmp_path / "world"))
-    found = sonar_in(scene)
-    assert found is not None
-    frames = Simulator(scene, found[0].replace(model="physical", rays_per_beam=200)).render(
-        [found[1]], labels=True, gain=1.0
+    result = sonar_in(scene)
+    assert result is not None
+    frames = Simulator(scene, result[0].replace(model="physical", rays_per_beam=200)).render(
+        [result[1]], labels=True, gain=1.0
     )
     assert frames.object_id is not None
     assert (frames.object_id >= 1).mean() > 0.005

@@ -54,7 +54,7 @@ def test_a_cloud_reverberates_as_its_density_says(variant: str) -> None:
         return float((levels * sonar.range_m**power)[inside].sum())
 
     known = total(scene(ball=sphere((0, 5.1, 0), 0.1)), 3, 8, 4) / (2 / 3 * np.pi * 0.1**2)
-    count, size, radius, found = 900, (2.0, 1.5, 2.0), 0.01, []
+    count, size, radius, result = 900, (2.0, 1.5, 2.0), 0.01, []
     for seed in range(4):
         vertices, faces = particle_mesh(count, size, radius, seed)
         mesh = mi.Mesh("cloud", len(vertices), len(faces))
@@ -62,10 +62,10 @@ def test_a_cloud_reverberates_as_its_density_says(variant: str) -> None:
         values["vertex_positions"] = (vertices + np.array([0, 5, 0])).ravel().astype(np.float32)
         values["faces"] = faces.ravel().astype(np.uint32)
         values.update()
-        found.append(total(scene(cloud=mesh), 4.5, 5.5, 2) / known)  # type: ignore[arg-type]
+        result.append(total(scene(cloud=mesh), 4.5, 5.5, 2) / known)  # type: ignore[arg-type]
     density, cross_section = count / np.prod(size), 4 * np.sqrt(3) * radius**2 / 6
     solid_angle = np.radians(14) * 2 * np.sin(np.radians(7))
-    assert np.mean(found) == pytest.approx(density * cross_section * solid_angle, rel=0.12)
+    assert np.mean(result) == pytest.approx(density * cross_section * solid_angle, rel=0.12)
 
 
 def test_mistakes_are_told() -> None:

@@ -38,18 +38,18 @@ def test_heights_have_the_variance_of_the_spectrum(spectrum: WaveSpectrum) -> No
 def test_a_small_patch_rides_on_long_waves() -> None:
     """On 4 m, where the peak is 88 m long, heights are Gaussian of the whole variance, and slopes those of the spectrum."""
     spectrum = pierson_moskowitz(10.0)
-    found = seas(spectrum, 17, 150)
-    middle = found[:, 8, 8]
+    result = seas(spectrum, 17, 150)
+    middle = result[:, 8, 8]
     assert stats.kstest(middle / math.sqrt(spectrum.variance(SHORT)), stats.norm.cdf).pvalue > 1e-5
     assert middle.std() == pytest.approx(math.sqrt(spectrum.variance(SHORT)), rel=0.18)
-    assert found.std(axis=(1, 2)).mean() < 0.25 * middle.std()
+    assert result.std(axis=(1, 2)).mean() < 0.25 * middle.std()
 
 
 def test_slopes_are_those_of_the_spectrum() -> None:
     """Differences over two steps lose (sin(k d) / k d)^2: 3 % on the whole here. Downwind slopes are larger."""
     spectrum = pierson_moskowitz(4.0)
-    found = seas(spectrum, 121, 20)
-    along, across = np.diff(found, axis=1) / STEP, np.diff(found, axis=2) / STEP
+    result = seas(spectrum, 121, 20)
+    along, across = np.diff(result, axis=1) / STEP, np.diff(result, axis=2) / STEP
     total = (along**2).mean() + (across**2).mean()
     assert 0.93 < total / spectrum.mean_square_slope(SHORT) < 1.01
     assert (along**2).mean() > 1.2 * (across**2).mean()
@@ -68,10 +68,10 @@ def test_the_periodogram_falls_with_the_fourth_power() -> None:
     edges = np.geomspace(1.5, 5.0, 9)
     rings = [(k >= low) & (k < high) for low, high in itertools.pairwise(edges)]
     level = np.array([power[ring].mean() for ring in rings])
-    wanted = np.array([(spectrum.density_of_wavenumber(k[ring]) / (2 * np.pi * k[ring])).mean() for ring in rings])
-    assert level == pytest.approx(wanted, rel=0.12)
-    assert (level / wanted).mean() == pytest.approx(1, abs=0.05)
-    slope, closed = (np.polyfit(np.log(edges[:-1]), np.log(values), 1)[0] for values in (level, wanted))
+    expected = np.array([(spectrum.density_of_wavenumber(k[ring]) / (2 * np.pi * k[ring])).mean() for ring in rings])
+    assert level == pytest.approx(expected, rel=0.12)
+    assert (level / expected).mean() == pytest.approx(1, abs=0.05)
+    slope, closed = (np.polyfit(np.log(edges[:-1]), np.log(values), 1)[0] for values in (level, expected))
     assert slope == pytest.approx(closed, abs=0.05)
     assert slope == pytest.approx(-4, abs=0.15)  # the foot of the peak is in the first rings
     assert power[k > 2 * np.pi / SHORT + 1].max() < 1e-3 * level[-1]  # shorter waves are not there
@@ -86,8 +86,8 @@ def test_waves_travel_with_the_wind_at_their_speed(depth: float) -> None:
     cross = (after * before.conj()).sum(axis=0)
     k = 2 * np.pi * np.fft.fftfreq(count, STEP)
     for row in (8, 14, 24, 32):
-        wanted = math.sqrt(GRAVITY * k[row] * math.tanh(k[row] * depth))
-        assert -np.angle(cross[row, 0]) / time == pytest.approx(wanted, rel=0.03)
+        expected = math.sqrt(GRAVITY * k[row] * math.tanh(k[row] * depth))
+        assert -np.angle(cross[row, 0]) / time == pytest.approx(expected, rel=0.03)
 
 
 def test_two_times_of_a_sea_are_correlated_as_its_spectrum_says() -> None:
@@ -98,6 +98,6 @@ def test_two_times_of_a_sea_are_correlated_as_its_spectrum_says() -> None:
     omega = np.linspace(0.4 * spectrum.peak_rad_s, float(spectrum.frequency(np.array(2 * np.pi / SHORT))), 4000)
     for time in (0.4, 1.1, 2.3):
         product = (first * seas(spectrum, count, seeds, time)).mean(axis=(1, 2))
-        wanted = np.trapezoid(spectrum.density(omega) * np.cos(omega * time), omega)
-        assert abs(product.mean() - wanted) < 3.5 * product.std() / math.sqrt(seeds)
-        assert abs(product.mean() - wanted) < 0.12 * spectrum.variance(SHORT)
+        expected = np.trapezoid(spectrum.density(omega) * np.cos(omega * time), omega)
+        assert abs(product.mean() - expected) < 3.5 * product.std() / math.sqrt(seeds)
+        assert abs(product.mean() - expected) < 0.12 * spectrum.variance(SHORT)

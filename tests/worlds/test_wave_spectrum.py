@@ -28,8 +28,8 @@ def test_the_variance_of_short_waves_is_that_of_the_integral() -> None:
     whole = 0.0081 * GRAVITY**2 / (5 * spectrum.peak_rad_s**4)
     for length in (0.3, 1.0, 20.0, 60.0):
         omega = math.sqrt(2 * math.pi * GRAVITY / length)
-        wanted = -whole * math.expm1(-1.25 * (spectrum.peak_rad_s / omega) ** 4)
-        assert spectrum.variance(0.0, length) == pytest.approx(wanted, rel=1e-5)
+        expected = -whole * math.expm1(-1.25 * (spectrum.peak_rad_s / omega) ** 4)
+        assert spectrum.variance(0.0, length) == pytest.approx(expected, rel=1e-5)
         assert spectrum.variance(length) + spectrum.variance(0.0, length) == pytest.approx(whole, rel=1e-6)
     assert spectrum.variance(0.0, 0.3) == pytest.approx(0.0081 / 4 * (0.3 / (2 * math.pi)) ** 2, rel=1e-3)
     assert spectrum.variance(1e6) == 0

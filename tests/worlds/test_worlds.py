@@ -39,7 +39,7 @@ def parts(mesh: Mesh) -> list[tuple[np.ndarray, np.ndarray]]:
     assert mesh.reflectivity is not None
     order = np.argsort(ids, kind="stable")
     borders = np.flatnonzero(np.diff(ids[order])) + 1
-    return [(mesh.vertices[np.unique(mesh.faces[own])], mesh.reflectivity[own]) for own in np.split(order, borders)]
+    return [(mesh.vertices[np.unique(mesh.faces[local])], mesh.reflectivity[local]) for local in np.split(order, borders)]
 
 
 def extents(mesh: Mesh) -> np.ndarray:
@@ -52,8 +52,10 @@ def centres(mesh: Mesh) -> np.ndarray:
 
 def is_uniform(values: np.ndarray, low: float, high: float) -> None:
     """Kolmogorov-Smirnov test."""
-    found = stats.kstest(values, stats.uniform(low, high - low).cdf)
-    assert found.pvalue > P, f"not uniform in {low}..{high}: {values.min():.4f}..{values.max():.4f}, p = {found.pvalue:.1e}"
+    result = stats.kstest(values, stats.uniform(low, high - low).cdf)
+    assert result.pvalue > P, (
+        f"not uniform in {low}..{high}: {values.min():.4f}..{values.max():.4f}, p = {result.pvalue:.1e}"
+    )
 
 
 # ---------------------------------------------------------------- bytes
@@ -63,9 +65,9 @@ def is_uniform(values: np.ndarray, low: float, high: float) -> None:
 def test_the_same_seed_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
     for folder, seed in (("a", 5), ("b", 5), ("c", 6)):
         create_family(name, **SMALL[name]).build(seed).write(tmp_path / folder)
-    one, again, other = (files_of(tmp_path / folder) for folder in "abc")
+    one, again, second = (files_of(tmp_path / folder) for folder in "abc")
     assert one == again
-    assert one != other
+    assert one != second
     assert {"scene.xml"} < set(one)
 
 
@@ -135,17 +137,17 @@ def test_rotations_are_about_each_axis_within_their_limits() -> None:
     one = {"cubes_a_side": 20, "cylinders_a_side": 0, "capsules_a_side": 0, "rock_size_m": (1, 1), "centre_height_m": (0, 0)}
     flat = RockyField(**one, rotation_deg=(0, 0)).build(3).meshes[0].vertices.reshape(400, -1, 3)
     turned = RockyField(**one, rotation_deg=(30, 30)).build(3).meshes[0].vertices.reshape(400, -1, 3)
-    wanted = Rotation.from_euler("xyz", [30, 30, 30], degrees=True).apply(flat[0] - flat[0].mean(axis=0))
-    np.testing.assert_allclose(turned[0] - turned[0].mean(axis=0), wanted, atol=3e-6)
+    expected = Rotation.from_euler("xyz", [30, 30, 30], degrees=True).apply(flat[0] - flat[0].mean(axis=0))
+    np.testing.assert_allclose(turned[0] - turned[0].mean(axis=0), expected, atol=3e-6)
     anyhow = RockyField(**one).build(3).meshes[0].vertices.reshape(400, -1, 3)
     upright = flat - flat.mean(axis=1, keepdims=True)
     drawn = stream(3, 1, 0)
     drawn.random(400 * (2 + 1 + 3))  # places, heights, sizes come first
     wanted_turns = Rotation.from_euler("xyz", -165 + 265 * drawn.random((400, 3)), degrees=True)
     for before, after, turn in zip(upright, anyhow - anyhow.mean(axis=1, keepdims=True), wanted_turns, strict=True):
-        found, error = Rotation.align_vectors(after, before)
+        result, error = Rotation.align_vectors(after, before)
         assert error < 1e-4
-        assert np.degrees((turn * found.inv()).magnitude()) < 0.01
+        assert np.degrees((turn * result.inv()).magnitude()) < 0.01
 
 
 def test_numbers_of_rocks_are_drawn_from_30_to_130() -> None:
@@ -167,7 +169,7 @@ def test_objects_are_numbered_through_and_have_their_own_reflectivity() -> None:
     values = np.concatenate([mesh.reflectivity for mesh in world.meshes if mesh.reflectivity is not None])
     assert 0 <= values.min() < 0.25
     assert 0.75 < values.max() <= 1
-    within = np.mean([own.std() for mesh in world.meshes for _, own in parts(mesh)])
+    within = np.mean([local.std() for mesh in world.meshes for _, local in parts(mesh)])
     assert 0.02 < within < values.std()  # Perlin's noise varies over a rock, less than between rocks
 
 
@@ -193,8 +195,8 @@ def test_perlin_is_the_published_noise() -> None:
             total += weight * np.dot(gradient, inside - offset)
         return total
 
-    wanted = [0.5 + 0.75 * (noise(p / 0.7) + 0.5 * noise(2 * p / 0.7)) / 1.5 for p in places]
-    np.testing.assert_allclose(got, np.clip(wanted, 0, 1), atol=1e-12)
+    expected = [0.5 + 0.75 * (noise(p / 0.7) + 0.5 * noise(2 * p / 0.7)) / 1.5 for p in places]
+    np.testing.assert_allclose(got, np.clip(expected, 0, 1), atol=1e-12)
 
 
 # ---------------------------------------------------------------- hull, flat objects, pattern
@@ -237,9 +239,9 @@ def test_flat_objects_follow_their_definition() -> None:
     assert len(set(counts)) > 9
     rectangles, ellipses = world.meshes
     assert rectangles.reflectivity is not None
-    own = np.array([(reflectivity.min(), reflectivity.max()) for _, reflectivity in parts(rectangles)])
-    np.testing.assert_array_equal(own[:, 0], own[:, 1])
-    is_uniform(own[:, 0], 0, 1)
+    local = np.array([(reflectivity.min(), reflectivity.max()) for _, reflectivity in parts(rectangles)])
+    np.testing.assert_array_equal(local[:, 0], local[:, 1])
+    is_uniform(local[:, 0], 0, 1)
     is_uniform(centres(rectangles)[:, 0], -25, 25)
     corners = np.array([vertices[vertices[:, 2] < 1e-9] for vertices, _ in parts(rectangles)])
     edge = np.sort(np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2), axis=1)[:, :2]
@@ -281,10 +283,10 @@ def test_worlds_render_and_tell_their_objects(name: str, tmp_path: Path) -> None
     """The scene loads as it is, from the sonar that stands in it; labels name shapes and objects of the file."""
     world = create_family(name, **({"size_m": 20.0, "a_side": (20, 30)} if name == "rocky-field" else {})).build(4)
     scene = load_scene(world.write(tmp_path / "world"))
-    found = sonar_in(scene)
-    assert found is not None
-    frames = Simulator(scene, found[0].replace(model="physical", rays_per_beam=200)).render(
-        [found[1]], labels=True, gain=1.0
+    result = sonar_in(scene)
+    assert result is not None
+    frames = Simulator(scene, result[0].replace(model="physical", rays_per_beam=200)).render(
+        [result[1]], labels=True, gain=1.0
     )
     assert np.isfinite(frames.image).all()
     assert 0.02 < (frames.image > 0).mean() < 0.98

@@ -82,15 +82,15 @@ def test_covariance_of_scatterers_drawn_at_random(source: str) -> None:
     """Products of taps over 12 grounds against the law, by a z-test of their weighted sum: of points written down in NumPy,
     and of the simulator's own."""
     motion, law = Motion(0.012, 0.03, 0.0), ResponseCovariance(SONAR, SONAR.receivers[0], HEIGHT, 0.05)
-    own, shared = (law.covariance(motion, lag) for lag in (0, 1))
+    local, shared = (law.covariance(motion, lag) for lag in (0, 1))
     grounds = [simulated(motion, seed) if source == "simulator" else pair(motion, seed=seed) for seed in range(12)]
     z = np.array([ground.response[:, 0, law.taps] for ground in grounds])
     # a sum of products that the law says is real, and as large as its energy times the mean strength of 1/2
-    told = np.einsum("nk,kl,nl->n", z[:, 0], shared.conj(), z[:, 1].conj()) / (np.abs(shared) ** 2).sum() / 0.5
-    error = np.std(told.real, ddof=1) / np.sqrt(len(told))
-    assert abs(told.real.mean() - 1) < 3.5 * error, f"{told.real.mean():.3f} +- {error:.3f}"
-    assert abs(told.imag.mean()) < 3.5 * np.std(told.imag, ddof=1) / np.sqrt(len(told))
-    energy = (np.abs(z) ** 2).mean(axis=(0, 1)).sum() / (0.5 * np.diag(own).real.sum())
+    message = np.einsum("nk,kl,nl->n", z[:, 0], shared.conj(), z[:, 1].conj()) / (np.abs(shared) ** 2).sum() / 0.5
+    error = np.std(message.real, ddof=1) / np.sqrt(len(message))
+    assert abs(message.real.mean() - 1) < 3.5 * error, f"{message.real.mean():.3f} +- {error:.3f}"
+    assert abs(message.imag.mean()) < 3.5 * np.std(message.imag, ddof=1) / np.sqrt(len(message))
+    energy = (np.abs(z) ** 2).mean(axis=(0, 1)).sum() / (0.5 * np.diag(local).real.sum())
     assert abs(energy - 1) < 0.25, f"energy {energy:.3f} of the law's"
 
 
@@ -102,9 +102,9 @@ def test_energy_at_every_delay_is_that_of_the_simulator() -> None:
     rng, poses = np.random.default_rng(1), np.zeros((300, 6))
     poses[:, :2], poses[:, 2], poses[:, 5] = rng.uniform(-7, 7, (300, 2)), HEIGHT, rng.uniform(0, 6, 300)
     received = np.concatenate([part.response for part in simulator_over(12.0, 7).pings(poses)])[:, :, law.taps]
-    found: NDArray[np.float64] = (np.abs(received) ** 2).mean(axis=(0, 1))
-    told = 0.5 * np.diag(law.covariance(Motion(0.0, 0.0, 0.0), 0)).real
-    pairs = zip(*(np.array_split(power, 5) for power in (found, told)), strict=True)
+    result: NDArray[np.float64] = (np.abs(received) ** 2).mean(axis=(0, 1))
+    message = 0.5 * np.diag(law.covariance(Motion(0.0, 0.0, 0.0), 0)).real
+    pairs = zip(*(np.array_split(power, 5) for power in (result, message)), strict=True)
     fifths = [10 * np.log10(of_simulator.sum() / of_law.sum()) for of_simulator, of_law in pairs]
     assert np.abs(fifths).max() < 0.3, f"{np.round(fifths, 2)} dB"
 
@@ -112,9 +112,9 @@ def test_energy_at_every_delay_is_that_of_the_simulator() -> None:
 def test_covariance_is_that_of_one_ground() -> None:
     """Hermitian, and together with the other ping's positive; the other way round it is the adjoint."""
     law = ResponseCovariance(SONAR, SONAR.receivers[1], HEIGHT, 0.05)
-    own, shared = (law.covariance((0.02, 0.01, 0.004), lag) for lag in (0, 1))
-    size = np.linalg.eigvalsh(block_toeplitz([own, shared]))
-    np.testing.assert_allclose(own, own.conj().T, atol=1e-12 * abs(own).max())
+    local, shared = (law.covariance((0.02, 0.01, 0.004), lag) for lag in (0, 1))
+    size = np.linalg.eigvalsh(block_toeplitz([local, shared]))
+    np.testing.assert_allclose(local, local.conj().T, atol=1e-12 * abs(local).max())
     assert size.min() > -1e-4 * size.max()
 
 
@@ -134,21 +134,21 @@ def test_law_is_the_same_for_receivers_of_one_kind() -> None:
     """What is computed for a look forward serves the other three, turned."""
     motion = np.array([0.02, -0.012, 0.0, 0.0])
     for receiver_band, receiver in zip(receiver_bands_of(SONAR, HEIGHT, 0.05, 0.1), SONAR.receivers, strict=True):
-        own = ResponseCovariance(SONAR, receiver, HEIGHT, 0.05, 0.1)
-        wanted, got = own.covariance(motion), receiver_band.law.covariance(receiver_band.turn @ motion)
-        np.testing.assert_allclose(got, wanted, atol=1e-4 * abs(wanted).max())
+        local = ResponseCovariance(SONAR, receiver, HEIGHT, 0.05, 0.1)
+        expected, got = local.covariance(motion), receiver_band.law.covariance(receiver_band.turn @ motion)
+        np.testing.assert_allclose(got, expected, atol=1e-4 * abs(expected).max())
 
 
 def test_gradient_is_the_slope_of_the_likelihood() -> None:
     receiver_band = receiver_bands_of(SONAR, HEIGHT, 0.05, 0.1)[3]
     z = pair(MOTIONS[0], noise=2e-4).response[:, 3, receiver_band.law.taps].astype(complex)
     at = np.array([MOTIONS[0].sideways + 2e-4, MOTIONS[0].forward - 1e-4, 0.0, 0.0])
-    told = judged(receiver_band, z, at, (0, 1), 1)
+    message = judged(receiver_band, z, at, (0, 1), 1)
     for number in (0, 1):
         step = 2e-5 * np.eye(4)[number]
         high, low = (judged(receiver_band, z, at + sign * step, (), 1).likelihood for sign in (1, -1))
-        size = np.sqrt(told.information[number, number])
-        assert abs((high - low) / 4e-5 - told.gradient[number]) < 0.1 * size + 0.1 * abs(told.gradient[number])
+        size = np.sqrt(message.information[number, number])
+        assert abs((high - low) / 4e-5 - message.gradient[number]) < 0.1 * size + 0.1 * abs(message.gradient[number])
 
 
 # ---------------------------------------------------------------- known motions
@@ -175,7 +175,7 @@ def test_likelihood_is_nearer_than_correlation_over_many_grounds() -> None:
         name: [create_estimator(name, **OPTIONS[name]).estimate(pair(motion, seed=200 + seed)) for seed in range(12)]
         for name in ("likelihood", "correlation")
     }
-    errors = {name: np.array([one.motion for one in found])[:, :2] - motion[:2] for name, found in answers.items()}
+    errors = {name: np.array([one.motion for one in result])[:, :2] - motion[:2] for name, result in answers.items()}
     rmse = {name: 1e3 * np.sqrt((error**2).sum(axis=1).mean()) for name, error in errors.items()}
     assert rmse["likelihood"] < 0.9 * rmse["correlation"], rmse
     laws = [np.asarray(one.covariance)[:2, :2] for one in answers["likelihood"]]
@@ -232,10 +232,10 @@ def test_limit_falls_with_noise_and_grows_with_what_is_unknown() -> None:
     motion = (0.02, 0.01, 0.0)
     quiet, loud = (channel_crlb(SONAR, HEIGHT, motion, snr_db=snr) for snr in (40.0, 10.0))
     assert (quiet < loud).all()
-    told = impulse_information(SONAR, HEIGHT, motion, free=(0, 1, 2))
+    message = impulse_information(SONAR, HEIGHT, motion, free=(0, 1, 2))
     two = impulse_information(SONAR, HEIGHT, motion, free=(0, 1))
-    np.testing.assert_allclose(told[:2, :2], two, rtol=1e-6)
-    assert (np.linalg.inv(told)[[0, 1], [0, 1]] >= np.linalg.inv(two)[[0, 1], [0, 1]] * (1 - 1e-9)).all()
+    np.testing.assert_allclose(message[:2, :2], two, rtol=1e-6)
+    assert (np.linalg.inv(message)[[0, 1], [0, 1]] >= np.linalg.inv(two)[[0, 1], [0, 1]] * (1 - 1e-9)).all()
 
 
 def test_limit_is_the_same_forward_and_sideways() -> None:
@@ -247,13 +247,13 @@ def test_limit_is_the_same_forward_and_sideways() -> None:
 def test_turns_show_where_receivers_sit_beside_their_look() -> None:
     """On a lever across the look a turn moves the receiver along it; on a lever along the look it hardly shows."""
     turned = [(0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (-0.3, 0.0, 0.0), (0.0, -0.3, 0.0)]
-    beside = [one.model_copy(update={"position": at}) for one, at in zip(SONAR.receivers, turned, strict=True)]
+    neighbours = [one.model_copy(update={"position": at}) for one, at in zip(SONAR.receivers, turned, strict=True)]
     motion = (0.01, 0.005, 0.0)
     along, across = (
         channel_crlb(
             SONAR.replace(receivers=tuple(one.model_dump() for one in receiver_bands)), HEIGHT, motion, free=(0, 1, 2)
         )[2]
-        for receiver_bands in (SONAR.receivers, beside)
+        for receiver_bands in (SONAR.receivers, neighbours)
     )
     assert across < along / 3, np.degrees([across, along])
 

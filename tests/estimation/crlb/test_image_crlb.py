@@ -53,8 +53,8 @@ def test_grey_values_have_the_law_that_noise_gives_them(noise: NoiseModel, level
     often = expected > 5
     assert abs(law.sum() - 1) < 1e-12
     assert greys[~often].sum() < expected[~often].sum() + 5 * np.sqrt(expected[~often].sum()) + 5
-    got, wanted = np.append(greys[often], greys[~often].sum()), np.append(expected[often], expected[~often].sum())
-    assert stats.chisquare(got[wanted > 0], wanted[wanted > 0]).pvalue > 1e-4
+    got, target = np.append(greys[often], greys[~often].sum()), np.append(expected[often], expected[~often].sum())
+    assert stats.chisquare(got[target > 0], target[target > 0]).pvalue > 1e-4
 
 
 def test_derivative_of_the_law() -> None:
@@ -72,11 +72,11 @@ def test_information_of_an_added_rayleigh_value(greys: int) -> None:
     g, phase = 0.1, np.array([0.2, 0.5])
     u = (1 - phase) / greys / g
     first = u**2 * np.exp(-(u**2)) / -np.expm1(-(u**2) / 2)
-    wanted = (first + special.exp1(u**2 / 2) / 2 + u**2 * np.exp(-(u**2) / 2)) / g**2
-    told = information(NoiseModel(mean=0.1, std=0.01, scale=g), (20 + phase - 0.5) / greys, greys=greys)
+    expected = (first + special.exp1(u**2 / 2) / 2 + u**2 * np.exp(-(u**2) / 2)) / g**2
+    message = information(NoiseModel(mean=0.1, std=0.01, scale=g), (20 + phase - 0.5) / greys, greys=greys)
     # rounding hides a little of the density in the next few grey values
-    np.testing.assert_allclose(told.law[:, 0, 0], wanted, rtol=0.025)  # type: ignore[index]
-    assert (told.law[:, 0, 0] < wanted).all()  # type: ignore[index]
+    np.testing.assert_allclose(message.law[:, 0, 0], expected, rtol=0.025)  # type: ignore[index]
+    assert (message.law[:, 0, 0] < expected).all()  # type: ignore[index]
 
 
 def test_finer_grey_values_tell_more_by_a_logarithm() -> None:
@@ -84,9 +84,9 @@ def test_finer_grey_values_tell_more_by_a_logarithm() -> None:
     level = np.linspace(0.2, 0.2 + 4 / 255, 400, endpoint=False)
     by_bits = []
     for greys in (255, 511, 1023, 2047):
-        told = information(NoiseModel(mean=0.1, std=0.01, scale=0.1), level, greys=greys)
-        by_bits.append(told.law[:, 0, 0].mean())  # type: ignore[index]
-        np.testing.assert_allclose(told.matched()[:, 0, 0], 1 / ((2 - np.pi / 2) * 0.1**2), rtol=2e-3)
+        message = information(NoiseModel(mean=0.1, std=0.01, scale=0.1), level, greys=greys)
+        by_bits.append(message.law[:, 0, 0].mean())  # type: ignore[index]
+        np.testing.assert_allclose(message.matched()[:, 0, 0], 1 / ((2 - np.pi / 2) * 0.1**2), rtol=2e-3)
     np.testing.assert_allclose(np.diff(by_bits), np.log(2) / 0.1**2, rtol=0.02)
 
 
@@ -104,9 +104,9 @@ def test_rounding_and_clipping_only_take_information_away() -> None:
 @pytest.mark.parametrize("noise", [LOW, HIGH], ids=["low", "high"])
 def test_the_matched_gaussian_never_tells_more_than_the_law(noise: NoiseModel) -> None:
     filled, level = np.meshgrid([0.05, 0.3, 0.7, 0.99], np.linspace(0.02, 0.9, 20))
-    told = information(noise, filled * level, filled)
-    assert told.law is not None
-    assert np.linalg.eigvalsh(told.law - told.matched()).min() > -1e-8 * told.law.max()
+    message = information(noise, filled * level, filled)
+    assert message.law is not None
+    assert np.linalg.eigvalsh(message.law - message.matched()).min() > -1e-8 * message.law.max()
     full = information(HIGH, np.linspace(0.02, 0.5, 500))
     ratio = np.sqrt(full.matched()[:, 0, 0] / full.law[:, 0, 0])  # type: ignore[index]
     assert 0.58 < ratio.mean() < 0.64  # the true bound is about 0.6 of the variance-matched one
@@ -125,21 +125,21 @@ def test_a_pixel_that_is_filled_or_not_is_a_coin_where_it_shows() -> None:
 def test_sums_have_the_information_of_their_gaussian() -> None:
     """The law that ``apply_sum`` draws: 1 / V for the sum, and for the number of echoes by mean and by variance."""
     nonzero, cells = np.array([0.0, 30.0, 96.0]), 96
-    told = information_of_sums(HIGH, nonzero, cells)
+    message = information_of_sums(HIGH, nonzero, cells)
     drawn = HIGH.apply_sum(np.full((4000, 3), 20.0), np.tile(nonzero, (4000, 1)), cells, seed=1, frames=np.arange(4000))
-    np.testing.assert_allclose(told.variance, drawn.var(axis=0), rtol=5 * np.sqrt(2 / 4000))
-    np.testing.assert_allclose(told.law[:, 0, 0], 1 / told.variance)  # type: ignore[index]
-    by_one = np.diff(information_of_sums(HIGH, nonzero + 1e-3, cells).variance - told.variance)
+    np.testing.assert_allclose(message.variance, drawn.var(axis=0), rtol=5 * np.sqrt(2 / 4000))
+    np.testing.assert_allclose(message.law[:, 0, 0], 1 / message.variance)  # type: ignore[index]
+    by_one = np.diff(information_of_sums(HIGH, nonzero + 1e-3, cells).variance - message.variance)
     assert abs(by_one).max() < 1e-12  # linear in the number
-    slope = (information_of_sums(HIGH, nonzero + 1, cells).variance - told.variance)[0]
-    wanted = told.slope[:, 1] ** 2 / told.variance + slope**2 / (2 * told.variance**2)
-    np.testing.assert_allclose(told.law[:, 1, 1], wanted)  # type: ignore[index]
+    slope = (information_of_sums(HIGH, nonzero + 1, cells).variance - message.variance)[0]
+    expected = message.slope[:, 1] ** 2 / message.variance + slope**2 / (2 * message.variance**2)
+    np.testing.assert_allclose(message.law[:, 1, 1], expected)  # type: ignore[index]
 
 
 def test_without_noise_only_rounding_is_left() -> None:
-    told = information(NOISE_MODELS["none"], 0.3)
-    assert told.law is None
-    np.testing.assert_allclose(told.matched(), [[12 * 255**2, 0], [0, 0]])
+    message = information(NOISE_MODELS["none"], 0.3)
+    assert message.law is None
+    np.testing.assert_allclose(message.matched(), [[12 * 255**2, 0], [0, 0]])
     assert information_of_sums(NOISE_MODELS["none"], 5.0, 10).law is None
 
 
@@ -168,9 +168,9 @@ def test_an_even_floor_does_not_tell_the_motion(model: str) -> None:
     from mitsonar.simulation.derivatives import differentiate
 
     source = simulator(SONAR.replace(model=model), floor=floor())
-    (found,) = next(differentiate(source, POSE, gain_of(source), pings=2))
-    assert found.filled.max() == 1
-    assert np.isinf(bound(found, HIGH).std()).all()  # type: ignore[union-attr]
+    (result,) = next(differentiate(source, POSE, gain_of(source), pings=2))
+    assert result.filled.max() == 1
+    assert np.isinf(bound(result, HIGH).std()).all()  # type: ignore[union-attr]
 
 
 @pytest.mark.usefixtures("variant")
@@ -189,8 +189,8 @@ def test_a_ramp_moves_as_geometry_says(model: str) -> None:
     )
     pose = Pose.from_degrees([0.3, -0.2, 2.5, 35, 0, 0])
     gain = 0.3 / float(next(even.pings([pose])).levels.max())
-    (found,), (flat,) = (next(differentiate(one, pose, gain, pings=10)) for one in (source, even))
-    by_sideways, by_forward, by_yaw = np.moveaxis(found.jacobian[..., 0, :].mean(axis=0, dtype=float), -1, 0)
+    (result,), (flat,) = (next(differentiate(one, pose, gain, pings=10)) for one in (source, even))
+    by_sideways, by_forward, by_yaw = np.moveaxis(result.jacobian[..., 0, :].mean(axis=0, dtype=float), -1, 0)
     inner = flat.filled == 1
     starboard = GroundGeometry(sonar.range_m, sonar.bearing_rad, sonar.bearing, 2.5, pose.pitch).points[..., 0]
     size = 0.04 * flat.level[inner]
@@ -210,17 +210,17 @@ def test_two_halves_cancel_the_noise_of_rays() -> None:
 
     texture = {"type": "cell_noise", "cells": 600}
     source = simulator(SONAR.replace(model="thesis", rays_per_beam=60), floor=floor(diffuse(texture), 10))
-    few = [found for (found,) in differentiate(source, [POSE] * 40, 0.2, pings=1)]
+    few = [result for (result,) in differentiate(source, [POSE] * 40, 0.2, pings=1)]
     (many,) = next(differentiate(source, POSE, 0.2, pings=64))
 
     def forward(first: np.ndarray, second: np.ndarray) -> float:
         return float(np.sum(first[..., 0, 1].astype(float) * second[..., 0, 1]))
 
-    wanted = forward(*many.jacobian)
-    crossed = [forward(*found.jacobian) for found in few]
-    assert abs(np.mean(crossed) - wanted) < 4 * np.std(crossed) / np.sqrt(40) + 0.02 * wanted
-    lifted = np.mean([forward(found.jacobian.mean(axis=0), found.jacobian.mean(axis=0)) for found in few])
-    assert lifted > 1.2 * wanted, f"{lifted / wanted:.2f}"
+    expected = forward(*many.jacobian)
+    crossed = [forward(*result.jacobian) for result in few]
+    assert abs(np.mean(crossed) - expected) < 4 * np.std(crossed) / np.sqrt(40) + 0.02 * expected
+    lifted = np.mean([forward(result.jacobian.mean(axis=0), result.jacobian.mean(axis=0)) for result in few])
+    assert lifted > 1.2 * expected, f"{lifted / expected:.2f}"
 
 
 @pytest.mark.usefixtures("variant")
@@ -228,8 +228,8 @@ def test_the_same_pings_twice_and_words_that_are_wrong() -> None:
     from mitsonar.simulation.derivatives import differentiate
 
     source = simulator(floor=floor(diffuse({"type": "cell_noise", "cells": 600}), 10))
-    one, other = (next(differentiate(source, POSE, 1e3, pings=2))[0] for _ in range(2))
-    assert np.array_equal(one.jacobian, other.jacobian)
+    one, second = (next(differentiate(source, POSE, 1e3, pings=2))[0] for _ in range(2))
+    assert np.array_equal(one.jacobian, second.jacobian)
     with pytest.raises(MitsonarError, match="at least 1 ping"):
         next(differentiate(source, POSE, 1.0, pings=0))
     with pytest.raises(MitsonarError, match="finite"):
@@ -269,16 +269,16 @@ def test_the_doubt_is_the_scatter_of_bounds() -> None:
     """Noise on Jacobians: F is right on average, and its standard error is what is scattered about it."""
     rng = np.random.default_rng(1)
     true, weight = rng.normal(size=(400, 1, 3)) * [2, 5, 3], np.ones((400, 1, 1))
-    made = [fisher(true + rng.normal(size=(2, 400, 1, 3)), weight) for _ in range(400)]
+    result = [fisher(true + rng.normal(size=(2, 400, 1, 3)), weight) for _ in range(400)]
     exact = true[:, 0].T @ true[:, 0]
-    got = np.array([one.information for one in made])
-    error = np.sqrt([one.reason[0, 1, 0, 1] for one in made]).mean()
+    got = np.array([one.information for one in result])
+    error = np.sqrt([one.reason[0, 1, 0, 1] for one in result]).mean()
     assert (abs(got.mean(axis=0) - exact) < 4.5 * got.std(axis=0) / 20).all()
     np.testing.assert_allclose(error, got[:, 0, 1].std(), rtol=0.2)
-    said = np.array([one.relative_error for one in made]).mean(axis=0)
-    stds = np.array([one.std() for one in made])
+    output = np.array([one.relative_error for one in result]).mean(axis=0)
+    stds = np.array([one.std() for one in result])
     assert np.isfinite(stds).all()
-    np.testing.assert_allclose(said, stds.std(axis=0) / stds.mean(axis=0), rtol=0.25)
+    np.testing.assert_allclose(output, stds.std(axis=0) / stds.mean(axis=0), rtol=0.25)
 
 
 def test_the_window_follows_the_floor() -> None:
@@ -478,26 +478,26 @@ def test_segments_and_their_sums() -> None:
         azimuth_fov_deg=100, elevation_fov_deg=100, beams=40, rays_per_beam=80, range_bins=64, range_min=2, range_max=4.5
     )
     names = ["q1", "q2", "q3", "q4"]
-    made = scene(floor=floor(diffuse({"type": "cell_noise", "cells": 100}), 10))
-    source = Simulator(made, sonar, views=[Segment(sonar, name) for name in names])
+    built = scene(floor=floor(diffuse({"type": "cell_noise", "cells": 100}), 10))
+    source = Simulator(built, sonar, views=[Segment(sonar, name) for name in names])
     pose = Pose.from_degrees([0, 0, 2.5, 90, 0, -90])
     gain = 0.5 / float(next(source.pings([pose])).levels.max())
-    found = bounds_of_views(names, next(differentiate(source, pose, gain, pings=24)), LOW)
-    assert {key[0] for key in found} == {"all views", *names}
+    result = bounds_of_views(names, next(differentiate(source, pose, gain, pings=24)), LOW)
+    assert {key[0] for key in result} == {"all views", *names}
     for kind in ("image", "vector"):
-        whole = found["all views", kind, "pixel"]
-        parts = [found[name, kind, "pixel"] for name in names]
+        whole = result["all views", kind, "pixel"]
+        parts = [result[name, kind, "pixel"] for name in names]
         assert whole is not None
         known = [part.information for part in parts if part is not None]
         assert len(known) == len(parts)
         np.testing.assert_allclose(whole.information, sum(known, np.zeros((3, 3))))
         assert np.isfinite(whole.std()).all()
-    overlapping = Simulator(made, sonar, views=[Segment(sonar, name) for name in ("whole", "q1")])
+    overlapping = Simulator(built, sonar, views=[Segment(sonar, name) for name in ("whole", "q1")])
     with pytest.raises(MitsonarError, match="name one of whole, q1"):
         cramer_rao_bound(overlapping, pose, LOW, gain, pings=2)
-    images, vectors = (found["all views", kind, "gaussian"] for kind in ("image", "vector"))
+    images, vectors = (result["all views", kind, "gaussian"] for kind in ("image", "vector"))
     assert (images.std() < 0.6 * vectors.std()).all()  # type: ignore[union-attr]
-    whole = found["all views", "vector", "pixel"]
+    whole = result["all views", "vector", "pixel"]
     assert whole is not None
     assert (cramer_rao_bound(source, pose, LOW, gain, kind="vector", pings=24)[0] == whole.std(2)).all()
 
@@ -538,7 +538,7 @@ def test_the_command_answers_the_buyer(tmp_path: Path) -> None:
     assert code == 0, text
     assert "image    image   pixel     -" in text
     assert "without limit" in text
-    for words, said in (
+    for words, output in (
         (["--vary", "heigth=1"], "height_m"),
         (["--vary", "window=3"], "3.2..5.6"),
         (["--from", "0,0,2.5,2,0,0", "--vary", "pitch_deg=3"], "horizon"),
@@ -546,7 +546,7 @@ def test_the_command_answers_the_buyer(tmp_path: Path) -> None:
     ):
         code, text = command(path, *words)
         assert code == 2
-        assert said in text, text
+        assert output in text, text
 
 
 @pytest.mark.usefixtures("variant")
@@ -565,9 +565,9 @@ def test_the_command_reads_data_sets(tmp_path: Path) -> None:
     (exact,) = [row["two_frames_each"] for row in rows if (row["data"], row["law"]) == ("image", "pixel")]
     store = DataStore.open(str(url))
     renderer = SceneRenderer(store.recipe, store.scenes[0])
-    wanted = cramer_rao_bound(renderer.simulator, store.read("pose")[:1], LOW, float(store.about["gain"]))[0]
-    assert np.isfinite(wanted).all()
-    np.testing.assert_allclose(exact[0], wanted * [1e3, 1e3, np.degrees(1)], rtol=1e-5)
+    expected = cramer_rao_bound(renderer.simulator, store.read("pose")[:1], LOW, float(store.about["gain"]))[0]
+    assert np.isfinite(expected).all()
+    np.testing.assert_allclose(exact[0], expected * [1e3, 1e3, np.degrees(1)], rtol=1e-5)
     code, text = command(url, "--sonar", "didson300")
     assert code == 2
     assert "data set" in text

@@ -55,12 +55,12 @@ def test_the_covariance_is_that_of_the_formula_and_is_inverted() -> None:
     covariance = ScoreCovariance.from_parts([(turn, shared), (power, shared * shared)], shape)
     whole = np.kron(neighbours(7, 0.42), neighbours(5, 0.45))
     flat = turn.ravel()
-    wanted = (flat.conj()[:, None] * whole * flat).real + 0.3 * whole**2 + 0.1 * np.eye(35)
+    expected = (flat.conj()[:, None] * whole * flat).real + 0.3 * whole**2 + 0.1 * np.eye(35)
     values = rng.normal(size=(3, *shape))
-    np.testing.assert_allclose((covariance @ values).reshape(3, -1), values.reshape(3, -1) @ wanted, atol=1e-12)
-    np.testing.assert_allclose(np.diag(wanted), 1)
+    np.testing.assert_allclose((covariance @ values).reshape(3, -1), values.reshape(3, -1) @ expected, atol=1e-12)
+    np.testing.assert_allclose(np.diag(expected), 1)
     np.testing.assert_allclose(
-        covariance.solve(values).reshape(3, -1), np.linalg.solve(wanted, values.reshape(3, -1).T).T, rtol=1e-3, atol=1e-4
+        covariance.solve(values).reshape(3, -1), np.linalg.solve(expected, values.reshape(3, -1).T).T, rtol=1e-3, atol=1e-4
     )
 
 
@@ -70,9 +70,9 @@ def test_an_even_change_of_speckle_counts_independent_cells() -> None:
     covariance = ScoreCovariance.from_parts([(np.ones(shape), shared * shared)], shape)
     jacobian = np.zeros((2, *shape, 3))
     jacobian[..., 0] = 1
-    told = CellScores(jacobian, np.ones(shape), covariance).bound().information[0, 0]
+    message = CellScores(jacobian, np.ones(shape), covariance).bound().information[0, 0]
     alone = (1 + 2 * 0.42**2) * (1 + 2 * 0.45**2)
-    assert told == pytest.approx(200 * 120 / alone, rel=0.01)
+    assert message == pytest.approx(200 * 120 / alone, rel=0.01)
 
 
 def test_strong_echoes_have_gaussian_amplitudes() -> None:
@@ -81,12 +81,12 @@ def test_strong_echoes_have_gaussian_amplitudes() -> None:
     shape, noise = (9, 6), 1e-7
     echo = np.exp(2j * np.pi * rng.random(shape)) * rng.uniform(1, 2, shape)
     slope = rng.normal(size=(*shape, 3))
-    found = CellScores(np.stack([slope, slope]), *grain_law(echo, np.full(shape, noise), near(*shape))).bound()
+    result = CellScores(np.stack([slope, slope]), *grain_law(echo, np.full(shape, noise), near(*shape))).bound()
     by_amplitude = (slope / (2 * np.abs(echo))[..., None]).reshape(-1, 3)
     turn = np.exp(1j * np.angle(echo)).ravel()
     whole = noise / 2 * (turn.conj()[:, None] * np.kron(neighbours(9, 0.42), neighbours(6, 0.45)) * turn).real
-    wanted = by_amplitude.T @ np.linalg.solve(whole, by_amplitude)
-    np.testing.assert_allclose(found.information, wanted, rtol=2e-3, atol=1e-3 * np.abs(wanted).max())
+    expected = by_amplitude.T @ np.linalg.solve(whole, by_amplitude)
+    np.testing.assert_allclose(result.information, expected, rtol=2e-3, atol=1e-3 * np.abs(expected).max())
 
 
 def test_rounding_is_a_variance_and_without_noise_it_is_all() -> None:
@@ -112,8 +112,8 @@ def source(noise_db: float, even: bool = False) -> Simulator:
     grain = ndimage.gaussian_filter(np.random.default_rng(5).random((400, 400)), 1.5, mode="wrap")
     picture = mi.Bitmap(np.clip(0.5 + (grain - 0.5) * 3, 0.02, 1).astype(np.float32)[..., None])
     blotches = {"type": "bitmap", "bitmap": picture, "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
-    made = scene(floor=floor(diffuse(0.5 if even else blotches), 10.0))
-    return Simulator(made, SONAR.replace(noise_level_db=noise_db))
+    result = scene(floor=floor(diffuse(0.5 if even else blotches), 10.0))
+    return Simulator(result, SONAR.replace(noise_level_db=noise_db))
 
 
 @lru_cache(maxsize=4)
@@ -142,10 +142,10 @@ def rician_scores(amplitude: Array, echo: Array, noise: Array, weight: Array) ->
 def grain_oracle(bounds: SpeckleBounds, draws: int) -> float:
     """e' F e / 3 of scoring from a start that is off, with the echoes rendered anew at each step; noise as pings have it."""
     pose = np.array(POSE)
-    told = bounds.grain(pose)
+    message = bounds.grain(pose)
     weight, covariance = grain_law(bounds.imager.echoes(pose)[0].astype(complex), bounds.noise, bounds.noise_correlation)
-    told = CellScores(told.jacobian, weight, covariance)  # amplitudes are not rounded here
-    limit = told.bound()
+    message = CellScores(message.jacobian, weight, covariance)  # amplitudes are not rounded here
+    limit = message.bound()
     echo = bounds.imager.echoes(pose)[0]
     amplitude = np.abs(np.array([echo + bounds.imager.receiver.noise(ping) for ping in range(draws)])).astype(float)
     motion = np.tile(limit.std() * [2, -1, 1], (draws, 1))
@@ -153,7 +153,7 @@ def grain_oracle(bounds: SpeckleBounds, draws: int) -> float:
         for frame in range(draws):
             moved = np.abs(bounds.imager.echoes(np.array(compose(POSE, Motion(*motion[frame]))))[0]).astype(float)
             scores = rician_scores(amplitude[frame], np.maximum(moved, 1e-12), bounds.noise, weight)
-            motion[frame] += np.linalg.solve(limit.information, pulled(told, scores[None])[0])
+            motion[frame] += np.linalg.solve(limit.information, pulled(message, scores[None])[0])
     return float(np.einsum("ni,ij,nj->n", motion, limit.information, motion).mean() / 3)
 
 
@@ -171,15 +171,15 @@ def ground_oracle(bounds: SpeckleBounds, draws: int) -> float:
     from mitsonar.simulation.models.coherent import CoherentImager
 
     pose = np.array(POSE)
-    told = bounds.ground(pose, 12)
-    limit = told.bound()
+    message = bounds.ground(pose, 12)
+    limit = message.bound()
     level = next(bounds.expected.pings(np.tile(pose, (24, 1)), first=9000)).levels.mean(axis=0)
     mean = level / bounds.imager.gain[:, None] + bounds.noise
     scores = []
     for seed in range(draws):
         imager = CoherentImager(bounds.expected.tracer.scene, bounds.sonar.replace(seed=1000 + seed))
         scores.append(np.abs(imager.image(pose, seed)[0].astype(complex)) ** 2 / mean - 1)
-    motion = np.linalg.solve(limit.information, pulled(told, np.array(scores)).T).T
+    motion = np.linalg.solve(limit.information, pulled(message, np.array(scores)).T).T
     return float(np.einsum("ni,ij,nj->n", motion, limit.information, motion).mean() / 3)
 
 
@@ -201,8 +201,8 @@ def test_grain_tells_far_more_than_ground_and_noise_hides_both() -> None:
     for law in ("grain", "ground"):
         assert (quiet[law].std(2) < loud[law].std(2)).all()
     simulator = source(-90.0)
-    found = cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["none"], 1.0)
-    np.testing.assert_allclose(found[0], quiet["ground"].std(2))
+    result = cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["none"], 1.0)
+    np.testing.assert_allclose(result[0], quiet["ground"].std(2))
     with pytest.raises(MitsonarError, match="adds its own noise"):
         cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["low"], 1e-3)
     with pytest.raises(MitsonarError, match="unknown law 'rays'"):

@@ -68,9 +68,9 @@ MOTIONS = [
 @pytest.mark.parametrize("name", EXTERNAL)
 def test_a_known_motion_is_found(name: str, motion: Motion, ground: NDArray[np.float64]) -> None:
     pytest.importorskip(MODULES[name])
-    found = create_estimator(name).estimate(pair(ground, motion))
-    assert found.valid, found.reason
-    error = (np.array(found.motion) - motion) * UNITS
+    result = create_estimator(name).estimate(pair(ground, motion))
+    assert result.valid, result.reason
+    error = (np.array(result.motion) - motion) * UNITS
     assert (np.abs(error) < ALLOWED[name]).all(), f"{name}: {error} mm, mm, deg"
 
 
@@ -78,9 +78,9 @@ def test_a_known_motion_is_found(name: str, motion: Motion, ground: NDArray[np.f
 def test_empty_frames_are_rejected(name: str, ground: NDArray[np.float64]) -> None:
     pytest.importorskip(MODULES[name])
     frames = pair(ground, Motion(0.0, 0.0, 0.0))
-    found = create_estimator(name).estimate(replace(frames, image=np.zeros_like(frames.image)))
-    assert not found.valid
-    assert found.reason
+    result = create_estimator(name).estimate(replace(frames, image=np.zeros_like(frames.image)))
+    assert not result.valid
+    assert result.reason
 
 
 def test_a_prior_begins_the_registration_of_points(ground: NDArray[np.float64]) -> None:
@@ -102,18 +102,18 @@ def test_an_absent_package_is_one_sentence(name: str, monkeypatch: pytest.Monkey
 
 def test_pictures_hold_nothing_but_the_fan(ground: NDArray[np.float64]) -> None:
     """The rectangle lies inside; its warp is that of the whole view, about another corner."""
-    found = ground_pair(pair(ground, Motion(0.0, 0.0, 0.0)), "it")
-    column, row = found.corner
-    rows, columns = found.first.shape
-    assert found.view.inside[row : row + rows, column : column + columns].all()
+    result = ground_pair(pair(ground, Motion(0.0, 0.0, 0.0)), "it")
+    column, row = result.corner
+    rows, columns = result.first.shape
+    assert result.view.inside[row : row + rows, column : column + columns].all()
     motion = Motion(0.02, -0.01, 0.03)
-    whole = found.view.warp(motion).astype(float)
+    whole = result.view.warp(motion).astype(float)
     cut = whole.copy()
-    cut[:, 2] += whole[:, :2] @ found.corner - found.corner
-    np.testing.assert_allclose(found.motion(cut), motion, atol=1e-6)
-    assert found.estimate(cut).valid
+    cut[:, 2] += whole[:, :2] @ result.corner - result.corner
+    np.testing.assert_allclose(result.motion(cut), motion, atol=1e-6)
+    assert result.estimate(cut).valid
     apart = cut + np.array([[0, 0, 0.6 * columns], [0, 0, 0]])
-    assert "overlap by less than half" in found.estimate(apart).reason
+    assert "overlap by less than half" in result.estimate(apart).reason
 
 
 # ---------------------------------------------------------------- anybody's class
@@ -214,12 +214,12 @@ PRIOR = MotionPrior(Motion(0.0, 0.7, 0.0), np.eye(3))
 def test_one_door_for_estimators_of_ones_own(ground: NDArray[np.float64]) -> None:
     """An instance, a class with options, and a text with options; each gets the prior if it takes one, and not if not."""
     frames = pair(ground, Motion(0.0, 0.0, 0.0))
-    made = create_estimator("my_module:Biased:key=5:name=mine")
-    kind: Any = type(getattr(made, "_made"))  # noqa: B009
-    for one in (made, create_estimator(kind(5, "mine")), create_estimator(kind, key=5, name="mine"), kind(5, "mine")):
-        found = create_estimator(one).estimate(frames, PRIOR)
-        assert found.motion == Motion(5.0, 0.7, 0.0)
-        assert found.reason == "mine"
+    built = create_estimator("my_module:Biased:key=5:name=mine")
+    kind: Any = type(getattr(built, "_made"))  # noqa: B009
+    for one in (built, create_estimator(kind(5, "mine")), create_estimator(kind, key=5, name="mine"), kind(5, "mine")):
+        result = create_estimator(one).estimate(frames, PRIOR)
+        assert result.motion == Motion(5.0, 0.7, 0.0)
+        assert result.reason == "mine"
     for text in ("my_module:Fixed", "my_module:Biased:key=0.02"):
         assert odometry(frames, text).estimates[0].motion == Motion(0.02, 0.0, 0.0)
     assert create_estimator("my_module:Fixed").estimate(frames, PRIOR).motion == Motion(0.02, 0.0, 0.0)
@@ -258,9 +258,9 @@ def test_a_network_of_torch_is_an_estimator(ground: NDArray[np.float64]) -> None
 
     frames = pair(ground, Motion(0.0, 0.05, 0.0))
     network = Means()
-    found = odometry(frames, network).estimates[0]
-    assert found.motion == pytest.approx([*frames.image.mean(axis=(1, 2)), 0.0], rel=1e-5)
-    assert found.covariance is None
+    result = odometry(frames, network).estimates[0]
+    assert result.motion == pytest.approx([*frames.image.mean(axis=(1, 2)), 0.0], rel=1e-5)
+    assert result.covariance is None
     assert network.training, "the user's network stays as it is"
     with pytest.raises(MitsonarError, match="unknown option 'layout': Means takes samples"):
         create_estimator(network, layout="side")
@@ -274,8 +274,8 @@ def test_a_worker_imports_the_class_again(ground: NDArray[np.float64], tmp_path:
     assert not {"", str(tmp_path)} & set(sys.path)
     estimator = create_estimator("my_module:Unpicklable")
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        found = pool.submit(estimator.estimate, pair(ground, Motion(0.0, 0.0, 0.0))).result()
-    assert found.motion == Motion(0.02, 0.0, 0.0)
+        result = pool.submit(estimator.estimate, pair(ground, Motion(0.0, 0.0, 0.0))).result()
+    assert result.motion == Motion(0.02, 0.0, 0.0)
 
 
 @pytest.mark.usefixtures("mine")

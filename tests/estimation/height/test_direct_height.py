@@ -49,10 +49,10 @@ def test_the_profile_of_the_floor_is_its_quadrature(model: str, bearing: str, ga
     sonar = sonar_ahead(model, bearing).replace(gain_exponent=gain)
     edges = np.linspace(sonar.range_min, sonar.range_max, 41)
     for height in (2.1, 2.6):
-        wanted = floor_levels(sonar, height, np.radians(35), 0.5, axis_only=model == "thesis").sum(axis=1)
-        wanted = wanted.reshape(40, 4).sum(axis=1)
-        found = FloorProfile(sonar, np.radians(35)).levels_at(height, edges)
-        np.testing.assert_allclose(found / found.sum(), wanted / wanted.sum(), atol=0.004)
+        expected = floor_levels(sonar, height, np.radians(35), 0.5, axis_only=model == "thesis").sum(axis=1)
+        expected = expected.reshape(40, 4).sum(axis=1)
+        result = FloorProfile(sonar, np.radians(35)).levels_at(height, edges)
+        np.testing.assert_allclose(result / result.sum(), expected / expected.sum(), atol=0.004)
 
 
 def test_ranges_are_proportional_to_the_height() -> None:
@@ -84,10 +84,10 @@ def test_the_height_over_a_rendered_floor(model: str, pitch: int, noise: str, he
         if noise == "high"
         else frames.image
     )
-    found = DirectHeight().height(replace(frames, image=np.asarray(image)))
-    assert found.valid
-    assert abs(found.height_m - height) < (0.01 if noise == "none" else 0.04) * height
-    assert found.std_m < 0.1 * height
+    result = DirectHeight().height(replace(frames, image=np.asarray(image)))
+    assert result.valid
+    assert abs(result.height_m - height) < (0.01 if noise == "none" else 0.04) * height
+    assert result.std_m < 0.1 * height
 
 
 def test_what_stands_on_the_floor_does_not_lift_it() -> None:
@@ -100,13 +100,13 @@ def test_what_stands_on_the_floor_does_not_lift_it() -> None:
     levels = (2 * ground.levels_at(2.5, edges) + tops) * rng.uniform(0.8, 1.2, 128)
     image = np.tile(levels[None, :, None] / levels.max(), (1, 1, 64)).astype(np.float32)
     frame = frame_of(image, sonar)
-    found = DirectHeight().height(frame)
-    assert abs(found.height_m - 2.5) < 0.02 * 2.5
-    assert abs(found.height_m - 2.5) < 3 * found.std_m
+    result = DirectHeight().height(frame)
+    assert abs(result.height_m - 2.5) < 0.02 * 2.5
+    assert abs(result.height_m - 2.5) < 3 * result.std_m
     vector = ViewFrames(
         "vector", {"whole": image.sum(axis=2)}, {"whole": sonar}, {"whole": sonar.bearing_rad}, *about(sonar)
     )
-    assert abs(DirectHeight().height(vector).height_m - found.height_m) < 1e-6
+    assert abs(DirectHeight().height(vector).height_m - result.height_m) < 1e-6
 
 
 def about(sonar: Sonar) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -175,10 +175,10 @@ def test_measured_heights_hide_the_true_ones() -> None:
     np.testing.assert_array_equal(seen.poses[:, 2], seen.height_m)
     assert source.digest() != FrameSource.of(pings).digest()
     empty = replace(pings, image=np.where(np.arange(3)[:, None, None] == 1, 0, pings.image))
-    found, said = measured(empty, DirectHeight())
-    assert [one.valid for one in said] == [True, False, True]
-    assert found.height_m is not None
-    np.testing.assert_array_equal(np.isfinite(found.height_m), [True, False, True])
+    result, output = measured(empty, DirectHeight())
+    assert [one.valid for one in output] == [True, False, True]
+    assert result.height_m is not None
+    np.testing.assert_array_equal(np.isfinite(result.height_m), [True, False, True])
 
 
 def test_frames_that_tell_no_height_are_bridged() -> None:
@@ -189,9 +189,9 @@ def test_frames_that_tell_no_height_are_bridged() -> None:
     pings = Simulator(scene(floor=floor()), sonar).render(poses)
     lost = replace(pings, image=np.where(np.isin(np.arange(6), [3, 4])[:, None, None], 0, pings.image))
     source = FrameSource.of(lost).with_heights_by(DirectHeight())
-    said = estimate_motions(source, Told(), np.arange(6))
-    assert [one.valid for one in said] == [True, True, True, False, True]
-    assert said[3].reason == "no height was found in the frames"
+    output = estimate_motions(source, Told(), np.arange(6))
+    assert [one.valid for one in output] == [True, True, True, False, True]
+    assert output[3].reason == "no height was found in the frames"
 
 
 class Told:
@@ -259,25 +259,25 @@ class TestNetworks:
         from mitsonar.training.evaluate import predictions
 
         words = {"kind": "vector", "frames": 1, "views": ["whole", "c2"]}
-        kept = self.trained(heights, tmp_path / "run", input=words)
+        stored = self.trained(heights, tmp_path / "run", input=words)
         estimator = height_estimator_from(str(tmp_path / "run"))
         assert estimator.views == ("whole", "c2")
         source = open_views(str(heights), ["whole", "c2"], "vector", sequence=2)
-        said = measured(source.read(np.arange(3)), estimator)[1]
-        samples = SonarPairs(heights, part="all", **kept.arrangement, labels=kept.labels["kind"])
-        wanted, _ = predictions(kept, samples, numbers=[6, 7, 8])
-        np.testing.assert_allclose([one.height_m for one in said], wanted[:, 0], rtol=1e-5)
-        rmse = kept.metrics["none"]["rmse"][0] / 1e3
-        assert said[0].std_m == pytest.approx(rmse)
+        output = measured(source.read(np.arange(3)), estimator)[1]
+        samples = SonarPairs(heights, part="all", **stored.arrangement, labels=stored.labels["kind"])
+        expected, _ = predictions(stored, samples, numbers=[6, 7, 8])
+        np.testing.assert_allclose([one.height_m for one in output], expected[:, 0], rtol=1e-5)
+        rmse = stored.metrics["none"]["rmse"][0] / 1e3
+        assert output[0].std_m == pytest.approx(rmse)
         done = mitsonar("height", heights, "--by", tmp_path / "run", "--sequence", 2)
         assert done.returncode == 0, done.stderr
         assert "vectors of whole, c2" in done.stdout
-        for answer, believed in ((0.5, True), (1.05, True), (1.2, False), (-0.2, False)):
-            far = HeightNetwork(kept)
+        for answer, valid in ((0.5, True), (1.05, True), (1.2, False), (-0.2, False)):
+            far = HeightNetwork(stored)
             vars(far)["_network"] = lambda inputs, place=answer: self.torch.tensor([[20.0 * place - 10.0]])
             one = far.height(source.read([0]))
-            assert one.valid is believed
-            assert ("beyond the heights of training" in one.reason) is not believed
+            assert one.valid is valid
+            assert ("beyond the heights of training" in one.reason) is not valid
         level = source.read([0])
         assert level.poses is not None
         tilted = replace(level, poses=level.poses - [0, 0, 0, 0.2, 0, 0])

@@ -67,40 +67,40 @@ def off(found: Estimate, motion: Motion) -> NDArray[np.float64]:
 @pytest.mark.parametrize("method", METHODS)
 def test_far_motions_are_found_without_a_prior(far: SonarFrames, method: str) -> None:
     """Beyond the search from no motion; the covariance holds."""
-    found = create_estimator(method).estimate(far)
-    assert found.valid, found.reason
-    assert found.about["start"] == "phase"
-    assert (off(found, FAR) < ALLOWED).all(), f"mm, mm, deg: {off(found, FAR)}"
-    assert found.covariance is not None
-    assert (off(found, FAR) < 4 * np.sqrt(np.diag(found.covariance)) * UNITS).all()
+    result = create_estimator(method).estimate(far)
+    assert result.valid, result.reason
+    assert result.about["start"] == "phase"
+    assert (off(result, FAR) < ALLOWED).all(), f"mm, mm, deg: {off(result, FAR)}"
+    assert result.covariance is not None
+    assert (off(result, FAR) < 4 * np.sqrt(np.diag(result.covariance)) * UNITS).all()
 
 
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("method", METHODS)
 def test_a_prior_is_where_it_starts(far: SonarFrames, method: str) -> None:
     """A prior that is 10 mm and 0.3 deg off, and says so."""
-    told = Motion(FAR.sideways + 0.01, FAR.forward - 0.01, FAR.yaw + np.radians(0.3))
-    found = create_estimator(method).estimate(far, expected(told, mm=10, deg=0.3))
-    assert found.valid, found.reason
-    assert found.about["start"] == "prior"
-    assert (off(found, FAR) < ALLOWED).all(), f"mm, mm, deg: {off(found, FAR)}"
+    message = Motion(FAR.sideways + 0.01, FAR.forward - 0.01, FAR.yaw + np.radians(0.3))
+    result = create_estimator(method).estimate(far, expected(message, mm=10, deg=0.3))
+    assert result.valid, result.reason
+    assert result.about["start"] == "prior"
+    assert (off(result, FAR) < ALLOWED).all(), f"mm, mm, deg: {off(result, FAR)}"
 
 
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("method", METHODS)
 def test_a_wrong_prior_rejects(far: SonarFrames, method: str) -> None:
     """One that is sure of no motion: nothing is looked for elsewhere, and nothing is believed."""
-    found = create_estimator(method).estimate(far, expected(Motion(0.0, 0.0, 0.0), mm=2, deg=0.1))
-    assert not found.valid
-    assert found.reason
+    result = create_estimator(method).estimate(far, expected(Motion(0.0, 0.0, 0.0), mm=2, deg=0.1))
+    assert not result.valid
+    assert result.reason
 
 
 @pytest.mark.usefixtures("variant")
 def test_a_wide_prior_does_not_bar_the_search(far: SonarFrames) -> None:
     """A prior of half a metre tells nothing: phase finds the start."""
-    found = Direct().estimate(far, expected(Motion(0.0, 0.0, 0.0), mm=500, deg=10))
-    assert found.valid, found.reason
-    assert found.about["start"] == "phase"
+    result = Direct().estimate(far, expected(Motion(0.0, 0.0, 0.0), mm=500, deg=10))
+    assert result.valid, result.reason
+    assert result.about["start"] == "phase"
 
 
 @pytest.mark.usefixtures("variant")
@@ -108,10 +108,10 @@ def test_a_near_motion_with_a_prior_is_that_without(rocks: Simulator) -> None:
     """The prior only chooses start and levels: at the finest level both end at one motion."""
     motion = Motion(0.015, -0.012, np.radians(0.4))
     frames = two(rocks, motion)
-    alone, told = Direct().estimate(frames), Direct().estimate(frames, expected(motion, mm=1, deg=0.05))
+    alone, message = Direct().estimate(frames), Direct().estimate(frames, expected(motion, mm=1, deg=0.05))
     assert alone.about["start"] == "zero"
-    assert told.valid, told.reason
-    assert (off(told, alone.motion) < [0.1, 0.1, 0.003]).all()
+    assert message.valid, message.reason
+    assert (off(message, alone.motion) < [0.1, 0.1, 0.003]).all()
 
 
 @pytest.mark.usefixtures("variant")
@@ -142,13 +142,13 @@ def test_light_over_even_ground_is_no_match() -> None:
 def test_the_prior_gate_is_chi_square() -> None:
     """Three numbers, each 2.7 standard deviations off, are 21.9 of chi-square; 2.6 are 20.3."""
     prior = expected(Motion(0.1, 0.0, 0.0), mm=3, deg=0.3)
-    own = np.diag([0.004, 0.004, np.radians(0.4)]) ** 2
+    local = np.diag([0.004, 0.004, np.radians(0.4)]) ** 2
     for times, rejected in ((2.6, False), (2.7, True)):
         apart = times * np.array([0.005, 0.005, np.radians(0.5)])
         motion = Motion(0.1 + apart[0], apart[1], apart[2])
-        assert bool(prior_rejection(motion, own, prior)) == rejected
-    assert "4.7 standard deviations" in prior_rejection(motion, own, prior)
-    assert not prior_rejection(motion, own, None)
+        assert bool(prior_rejection(motion, local, prior)) == rejected
+    assert "4.7 standard deviations" in prior_rejection(motion, local, prior)
+    assert not prior_rejection(motion, local, None)
 
 
 def test_an_unknown_component_does_not_hide_a_known_one() -> None:
@@ -186,10 +186,10 @@ def test_far_covariances_know_the_relief_of_the_first_echoes(far: SonarFrames, m
     for tops_m in (0.0, 0.05, 0.1):
         told = replace(attitude_of(far, "direct", None, None), first=FirstEchoes(2.2, tops_m, False))
         monkeypatch.setattr(direct, "attitude_of", lambda *_, told=told: told)
-        found = Direct().estimate(far, expected(FAR, mm=10, deg=0.3))
-        assert found.covariance is not None
-        covariances.append(found.covariance)
-        motion.append(found.motion)
+        result = Direct().estimate(far, expected(FAR, mm=10, deg=0.3))
+        assert result.covariance is not None
+        covariances.append(result.covariance)
+        motion.append(result.motion)
     assert motion[0] == motion[1] == motion[2]
     np.testing.assert_allclose(covariances[2] - covariances[0], 4 * (covariances[1] - covariances[0]), rtol=1e-6)
     assert covariances[2][1, 1] > 2 * covariances[0][1, 1]

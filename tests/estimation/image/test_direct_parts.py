@@ -41,15 +41,15 @@ def frames(bins: int = 512, beams: int = 96) -> SonarFrames:
 @pytest.mark.parametrize("block", [(8, 4), (5, 7), (40, 3), (3, 50)])
 def test_products_are_summed_over_blocks(block: tuple[int, int]) -> None:
     """Against plain sums; blocks that are not whole belong to the last, and a block may be larger than the map."""
-    one, other = np.random.default_rng(2).normal(size=(2, 30, 19)).astype(np.float32)
+    one, second = np.random.default_rng(2).normal(size=(2, 30, 19)).astype(np.float32)
     rows, columns = (
         np.minimum(np.arange(size) // edge, count - 1)
         for size, edge, count in zip(one.shape, block, cell_blocks(one.shape, block), strict=True)
     )
     plain = np.zeros(cell_blocks(one.shape, block))
-    np.add.at(plain, (rows[:, None], columns), (one * other).astype(float))
-    np.testing.assert_allclose(products_by_block([(one, other)], block)[0], plain.ravel(), atol=1e-4)
-    np.testing.assert_allclose(by_block(one * other, block), plain.ravel(), atol=1e-4)
+    np.add.at(plain, (rows[:, None], columns), (one * second).astype(float))
+    np.testing.assert_allclose(products_by_block([(one, second)], block)[0], plain.ravel(), atol=1e-4)
+    np.testing.assert_allclose(by_block(one * second, block), plain.ravel(), atol=1e-4)
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -63,8 +63,8 @@ def test_patches_move_as_their_cells_do(level: DirectLevel) -> None:
         change = (cells.shift(v) - cells.shift(-v)) / (2 * small)
         middle = by_block(change, cells.patch) / by_block(np.ones(change.shape[1:]), cells.patch)
         usable = middle.reshape(2, *cells.patches)[:, -(-cells.usable.start // cells.patch[0]) : -1]
-        told = cells.derivative[k].reshape(2, *cells.patches)[:, -usable.shape[1] - 1 : -1]
-        assert np.abs(told - usable).max() < 0.05 * np.abs(usable).max()
+        message = cells.derivative[k].reshape(2, *cells.patches)[:, -usable.shape[1] - 1 : -1]
+        assert np.abs(message - usable).max() < 0.05 * np.abs(usable).max()
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -88,9 +88,9 @@ def test_small_frames_leave_out_coarse_levels_over_relief() -> None:
     """Frames of 64 bins: the level of every fourth bin has too few rows, and no motion is found."""
     small = frames(64, 32)
     assert not is_resolved(64, LEVELS[1])
-    found = registered_over_relief(two_frames(small), small, ATTITUDE, np.zeros(3))
-    assert found is not None
-    assert (np.abs(found[0]) < [1e-3, 1e-3, 1e-3]).all()
+    result = registered_over_relief(two_frames(small), small, ATTITUDE, np.zeros(3))
+    assert result is not None
+    assert (np.abs(result[0]) < [1e-3, 1e-3, 1e-3]).all()
 
 
 def test_a_wide_fan_has_larger_pixels() -> None:

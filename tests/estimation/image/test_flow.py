@@ -69,9 +69,9 @@ def test_sign_and_size_of_each_axis(axis: int, size: float) -> None:
     """Motions of 6 to 100 mm and 0.12 to 2 deg along one axis."""
     motion = np.zeros(3)
     motion[axis] = size * np.array([0.02, 0.02, np.radians(0.4)])[axis]
-    found = Flow(relief_m=0).estimate(painted(Motion(*motion), Sonar()))
-    error = (np.array(found.motion) - motion) * UNITS
-    assert found.valid, found.reason
+    result = Flow(relief_m=0).estimate(painted(Motion(*motion), Sonar()))
+    error = (np.array(result.motion) - motion) * UNITS
+    assert result.valid, result.reason
     assert (np.abs(error) < [0.3, 0.1, 0.01]).all(), f"mm, mm, deg: {error}"
 
 
@@ -83,9 +83,9 @@ def test_all_three_at_once_for_both_bearings_and_matches(
 ) -> None:
     motion = np.array(signs) * [0.1, 0.1, np.radians(2)]
     sonar = Sonar.create(bearing=bearing, beam_layout="sine" if bearing == "cone" else "even")
-    found = Flow(match=match, relief_m=0).estimate(painted(Motion(*motion), sonar))
-    error = (np.array(found.motion) - motion) * UNITS
-    assert found.valid, found.reason
+    result = Flow(match=match, relief_m=0).estimate(painted(Motion(*motion), sonar))
+    error = (np.array(result.motion) - motion) * UNITS
+    assert result.valid, result.reason
     assert (np.abs(error) < [1.0, 0.3, 0.03]).all(), f"mm, mm, deg: {error}"
 
 
@@ -96,10 +96,10 @@ def test_covariance_says_the_errors_that_noise_makes() -> None:
     frames = painted(Motion(*motion), Sonar())
     over = []
     for seed in range(10):
-        found = Flow(relief_m=0).estimate(noisy(frames, "high", seed))
-        assert found.valid, found.reason
-        assert found.covariance is not None
-        over.append((np.array(found.motion) - motion) / np.sqrt(np.diag(found.covariance)))
+        result = Flow(relief_m=0).estimate(noisy(frames, "high", seed))
+        assert result.valid, result.reason
+        assert result.covariance is not None
+        over.append((np.array(result.motion) - motion) / np.sqrt(np.diag(result.covariance)))
     rms = np.sqrt(np.mean(np.square(over), axis=0))
     assert ((rms > 0.3) & (rms < 2.0)).all(), rms
 
@@ -109,14 +109,14 @@ def test_height_is_a_further_unknown() -> None:
     larger covariance where the height was right."""
     motion = Motion(0.0, 0.06, 0.0)
     frames = painted(motion, Sonar())
-    held, free = (Flow(height_m=2.65, relief_m=0, height_std=std).estimate(frames) for std in (0.0, 0.05))
-    errors = [abs(found.motion.forward - motion.forward) * 1e3 for found in (held, free)]
+    stored, free = (Flow(height_m=2.65, relief_m=0, height_std=std).estimate(frames) for std in (0.0, 0.05))
+    errors = [abs(result.motion.forward - motion.forward) * 1e3 for result in (stored, free)]
     assert errors[0] > 1.0
     assert errors[1] < 0.5 * errors[0]
-    held, free = (Flow(relief_m=0, height_std=std).estimate(noisy(frames, "high")) for std in (0.0, 0.05))
-    assert held.covariance is not None
+    stored, free = (Flow(relief_m=0, height_std=std).estimate(noisy(frames, "high")) for std in (0.0, 0.05))
+    assert stored.covariance is not None
     assert free.covariance is not None
-    assert free.covariance[1, 1] > held.covariance[1, 1]
+    assert free.covariance[1, 1] > stored.covariance[1, 1]
 
 
 @pytest.mark.thorough
@@ -139,14 +139,14 @@ def test_nothing_to_match_is_not_believed() -> None:
         "one object, noise": noisy(changed(frames, image=one), "low"),
     }
     for match in ("map", "vector"):
-        believed = [name for name, pair in wrong.items() if Flow(match=match).estimate(pair).valid]
-        assert not believed, f"{match}: {believed}"
+        valid = [name for name, pair in wrong.items() if Flow(match=match).estimate(pair).valid]
+        assert not valid, f"{match}: {valid}"
 
 
 @pytest.mark.parametrize("geometry", [{"height_m": 1.2}, {"height_m": 6.0}, {"pitch_rad": 0.2}, {"pitch_rad": 1.1}])
 def test_badly_wrong_geometry_is_not_believed(geometry: dict[str, Any]) -> None:
-    found = Flow(**geometry).estimate(painted(Motion(0.01, 0.02, 0.005), Sonar()))
-    assert not found.valid
+    result = Flow(**geometry).estimate(painted(Motion(0.01, 0.02, 0.005), Sonar()))
+    assert not result.valid
 
 
 def test_what_is_missing_or_wrong_is_said() -> None:
@@ -179,10 +179,10 @@ def test_rendered_frames(simulator: Simulator, noise: str) -> None:
     """A second route to the known motion: traced rays instead of painted cells."""
     motion = Motion(0.015, -0.012, np.radians(0.4))
     poses = Trajectory(np.array([START, compose(START, motion)]), np.array([0.0, 0.1]))
-    found = Flow().estimate(simulator.render(poses, noise=NOISE_MODELS[noise], seed=3))
-    error = (np.array(found.motion) - motion) * UNITS
+    result = Flow().estimate(simulator.render(poses, noise=NOISE_MODELS[noise], seed=3))
+    error = (np.array(result.motion) - motion) * UNITS
     allowed = {"none": [3.0, 1.0, 0.07], "high": [6.0, 2.0, 0.12]}[noise]
-    assert found.valid, found.reason
+    assert result.valid, result.reason
     assert (np.abs(error) < allowed).all(), f"{noise}, mm, mm, deg: {error}"
 
 

@@ -38,9 +38,9 @@ def hull(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Simulator:
 def test_the_outline_of_the_light_holds_nothing_back(hull: Simulator, method: str, noise: str) -> None:
     """It moves with the sonar: matched, it took 2.2 mm off this motion of corrnet in low noise (squared error 28)."""
     poses = Trajectory(np.array([START, compose(START, MOTION)]), np.array([0.0, 0.1]))
-    found = create_estimator(method).estimate(hull.render(poses, noise=NOISE_MODELS[noise], seed=3))
-    error = (np.array(found.motion) - MOTION) * UNITS
-    assert found.valid, found.reason
+    result = create_estimator(method).estimate(hull.render(poses, noise=NOISE_MODELS[noise], seed=3))
+    error = (np.array(result.motion) - MOTION) * UNITS
+    assert result.valid, result.reason
     assert abs(error[1]) < 1.8, f"mm, mm, deg: {error}"
-    assert found.covariance is not None
-    assert error @ np.linalg.solve(found.covariance * np.outer(UNITS, UNITS), error) < 21.1, f"mm, mm, deg: {error}"
+    assert result.covariance is not None
+    assert error @ np.linalg.solve(result.covariance * np.outer(UNITS, UNITS), error) < 21.1, f"mm, mm, deg: {error}"

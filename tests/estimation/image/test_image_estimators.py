@@ -108,9 +108,9 @@ def test_sign_and_size_of_each_axis(pair: Pair, method: str, axis: int, size: fl
     """Motions along one axis of 6, 20 and 100 mm, or 0.12, 0.4 and 2 deg."""
     motion = np.zeros(3)
     motion[axis] = size * np.array([0.02, 0.02, np.radians(0.4)])[axis]
-    found = create_estimator(method).estimate(pair(Motion(*motion)))
-    error = (np.array(found.motion) - motion) * UNITS
-    assert found.valid, found.reason
+    result = create_estimator(method).estimate(pair(Motion(*motion)))
+    error = (np.array(result.motion) - motion) * UNITS
+    assert result.valid, result.reason
     beyond = 3 if method in TRAINED and abs(size) > 1 else 1  # beyond what it has learnt: phase finds where it starts
     assert (np.abs(error) < beyond * np.array(ALLOWED[method])).all(), f"mm, mm, deg: {error}"
 
@@ -121,18 +121,18 @@ def test_a_fan_of_forty_metres_is_answered(method: str) -> None:
     sonar = load_sonar("oculus-m750d-750khz").replace(beams=128, range_bins=512)
     poses = np.array([[0, 0, 4.0, np.radians(20), 0, 0], [0, 0.3, 4.0, np.radians(20), 0, 0.01]])
     frames = over_ground(Trajectory(poses, np.array([0.0, 0.1])), sonar)
-    found = create_estimator(method).estimate(frames)
-    assert found.valid or found.reason
-    assert not found.valid or abs(found.motion.forward - 0.3) < 0.07  # half a pixel
+    result = create_estimator(method).estimate(frames)
+    assert result.valid or result.reason
+    assert not result.valid or abs(result.motion.forward - 0.3) < 0.07  # half a pixel
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_all_three_at_once_on_rocks(rocks: Simulator, method: str) -> None:
     """The relief is not told: heights come from the first echoes."""
     motion = np.array([0.015, -0.012, np.radians(0.4)])
-    found = create_estimator(method).estimate(two(rocks, Motion(*motion)))
-    error = (np.array(found.motion) - motion) * UNITS
-    assert found.valid, found.reason
+    result = create_estimator(method).estimate(two(rocks, Motion(*motion)))
+    error = (np.array(result.motion) - motion) * UNITS
+    assert result.valid, result.reason
     assert (np.abs(error) < np.array([1.5, 1, 1.5]) * ALLOWED[method]).all(), f"mm, mm, deg: {error}"
 
 
@@ -141,13 +141,13 @@ def test_all_three_at_once_on_rocks(rocks: Simulator, method: str) -> None:
 def test_covariances_hold_with_noise(pair: Pair, rocks: Simulator, method: str, noise: str, allowed: list[float]) -> None:
     """A network's hold on what it has learnt only: rocks; on large plates they are too small."""
     motion = Motion(0.015, -0.012, np.radians(0.4))
-    found = create_estimator(method).estimate(pair(motion, noise) if method == "direct" else two(rocks, motion, noise))
-    error = (np.array(found.motion) - motion) * UNITS
-    assert found.valid, found.reason
+    result = create_estimator(method).estimate(pair(motion, noise) if method == "direct" else two(rocks, motion, noise))
+    error = (np.array(result.motion) - motion) * UNITS
+    assert result.valid, result.reason
     assert (np.abs(error) < allowed).all(), f"{noise}, mm, mm, deg: {error}"
-    assert found.covariance is not None
-    assert (np.linalg.eigvalsh(found.covariance) > 0).all()
-    std = np.sqrt(np.diag(found.covariance)) * UNITS
+    assert result.covariance is not None
+    assert (np.linalg.eigvalsh(result.covariance) > 0).all()
+    std = np.sqrt(np.diag(result.covariance)) * UNITS
     assert (np.abs(error) < 4 * std).all(), f"errors {error}, standard deviations {std}"
 
 
@@ -174,14 +174,14 @@ def test_a_wrong_height_of_a_sonar_that_rolls_is_within_the_covariance() -> None
     second = [0.0, 0.04, 2.51, np.radians(35.5), np.radians(1.5), 0.0]
     poses = np.array([[0, 0, 2.5, np.radians(35), 0, 0], second])
     frames = over_ground(Trajectory(poses, np.array([0.0, 0.1])), sonar)
-    low, told, high = (Direct(height_m=height_m, relief_m=0.0).estimate(frames) for height_m in (2.48, 2.5, 2.52))
+    low, message, high = (Direct(height_m=height_m, relief_m=0.0).estimate(frames) for height_m in (2.48, 2.5, 2.52))
     assert low.valid
     assert high.valid
-    assert told.covariance is not None
+    assert message.covariance is not None
     by_height = (np.array(high.motion) - low.motion) / 0.04
     assert abs(by_height[2]) > np.radians(0.02)  # a yaw of 0.02 deg a metre
     shift = STD_MEASURED * 2.5 * by_height
-    assert shift @ np.linalg.solve(told.covariance, shift) < 2
+    assert shift @ np.linalg.solve(message.covariance, shift) < 2
 
 
 def test_swapped_frames_tell_the_opposite_motion(pair: Pair) -> None:
@@ -207,9 +207,9 @@ def test_nothing_to_match_is_not_believed(pair: Pair, simulator: Simulator, meth
     half = changed(frames, image=np.stack([frames.image[0], blank.image[0]]))
     noise = NOISE_MODELS["high"].apply(blank.image, seed=1, frames=np.arange(2))
     for name, seen in {"blank": blank, "one blank": half, "noise": changed(frames, image=noise)}.items():
-        found = estimator.estimate(seen)
-        assert not found.valid, name
-        assert found.reason
+        result = estimator.estimate(seen)
+        assert not result.valid, name
+        assert result.reason
     elsewhere = two(simulator, Motion(2.0, 0.0, 1.0))
     assert not estimator.estimate(elsewhere).valid, "elsewhere"
 
@@ -221,8 +221,8 @@ def test_one_object_alone_is_not_believed(method: str) -> None:
     start = Pose(0.0, -3.6, 2.5, np.radians(35), 0, 0)
     frames = only.render(Trajectory(np.array([start, compose(start, Motion(0.01, 0.01, 0.003))]), np.array([0.0, 0.1])))
     assert (frames.image > 0).mean() > 0.003
-    found = create_estimator(method).estimate(changed(frames, height_m=np.full(2, 2.5)))
-    assert not found.valid
+    result = create_estimator(method).estimate(changed(frames, height_m=np.full(2, 2.5)))
+    assert not result.valid
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -232,12 +232,12 @@ def test_one_object_alone_is_not_believed(method: str) -> None:
 def test_wrong_geometry_is_reported(rocks: Simulator, method: str, wrong: dict[str, float]) -> None:
     """First echoes give another height. The given one counts, with a covariance that holds both."""
     motion = Motion(0.01, 0.01, 0.003)
-    found = create_estimator(method, **wrong).estimate(two(rocks, motion))
-    assert not found.valid or found.about["doubt"].startswith("first echoes give a height of")
-    if found.valid and method == "direct":
-        assert found.covariance is not None
-        off = np.array(found.motion) - motion
-        assert off @ np.linalg.solve(found.covariance, off) < 16
+    result = create_estimator(method, **wrong).estimate(two(rocks, motion))
+    assert not result.valid or result.about["doubt"].startswith("first echoes give a height of")
+    if result.valid and method == "direct":
+        assert result.covariance is not None
+        off = np.array(result.motion) - motion
+        assert off @ np.linalg.solve(result.covariance, off) < 16
 
 
 # ---------------------------------------------------------------- height and ground
@@ -246,8 +246,8 @@ def test_wrong_geometry_is_reported(rocks: Simulator, method: str, wrong: dict[s
 def test_height_comes_from_first_echoes(pair: Pair) -> None:
     """Over a flat floor the steepest rays end at the sonar's height: a given height of 8 % less or more moves it by 2 %."""
     frames = pair(Motion(0.0, 0.0, 0.0))
-    for told in (np.full(2, 2.3), np.full(2, 2.7), None):
-        attitude = attitude_of(changed(frames, height_m=told), "direct", None, None)
+    for message in (np.full(2, 2.3), np.full(2, 2.7), None):
+        attitude = attitude_of(changed(frames, height_m=message), "direct", None, None)
         assert attitude.height_m == pytest.approx(2.5, rel=0.02)
         assert attitude.pitch_rad == pytest.approx(np.radians(35))
         assert not attitude.reason
@@ -305,6 +305,6 @@ def test_a_view_of_the_ground_moves_with_the_motion(pair: Pair) -> None:
     column, row = 31.0, 17.0
     ground = np.array([left + (column + 0.5) * view.edge, far - (row + 0.5) * view.edge])
     there = moved(ground, motion)
-    wanted = [(there[0] - left) / view.edge - 0.5, (far - there[1]) / view.edge - 0.5]
-    assert np.allclose(warp @ [column, row, 1], wanted, atol=1e-4)
+    expected = [(there[0] - left) / view.edge - 0.5, (far - there[1]) / view.edge - 0.5]
+    assert np.allclose(warp @ [column, row, 1], expected, atol=1e-4)
     assert np.allclose(view.motion(warp), motion, atol=1e-6)

@@ -18,8 +18,8 @@ def texture(shift: tuple[float, float] = (0.0, 0.0), noise: float = 0.0, seed: i
     plain = cv2.GaussianBlur(rng.random((320, 160)).astype(np.float32), (0, 0), sigmaX=1.2, sigmaY=2.0)
     turn = np.fft.fftfreq(320)[:, None] * shift[0] + np.fft.fftfreq(160)[None, :] * shift[1]
     moved = np.fft.ifft2(np.fft.fft2(plain) * np.exp(-2j * np.pi * turn)).real.astype(np.float32)
-    made = 0.3 + 3 * (moved - plain.mean())[30:290, 32:128]
-    return np.asarray(np.maximum(made, 0) + noise * np.random.default_rng(seed).standard_normal(made.shape), np.float32)
+    result = 0.3 + 3 * (moved - plain.mean())[30:290, 32:128]
+    return np.asarray(np.maximum(result, 0) + noise * np.random.default_rng(seed).standard_normal(result.shape), np.float32)
 
 
 def patches_of(frame: Floats) -> tuple[Patches, NDArray[np.float64], NDArray[np.float64]]:
@@ -34,11 +34,11 @@ def patches_of(frame: Floats) -> tuple[Patches, NDArray[np.float64], NDArray[np.
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.37, -0.21), (2.4, 0.8)])
 def test_patches_are_found_where_they_moved(shift: tuple[float, float]) -> None:
     patches, rows, columns = patches_of(texture())
-    found = align(patch_image(2 * texture(shift) + 0.1), patches, rows, columns)
-    good = found.correlation > 0.9
+    result = align(patch_image(2 * texture(shift) + 0.1), patches, rows, columns)
+    good = result.correlation > 0.9
     assert good.mean() > 0.8
     assert len(rows) > 40
-    off = found.shift[good] - shift
+    off = result.shift[good] - shift
     assert np.abs(np.median(off, axis=0)).max() < 0.04, "OpenCV interpolates at 32nds of a pixel"
     assert (np.abs(off) < 0.15).all(axis=1).mean() > 0.9
 
@@ -47,9 +47,9 @@ def test_covariance_is_that_of_repeated_noise() -> None:
     patches, rows, columns = patches_of(texture())
     shifts, promised = [], []
     for seed in range(30):
-        found = align(patch_image(texture(noise=0.05, seed=seed)), patches, rows, columns)
-        shifts.append(found.shift)
-        promised.append(np.diagonal(found.covariance, axis1=1, axis2=2))
+        result = align(patch_image(texture(noise=0.05, seed=seed)), patches, rows, columns)
+        shifts.append(result.shift)
+        promised.append(np.diagonal(result.covariance, axis1=1, axis2=2))
     ratio = np.var(shifts, axis=0) / np.mean(promised, axis=0)
     assert 0.2 < float(np.median(ratio)) < 1.5
 

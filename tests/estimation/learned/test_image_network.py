@@ -35,28 +35,28 @@ def test_other_heights_explain_the_same_shifts_by_other_motions() -> None:
     lower, higher = (
         np.linalg.lstsq(np.moveaxis(one["derivative"], 1, -1).reshape(-1, 3), shifts, rcond=None)[0] for one in (low, high)
     )
-    found = image_network._by_height(image_network._batch(here), MOTION)
-    np.testing.assert_allclose(found, (higher - lower) / 0.02, rtol=0.02, atol=1e-5)
-    assert found[1] / MOTION.forward > 0.2, "a sonar that looks down by 35 deg scales forward motions by the height"
+    result = image_network._by_height(image_network._batch(here), MOTION)
+    np.testing.assert_allclose(result, (higher - lower) / 0.02, rtol=0.02, atol=1e-5)
+    assert result[1] / MOTION.forward > 0.2, "a sonar that looks down by 35 deg scales forward motions by the height"
 
 
 def test_heights_less_certain_than_in_training_join_the_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
     """Variances add: what is beyond training is twice as much at the root of 7 times its standard deviation as at twice."""
     frames, _, _ = lit_plane(Sonar(), HEIGHT_M, PITCH_RAD)
     frames = replace(frames, image=np.stack([frames.image[0], np.roll(frames.image[0], -3, axis=0)]))
-    found = []
+    result = []
     for part in (1.0, 2.0, 7**0.5):
         told = Attitude(HEIGHT_M, part * STD_MEASURED * HEIGHT_M, PITCH_RAD)
         monkeypatch.setattr(image_network, "attitude_of", lambda *_, told=told: told)
-        found.append(create_estimator("corrnet").estimate(frames))
-    as_trained, twice, more = (one.covariance for one in found)
+        result.append(create_estimator("corrnet").estimate(frames))
+    as_trained, twice, more = (one.covariance for one in result)
     assert as_trained is not None
     assert twice is not None
     assert more is not None
-    assert found[0].motion == found[1].motion == found[2].motion
+    assert result[0].motion == result[1].motion == result[2].motion
     np.testing.assert_allclose(more - as_trained, 2 * (twice - as_trained), rtol=1e-6)
     assert np.linalg.matrix_rank(twice - as_trained, tol=1e-6 * np.abs(twice - as_trained).max()) == 1
-    by_forward = abs(found[0].motion.forward) * 0.2 * STD_MEASURED
+    by_forward = abs(result[0].motion.forward) * 0.2 * STD_MEASURED
     assert twice[1, 1] - as_trained[1, 1] > 3 * by_forward**2
 
 

@@ -37,14 +37,14 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> SonarPairs:
 def test_it_knows_motions_over_worlds_that_it_has_not_seen(pairs: SonarPairs) -> None:
     """Within twice the errors that its file promises; the covariance is that of these."""
     network = create_estimator("posenet")
-    found = [network.estimate(pairs.sonar_frames(k)) for k in range(len(pairs))]
-    assert all(one.valid for one in found), [one.reason for one in found]
+    result = [network.estimate(pairs.sonar_frames(k)) for k in range(len(pairs))]
+    assert all(one.valid for one in result), [one.reason for one in result]
     truth = np.array([pairs.target(k) for k in range(len(pairs))])
-    rmse = np.sqrt((in_units(np.array([one.motion for one in found]) - truth) ** 2).mean(axis=0))
+    rmse = np.sqrt((in_units(np.array([one.motion for one in result]) - truth) ** 2).mean(axis=0))
     promised = np.array(Checkpoint.load("posenet").metrics["none"]["rmse"])
     assert (promised < [2.5, 0.8, 0.045]).all()
     assert (rmse < 2 * promised).all(), rmse
-    covariance = found[0].covariance
+    covariance = result[0].covariance
     assert covariance is not None
     np.testing.assert_allclose(in_units(np.sqrt(np.diag(covariance))), promised)
 
@@ -59,9 +59,9 @@ def test_it_refuses_what_it_has_not_learnt(pairs: SonarPairs) -> None:
     higher[:, 2] += 1.0
     steeper[:, 3] += np.radians(5)
     for changed in (replace(frames, poses=higher, height_m=frames.height_m + 1.0), replace(frames, poses=steeper)):
-        found = network.estimate(changed)
-        assert not found.valid
-        assert "height 2.5 m, pitch 35 deg are fixed by training" in found.reason
+        result = network.estimate(changed)
+        assert not result.valid
+        assert "height 2.5 m, pitch 35 deg are fixed by training" in result.reason
     with pytest.raises(MitsonarError, match=r"trained on the sonar .* window"):
         network.estimate(replace(frames, range_m=frames.range_m + 1.0))
 
@@ -73,8 +73,8 @@ def test_one_that_was_trained_with_noise_knows_motions_in_noise(pairs: SonarPair
     rmse = {}
     for name in ("posenet", "posenet-noise"):
         network = create_estimator(name)
-        found = [network.estimate(noisy.sonar_frames(k)).motion for k in range(len(noisy))]
-        rmse[name] = np.sqrt((in_units(np.array(found) - truth) ** 2).mean(axis=0))
+        result = [network.estimate(noisy.sonar_frames(k)).motion for k in range(len(noisy))]
+        rmse[name] = np.sqrt((in_units(np.array(result) - truth) ** 2).mean(axis=0))
     promised = np.array(Checkpoint.load("posenet-noise").metrics["high"]["rmse"])
     assert (promised < [3.6, 1.5, 0.07]).all()  # Almanza-Medina, table 3.3, by pair: 3.63 / 1.50 / 0.070
     assert (rmse["posenet-noise"] < 2 * promised).all(), rmse

@@ -79,13 +79,13 @@ def test_range_levels_are_those_of_a_sonar_with_fewer_bins(portions: Path) -> No
     renderer = SceneRenderer(few, scenes_of(few, few.sequences)[0])
     here = pairs.frame_numbers(3)
     (looks,) = renderer.render_views(pairs.pose[here], here.start)
-    wanted = looks[[view.name for view in renderer.simulator.views].index("c2")].levels.sum(axis=2)
-    wanted = wanted * float(pairs.store.about["gain"])
-    found = pairs[3][0].numpy()
-    assert found.shape == (2, 10)
+    expected = looks[[view.name for view in renderer.simulator.views].index("c2")].levels.sum(axis=2)
+    expected = expected * float(pairs.store.about["gain"])
+    result = pairs[3][0].numpy()
+    assert result.shape == (2, 10)
     # pixels at the maximum are cut off in the fine image, others lie on the border of two bins
-    np.testing.assert_allclose(found.sum(axis=1), wanted.sum(axis=1), rtol=0.02)
-    assert np.median(np.abs(found - wanted)[wanted > 0] / wanted[wanted > 0]) < 1e-3
+    np.testing.assert_allclose(result.sum(axis=1), expected.sum(axis=1), rtol=0.02)
+    assert np.median(np.abs(result - expected)[expected > 0] / expected[expected > 0]) < 1e-3
 
 
 @pytest.mark.thorough
@@ -95,8 +95,8 @@ def test_halves_are_sums_over_port_and_starboard_beams(ahead: Path) -> None:
     halves = SonarPairs(ahead, part="all", kind="vector", halves=True, noise="high", seed=4)
     image, columns = images[5][0].numpy(), halves[5][0].numpy()[0]
     middle = image.shape[2] // 2
-    wanted = [part for side in (image[..., :middle], image[..., middle:]) for part in side.sum(axis=2)]
-    np.testing.assert_allclose(columns.T, wanted, rtol=1e-5)
+    expected = [part for side in (image[..., :middle], image[..., middle:]) for part in side.sum(axis=2)]
+    np.testing.assert_allclose(columns.T, expected, rtol=1e-5)
     coarse = SonarPairs(ahead, part="all", kind="vector", halves=True, range_levels=20, noise="high", seed=4)
     np.testing.assert_allclose(coarse[5][0][0], columns.reshape(20, -1, 4).sum(axis=1), rtol=1e-5)
     assert coarse.described()["arrangement"]["range_levels"] == 20
@@ -258,31 +258,31 @@ SMALL: dict[str, Any] = {
 
 def test_a_network_of_vectors_learns_and_is_evaluated(portions: Path, tmp_path: Path, mitsonar: Command) -> None:
     recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "range_levels": 20}})
-    kept = train(TrainOptions(recipe, portions, tmp_path / "run"))
-    assert kept.options["size"] == [20, 8]
+    stored = train(TrainOptions(recipe, portions, tmp_path / "run"))
+    assert stored.options["size"] == [20, 8]
     done = mitsonar("evaluate", tmp_path / "run", portions, "--part", "all", "--noise", "none")
     assert done.returncode == 0, done.stderr
     assert "posenetvec" in done.stdout
     with pytest.raises(MitsonarError, match="two frames of one view"):
-        ImageNetwork(kept)
+        ImageNetwork(stored)
 
 
 def test_a_network_of_halves_estimates_from_any_frames(ahead: Path, tmp_path: Path) -> None:
     """As the training arranged them: frames in, the same answer as from the data set."""
     recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "halves": True}})
-    kept = train(TrainOptions(recipe, ahead, tmp_path / "run"))
-    assert kept.options["size"][1] == 4
+    stored = train(TrainOptions(recipe, ahead, tmp_path / "run"))
+    assert stored.options["size"][1] == 4
     frames = SonarPairs(ahead, part="all", layout="channels").sonar_frames(7)
-    samples = SonarPairs(ahead, part="all", **kept.arrangement, labels=kept.labels["kind"])
+    samples = SonarPairs(ahead, part="all", **stored.arrangement, labels=stored.labels["kind"])
     with torch.inference_mode():
-        wanted = samples.labels.decode(kept.build()(samples[7][0][None]))[0]
-    np.testing.assert_allclose(ImageNetwork(kept).estimate(frames).motion, wanted, rtol=1e-4, atol=1e-7)
+        expected = samples.labels.decode(stored.build()(samples[7][0][None]))[0]
+    np.testing.assert_allclose(ImageNetwork(stored).estimate(frames).motion, expected, rtol=1e-4, atol=1e-7)
 
 
 def test_heights_of_vectors(portions: Path, tmp_path: Path) -> None:
     recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "frames": 1, "views": ["c1"]}})
-    kept = train(TrainOptions(recipe, portions, tmp_path / "run"))
-    assert (kept.options["size"][1], kept.options["outputs"]) == (1, 1)
+    stored = train(TrainOptions(recipe, portions, tmp_path / "run"))
+    assert (stored.options["size"][1], stored.options["outputs"]) == (1, 1)
 
 
 SIZES = {
@@ -367,22 +367,22 @@ def test_a_network_of_views_drives_a_path(
     )
     assert done.returncode == 0, done.stderr
     assert "vectors of c2, c1, c3, c4" in done.stdout
-    kept = Checkpoint.load(learnt)
-    samples = SonarPairs(portions, part="all", **kept.arrangement, labels=kept.labels["kind"], noise=noise)
+    stored = Checkpoint.load(learnt)
+    samples = SonarPairs(portions, part="all", **stored.arrangement, labels=stored.labels["kind"], noise=noise)
     mine = [number for number in range(len(samples)) if samples.sequence[samples.first[number]] == 3]
-    wanted, _ = predictions(kept, samples, numbers=mine)
-    source = open_views(str(portions), ViewNetwork(kept).views, "vector", sequence=3).with_noise(load_noise(noise))
+    expected, _ = predictions(stored, samples, numbers=mine)
+    source = open_views(str(portions), ViewNetwork(stored).views, "vector", sequence=3).with_noise(load_noise(noise))
     seen = source.read(np.arange(len(source)))
-    found = [ViewNetwork(kept).estimate(seen.select(slice(k, k + 2))).motion for k in range(len(seen) - 1)]
-    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-7)
+    result = [ViewNetwork(stored).estimate(seen.select(slice(k, k + 2))).motion for k in range(len(seen) - 1)]
+    np.testing.assert_allclose(result, expected, rtol=1e-4, atol=1e-7)
     assert seen.poses is not None
     assert not seen.poses[:, [0, 1, 5]].any()
     # the path is the vehicle's, whose motion is learnt: the sonar on it looks 90 deg to port
     truth = [samples.target(number) for number in mine]
     np.testing.assert_allclose(motions(source.poses), truth, atol=1e-9)
-    told = json.loads((tmp_path / "path" / "table.json").read_text())["rows"]
-    (rmse,) = [one["value"] for one in told if one["name"] == "motion error RMSE, sideways"]
-    assert rmse == pytest.approx(1e3 * np.sqrt(((wanted - truth)[:, 0] ** 2).mean()), rel=1e-3)
+    message = json.loads((tmp_path / "path" / "table.json").read_text())["rows"]
+    (rmse,) = [one["value"] for one in message if one["name"] == "motion error RMSE, sideways"]
+    assert rmse == pytest.approx(1e3 * np.sqrt(((expected - truth)[:, 0] ** 2).mean()), rel=1e-3)
 
 
 def test_a_network_of_views_doubts_what_does_not_belong_together(portions: Path, learnt: Path) -> None:
@@ -400,9 +400,9 @@ def test_a_network_of_views_doubts_what_does_not_belong_together(portions: Path,
     assert "the sonar was at" in high.reason
     with pytest.raises(MitsonarError, match="two pings of c2, c1, c3, c4 are needed: got 3"):
         network.estimate(source.read([0, 1, 2]))
-    other = {view: one.replace(range_max=2 * one.range_max) for view, one in pair.sonars.items()}
+    second = {view: one.replace(range_max=2 * one.range_max) for view, one in pair.sonars.items()}
     with pytest.raises(MitsonarError, match="the frames are of didson300: window"):
-        network.estimate(replace(pair, sonars=other))
+        network.estimate(replace(pair, sonars=second))
     with pytest.raises(MitsonarError, match="must have the shape"):
         replace(pair, values={view: one[:, :-1] for view, one in pair.values.items()})
 
@@ -430,8 +430,8 @@ def test_the_shipped_profilenet_knows_unseen_fields(tmp_path: Path, model: str) 
     scenes = [{"count": 1, "sequences": 12, "world": {"size_m": 30}}]
     changes = {"seed": 4713, "sonar.model": model, "flight.pings": 2, "scenes": scenes, "gain": GAINS[model]}
     make_dataset(load_recipe("looking-down-coherent", changes), str(tmp_path / "unseen.zarr"))
-    kept = Checkpoint.load("profilenet-quadrants-coherent")
-    report = evaluate(kept, str(tmp_path / "unseen.zarr"), part="all", noise=["none"])
+    stored = Checkpoint.load("profilenet-quadrants-coherent")
+    report = evaluate(stored, str(tmp_path / "unseen.zarr"), part="all", noise=["none"])
     network, zero = (np.array(report["tables"][0]["rows"][k]["rmse"][:2]) for k in (0, 1))
     assert (network < zero / 2).all(), (network, zero)
     assert "model" not in " ".join(report["notes"])
