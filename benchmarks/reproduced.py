@@ -140,7 +140,7 @@ def texts_of(row: TableRow, words: str, ours: Found) -> Texts:
     """Format what was reached for a row."""
     parts = {"by_pair": "validation", "other": "test", "unseen": "unseen"}
     scores = {name: ours.score(part, "none") for name, part in parts.items()}  # type: ignore[arg-type]
-    texts = {name: "-" if score is None else row.said(score.rmse) for name, score in scores.items()}
+    texts = {name: "-" if score is None else row.format_errors(score.rmse) for name, score in scores.items()}
     if ours.reached.split != "sample":
         texts |= {"by_pair": "-", "other": texts["by_pair"]}
     noisy, reached = ours.score("validation", "high"), ours.reached
@@ -149,7 +149,7 @@ def texts_of(row: TableRow, words: str, ours: Found) -> Texts:
     given = [word.partition("=")[2] for word in parts_of_command if word.startswith("network.width=")]
     data = [parts_of_command[place + 1] for place, word in enumerate(parts_of_command) if word == "--data"]
     return texts | {
-        "high": "-" if noisy is None else row.said(noisy.rmse),
+        "high": "-" if noisy is None else row.format_errors(noisy.rmse),
         "seen": f"{reached.pairs_seen:,} of {planned:,.0f} ({reached.training_pairs:,} different)",
         "width": "; ".join([given[-1] if given else "1", *data]),
         "reached": f"{reached.minutes:.0f}, {reached.machine}, {reached.date}",
@@ -201,7 +201,7 @@ def trained(table: DocumentTable, found: dict[str, Texts]) -> list[str]:
     heads = ["row", "Almanza-Medina", "its high noise", *COLUMNS.values()]
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for row in table.rows:
-        printed = [row.said(row.printed.get(noise)) for noise in ("none", "high")]
+        printed = [row.format_errors(row.printed.get(noise)) for noise in ("none", "high")]
         texts = found.get(row.name, {"by_pair": "not trained yet"})
         lines.append(f"| {' | '.join([row.approach, *printed, *(texts.get(key, '-') for key in COLUMNS)])} |")
     return lines

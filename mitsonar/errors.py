@@ -64,9 +64,9 @@ class MitsonarError(ValueError):
     """Error caused by invalid or unusable input. The command line prints the message and exits with code 2."""
 
     def __str__(self) -> str:
-        return self.said({})
+        return self.with_options({})
 
-    def said(self, options: Mapping[str, str]) -> str:
+    def with_options(self, options: Mapping[str, str]) -> str:
         """Return the message with the names of marked arguments replaced by command-line options.
 
         Args:

@@ -545,7 +545,7 @@ class TableRow(Strict):
         """Return an RMSE as a figure shows it: heights in percent of their interval."""
         return errors if self.interval is None else (errors[0] / 10 / self.interval,)
 
-    def said(self, errors: tuple[float, ...] | None) -> str:
+    def format_errors(self, errors: tuple[float, ...] | None) -> str:
         """Format an RMSE for people: heights in cm and in percent of their interval."""
         if errors is None:
             return "-"
@@ -875,8 +875,8 @@ def _error_cells(table: DocumentTable, results: Mapping[str, Found], first: Foun
         cells.append([row.approach])
         for noise in _noises(table, results):
             scores = [result.score(part, noise) if result else None for part in parts]
-            our_cells = [row.said(score.rmse) if score is not None else "-" if result else NOT_YET for score in scores]
-            cells[-1] += [row.said(row.printed.get(noise))] * (noise != LOUD) + our_cells
+            our_cells = [row.format_errors(score.rmse) if score is not None else "-" if result else NOT_YET for score in scores]
+            cells[-1] += [row.format_errors(row.printed.get(noise))] * (noise != LOUD) + our_cells
     if timed:
         head += ["Almanza-Medina, ms", "here, ms"]
         for row, line in zip(table.rows, cells[-len(table.rows) :], strict=True):

@@ -180,7 +180,7 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
             with _signals_stop():
                 return command(*args, **kwargs)
         except MitsonarError as error:
-            typer.echo(f"error: {' '.join(error.said(typed).split())}", err=True)
+            typer.echo(f"error: {' '.join(error.with_options(typed).split())}", err=True)
         except ModuleNotFoundError as error:
             typer.echo(f"error: {explain_missing(error)}", err=True)
         except BrokenPipeError:  # the reader of our output has ended, which is no error

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
     from mitsonar.config.data import Recipe
-    from mitsonar.datasets.make import Made
+    from mitsonar.datasets.make import GenerationReport
     from mitsonar.worlds.world import Family, World
 
 __all__ = ["datasets", "worlds"]
@@ -107,7 +107,7 @@ def make(
     say(f"show it: {command_line('dataset', 'show', report.url)}")
 
 
-def _make_with_bar(recipe: Recipe, out: str, **words: object) -> Made:
+def _make_with_bar(recipe: Recipe, out: str, **words: object) -> GenerationReport:
     """Make a data set with a progress bar; Ctrl-C ends the process at once."""
     from mitsonar.datasets.make import make_dataset
 

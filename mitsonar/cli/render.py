@@ -107,7 +107,7 @@ def render(
         scene_sonar = (sonar_in(loaded) or channel_sonar_in(loaded)) if file is None else None
         path = options.path_for(Sonar(), scene_sonar and scene_sonar[1], scene, frames, start, end, trajectory, frame, speed)
         options.warn_of_speed(path, end, speed)
-        motions = _motions(loaded, moving, named, [] if file is None else file.said)
+        motions = _motions(loaded, moving, named, [] if file is None else file.motion_specs)
         return _render_vehicle(loaded, file, path, changes, motions, outputs, Destination(folder, origin, overwrite, resume))
     instrument, attitude = options.instrument_for(loaded, sonar, changes)
     refuse_noise(outputs.noise, instrument)

@@ -383,7 +383,7 @@ def _list() -> None:
             say(f"    {table.command}")
             continue
         for row in table.rows:
-            errors = [row.said(row.printed.get(noise)) for noise in table.noises if noise != LOUD] if row.printed else []
+            errors = [row.format_errors(row.printed.get(noise)) for noise in table.noises if noise != LOUD] if row.printed else []
             say(f"    {row.name:32} {'   '.join(errors) or '-'}   {row.approach}")
 
 

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FRAMES_A_SCENE",
-    "Made",
+    "GenerationReport",
     "Queue",
     "ResponseRenderer",
     "SceneRenderer",
@@ -80,7 +80,7 @@ SHARDS_TO_CHECK = 32
 
 
 @dataclass(frozen=True)
-class Made:
+class GenerationReport:
     """Report of :func:`make_dataset`.
 
     Attributes:
@@ -108,7 +108,7 @@ def make_dataset(
     verify: bool = False,
     begun: Callable[[int, int], None] = lambda frames, done: None,
     progress: Callable[[int], None] = lambda frames: None,
-) -> Made:
+) -> GenerationReport:
     """Make a data set, or continue one that was interrupted; the result is the same bit for bit.
 
     Args:
@@ -153,7 +153,7 @@ def make_dataset(
         if todo:
             raise MitsonarError(f"{url}: shards vanish while others are written; does another program write there?")
         store.finish()
-        return Made(storage.url, len(store), written, store.shards, _warnings(store))
+        return GenerationReport(storage.url, len(store), written, store.shards, _warnings(store))
 
 
 def _refuse_other_files(storage: Storage) -> None:

@@ -78,7 +78,7 @@ class VehicleFile(NamedTuple):
     """Sensors of a vehicle keyed by name, and the motion specifications of bodies in its file."""
 
     sensors: dict[str, Mounted]
-    said: list[Said]
+    motion_specs: list[Said]
 
 
 class VehicleSimulator:

@@ -167,7 +167,7 @@ def test_a_network_gets_the_input_of_its_training(pairs: SonarPairs) -> None:
     result = estimator.estimate(pairs.sonar_frames(3))
     assert result.motion == pytest.approx([local.labels.high[0], local.labels.low[1], 0.0])
     expected = torch.cat([*torch.from_numpy(pairs.sonar_frames(3).image)], dim=1)
-    assert torch.equal(estimator._made._network.seen[0, 0], expected)
+    assert torch.equal(estimator._wrapped._network.seen[0, 0], expected)
     assert list(_methods([estimator])) == ["Sums"], "the row of a table is named after the network, not after what wraps it"
 
 

@@ -92,7 +92,7 @@ def test_the_grain_tells_the_coding(recordings: dict[str, SonarFrames]) -> None:
     frames.sonar = frames.sonar.replace(coding_db=90.0)
     stated, measured = fit_sonar(frames), fit_sonar(frames, measure_coding=True)
     assert stated.sonar.coding_db == 90
-    assert "where the frames state 90" in stated.notes[0]
+    assert "but the frames state 90" in stated.notes[0]
     assert measured.sonar.coding_db == pytest.approx(70, rel=0.08)
     gamma = recordings["gamma"].select(slice(None))
     gamma.sonar = gamma.sonar.replace(coding_gamma=1.0)

@@ -442,16 +442,16 @@ class _PingRuns:
     @property
     def count(self) -> int:
         """Return the number of runs."""
-        return int(self.inside.shape[1])
+        return int(self.coefficients.shape[1])
 
     @property
     def power(self) -> Array:
         """Return the power along each eigenvector, summed over all runs."""
-        return np.asarray((np.abs(self.inside) ** 2).sum(axis=1))
+        return np.asarray((np.abs(self.coefficients) ** 2).sum(axis=1))
 
     def score(self, slopes: list[Complex], noise: float, level: float) -> tuple[Array, Array]:
         """Return gradient ``(k,)`` and information ``(k, k)``."""
-        solved = self.vectors @ (self.inside / (self.size + noise)[:, None])
+        solved = self.vectors @ (self.coefficients / (self.size + noise)[:, None])
         inverse = (self.vectors / (self.size + noise)) @ self.vectors.conj().T
         turned = [inverse @ slope for slope in slopes]
         gradient = [

@@ -215,7 +215,7 @@ def test_one_door_for_estimators_of_ones_own(ground: NDArray[np.float64]) -> Non
     """An instance, a class with options, and a text with options; each gets the prior if it takes one, and not if not."""
     frames = pair(ground, Motion(0.0, 0.0, 0.0))
     built = create_estimator("my_module:Biased:key=5:name=mine")
-    kind: Any = type(getattr(built, "_made"))  # noqa: B009
+    kind: Any = type(getattr(built, "_wrapped"))  # noqa: B009
     for one in (built, create_estimator(kind(5, "mine")), create_estimator(kind, key=5, name="mine"), kind(5, "mine")):
         result = create_estimator(one).estimate(frames, PRIOR)
         assert result.motion == Motion(5.0, 0.7, 0.0)
