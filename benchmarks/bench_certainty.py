@@ -135,9 +135,9 @@ def measure_kind(out: Path, name: str, kind: Kind, noise: str, methods: Sequence
 
 def stored(data: Path, noise: str, seed: int) -> Pairs:
     """Read the pairs of a data set."""
-    samples = SonarPairs(data, part="all", frames=2, noise=noise, seed=seed, one_a_sequence=True)
+    samples = SonarPairs(data, part="all", frames=2, noise=noise, seed=seed, one_per_sequence=True)
     for number in range(len(samples)):
-        here = samples.frame_numbers(number)
+        here = samples.frame_slice(number)
         truth = motions(samples.pose[here][[0, -1]])[0]
         yield samples.sonar_frames(number), truth, int(samples.scene[samples.first[number]])
 

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 import mitsonar
 from mitsonar.instruments.sonar import FAR_GRAZING_RAD, QUALITIES, one_beam, scans
 from mitsonar.instruments.sounder import named_sonars, preset
-from mitsonar.io.files import write_whole
+from mitsonar.io.files import write_atomic
 from mitsonar.simulation.device import ensure_variant
 
 if TYPE_CHECKING:
@@ -206,7 +206,7 @@ def write(rows: dict[str, dict[str, dict[str, float]]]) -> None:
         for quality, row in by_quality.items():
             output = yaml.safe_dump(row, default_flow_style=True, sort_keys=False, width=200).strip()
             lines.append(f"    {quality}: {output}")
-    write_whole(TABLE, ("\n".join(lines) + "\n").encode())
+    write_atomic(TABLE, ("\n".join(lines) + "\n").encode())
 
 
 if __name__ == "__main__":

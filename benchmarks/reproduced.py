@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.files import write_whole
+from mitsonar.io.files import write_atomic
 from mitsonar.reproduction.tables import DocumentTable, Found, ScriptedTable, TableRow, contents, load_tables, tables_with
 
 HERE = Path(__file__).resolve().parent
@@ -64,7 +64,7 @@ def main() -> None:
         return None
     for run in arguments.runs if arguments.what == "add" else []:
         add(run)
-    write_whole(PAGE, page(results()).encode())
+    write_atomic(PAGE, page(results()).encode())
     print(PAGE)
 
 
@@ -109,7 +109,7 @@ def add(run: Path) -> None:
     for path in rows:
         result = json.loads(path.read_text(encoding="utf-8"))
         table = {"command": command(path.stem, effort), **Found(**result).model_dump(mode="json")}
-        write_whole(RESULTS / path.name, (json.dumps(table, indent=1) + "\n").encode())
+        write_atomic(RESULTS / path.name, (json.dumps(table, indent=1) + "\n").encode())
 
 
 def command(row: str, effort: dict[str, object]) -> str:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.files import write_whole
+from mitsonar.io.files import write_atomic
 
 HERE = Path(__file__).resolve().parent
 RESULTS, PAGE = HERE / "results" / "tables", HERE / "RESULTS.md"
@@ -56,7 +56,7 @@ def main() -> None:
     options = parser.parse_args()
     text = page(RESULTS)
     if options.what == "write" and not options.quick:
-        write_whole(PAGE, text.encode())
+        write_atomic(PAGE, text.encode())
         print(PAGE)
     elif not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != text:
         raise SystemExit(f"{PAGE.name} differs from the results: run  python benchmarks/tables.py write")

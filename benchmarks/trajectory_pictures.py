@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from trajectory_jobs import NOISE_OF, RECIPES, Job, trajectory_job
 
-from mitsonar.io.files import write_whole
+from mitsonar.io.files import write_atomic
 from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Blend, Mosaic, MosaicOptions, build_mosaic, illumination
 from mitsonar.motion.errors import AXES, in_units
 from mitsonar.motion.trajectory import Trajectory
@@ -39,7 +39,7 @@ def save_small(path: Path, figure: Figure) -> None:
     Image.open(drawn).convert("RGB").quantize(160, method=Image.Quantize.MAXCOVERAGE).save(
         small, format="png", optimize=True
     )
-    write_whole(path, small.getvalue())
+    write_atomic(path, small.getvalue())
 
 
 def paths_of(out: Path, job: Job, name: str) -> tuple[SonarFrames, dict[str, Trajectory]]:

@@ -78,8 +78,8 @@ def panel(axis: Axes, convention: Convention) -> None:
     ours = turn.as_matrix()[0] @ np.linalg.inv(np.array(convention.body, dtype=float))
     triad(axis, place, ours, 1.2, body)
     axis.plot(*on_paper(place[None])[0], "ko", ms=5)
-    position, _ = convention.from_ours(place[None], turn)
-    pitch, roll, around = np.degrees(convention.angles_from_ours(np.array([POSE[3:]])))[0] + 0.0
+    position, _ = convention.from_mitsonar(place[None], turn)
+    pitch, roll, around = np.degrees(convention.angles_from_mitsonar(np.array([POSE[3:]])))[0] + 0.0
     x, y, z = position[0]
     axis.set_title(TITLES[convention.name], fontsize=12)
     output = f"x {x:.1f}  y {y:.1f}  z {z:.1f} m\nroll {roll:.0f}  pitch {pitch:.0f}  {convention.turn[0]} {around:.0f} deg"

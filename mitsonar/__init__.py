@@ -15,7 +15,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 from mitsonar import plugins
-from mitsonar.errors import explain_missing
+from mitsonar.errors import missing_package_error
 
 if TYPE_CHECKING:
     from mitsonar.acoustics.noise import load_noise
@@ -210,7 +210,7 @@ def __getattr__(name: str) -> object:
     try:
         found: object = getattr(import_module(f"mitsonar.{_MODULES[name]}"), name)
     except ModuleNotFoundError as error:
-        raise explain_missing(error) from None
+        raise missing_package_error(error) from None
     return found
 
 

@@ -17,13 +17,13 @@ __all__ = [
     "MitsonarError",
     "MitsonarWarning",
     "argument",
-    "complaint",
-    "counted",
-    "explain_missing",
-    "meant",
-    "nearest_names",
-    "refuse_unknown",
-    "shortened",
+    "check_argument_names",
+    "count_noun",
+    "did_you_mean",
+    "missing_package_error",
+    "short_repr",
+    "suggest_names",
+    "validation_message",
 ]
 
 EXTRAS = {
@@ -96,7 +96,7 @@ class MitsonarWarning(UserWarning):
     """Warning about a result that is valid, but has a limitation that the user should know."""
 
 
-def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
+def missing_package_error(error: ModuleNotFoundError) -> MitsonarError:
     """Return an error that states which extra installs a missing optional package.
 
     Raises:
@@ -110,7 +110,7 @@ def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
     return MitsonarError(f"{what} {needs} {package}, which is not installed: pip install 'mitsonar[{extra}]'")
 
 
-def nearest_names(wrong: str, names: Iterable[str]) -> str:
+def suggest_names(wrong: str, names: Iterable[str]) -> str:
     """Format the known names for the end of an error message, after a suggestion of those similar to ``wrong``."""
     known = list(names)
     similar = [name for name in known if wrong and wrong.lower() in name.lower()]
@@ -118,18 +118,18 @@ def nearest_names(wrong: str, names: Iterable[str]) -> str:
     return f"did you mean {' or '.join(similar)}? Known: {', '.join(known)}" if similar else f"known: {', '.join(known)}"
 
 
-def counted(number: int, noun: str, plural: str = "") -> str:
+def count_noun(number: int, noun: str, plural: str = "") -> str:
     """Format a number with its noun for messages: ``1 frame``, ``1,200 frames``."""
     return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
 
 
-def meant(wrong: object, names: Iterable[str]) -> str:
+def did_you_mean(wrong: object, names: Iterable[str]) -> str:
     """Format a suggestion of the most similar name, for the end of a message; empty if no name is similar."""
     similar = difflib.get_close_matches(str(wrong).lower(), [str(name) for name in names], n=1, cutoff=0.5)
     return f"; did you mean {similar[0]}?" if similar else ""
 
 
-def refuse_unknown(given: Iterable[str], known: Iterable[str], owner: str) -> None:
+def check_argument_names(given: Iterable[str], known: Iterable[str], owner: str) -> None:
     """Reject keyword arguments with unknown names.
 
     Args:
@@ -143,10 +143,10 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str], owner: str) -> No
     names = list(known)
     for name in given:
         if name not in names:
-            raise MitsonarError(f"{owner} has no argument {name}: {nearest_names(name, names)}")
+            raise MitsonarError(f"{owner} has no argument {name}: {suggest_names(name, names)}")
 
 
-def complaint(error: ValidationError, model: type[BaseModel], what: str, see: str = "") -> str:
+def validation_message(error: ValidationError, model: type[BaseModel], what: str, see: str = "") -> str:
     """Format a pydantic validation error as one sentence: what is wrong, what was given, what is allowed.
 
     Only the first error is reported; unknown keys come first.
@@ -162,24 +162,24 @@ def complaint(error: ValidationError, model: type[BaseModel], what: str, see: st
     key = ".".join(part if len(part) <= MAX_KEY_LENGTH else f"{part[:MAX_KEY_LENGTH]}..." for part in where)
     if first["type"] == "extra_forbidden":
         known = _fields_of(model, where[:-1]) or model.model_fields
-        return f"unknown {what} key {key}: {nearest_names(where[-1], known)}"
+        return f"unknown {what} key {key}: {suggest_names(where[-1], known)}"
     if first["type"] == "missing":
         return f"{what} lacks {key}{see}"
     if first["type"] == "value_error":
         reason = str(first["ctx"]["error"])
         return f"{argument(f'{what} {key}')}: {reason}" if where else reason
     message = first["msg"][0].lower() + first["msg"][1:]
-    return f"{argument(f'{what} {key}')}: {message}, got {shortened(first['input'])}{_suggest_literal(first)}{see}"
+    return f"{argument(f'{what} {key}')}: {message}, got {short_repr(first['input'])}{_suggest_literal(first)}{see}"
 
 
 def _suggest_literal(error: ErrorDetails) -> str:
     """Suggest the most similar allowed value if the given one is not allowed."""
     if error["type"] != "literal_error":
         return ""
-    return meant(error["input"], re.findall(r"'([^']*)'", str(error["ctx"]["expected"])))
+    return did_you_mean(error["input"], re.findall(r"'([^']*)'", str(error["ctx"]["expected"])))
 
 
-def shortened(value: object) -> str:
+def short_repr(value: object) -> str:
     """Return the repr of a value, truncated if it is long. Huge and self-referential values are safe."""
     if isinstance(value, int) and abs(value) > 10**40:
         return f"an integer of {value.bit_length():,} bits"

@@ -19,7 +19,7 @@ __all__ = [
     "constant_on_facets",
     "is_black",
     "kinds_and_textures",
-    "one_number",
+    "reduce_colour",
     "reflectances_of",
     "reflectivity_at",
     "unit",
@@ -43,10 +43,10 @@ def reflectivity_at(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f) -> DeviceArray:
     """Return the reflectivity 0..1 of a BSDF at points, or :data:`DEFAULT_REFLECTIVITY` without a diffuse reflectance."""
     if not kinds_and_textures(bsdf)[0] <= DIFFUSE | APPROXIMATED | WRAPPERS:
         return mi.Float(DEFAULT_REFLECTIVITY)
-    return unit(one_number(bsdf.eval_diffuse_reflectance(si)))
+    return unit(reduce_colour(bsdf.eval_diffuse_reflectance(si)))
 
 
-def one_number(spectrum: DeviceArray) -> DeviceArray:
+def reduce_colour(spectrum: DeviceArray) -> DeviceArray:
     """Return the luminance of a spectrum."""
     return mi.luminance(spectrum) if mi.is_rgb else spectrum[0]
 

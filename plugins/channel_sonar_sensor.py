@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mitsonar.arrays import DeviceArray
-from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.instruments.hydrophones import LOOKS, ChannelSonar, FieldOfView, four_receivers
+from mitsonar.errors import MitsonarError, suggest_names
+from mitsonar.instruments.hydrophones import RECEIVER_HEADINGS_DEG, ChannelSonar, FieldOfView, four_receivers
 from mitsonar.motion.pose import Pose, pose_from_to_world, to_world_matrices
 from mitsonar.plugins.native_plugins import load_dict
 
@@ -110,7 +110,7 @@ def _read(props: mi.Properties) -> ChannelSonar:
     fields = _some(props, SONAR_KEYS)
     shared = _some(props, tuple(name for name in FIELD_KEYS if name != "heading_deg"))
     transmitter = {"shape": "all", **_some(props, FIELD_KEYS, "transmitter_")}
-    names = [name.strip() for name in str(props.get("receivers", ", ".join(LOOKS))).split(",")]
+    names = [name.strip() for name in str(props.get("receivers", ", ".join(RECEIVER_HEADINGS_DEG))).split(",")]
     known = {one.name: one.model_dump() for one in four_receivers()}
     receivers = []
     for name in names:
@@ -164,7 +164,7 @@ def _refuse_unknown(props: mi.Properties, names: list[str]) -> None:
     known |= {f"{name}_{key}" for name in names for key in (*FIELD_KEYS, "position")}
     for key in props:
         if key not in known and props.type(key) not in (mi.Properties.Type.Object, mi.Properties.Type.Reference):
-            raise MitsonarError(f"the sensor channel_sonar has no property {key!r}: {nearest_names(key, sorted(known))}")
+            raise MitsonarError(f"the sensor channel_sonar has no property {key!r}: {suggest_names(key, sorted(known))}")
 
 
 def _some(props: mi.Properties, names: tuple[str, ...], before: str = "") -> dict[str, object]:

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from mitsonar.errors import MitsonarError, meant, shortened
+from mitsonar.errors import MitsonarError, did_you_mean, short_repr
 
 __all__ = ["file_resolver", "foreign_names", "load_dict", "own_code_only", "search_folders", "search_in"]
 
@@ -55,7 +55,7 @@ def foreign_names(names: Iterable[str]) -> list[str]:
     foreign = sorted(set(names) - mitsuba_names())
     for name in foreign:
         if not NAME.fullmatch(name):
-            raise MitsonarError(f"a type must be the name of a plugin, of letters, digits and _: got {shortened(name)}")
+            raise MitsonarError(f"a type must be the name of a plugin, of letters, digits and _: got {short_repr(name)}")
     return foreign
 
 
@@ -88,7 +88,7 @@ def own_code_only(names: Iterable[str]) -> Iterator[None]:
         name = next((name for name in foreign if Path(name).stem == unknown[1] or name == unknown[1]), unknown[1])
         raise MitsonarError(
             f"there is no plugin {name}: Mitsuba has none of that name, and none is registered in Python"
-            f"{meant(name, mitsuba_names())}"
+            f"{did_you_mean(name, mitsuba_names())}"
         ) from None
 
 

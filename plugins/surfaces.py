@@ -21,7 +21,7 @@ from typing import cast
 import drjit as dr
 import mitsuba as mi
 
-from mitsonar.acoustics.materials import hearing_notes
+from mitsonar.acoustics.materials import frequency_notes
 from mitsonar.arrays import DeviceArray
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.plugins.acoustic_material import AcousticMaterial
@@ -35,7 +35,7 @@ from mitsonar.plugins.bsdf_reflectance import (
     by_vertex,
     constant_on_facets,
     kinds_and_textures,
-    one_number,
+    reduce_colour,
     reflectivity_at,
     unit,
 )
@@ -196,7 +196,7 @@ class Surfaces:
             return self
         laws = law_rows(self.materials, sonar)
         dr.eval(laws)
-        notes = hearing_notes([one.material for one in self.materials], sonar.frequency_hz, sonar.sound_speed)
+        notes = frequency_notes([one.material for one in self.materials], sonar.frequency_hz, sonar.sound_speed)
         return replace(self, laws=laws, lawful=True, notes=[*self.notes, *notes])
 
     def mirror(self, material: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
@@ -226,14 +226,14 @@ class Surfaces:
         if self.textured:
             evaluated = tabled & (reflectivity < 0)
             si = self._on_facet(intersection, ray, normal, mi.UInt32(shape.y), evaluated)
-            reflectance: DeviceArray = one_number(intersection.shape.bsdf().eval_diffuse_reflectance(si, evaluated))
+            reflectance: DeviceArray = reduce_colour(intersection.shape.bsdf().eval_diffuse_reflectance(si, evaluated))
             reflectivity = dr.select(evaluated, unit(reflectance), reflectivity)
         # 3. Let Mitsuba evaluate shapes that are not in the tables. An instance counts as one shape of the scene.
         if self.foreign:
             evaluated = valid & ~tabled
             si = intersection.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, evaluated)
             fixed = dr.select(known, dr.gather(mi.Float, self.constant, index, known), -1)
-            reflectance = one_number(si.bsdf().eval_diffuse_reflectance(si, evaluated & (fixed < 0)))
+            reflectance = reduce_colour(si.bsdf().eval_diffuse_reflectance(si, evaluated & (fixed < 0)))
             normal = dr.select(tabled, normal, si.n)
             reflectivity = dr.select(tabled, reflectivity, unit(dr.select(fixed < 0, reflectance, fixed)))
             top: DeviceArray = dr.reinterpret_array(mi.UInt32, intersection.instance)

@@ -19,7 +19,7 @@ from array_api_compat import array_namespace
 from scipy.special import sici
 
 from mitsonar.arrays import AnyArray
-from mitsonar.errors import MitsonarError, argument, shortened
+from mitsonar.errors import MitsonarError, argument, short_repr
 
 __all__ = [
     "ambient_noise_db",
@@ -237,9 +237,9 @@ def ambient_noise_db(
         MitsonarError: a negative wind, a shipping outside 0..1, a bandwidth that is not above 0.
     """
     if not 0 <= wind_m_s < math.inf:
-        raise MitsonarError(f"{argument('wind_m_s')} must be a finite speed from 0: got {shortened(wind_m_s)}")
+        raise MitsonarError(f"{argument('wind_m_s')} must be a finite speed from 0: got {short_repr(wind_m_s)}")
     if not 0 <= shipping <= 1:
-        raise MitsonarError(f"{argument('shipping')} must lie in 0..1: got {shortened(shipping)}")
+        raise MitsonarError(f"{argument('shipping')} must lie in 0..1: got {short_repr(shipping)}")
     khz = frequency_hz * 1e-3
     log = decibels(khz) / 10.0
     turbulence = 17.0 - 30.0 * log
@@ -358,5 +358,5 @@ def _band_db(bandwidth_hz: float, directivity_index_db: float) -> float:
 def _length(value: float, name: str) -> float:
     """Check that a number is finite and above 0."""
     if not 0 < value < math.inf:
-        raise MitsonarError(f"{argument(name)} must be a finite number above 0: got {shortened(value)}")
+        raise MitsonarError(f"{argument(name)} must be a finite number above 0: got {short_repr(value)}")
     return float(value)

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel
-from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, argument, suggest_names
 from mitsonar.estimation.compare import Answers, Cells, markdown
 from mitsonar.estimation.crlb.image import bounds_at, laws_of, overall
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, PlainTable
 from mitsonar.estimation.named import EXTERNAL, create_estimator
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
-from mitsonar.io.files import parse_json, read_json, whole_lines, write_json, write_whole
+from mitsonar.io.files import parse_json, read_json, whole_lines, write_atomic, write_json
 from mitsonar.io.runs import RunDirectory, RunKind, digest, versions
 from mitsonar.mapping.odometry import Odometry, OdometryOptions
 from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder, run_odometry
@@ -70,7 +70,7 @@ __all__ = [
     "benchmark_lines",
     "benchmark_odometry",
     "dive_course",
-    "measured_row",
+    "measure_row",
 ]
 
 
@@ -120,7 +120,7 @@ class Case:
         return " ".join([f"--set {self.name} --texture {self.texture}", *noise, f"--method {self.method}"])
 
 
-def measured_row(
+def measure_row(
     case: Case,
     source: FrameSource,
     estimator: AnyEstimator,
@@ -611,7 +611,7 @@ def _cells(request: Wanted) -> Iterator[Case]:
     for kind, names, known in (("texture", request.textures, TEXTURES), ("noise", request.noises, NOISES)):
         for choice in names:
             if choice not in known:
-                raise MitsonarError(f"unknown {kind} {choice!r}: {nearest_names(choice, known)}")
+                raise MitsonarError(f"unknown {kind} {choice!r}: {suggest_names(choice, known)}")
     if request.frames is not None and request.frames < 3:
         raise MitsonarError(f"{argument('frames')} must be at least 3: got {request.frames}")
     for name in dict.fromkeys(request.sets):
@@ -625,7 +625,7 @@ def _cells(request: Wanted) -> Iterator[Case]:
             )
         elif not Path(name).exists():
             raise MitsonarError(
-                f"unknown set {name!r}: {nearest_names(name, SET_NAMES)}; or give the path of a recording or a run"
+                f"unknown set {name!r}: {suggest_names(name, SET_NAMES)}; or give the path of a recording or a run"
             )
         else:
             if record_at(name) is not SonarFrames:
@@ -712,7 +712,7 @@ class _Bench:
         loops = 0 if source.true is not None else max(0, len(source) - 1 - LOOP)
         with begin(" ".join(case.key), len(source) - 1 + loops) as progress:
             folder = self.out / "paths" / _folder_name(case)
-            return measured_row(case, source, estimator, folder, bound=bound, workers=workers, progress=progress)
+            return measure_row(case, source, estimator, folder, bound=bound, workers=workers, progress=progress)
 
     def _bound(self, case: Case, rendered: RenderedSet, begin: Begin) -> NDArray[np.float64] | None:
         """Return the bound of a set, computed once; None if it cannot be computed."""
@@ -732,7 +732,7 @@ class _Bench:
         """Write the table of all rows."""
         report: PlainTable = {**self.run.asked, "loop": LOOP, "notes": [*self.opening_notes, *notes], "rows": rows}
         report |= versions(BENCHMARK.packages)
-        write_whole(self.out / "table.md", ("\n".join(benchmark_lines(rows)) + "\n").encode())
+        write_atomic(self.out / "table.md", ("\n".join(benchmark_lines(rows)) + "\n").encode())
         write_json(self.out / "table.json", report)
         self.run.finish()
         return report

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, suggest_names
 
 if TYPE_CHECKING:
     from mitsonar.datasets.responses import ImpulseSamples
@@ -197,7 +197,7 @@ def score_all(
     chosen = list(REGRESSORS) if names is None else list(names)
     for name in chosen:
         if name not in REGRESSORS:
-            raise MitsonarError(f"unknown regressor {name!r}: {nearest_names(name, REGRESSORS)}")
+            raise MitsonarError(f"unknown regressor {name!r}: {suggest_names(name, REGRESSORS)}")
     if axis not in (0, 1):
         raise MitsonarError(f"axis must be 0 (sideways) or 1 (forward): got {axis}")
     features, test_features = (np.asarray(part[0], dtype=np.float64) for part in (train, test))

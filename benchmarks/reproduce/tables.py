@@ -25,9 +25,9 @@ from mitsonar.config.training import TrainingRecipe, TrainOptions, load_training
 from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.sample_index import split_for
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError, argument, complaint, nearest_names
-from mitsonar.io.files import read_json, write_json, write_whole
-from mitsonar.io.runs import RunDirectory, RunKind, plain_json, refuse_other, versions
+from mitsonar.errors import MitsonarError, argument, suggest_names, validation_message
+from mitsonar.io.files import read_json, write_atomic, write_json
+from mitsonar.io.runs import RunDirectory, RunKind, check_same_settings, plain_json, versions
 from mitsonar.io.storage import Storage
 from mitsonar.motion.errors import AXES, Axis
 from mitsonar.networks.checkpoint import Checkpoint
@@ -292,7 +292,7 @@ class TableBuilder:
         self.run.start(tables=[], recipes={})
         stored, requested = self.recipes, plain_json({name: recipe.plain() for name, recipe in recipes.items()})
         shared = {name: recipe for name, recipe in requested.items() if name in stored}
-        refuse_other(self.folder, {"row": {name: stored[name] for name in shared}}, {"row": shared})
+        check_same_settings(self.folder, {"row": {name: stored[name] for name in shared}}, {"row": shared})
         tables = [name for name in load_tables() if name == table or name in self.tables]
         self.run.note(tables=tables, recipes=stored | requested)
 
@@ -313,7 +313,7 @@ class TableBuilder:
         checkpoint = self._train(name, recipe, seen, crew)
         noises = list(document_table.noises)[: 1 if self.effort.quick else None]
         parts = {"validation": (seen, "validation"), "unseen": (unseen, "all")}
-        if split_for(recipe.split_of, data).test:
+        if split_for(recipe.resolved_split, data).test:
             parts["test"] = seen, "test"
         scores = {
             key: _scores(evaluate(checkpoint, url, noise=noises, part=part, begin=_progress(crew.watch, f"{name}, {key}")))
@@ -366,7 +366,7 @@ class TableBuilder:
             try:
                 rows[path.stem] = Found(**read_json(path))
             except (ValidationError, TypeError) as error:
-                reason = complaint(error, Found, "row") if isinstance(error, ValidationError) else str(error)
+                reason = validation_message(error, Found, "row") if isinstance(error, ValidationError) else str(error)
                 raise MitsonarError(f"{path} is damaged ({reason}): remove it, and the row is evaluated again") from None
         return rows
 
@@ -384,10 +384,10 @@ class TableBuilder:
             )
             buffer = io.BytesIO()
             figure.savefig(buffer, format="png", dpi=80)
-            write_whole(self.folder / f"table-{table.name}.png", buffer.getvalue())
+            write_atomic(self.folder / f"table-{table.name}.png", buffer.getvalue())
         report = {"version": version, **self.run.asked, "recipes": self.recipes}
         report["tables"] = {table.name: plain_table(table, results) for table in tables}
-        write_whole(self.folder / "table.md", ("\n".join(lines) + "\n").encode())
+        write_atomic(self.folder / "table.md", ("\n".join(lines) + "\n").encode())
         write_json(self.folder / "table.json", report)
         return report
 
@@ -484,11 +484,11 @@ def _processor() -> str:
 # ---------------- Tables of trained networks as Almanza-Medina prints them
 
 
-LOUD: Literal["0.0274,0.0062,0.0274"] = "0.0274,0.0062,0.0274"
+HIGHEST_NOISE: Literal["0.0274,0.0062,0.0274"] = "0.0274,0.0062,0.0274"
 """A fifth of the high noise: what echoes of five times the gain have. The baseline of Almanza-Medina hardly feels the high
 noise (table 3.8: 8.39 and 8.16 mm), and ``ecc`` hardly feels this (0.98 and 1.02 mm; 1.89 with high noise)."""
 
-NOISES = {"none": "noiseless", "high": "high noise", LOUD: "high noise, 5 times the gain"}
+NOISES = {"none": "noiseless", "high": "high noise", HIGHEST_NOISE: "high noise, 5 times the gain"}
 """Noise of the validation samples, and the heading of its half of a table."""
 
 CHAPTERS = ("chapter3", "chapter4", "chapter5")
@@ -584,7 +584,7 @@ class DocumentTable(Strict):
     )
     largest: Errors = (20.0, 20.0, 0.45)
     set: JsonObject = Field(default_factory=dict)
-    noises: list[Literal["none", "high", "0.0274,0.0062,0.0274"]] = ["none", "high", LOUD]
+    noises: list[Literal["none", "high", "0.0274,0.0062,0.0274"]] = ["none", "high", HIGHEST_NOISE]
     unseen: int | None = Field(None, ge=1)
     rows: list[TableRow] = Field(min_length=1)
 
@@ -655,7 +655,7 @@ def table_named(name: str) -> DocumentTable:
     if name in scripted:
         raise MitsonarError(f"{name} is made by a script of mitsonar's sources: run there  {scripted[name].command}")
     if name not in tables:
-        raise MitsonarError(f"no table {name!r}: {nearest_names(name, [one.name for one in contents()])}")
+        raise MitsonarError(f"no table {name!r}: {suggest_names(name, [one.name for one in contents()])}")
     return tables[name]
 
 
@@ -668,7 +668,7 @@ def rows_named(table: DocumentTable, names: list[str] | None = None) -> list[Tab
     known = [row.name for row in table.rows]
     for name in names or []:
         if name not in known:
-            raise MitsonarError(f"table {table.name} has no row {name!r}: {nearest_names(name, known)}")
+            raise MitsonarError(f"table {table.name} has no row {name!r}: {suggest_names(name, known)}")
     return [row for row in table.rows if not names or row.name in names]
 
 
@@ -853,7 +853,9 @@ def _parts(table: DocumentTable, results: Mapping[str, Found]) -> dict[Part, str
 def _noises(table: DocumentTable, results: Mapping[str, Found]) -> list[str]:
     """Return the noises that rows are scored with; one that is not printed only if a row has it."""
     return [
-        noise for noise in table.noises if noise != LOUD or any(noise in result.validation for result in results.values())
+        noise
+        for noise in table.noises
+        if noise != HIGHEST_NOISE or any(noise in result.validation for result in results.values())
     ]
 
 
@@ -864,7 +866,7 @@ def _error_cells(table: DocumentTable, results: Mapping[str, Found], first: Foun
     heights, timed = table.axes == (HEIGHT,), any(row.ms for row in table.rows)
     head, zero = ["RMSE of heights" if heights else f"RMSE, {units}"], ["*always answering no motion*"]
     for noise in _noises(table, results):
-        printed = noise != LOUD
+        printed = noise != HIGHEST_NOISE
         head += [f"Almanza-Medina, {NOISES[noise]}"] * printed + [f"{part}, {NOISES[noise]}" for part in parts.values()]
         scores = [first.score(part, noise) if first else None for part in parts]
         zero += [format_errors(table.no_motion)] * printed
@@ -875,8 +877,10 @@ def _error_cells(table: DocumentTable, results: Mapping[str, Found], first: Foun
         cells.append([row.approach])
         for noise in _noises(table, results):
             scores = [result.score(part, noise) if result else None for part in parts]
-            our_cells = [row.format_errors(score.rmse) if score is not None else "-" if result else NOT_YET for score in scores]
-            cells[-1] += [row.format_errors(row.printed.get(noise))] * (noise != LOUD) + our_cells
+            our_cells = [
+                row.format_errors(score.rmse) if score is not None else "-" if result else NOT_YET for score in scores
+            ]
+            cells[-1] += [row.format_errors(row.printed.get(noise))] * (noise != HIGHEST_NOISE) + our_cells
     if timed:
         head += ["Almanza-Medina, ms", "here, ms"]
         for row, line in zip(table.rows, cells[-len(table.rows) :], strict=True):

@@ -29,7 +29,7 @@ from pydantic import ConfigDict, Field, model_validator
 from scipy.special import hankel1
 
 from mitsonar.arrays import AnyArray
-from mitsonar.errors import MitsonarError, argument, nearest_names, shortened
+from mitsonar.errors import MitsonarError, argument, short_repr, suggest_names
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import View, Whole
@@ -51,7 +51,7 @@ __all__ = [
     "check_channel_mirrors",
     "check_image_mirrors",
     "depends_on_frequency",
-    "hearing_notes",
+    "frequency_notes",
     "material",
     "mirror_amplitude",
     "mu_at",
@@ -172,7 +172,7 @@ def depends_on_frequency(material: Material) -> bool:
     return material.law == "rough-fluid" or material.has_mirror
 
 
-def hearing_notes(materials: Sequence[Material], frequency_hz: float | None, sound_speed_m_s: float = 1500.0) -> list[str]:
+def frequency_notes(materials: Sequence[Material], frequency_hz: float | None, sound_speed_m_s: float = 1500.0) -> list[str]:
     """Return one-sentence notes for the user about materials at the frequency of a sonar.
 
     They report a missing frequency, a frequency outside the band of a material, and cross-sections that are clipped.
@@ -256,7 +256,7 @@ def sediment_of(phi: float) -> Sediment:
     if not COARSEST_PHI <= phi <= FINEST_PHI:
         raise MitsonarError(
             f"{argument('grain_size_phi')} must lie in {COARSEST_PHI:g}..{FINEST_PHI:g}, sandy gravel to clay: got "
-            f"{shortened(phi)}; use the named material rock, or give the parameters"
+            f"{short_repr(phi)}; use the named material rock, or give the parameters"
         )
     speed = _speed_ratio(phi)
     return Sediment(
@@ -648,7 +648,7 @@ def _wavenumber(frequency_hz: float, sound_speed_m_s: float) -> float:
     """Return 2 pi f / c [rad/m]."""
     for value, name in ((frequency_hz, "frequency_hz"), (sound_speed_m_s, "sound_speed_m_s")):
         if not 0 < value < math.inf:
-            raise MitsonarError(f"{name} must be a finite number above 0: got {shortened(value)}")
+            raise MitsonarError(f"{name} must be a finite number above 0: got {short_repr(value)}")
     return 2 * math.pi * frequency_hz / sound_speed_m_s
 
 
@@ -687,7 +687,7 @@ def material(name_or_file: str | Path) -> Material:
     fields = _fill_from_grain_size(fields, text)
     base = fields.pop("material", None)
     if not isinstance(base, str | None):
-        raise MitsonarError(f"material in {text} must name a material: got {shortened(base)}")
+        raise MitsonarError(f"material in {text} must name a material: got {short_repr(base)}")
     base_fields = {} if base is None else _named_fields(base)
     if fields.get("law", base_fields.get("law")) != base_fields.get("law"):
         numeric_keys = {key for keys in (*LAWS.values(), MIRROR) for key in keys}
@@ -701,7 +701,7 @@ def _fill_from_grain_size(fields: dict[str, PlainValue], text: str) -> dict[str,
         return fields
     phi = fields.pop("grain_size_phi")
     if isinstance(phi, bool) or not isinstance(phi, int | float):
-        raise MitsonarError(f"grain_size_phi in {text} must be a number: got {shortened(phi)}")
+        raise MitsonarError(f"grain_size_phi in {text} must be a number: got {short_repr(phi)}")
     if "material" in fields:
         raise MitsonarError(f"grain_size_phi and material both set the parameters: {text} gives both; omit one of them")
     band = {"frequency_min_hz": 10e3, "frequency_max_hz": 100e3}
@@ -713,7 +713,7 @@ def _named_fields(name: str) -> dict[str, PlainValue]:
     """Return the fields of a named material, with its sources joined into one text."""
     known = named_materials()
     if name not in known:
-        raise MitsonarError(f"unknown material {shortened(name)}: {nearest_names(name, known)}")
+        raise MitsonarError(f"unknown material {short_repr(name)}: {suggest_names(name, known)}")
     entry = known[name]
     source = "; ".join(f"{key}: {text}" for key, text in entry.sources.items())
     return {"name": name, "about": entry.about, "source": source, **entry.values}

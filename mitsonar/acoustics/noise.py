@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 from scipy.special import ndtr
 
 from mitsonar.arrays import AnyArray
-from mitsonar.errors import MitsonarError, complaint, meant, shortened
+from mitsonar.errors import MitsonarError, did_you_mean, short_repr, validation_message
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.checked_model import CheckedModel
 from mitsonar.io.files import read_yaml
@@ -27,12 +27,12 @@ __all__ = [
     "NOISE_MODELS",
     "Information",
     "NoiseModel",
+    "format_snr",
     "information",
     "information_of_sums",
     "load_noise",
+    "parse_snr",
     "refuse_noise",
-    "snr_of",
-    "snr_said",
     "uniform",
 ]
 
@@ -363,21 +363,23 @@ def load_noise(text: str) -> NoiseModel:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise MitsonarError(complaint(error, NoiseModel, "noise")) from None
-        raise MitsonarError(f"noise {key} must be a fraction 0..1 of the maximum: got {shortened(first['input'])}") from None
+            raise MitsonarError(validation_message(error, NoiseModel, "noise")) from None
+        raise MitsonarError(
+            f"noise {key} must be a fraction 0..1 of the maximum: got {short_repr(first['input'])}"
+        ) from None
     except (ValueError, TypeError) as error:
         if isinstance(error, MitsonarError):
             raise
         raise MitsonarError(
-            f"noise must be {', '.join(NOISE_MODELS)}, three fractions mean,std,scale, or a YAML file: got {shortened(text)}"
-            f"{meant(text, NOISE_MODELS)}"
+            f"noise must be {', '.join(NOISE_MODELS)}, three fractions mean,std,scale, or a YAML file: "
+            f"got {short_repr(text)}{did_you_mean(text, NOISE_MODELS)}"
         ) from None
 
 
 # ---------------- Signal-to-noise ratios in recipes and commands
 
 
-def snr_of(text: str) -> float | None:
+def parse_snr(text: str) -> float | None:
     """Parse a signal-to-noise ratio in dB, such as ``20 dB``; ``none`` means no noise.
 
     Raises:
@@ -386,11 +388,11 @@ def snr_of(text: str) -> float | None:
     match = re.fullmatch(r"\s*([+-]?\d+(?:\.\d+)?)\s*dB\s*", text)
     if text != "none" and not match:
         raise MitsonarError(
-            f"noise of impulse responses is a signal to noise ratio such as '20 dB', or none: got {shortened(text)}"
+            f"noise of impulse responses is a signal to noise ratio such as '20 dB', or none: got {short_repr(text)}"
         )
     return float(match[1]) if match else None
 
 
-def snr_said(snr_db: float | None) -> str:
-    """Format a signal-to-noise ratio [dB] in the form that :func:`snr_of` parses."""
+def format_snr(snr_db: float | None) -> str:
+    """Format a signal-to-noise ratio [dB] in the form that :func:`parse_snr` parses."""
     return "none" if snr_db is None else f"{snr_db:g} dB"

@@ -14,13 +14,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-__all__ = ["BLENDED", "ScoreShares", "contrast", "intensity_tail", "patch_amplitudes", "rician_information", "score_shares"]
+__all__ = [
+    "BLENDED_VARIANCE",
+    "ScoreComponents",
+    "contrast",
+    "intensity_tail",
+    "patch_amplitudes",
+    "rician_information",
+    "score_components",
+]
 
 
 ENTRIES = 4096
 """Number of entries in the table of patch amplitudes."""
 
-BLENDED = 4 / 9
+BLENDED_VARIANCE = 4 / 9
 """Share of the variance of the patch power that remains after bilinear interpolation: two thirds along each axis."""
 
 
@@ -81,7 +89,7 @@ ENTRIES_PER_DECADE = 16
 """Number of table entries per decade of q."""
 
 
-class ScoreShares(NamedTuple):
+class ScoreComponents(NamedTuple):
     """Decomposition of a score: signed square roots of the shares of its variance. Their squares sum to at most 1.
 
     Attributes:
@@ -110,12 +118,12 @@ def rician_information(power: ArrayLike, noise: ArrayLike) -> NDArray[np.float64
     return np.asarray(information * np.minimum(1, most / np.maximum(q, most)) / noise**2, dtype=np.float64)
 
 
-def score_shares(power: ArrayLike, noise: ArrayLike) -> ScoreShares:
+def score_components(power: ArrayLike, noise: ArrayLike) -> ScoreComponents:
     """Decompose the score of an amplitude into polynomials of the noise. Arguments: see :func:`rician_information`."""
     least, most = (10.0**end for end in DECADES)
     q = np.clip(np.asarray(power, dtype=float) / np.asarray(noise, dtype=float), least, most)
     table = _tables()
-    return ScoreShares(*(np.interp(np.log(q), table.log_q, values) for values in table.shares))
+    return ScoreComponents(*(np.interp(np.log(q), table.log_q, values) for values in table.shares))
 
 
 class _Tables(NamedTuple):
@@ -123,7 +131,7 @@ class _Tables(NamedTuple):
 
     log_q: NDArray[np.float64]
     log_information: NDArray[np.float64]
-    shares: ScoreShares
+    shares: ScoreComponents
 
 
 @lru_cache(maxsize=1)
@@ -143,4 +151,4 @@ def _tables() -> _Tables:
     # The information is the variance of the score; each share is its projection on a unit-variance polynomial.
     information = np.einsum("qij,ij->q", score * score, weights)
     shares = (np.einsum("qij,ij->q", score, weights * part) / np.sqrt(information) for part in parts)
-    return _Tables(np.log(q), np.log(information), ScoreShares(*shares))
+    return _Tables(np.log(q), np.log(information), ScoreComponents(*shares))

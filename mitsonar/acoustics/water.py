@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from mitsonar.arrays import AnyArray
-from mitsonar.errors import MitsonarError, meant, shortened
+from mitsonar.errors import MitsonarError, did_you_mean, short_repr
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.checked_model import CheckedModel
 
@@ -254,12 +254,14 @@ def _outside(water: Water, bands: dict[str, tuple[float, float]], what: str) -> 
 def _check_frequency(frequency_hz: AnyArray) -> None:
     """Reject a number that is not a valid frequency; arrays are not checked."""
     if isinstance(frequency_hz, int | float) and not 0 < frequency_hz < math.inf:
-        raise MitsonarError(f"a frequency must be a finite number of Hz above 0: got {shortened(frequency_hz)}")
+        raise MitsonarError(f"a frequency must be a finite number of Hz above 0: got {short_repr(frequency_hz)}")
 
 
 def _unknown(formula: object) -> MitsonarError:
     known = ", ".join(FORMULAS)
-    return MitsonarError(f"unknown formula of absorption {shortened(formula)}: known: {known}{meant(formula, FORMULAS)}")
+    return MitsonarError(
+        f"unknown formula of absorption {short_repr(formula)}: known: {known}{did_you_mean(formula, FORMULAS)}"
+    )
 
 
 # ---------------- Absorption, gain and noise of a sonar

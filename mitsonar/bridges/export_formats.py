@@ -40,10 +40,10 @@ from mitsonar.bridges.export_source import (
     shots,
 )
 from mitsonar.config.data import Keys, Recipe, load_recipe, recipe_from, set_key, shipped_recipes
-from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, suggest_names
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar, named_sonars
-from mitsonar.io.files import PlainValue, write_whole
+from mitsonar.io.files import PlainValue, write_atomic
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.records.frames import to_float32
@@ -88,7 +88,7 @@ def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) 
             tables[part] = files.enter_context(images.open("w")), files.enter_context(annotations.open("w"))
         for shot in shots(source):
             name = f"{shot.name}.png"
-            write_whole(folder / "images" / shot.part / name, png(pictures.picture(shot.frames, shot.index)))
+            write_atomic(folder / "images" / shot.part / name, png(pictures.picture(shot.frames, shot.index)))
             size = {"width": columns, "height": rows, "file_name": name}
             extra = {"part": shot.part, "sequence": int(source.sequence[shot.number])}
             tables[shot.part][0].write(f"{json_line({'id': shot.number + 1, **size, **extra})}\n")
@@ -167,12 +167,12 @@ def export_yolo(source: ExportSource, pictures: LabelledPictures, folder: Path, 
         lines = [
             line for region in _regions(source, pictures, shot) for line in _yolo_lines(region, pictures.size, polygons)
         ]
-        write_whole(folder / "images" / part / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
-        write_whole(folder / "labels" / part / f"{shot.name}.txt", "".join(f"{line}\n" for line in lines).encode())
+        write_atomic(folder / "images" / part / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
+        write_atomic(folder / "labels" / part / f"{shot.name}.txt", "".join(f"{line}\n" for line in lines).encode())
         yield 1
     pictures.require_regions(source.frames)
     table = {**{part: f"images/{part}" for part in parts}, "names": dict(enumerate(pictures.classes))}
-    write_whole(folder / "data.yaml", yaml.safe_dump(table, sort_keys=False, allow_unicode=True).encode())
+    write_atomic(folder / "data.yaml", yaml.safe_dump(table, sort_keys=False, allow_unicode=True).encode())
 
 
 def _yolo_lines(region: Region, size: tuple[int, int], polygons: bool) -> list[str]:
@@ -455,7 +455,7 @@ def export_hugging_face(source: ExportSource, pictures: LabelledPictures, folder
                 part_folder.mkdir(parents=True)
                 tables[shot.part] = files.enter_context((part_folder / "metadata.jsonl").open("w"))
             counts[shot.part] = counts.get(shot.part, 0) + 1
-            write_whole(part_folder / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
+            write_atomic(part_folder / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
             record: dict[str, PlainValue] = {"file_name": f"{shot.name}.png", **pose_fields(shot)}
             record["sequence"] = int(source.sequence[shot.number])
             keys = {key: "sc:Integer" if isinstance(value, int) else "sc:Float" for key, value in record.items()}
@@ -464,8 +464,8 @@ def export_hugging_face(source: ExportSource, pictures: LabelledPictures, folder
             tables[shot.part].write(f"{json_line(record)}\n")
             yield 1
     keys["file_name"] = "sc:Text"
-    write_whole(folder / "README.md", _card(source, pictures, counts).encode())
-    write_whole(folder / "croissant.json", as_json(_croissant(source, folder, sorted(counts), keys)))
+    write_atomic(folder / "README.md", _card(source, pictures, counts).encode())
+    write_atomic(folder / "croissant.json", as_json(_croissant(source, folder, sorted(counts), keys)))
 
 
 def _card(source: ExportSource, pictures: LabelledPictures, counts: dict[str, int]) -> str:
@@ -549,7 +549,7 @@ def export_webdataset(source: ExportSource, pictures: LabelledPictures, folder: 
             yield 1
     names = {"shapes": list(source.like.shape_names), "objects": list(source.like.object_names)}
     metadata = {"source": source.name, "about": source.about, "picture": pictures.picture_kind, "samples": counts, **names}
-    write_whole(folder / "about.json", as_json(metadata))
+    write_atomic(folder / "about.json", as_json(metadata))
 
 
 # ---------------- KITTI and neusis
@@ -591,7 +591,7 @@ def export_kitti(source: ExportSource, pictures: LabelledPictures, folder: Path)
             poses.write(" ".join(f"{value:.12e}" for value in relative[:3].ravel()) + "\n")
             times.write(f"{float(np.mean(shot.frames.time_s[shot.index])) - start_s:.9e}\n")
             picture = png(pictures.picture(shot.frames, shot.index))
-            write_whole(folder / "sequences" / f"{sequence:02d}" / "image_0" / f"{number:06d}.png", picture)
+            write_atomic(folder / "sequences" / f"{sequence:02d}" / "image_0" / f"{number:06d}.png", picture)
             number += 1
             yield 1
     finally:
@@ -613,7 +613,7 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
         assert shot.frames.poses is not None
         values = to_float32(shot.frames.image[shot.index])
         state = {"ImagingSonar": values[:, ::-1].copy(), "PoseSensor": port_matrix(shot.frames.poses[shot.index])}
-        write_whole(folder / "Data" / f"{shot.name}.pkl", pickle.dumps(state, protocol=4))
+        write_atomic(folder / "Data" / f"{shot.name}.pkl", pickle.dumps(state, protocol=4))
         yield 1
     sonar = source.like.sonar
     bearing_rad = source.like.bearing_rad
@@ -627,12 +627,12 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
         "AzimuthBins": len(bearing_rad),
     }
     agent = {"sensors": [{"sensor_type": "ImagingSonar", "configuration": configuration}]}
-    write_whole(folder / "Config.json", as_json({"name": source.name, "agents": [agent]}))
+    write_atomic(folder / "Config.json", as_json({"name": source.name, "agents": [agent]}))
 
 
 def port_matrix(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrix ``(4, 4)`` from (forward, port, up) to the world for a pose ``(6,)`` [m, rad]."""
-    positions, rotations = CONVENTIONS["ros-enu"].from_ours(pose[None, :3], vehicle_rotation(pose))
+    positions, rotations = CONVENTIONS["ros-enu"].from_mitsonar(pose[None, :3], vehicle_rotation(pose))
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotations.as_matrix()[0], positions[0]
     return matrix
@@ -692,7 +692,7 @@ def export_to(
             export to COCO or YOLO contains no object.
     """
     if layout not in EXPORTS:
-        raise MitsonarError(f"unknown layout {layout!r}: {nearest_names(layout, EXPORTS)}")
+        raise MitsonarError(f"unknown layout {layout!r}: {suggest_names(layout, EXPORTS)}")
     if polygons and layout != "yolo":
         raise MitsonarError(f"--polygons applies only to the layout yolo: got {layout}; COCO always has masks")
     if layout == "neusis" and picture != "polar":

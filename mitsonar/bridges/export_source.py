@@ -26,8 +26,8 @@ from mitsonar.acoustics.water import noise_of
 from mitsonar.config.data import Recipe, Split, recipe_from
 from mitsonar.datasets.modality import Scene, Values
 from mitsonar.datasets.plan import Plan
-from mitsonar.datasets.store import PACKAGES, PARTS, DataStore, deal, names_of_scenes, world_of
-from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
+from mitsonar.datasets.store import PACKAGES, PARTS, DataStore, frames_in_part, shape_names_of, world_numbers
+from mitsonar.errors import MitsonarError, MitsonarWarning, count_noun, suggest_names
 from mitsonar.estimation.sonar_fit import NOISE_FIELDS, as_instrument
 from mitsonar.geometry.fan import nearest_cells
 from mitsonar.instruments.sonar import Sonar
@@ -224,7 +224,7 @@ def _open_data_set(url: str, view: str | None, split: tuple[float, float, float]
     stored_view = view_in(store, view)
     labels = {label: f"{label}{store.recipe.suffix(stored_view.name)}" for label in store.recipe.labels}
     scene = np.asarray(store.read("scene"))
-    shape_names, shape_indices = names_of_scenes(store) if "shape_id" in labels else ((), {})
+    shape_names, shape_indices = shape_names_of(store) if "shape_id" in labels else ((), {})
 
     def read(span: slice) -> SonarFrames:
         label_maps: dict[str, Any] = {label: store.read(array, span) for label, array in labels.items()}
@@ -263,11 +263,11 @@ def _parts_by_split(store: DataStore, shares: tuple[float, float, float] | None)
     if split.by == "sample":
         return parts
     sequence = np.asarray(store.read("sequence"), dtype=np.int32)
-    world = world_of(store.recipe, store.scenes)[np.asarray(store.read("scene"))]
+    world = world_numbers(store.recipe, store.scenes)[np.asarray(store.read("scene"))]
     try:
         for name in ("validation", "test"):
             if getattr(split, name) > 0:
-                parts[deal(world, sequence, split, name)] = name
+                parts[frames_in_part(world, sequence, split, name)] = name
     except MitsonarError as error:  # too few sequences or worlds for the parts
         if shares is not None:
             raise
@@ -474,7 +474,7 @@ class LabelledPictures:
         names = like.shape_names
         for glob, _ in classes if names else ():
             if not any(fnmatchcase(name, glob) for name in names):
-                raise MitsonarError(f"no shape is named {glob!r}: {nearest_names(glob, names)}")
+                raise MitsonarError(f"no shape is named {glob!r}: {suggest_names(glob, names)}")
         class_of = self._class_names(names)
         self.classes = list(dict.fromkeys(name for name in class_of if name))
         self.left_out = [shape for shape, name in zip(names, class_of, strict=True) if not name]
@@ -1123,7 +1123,8 @@ def _notes(sources: Sequence[FramesWithPoses], sequences: int) -> list[str]:
     """Return notes for the user, one sentence each."""
     notes = [f"{source.name}: {note}" for source in sources for note in source.notes]
     notes += [
-        f"{source.name}: left out: {counted(source.left_out, 'frame')} without pose or neighbour, or with another geometry"
+        f"{source.name}: left out: {count_noun(source.left_out, 'frame')} without pose or neighbour, "
+        "or with another geometry"
         for source in sources
         if source.left_out
     ]

@@ -24,7 +24,7 @@ from mitsonar.bridges.live import (
     projected_image,
     timing,
 )
-from mitsonar.errors import MitsonarError, shortened
+from mitsonar.errors import MitsonarError, short_repr
 
 __all__ = ["SONAR_FRAME", "WORLD_FRAME", "FoxgloveServer"]
 
@@ -134,9 +134,9 @@ class _PoseListener(ServerListener):
     def on_client_advertise(self, client: Any, channel: Any) -> None:
         message = None
         if channel.topic != POSE_TOPIC:
-            message = f"poses must be published on {POSE_TOPIC}: got the topic {shortened(channel.topic)}"
+            message = f"poses must be published on {POSE_TOPIC}: got the topic {short_repr(channel.topic)}"
         elif channel.encoding != "json":
-            message = f"poses must be encoded as json: got the encoding {shortened(channel.encoding)}"
+            message = f"poses must be encoded as json: got the encoding {short_repr(channel.encoding)}"
         if message is not None:
             self.warn(message)
             return

@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
-from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names, refuse_unknown
+from mitsonar.errors import MitsonarError, MitsonarWarning, argument, check_argument_names, suggest_names
 from mitsonar.geometry.fan import CartesianMap, cartesian_map
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
@@ -512,7 +512,7 @@ class SonarTask:
         if unknown or "image" not in self.observe:
             wrong = str(unknown[0] if unknown else self.observe)
             raise MitsonarError(
-                f"observe must be a tuple that contains image: got {wrong!r}; {nearest_names(wrong, OBSERVABLE)}"
+                f"observe must be a tuple that contains image: got {wrong!r}; {suggest_names(wrong, OBSERVABLE)}"
             )
         self.refuse_outside(self.span)
 
@@ -546,7 +546,7 @@ class SonarTask:
         Raises:
             MitsonarError: a field is unknown, or a value is not allowed.
         """
-        refuse_unknown(given, (*(field.name for field in fields(cls)), *other_arguments), "an environment")
+        check_argument_names(given, (*(field.name for field in fields(cls)), *other_arguments), "an environment")
         return cls(**given)
 
     @property

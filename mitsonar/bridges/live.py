@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from mitsonar.acoustics.noise import NoiseModel
-from mitsonar.errors import MitsonarError, meant, shortened
+from mitsonar.errors import MitsonarError, did_you_mean, short_repr
 from mitsonar.io.files import PlainValue, parse_json
 from mitsonar.motion.pose import Pose, poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import CONVENTIONS, Trajectory
@@ -204,19 +204,19 @@ def parse_pose(message: bytes) -> PoseRequest:
     if not isinstance(table, dict):
         raise MitsonarError(
             f"a pose must be a JSON object with {', '.join(POSE_KEYS)} (m, deg), or with the key pose: "
-            f"got {shortened(table)}"
+            f"got {short_repr(table)}"
         )
     unknown = [key for key in table if key not in (*POSE_KEYS, *OTHER_KEYS)]
     if unknown:
         raise MitsonarError(
-            f"a pose has no key {shortened(unknown[0])}{meant(unknown[0], POSE_KEYS)}: "
+            f"a pose has no key {short_repr(unknown[0])}{did_you_mean(unknown[0], POSE_KEYS)}: "
             f"give {', '.join(POSE_KEYS)} in m and deg, or pose"
         )
     request_id = table.get("id")
     if not isinstance(request_id, int | float | str | None) or (
         isinstance(request_id, float) and not math.isfinite(request_id)
     ):
-        raise MitsonarError(f"id of a pose must be a finite number or a string: got {shortened(request_id)}")
+        raise MitsonarError(f"id of a pose must be a finite number or a string: got {short_repr(request_id)}")
     # 2. Read the form of REP 103.
     if "pose" in table:
         extra_keys = [key for key in POSE_KEYS if key in table]
@@ -247,7 +247,7 @@ def pose_from_ros(position: ArrayLike, quaternion: ArrayLike) -> Pose:
     length = float(np.linalg.norm(rotation_xyzw))
     if not 1e-6 < length < 1e6:
         raise MitsonarError(f"the orientation of a pose must be a quaternion of length 1: got length {length:g}")
-    positions, rotations = ROS_CONVENTION.to_ours(
+    positions, rotations = ROS_CONVENTION.to_mitsonar(
         np.asarray(position, dtype=float).reshape(1, 3), Rotation.from_quat(rotation_xyzw[None] / length)
     )
     return _check_position(Pose(*(float(value) for value in poses_from(positions, rotations)[0])))
@@ -256,7 +256,7 @@ def pose_from_ros(position: ArrayLike, quaternion: ArrayLike) -> Pose:
 def pose_in_ros(pose: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Convert a pose ``(6,)`` [m, rad] to REP 103: position ``(3,)`` [m] and quaternion ``(4,)`` x, y, z, w."""
     table = np.atleast_2d(np.asarray(pose, dtype=float))
-    position, rotation = ROS_CONVENTION.from_ours(table[:, :3], vehicle_rotation(table))
+    position, rotation = ROS_CONVENTION.from_mitsonar(table[:, :3], vehicle_rotation(table))
     return position[0], rotation.as_quat(canonical=True)[0]
 
 
@@ -280,10 +280,10 @@ def _check_keys(value: PlainValue, name: str, keys: tuple[str, ...]) -> dict[str
         MitsonarError: the value is not an object, or has unknown keys.
     """
     if not isinstance(value, dict):
-        raise MitsonarError(f"{name} must be an object with {', '.join(keys)}: got {shortened(value)}")
+        raise MitsonarError(f"{name} must be an object with {', '.join(keys)}: got {short_repr(value)}")
     unknown = [key for key in value if key not in keys]
     if unknown:
-        raise MitsonarError(f"{name} has no key {shortened(unknown[0])}: allowed are {', '.join(keys)}")
+        raise MitsonarError(f"{name} has no key {short_repr(unknown[0])}: allowed are {', '.join(keys)}")
     return value
 
 
@@ -297,7 +297,7 @@ def _numbers(value: PlainValue, name: str, keys: tuple[str, ...]) -> list[float]
     for key, number in table.items():
         fine = isinstance(number, int | float) and not isinstance(number, bool)
         if not fine or not math.isfinite(number):
-            raise MitsonarError(f"{key} of {name} must be a finite number: got {shortened(number)}")
+            raise MitsonarError(f"{key} of {name} must be a finite number: got {short_repr(number)}")
     return [float(table.get(key, 0.0)) for key in keys]
 
 

@@ -15,9 +15,9 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from mitsonar.errors import MitsonarError, shortened
+from mitsonar.errors import MitsonarError, short_repr
 from mitsonar.io.files import read_bytes
-from mitsonar.worlds.meshes import MOST_TRIANGLES, UP, Piece, read_pieces
+from mitsonar.worlds.meshes import MAX_TRIANGLES, UP, Piece, read_pieces
 
 __all__ = [
     "Body",
@@ -180,15 +180,15 @@ class Shapes:
         self._files: dict[Path, list[Piece]] = {}
         self._triangles = 0
 
-    def counted(self, pieces: list[Piece], source: str) -> list[Piece]:
+    def count_noun(self, pieces: list[Piece], source: str) -> list[Piece]:
         """Count the triangles of geometries, and return the geometries.
 
         Raises:
             MitsonarError: there are too many triangles in total.
         """
         self._triangles += sum(len(piece.faces) for piece in pieces)
-        if self._triangles > MOST_TRIANGLES:
-            raise MitsonarError(f"{source} contains more than {MOST_TRIANGLES:,} triangles: give a smaller scene")
+        if self._triangles > MAX_TRIANGLES:
+            raise MitsonarError(f"{source} contains more than {MAX_TRIANGLES:,} triangles: give a smaller scene")
         return pieces
 
     def of_file(self, path: Path, scale: ArrayLike, reflectivity: float | None) -> list[Piece]:
@@ -208,7 +208,9 @@ class Shapes:
         unit = _unit_m(path) if suffix == ".dae" else 1.0
         axes = np.asarray(UP["y" if suffix in (".glb", ".gltf") else "z"], dtype=float) * unit
         pieces = [piece.moved(np.diag(np.asarray(scale, dtype=float)) @ axes, np.zeros(3)) for piece in self._files[path]]
-        return [piece if reflectivity is None else piece.uniform(reflectivity) for piece in self.counted(pieces, str(path))]
+        return [
+            piece if reflectivity is None else piece.uniform(reflectivity) for piece in self.count_noun(pieces, str(path))
+        ]
 
 
 def _unit_m(path: Path) -> float:
@@ -268,12 +270,12 @@ class ModelSearch:
         name = name.strip()
         if len(name) > MAX_NAME_LENGTH or "\0" in name or not name:
             raise MitsonarError(
-                f"{referrer} names the file {shortened(name)}: give a path of 1 to {MAX_NAME_LENGTH} characters"
+                f"{referrer} names the file {short_repr(name)}: give a path of 1 to {MAX_NAME_LENGTH} characters"
             )
         scheme = next((scheme for scheme in PACKAGE_SCHEMES if name.startswith(scheme)), "")
         if not scheme and "://" in name and not name.startswith("file://"):
             raise MitsonarError(
-                f"{referrer} names {shortened(name)}: nothing is downloaded; download it, name it model://..., and "
+                f"{referrer} names {short_repr(name)}: nothing is downloaded; download it, name it model://..., and "
                 "give its folder by --search"
             )
         for candidate in self._candidates(name, scheme, referrer):
@@ -285,7 +287,7 @@ class ModelSearch:
         outside = any(os.path.exists(path) for path in candidates)
         missing = "there is no such file" if inside and not outside else "which is not"
         raise MitsonarError(
-            f"{referrer} names {shortened(name)}, {missing} within {', '.join(map(str, self.roots))}: give the folder that "
+            f"{referrer} names {short_repr(name)}, {missing} within {', '.join(map(str, self.roots))}: give the folder that "
             "contains it by --search"
         )
 
@@ -374,7 +376,7 @@ def read_xml(path: Path, what: str) -> Element:
 def refused(path: Path, element: Element, reason: str) -> MitsonarError:
     """Return an error for an element of a file; ``reason`` states what is wrong, what was found and what is allowed."""
     name = element.get("name")
-    where = f"<{element.tag[:40]}{f' name={shortened(name)}' if name else ''}>"
+    where = f"<{element.tag[:40]}{f' name={short_repr(name)}' if name else ''}>"
     return MitsonarError(f"{path}, {where}: {reason}")
 
 
@@ -410,7 +412,7 @@ def numbers_of(path: Path, element: Element, text: str | None, count: int, defau
     except ValueError:
         values = ()
     if len(values) != count or not all(math.isfinite(value) and abs(value) <= MAX_NUMBER for value in values):
-        raise refused(path, element, f"expected {count} finite numbers up to {MAX_NUMBER:g}: got {shortened(text.strip())}")
+        raise refused(path, element, f"expected {count} finite numbers up to {MAX_NUMBER:g}: got {short_repr(text.strip())}")
     return values
 
 

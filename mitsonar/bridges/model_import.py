@@ -17,7 +17,7 @@ from mitsonar.bridges.model_files import Matrix, ModelSearch, ReadScene, Shapes,
 from mitsonar.bridges.sdf import read_sdf
 from mitsonar.bridges.urdf import read_urdf
 from mitsonar.bridges.usd import read_usd
-from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, argument, suggest_names
 from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.worlds.meshes import Piece, merged, overview, random_seabed, reflectivity_of
 from mitsonar.worlds.world import Mesh, Standpoint, World
@@ -288,7 +288,7 @@ def _groups(path: Path, scene: ReadScene, own_axes: Sequence[str]) -> dict[str, 
     groups: dict[str, list[Piece]] = {}
     for name in own_axes:
         if name not in scene.frames:
-            raise MitsonarError(f"{path} has no link, model or prim {name[:80]}: {nearest_names(name, scene.frames)}"[:400])
+            raise MitsonarError(f"{path} has no link, model or prim {name[:80]}: {suggest_names(name, scene.frames)}"[:400])
         groups[name] = []
     to_mitsonar = np.eye(4)
     to_mitsonar[:3, :3] = np.array(CONVENTIONS["ros-enu"].body).T  # from (forward, left, up) to (starboard, forward, up)
@@ -344,9 +344,9 @@ def _checked_materials(path: Path, scene: ReadScene, materials: Mapping[str, str
     known = {name for body in scene.bodies for name in (body.name, *body.within)}
     for name, material in materials.items():
         if name not in known:
-            raise MitsonarError(f"{path} has no link, model or prim {name[:80]}: {nearest_names(name, sorted(known))}"[:400])
+            raise MitsonarError(f"{path} has no link, model or prim {name[:80]}: {suggest_names(name, sorted(known))}"[:400])
         if material not in named_materials():
-            raise MitsonarError(f"unknown material {material[:80]!r}: {nearest_names(material, named_materials())}")
+            raise MitsonarError(f"unknown material {material[:80]!r}: {suggest_names(material, named_materials())}")
     material_of: dict[str, str] = {}
     for body in scene.bodies:
         for name in (*body.within, body.name):

@@ -26,8 +26,8 @@ from mitsonar.bridges.model_files import (
     refused,
 )
 from mitsonar.bridges.urdf import joint_motion
-from mitsonar.errors import MitsonarError, nearest_names, shortened
-from mitsonar.worlds.meshes import UNCOLOURED, Piece, one_number
+from mitsonar.errors import MitsonarError, short_repr, suggest_names
+from mitsonar.worlds.meshes import UNCOLOURED, Piece, reduce_colour
 
 __all__ = ["Scope", "pose_of", "read_sdf"]
 
@@ -59,7 +59,7 @@ def pose_of(path: Path, element: Element) -> tuple[Matrix, str]:
             raise refused(path, element, "the quaternion of its pose has length 0")
         return placed(numbers[:3], Rotation.from_quat(numbers[3:])), frame
     if form != "euler_rpy":
-        raise refused(path, element, f"rotation_format must be euler_rpy or quat_xyzw: got {shortened(form)}")
+        raise refused(path, element, f"rotation_format must be euler_rpy or quat_xyzw: got {short_repr(form)}")
     numbers = numbers_of(path, element, pose.text, 6, (0,) * 6)
     degrees = pose.get("degrees", "false").strip().lower() in ("true", "1")
     return placed(numbers[:3], Rotation.from_euler("xyz", numbers[3:], degrees=degrees)), frame
@@ -89,7 +89,7 @@ class Scope:
         """
         if name in self._definitions or name in SELF_NAMES:
             raise MitsonarError(
-                f"{self.path}: the name {shortened(name)} is given twice, or is reserved for the model itself"
+                f"{self.path}: the name {short_repr(name)} is given twice, or is reserved for the model itself"
             )
         self._definitions[name] = (base, pose)
 
@@ -104,7 +104,7 @@ class Scope:
         while frame not in SELF_NAMES and frame not in self._poses:
             if frame in chain or len(chain) > MAX_CHAIN:
                 raise MitsonarError(
-                    f"{self.path}: the pose of {shortened(name)} is relative to itself, or "
+                    f"{self.path}: the pose of {short_repr(name)} is relative to itself, or "
                     f"has a chain of more than {MAX_CHAIN} frames"
                 )
             base, chain[frame] = self._base_of(frame)
@@ -122,7 +122,7 @@ class Scope:
         model, _, inner = name.partition("::")
         if inner and model in self.nested:
             return model, self.nested[model].pose(inner)
-        raise MitsonarError(f"{self.path} names the frame {shortened(name)}, which does not exist")
+        raise MitsonarError(f"{self.path} names the frame {short_repr(name)}, which does not exist")
 
 
 # ---------------- Models, links and geometries
@@ -275,7 +275,7 @@ class _Reader:
             ancestor, seen = link, set[str]()
             while ancestor in joints:
                 if ancestor in seen:
-                    raise refused(model.file, model.element, f"the joints of link {shortened(link)} form a circle")
+                    raise refused(model.file, model.element, f"the joints of link {short_repr(link)} form a circle")
                 seen.add(ancestor)
                 ancestor, motion = joints[ancestor]
                 poses[link] = motion @ poses[link]
@@ -314,7 +314,7 @@ class _Reader:
             pieces = self.shapes.of_file(self.search.find(uri, file), scale, colour)
         else:
             solid = primitive(kind.tag, _size(file, kind), UNCOLOURED if colour is None else colour, f"{file}, <{kind.tag}>")
-            pieces = self.shapes.counted([solid], str(file))
+            pieces = self.shapes.count_noun([solid], str(file))
         pose, base = pose_of(file, element)
         if base:
             pose = np.linalg.inv(scope.pose(link)) @ scope.pose(base) @ pose
@@ -331,7 +331,7 @@ class _Reader:
         if text is None:
             return None
         rgb = numbers_of(file, element, " ".join(text.split()[:3]), 3, (0.7, 0.7, 0.7))
-        return float(one_number(np.clip(np.array([rgb]), 0, 1), self.shapes.value)[0])
+        return float(reduce_colour(np.clip(np.array([rgb]), 0, 1), self.shapes.value)[0])
 
 
 def read_sdf(
@@ -359,8 +359,8 @@ def read_sdf(
     reader.collect(model, np.eye(4), ())
     for name in joints:
         if name not in reader.joint_names and not any(known.endswith(f"::{name}") for known in reader.joint_names):
-            hint = nearest_names(name, reader.joint_names) if reader.joint_names else "it has none"
-            raise MitsonarError(f"{path} has no joint {shortened(name)} that moves: {hint}")
+            hint = suggest_names(name, reader.joint_names) if reader.joint_names else "it has none"
+            raise MitsonarError(f"{path} has no joint {short_repr(name)} that moves: {hint}")
     return reader.scene
 
 

@@ -30,8 +30,8 @@ from mitsonar.bridges.model_files import (
     read_xml,
     refused,
 )
-from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names, shortened
-from mitsonar.worlds.meshes import UNCOLOURED, Piece, one_number
+from mitsonar.errors import MitsonarError, MitsonarWarning, short_repr, suggest_names
+from mitsonar.worlds.meshes import UNCOLOURED, Piece, reduce_colour
 
 __all__ = ["check_joint_names", "joint_motion", "read_urdf"]
 
@@ -104,7 +104,7 @@ def _link_poses(
     for name, joint in joints.items():
         ends = [_linked_name(path, joint, tag, links) for tag in ("parent", "child")]
         if ends[1] in parents:
-            raise refused(path, joint, f"link {shortened(ends[1])} is the child of two joints: URDF is a tree")
+            raise refused(path, joint, f"link {short_repr(ends[1])} is the child of two joints: URDF is a tree")
         value = _joint_value(path, name, joints, joint_values)
         origin = _origin(path, joint)
         axis = joint.find("axis")
@@ -125,7 +125,7 @@ def _link_poses(
         ancestor = link
         while ancestor not in poses:
             if ancestor in chain:
-                raise MitsonarError(f"{path}: the joints of link {shortened(link)} form a circle")
+                raise MitsonarError(f"{path}: the joints of link {short_repr(link)} form a circle")
             chain[ancestor] = None
             ancestor = parents[ancestor][0]
         for ancestor in reversed(chain):
@@ -146,8 +146,8 @@ def check_joint_names(path: Path, joint_values: Mapping[str, float], known: list
     """
     for name, value in joint_values.items():
         if name not in known:
-            hint = nearest_names(name, known) if known else "it has none"
-            raise MitsonarError(f"{path} has no joint {shortened(name)} that moves: {hint}"[:400])
+            hint = suggest_names(name, known) if known else "it has none"
+            raise MitsonarError(f"{path} has no joint {short_repr(name)} that moves: {hint}"[:400])
         if not abs(value) <= 1e6:
             raise MitsonarError(f"joint {name} needs a finite number [rad, m]: got {value:g}")
 
@@ -159,7 +159,7 @@ def _linked_name(path: Path, joint: Element, tag: str, links: dict[str, Element]
         raise refused(path, joint, f"it has no {tag}")
     name = attribute_of(path, element, "link")
     if name not in links:
-        raise refused(path, joint, f"its {tag} is the link {shortened(name)}, which does not exist")
+        raise refused(path, joint, f"its {tag} is the link {short_repr(name)}, which does not exist")
     return name
 
 
@@ -184,7 +184,7 @@ def _joint_value(path: Path, name: str, joints: dict[str, Element], joint_values
         factor *= number_of(path, joint, mimic.get("multiplier"), 1.0)
         name = attribute_of(path, mimic, "joint")
         if name not in joints:
-            raise refused(path, joint, f"it mimics the joint {shortened(name)}, which does not exist")
+            raise refused(path, joint, f"it mimics the joint {short_repr(name)}, which does not exist")
     raise refused(path, joints[name], "joints mimic each other in a circle")
 
 
@@ -246,7 +246,7 @@ def _pieces(path: Path, element: Element, search: ModelSearch, shapes: Shapes, c
     else:
         size = _size(path, kind)
         solid = primitive(kind.tag, size, UNCOLOURED if colour is None else colour, f"{path}, <{kind.tag}>")
-        pieces = shapes.counted([solid], str(path))
+        pieces = shapes.count_noun([solid], str(path))
     pose = _origin(path, element)
     return [piece.moved(pose[:3, :3], -pose[:3, 3]) for piece in pieces]
 
@@ -275,4 +275,4 @@ def _reflectivity(path: Path, element: Element, shapes: Shapes, colours: dict[st
     if colour is None:
         return None
     rgba = numbers_of(path, material, colour.get("rgba"), 4, (0.5, 0.5, 0.5, 1.0))
-    return float(one_number(np.clip(np.array([rgba[:3]]), 0, 1), shapes.value)[0])
+    return float(reduce_colour(np.clip(np.array([rgba[:3]]), 0, 1), shapes.value)[0])

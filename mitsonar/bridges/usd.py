@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.bridges.model_files import Body, Matrix, ModelSearch, ReadScene, Shapes, placed, primitive
-from mitsonar.errors import MitsonarError, explain_missing
+from mitsonar.errors import MitsonarError, missing_package_error
 from mitsonar.io.files import PlainValue
 from mitsonar.worlds.meshes import LUMINANCE, UNCOLOURED, UP, Piece
 
@@ -38,7 +38,7 @@ def read_usd(path: Path, search: ModelSearch, shapes: Shapes, collision: bool = 
         MitsonarError: the stage is damaged, has layers outside the folders, or usd-core is not installed.
     """
     if find_spec("pxr") is None:
-        raise explain_missing(ModuleNotFoundError(name="pxr"))
+        raise missing_package_error(ModuleNotFoundError(name="pxr"))
     report, arrays = _read_in_subprocess(path, search, collision)
     metres, up = report["metres"], report["up"]
     if not (np.isfinite(metres) and 1e-9 <= metres <= 1e9) or up not in UP:
@@ -60,7 +60,7 @@ def read_usd(path: Path, search: ModelSearch, shapes: Shapes, collision: bool = 
         if len(piece.faces):
             upright = piece.moved(to_stage[:3, :3].T, np.zeros(3))  # to axes with z upwards
             parents = [str(parent) for parent in Path(name).parents][-2::-1]
-            scene.bodies.append(Body(name, scene.frames[name], shapes.counted([upright], str(path)), tuple(parents)))
+            scene.bodies.append(Body(name, scene.frames[name], shapes.count_noun([upright], str(path)), tuple(parents)))
     return scene
 
 

@@ -11,7 +11,7 @@ import urllib.request
 from pathlib import Path
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.files import write_whole
+from mitsonar.io.files import write_atomic
 
 __all__ = ["RECORDING", "VIEWER", "write_page"]
 
@@ -81,7 +81,7 @@ def write_page(folder: Path) -> None:
     page = page.replace('    <link\n      rel="stylesheet"\n    />\n', "").replace(head, head + NETWORK_BLOCK)
     files["index.html"] = page.replace(script, f"{OPEN_RECORDING.strip()}\n    {script}").encode()
     for name, content in files.items():
-        write_whole(folder / name, content)
+        write_atomic(folder / name, content)
 
 
 def _fetch(port: int, name: str, process: subprocess.Popen[bytes]) -> bytes:

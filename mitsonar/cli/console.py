@@ -23,7 +23,7 @@ from typing import ParamSpec, Protocol, TypeVar
 import typer
 from rich.markup import escape
 
-from mitsonar.errors import MitsonarError, MitsonarWarning, explain_missing
+from mitsonar.errors import MitsonarError, MitsonarWarning, missing_package_error
 
 __all__ = [
     "LaterBar",
@@ -182,7 +182,7 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
         except MitsonarError as error:
             typer.echo(f"error: {' '.join(error.with_options(typed).split())}", err=True)
         except ModuleNotFoundError as error:
-            typer.echo(f"error: {explain_missing(error)}", err=True)
+            typer.echo(f"error: {missing_package_error(error)}", err=True)
         except BrokenPipeError:  # the reader of our output has ended, which is no error
             raise typer.Exit(0) from None
         except OSError as error:

@@ -43,7 +43,7 @@ from mitsonar.cli.recording import (
     numbers_of,
     shares_of,
 )
-from mitsonar.errors import MitsonarError, counted
+from mitsonar.errors import MitsonarError, count_noun
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -101,7 +101,7 @@ def make(
     report = _make_with_bar(described, out, sequences=sequences, workers=processes, scheduler=scheduler, verify=verify)
     present = report.shards - report.made
     say(
-        f"{counted(report.frames, 'frame')} in {report.url}: {counted(report.made, 'shard')} made"
+        f"{count_noun(report.frames, 'frame')} in {report.url}: {count_noun(report.made, 'shard')} made"
         + (f", {present} were already complete" if present else "")
     )
     say(f"show it: {command_line('dataset', 'show', report.url)}")
@@ -238,7 +238,7 @@ def show(
 
     from mitsonar.datasets.overview import sheet_figure
     from mitsonar.datasets.store import DataStore
-    from mitsonar.io.files import write_whole
+    from mitsonar.io.files import write_atomic
     from mitsonar.io.runs import refuse_to_replace
 
     store = DataStore.open(data)
@@ -248,7 +248,7 @@ def show(
     refuse_to_replace(path, overwrite=overwrite)
     buffer = io.BytesIO()
     sheet_figure(store, samples=samples, view=view, seed=seed).savefig(buffer, format="png", dpi=90)
-    write_whole(path, buffer.getvalue())
+    write_atomic(path, buffer.getvalue())
     say(f"picture: {path}")
 
 
@@ -268,7 +268,7 @@ def check(data: Data) -> None:
             f"{len(faults)} faults in {data}: the `mitsonar dataset make` that made it resumes where it stopped, and with "
             "--verify remakes damaged shards; empty frames stay until the recipe changes"
         )
-    say(f"{counted(len(store), 'frame')} in {counted(store.shards, 'shard')}: all is well")
+    say(f"{count_noun(len(store), 'frame')} in {count_noun(store.shards, 'shard')}: all is well")
 
 
 @answered
@@ -351,7 +351,7 @@ def from_frames(
         report = write_recorded(sources, out, begun=bar.begin, progress=bar.advance)
     for sentence in report.notes:
         warn(sentence)
-    say(f"{counted(report.frames, 'frame')} in {counted(report.sequences, 'sequence')} in {report.path}")
+    say(f"{count_noun(report.frames, 'frame')} in {count_noun(report.sequences, 'sequence')} in {report.path}")
     part = ["--part", "all"] if report.sequences == 1 else []
     say(f"compare estimators on it: {command_line('compare', report.path, *part)}")
 
@@ -556,4 +556,4 @@ def _joint_values(pairs: list[str]) -> dict[str, float]:
 def _write(world: World, out: Path) -> None:
     scene = world.write(out)
     say(world.about)
-    say(f"{counted(world.faces, 'triangle')} in {scene}; render it with: {command_line('render', scene, '--cartesian')}")
+    say(f"{count_noun(world.faces, 'triangle')} in {scene}; render it with: {command_line('render', scene, '--cartesian')}")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mitsonar.cli.console import answered, say, warn
-from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.errors import MitsonarError, short_repr, suggest_names
 
 if TYPE_CHECKING:
     from mitsonar.instruments.sonar import Sonar
@@ -134,12 +134,12 @@ def _one(name: str) -> None:
     Raises:
         MitsonarError: neither a sonar nor an instrument, with the nearest names.
     """
-    from mitsonar.instruments.sounder import OF_KIND, load_sounder, named_sonars, named_sounders, preset
+    from mitsonar.instruments.sounder import DEFAULT_PRESETS, load_sounder, named_sonars, named_sounders, preset
 
     sonars, sounders = named_sonars(), named_sounders()
-    key = OF_KIND.get(name, name)
+    key = DEFAULT_PRESETS.get(name, name)
     if key not in sonars and key not in sounders:
-        raise MitsonarError(f"unknown preset {shortened(name)}: {nearest_names(name, [*sonars, *sounders])}")
+        raise MitsonarError(f"unknown preset {short_repr(name)}: {suggest_names(name, [*sonars, *sounders])}")
     if key in sonars:
         _print_keys(key, sonars[key], preset(key))
         for line in _accuracy([key]):

@@ -13,8 +13,8 @@ import typer
 
 from mitsonar.cli.console import answered, command_line, numbers, progress_bar, say, say_json, warn
 from mitsonar.cli.options import NOISE, SIX, Frame, Noise, instrument_for, path_for, scene_parameters, sonar_changes
-from mitsonar.errors import MitsonarError, counted, meant
-from mitsonar.io.files import write_whole
+from mitsonar.errors import MitsonarError, count_noun, did_you_mean
+from mitsonar.io.files import write_atomic
 from mitsonar.io.runs import kind_of_run, refuse_to_replace
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def odometry(
     count, lost = len(result.estimates), int((~result.valid).sum())
     if result.graph is not None and result.graph.sensors:
         say(f"sensors: {', '.join(result.graph.sensors)}")
-    say(f"{counted(count, 'motion')} by {estimator} ({method.inputs}), {lost} invalid and bridged, in {out}")
+    say(f"{count_noun(count, 'motion')} by {estimator} ({method.inputs}), {lost} invalid and bridged, in {out}")
     say(f"picture: {out / 'path.png'}")
 
 
@@ -260,9 +260,9 @@ def mosaic(
     with progress_bar("laying", len(index), "frames") as progress:
         ground_map = build_mosaic(_counted(source.chunks(index), progress), poses, heights, options, illumination=light)
     if len(index) < len(source):
-        warn(f"left out without a pose at their time: {len(source) - len(index):,} of {counted(len(source), 'frame')}")
+        warn(f"left out without a pose at their time: {len(source) - len(index):,} of {count_noun(len(source), 'frame')}")
     if ground_map.frames_without_ground:
-        without, frames_added = ground_map.frames_without_ground, counted(ground_map.frames, "frame")
+        without, frames_added = ground_map.frames_without_ground, count_noun(ground_map.frames, "frame")
         warn(f"left out since they show no ground: {without:,} of {frames_added}")
     if quality is None:
         save_geotiff(out, ground_map)
@@ -275,7 +275,7 @@ def mosaic(
     rows, columns = ground_map.mean.shape
     spread = float(np.nanmedian(ground_map.std)) if np.isfinite(ground_map.std).any() else float("nan")
     say(
-        f"{counted(ground_map.frames, 'frame')} along the {laid_along} path: {rows:,} x {columns:,} cells of "
+        f"{count_noun(ground_map.frames, 'frame')} along the {laid_along} path: {rows:,} x {columns:,} cells of "
         f"{cell_mm:g} mm, {rows * cell_mm / 1e3:.4g} x {columns * cell_mm / 1e3:.4g} m; "
         f"median standard deviation {spread:.4f}"
     )
@@ -314,7 +314,7 @@ def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Tr
         if not Path(trajectory).exists():
             raise MitsonarError(
                 f"there is no trajectory {trajectory}: give a TUM or CSV file, the folder of an odometry, or "
-                f"`true`{meant(trajectory, ['true'])}"
+                f"`true`{did_you_mean(trajectory, ['true'])}"
             )
         paths["estimated"] = Trajectory.load(trajectory, frame)
     if true is not None:
@@ -385,7 +385,7 @@ def height(
             progress(len(here))
     true = None if source.sonar_poses is None else source.sonar_poses[:, 2]
     if out is not None:
-        write_whole(out, heights_csv(source.time_s, estimates, true).encode())
+        write_atomic(out, heights_csv(source.time_s, estimates, true).encode())
     for line in heights_lines(estimates, true):
         say(line)
     lost = sum(not one.valid for one in estimates)
@@ -395,7 +395,7 @@ def height(
         else f"pitch {pitch_deg:g} deg from the command line, which the frames cannot verify"
     )
     say(
-        f"{counted(len(estimates), 'frame')} by {by} ({given}), {lost:,} invalid"
+        f"{count_noun(len(estimates), 'frame')} by {by} ({given}), {lost:,} invalid"
         + (f", in {out}" if out is not None else "")
     )
     if lost == len(estimates):
@@ -501,10 +501,10 @@ def crlb(
     with progress_bar("differentiating", subject.poses * max(1, len(values)), "poses") as progress:
         report = bounds_report(source, subject, options, progress)
     if plot is not None:
-        from mitsonar.io.files import write_whole
+        from mitsonar.io.files import write_atomic
         from mitsonar.plotting.figures import crlb_png
 
-        write_whole(plot, crlb_png(report))
+        write_atomic(plot, crlb_png(report))
     if as_json:
         say_json(report, indent=1)
         return
@@ -523,14 +523,14 @@ def crlb(
 
 def _variable(text: str | None) -> tuple[str | None, list[Value]]:
     """Parse ``NAME=V1,V2,...``; of ``window`` the values are intervals."""
-    from mitsonar.errors import nearest_names
+    from mitsonar.errors import suggest_names
     from mitsonar.estimation.crlb.image import VARIABLES
 
     if text is None:
         return None, []
     name, _, rest = text.partition("=")
     if name not in VARIABLES:
-        raise MitsonarError(f"--vary takes NAME=V1,V2,...: got {text!r}; {nearest_names(name, VARIABLES)}")
+        raise MitsonarError(f"--vary takes NAME=V1,V2,...: got {text!r}; {suggest_names(name, VARIABLES)}")
     try:
         values: list[Value] = []
         for word in rest.split(","):

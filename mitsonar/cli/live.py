@@ -14,7 +14,7 @@ import typer
 
 from mitsonar.cli import options
 from mitsonar.cli.console import answered, command_line, progress_bar, say, warn
-from mitsonar.errors import MitsonarError, counted
+from mitsonar.errors import MitsonarError, count_noun
 
 if TYPE_CHECKING:
     from mitsonar.bridges.live import LivePublisher, PoseMailbox
@@ -73,7 +73,7 @@ def serve(
                     break
     finally:
         publisher.close()
-    say(f"{counted(served, 'ping')}")
+    say(f"{count_noun(served, 'ping')}")
 
 
 @contextmanager
@@ -162,8 +162,8 @@ def view(
     if boxed:
         names = ", ".join(boxed[:5]) + (" ..." if len(boxed) > 5 else "")
         warn(f"{len(boxed)} shapes are drawn as boxes, since they are instances or too large meshes: {names}")
-    summary = f"{counted(frames, 'frame')}, {counted(len(shown.shapes), 'shape')}"
-    summary += f", {counted(len(shown.estimated), 'estimated path')}"
+    summary = f"{count_noun(frames, 'frame')}, {count_noun(len(shown.shapes), 'shape')}"
+    summary += f", {count_noun(len(shown.estimated), 'estimated path')}"
     if html is not None:
         write_page(html)
         say(f"{summary}: {html}; serve it: python -m http.server -d {html}")

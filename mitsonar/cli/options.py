@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 from mitsonar.cli.console import numbers, warn
-from mitsonar.errors import MitsonarError, meant
+from mitsonar.errors import MitsonarError, did_you_mean
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -92,7 +92,7 @@ def path_for(
         shipped = str(file) == "shipped"
         if not shipped and not file.exists():
             raise MitsonarError(
-                f"there is no trajectory {file}: give a TUM or CSV file, or `shipped`{meant(file, ['shipped'])}"
+                f"there is no trajectory {file}: give a TUM or CSV file, or `shipped`{did_you_mean(file, ['shipped'])}"
             )
         path = Trajectory.load_tum(shipped_trajectory(scene)) if shipped else Trajectory.load(file, frame)
         if frames is None:

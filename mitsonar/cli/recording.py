@@ -13,8 +13,8 @@ import typer
 
 from mitsonar.cli.console import answered, changes_of, command_line, progress_bar, say, say_json, warn
 from mitsonar.cli.estimate import Geometry
-from mitsonar.errors import MitsonarError, counted, nearest_names
-from mitsonar.io.files import write_whole
+from mitsonar.errors import MitsonarError, count_noun, suggest_names
+from mitsonar.io.files import write_atomic
 from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
@@ -87,14 +87,14 @@ def info(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Print the contents of a recording: frames, parts, window, beams, rate, times, gaps, attitude, facts and notes."""
-    from mitsonar.recordings.handedness import handedness_of
+    from mitsonar.recordings.handedness import check_handedness
     from mitsonar.recordings.open import summary_lines, summary_of
 
     recording = _opened(file, topic, geometry)
     summary = summary_of(recording)
     verdict = None
     if handedness or turn_deg is not None:
-        verdict = handedness_of(recording.part(), None if turn_deg is None else math.radians(turn_deg))
+        verdict = check_handedness(recording.part(), None if turn_deg is None else math.radians(turn_deg))
     if as_json:
         extra = {} if verdict is None else {"handedness": verdict._asdict()}
         say_json({**summary, **extra})
@@ -105,7 +105,7 @@ def info(
         why = f" ({verdict.reason})" if verdict.reason else ""
         say(
             f"handedness             {verdict.verdict}{why}: "
-            f"correlation {verdict.correlation:.2f} over {counted(verdict.pairs, 'pair')}"
+            f"correlation {verdict.correlation:.2f} over {count_noun(verdict.pairs, 'pair')}"
         )
 
 
@@ -121,11 +121,11 @@ def show(
     overwrite: Overwrite = False,
 ) -> None:
     """Draw one frame as a fan with axes in metres and a colour bar in dB."""
-    from mitsonar.plotting.fans import coded_in_decibels, save_fan
+    from mitsonar.plotting.fans import save_fan, to_decibels
 
     refuse_to_replace(out, overwrite=overwrite)
     recording = _opened(file, topic, geometry)
-    frames = coded_in_decibels(recording.part(part).read([frame]), span_db)
+    frames = to_decibels(recording.part(part).read([frame]), span_db)
     save_fan(out, frames, title=f"{Path(file).name}, frame {frame}")
     say(f"picture: {out}")
 
@@ -154,7 +154,7 @@ def video(
     with progress_bar("drawing", len(chosen), "frames") as progress:
         speed = rate or min(1000.0, frame_rate_hz)
         count = write_fan_video(chosen.chunks(), out, speed, span_db=span_db, overwrite=overwrite, progress=progress)
-    say(f"{counted(count, 'frame')} at {speed:.4g} a second in {out}")
+    say(f"{count_noun(count, 'frame')} at {speed:.4g} a second in {out}")
 
 
 def convert(
@@ -185,7 +185,7 @@ def convert(
     from mitsonar.recordings.write_mcap import write_mcap
 
     if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
-        raise MitsonarError(f"{out}: unknown ending; {nearest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
+        raise MitsonarError(f"{out}: unknown ending; {suggest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
     if (full or labels) and out.suffix != ".mcap":
         raise MitsonarError(f"--full and --labels apply only to MCAP files: got {out}; leave them out")
     if resume and out.suffix:
@@ -196,7 +196,7 @@ def convert(
     spans = [None if text is None else _span(text, option) for text, option in ((crop_bins, "bins"), (crop_beams, "beams"))]
     if len(recording.parts) > 1:
         number = recording.longest if part is None else part
-        say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {counted(len(recording), 'frame')}")
+        say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {count_noun(len(recording), 'frame')}")
     if any(spans):
         chosen = chosen.cropped(*spans)
         # a resumed conversion compares formats, so that it does not go on with another crop
@@ -211,7 +211,7 @@ def convert(
             _to_aris(chosen, out, beams=beams, overwrite=overwrite, progress=progress)
         else:
             written = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
-    say(f"{counted(len(chosen), 'frame')} in {written}")
+    say(f"{count_noun(len(chosen), 'frame')} in {written}")
 
 
 def _span(text: str, what: str) -> tuple[int, int]:
@@ -245,13 +245,13 @@ def _to_aris(part: Part, out: Path, *, beams: int | None, overwrite: bool, progr
     part_file = out.with_name(f".{out.stem}.new.aris")  # the writer replaces nothing
     part_file.unlink(missing_ok=True)
 
-    def counted() -> Iterator[SonarFrames]:
+    def count_noun() -> Iterator[SonarFrames]:
         for frames in part.chunks():
             yield frames
             progress(len(frames))
 
     try:
-        written = write_aris(part_file, counted(), beams=beams)
+        written = write_aris(part_file, count_noun(), beams=beams)
         part_file.replace(out)
     finally:
         part_file.unlink(missing_ok=True)
@@ -371,10 +371,10 @@ def _fit_and_write(
 
     fitted = fit_sonar(frames, known.sonar, measure_coding=measure_coding, **known.fields)
     if noise is None:
-        write_whole(out, fitted.yaml().encode())
+        write_atomic(out, fitted.yaml().encode())
     else:
-        write_whole(out, fitted.yaml(leave=NOISE_FIELDS).encode())
-        write_whole(noise, fitted.yaml(only=NOISE_FIELDS).encode())
+        write_atomic(out, fitted.yaml(leave=NOISE_FIELDS).encode())
+        write_atomic(noise, fitted.yaml(only=NOISE_FIELDS).encode())
     for line in fitted.lines():
         say(line)
     for note in (*notes, *fitted.notes):
@@ -511,7 +511,7 @@ def exported(
     with progress_bar("exporting", source.frames, "frames") as progress:
         kind = cast(PictureKind, picture)
         report = export_to(to, source, out, picture=kind, every_class=every_class, progress=progress, **words)  # type: ignore[arg-type]
-    say(f"{counted(source.frames, 'frame')} as {to}: {out}")
+    say(f"{count_noun(source.frames, 'frame')} as {to}: {out}")
     for part in ("train", "validation", "test"):
         counts = ", ".join(f"{name} {report.boxes[part, name]:,}" for name in report.classes)
         if to in ("coco", "yolo") and (source.part == part).any():

@@ -12,7 +12,7 @@ import typer
 
 from mitsonar.cli import options
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.errors import MitsonarError, counted, meant
+from mitsonar.errors import MitsonarError, count_noun, did_you_mean
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.runs import Destination, RenderOptions
-    from mitsonar.simulation.scene import Said
+    from mitsonar.simulation.scene import MotionSpec
     from mitsonar.simulation.simulator import Simulator
     from mitsonar.simulation.vehicle import VehicleFile
 
@@ -90,7 +90,7 @@ def render(
     from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.runs import Destination, RenderOptions, run
-    from mitsonar.simulation.scene import channel_sonar_in, digests_of, find_scene, read_said, sonar_in
+    from mitsonar.simulation.scene import channel_sonar_in, digests_of, find_scene, read_motion_specs, sonar_in
     from mitsonar.simulation.simulator import Simulator
 
     if label_floor and not labels:
@@ -118,7 +118,7 @@ def render(
             f"--mirrors needs the model coherent, or --set bounces=2: got {instrument.model}; leave it out, or give one"
         )
     motions = _motions(loaded, moving, named)
-    bodies = MovingBodies.of(read_said(motions), named, path)
+    bodies = MovingBodies.of(read_motion_specs(motions), named, path)
     simulator = Simulator(
         loaded, instrument, mirrors="materials" if mirrors else None, moving=bodies, rays_per_launch=rays_per_launch
     )
@@ -131,7 +131,7 @@ def render(
         report = run(simulator, path, outputs, Destination(folder, origin, overwrite, resume, progress))
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{counted(report.frames, 'frame')} ({instrument.model} model, {instrument.title}) in {folder}")
+    say(f"{count_noun(report.frames, 'frame')} ({instrument.model} model, {instrument.title}) in {folder}")
     say(options.poses_line(path))
     if line := absorption_line(instrument):
         say(line)
@@ -173,21 +173,21 @@ def _check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: S
         warn(f"{frames} {buried.text}: its frames show the ground from below")
 
 
-def _motions(scene: Any, moving: list[str] | None, frame: str, also: Sequence[Said] = ()) -> list[Said]:
+def _motions(scene: Any, moving: list[str] | None, frame: str, also: Sequence[MotionSpec] = ()) -> list[MotionSpec]:
     """Return the motions of bodies: from --moving, else from the file of the vehicle, else from the scene."""
     from mitsonar.motion.bodies import BodyMotion
-    from mitsonar.simulation.scene import Said, said_by, said_in
+    from mitsonar.simulation.scene import MotionSpec, motion_specs_in, motion_specs_of
 
-    given: list[Said] = []
+    given: list[MotionSpec] = []
     for option in moving or []:
         name, _, file = option.partition("=")
         if option.lower().endswith((".yaml", ".yml")) and not file:
-            given += said_in(option)
+            given += motion_specs_in(option)
         elif name and file:
-            given.append(Said(name, BodyMotion(path=file, frame=frame), [Path()]))
+            given.append(MotionSpec(name, BodyMotion(path=file, frame=frame), [Path()]))
         else:
             raise MitsonarError(f"--moving takes ID=FILE.tum, ID=vehicle or FILE.yaml: got {option!r}")
-    for weaker in (also, said_by(scene)):
+    for weaker in (also, motion_specs_of(scene)):
         named = {one.name for one in given}
         given += [one for one in weaker if one.name not in named]
     return given
@@ -212,7 +212,7 @@ def _render_vehicle(
     vehicle: VehicleFile | None,
     path: Trajectory,
     changes: dict[str, Any],
-    motions: list[Said],
+    motions: list[MotionSpec],
     outputs: RenderOptions,
     destination: Destination,
 ) -> None:
@@ -221,7 +221,7 @@ def _render_vehicle(
     from mitsonar.instruments.sounder import Sounder
     from mitsonar.motion.pose import Pose
     from mitsonar.simulation.instrument_runs import run_vehicle
-    from mitsonar.simulation.scene import digests_of, read_said
+    from mitsonar.simulation.scene import digests_of, read_motion_specs
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, sensors_in
 
     sensors = sensors_in(scene, Pose.from_row(path.poses[0])) if vehicle is None else vehicle.sensors
@@ -232,15 +232,15 @@ def _render_vehicle(
             instrument = instrument.replace(**changes)
         changed[name] = Mounted(instrument, one.mount)
     origin = {**destination.origin, **({"moving": digests_of(motions)} if motions else {})}
-    simulator = VehicleSimulator(scene, changed, moving=read_said(motions))
+    simulator = VehicleSimulator(scene, changed, moving=read_motion_specs(motions))
     with progress_bar("rendering", len(path) * len(changed), "pings") as progress:
         report = run_vehicle(simulator, path, outputs, replace(destination, origin=origin, progress=progress))
     for sentence in report.warnings:
         warn(sentence)
     say(options.poses_line(path, {name: one.mount for name, one in changed.items()}))
     say(
-        f"{counted(len(path), 'pose')}, "
-        f"{counted(len(report.sensors), 'sensor')} ({', '.join(report.sensors)}) in {destination.folder}, a folder each"
+        f"{count_noun(len(path), 'pose')}, "
+        f"{count_noun(len(report.sensors), 'sensor')} ({', '.join(report.sensors)}) in {destination.folder}, a folder each"
     )
 
 
@@ -308,8 +308,8 @@ def impulse(
         warn(sentence)
     names = ", ".join(receiver.name for receiver in sonar.receivers)
     say(
-        f"{counted(len(flown), 'ping')} ({sonar.model} model, {sonar.title}: {names}) of "
-        f"{counted(sonar.taps, 'tap')} in {folder}"
+        f"{count_noun(len(flown), 'ping')} ({sonar.model} model, {sonar.title}: {names}) of "
+        f"{count_noun(sonar.taps, 'tap')} in {folder}"
     )
     say(options.poses_line(flown, {}))
     spread = report.spread
@@ -370,7 +370,7 @@ def _receivers(sonar: ChannelSonar, names: str) -> list[dict[str, object]]:
         if name not in known:
             raise MitsonarError(
                 f"--set receivers=NAME,NAME chooses among the receivers {', '.join(known)}: got "
-                f"{name!r}{meant(name, known)}; describe others in the channel_sonar of the scene"
+                f"{name!r}{did_you_mean(name, known)}; describe others in the channel_sonar of the scene"
             )
     return [known[name].model_dump() for name in chosen]
 
@@ -463,7 +463,7 @@ def sound(
     from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.instrument_runs import run_sounder
     from mitsonar.simulation.runs import Destination
-    from mitsonar.simulation.scene import digests_of, read_said
+    from mitsonar.simulation.scene import digests_of, read_motion_specs
     from mitsonar.simulation.sounding import SounderSimulator
 
     named = convention_named(frame).name
@@ -475,7 +475,7 @@ def sound(
     flown = options.under_vehicle(flown, sounder, trajectory)
     options.warn_of_speed(flown, end, speed)
     motions = _motions(loaded, moving, named)
-    bodies = MovingBodies.of(read_said(motions), named, flown)
+    bodies = MovingBodies.of(read_motion_specs(motions), named, flown)
     simulator = SounderSimulator(loaded, sounder, moving=bodies, rays_per_launch=rays_per_launch)
     _check_above_ground(loaded, flown, bool(motions))
     origin |= {"moving": digests_of(motions)} if motions else {}
@@ -485,9 +485,9 @@ def sound(
         report = run_sounder(simulator, flown, destination, frame=named)
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{counted(len(flown), 'ping')} ({sounder.kind}, {sounder.name}, {sounder.fan.model} model) in {folder}")
+    say(f"{count_noun(len(flown), 'ping')} ({sounder.kind}, {sounder.name}, {sounder.fan.model} model) in {folder}")
     say(options.poses_line(flown, {name: Pose.from_degrees(mount) for name, mount in sounder.mounts.items()}))
-    say(f"echoes in {report.found:,} of {counted(report.beams, 'beam')}; files: {', '.join(report.files)}")
+    say(f"echoes in {report.found:,} of {count_noun(report.beams, 'beam')}; files: {', '.join(report.files)}")
 
 
 # ---------------- ``mitsonar image``: bin stored echoes into new frames, without tracing
@@ -523,6 +523,6 @@ def image(
         report = run(source, source.trajectory, outputs, Destination(folder, origin, overwrite, resume, progress))
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{counted(report.frames, 'frame')} of {counted(source.sonar.range_bins, 'bin')} in {folder}")
+    say(f"{count_noun(report.frames, 'frame')} of {count_noun(source.sonar.range_bins, 'bin')} in {folder}")
     if report.pictures:
         say(f"pictures: {report.pictures[0]}")

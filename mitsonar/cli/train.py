@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mitsonar.cli.console import Terminated, answered, changes_of, progress_bar, say, say_json, say_stopped, warn
-from mitsonar.errors import MitsonarError, counted, meant
+from mitsonar.errors import MitsonarError, count_noun, did_you_mean
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -64,14 +64,14 @@ def train(
     """Train a network. After a stop, --resume continues; on a CPU to the same bits."""
     given = locals()  # by name the fields of TrainOptions, and the changes of the recipe
     from mitsonar.config.training import TrainOptions, load_training_recipe
-    from mitsonar.training.run import leads
+    from mitsonar.training.run import is_main_process
     from mitsonar.training.run import train as train_network
 
     changes = changes_of(given.pop("change") or [], None)
     options = TrainOptions(**{**given, "recipe": load_training_recipe(recipe, changes)})
     with stop_on_signals() as stop, TrainingBar() as bar:
         report = train_network(options, progress=bar, stop=stop)
-    if not leads():
+    if not is_main_process():
         return
     for name, text in report.rows():
         say(f"{name:18} {text}")
@@ -200,11 +200,11 @@ def evaluate(
     """
     checkpoint = checkpoint_from(run)
     from mitsonar.estimation.compare import FEWEST_SCENES
+    from mitsonar.training.evaluate import check_no_tables, report_lines, save_tables
     from mitsonar.training.evaluate import evaluate as evaluated
-    from mitsonar.training.evaluate import refuse_tables, report_lines, save_tables
 
     if out is not None:
-        refuse_tables(out, overwrite=overwrite)
+        check_no_tables(out, overwrite=overwrite)
     levels = None if noise is None else list(dict.fromkeys(noise.split(";" if ";" in noise else ",")))
     with ExitStack() as bar:
         report = evaluated(
@@ -223,7 +223,7 @@ def evaluate(
         warn(sentence)
     if report["scenes"] < FEWEST_SCENES:
         warn(
-            f"{counted(report['scenes'], 'scene')} only: the 95 % intervals are too narrow; evaluate on "
+            f"{count_noun(report['scenes'], 'scene')} only: the 95 % intervals are too narrow; evaluate on "
             f"{FEWEST_SCENES} or more"
         )
     lines = report_lines(report)
@@ -266,10 +266,10 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
     """Export a network to ONNX, with metadata on inputs and outputs, or to a checkpoint of half the size."""
-    from mitsonar.io.files import write_whole
+    from mitsonar.io.files import write_atomic
 
     if batch != "dynamic" and not (batch.isdecimal() and int(batch) > 0):
-        raise MitsonarError(f"--batch is a number of samples, or dynamic: got {batch!r}{meant(batch, ['dynamic'])}")
+        raise MitsonarError(f"--batch is a number of samples, or dynamic: got {batch!r}{did_you_mean(batch, ['dynamic'])}")
     if onnx is None and half is None:
         raise MitsonarError("nothing to write: give --onnx FILE.onnx, --half FILE.ckpt, or both")
     for option, path, suffix in (("--onnx", onnx, ".onnx"), ("--half", half, ".ckpt")):
@@ -279,13 +279,13 @@ def export(
     network = f"{checkpoint.network} of mitsonar {checkpoint.version}"
     if half is not None:
         content = checkpoint.halved().to_bytes()
-        write_whole(half, content)
+        write_atomic(half, content)
         say(f"{network}, {len(content):,} bytes: {half}")
     if onnx is not None:
-        from mitsonar.networks.checkpoint import onnx_of
+        from mitsonar.networks.checkpoint import to_onnx
 
-        content = onnx_of(checkpoint, None if batch == "dynamic" else int(batch))
-        write_whole(onnx, content)
+        content = to_onnx(checkpoint, None if batch == "dynamic" else int(batch))
+        write_atomic(onnx, content)
         say(f"{network}, {len(content):,} bytes: {onnx}")
 
 
@@ -371,9 +371,9 @@ def reproduce(
 
 def _list() -> None:
     """List all tables and figures with their rows, or with the command that makes them."""
-    from mitsonar.reproduction.tables import LOUD, NOISES, ScriptedTable, contents
+    from mitsonar.reproduction.tables import HIGHEST_NOISE, NOISES, ScriptedTable, contents
 
-    printed = [text for noise, text in NOISES.items() if noise != LOUD]
+    printed = [text for noise, text in NOISES.items() if noise != HIGHEST_NOISE]
     say(f"RMSE in Almanza-Medina, sideways mm / forward mm / yaw deg: {', '.join(printed)}")
     for table in contents():
         say(f"\n{table.name}  {table.title}")
@@ -383,7 +383,11 @@ def _list() -> None:
             say(f"    {table.command}")
             continue
         for row in table.rows:
-            errors = [row.format_errors(row.printed.get(noise)) for noise in table.noises if noise != LOUD] if row.printed else []
+            errors = (
+                [row.format_errors(row.printed.get(noise)) for noise in table.noises if noise != HIGHEST_NOISE]
+                if row.printed
+                else []
+            )
             say(f"    {row.name:32} {'   '.join(errors) or '-'}   {row.approach}")
 
 

@@ -28,7 +28,7 @@ from pydantic import (
 )
 
 from mitsonar.acoustics.materials import check_channel_mirrors, check_image_mirrors
-from mitsonar.errors import MitsonarError, complaint, nearest_names, shortened
+from mitsonar.errors import MitsonarError, short_repr, suggest_names, validation_message
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import sonar_from
@@ -89,7 +89,7 @@ def recipe_fields(
     path = Path(name_or_file)
     if path.suffix.lower() not in (".yaml", ".yml"):
         if str(name_or_file) not in shipped:
-            names = nearest_names(str(name_or_file), shipped)
+            names = suggest_names(str(name_or_file), shipped)
             raise MitsonarError(
                 f"no {what} {str(name_or_file)!r}: give a YAML file or the name of a shipped recipe, {names}"
             )
@@ -140,7 +140,7 @@ def _as_mirrors(given: object) -> object:
     if not fits:
         raise ValueError(
             "give [reflection, rms height in m] by the ids of shapes, reflections in -1..1 and rms heights in 0..1, or the "
-            f"word materials: got {shortened(given)}"
+            f"word materials: got {short_repr(given)}"
         )
     return given
 
@@ -184,7 +184,7 @@ RESERVED = ("frames", "label")
 
 def _check_view_name(name: str) -> str:
     if not name.isidentifier():
-        raise ValueError(f"a name must consist of letters, digits and _: got {shortened(name)}")
+        raise ValueError(f"a name must consist of letters, digits and _: got {short_repr(name)}")
     if name in RESERVED or name.startswith("nonzero"):
         raise ValueError(f"{name} is reserved in a data set: choose another name")
     return name
@@ -462,7 +462,7 @@ class Recipe(RecipePart):
             MitsonarError: keys contradict each other.
         """
         if len({view.name for view in self.views}) < len(self.views):
-            names = shortened([view.name for view in self.views])
+            names = short_repr([view.name for view in self.views])
             raise MitsonarError(f"receivers and segments must have different names: got {names}")
         if len({(view.sonar.range_min, view.sonar.range_max, view.sonar.range_bins) for view in self.views}) > 1:
             raise MitsonarError("all receivers must have the same window: range_min, range_max and range_bins")
@@ -481,7 +481,7 @@ class Recipe(RecipePart):
                 "everything that is labelled"
             )
         if len(set(self.bodies)) < len(self.bodies):
-            raise MitsonarError(f"each body must be named only once: got {shortened(self.bodies)}")
+            raise MitsonarError(f"each body must be named only once: got {short_repr(self.bodies)}")
         if self.recorded is None:
             check_image_mirrors(self.instrument, self.views, bool(self.mirrors))
 
@@ -665,7 +665,7 @@ def _validated(part: type[_PartT], what: str, fields: Keys) -> _PartT:
     try:
         return part(**fields)
     except ValidationError as error:
-        raise MitsonarError(complaint(error, part, what, " (see docs/guides/data-sets.md)")) from None
+        raise MitsonarError(validation_message(error, part, what, " (see docs/guides/data-sets.md)")) from None
     except TypeError as error:
         raise MitsonarError(f"{what} keys must be strings: {error}") from None
 

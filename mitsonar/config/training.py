@@ -17,9 +17,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from mitsonar.acoustics.noise import load_noise, snr_of
+from mitsonar.acoustics.noise import load_noise, parse_snr
 from mitsonar.config.data import SPLITS, Keys, Split, recipe_fields, set_key, split_from
-from mitsonar.errors import MitsonarError, complaint, shortened
+from mitsonar.errors import MitsonarError, short_repr, validation_message
 
 __all__ = [
     "STATE_MINUTES",
@@ -41,7 +41,7 @@ class _Part(BaseModel):
 
 
 def _check_noise(text: str) -> str:
-    (snr_of if text.endswith("dB") else load_noise)(text)
+    (parse_snr if text.endswith("dB") else load_noise)(text)
     return text
 
 
@@ -232,7 +232,9 @@ class TrainingRecipe(_Part):
         for level in {*self.noises, *self.validate_.noise} - {"none"}:
             if level.endswith("dB") != decibels:
                 allowed = "a signal to noise ratio such as '20 dB'" if decibels else "low, high, chapter2 or mean,std,scale"
-                raise ValueError(f"noise of input.kind {self.input.kind} must be {allowed}, or none: got {shortened(level)}")
+                raise ValueError(
+                    f"noise of input.kind {self.input.kind} must be {allowed}, or none: got {short_repr(level)}"
+                )
         if self.augment and not self.input.ground:
             raise ValueError("augment needs inputs with ground: set input.ground: true, or leave augment out")
         if isinstance(self.split, dict):
@@ -252,12 +254,12 @@ class TrainingRecipe(_Part):
         return [self.noise] if isinstance(self.noise, str) else list(self.noise)
 
     @property
-    def noise_said(self) -> str:
+    def noise_text(self) -> str:
         """Return the noise levels in training as text."""
         return " or ".join(self.noises)
 
     @cached_property
-    def split_of(self) -> str | Split:
+    def resolved_split(self) -> str | Split:
         """Return the split in the form that SonarPairs accepts."""
         return split_from(self.split) if isinstance(self.split, dict) else self.split
 
@@ -324,7 +326,7 @@ def training_recipe_from(fields: Keys) -> TrainingRecipe:
     try:
         return TrainingRecipe(**fields)
     except ValidationError as error:
-        message = complaint(error, TrainingRecipe, "training recipe")
+        message = validation_message(error, TrainingRecipe, "training recipe")
         raise MitsonarError(message.replace("validate_", "validate")) from None
     except TypeError as error:
         raise MitsonarError(f"training recipe keys must be strings: {error}") from None

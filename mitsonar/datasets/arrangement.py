@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, load_noise, uniform
 from mitsonar.config.data import Recipe
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, suggest_names
 from mitsonar.geometry.fan import CartesianMap, cartesian_map
 
 __all__ = ["LABELS", "Arrangement", "ArrayOfAnyLibrary", "Labels", "arrangement_of"]
@@ -63,7 +63,7 @@ class Labels:
             MitsonarError: unknown kind.
         """
         if kind not in LABELS:
-            raise MitsonarError(f"unknown labels {kind!r}: {nearest_names(kind, LABELS)}")
+            raise MitsonarError(f"unknown labels {kind!r}: {suggest_names(kind, LABELS)}")
         flight = recipe.flight
         if frames == 1:
             low, high = flight.heights
@@ -312,7 +312,7 @@ def _check_names(recipe: Recipe, views: tuple[str, ...], kind: str, layout: str,
     unknown = [name for name in views if name not in known]
     if unknown or not views:
         raise MitsonarError(
-            f"unknown view {unknown[0] if unknown else 'none'}: {nearest_names(unknown[0] if unknown else '', known)}"
+            f"unknown view {unknown[0] if unknown else 'none'}: {suggest_names(unknown[0] if unknown else '', known)}"
         )
     if kind == "image" and "image" not in recipe.kinds:
         raise MitsonarError("the data set holds vectors only: read kind='vector', or make one with store: images or both")

@@ -33,10 +33,10 @@ from mitsonar.datasets.plan import (
     sequences_of,
     world_seed,
 )
-from mitsonar.datasets.store import PACKAGES, PARTS, DataStore, deal, world_of
-from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.datasets.store import PACKAGES, PARTS, DataStore, frames_in_part, world_numbers
+from mitsonar.errors import MitsonarError, short_repr, suggest_names
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.io.runs import refuse_other, versions
+from mitsonar.io.runs import check_same_settings, versions
 from mitsonar.io.storage import Storage
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import mounted
@@ -62,9 +62,9 @@ __all__ = [
     "check",
     "forget",
     "loaded_world",
-    "made_by",
     "make_dataset",
     "make_shard",
+    "make_shards",
     "refuse_worlds",
 ]
 
@@ -144,8 +144,8 @@ def make_dataset(
             if not todo:
                 break
             _check_versions(store)
-            store.unfinish()
-            for shard in made_by(store, todo, workers=workers, scheduler=scheduler):
+            store.mark_unfinished()
+            for shard in make_shards(store, todo, workers=workers, scheduler=scheduler):
                 check_lock()
                 progress(_frame_count(store, [shard]))
             written += len(todo)
@@ -176,9 +176,9 @@ def _open_or_create(storage: Storage, recipe: Recipe, sequences: int | None, var
         _check_same(store, recipe, count, variant)
         if store.ready:
             if verify:
-                store.mend_known(Plan.of(recipe, count))
+                store.repair_planned_arrays(Plan.of(recipe, count))
             return store
-    about = {**renderer_of(modality_of(recipe)).settled(recipe), "variant": variant, "versions": versions(PACKAGES)}
+    about = {**renderer_of(modality_of(recipe)).fixed_attributes(recipe), "variant": variant, "versions": versions(PACKAGES)}
     return DataStore.create(storage, recipe, Plan.of(recipe, count), about)
 
 
@@ -191,7 +191,7 @@ def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) 
     about = store.about
     requested = {**recipe.model_dump(mode="json"), "sequences": sequences}
     stored = {**about["recipe"], "sequences": about["sequences"]}
-    refuse_other(store.place.url, stored, requested, " (`mitsonar dataset info --recipe` prints the recipe)")
+    check_same_settings(store.place.url, stored, requested, " (`mitsonar dataset info --recipe` prints the recipe)")
     if about["variant"] != variant:
         raise MitsonarError(
             f"{store.place.url} was begun with {about['variant']}, this is {variant}, which differs in the last bits: set "
@@ -205,7 +205,7 @@ def _check_versions(store: DataStore) -> None:
     Raises:
         MitsonarError: the store was begun with other versions.
     """
-    changed = store.other_versions()
+    changed = store.changed_versions()
     if changed:
         raise MitsonarError(
             f"{store.place.url} was begun with {', '.join(changed)}: the rest would differ from it; finish it with these "
@@ -224,9 +224,9 @@ def _clear_parts(storage: Storage) -> None:
 def _split_warnings(store: DataStore) -> list[str]:
     """Return a warning if there are too few scenes or sequences for the recipe's split."""
     split = store.recipe.split
-    worlds = world_of(store.recipe, store.scenes)[store.read("scene")]
+    worlds = world_numbers(store.recipe, store.scenes)[store.read("scene")]
     try:
-        deal(worlds, store.read("sequence"), split, max(PARTS, key=lambda part: getattr(split, part)))
+        frames_in_part(worlds, store.read("sequence"), split, max(PARTS, key=lambda part: getattr(split, part)))
     except MitsonarError as error:
         return [str(error)]
     return []
@@ -309,7 +309,7 @@ class Client(Protocol):
         """Cancel tasks."""
 
 
-def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: str | None = None) -> Iterator[int]:
+def make_shards(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: str | None = None) -> Iterator[int]:
     """Make shards, and yield the number of each when it is done.
 
     Args:
@@ -502,7 +502,7 @@ def _work(url: str, shard: int) -> int:
 
     use_threads(get_worker().state.nthreads)
     store = DataStore.open(url, write=True, unfinished=True)
-    changed = store.other_versions()
+    changed = store.changed_versions()
     if changed:
         raise MitsonarError(
             f"the store was begun with {', '.join(changed)} on {socket.gethostname()}: install the same versions everywhere"
@@ -634,7 +634,7 @@ def _plan_faults(store: DataStore) -> list[str]:
     if store.recipe.recorded is not None:  # recorded frames come with their poses, there is no plan
         return []
     plan = Plan.of(store.recipe, int(store.about["sequences"]))
-    return [f"{name} differs from the plan of recipe and seed" for name in store.unplanned(plan)]
+    return [f"{name} differs from the plan of recipe and seed" for name in store.deviating_arrays(plan)]
 
 
 def _count_faults(store: DataStore) -> list[str]:
@@ -748,7 +748,7 @@ class SceneRenderer:
             self._labeller = Simulator(world, sonar.replace(model="physical", **patterns))
 
     @staticmethod
-    def settled(recipe: Recipe) -> Fields:
+    def fixed_attributes(recipe: Recipe) -> Fields:
         """Compute the gain of the data set, its inverse, and, if shapes are labelled, the shape names of scene files.
 
         See :func:`calibrate` for the gain. The names are a list for each group of scenes; it is empty for generated worlds.
@@ -864,8 +864,8 @@ def body_places(recipe: Recipe, motion: SceneMotion | None) -> list[int]:
     moving = () if motion is None else motion.bodies.names
     for name in recipe.bodies:
         if name not in moving:
-            hint = nearest_names(name, moving) if moving else "nothing moves there"
-            raise MitsonarError(f"bodies: no body {shortened(name)} moves in the scene: {hint}")
+            hint = suggest_names(name, moving) if moving else "nothing moves there"
+            raise MitsonarError(f"bodies: no body {short_repr(name)} moves in the scene: {hint}")
     return [moving.index(name) for name in recipe.bodies]
 
 
@@ -880,7 +880,7 @@ def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
         path, parameters = family.prepare(scene.seed, Path(folder) / "world")
         loaded = load_scene(path, **parameters)
         extent = loaded.bbox()
-        family.refuse_smaller(np.array(extent.min, dtype=float).ravel(), np.array(extent.max, dtype=float).ravel())
+        family.check_scene_extent(np.array(extent.min, dtype=float).ravel(), np.array(extent.max, dtype=float).ravel())
         return loaded
 
 
@@ -963,7 +963,7 @@ class ResponseRenderer:
         self.simulator = ChannelSimulator(loaded_world(recipe, scene), recipe.channel_sonar, mirrors=recipe.mirrors)
 
     @staticmethod
-    def settled(recipe: Recipe) -> Fields:
+    def fixed_attributes(recipe: Recipe) -> Fields:
         """Check that the worlds have the recipe's mirrors, and return no attributes, because responses have no gain."""
         refuse_worlds(recipe)
         return {}

@@ -99,7 +99,7 @@ class Renderer(Protocol):
     def __init__(self, recipe: Recipe, scene: Scene) -> None: ...
 
     @staticmethod
-    def settled(recipe: Recipe) -> Fields:
+    def fixed_attributes(recipe: Recipe) -> Fields:
         """Compute the attributes of the whole data set that must be known before its first ping is recorded.
 
         Raises:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.config.data import array_names
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError, counted, nearest_names
+from mitsonar.errors import MitsonarError, count_noun, suggest_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,7 +52,7 @@ def info(store: DataStore) -> Table:
         "sonar": store.modality.sonar.name,
         **({"views": list(about["views"])} if "views" in about else {"receivers": about["receivers"]}),
         "seed": store.recipe.seed,
-        **{name: about[name] for name in ("gain",) if name in store.modality.settled},
+        **{name: about[name] for name in ("gain",) if name in store.modality.fixed_attributes},
         "bytes": sum(sizes.values()),
         "arrays": arrays,
         **({"levels": _level_table(store)} if store.recipe.channel is None else {}),
@@ -81,7 +81,7 @@ def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None,
     names = {v: name for name, (kind, v) in array_names(store.recipe).items() if kind == store.recipe.kinds[0]}
     view = view or next(iter(names))
     if view not in names:
-        raise MitsonarError(f"unknown view {view}: {nearest_names(view, names)}")
+        raise MitsonarError(f"unknown view {view}: {suggest_names(view, names)}")
     frames, name = store.recipe.frames, names[view]
     starts = _sample_starts(store, samples, seed)
     columns = max(frames + 2, 4)
@@ -109,7 +109,7 @@ def _sample_starts(store: DataStore, samples: int, seed: int) -> list[int]:
 
 def _title(store: DataStore, part: str) -> str:
     """Return the title of an overview of a view or receiver."""
-    size = f"{counted(len(store), store.modality.what)} in {counted(store.about['sequences'], 'sequence')}"
+    size = f"{count_noun(len(store), store.modality.what)} in {count_noun(store.about['sequences'], 'sequence')}"
     return f"{store.recipe.name}, {part}: {size}"
 
 
@@ -227,7 +227,7 @@ def _response_sheet(store: DataStore, *, samples: int, receiver: str | None, see
     names = [one.name for one in store.recipe.channel_sonar.receivers]
     receiver = receiver or names[0]
     if receiver not in names:
-        raise MitsonarError(f"unknown receiver {receiver}: {nearest_names(receiver, names)}")
+        raise MitsonarError(f"unknown receiver {receiver}: {suggest_names(receiver, names)}")
     starts = _sample_starts(store, samples, seed)
     figure = Figure(figsize=(13, 2.6 * (len(starts) + 1)), layout="constrained")
     axes = figure.subplots(len(starts) + 1, 3, squeeze=False)

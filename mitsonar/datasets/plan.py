@@ -16,7 +16,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.noise import NoiseModel, load_noise, snr_of
+from mitsonar.acoustics.noise import NoiseModel, load_noise, parse_snr
 from mitsonar.config.data import Flight, Recipe, array_names
 from mitsonar.datasets.modality import Fields, Modality, Read, Scene, StoredArray, StoredAxis, Values, ground_reach
 from mitsonar.errors import MitsonarError
@@ -625,7 +625,7 @@ class ResponseModality:
         Raises:
             MitsonarError: the name is not a ratio.
         """
-        snr_of(name)
+        parse_snr(name)
 
     def empty(self, read: Read, here: slice) -> NDArray[np.bool_]:
         """Mark the pings ``(pings,)`` of which no receiver recorded an echo."""

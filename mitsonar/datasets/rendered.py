@@ -18,13 +18,13 @@ from mitsonar.datasets.make import SceneRenderer, calibrate
 from mitsonar.datasets.modality import Scene, Values
 from mitsonar.datasets.plan import scenes_of, sequences_of, world_seed
 from mitsonar.datasets.samples import ArrangementOptions, Batch, Device, RawSample, Samples, SonarPairs
-from mitsonar.errors import MitsonarError, refuse_unknown
+from mitsonar.errors import MitsonarError, check_argument_names
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import mounted
 from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.device import ensure_variant, release_memory, use_threads
 
-__all__ = ["RawStream", "RenderedPairs", "re_rendered"]
+__all__ = ["RawStream", "RenderedPairs", "rerender"]
 
 
 class RenderedPairs(IterableDataset[Batch], Samples):
@@ -42,7 +42,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         recipe: a recipe, its name, or a YAML file.
         seed: seed of worlds, flights, jitter and noise.
         length: number of samples per epoch over all workers; None: endless.
-        sequences_a_world: number of sequences per world.
+        sequences_per_world: number of sequences per world.
         buffer: number of samples from which the next one is drawn at random.
         gain: gain of the pixels; default: the gain that a data set of this recipe has, computed once at the start.
         arrangement: options of ``SonarPairs``: frames, views, kind, layout, coordinates, noise, labels.
@@ -60,13 +60,13 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         *,
         seed: int,
         length: int | None = None,
-        sequences_a_world: int = 1000,
+        sequences_per_world: int = 1000,
         buffer: int = 500,
         gain: float | None = None,
         **arrangement: Unpack[ArrangementOptions],
     ) -> None:
-        option_names = ("seed", "length", "sequences_a_world", "buffer", "gain")
-        refuse_unknown(arrangement, (*option_names, *ArrangementOptions.__annotations__), type(self).__name__)
+        option_names = ("seed", "length", "sequences_per_world", "buffer", "gain")
+        check_argument_names(arrangement, (*option_names, *ArrangementOptions.__annotations__), type(self).__name__)
         recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
         Samples.__init__(self, recipe, seed=seed, **arrangement)
         if recipe.flight.kind != "random":
@@ -77,7 +77,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
             raise MitsonarError(f"frames must be at most flight.pings, {recipe.flight.pings}: got {self.frames}")
         stream_seed = int(np.random.SeedSequence([self.seed, 9]).generate_state(1)[0] // 2)
         self.worlds = recipe_from({**recipe.model_dump(), "seed": stream_seed})  # rebuilt, since a copy keeps cached values
-        self.length, self.sequences_a_world, self.buffer, self.gain = length, sequences_a_world, buffer, gain
+        self.length, self.sequences_per_world, self.buffer, self.gain = length, sequences_per_world, buffer, gain
 
     def __repr__(self) -> str:
         length = "endless" if self.length is None else f"{self.length:,}"
@@ -174,13 +174,13 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         """
         weights = np.array([group.count * group.sequences for group in self.worlds.scenes], dtype=float)
         samples_per_sequence = self.worlds.flight.pings - self.frames + 1
-        world, sequence = divmod(first // samples_per_sequence, self.sequences_a_world)
+        world, sequence = divmod(first // samples_per_sequence, self.sequences_per_world)
         number = worker + (world + self.epoch * 10**6) * workers
         count = (first // samples_per_sequence) * samples_per_sequence
         while True:
             rng = np.random.default_rng([self.seed, 8, number])
             group = int(rng.choice(len(weights), p=weights / weights.sum()))
-            scene = Scene(number, group, world_seed(self.worlds.seed, number), self.sequences_a_world)
+            scene = Scene(number, group, world_seed(self.worlds.seed, number), self.sequences_per_world)
             release_memory()
             for sample in self._samples_of_world(SceneRenderer(self.worlds, scene), sequence):
                 yield count, sample
@@ -193,9 +193,9 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         recipe, pings = renderer.recipe, renderer.recipe.flight.pings
         sequences_per_launch = max(1, renderer.simulator.model.pings_per_launch // pings)
         sequences = itertools.islice(sequences_of(recipe, renderer.scene), begin, None)
-        first_number = renderer.scene.number * self.sequences_a_world * pings
-        for start in range(begin, self.sequences_a_world, sequences_per_launch):
-            vehicles = [next(sequences).vehicle for _ in range(min(sequences_per_launch, self.sequences_a_world - start))]
+        first_number = renderer.scene.number * self.sequences_per_world * pings
+        for start in range(begin, self.sequences_per_world, sequences_per_launch):
+            vehicles = [next(sequences).vehicle for _ in range(min(sequences_per_launch, self.sequences_per_world - start))]
             poses = mounted(np.concatenate(vehicles), recipe.mount.pose)
             values = renderer.frames(poses, start * pings, self.gain)
             for k, vehicle in enumerate(vehicles):
@@ -267,7 +267,7 @@ class RawStream(IterableDataset[RawSample]):
 # ---------------- Rendering stored samples again
 
 
-def re_rendered(
+def rerender(
     pairs: SonarPairs,
     numbers: Sequence[int],
     *,
@@ -303,7 +303,7 @@ def re_rendered(
         renderer = SceneRenderer(recipe, scene)
         start = int(np.argmax(pairs.scene == scene.number))
         for index in indices.tolist():
-            here = pairs.frame_numbers(index)
+            here = pairs.frame_slice(index)
             poses = pairs.pose[here] if shift is None else shift(index, pairs.pose[here])
             values = renderer.frames(poses, here.start - start, gain)
             yield index, pairs.sonar_frames(index, next(array for name, array in values.items() if name.startswith("image")))

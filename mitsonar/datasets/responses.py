@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.acoustics.noise import snr_of
+from mitsonar.acoustics.noise import parse_snr
 from mitsonar.config.data import Recipe
 from mitsonar.datasets.arrangement import WHICH_LEVEL, Labels
 from mitsonar.datasets.sample_index import AnySplit, Part
@@ -20,14 +20,14 @@ from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import motions
 from mitsonar.records.responses import ImpulseResponses
 
-__all__ = ["ImpulseSamples", "Leak", "Packing", "displacement_labels", "noise_power", "packed", "with_noise"]
+__all__ = ["ImpulseSamples", "Leak", "Packing", "displacement_labels", "noise_power", "pack_responses", "with_noise"]
 
 
 SIGNAL_ENERGY = (0.01, 0.99)
 """Fractions of the energy that mark the first and the last tap of the signal."""
 
 
-def packed(response: NDArray[np.complexfloating]) -> NDArray[np.float32]:
+def pack_responses(response: NDArray[np.complexfloating]) -> NDArray[np.float32]:
     """Pack responses ``(..., Q, M, taps)`` into matrices ``(..., taps, 2 M Q)`` (Almanza-Medina, 5.2.5).
 
     For each of M receivers, the columns are the real parts of its Q responses, then their imaginary parts. They are divided
@@ -104,7 +104,7 @@ class Packing:
             seed: seed of the noise.
         """
         rows = zip(response, np.asarray(numbers), strict=True)
-        return packed(np.stack([self.received(sample, pings, seed) for sample, pings in rows]))[:, None]
+        return pack_responses(np.stack([self.received(sample, pings, seed) for sample, pings in rows]))[:, None]
 
 
 # ---------------- Samples for estimators, without torch
@@ -139,7 +139,7 @@ class ImpulseSamples:
         leak: a test that removes the motion from the samples: whatever an estimator still learns has another source.
             ``one_ping`` repeats the first response; ``strangers`` takes all but the first response from a sample of another
             scene.
-        one_a_sequence: whether to take only one sample from each sequence.
+        one_per_sequence: whether to take only one sample from each sequence.
 
     Attributes:
         sonar: transmitter and receivers.
@@ -160,7 +160,7 @@ class ImpulseSamples:
         labels: str = "normx10",
         seed: int = 0,
         leak: Leak = "none",
-        one_a_sequence: bool = False,
+        one_per_sequence: bool = False,
     ) -> None:
         self.store, self._part = DataStore.open(url), part
         self.recipe = self.store.recipe
@@ -173,10 +173,10 @@ class ImpulseSamples:
         levels = [noise] if isinstance(noise, str) else list(noise)
         if not levels:
             raise MitsonarError("noise must be a ratio or a list of ratios, not an empty list: give 'none' for no noise")
-        self.arrange = Packing(tuple(one.name for one in self.sonar.receivers), tuple(map(snr_of, levels)))
+        self.arrange = Packing(tuple(one.name for one in self.sonar.receivers), tuple(map(parse_snr, levels)))
         self.labels = displacement_labels(labels, self.recipe, self.frames)
         self.seed, self.epoch, self.leak = seed, 0, leak
-        self.chosen = Part.of(self.store, part, split, self.frames, seed=seed, one_a_sequence=one_a_sequence)
+        self.chosen = Part.of(self.store, part, split, self.frames, seed=seed, one_per_sequence=one_per_sequence)
         self.split, self.first = self.chosen.split, self.chosen.first
         self.scene, self.sequence = self.chosen.scene, self.chosen.sequence
         if leak == "strangers" and len(np.unique(self.scene[self.first])) < 2:
@@ -192,16 +192,16 @@ class ImpulseSamples:
             f"part {self._part}, {self.recipe.name}: {self.store.place.url})"
         )
 
-    def frame_numbers(self, index: int) -> slice:
+    def frame_slice(self, index: int) -> slice:
         """Return the slice of a sample's pings in the store."""
-        return self.chosen.frame_numbers(index)
+        return self.chosen.frame_slice(index)
 
     def target(self, index: int) -> NDArray[np.float64]:
         """Return the displacement from the first ping to the last (Almanza-Medina, eq. 3.4).
 
         Its components are sideways, forward [m] and, if the recipe has yaw, yaw [rad].
         """
-        here = self.frame_numbers(index)
+        here = self.frame_slice(index)
         ends = self.chosen.pose[[here.start, here.stop - 1]]
         return np.asarray(motions(ends)[0, : len(self.labels.names)])
 
@@ -211,13 +211,13 @@ class ImpulseSamples:
 
     def response(self, index: int) -> NDArray[np.complex64]:
         """Read the responses of a sample ``(Q, M, taps)`` without noise; ``leak`` selects responses to replace."""
-        responses = self.store.read("response", self.frame_numbers(index))
+        responses = self.store.read("response", self.frame_slice(index))
         if self.leak == "one_ping":
             return np.repeat(responses[:1], self.frames, axis=0)
         if self.leak == "strangers":
             strangers = np.flatnonzero(self.scene[self.first] != self.scene[self.first[index]])
             stranger = int(np.random.default_rng([self.seed, 11, int(self.first[index])]).choice(strangers))
-            return np.concatenate([responses[:1], self.store.read("response", self.frame_numbers(stranger))[1:]])
+            return np.concatenate([responses[:1], self.store.read("response", self.frame_slice(stranger))[1:]])
         return responses
 
     @property
@@ -227,16 +227,16 @@ class ImpulseSamples:
 
     def received(self, index: int) -> NDArray[np.complexfloating]:
         """Read the responses of a sample ``(Q, M, taps)`` with noise."""
-        here = self.frame_numbers(index)
+        here = self.frame_slice(index)
         return self.arrange.received(self.response(index), np.arange(here.start, here.stop), self.noise_seed)
 
     def matrix(self, index: int) -> NDArray[np.float32]:
         """Read the packed matrix ``(taps, 2 M Q)`` of a sample with noise."""
-        return packed(self.received(index))
+        return pack_responses(self.received(index))
 
     def responses(self, index: int) -> ImpulseResponses:
         """Read a sample with noise as :class:`ImpulseResponses`, the input of estimators."""
-        here = self.frame_numbers(index)
+        here = self.frame_slice(index)
         per_ping = self._per_ping
         return ImpulseResponses(
             response=self.received(index),

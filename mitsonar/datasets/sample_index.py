@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mitsonar.config.data import SPLITS, Recipe, Split, split_from
 from mitsonar.datasets.modality import Fields
-from mitsonar.datasets.store import DataStore, deal, deal_samples, world_of
+from mitsonar.datasets.store import DataStore, frames_in_part, samples_in_part, world_numbers
 from mitsonar.errors import MitsonarError
 
 __all__ = ["AnySplit", "Part", "split_for"]
@@ -49,7 +49,7 @@ class Part:
         frames: int,
         *,
         seed: int = 0,
-        one_a_sequence: bool = False,
+        one_per_sequence: bool = False,
     ) -> Part:
         """Find the samples of a part.
 
@@ -59,7 +59,7 @@ class Part:
             split: see :func:`split_for`.
             frames: number of frames per sample.
             seed: of the random choice of one sample per sequence.
-            one_a_sequence: whether to take only one sample from each sequence.
+            one_per_sequence: whether to take only one sample from each sequence.
 
         Raises:
             MitsonarError: the part or split is unknown, or the part has no samples.
@@ -69,21 +69,21 @@ class Part:
         first = np.arange(max(0, len(sequence) - frames + 1))
         first = first[sequence[first] == sequence[first + frames - 1]]
         if resolved.by == "sample":
-            first = first[deal_samples(sequence[first], resolved, part)]
+            first = first[samples_in_part(sequence[first], resolved, part)]
         else:
-            first = first[deal(world_of(store.recipe, store.scenes)[scene], sequence, resolved, part)[first]]
+            first = first[frames_in_part(world_numbers(store.recipe, store.scenes)[scene], sequence, resolved, part)[first]]
         if not len(first):
             raise MitsonarError(
                 f"{store.place.url} has no sample of {frames} frames in part {part!r}: its sequences have "
                 f"{np.bincount(sequence).max()} frames; request fewer frames, or another part"
             )
-        if one_a_sequence:
+        if one_per_sequence:
             rank = np.random.default_rng([seed, 5]).permutation(len(first))
             order = np.lexsort((rank, sequence[first]))
             first = np.sort(first[order][np.unique(sequence[first][order], return_index=True)[1]])
         return cls(resolved, frames, first, scene, sequence, pose, motion)
 
-    def frame_numbers(self, index: int) -> slice:
+    def frame_slice(self, index: int) -> slice:
         """Return the slice of the store's frames that a sample holds."""
         first = int(self.first[index])
         return slice(first, first + self.frames)

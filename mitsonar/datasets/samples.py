@@ -13,15 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, load_noise, snr_of, snr_said
+from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, format_snr, load_noise, parse_snr
 from mitsonar.config.data import Recipe, array_names
 from mitsonar.datasets.arrangement import Arrangement, Labels, arrangement_of
 from mitsonar.datasets.modality import Fields, Values
 from mitsonar.datasets.responses import ImpulseSamples, Packing
 from mitsonar.datasets.sample_index import AnySplit, Part
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError, refuse_unknown
-from mitsonar.geometry.ground import Attitude, GroundGeometry, attitude_of, margin_of_light, nearest_known
+from mitsonar.errors import MitsonarError, check_argument_names
+from mitsonar.geometry.ground import Attitude, GroundGeometry, attitude_of, lit_margin, nearest_known
 from mitsonar.instruments.sonar import Bearing
 from mitsonar.motion.composition import motions
 from mitsonar.records.frames import SonarFrames
@@ -123,7 +123,7 @@ def ground_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.f
 def light_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.float32]]:
     """Compute how far inside the insonified area the ground at each node lies, as ``lit (R, C)``.
 
-    See :func:`mitsonar.geometry.ground.margin_of_light`. The result is empty if the outline of the area is not to be masked,
+    See :func:`mitsonar.geometry.ground.lit_margin`. The result is empty if the outline of the area is not to be masked,
     which is the case if little of the window is insonified. Training does not use this array.
     """
     range_m, bearing_rad = (
@@ -132,7 +132,7 @@ def light_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.fl
     )
     sonar, pitch_rad, roll_rad = frames.sonar, attitude.pitch_rad, attitude.roll_rad
     ground = GroundGeometry(range_m, bearing_rad, sonar.bearing, attitude.height_m, pitch_rad, roll_rad)
-    margin = margin_of_light(ground, attitude, sonar.elevation_fov_deg, mostly=0.0)
+    margin = lit_margin(ground, attitude, sonar.elevation_fov_deg, mostly=0.0)
     return {} if margin is None else {"lit": margin.astype(np.float32)}
 
 
@@ -488,7 +488,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         seed: of noise and order. The split has a separate seed (``Split.seed``), so another seed never mixes its parts.
         ground: whether the input is images and the geometry of the ground below them, as ``corrnet`` requires. The labels
             are then motions of the sonar, not of the vehicle that carries it.
-        one_a_sequence: whether to take only one sample from each sequence, for independent tests.
+        one_per_sequence: whether to take only one sample from each sequence, for independent tests.
 
     Raises:
         MitsonarError: there is no finished data set, an option is unknown, or the part has no frames.
@@ -500,14 +500,14 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         *,
         part: str = "train",
         split: AnySplit = None,
-        one_a_sequence: bool = False,
+        one_per_sequence: bool = False,
         **arrangement: Unpack[SampleOptions],
     ) -> None:
-        names = ("part", "split", "one_a_sequence")
-        refuse_unknown(arrangement, (*names, *SampleOptions.__annotations__), type(self).__name__)
+        names = ("part", "split", "one_per_sequence")
+        check_argument_names(arrangement, (*names, *SampleOptions.__annotations__), type(self).__name__)
         self.store, self._part = DataStore.open(url), part
         Samples.__init__(self, self.store.recipe, **arrangement)
-        self.chosen = Part.of(self.store, part, split, self.frames, seed=self.seed, one_a_sequence=one_a_sequence)
+        self.chosen = Part.of(self.store, part, split, self.frames, seed=self.seed, one_per_sequence=one_per_sequence)
         self.split, self.first = self.chosen.split, self.chosen.first
         self.scene, self.sequence = self.chosen.scene, self.chosen.sequence
         self.pose, self.motion = self.chosen.pose, self.chosen.motion
@@ -523,16 +523,16 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
     def __len__(self) -> int:
         return len(self.first)
 
-    def frame_numbers(self, index: int) -> slice:
+    def frame_slice(self, index: int) -> slice:
         """Return the slice of the store's frames that a sample holds."""
-        return self.chosen.frame_numbers(index)
+        return self.chosen.frame_slice(index)
 
     def target(self, index: int) -> NDArray[np.float64]:
         """Return the mean motion from frame to frame (sideways [m], forward [m], yaw [rad]).
 
         The target of a sample with one frame is its height above z = 0 [m].
         """
-        here = self.frame_numbers(index)
+        here = self.frame_slice(index)
         if self.frames == 1:
             return self.pose[here, 2]
         if self.ground:  # in the frame of the sonar, as the ground geometry
@@ -541,7 +541,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
 
     def raw(self, index: int) -> RawSample:
         """Read a sample as stored: the frames keyed by view, their numbers, and the label; see :meth:`finished`."""
-        here = self.frame_numbers(index)
+        here = self.frame_slice(index)
         sample: RawSample = {
             "frames": np.arange(here.start, here.stop),
             "label": self.labels.encode(self.target(index)),
@@ -583,7 +583,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         """
         if len(self.arrange.views) > 1 or self.arrange.kind != "image":
             raise MitsonarError(f"frames hold images of one view: choose one of {', '.join(self.arrange.views)}")
-        here, (name,) = self.frame_numbers(index), self.arrange.views
+        here, (name,) = self.frame_slice(index), self.arrange.views
         sample = {key: np.asarray(values)[None] for key, values in self.raw(index).items()}
         if image is not None:
             sample[name] = image[None]
@@ -733,7 +733,7 @@ class ImpulsePairs(ImpulseSamples, StoredBatches, Dataset[Batch]):
 
     def raw(self, index: int) -> RawSample:
         """Read a sample as stored: the responses ``(Q, M, taps)``, the numbers of the pings, and the label."""
-        here = self.frame_numbers(index)
+        here = self.frame_slice(index)
         label = self.labels.encode(self.target(index))
         return {"frames": np.arange(here.start, here.stop), "response": self.response(index), "label": label}
 
@@ -749,7 +749,7 @@ class ImpulsePairs(ImpulseSamples, StoredBatches, Dataset[Batch]):
         Raises:
             MitsonarError: unknown level.
         """
-        return replace(self.arrange, levels=(snr_of(level),))
+        return replace(self.arrange, levels=(parse_snr(level),))
 
     def described(self) -> Fields:
         """Return the description for a checkpoint; see :meth:`~mitsonar.datasets.samples.Batches.described`."""
@@ -767,5 +767,5 @@ class ImpulsePairs(ImpulseSamples, StoredBatches, Dataset[Batch]):
             "sonar": {"channel": self.sonar.model_dump(mode="json")},
             "trained_at": {"height_m": [low, high], "pitch_deg": 0.0, "roll_deg": 0.0},
             "model": self.sonar.model,
-            "noise": "; ".join(map(snr_said, self.arrange.levels)),
+            "noise": "; ".join(map(format_snr, self.arrange.levels)),
         }

@@ -22,28 +22,28 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from mitsonar.config.data import Recipe, Split, recipe_from
 from mitsonar.datasets.modality import Fields, Modality, Scene, StoredArray, Values
 from mitsonar.datasets.plan import Plan, modality_of
-from mitsonar.errors import MitsonarError, meant, shortened
-from mitsonar.io.files import check_plain, finite_number, whole_number
-from mitsonar.io.runs import other_versions
+from mitsonar.errors import MitsonarError, did_you_mean, short_repr
+from mitsonar.io.files import check_plain_value, finite_number, whole_number
+from mitsonar.io.runs import changed_versions
 from mitsonar.io.storage import Storage, refuse_codecs
-from mitsonar.records.frames import FEW_ROWS, rows_that_fit
+from mitsonar.records.frames import ALWAYS_ACCEPTED_ROWS, max_plausible_rows
 from mitsonar.worlds.world import Family
 
 __all__ = [
-    "DECIDING",
     "FORMAT",
     "PACKAGES",
     "PARTS",
+    "RESULT_PACKAGES",
     "SEAL",
     "DataStore",
     "ShardLayout",
     "check_attributes",
     "create_arrays",
-    "deal",
-    "deal_samples",
-    "names_of_scenes",
+    "frames_in_part",
     "planned_arrays",
-    "world_of",
+    "samples_in_part",
+    "shape_names_of",
+    "world_numbers",
     "write_planned",
 ]
 
@@ -54,7 +54,7 @@ FORMAT = 1
 PACKAGES = ("mitsonar", "mitsuba", "drjit", "numpy", "finufft", "zarr")
 """Packages whose versions a store records."""
 
-DECIDING = PACKAGES[:3]
+RESULT_PACKAGES = PACKAGES[:3]
 """Packages whose versions affect the recorded values."""
 
 DType: TypeAlias = np.dtype[Any]
@@ -132,7 +132,7 @@ class DataStore:
             attributes: Fields = dict(group.attrs)
             is_data_set = attributes.get("kind") == "mitsonar data set"
             stored_format = attributes.get("format")
-            check_plain(attributes, "its zarr.json")
+            check_plain_value(attributes, "its zarr.json")
         except Exception as error:  # a damaged file, or a storage that does not answer, may raise anything
             no_group = isinstance(error, zarr.errors.GroupNotFoundError)
             reason = "it is not a Zarr group" if no_group else " ".join(str(error).split())[:200] or type(error).__name__
@@ -141,14 +141,14 @@ class DataStore:
                 "from-frames`"
             ) from None
         if not is_data_set:
-            kind = shortened(attributes.get("kind"))
+            kind = short_repr(attributes.get("kind"))
             raise MitsonarError(
                 f"{storage.url} is not a mitsonar data set, but a Zarr group of the kind {kind}: give the output of "
                 "`mitsonar dataset make` or `dataset from-frames`"
             )
         if stored_format != FORMAT:
             raise MitsonarError(
-                f"{storage.url} has format {shortened(stored_format)}, but this version of mitsonar reads format {FORMAT}: "
+                f"{storage.url} has format {short_repr(stored_format)}, but this version of mitsonar reads format {FORMAT}: "
                 "use the version that wrote it"
             )
         try:
@@ -252,13 +252,13 @@ class DataStore:
         Raises:
             ValueError: they do not.
         """
-        if len(self) <= FEW_ROWS:
+        if len(self) <= ALWAYS_ACCEPTED_ROWS:
             return
         stored_bytes = 0
         for key in ("pose/c/0/0", "motion/c/0/0", "time_s/c/0"):
             with contextlib.suppress(OSError):
                 stored_bytes = max(stored_bytes, int(self.place.fs.size(f"{self.place.root}/{key}") or 0))
-        if len(self) > rows_that_fit(stored_bytes):
+        if len(self) > max_plausible_rows(stored_bytes):
             raise ValueError(f"{len(self):,} frames are more than the {stored_bytes:,} bytes of their poses can hold")
 
     def _check_array(self, name: str, array: zarr.Array[Any]) -> None:
@@ -387,16 +387,16 @@ class DataStore:
         """Mark the store as finished, once every shard has been written."""
         self.group.attrs["finished"] = True
 
-    def unfinish(self) -> None:
+    def mark_unfinished(self) -> None:
         """Mark the store as not finished, because shards will be rewritten."""
         if self.finished:
             self.group.attrs["finished"] = False
 
-    def other_versions(self) -> list[str]:
+    def changed_versions(self) -> list[str]:
         """List the packages that affect recorded values and whose installed versions differ from the recorded ones."""
-        return other_versions(self.about["versions"], (*DECIDING, *self.modality.decided_by))
+        return changed_versions(self.about["versions"], (*RESULT_PACKAGES, *self.modality.result_packages))
 
-    def unplanned(self, plan: Plan) -> list[str]:
+    def deviating_arrays(self, plan: Plan) -> list[str]:
         """List the planned arrays that deviate from the plan by more than 1e-9.
 
         The tolerance allows for processors that differ in the last bits.
@@ -412,9 +412,9 @@ class DataStore:
                 deviating.append(name)
         return deviating
 
-    def mend_known(self, plan: Plan) -> None:
+    def repair_planned_arrays(self, plan: Plan) -> None:
         """Rewrite the planned arrays that are damaged or deviate from the plan."""
-        for name in self.unplanned(plan):
+        for name in self.deviating_arrays(plan):
             self._arrays.pop(name, None)
             write_planned(self.group, name, planned_arrays(plan, self.modality)[name])
 
@@ -595,7 +595,7 @@ def check_attributes(about: Fields, recipe: Recipe, modality: Modality) -> None:
         total += whole_number(scene["sequences"], "sequences of a scene", 1, sequences)
     if total != sequences or len(numbers) != len(about["scenes"]):
         raise ValueError(f"scenes have {total:,} sequences, but the attributes state {sequences:,} for {frames:,} frames")
-    for name in modality.settled:
+    for name in modality.fixed_attributes:
         finite_number(about[name], name, above=0)
     versions = about["versions"]
     if not (isinstance(versions, dict) and isinstance(about["variant"], str)):
@@ -610,7 +610,7 @@ def check_attributes(about: Fields, recipe: Recipe, modality: Modality) -> None:
 PARTS = ("train", "validation", "test")
 
 
-def world_of(recipe: Recipe, scenes: dict[int, Scene]) -> NDArray[np.int64]:
+def world_numbers(recipe: Recipe, scenes: dict[int, Scene]) -> NDArray[np.int64]:
     """Return, for each scene number, the first scene with the same world; some worlds do not depend on the seed."""
     if recipe.recorded is not None:  # it is unknown whether two recordings show the same place
         return np.arange(max(scenes) + 1)
@@ -623,7 +623,7 @@ def world_of(recipe: Recipe, scenes: dict[int, Scene]) -> NDArray[np.int64]:
     return worlds
 
 
-def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
+def frames_in_part(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
     """Return the mask ``(frames,)`` of the frames in a part.
 
     Sequences, or worlds with all their frames, are assigned to the parts at random, as a whole.
@@ -640,7 +640,7 @@ def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, pa
     if part == "all":
         return np.ones(len(world), dtype=bool)
     if part not in PARTS:
-        raise MitsonarError(f"part must be {', '.join(PARTS)} or all: got {part!r}{meant(part, (*PARTS, 'all'))}")
+        raise MitsonarError(f"part must be {', '.join(PARTS)} or all: got {part!r}{did_you_mean(part, (*PARTS, 'all'))}")
     shares = np.array([getattr(split, name) for name in PARTS])
     if shares[PARTS.index(part)] == 0:
         raise MitsonarError(f"the split by {split.by} has no {part} part: {_format_shares(split)}; give another split")
@@ -658,7 +658,7 @@ def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, pa
     return np.isin(unit, shuffled[ends[index] - counts[index] : ends[index]])
 
 
-def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
+def samples_in_part(sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
     """Return the mask ``(samples,)`` of the samples in a part.
 
     Samples are assigned to training and validation one by one, so the two parts share sequences. Samples of a sequence have
@@ -675,18 +675,18 @@ def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArra
     # 1. Without a test part, each sample is assigned as if it were a sequence.
     number = np.arange(len(sequence), dtype=np.int32)
     if part not in PARTS or not split.test:
-        return deal(number.astype(np.int64), number, split, part)
+        return frames_in_part(number.astype(np.int64), number, split, part)
     # 2. Otherwise set whole sequences aside for the test, so that it shares no motion with training.
     sequence_split = Split(by="sequence", train=1 - split.test, validation=0.0, test=split.test, seed=split.seed)
     if part == "test":
-        return deal(sequence.astype(np.int64), sequence, sequence_split, part)
+        return frames_in_part(sequence.astype(np.int64), sequence, sequence_split, part)
     # 3. Assign the remaining samples one by one, with the shares that remain.
-    mask = deal(sequence.astype(np.int64), sequence, sequence_split, "train")
+    mask = frames_in_part(sequence.astype(np.int64), sequence, sequence_split, "train")
     remaining = 1 - split.test
     sample_split = split.model_copy(
         update={"train": split.train / remaining, "validation": split.validation / remaining, "test": 0.0}
     )
-    mask[mask] = deal(number[mask].astype(np.int64), number[mask], sample_split, part)
+    mask[mask] = frames_in_part(number[mask].astype(np.int64), number[mask], sample_split, part)
     return mask
 
 
@@ -706,7 +706,7 @@ def _format_shares(split: Split) -> str:
 # ---------------- Shape names of the labels
 
 
-def names_of_scenes(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArray[np.int32]]]:
+def shape_names_of(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArray[np.int32]]]:
     """Return the names of all shapes in a data set, and the mapping from each scene's ``shape_id`` to these names.
 
     The store contains the names of scene files. Other worlds are rebuilt.

@@ -24,17 +24,17 @@ from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.make import SceneRenderer
 from mitsonar.datasets.modality import samples_of
 from mitsonar.datasets.plan import modality_of, scenes_of
-from mitsonar.datasets.rendered import re_rendered
+from mitsonar.datasets.rendered import rerender
 from mitsonar.datasets.responses import ImpulseSamples
 from mitsonar.datasets.sample_index import split_for
 from mitsonar.datasets.samples import SonarPairs
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError, argument, counted, meant
+from mitsonar.errors import MitsonarError, argument, count_noun, did_you_mean
 from mitsonar.estimation.crlb.image import bounds_at, overall
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable, Record
 from mitsonar.estimation.external import OwnEstimator
 from mitsonar.estimation.named import EstimatorLike, create_estimator
-from mitsonar.io.files import read_json, read_npz, write_json, write_whole
+from mitsonar.io.files import read_json, read_npz, write_atomic, write_json
 from mitsonar.io.runs import RunDirectory, RunKind, digest, versions
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import AXES, MotionErrors, cluster_resamples, in_units, motion_errors
@@ -158,9 +158,9 @@ def frames_of(pairs: Samples, numbers: Sequence[int], variation: str) -> Iterato
         for number in numbers:
             yield number, pairs.responses(number)
     elif variation == "heave 5 mm":
-        yield from re_rendered(pairs, numbers, shift=_heaved)
+        yield from rerender(pairs, numbers, shift=_heaved)
     elif variation == "jitter":
-        yield from re_rendered(pairs, numbers, jitter=True)
+        yield from rerender(pairs, numbers, jitter=True)
     elif variation in VARIATIONS:
         for number in numbers:
             yield number, _with_wrong_inputs(pairs.sonar_frames(number), variation, _sign(number))
@@ -404,7 +404,7 @@ class Comparison:
         """Return the tables as printed by ``mitsonar compare``."""
         report = self.report
         head = (
-            f"{report['data']}: {counted(report['pairs'], 'pair')} of {counted(report['scenes'], 'scene')}, "
+            f"{report['data']}: {count_noun(report['pairs'], 'pair')} of {count_noun(report['scenes'], 'scene')}, "
             f"{report['model']} model; sideways mm / forward mm / yaw deg"
         )
         return "\n".join([head, *(line for table in report["tables"] for line in table_lines(table))])
@@ -416,7 +416,7 @@ class Comparison:
         writer.writeheader()
         writer.writerows(rows)
         if path is not None:
-            write_whole(path, text.getvalue().encode())
+            write_atomic(path, text.getvalue().encode())
         return text.getvalue()
 
     def __str__(self) -> str:
@@ -633,10 +633,10 @@ def compare(
         bounds = _bounds(bench, level, options.limit, answer_store, begin)
         tables += [_table(bench, options, level, variation, answers[level, variation], bounds) for variation in variations]
     scenes = len(np.unique(bench.scenes))
-    notes = [f"{counted(scenes, 'scene')} only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
+    notes = [f"{count_noun(scenes, 'scene')} only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
     notes = notes if scenes < FEWEST_SCENES else []
     notes += [
-        f"{name} was trained on {count} of the {counted(len(bench.numbers), 'pair')}, whose errors are too small; "
+        f"{name} was trained on {count} of the {count_noun(len(bench.numbers), 'pair')}, whose errors are too small; "
         f"give {argument('part')} {bench.first.split.unseen}, or other data"
         for name, count in bench.learnt.items()
         if count
@@ -662,7 +662,7 @@ def _bench(data: str, estimators: Estimators, options: ComparisonOptions) -> Ben
     if not methods or (options.reference is not None and options.reference not in methods):
         raise MitsonarError(
             f"{argument('reference')} must be one of {', '.join(methods) or 'the estimators'}: got {options.reference!r}"
-            f"{meant(options.reference, methods)}"
+            f"{did_you_mean(options.reference, methods)}"
         )
     perturb, jitter, prior = (argument(name) for name in ("perturb", "jitter", "prior"))
     if not modality.variations and (options.perturb or options.jitter or options.prior):
@@ -674,7 +674,7 @@ def _bench(data: str, estimators: Estimators, options: ComparisonOptions) -> Ben
     split = _split(options.split, methods, recipe)
     chosen_samples = {
         **{"part": options.part or split.unseen, "split": split},
-        **{"one_a_sequence": recipe.recorded is None, "seed": options.seed},
+        **{"one_per_sequence": recipe.recorded is None, "seed": options.seed},
     }
     samples = {level: samples_of(modality, data, noise=level, **chosen_samples) for level in levels}
     first = next(iter(samples.values()))
@@ -685,7 +685,7 @@ def _bench(data: str, estimators: Estimators, options: ComparisonOptions) -> Ben
     numbers = chosen(len(first), options.pairs, options.seed)
     # motion of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
     pose = first.chosen.pose
-    truth = np.array([motions(pose[first.frame_numbers(number)][[0, -1]])[0] for number in numbers])
+    truth = np.array([motions(pose[first.frame_slice(number)][[0, -1]])[0] for number in numbers])
     learnt = {
         name: int(np.any([one.learnt(first)[numbers] for one in checkpoints], axis=0).sum())
         for name, checkpoints in _checkpoints(methods).items()
@@ -897,7 +897,7 @@ class AnswersOnDisk(AnswerFolder):
         for name, one in answers.items():
             arrays |= one.arrays(name)
         np.savez(buffer, **arrays)  # type: ignore[arg-type]
-        write_whole(self._path(f"answers {level} {variation}", ".npz"), buffer.getvalue())
+        write_atomic(self._path(f"answers {level} {variation}", ".npz"), buffer.getvalue())
 
     def load_bounds(self, level: str, count: int) -> dict[str, Array] | None:
         """Return the bounds of an earlier run; None if there are none.
@@ -924,7 +924,7 @@ class AnswersOnDisk(AnswerFolder):
     def finish(self, report: PlainTable) -> None:
         """Write the tables."""
         lines = [line for table in report["tables"] for line in table_lines(table)]
-        write_whole(self.run.path / "table.md", ("\n".join(lines) + "\n").encode())
+        write_atomic(self.run.path / "table.md", ("\n".join(lines) + "\n").encode())
         write_json(self.run.path / "table.json", report)
         self.run.finish()
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, meant
+from mitsonar.errors import MitsonarError, did_you_mean
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.motion.errors import in_units
 from mitsonar.records.frames import SonarFrames, ViewFrames
@@ -398,5 +398,7 @@ def checked_options(name: str, options: Options, factory: Callable[..., object],
     known = [one.name for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
     for key in options:
         if key not in known:
-            raise MitsonarError(f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}{meant(key, known)}")
+            raise MitsonarError(
+                f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}{did_you_mean(key, known)}"
+            )
     return options

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, explain_missing
+from mitsonar.errors import MitsonarError, missing_package_error
 from mitsonar.estimation.estimator import INPUTS, Estimate, Options, checked_options, rejected, two_frames
 from mitsonar.geometry.ground import Attitude, GroundView, attitude_of
 from mitsonar.motion.composition import Motion, MotionPrior
@@ -282,7 +282,7 @@ def package(name: str, install: str = "") -> ModuleType:
     except ModuleNotFoundError as error:
         if install and error.name == name:
             raise MitsonarError(f"this estimator needs {name}, which is not installed: {install}") from None
-        raise explain_missing(error) from None
+        raise missing_package_error(error) from None
 
 
 # ---------------- Estimators of the user

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.datasets.arrangement import Arrangement
-from mitsonar.datasets.responses import packed
+from mitsonar.datasets.responses import pack_responses
 from mitsonar.datasets.samples import ground_of, light_of
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.channel.correlation import pings_of
@@ -846,7 +846,7 @@ class ResponseNetwork(Trained):
         self._check_channel(responses.sonar)
         if len(pings.silent) == len(responses.sonar.receivers):
             return rejected("no receiver has any echo")
-        inputs = torch.from_numpy(packed(pings.response)[None, None])
+        inputs = torch.from_numpy(pack_responses(pings.response)[None, None])
         with torch.inference_mode(), one_thread():
             targets, _ = self._checkpoint.decode(answer_of(self._network, inputs))
         if not np.isfinite(targets).all():

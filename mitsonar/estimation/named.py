@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 
-from mitsonar.errors import MitsonarError, explain_missing, meant, nearest_names
+from mitsonar.errors import MitsonarError, did_you_mean, missing_package_error, suggest_names
 from mitsonar.estimation.channel.correlation import Correlation, pings_of
 from mitsonar.estimation.channel.likelihood import Likelihood
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, Options, Record, checked_options, two_frames
@@ -160,7 +160,7 @@ def _from_text(text: str, options: Options) -> AnyEstimator:
     if user_estimator is not None:
         return user_estimator
     if not names_checkpoint(name):
-        names = nearest_names(name, NAMES)
+        names = suggest_names(name, NAMES)
         alternatives = "a checkpoint, the folder of a training run, or a class as my_module:MyEstimator"
         raise MitsonarError(f"unknown estimator {name!r}: {names}; or give {alternatives}")
     factory = _factory_of_checkpoint(name)
@@ -232,7 +232,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     try:
         from mitsonar.networks.checkpoint import Checkpoint
     except ModuleNotFoundError as error:
-        raise explain_missing(error) from None
+        raise missing_package_error(error) from None
     return Checkpoint.load(path)
 
 
@@ -248,7 +248,9 @@ def options_from(name: str, words: list[str], factory: Callable[..., object]) ->
         if not value:
             raise MitsonarError(f"an estimator is NAME or NAME:key=value:key=value: got {':'.join([name, *words])!r}")
         if key not in known:
-            raise MitsonarError(f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}{meant(key, known)}")
+            raise MitsonarError(
+                f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}{did_you_mean(key, known)}"
+            )
         try:
             number = float(value)
         except ValueError:
@@ -283,7 +285,7 @@ def height_estimator_from(text: str) -> HeightEstimator:
     if not names_checkpoint(name):
         raise MitsonarError(
             "a height estimator is direct, a checkpoint or the folder of a training run: got "
-            f"{name!r}{meant(name, ['direct'])}"
+            f"{name!r}{did_you_mean(name, ['direct'])}"
         )
     from mitsonar.estimation.height_network import HeightNetwork  # loads torch
 

@@ -33,7 +33,7 @@ __all__ = [
     "attitude_of",
     "echo_heights",
     "fan_places",
-    "margin_of_light",
+    "lit_margin",
     "moved",
     "nearest_known",
 ]
@@ -128,7 +128,7 @@ class GroundGeometry:
             turning = (aside - (s / radius) * along) / np.sqrt(radius * radius - s * s)
         return np.stack([along, turning], axis=-1)
 
-    def motions_of_lean(self, along: int, half_rad: float) -> NDArray[np.float64]:
+    def motion_per_attitude(self, along: int, half_rad: float) -> NDArray[np.float64]:
         """Compute the apparent motion caused by a change of height, pitch or roll between two pings.
 
         It is the planar motion that best reproduces, in least squares, the changes of range (in bins) and bearing (in beams)
@@ -254,7 +254,7 @@ LIT = 0.9
 """Fraction of the elevation field of view that is free of its outline."""
 
 
-def margin_of_light(
+def lit_margin(
     ground: GroundGeometry, attitude: Attitude, elevation_fov_deg: float, mostly: float = MOSTLY
 ) -> NDArray[np.float64] | None:
     """Compute how far inside the light each cell's ground lies, if the outline must be excluded from matching.
@@ -620,7 +620,7 @@ class Attitude:
         std = np.array(self.unsure)
         if not std.any():
             return covariance
-        apparent = self.ground(frames).motions_of_lean(COARSE, np.radians(frames.sonar.elevation_fov_deg) / 2) * std
+        apparent = self.ground(frames).motion_per_attitude(COARSE, np.radians(frames.sonar.elevation_fov_deg) / 2) * std
         return np.asarray(covariance + apparent @ apparent.T)
 
     def ground(self, frames: SonarFrames, number: int | None = None) -> GroundGeometry:

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from mitsonar.arrays import AnyArray
-from mitsonar.errors import MitsonarError, shortened
+from mitsonar.errors import MitsonarError, short_repr
 from mitsonar.instruments.sonar import FieldValue, Instrument
 from mitsonar.io.checked_model import CheckedModel
 
 __all__ = [
-    *("LOOKS", "NUMPY", "PADDING", "ChannelModel", "ChannelSonar"),
+    *("RECEIVER_HEADINGS_DEG", "NUMPY", "PADDING", "ChannelModel", "ChannelSonar"),
     *("FieldOfView", "Hydrophone", "Maths", "four_receivers"),
 ]
 
@@ -126,11 +126,11 @@ class Hydrophone(CheckedModel):
         if not (np.isfinite(self.position).all() and math.dist(self.position, (0, 0, 0)) <= 100):
             raise ValueError(f"receiver {self.name[:40]}: position must be finite and within 100 m: got {self.position}")
         if not self.name.isidentifier():
-            raise ValueError(f"a receiver's name is letters, digits and _ : got {shortened(self.name)}")
+            raise ValueError(f"a receiver's name is letters, digits and _ : got {short_repr(self.name)}")
         return self
 
 
-LOOKS = {"front": 0.0, "left": -90.0, "back": 180.0, "right": 90.0}
+RECEIVER_HEADINGS_DEG = {"front": 0.0, "left": -90.0, "back": 180.0, "right": 90.0}
 """Headings of receivers 1 to 4 of Almanza-Medina, 5.4 [deg]."""
 
 
@@ -142,7 +142,7 @@ def four_receivers(distance_m: float = 0.1, **field: FieldValue) -> tuple[Hydrop
         field: fields of :class:`FieldOfView`, common to all receivers.
     """
     receivers = []
-    for name, heading in LOOKS.items():
+    for name, heading in RECEIVER_HEADINGS_DEG.items():
         turn = math.radians(heading)
         position = (round(distance_m * math.sin(turn), 12), round(distance_m * math.cos(turn), 12), 0.0)
         receivers.append(Hydrophone(name=name, position=position, field=FieldOfView(heading_deg=heading, **field)))
@@ -296,7 +296,7 @@ class ChannelSonar(Instrument):
         whole = isinstance(receiver, int | np.integer) and not isinstance(receiver, bool)
         if not whole or not 0 <= int(receiver) < len(names):
             raise MitsonarError(
-                f"receiver must be a name of {', '.join(names)}, or a number 0..{len(names) - 1}: got {shortened(receiver)}"
+                f"receiver must be a name of {', '.join(names)}, or a number 0..{len(names) - 1}: got {short_repr(receiver)}"
             )
         return int(receiver)
 

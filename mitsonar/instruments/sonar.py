@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
-from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.errors import MitsonarError, short_repr, suggest_names
 from mitsonar.instruments.beams import Aperture, Pattern, Pulse, Shading
 from mitsonar.io.checked_model import CheckedModel
 from mitsonar.motion.pose import Pose, mounted
@@ -97,7 +97,7 @@ QUALITIES: dict[str, RayCounts] = {
 
 def _check_quality(name: object) -> object:
     if not isinstance(name, str) or name not in QUALITIES:
-        raise ValueError(f"unknown quality {shortened(name)}: {nearest_names(str(name)[:40], QUALITIES)}")
+        raise ValueError(f"unknown quality {short_repr(name)}: {suggest_names(str(name)[:40], QUALITIES)}")
     return name
 
 
@@ -296,7 +296,7 @@ def timed_path(sonar: Sonar, path: Trajectory) -> TimedPath:
         # A scanning sonar sweeps without pauses, as often as the path allows.
         due = path.time_s[0] + (np.arange(int(duration_s / sweep + 1e-9)) + 0.5) * sweep
     # Extend the path, since the outer pings of the first and last frame lie beyond its ends.
-    longer = path.lengthened(-offsets[0])
+    longer = path.extrapolated(-offsets[0])
     time = due[:, None] + offsets
     poses = longer.at(time.ravel()).reshape(*time.shape, 6)
     frames = path if due is path.time_s else Trajectory(longer.at(due), due)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.errors import MitsonarError, short_repr, suggest_names
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import directions
 from mitsonar.io.checked_model import CheckedModel, Preset, presets_in
@@ -20,8 +20,8 @@ from mitsonar.io.files import read_yaml
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
 
 __all__ = [
+    "DEFAULT_PRESETS",
     "KINDS",
-    "OF_KIND",
     "Kind",
     "Sounder",
     "fields_in",
@@ -84,7 +84,7 @@ class Sounder(CheckedModel):
         unknown = sorted(set(fields) - instrument_keys - set(Sonar.model_fields))
         if unknown:
             known = instrument_keys | set(Sonar.model_fields)
-            raise MitsonarError(f"unknown instrument key {unknown[0]}: {nearest_names(unknown[0], known)}")
+            raise MitsonarError(f"unknown instrument key {unknown[0]}: {suggest_names(unknown[0], known)}")
         fan = Sonar.create(**{key: value for key, value in fields.items() if key not in instrument_keys or key == "name"})
         return cls(fan=fan, **{key: value for key, value in fields.items() if key in instrument_keys})
 
@@ -166,7 +166,7 @@ class Sounder(CheckedModel):
 # One YAML file per instrument in ``sounders/``, with the source document of every number.
 
 
-OF_KIND = {
+DEFAULT_PRESETS = {
     "sidescan": "starfish-450f",
     "altimeter": "ping2",
     "profiler": "deltat-837",
@@ -201,9 +201,9 @@ def load_sounder(name_or_file: str | Path) -> Sounder:
 def _preset(name: str) -> Sounder:
     """Return the instrument of a preset, given by its name or its kind."""
     known = named_sounders()
-    preset_name = OF_KIND.get(name, name)
+    preset_name = DEFAULT_PRESETS.get(name, name)
     if preset_name not in known:
-        raise MitsonarError(f"unknown instrument {shortened(name)}: {nearest_names(name, [*KINDS, *known])}")
+        raise MitsonarError(f"unknown instrument {short_repr(name)}: {suggest_names(name, [*KINDS, *known])}")
     fields: dict[str, Any] = known[preset_name].values
     return Sounder.create(name=preset_name, **fields)
 
@@ -231,7 +231,7 @@ def preset(name: str) -> Sonar:
     """
     known = named_sonars()
     if name not in known:
-        raise MitsonarError(f"unknown sonar preset {shortened(name)}: {nearest_names(name, known)}")
+        raise MitsonarError(f"unknown sonar preset {short_repr(name)}: {suggest_names(name, known)}")
     return Sonar.create(name=name, **known[name].values)
 
 

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from mitsonar.errors import MitsonarError, complaint
+from mitsonar.errors import MitsonarError, validation_message
 from mitsonar.io.files import read_yaml
 from mitsonar.motion.bodies import BodyMotion, motions_from
 
@@ -77,7 +77,7 @@ def load_vehicle_recipe(file: str | Path) -> VehicleRecipe:
     try:
         return VehicleRecipe(**table)
     except ValidationError as error:
-        raise MitsonarError(f"{file}: {complaint(error, VehicleRecipe, 'vehicle', SEE)}") from None
+        raise MitsonarError(f"{file}: {validation_message(error, VehicleRecipe, 'vehicle', SEE)}") from None
 
 
 def _sensor(name: str, keys: Any, file: str | Path) -> SensorKeys:
@@ -88,7 +88,7 @@ def _sensor(name: str, keys: Any, file: str | Path) -> SensorKeys:
     try:
         return SensorKeys(**keys)
     except ValidationError as error:
-        raise MitsonarError(f"{file}: sensor {name}: {complaint(error, SensorKeys, 'sensor', SEE)}") from None
+        raise MitsonarError(f"{file}: sensor {name}: {validation_message(error, SensorKeys, 'sensor', SEE)}") from None
 
 
 def check_sensor_name(name: str) -> None:

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.errors import MitsonarError, short_repr, suggest_names
 from mitsonar.instruments.sonar import Bearing, Sonar
 from mitsonar.motion.pose import Pose
 
@@ -87,7 +87,7 @@ class Segment:
 
     def __init__(self, sonar: Sonar, name: str) -> None:
         if name not in SEGMENTS:
-            raise MitsonarError(f"unknown segment {shortened(name)}: {nearest_names(name, SEGMENTS)}")
+            raise MitsonarError(f"unknown segment {short_repr(name)}: {suggest_names(name, SEGMENTS)}")
         if sonar.beams % 2 or sonar.rays_per_beam % 2:
             raise MitsonarError(
                 f"segments halve the field of view: beams and rays_per_beam must be even, got {sonar.beams} and "

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, Self
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from mitsonar.errors import MitsonarError, complaint
+from mitsonar.errors import MitsonarError, validation_message
 
 __all__ = ["CheckedModel", "Preset", "presets_in"]
 
@@ -64,7 +64,7 @@ class CheckedModel(Checked):
         Raises:
             MitsonarError: the first of pydantic's errors.
         """
-        raise MitsonarError(complaint(error, cls, cls.called, cls.see)) from None
+        raise MitsonarError(validation_message(error, cls, cls.called, cls.see)) from None
 
 
 class Preset(NamedTuple):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, suggest_names
 from mitsonar.io.files import read_bytes
 
 __all__ = ["CsvTable"]
@@ -58,13 +58,13 @@ class CsvTable:
         if name not in self.names:
             if default is not None:
                 return np.full(len(self), default)
-            raise MitsonarError(f"{self.path} has no column {name}: {nearest_names(name, self.names)}")
+            raise MitsonarError(f"{self.path} has no column {name}: {suggest_names(name, self.names)}")
         return self.at(self.names.index(name))
 
     def whole(self, name: str) -> NDArray[np.int64]:
         """Return a column of integers ``(rows,)`` by name, exact to the last digit; invalid cells are -1."""
         if name not in self.names:
-            raise MitsonarError(f"{self.path} has no column {name}: {nearest_names(name, self.names)}")
+            raise MitsonarError(f"{self.path} has no column {name}: {suggest_names(name, self.names)}")
         return self.whole_at(self.names.index(name))
 
     def at(self, column: int) -> NDArray[np.float64]:

@@ -18,16 +18,16 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, shortened
+from mitsonar.errors import MitsonarError, short_repr
 
 __all__ = [
     "FileArray",
     "PlainValue",
-    "at_most",
-    "check_plain",
+    "check_plain_value",
     "finite_number",
     "parse_json",
     "parse_yaml",
+    "read_at_most",
     "read_bytes",
     "read_json",
     "read_npz",
@@ -35,8 +35,8 @@ __all__ = [
     "refuse_beyond_memory",
     "refuse_irregular",
     "whole_number",
+    "write_atomic",
     "write_json",
-    "write_whole",
 ]
 
 
@@ -60,7 +60,7 @@ FileArray: TypeAlias = NDArray[Any]
 """An array read from a file: numbers of any type, or strings. Its reader checks which."""
 
 
-def write_whole(path: str | Path, content: bytes) -> None:
+def write_atomic(path: str | Path, content: bytes) -> None:
     """Write a file atomically, by renaming a temporary file: a reader finds either the old or the complete new file."""
     path = Path(path)
     temporary = path.with_name(f".{path.name}.part")
@@ -73,10 +73,10 @@ def write_whole(path: str | Path, content: bytes) -> None:
 
 def write_json(path: str | Path, value: dict[str, PlainValue]) -> None:
     """Write a JSON file atomically."""
-    write_whole(path, (json.dumps(value, indent=2) + "\n").encode())
+    write_atomic(path, (json.dumps(value, indent=2) + "\n").encode())
 
 
-def at_most(path: str | Path, limit: int) -> bytes:
+def read_at_most(path: str | Path, limit: int) -> bytes:
     """Read a file up to ``limit`` + 1 bytes, which also works for a device that never ends.
 
     Raises:
@@ -123,7 +123,7 @@ def read_bytes(path: str | Path, what: str, limit: int) -> bytes:
         MitsonarError: no such file, not readable, or larger than the limit.
     """
     try:
-        content = at_most(path, limit)
+        content = read_at_most(path, limit)
     except FileNotFoundError:
         raise MitsonarError(f"no such file: {path}") from None
     except (OSError, ValueError) as error:
@@ -183,7 +183,7 @@ def read_yaml(path: str | Path, what: str, also: str = "") -> PlainValue:
         MitsonarError: no such file, not YAML, or beyond the size limits.
     """
     try:
-        content = at_most(path, MAX_YAML_BYTES)
+        content = read_at_most(path, MAX_YAML_BYTES)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise MitsonarError(f"cannot read {what} {path}: {reason}; give a YAML file{also}") from None
@@ -301,7 +301,7 @@ def parse_json(text: str | bytes, source: str, *, check: bool = True) -> PlainVa
     Args:
         text: content of the file.
         source: name of the file in error messages.
-        check: whether to check depth, size and integers; otherwise the caller must call :func:`check_plain`.
+        check: whether to check depth, size and integers; otherwise the caller must call :func:`check_plain_value`.
 
     Raises:
         MitsonarError: not JSON, or a depth, size or integer beyond the limits of this module.
@@ -313,7 +313,7 @@ def parse_json(text: str | bytes, source: str, *, check: bool = True) -> PlainVa
     except ValueError as error:
         raise MitsonarError(f"cannot read {source}: it is not JSON ({' '.join(str(error).split())[:160]})") from None
     if check:
-        check_plain(value, source)
+        check_plain_value(value, source)
     return value
 
 
@@ -347,11 +347,11 @@ def parse_yaml(text: str, source: str) -> PlainValue:
     finally:
         if loader is not None:
             loader.dispose()
-    check_plain(value, source, MAX_YAML_VALUES)
+    check_plain_value(value, source, MAX_YAML_VALUES)
     return value
 
 
-def check_plain(value: object, source: str, most: int = MAX_VALUES) -> None:
+def check_plain_value(value: object, source: str, most: int = MAX_VALUES) -> None:
     """Check that a value contains only tables, lists, strings, numbers and dates, within limits of depth and size.
 
     Args:
@@ -389,7 +389,7 @@ def whole_number(value: object, name: str, low: int = 0, high: int = LARGEST_COU
     """
     if type(value) is not int or not low <= value <= high:
         largest = "2^63" if high == LARGEST_COUNT else f"{high:,}"
-        raise MitsonarError(f"{name} must be a whole number in {low:,}..{largest}: got {shortened(value)}")
+        raise MitsonarError(f"{name} must be a whole number in {low:,}..{largest}: got {short_repr(value)}")
     return value
 
 
@@ -402,7 +402,7 @@ def finite_number(value: Any, name: str, above: float = -math.inf, below: float 
     if type(value) not in (int, float) or not above < value < below or abs(value) > sys.float_info.max:
         lower = "" if above == -math.inf else f" above {above:g}"
         upper = "" if below == math.inf else f" below {below:g}"
-        raise MitsonarError(f"{name} must be a finite number{lower}{upper}: got {shortened(value)}")
+        raise MitsonarError(f"{name} must be a finite number{lower}{upper}: got {short_repr(value)}")
     return float(value)
 
 

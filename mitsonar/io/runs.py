@@ -17,21 +17,29 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any
 
-from mitsonar.errors import MitsonarError, complaint
-from mitsonar.io.files import LARGEST_COUNT, PlainValue, check_plain, finite_number, read_json, whole_number, write_json
+from mitsonar.errors import MitsonarError, validation_message
+from mitsonar.io.files import (
+    LARGEST_COUNT,
+    PlainValue,
+    check_plain_value,
+    finite_number,
+    read_json,
+    whole_number,
+    write_json,
+)
 
 __all__ = [
     "RUN_FILE",
     "RunDirectory",
     "RunKind",
+    "changed_versions",
+    "check_same_settings",
     "differences",
     "digest",
     "file_digest",
     "json_digest",
     "kind_of_run",
-    "other_versions",
     "plain_json",
-    "refuse_other",
     "refuse_to_replace",
     "shown",
     "versions",
@@ -51,7 +59,7 @@ MAX_VALUE_LENGTH = 60
 # ---------------- Comparison of settings
 
 
-def refuse_other(where: str | Path, had: Mapping[str, object], asked: Mapping[str, object], hint: str = "") -> None:
+def check_same_settings(where: str | Path, had: Mapping[str, object], asked: Mapping[str, object], hint: str = "") -> None:
     """Refuse to resume a run with settings that differ from those that it was started with.
 
     Args:
@@ -132,7 +140,7 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
     return installed
 
 
-def other_versions(had: Mapping[str, object], packages: Iterable[str]) -> list[str]:
+def changed_versions(had: Mapping[str, object], packages: Iterable[str]) -> list[str]:
     """List the packages whose version has changed: ``mitsuba 3.8.0 (now 3.9.0)``."""
     return [
         f"{name} {had.get(name)} (now {current})" for name, current in versions(packages).items() if had.get(name) != current
@@ -229,7 +237,7 @@ class RunDirectory:
                 "another -o"
             )
         deciding = [{name: run.versions.get(name) for name in kind.deciding} for run in (existing, new)]
-        refuse_other(new.path, existing.asked | deciding[0], new.asked | deciding[1])
+        check_same_settings(new.path, existing.asked | deciding[0], new.asked | deciding[1])
         existing.resumed = True
         return existing
 
@@ -377,7 +385,7 @@ def _check(content: dict[str, Any], kind: RunKind) -> None:
     """
     from pydantic import ConfigDict, Field, ValidationError, create_model
 
-    check_plain(content, "it")
+    check_plain_value(content, "it")
     stricter: dict[Any, Any] = {int: Annotated[int, Field(ge=0, le=LARGEST_COUNT)], list: list[str | int | float]}
     fields: dict[str, Any] = {name: (expected, ...) for name, expected in COMMON_KEYS.items()}
     fields |= {name: (stricter.get(expected, expected), None) for name, expected in kind.notes.items()}
@@ -387,7 +395,7 @@ def _check(content: dict[str, Any], kind: RunKind) -> None:
     try:
         model.model_validate(content)
     except ValidationError as error:
-        raise MitsonarError(complaint(error, model, "run")) from None
+        raise MitsonarError(validation_message(error, model, "run")) from None
 
 
 def _remove(path: Path, outputs: Iterable[str]) -> None:

@@ -29,10 +29,10 @@ from mitsonar.records.frames import SonarFrames
 __all__ = [
     "Canvas",
     "CoarseView",
-    "Likeness",
     "LoopSearch",
+    "ViewMatch",
     "canvas_of",
-    "likenesses",
+    "match_views",
     "search_loops",
 ]
 
@@ -143,14 +143,14 @@ class CoarseView:
         return tuple(np.conj(np.fft.rfft2(part, self.canvas.shape)) for part in parts)
 
 
-class Likeness(NamedTuple):
+class ViewMatch(NamedTuple):
     """The correlation of two views where they overlap, after a motion between them."""
 
     motion: Motion
     correlation: float
 
 
-def likenesses(first: CoarseView, second: CoarseView, yaws: Array, expected: Array, window: Array) -> list[Likeness]:
+def match_views(first: CoarseView, second: CoarseView, yaws: Array, expected: Array, window: Array) -> list[ViewMatch]:
     """Return the motions at which two views correlate best, with the largest correlation first.
 
     Each yaw contributes the best shift, and the best shift at another place.
@@ -169,7 +169,7 @@ def likenesses(first: CoarseView, second: CoarseView, yaws: Array, expected: Arr
     return sorted(matches, key=lambda one: -one.correlation)
 
 
-def _best_shifts(first: CoarseView, second: CoarseView, motion: Motion, window: Array) -> list[Likeness]:
+def _best_shifts(first: CoarseView, second: CoarseView, motion: Motion, window: Array) -> list[ViewMatch]:
     """Return the two best motions with the yaw of ``motion``, by masked correlation over all shifts (Padfield, 2012)."""
     canvas, reach = first.canvas, first.canvas.reach_m
     # 1. turn the second view about its middle, so that it stays on the canvas; the correlation finds the shift
@@ -206,12 +206,12 @@ def _best_shifts(first: CoarseView, second: CoarseView, motion: Motion, window: 
     allowed = (np.abs(rows - expected[1]) <= farthest)[:, None] & (np.abs(columns - expected[0]) <= farthest)[None]
     allowed = allowed & (overlap >= LEAST_OVERLAP * float(first.inside.sum()))
     # 5. the best shift, then the best one away from it: the caller needs a rival to detect ambiguity
-    best: list[Likeness] = []
+    best: list[ViewMatch] = []
     while allowed.any() and len(best) < 2:
         row, column = np.unravel_index(int(np.where(allowed, correlation, -2).argmax()), canvas.shape)
         shifted = warp.astype(float)
         shifted[:, 2] += shifted[:, :2] @ [columns[column], rows[row]]
-        best.append(Likeness(canvas.view.motion(shifted), float(correlation[row, column])))
+        best.append(ViewMatch(canvas.view.motion(shifted), float(correlation[row, column])))
         near = (np.abs(rows - rows[row]) < RIVAL_CELLS)[:, None] & (np.abs(columns - columns[column]) < RIVAL_CELLS)[None]
         allowed &= ~near
     return best
@@ -416,7 +416,7 @@ def _searched(source: FrameSource, numbers: Index, solution: GraphSolution, canv
 # ---------------- Loop closure: appearance
 
 
-def _matches(searched: _Searched, second: int) -> tuple[list[tuple[int, Likeness]], int]:
+def _matches(searched: _Searched, second: int) -> tuple[list[tuple[int, ViewMatch]], int]:
     """Return the matches of a keyframe with earlier ones that may show the same ground, and how many were compared."""
     # 1. earlier keyframes far enough back along the path
     apart = searched.travelled[second] - searched.travelled[searched.keys] >= APART * searched.extent
@@ -443,7 +443,7 @@ def _matches(searched: _Searched, second: int) -> tuple[list[tuple[int, Likeness
         window = np.minimum(GATE * std[:2], 2 * searched.extent)
         first = int(earlier[place])
         views = searched.views[first], searched.views[second]
-        matches += [(first, one) for one in likenesses(*views, turns, motions[place, :2], window)]
+        matches += [(first, one) for one in match_views(*views, turns, motions[place, :2], window)]
     return matches, len(chosen)
 
 
@@ -464,7 +464,7 @@ def _relative(searched: _Searched, first: Index, second: int) -> tuple[Array, Ar
     return relative_motions(searched.poses, first, others), covariances
 
 
-def _unambiguous(searched: _Searched, second: int, matches: list[tuple[int, Likeness]]) -> tuple[str, _Candidate | None]:
+def _unambiguous(searched: _Searched, second: int, matches: list[tuple[int, ViewMatch]]) -> tuple[str, _Candidate | None]:
     """Return the one candidate of a keyframe; or why there is none, with an empty reason if no view matches."""
     if not matches:
         return "", None

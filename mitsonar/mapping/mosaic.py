@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, argument, counted, nearest_names
+from mitsonar.errors import MitsonarError, argument, count_noun, suggest_names
 from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.views import directions
-from mitsonar.io.files import write_whole
+from mitsonar.io.files import write_atomic
 from mitsonar.motion.pose import Pose
 from mitsonar.records.frames import SonarFrames
 
@@ -100,7 +100,7 @@ class MosaicOptions:
                 f"{argument('cell_m')} must be above 0: got {self.cell_m:g} m; 0.01 m suits range bins of 5 mm"
             )
         if self.blend not in get_args(Blend):
-            raise MitsonarError(f"unknown blend {self.blend!r}: {nearest_names(self.blend, get_args(Blend))}")
+            raise MitsonarError(f"unknown blend {self.blend!r}: {suggest_names(self.blend, get_args(Blend))}")
         if self.centre_beams < 2 or self.most_cells < 1:
             raise MitsonarError(
                 f"{argument('centre_beams')} must be at least 2 and {argument('most_cells')} at least 1: got "
@@ -310,7 +310,7 @@ class Mosaic:
             raise MitsonarError(self._empty())
 
     def _empty(self) -> str:
-        added = f"{counted(self.frames, 'frame')} added, without ground in {self.frames_without_ground:,}"
+        added = f"{count_noun(self.frames, 'frame')} added, without ground in {self.frames_without_ground:,}"
         return f"the mosaic is empty: {added}; check height, pitch and window"
 
     @property
@@ -765,4 +765,4 @@ def save_geotiff(path: str | Path, mosaic: Mosaic) -> None:
         metadata=None,
         extratags=tags,
     )
-    write_whole(path, buffer.getvalue())
+    write_atomic(path, buffer.getvalue())

@@ -20,7 +20,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, argument, counted, nearest_names
+from mitsonar.errors import MitsonarError, argument, count_noun, suggest_names
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.named import EstimatorLike, create_estimator
 from mitsonar.mapping.local_map import USED, map_attitudes, mapped
@@ -115,7 +115,7 @@ class OdometryOptions:
         if self.closure < 0 or self.closure == 1:
             raise MitsonarError(f"{argument('closure')} must be 0, or 2 motions or more: got {self.closure}")
         if self.smooth not in get_args(Smoothing):
-            raise MitsonarError(f"unknown smoothing {self.smooth!r}: {nearest_names(self.smooth, get_args(Smoothing))}")
+            raise MitsonarError(f"unknown smoothing {self.smooth!r}: {suggest_names(self.smooth, get_args(Smoothing))}")
         if isinstance(self.scale, str) and self.scale != "fit":
             raise MitsonarError(f"scale is three factors or fit: got {self.scale!r}")
         if self.smooth != "none" and (self.loops or self.sensors is not None):
@@ -353,7 +353,8 @@ class Odometry:
             if len(reasons) > MANY * len(self.estimates):
                 part = 100 * len(reasons) / len(self.estimates)
                 warnings.append(
-                    f"{len(reasons)} of {counted(len(self.estimates), 'motion')} ({part:.0f} %) {what}: {_frequent(reasons)}"
+                    f"{len(reasons)} of {count_noun(len(self.estimates), 'motion')} ({part:.0f} %) {what}: "
+                    f"{_frequent(reasons)}"
                 )
         doubts = [str(one.about["doubt"]) for one in self.estimates if "doubt" in one.about]
         if doubts:
@@ -375,7 +376,7 @@ def _frequent(reasons: list[str]) -> str:
     """Return the three most frequent reasons as text; reasons that differ only in their numbers count as one."""
     kinds = Counter(re.sub(r"-?\d+(\.\d+)?", "#", reason) for reason in reasons).most_common(3)
     example = {re.sub(r"-?\d+(\.\d+)?", "#", reason): reason for reason in reversed(reasons)}
-    return "; ".join(f"{counted(count, 'time')} such as {example[kind]!r}" for kind, count in kinds)
+    return "; ".join(f"{count_noun(count, 'time')} such as {example[kind]!r}" for kind, count in kinds)
 
 
 def series_of(estimates: list[Estimate], time_s: ArrayLike) -> MotionSeries:

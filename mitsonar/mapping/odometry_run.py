@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, PlainTable
-from mitsonar.io.files import finite_number, parse_json, whole_lines, whole_number, write_json, write_whole
+from mitsonar.io.files import finite_number, parse_json, whole_lines, whole_number, write_atomic, write_json
 from mitsonar.io.runs import RunDirectory, RunKind
 from mitsonar.mapping.odometry import Odometry, OdometryOptions, Row, odometry
 from mitsonar.mapping.open_source import Source
@@ -148,20 +148,20 @@ class OdometryFolder(EstimateStore):
         _save_tum(self.path / "estimated.tum", result.path, frame)
         if result.true is not None:
             _save_tum(self.path / "true.tum", result.true, frame)
-        write_whole(self.path / "motions.csv", _motions_csv(result).encode())
-        write_whole(self.path / "covariances.npz", _covariances(result))
+        write_atomic(self.path / "motions.csv", _motions_csv(result).encode())
+        write_atomic(self.path / "covariances.npz", _covariances(result))
         if np.isfinite(result.heights.height_m).any():
-            write_whole(self.path / "height_profile.csv", result.heights.csv().encode())
+            write_atomic(self.path / "height_profile.csv", result.heights.csv().encode())
         else:
             (self.path / "height_profile.csv").unlink(missing_ok=True)  # left from an earlier run with heights
         if result.graph is not None and result.graph.search is not None:
-            write_whole(
+            write_atomic(
                 self.path / "loops.csv", _loops_csv(result, result.graph.search.loops, result.graph.accepted).encode()
             )
         else:
             (self.path / "loops.csv").unlink(missing_ok=True)  # left from an earlier search
         rows = result.rows()
-        write_whole(self.path / "table.md", ("\n".join(table_lines(rows)) + "\n").encode())
+        write_atomic(self.path / "table.md", ("\n".join(table_lines(rows)) + "\n").encode())
         table = [{"name": name, "value": value if np.isfinite(value) else None, "unit": unit} for name, value, unit in rows]
         write_json(self.path / "table.json", {"rows": table})
         save_figure(self.path / "path.png", _figure(result, title))

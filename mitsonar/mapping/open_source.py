@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, Self, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.acoustics.noise import NoiseModel, load_noise, snr_of, snr_said
+from mitsonar.acoustics.noise import NoiseModel, format_snr, load_noise, parse_snr
 from mitsonar.datasets.responses import with_noise
-from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, suggest_names
 from mitsonar.estimation.estimator import AnyEstimator
 from mitsonar.estimation.named import height_estimator_from
 from mitsonar.mapping.sources import FrameSource, is_recording, measured, open_frames, sequence_in
@@ -198,7 +198,7 @@ def _check_views(store: DataStore, views: Sequence[str], kind: str) -> None:
     available = {view for kind_there, view in array_names(store.recipe).values() if kind_there == kind}
     missing = [view for view in views if view not in available]
     if missing:
-        hint = nearest_names(missing[0], sorted(available)) if available else f"it holds no {kind}s"
+        hint = suggest_names(missing[0], sorted(available)) if available else f"it holds no {kind}s"
         raise MitsonarError(f"{store.place.url} has no {kind}s of view {missing[0]!r}: {hint}")
 
 
@@ -213,7 +213,7 @@ class ResponseNoise:
 
     def model_dump(self) -> dict[str, str]:
         """Return the kind and ratio of the noise, for the record of a run."""
-        return {"kind": "white", "snr": snr_said(self.snr_db)}
+        return {"kind": "white", "snr": format_snr(self.snr_db)}
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ class ResponseSource:
         Raises:
             MitsonarError: ``snr`` is not a ratio.
         """
-        ratio = snr_of(snr)
+        ratio = parse_snr(snr)
         return replace(self, noise=None if ratio is None else ResponseNoise(ratio), seed=seed)
 
     def with_height(self, height_m: float | None) -> Self:
@@ -490,7 +490,7 @@ def _with_contrast(source: FrameSource, reading: Reading, *, bare: bool) -> Fram
     """
     contrast = reading.contrast or ("local" if bare else "levels")
     if contrast not in CONTRASTS:
-        raise MitsonarError(f"unknown contrast {contrast!r}: {nearest_names(contrast, CONTRASTS)}")
+        raise MitsonarError(f"unknown contrast {contrast!r}: {suggest_names(contrast, CONTRASTS)}")
     return source if contrast == "levels" else source.with_contrast(moving=contrast == "moving")
 
 

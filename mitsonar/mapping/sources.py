@@ -22,7 +22,7 @@ from scipy.spatial.transform import Slerp
 
 from mitsonar.acoustics.levels import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
-from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, count_noun, suggest_names
 from mitsonar.motion.errors import associated
 from mitsonar.motion.pose import poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
@@ -303,7 +303,7 @@ class FrameSource:
     def chunks(self, index: ArrayLike) -> Iterator[SonarFrames]:
         """Read the frames with these numbers ``(n,)``, a few at a time."""
         chosen = np.asarray(index, dtype=np.intp)
-        count = self.frames_a_chunk
+        count = self.frames_per_chunk
         for start in range(0, len(chosen), count):
             yield self.read(chosen[start : start + count])
 
@@ -331,7 +331,7 @@ class FrameSource:
         return index, poses
 
     @property
-    def frames_a_chunk(self) -> int:
+    def frames_per_chunk(self) -> int:
         """Return the number of frames that are read at a time."""
         return max(1, CHUNK_BYTES // max(1, len(self.like.range_m) * len(self.like.bearing_rad) * 4))
 
@@ -439,9 +439,9 @@ def is_recording(where: str | Path) -> bool:
     run = os.path.isfile(Path(where) / "run.json") and any(os.path.exists(Path(where) / name) for name in RUN_FRAMES)
     if run or "://" in str(where):
         return False
-    from mitsonar.recordings.open import format_of
+    from mitsonar.recordings.open import detect_format
 
-    return format_of(where) is not None
+    return detect_format(where) is not None
 
 
 def _open_recording(path: Path, number: int | None, view: str | None, geometry: str | Path | None) -> FrameSource:
@@ -455,7 +455,7 @@ def _open_recording(path: Path, number: int | None, view: str | None, geometry: 
     if len(recording.parts) > 1:
         chosen = recording.longest if number is None else number
         longest = ", the longest" if number is None else ""
-        which = f"part {chosen} of {len(recording.parts):,}{longest}: {counted(len(part), 'frame')}"
+        which = f"part {chosen} of {len(recording.parts):,}{longest}: {count_noun(len(part), 'frame')}"
     return FrameSource.of_part(part, str(path), which)
 
 
@@ -501,7 +501,7 @@ def _open_zarr(path: Path, name: str) -> FrameSource:
     if times.ndim == 1:
         check_column(times, "time_s", COLUMNS["time_s"], {"frames": done}, str(path))
     if done < image.shape[0]:
-        message = f"{path} is not finished: {done:,} of {counted(image.shape[0], 'frame')} written"
+        message = f"{path} is not finished: {done:,} of {count_noun(image.shape[0], 'frame')} written"
         warnings.warn(message, MitsonarWarning, stacklevel=3)
     poses, attitude, height = table.get("poses"), table.get("attitude_rad"), table.get("height_m")
 
@@ -561,7 +561,7 @@ def view_in(store: DataStore, view: str | None = None) -> StoredView:
         raise MitsonarError(f"{store.place.url} holds vectors but no images: give a data set of images")
     name = next(iter(stored)) if view is None else view
     if name not in stored:
-        raise MitsonarError(f"{store.place.url} has no view {name!r}: {nearest_names(name, stored)}")
+        raise MitsonarError(f"{store.place.url} has no view {name!r}: {suggest_names(name, stored)}")
     known = {one.name: one for one in store.recipe.views}[name]
     image = store.array(stored[name])
     like = SonarFrames(
@@ -591,7 +591,7 @@ def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, i
         raise MitsonarError(f"{store.place.url} has no sequence {number}: it has {len(lengths):,}, numbered from 0")
     first = int(np.argmax(sequences == number))
     longest = ", the longest" if sequence is None else ""
-    which = f"sequence {number} of {len(lengths):,}{longest}: {counted(int(lengths[number]), 'frame')}"
+    which = f"sequence {number} of {len(lengths):,}{longest}: {count_noun(int(lengths[number]), 'frame')}"
     return slice(first, first + int(lengths[number])), number, which
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mitsonar.errors import MitsonarError, complaint
+from mitsonar.errors import MitsonarError, validation_message
 from mitsonar.io.files import read_yaml
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
@@ -25,7 +25,7 @@ __all__ = [
     "MeshSequence",
     "Moving",
     "MovingBodies",
-    "VertexLaw",
+    "VertexFunction",
     "files_of",
     "motions_from",
     "read_motions",
@@ -35,7 +35,7 @@ __all__ = [
 # ---------------- Deforming bodies
 
 
-VertexLaw: TypeAlias = Callable[[float], NDArray[Any]]
+VertexFunction: TypeAlias = Callable[[float], NDArray[Any]]
 """Vertices ``(vertices, 3)`` [m] in the body's axes at a time [s], in the order of the shape's mesh."""
 
 
@@ -49,7 +49,7 @@ class Deforming:
     """
 
     path: Trajectory
-    vertices: VertexLaw
+    vertices: VertexFunction
 
     def __repr__(self) -> str:
         deformation = self.vertices
@@ -142,7 +142,7 @@ class MovingBodies:
 
     shapes: tuple[str, ...]
     paths: tuple[Trajectory, ...]
-    deforming: Mapping[str, VertexLaw] = field(default_factory=dict)
+    deforming: Mapping[str, VertexFunction] = field(default_factory=dict)
 
     @classmethod
     def of(cls, moving: Moving, frame: str = "mitsonar", vehicle: Trajectory | None = None) -> MovingBodies:
@@ -158,7 +158,7 @@ class MovingBodies:
         """
         shapes: list[str] = []
         paths: list[Trajectory] = []
-        deforming: dict[str, VertexLaw] = {}
+        deforming: dict[str, VertexFunction] = {}
         for name, motion in moving.items():
             if isinstance(motion, str) and motion == VEHICLE:
                 if vehicle is None:
@@ -265,7 +265,7 @@ class BodyMotion(BaseModel):
         try:
             motion = cls(**fields)
         except ValidationError as error:
-            raise MitsonarError(f"moving: {name}: {complaint(error, cls, 'motion', SEE)}") from None
+            raise MitsonarError(f"moving: {name}: {validation_message(error, cls, 'motion', SEE)}") from None
         if motion.path is None and motion.meshes is None:
             raise MitsonarError(f"moving: {name} needs a path or meshes{SEE}")
         return motion

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, suggest_names
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 
@@ -83,7 +83,7 @@ def course(name: str, around: Pose) -> Trajectory:
         MitsonarError: unknown name.
     """
     if name not in COURSES:
-        raise MitsonarError(f"unknown course {name!r}: {nearest_names(name, COURSES)}")
+        raise MitsonarError(f"unknown course {name!r}: {suggest_names(name, COURSES)}")
     flat = COURSES[name]()
     flat = flat - (flat.min(axis=0) + flat.max(axis=0)) / 2
     level = vehicle_rotation(around._replace(pitch=0.0, roll=0.0))

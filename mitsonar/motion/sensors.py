@@ -15,9 +15,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, suggest_names
 from mitsonar.io.csv_table import CsvTable
-from mitsonar.io.files import write_whole
+from mitsonar.io.files import write_atomic
 from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.motion.trajectory import ALIASES, Trajectory
 
@@ -519,7 +519,7 @@ def save_sensors(path: str | Path, sensors: VehicleSensors) -> None:
         cells[np.searchsorted(times, time), number] = [f"{value:.12g}" for value in values]
     lines = [",".join(["time_s", *columns])]
     lines += [",".join([f"{time:.9f}", *row]) for time, row in zip(times, cells, strict=True)]
-    write_whole(Path(path), ("\n".join(lines) + "\n").encode())
+    write_atomic(Path(path), ("\n".join(lines) + "\n").encode())
 
 
 def _readings_by_column(sensors: VehicleSensors) -> Mapping[str, Readings]:
@@ -581,7 +581,7 @@ def _parse_readings(table: CsvTable, time: Array, name: str) -> Readings | None:
     if not known.any():
         return None
     if noise not in table.names:
-        hint = nearest_names(noise, [one for one in table.names if one]) if table.names else ""
+        hint = suggest_names(noise, [one for one in table.names if one]) if table.names else ""
         raise MitsonarError(f"{table.path} has {name}, but not its noise: add the column {noise} ({hint})")
     first, std = _first_number(table, noise), _column(table, noise)
     std = np.where(np.isfinite(std), std, first)

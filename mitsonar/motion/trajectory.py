@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
-from mitsonar.io.files import at_most, write_whole
+from mitsonar.errors import MitsonarError, MitsonarWarning, count_noun, suggest_names
+from mitsonar.io.files import read_at_most, write_atomic
 from mitsonar.motion.pose import Pose, poses_from, refuse_beyond_reach, vehicle_rotation
 
 __all__ = [
@@ -128,7 +128,7 @@ class Trajectory:
         position = np.column_stack([np.interp(time, self.time_s, axis) for axis in self.poses[:, :3].T])
         return poses_from(position, Slerp(self.time_s, vehicle_rotation(self.poses))(time))
 
-    def lengthened(self, seconds: float) -> Trajectory:
+    def extrapolated(self, seconds: float) -> Trajectory:
         """Extend the trajectory by one pose ``seconds`` before its first and one after its last [s].
 
         Velocity and rotation of the first and the last step continue. A trajectory of a single pose is returned unchanged.
@@ -192,9 +192,9 @@ class Trajectory:
         convention = convention_named(frame)
         position, rotation = self.poses[:, :3], vehicle_rotation(self.poses)
         if frame != "mitsonar":  # the conversion would round the numbers
-            position, rotation = convention.from_ours(position, rotation)
+            position, rotation = convention.from_mitsonar(position, rotation)
         if Path(path).suffix.lower() == ".csv":
-            angles = convention.angles_from_ours(self.poses[:, 3:])
+            angles = convention.angles_from_mitsonar(self.poses[:, 3:])
             write_csv(path, np.column_stack([self.time_s, position, angles]), convention)
         else:
             table = np.column_stack([self.time_s, position, rotation.as_quat(canonical=True)])
@@ -220,13 +220,13 @@ def _poses_from_quaternions(table: NDArray[np.float64], convention: Convention) 
     """Make poses ``(n, 6)`` from times, positions and quaternions ``(n, 8)`` in a convention."""
     if convention.name == "mitsonar":
         return poses_from(table[:, 1:4], Rotation.from_quat(table[:, 4:]))
-    return poses_from(*convention.to_ours(table[:, 1:4], Rotation.from_quat(table[:, 4:])))
+    return poses_from(*convention.to_mitsonar(table[:, 1:4], Rotation.from_quat(table[:, 4:])))
 
 
 def _poses_from_angles(table: NDArray[np.float64], convention: Convention) -> NDArray[np.float64]:
     """Make poses ``(n, 6)`` from times, positions, pitch, roll and turn about the vertical ``(n, 7)`` in a convention."""
-    position, _ = convention.to_ours(table[:, 1:4], Rotation.identity(len(table)))
-    return np.column_stack([position, convention.angles_to_ours(table[:, 4:])])
+    position, _ = convention.to_mitsonar(table[:, 1:4], Rotation.identity(len(table)))
+    return np.column_stack([position, convention.angles_to_mitsonar(table[:, 4:])])
 
 
 def _warn_of_attitude(
@@ -242,7 +242,7 @@ def _warn_of_attitude(
     frames = len(poses_by_frame[frame])
     count = round(fraction[frame] * frames)
     warnings.warn(
-        f"the sonar looks sideways or at the sky in {count} of {counted(frames, 'frame')} of {path}, read as "
+        f"the sonar looks sideways or at the sky in {count} of {count_noun(frames, 'frame')} of {path}, read as "
         f"{frame} (first pose: pitch {pitch:.3g}, roll {roll:.3g}, heading {heading:.3g} deg); {better}: name the file's "
         f"convention by --frame (frame= in Python), one of {', '.join(CONVENTIONS)}; ignore this if it is intended",
         MitsonarWarning,
@@ -360,12 +360,12 @@ def write_csv(path: str | Path, table: Table, convention: Convention) -> None:
     shown = np.column_stack([table[:, :4], np.degrees(table[:, [5, 4, 6]])])
     text = io.StringIO()
     np.savetxt(text, shown, fmt="%.9f", delimiter=",", header=",".join(names), comments="")
-    write_whole(Path(path), text.getvalue().encode())
+    write_atomic(Path(path), text.getvalue().encode())
 
 
 def _read_text(path: str | Path) -> str:
     try:
-        content = at_most(path, LARGEST)
+        content = read_at_most(path, LARGEST)
         text = content.decode("utf-8-sig")
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
@@ -448,7 +448,7 @@ def _angle(path: str | Path, names: list[str], aliases: Sequence[str], conventio
             f"trajectory {path} has a heading, which turns clockwise from north; {convention.name} has a yaw, which turns "
             "anticlockwise from east: name the column yaw_deg if it is that, or give the file's --frame"
         )
-    suggestion = nearest_names(f"{aliases[0]}_deg", unit_by_column)
+    suggestion = suggest_names(f"{aliases[0]}_deg", unit_by_column)
     raise MitsonarError(
         f"trajectory {path} has no column {aliases[0]} ({', '.join(names)[:80]}): {suggestion}; columns are {COLUMNS}"
     )
@@ -506,7 +506,7 @@ class Convention:
     north: float
     turn: tuple[str, ...]
 
-    def to_ours(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
+    def to_mitsonar(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
         """Convert positions and attitudes to the convention of mitsonar.
 
         Args:
@@ -519,12 +519,12 @@ class Convention:
         world, body = Rotation.from_matrix(self.world), Rotation.from_matrix(self.body)
         return world.apply(position), world * rotation * body
 
-    def from_ours(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
+    def from_mitsonar(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
         """Convert positions and attitudes from the convention of mitsonar, the inverse of :meth:`to_ours`."""
         world, body = Rotation.from_matrix(self.world), Rotation.from_matrix(self.body)
         return world.inv().apply(position), world.inv() * rotation * body.inv()
 
-    def angles_to_ours(self, angles: Table) -> Table:
+    def angles_to_mitsonar(self, angles: Table) -> Table:
         """Convert angles to pitch, roll, heading of mitsonar ``(n, 3)`` [rad].
 
         Args:
@@ -533,7 +533,7 @@ class Convention:
         """
         return np.asarray((angles - (0, 0, self.north)) * self.signs)
 
-    def angles_from_ours(self, angles: Table) -> Table:
+    def angles_from_mitsonar(self, angles: Table) -> Table:
         """Convert angles from the convention of mitsonar, the inverse of :meth:`angles_to_ours`."""
         return np.asarray(angles * self.signs + (0, 0, self.north))
 
@@ -580,7 +580,7 @@ def convention_named(name: str) -> Convention:
         MitsonarError: the name is unknown.
     """
     if name not in CONVENTIONS:
-        raise MitsonarError(f"unknown frame {name!r} of poses: {nearest_names(name, CONVENTIONS)}")
+        raise MitsonarError(f"unknown frame {name!r} of poses: {suggest_names(name, CONVENTIONS)}")
     return CONVENTIONS[name]
 
 

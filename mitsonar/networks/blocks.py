@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mitsonar.datasets.modality import Fields
-from mitsonar.errors import MitsonarError, shortened
+from mitsonar.errors import MitsonarError, short_repr
 
 __all__ = [
     "ConvolutionNetwork",
@@ -67,16 +67,16 @@ class Network(nn.Module):
         counts = {"outputs": outputs} | ({} if channels is None else {"channels": channels})
         for name, count in counts.items():
             if not isinstance(count, int) or count < 1:
-                raise MitsonarError(f"{name} must be a whole number of at least 1: got {shortened(count)}")
+                raise MitsonarError(f"{name} must be a whole number of at least 1: got {short_repr(count)}")
         if not isinstance(width, int | float) or not 0 < width < math.inf:
-            raise MitsonarError(f"width must be a number above 0 (1 for Almanza-Medina's channels): got {shortened(width)}")
+            raise MitsonarError(f"width must be a number above 0 (1 for Almanza-Medina's channels): got {short_repr(width)}")
         if not isinstance(dropout, int | float) or not 0 <= dropout < 1:
-            raise MitsonarError(f"dropout must be a rate from 0 to below 1: got {shortened(dropout)}")
+            raise MitsonarError(f"dropout must be a rate from 0 to below 1: got {short_repr(dropout)}")
         self.options: Fields = {"width": width, "dropout": dropout, **counts}
         for name, size in sizes.items():
             if not _is_size(size):
                 raise MitsonarError(
-                    f"{name} must be the input's rows and columns, such as [512, 192]: got {shortened(size)}"
+                    f"{name} must be the input's rows and columns, such as [512, 192]: got {short_repr(size)}"
                 )
             self.options[name] = [int(length) for length in size]
 

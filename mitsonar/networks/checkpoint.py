@@ -29,11 +29,11 @@ from mitsonar.datasets.arrangement import Coordinates, LabelKind, Labels, Layout
 from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.sample_index import Part, split_for
 from mitsonar.datasets.samples import Batches, ground_at
-from mitsonar.errors import MitsonarError, complaint, meant, shortened
+from mitsonar.errors import MitsonarError, did_you_mean, short_repr, validation_message
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import sonar_from
-from mitsonar.io.files import check_plain, read_bytes, write_whole
+from mitsonar.io.files import check_plain_value, read_bytes, write_atomic
 from mitsonar.motion.errors import AXES
 from mitsonar.networks.corrnet import GaussianHead
 from mitsonar.networks.create import NETWORKS, create_network
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from mitsonar.datasets.responses import ImpulseSamples
     from mitsonar.datasets.samples import SonarPairs
 
-__all__ = ["FILE", "Checkpoint", "onnx_of"]
+__all__ = ["FILE", "Checkpoint", "to_onnx"]
 
 FORMAT = 1
 """Version of the file format. A reader accepts only this version."""
@@ -161,13 +161,13 @@ class Checkpoint:
                 raise MitsonarError(f"{error} ({written})") from None
             except Exception as error:  # invalid options may raise anything
                 raise MitsonarError(
-                    f"no {self.network} has these options, {shortened(self.options)}: {_first_line(error)}"
+                    f"no {self.network} has these options, {short_repr(self.options)}: {_first_line(error)}"
                 ) from None
         try:
             network.load_state_dict(self.weights)
         except RuntimeError as error:
             raise MitsonarError(
-                f"the weights do not fit a {self.network} with options {shortened(self.options)}: "
+                f"the weights do not fit a {self.network} with options {short_repr(self.options)}: "
                 f"{_mismatch(error)} ({written})"
             ) from None
         return network.eval().requires_grad_(False)
@@ -181,7 +181,7 @@ class Checkpoint:
         large = [name for name, value in _numbers_in(self.options) if not abs(value) <= LARGEST_OPTION]
         if large:
             raise MitsonarError(
-                f"no {self.network} has these options, {shortened(self.options)}: {large[0]} is beyond {LARGEST_OPTION:,}"
+                f"no {self.network} has these options, {short_repr(self.options)}: {large[0]} is beyond {LARGEST_OPTION:,}"
             )
         try:
             with torch.device("meta"), torch.random.fork_rng(devices=[]):
@@ -192,7 +192,7 @@ class Checkpoint:
         required = sum(values.numel() for values in expected.values())
         if required > 2 * stored + FEW_WEIGHTS:
             raise MitsonarError(
-                f"the weights do not fit a {self.network} with options {shortened(self.options)}: the file has "
+                f"the weights do not fit a {self.network} with options {short_repr(self.options)}: the file has "
                 f"{stored:,}, the network {required:,} ({written})"
             )
 
@@ -346,7 +346,7 @@ class Checkpoint:
 
     def save(self, path: str | Path) -> None:
         """Write the file atomically: either all of it or nothing."""
-        write_whole(path, self.to_bytes())
+        write_atomic(path, self.to_bytes())
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -367,7 +367,7 @@ class Checkpoint:
         if not os.path.exists(path):
             raise MitsonarError(
                 f"no checkpoint {path}: give a {FILE}, the folder of `mitsonar train`, or {' or '.join(SHIPPED)}"
-                f"{meant(path, SHIPPED)}"
+                f"{did_you_mean(path, SHIPPED)}"
             )
         content = read_bytes(path, "checkpoint", LARGEST)
         return cls.from_bytes(content, str(path))
@@ -386,17 +386,17 @@ class Checkpoint:
             raise MitsonarError(f"{source} is not a checkpoint of mitsonar, but {actual}: give a {FILE}")
         if table.get("format") != FORMAT:
             raise MitsonarError(
-                f"{source} is a checkpoint of format {shortened(table.get('format'))}, written by mitsonar "
+                f"{source} is a checkpoint of format {short_repr(table.get('format'))}, written by mitsonar "
                 f"{str(table.get('version'))[:40]}; this is mitsonar {version('mitsonar')}, which reads format {FORMAT}: "
                 "use the version that wrote it, or train again"
             )
         try:
-            check_plain({name: value for name, value in table.items() if name != "weights"}, "it")
+            check_plain_value({name: value for name, value in table.items() if name != "weights"}, "it")
             _Contents.model_validate(table)
         except MitsonarError as error:
             reason = str(error)
         except ValidationError as error:
-            reason = complaint(error, _Contents, "checkpoint")
+            reason = validation_message(error, _Contents, "checkpoint")
         else:
             return cls(**{one.name: table[one.name] for one in fields(cls)})
         raise MitsonarError(f"{source} is damaged: {reason}; train again, or use an intact copy")
@@ -588,7 +588,7 @@ def _first_line(error: Exception) -> str:
 # ---------------- Export to ONNX
 
 
-def onnx_of(checkpoint: Checkpoint, batch: int | None = None) -> bytes:
+def to_onnx(checkpoint: Checkpoint, batch: int | None = None) -> bytes:
     """Return a checkpoint as the bytes of an ONNX file, for programs without torch.
 
     The inputs are ``image`` in the checkpoint's arrangement, with grey values in 0..1, and ``cartesian`` for ``both``

@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.samples import NODES
-from mitsonar.errors import MitsonarError, shortened
+from mitsonar.errors import MitsonarError, short_repr
 from mitsonar.geometry.ground import moved
 
 __all__ = [
@@ -85,8 +85,8 @@ class CorrNet(nn.Module):
         valid_counts = all(isinstance(count, int) and count >= 1 for count in (looks, finer))
         if not isinstance(width, int | float) or not 0 < width < math.inf or not valid_counts:
             raise MitsonarError(
-                f"corrnet takes a width above 0, looks and finer of at least 1: got {shortened(width)}, {shortened(looks)} "
-                f"and {shortened(finer)}"
+                f"corrnet takes a width above 0, looks and finer of at least 1: got {short_repr(width)}, "
+                f"{short_repr(looks)} and {short_repr(finer)}"
             )
         self.options: Fields = {"width": width, "looks": looks, "finer": finer, "relief": relief}
         first, second, channels, hidden, filters = (max(2, round(width * count)) for count in (12, 24, 16, 16, 6))

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.samples import Inputs
-from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.errors import MitsonarError, short_repr, suggest_names
 from mitsonar.networks.corrnet import CorrNet
 from mitsonar.networks.profilenet import ProfileNet
 from mitsonar.networks.thesis import Cnn1b, Cnn4b, Cnn4PoseNet, ImpulsePoseNet, PoseNet, PoseNetDual, PoseNetVec, SfMNet
@@ -49,7 +49,7 @@ def create_network(name: str, **options: object) -> nn.Module:
     known = options_of(name)
     for option in options:
         if option not in known:
-            raise MitsonarError(f"unknown option {shortened(option)} of {name}: {nearest_names(option, known)}")
+            raise MitsonarError(f"unknown option {short_repr(option)} of {name}: {suggest_names(option, known)}")
     network: nn.Module = NETWORKS[name](**options)
     return network
 
@@ -66,7 +66,7 @@ def options_of(name: str) -> list[str]:
         MitsonarError: unknown name.
     """
     if name not in NETWORKS:
-        raise MitsonarError(f"unknown network {shortened(name)}: {nearest_names(str(name), NETWORKS)}")
+        raise MitsonarError(f"unknown network {short_repr(name)}: {suggest_names(str(name), NETWORKS)}")
     return list(inspect.signature(NETWORKS[name]).parameters)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mitsonar.datasets.modality import Fields
-from mitsonar.errors import MitsonarError, shortened
+from mitsonar.errors import MitsonarError, short_repr
 from mitsonar.networks.blocks import Network, Size
 
 __all__ = ["ProfileNet"]
@@ -88,7 +88,9 @@ class ProfileNet(Network):
             )
         for name, value, least in (("filters", filters, 1), ("taps", taps, 1), ("lags", lags, 1), ("windows", windows, 1)):
             if not isinstance(value, int) or value < least or (name == "taps" and value % 2 == 0):
-                raise MitsonarError(f"{name} must be a whole number of at least {least} (taps: odd): got {shortened(value)}")
+                raise MitsonarError(
+                    f"{name} must be a whole number of at least {least} (taps: odd): got {short_repr(value)}"
+                )
         if windows > levels:
             raise MitsonarError(f"windows must be at most the {levels} levels: got {windows}")
         self.options |= {"filters": filters, "taps": taps, "lags": lags, "windows": windows}

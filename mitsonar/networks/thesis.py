@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mitsonar.datasets.modality import Fields
-from mitsonar.errors import MitsonarError, shortened
+from mitsonar.errors import MitsonarError, short_repr
 from mitsonar.networks.blocks import (
     ConvolutionNetwork,
     Network,
@@ -416,12 +416,12 @@ class ImpulsePoseNet(Network):
         super().__init__(outputs=outputs, width=width, dropout=dropout, size=size)
         if not isinstance(layers, int) or not IMPULSE_LAYERS[0] <= layers <= IMPULSE_LAYERS[1]:
             raise MitsonarError(
-                f"layers must be {IMPULSE_LAYERS[0]} to {IMPULSE_LAYERS[1]}, as in table 5.2: got {shortened(layers)}"
+                f"layers must be {IMPULSE_LAYERS[0]} to {IMPULSE_LAYERS[1]}, as in table 5.2: got {short_repr(layers)}"
             )
         if not isinstance(receivers, int) or receivers < 1 or size[1] % (2 * receivers):
             raise MitsonarError(
                 f"size {list(size)} must have real and imaginary columns for each receiver: got receivers "
-                f"{shortened(receivers)}; leave out receivers and size, which the data define"
+                f"{short_repr(receivers)}; leave out receivers and size, which the data define"
             )
         self.options |= {"layers": layers, "receivers": receivers}
         self.nets = nn.ModuleList(_pose_net(layers, width, dropout) for _ in range(receivers))

@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mitsonar.acoustics.levels import decoded
-from mitsonar.errors import MitsonarError, explain_missing
+from mitsonar.errors import MitsonarError, missing_package_error
 from mitsonar.geometry.fan import CartesianMap, cartesian_map, nearest_cells, to_cartesian
-from mitsonar.io.files import write_json, write_whole
+from mitsonar.io.files import write_atomic, write_json
 from mitsonar.io.runs import refuse_to_replace
 from mitsonar.records.frames import SonarFrames, to_float32, to_uint8
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["CODECS", "FanPictures", "coded_in_decibels", "fan_figure", "save_fan", "write_fan_video"]
+__all__ = ["CODECS", "FanPictures", "fan_figure", "save_fan", "to_decibels", "write_fan_video"]
 
 
 GAMMA = 0.6
@@ -65,11 +65,11 @@ def save_fan(path: str | Path, frames: SonarFrames, index: int = 0, *, title: st
     """Write :func:`fan_figure` as a PNG file, completely or not at all."""
     import io
 
-    from mitsonar.io.files import write_whole
+    from mitsonar.io.files import write_atomic
 
     buffer = io.BytesIO()
     fan_figure(frames, index, title=title).savefig(buffer, format="png", dpi=110)
-    write_whole(path, buffer.getvalue())
+    write_atomic(path, buffer.getvalue())
 
 
 # ---------------- Plain fan pictures and label maps
@@ -132,7 +132,7 @@ class FanPictures:
         for name, values in pictures.items():
             buffer = io.BytesIO()
             Image.fromarray(values).save(buffer, format="PNG", compress_level=3)
-            write_whole(folder / f"{number:06d}{'.' * bool(name)}{name}.png", buffer.getvalue())
+            write_atomic(folder / f"{number:06d}{'.' * bool(name)}{name}.png", buffer.getvalue())
         if not (folder / "fan.json").is_file():
             starboard, forward = self.fan.extent[:2], self.fan.extent[2:]
             write_json(folder / "fan.json", {"pixel_m": self.pixel_m, "starboard_m": starboard, "forward_m": forward})
@@ -198,14 +198,14 @@ def _write(
     try:
         import cv2
     except ModuleNotFoundError as error:
-        raise explain_missing(error) from None
+        raise missing_package_error(error) from None
     colours = _colours()
     writer, fan, count, first_s = None, None, 0, 0.0
     try:
         for frames in chunks:
             if fan is None:
                 fan = cartesian_map(frames.range_m, frames.bearing_rad, rows=2 * (rows // 2))
-            decibel_images = coded_in_decibels(frames, span_db).image
+            decibel_images = to_decibels(frames, span_db).image
             for image, time in zip(decibel_images, np.atleast_2d(frames.time_s.T).T.mean(axis=1), strict=True):
                 values = np.asarray(fan.apply(np.asarray(image, np.float32)))
                 picture = _even(colours[np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)])
@@ -244,7 +244,7 @@ def _even(picture: Picture) -> Picture:
 # ---------------- Decibel coding
 
 
-def coded_in_decibels(frames: SonarFrames, span_db: float) -> SonarFrames:
+def to_decibels(frames: SonarFrames, span_db: float) -> SonarFrames:
     """Convert frames of any coding to decibels: values 0..1, float32, span the ``span_db`` decibels below full scale.
 
     Lower levels become 0.

@@ -13,8 +13,8 @@ from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, counted
-from mitsonar.io.files import write_whole
+from mitsonar.errors import MitsonarError, count_noun
+from mitsonar.io.files import write_atomic
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import AXES
 from mitsonar.motion.trajectory import Trajectory
@@ -37,9 +37,9 @@ __all__ = [
     "response_png",
     "save_figure",
     "save_sounding_figure",
+    "side_scan_figure",
     "soundings_figure",
     "waterfall_figure",
-    "waterfall_figure_of",
     "waterfall_png",
 ]
 
@@ -169,7 +169,7 @@ def save_figure(path: str | Path, figure: Figure, *, dpi: int = 130) -> None:
     known = figure.canvas.get_supported_filetypes()
     if kind not in known:
         raise MitsonarError(f"a figure's name must end in one of {', '.join(sorted(known))}: got {str(path)!r}")
-    write_whole(path, _encoded(figure, dpi, kind))
+    write_atomic(path, _encoded(figure, dpi, kind))
 
 
 def _encoded(figure: Figure, dpi: int, kind: str = "png", **options: Any) -> bytes:
@@ -384,7 +384,7 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
         axes.set(title=receiver.name, xlabel="delay (ms)")
     grid[0].set_ylabel("time (s)")
     figure.colorbar(image, ax=list(grid), label="dB of the largest of all receivers", fraction=0.04)
-    figure.suptitle(_title(responses, counted(len(responses), "ping")), fontsize=10)
+    figure.suptitle(_title(responses, count_noun(len(responses), "ping")), fontsize=10)
     return figure
 
 
@@ -426,10 +426,10 @@ MAX_POINTS = 200_000
 
 def save_sounding_figure(figure: Figure, path: Path) -> None:
     """Write a figure as a PNG file, completely or not at all."""
-    write_whole(path, _encoded(figure, 110, metadata={"Software": None}))
+    write_atomic(path, _encoded(figure, 110, metadata={"Software": None}))
 
 
-def waterfall_figure_of(echogram: Echogram) -> Figure:
+def side_scan_figure(echogram: Echogram) -> Figure:
     """Draw the waterfall of a side-scan sonar: slant range across with port to the left, the first ping at the bottom."""
     figure, axes = _single_axes(8.4, 5.2)
     level, channels = echogram.decibels(SHOWN_SPAN_DB), echogram.sounder.channels
@@ -448,7 +448,9 @@ def waterfall_figure_of(echogram: Echogram) -> Figure:
     axes.imshow(starboard, extent=(near, far, *along), **options)
     axes.set(xlim=(-far, far), ylim=along, xlabel="slant range, port - starboard (m)", ylabel="along the path (m)")
     figure.colorbar(image, ax=axes, label="level (dB)")
-    axes.set_title(f"{echogram.sounder.name}, {echogram.sounder.fan.model}, {counted(len(echogram), 'ping')}", fontsize=10)
+    axes.set_title(
+        f"{echogram.sounder.name}, {echogram.sounder.fan.model}, {count_noun(len(echogram), 'ping')}", fontsize=10
+    )
     return figure
 
 
@@ -464,7 +466,7 @@ def echogram_figure(echogram: Echogram, soundings: Soundings | None = None) -> F
         axes.plot(time_s, soundings.range_m[:, 0, 0], color="tab:red", lw=1, label="first echo")
         axes.legend(loc="lower right", fontsize=8)
     axes.set(xlabel="time (s)", ylabel="range (m)")
-    axes.set_title(f"{echogram.sounder.name}, {fan.model}, {counted(len(echogram), 'ping')}", fontsize=10)
+    axes.set_title(f"{echogram.sounder.name}, {fan.model}, {count_noun(len(echogram), 'ping')}", fontsize=10)
     figure.colorbar(image, ax=axes, label="level (dB)")
     return figure
 
@@ -477,7 +479,7 @@ def soundings_figure(soundings: Soundings) -> Figure:
     low, high = np.percentile(points[:, 2], [1, 99]) if len(points) else (0, 1)
     scatter = axes.scatter(*points.T[:2], c=points[:, 2], s=1.5, lw=0, cmap="viridis", vmin=low, vmax=high)
     axes.set(xlabel="x, east (m)", ylabel="y, north (m)", aspect="equal")
-    axes.set_title(f"{soundings.sounder.name}: {counted(int(soundings.found.sum()), 'sounding')}", fontsize=10)
+    axes.set_title(f"{soundings.sounder.name}: {count_noun(int(soundings.found.sum()), 'sounding')}", fontsize=10)
     figure.colorbar(scatter, ax=axes, label="z (m)")
     return figure
 
@@ -525,7 +527,7 @@ def dvl_figure(readings: DvlReadings, true: NDArray[np.float64] | None = None) -
     below.set(xlabel="time (s)", ylabel="altitude (m)")
     unlocked = int((~readings.locked).sum())
     above.set_title(
-        f"{readings.soundings.sounder.name}: {counted(len(time_s), 'ping')}, {unlocked} without bottom lock", fontsize=10
+        f"{readings.soundings.sounder.name}: {count_noun(len(time_s), 'ping')}, {unlocked} without bottom lock", fontsize=10
     )
     return figure
 

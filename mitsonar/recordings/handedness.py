@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.recordings.recording import Part
 
-__all__ = ["Handedness", "handedness_of"]
+__all__ = ["Handedness", "check_handedness"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -72,7 +72,7 @@ class Handedness(NamedTuple):
     reason: str = ""
 
 
-def handedness_of(part: Part, heading_rad: ArrayLike | None = None) -> Handedness:
+def check_handedness(part: Part, heading_rad: ArrayLike | None = None) -> Handedness:
     """Determine whether the pictures of a part rotate as its headings do.
 
     Args:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, counted
+from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import preset
 from mitsonar.io.files import INFLATION
@@ -191,10 +191,11 @@ def _pings_of(messages: Messages) -> tuple[_Pings, list[str]]:
     place = np.flatnonzero(fan >= 0)
     notes = []
     if len(place) < len(messages):
-        notes.append(f"left out: {counted(len(messages) - len(place), 'damaged ping')}")
+        notes.append(f"left out: {count_noun(len(messages) - len(place), 'damaged ping')}")
     if messages.skipped:
         notes.append(
-            f"left out: {counted(messages.skipped, 'message or item', 'messages or items')} of other kinds without an image"
+            f"left out: {count_noun(messages.skipped, 'message or item', 'messages or items')} of other kinds "
+            "without an image"
         )
     if messages.left_over:
         notes.append(f"{messages.left_over:,} bytes are not a complete message and are left out")

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, counted
+from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.recordings.oculus import is_oculus, read_oculus
 from mitsonar.recordings.pictures import (
     holds_pictures,
@@ -27,7 +27,7 @@ from mitsonar.recordings.ros_messages import is_ros_bag
 from mitsonar.recordings.ros_reader import read_ros_bag
 from mitsonar.recordings.sound_metrics import SIGNATURE, SIGNATURES, read_aris, read_didson
 
-__all__ = ["FORMATS", "Format", "Summary", "format_of", "known_formats", "open_recording", "summary_lines", "summary_of"]
+__all__ = ["FORMATS", "Format", "Summary", "detect_format", "known_formats", "open_recording", "summary_lines", "summary_of"]
 
 
 FIRST_BYTES = 16
@@ -85,7 +85,7 @@ FORMATS: tuple[Format, ...] = (
 """All formats, in the order in which they are tried."""
 
 
-def format_of(path: str | Path) -> Format | None:
+def detect_format(path: str | Path) -> Format | None:
     """Return the format of a file or folder; None if it is not a recording or does not exist."""
     path = Path(path)
     first = b""
@@ -117,7 +117,7 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
         MitsonarError: if the path does not exist, has no known format or is damaged, if there is no such topic, or if a
             geometry is given that is not needed.
     """
-    recording_format = format_of(path)
+    recording_format = detect_format(path)
     if recording_format is None:
         if not os.path.exists(path):
             raise MitsonarError(f"no such file: {path}")
@@ -212,7 +212,7 @@ def summary_lines(summary: Summary) -> list[str]:
     rows = [("file", summary["name"]), ("format", summary["format"]), ("frames", f"{summary['frames']:,}")]
     for number, part in enumerate(summary["parts"]):
         if len(summary["parts"]) > 1:
-            rows.append((f"part {number}", counted(part["frames"], "frame")))
+            rows.append((f"part {number}", count_noun(part["frames"], "frame")))
         rows += _part_rows(part)
     rows += [(f"fact {name}", _format_value(value)) for name, value in summary["facts"].items()]
     rows += [("note", note) for note in summary["notes"]]
@@ -227,7 +227,7 @@ def _part_rows(part: Summary) -> list[tuple[str, str]]:
     first, last = part["bearing_deg"]
     rows = [
         ("sonar", part["sonar"]),
-        ("window", f"{low:.4g}..{high:.4g} m, {counted(part['bins'], 'bin')}{step}"),
+        ("window", f"{low:.4g}..{high:.4g} m, {count_noun(part['bins'], 'bin')}{step}"),
         ("beams", f"{part['beams']:,} from {first:.4g} to {last:.4g} deg, {part['elevation_fov_deg']:.4g} deg high"),
         ("level", f"{part['level']}, {part['samples']}"),
         ("sound speed", f"{part['sound_speed']:.6g} m/s"),
@@ -239,7 +239,7 @@ def _part_rows(part: Summary) -> list[tuple[str, str]]:
         rows.append(("times", f"{_format_time(part['first_s'])} to {_format_time(part['last_s'])}, {duration_s:.6g} s"))
     if "rate_hz" in part:
         longest = f"; the longest step takes {part['longest_step_s']:.4g} s" if part["gaps"] else ""
-        rows.append(("rate", f"{part['rate_hz']:.4g} Hz, {counted(part['gaps'], 'gap')}{longest}"))
+        rows.append(("rate", f"{part['rate_hz']:.4g} Hz, {count_noun(part['gaps'], 'gap')}{longest}"))
     units = {"pitch_deg": "deg", "roll_deg": "deg", "heading_deg": "deg", "height_m": "m", "gain_db": "dB"}
     for name, unit in units.items():
         if part.get(name) is not None:

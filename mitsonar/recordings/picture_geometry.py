@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from mitsonar.errors import MitsonarError, complaint
+from mitsonar.errors import MitsonarError, validation_message
 from mitsonar.instruments.sonar import Bearing, Coding
 from mitsonar.io.files import read_yaml
 
@@ -97,7 +97,7 @@ class PictureGeometry(BaseModel):
         try:
             return cls(**fields)
         except ValidationError as error:
-            raise MitsonarError(complaint(error, cls, "geometry", SEE)) from None
+            raise MitsonarError(validation_message(error, cls, "geometry", SEE)) from None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.sparse import csr_array, vstack
 
-from mitsonar.errors import MitsonarError, counted, explain_missing
+from mitsonar.errors import MitsonarError, count_noun, missing_package_error
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import FileArray, read_bytes, read_npz
 from mitsonar.io.runs import RunDirectory, RunKind
@@ -32,7 +32,7 @@ from mitsonar.recordings.picture_geometry import (
     load_geometry,
 )
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order
-from mitsonar.records.frames import LONGEST_NPZ, FrameStore, SonarFrames
+from mitsonar.records.frames import MAX_NPZ_FRAMES, FrameStore, SonarFrames
 
 __all__ = [
     "CONVERSION",
@@ -310,10 +310,10 @@ def _select_one_size(files: list[Path], folder: Path) -> tuple[list[Path], tuple
     same_size = [file for file, size in sizes.items() if size == shape]
     notes = []
     if len(sizes) < len(files):
-        notes.append(f"left out: {counted(len(files) - len(sizes), 'picture')} cut off or damaged")
+        notes.append(f"left out: {count_noun(len(files) - len(sizes), 'picture')} cut off or damaged")
     if len(same_size) < len(sizes):
         others = len(sizes) - len(same_size)
-        notes.append(f"left out: {counted(others, 'picture')} of another size than {shape[1]:,} x {shape[0]:,} pixels")
+        notes.append(f"left out: {count_noun(others, 'picture')} of another size than {shape[1]:,} x {shape[0]:,} pixels")
     return same_size, shape, notes
 
 
@@ -468,7 +468,7 @@ class _Video:
         try:
             import cv2
         except ModuleNotFoundError as error:
-            raise explain_missing(error) from None
+            raise missing_package_error(error) from None
         self.cv2, self.path = cv2, path
         self.capture: Any = None
         self.position = 0
@@ -942,7 +942,7 @@ def write_frames(
         store.write(start, frames)
         run.note(frames_done=start + len(frames))
         report_progress(len(frames))
-    if len(part) <= LONGEST_NPZ:
+    if len(part) <= MAX_NPZ_FRAMES:
         store.pack(npz_path)
     run.finish()
     return npz_path if npz_path.exists() else zarr_path

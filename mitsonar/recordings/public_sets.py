@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mitsonar.errors import MitsonarError, argument, counted
+from mitsonar.errors import MitsonarError, argument, count_noun
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.csv_table import CsvTable
 from mitsonar.io.files import FileArray, PlainValue, finite_number, read_bytes, read_json
@@ -29,9 +29,9 @@ from mitsonar.recordings.sound_metrics import (
     FRAME,
     KINDS,
     attitude_of,
+    empty_aris_frames,
     facts_of,
     height_of,
-    like_of,
     notes_of,
     windows_of,
 )
@@ -103,7 +103,9 @@ def read_canoe(path: Path) -> Recording:
     pictures = sorted((time, one) for one in (path / "sonar").glob("*.png") if (time := _time_us(one)))
     complete = [(time, one) for time, one in pictures if is_complete(one)]
     notes = (
-        [f"left out: {counted(len(pictures) - len(complete), 'picture')} cut off"] if len(complete) < len(pictures) else []
+        [f"left out: {count_noun(len(pictures) - len(complete), 'picture')} cut off"]
+        if len(complete) < len(pictures)
+        else []
     )
     if not complete:
         raise MitsonarError(f"{path / 'sonar'} holds no complete picture")
@@ -112,7 +114,7 @@ def read_canoe(path: Path) -> Recording:
     poses, pose_notes = _canoe_poses(path / POSES, stamps)
     if poses is not None and not np.isfinite(poses).all():
         posed = np.flatnonzero(np.isfinite(poses).all(axis=1))
-        notes.append(f"left out: {counted(len(files) - len(posed), 'picture')} without a pose")
+        notes.append(f"left out: {count_noun(len(files) - len(posed), 'picture')} without a pose")
         stamps, files, poses = stamps[posed], [files[place] for place in posed], poses[posed]
     # 3. Make a part of each run of pictures of the same size.
     times = np.asarray(stamps * 1e-6, dtype=float)
@@ -221,7 +223,7 @@ def _canoe_poses(path: Path, stamps: NDArray[np.int64]) -> tuple[Array | None, l
     )
     if (row_index >= 0).sum() < max(2, len(stamps) // 2):
         return None, [
-            f"left out: {POSES}, which has poses of {(row_index >= 0).sum():,} of {counted(len(stamps), 'picture')}"
+            f"left out: {POSES}, which has poses of {(row_index >= 0).sum():,} of {count_noun(len(stamps), 'picture')}"
         ]
     # 2. Determine which rotation the angles describe, and which of its axes are starboard, forward and up.
     values = values[row_index[row_index >= 0]]
@@ -353,12 +355,12 @@ def read_uxo(path: Path) -> Recording:
     has_picture = np.array([int(index) in files and is_complete(files[int(index)]) for index in headers["index"]])
     notes = []
     if not plausible.all():
-        notes.append(f"left out: {counted(int((~plausible).sum()), 'row')} of {TABLE} with implausible numbers")
+        notes.append(f"left out: {count_noun(int((~plausible).sum()), 'row')} of {TABLE} with implausible numbers")
     if not has_picture.all():
-        notes.append(f"left out: {counted(int((~has_picture).sum()), 'frame')} of {TABLE} without a picture")
+        notes.append(f"left out: {count_noun(int((~has_picture).sum()), 'frame')} of {TABLE} without a picture")
     extra = len(files) - len(set(files) & {int(index) for index in headers["index"]})
     if extra:
-        notes.append(f"left out: {counted(extra, 'picture')} without a row in {TABLE}")
+        notes.append(f"left out: {count_noun(extra, 'picture')} without a row in {TABLE}")
     # 2. Sort them by time, assign poses, and make a part of each run of frames with the same geometry.
     usable = plausible & has_picture
     order, order_notes = in_time_order(np.where(usable, headers["time_us"] * 1e-6, np.nan), headers["index"])
@@ -405,7 +407,7 @@ def _uxo_part(headers: Header, files: dict[int, Path], poses: Array | None) -> P
     samples, beams = int(headers["samples"][0]), BEAMS[int(headers["ping_mode"][0])]
     paths = tuple(files[int(index)] for index in headers["index"])
     return Part(
-        like=like_of(headers, samples, beams),
+        like=empty_aris_frames(headers, samples, beams),
         time_s=headers["time_us"] * 1e-6,
         images=_Pgm(paths, (samples, beams)),
         poses=poses,
@@ -446,7 +448,7 @@ def _uxo_poses(path: Path, index: NDArray[np.integer]) -> tuple[Array | None, li
     row_index = np.array([rows.get(int(number), -1) for number in index], dtype=np.intp)
     if (row_index < 0).any() or not valid[row_index].all():
         missing = int(((row_index < 0) | ~valid[row_index]).sum())
-        return None, [f"left out: the poses, because {ROTATOR} has no valid one for {counted(missing, 'frame')}"]
+        return None, [f"left out: the poses, because {ROTATOR} has no valid one for {count_noun(missing, 'frame')}"]
     rotation = Rotation.from_quat(quaternion[row_index])
     return poses_from(position[row_index] + rotation.apply(SONAR_AT), rotation * FORWARD_STARBOARD_DOWN), []
 

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, argument, counted
+from mitsonar.errors import MitsonarError, argument, count_noun
 from mitsonar.records.frames import SonarFrames
 
 __all__ = [
@@ -193,17 +193,17 @@ def in_time_order(time_s: ArrayLike, number: ArrayLike | None = None) -> tuple[I
     time = np.asarray(time_s, dtype=float)
     known = np.isfinite(time)
     order = np.flatnonzero(known)[np.argsort(time[known], kind="stable")]
-    notes = [] if known.all() else [f"left out: {counted(int((~known).sum()), 'frame')} without a valid time"]
+    notes = [] if known.all() else [f"left out: {count_noun(int((~known).sum()), 'frame')} without a valid time"]
     if (np.diff(order) < 0).any():
         notes.append("frames are not in order of time: they were sorted")
     increasing = order[np.diff(time[order], prepend=-np.inf) > 0]
     if len(increasing) < len(order):
-        notes.append(f"left out: {counted(len(order) - len(increasing), 'frame')} at the time of the one before")
+        notes.append(f"left out: {count_noun(len(order) - len(increasing), 'frame')} at the time of the one before")
     if number is not None and len(increasing) > 1:
         steps = np.diff(np.asarray(number, dtype=float)[increasing])
         missing = float((steps[steps > 1] - 1).sum())
         if missing:
-            notes.append(f"missing: {counted(round(missing), 'frame')}, by the numbers that the sonar gave them")
+            notes.append(f"missing: {count_noun(round(missing), 'frame')}, by the numbers that the sonar gave them")
     return increasing, notes
 
 

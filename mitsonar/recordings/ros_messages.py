@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from mitsonar.errors import MitsonarError, explain_missing
+from mitsonar.errors import MitsonarError, missing_package_error
 from mitsonar.io.files import finite_number, parse_json
 from mitsonar.records.frames import SonarFrames
 
@@ -130,7 +130,7 @@ class BagFile:
         try:
             from rosbags.highlevel import AnyReader
         except ModuleNotFoundError as error:
-            raise explain_missing(error) from None
+            raise missing_package_error(error) from None
         self._check_name()
         reader = AnyReader([self.path], default_typestore=ros1_types() if self.is_ros1 else ros2_types())
         reader.open()
@@ -380,7 +380,7 @@ def _record_in(path: Path) -> dict[str, str] | None:
     try:
         from mcap.reader import make_reader
     except ModuleNotFoundError as error:
-        raise explain_missing(error) from None
+        raise missing_package_error(error) from None
     try:
         with path.open("rb") as file:
             return next((one.metadata for one in make_reader(file).iter_metadata() if one.name == RECORD), None)

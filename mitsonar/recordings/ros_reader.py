@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, counted, nearest_names
+from mitsonar.errors import MitsonarError, count_noun, suggest_names
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order, runs_of
 from mitsonar.recordings.ros_messages import FANS, OCULUS, PROJECTED, WRITTEN, BagFile, Topic, frames_like, short
@@ -106,10 +106,10 @@ def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (
     if topic is not None:
         named = next((one for one in topics if one.name == topic), None)
         if named is None:
-            raise MitsonarError(f"{bag.path} has no topic {topic!r}: {nearest_names(topic, [one.name for one in topics])}")
+            raise MitsonarError(f"{bag.path} has no topic {topic!r}: {suggest_names(topic, [one.name for one in topics])}")
         if named not in readable:
             raise MitsonarError(
-                f"{bag.path}: {topic} holds {counted(named.messages, 'message')} {short(named.kind)}; a sonar's "
+                f"{bag.path}: {topic} holds {count_noun(named.messages, 'message')} {short(named.kind)}; a sonar's "
                 f"are {_type_names(*kinds)}"
             )
         return named

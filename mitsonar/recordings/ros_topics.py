@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from mitsonar.errors import MitsonarError, counted
+from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.motion.pose import poses_from
 from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.recordings.pictures import Grey, Pictures, geometry_for, recording_of, refuse_size
@@ -437,7 +437,7 @@ class TopicScan:
 
     def notes(self) -> list[str]:
         """Return sentences on what was left out or assumed."""
-        notes = [] if not self.lost else [f"left out: {counted(self.lost, 'message')} that cannot be read: {self.reason}"]
+        notes = [] if not self.lost else [f"left out: {count_noun(self.lost, 'message')} that cannot be read: {self.reason}"]
         if not self._is_stamped():
             notes.append("the headers hold no times: times are those at which the messages were received")
         if self.gaps:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, counted
+from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import preset
 from mitsonar.recordings.recording import (
@@ -52,10 +52,10 @@ __all__ = [
     "aris_bearings",
     "attitude_of",
     "didson_bearings",
+    "empty_aris_frames",
     "facts_of",
     "height_of",
     "in_beam_order",
-    "like_of",
     "nominal_window",
     "notes_of",
     "poses_of",
@@ -241,7 +241,7 @@ def _valid_frames(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool
     valid = has_table if has_table.any() else valid  # if all frames lack a table, a later error names the missing one
     notes = []
     if not valid.all():
-        notes.append(f"left out: {counted(int((~valid).sum()), 'frame')} with a damaged header")
+        notes.append(f"left out: {count_noun(int((~valid).sum()), 'frame')} with a damaged header")
     if frames.left_over:
         notes.append(f"the last {frames.left_over:,} bytes are not a complete frame and are left out")
     return valid, notes
@@ -275,7 +275,7 @@ def _aris_part(frames: EqualFrames, headers: Header, places: NDArray[np.intp], b
     )
     attitude = attitude_of(part_headers)
     return Part(
-        like=like_of(part_headers, samples, beams),
+        like=empty_aris_frames(part_headers, samples, beams),
         time_s=part_headers["time_us"] * 1e-6,
         images=raw,
         poses=poses_of(part_headers, attitude),
@@ -326,7 +326,7 @@ def in_beam_order(samples: Bytes, mode: int) -> Bytes:
     return ordered
 
 
-def like_of(headers: Header, samples: int, beams: int) -> SonarFrames:
+def empty_aris_frames(headers: Header, samples: int, beams: int) -> SonarFrames:
     """Return empty frames with the geometry of a part of an ARIS file."""
     first = headers[0]
     kind = KINDS[int(first["system"])]
@@ -509,7 +509,7 @@ def read_didson(path: str | Path) -> Recording:
         & (headers["start_code"] <= MAX_START_CODE)
         & (headers["length_code"] < 4)
     )
-    notes = [f"left out: {counted(int((~valid).sum()), 'frame')} with a damaged header"] if not valid.all() else []
+    notes = [f"left out: {count_noun(int((~valid).sum()), 'frame')} with a damaged header"] if not valid.all() else []
     notes += [f"the last {frames.left_over:,} bytes are not a complete frame and are left out"] if frames.left_over else []
     time_s, time_notes = _times(headers, head)
     order, order_notes = in_time_order(np.where(valid, time_s, np.nan), headers["index"])
@@ -578,7 +578,7 @@ def _spread(time_s: Array, number: Index, period_s: float) -> tuple[Array, list[
     # 3. Divide that time evenly among the frames of the group.
     group = np.cumsum(new) - 1
     part = (np.arange(len(time_s)) - begin[group]) / count[group]
-    note = f"{counted(int((~new).sum()), 'frame')} with the time of the one before: spread evenly up to the next"
+    note = f"{count_noun(int((~new).sum()), 'frame')} with the time of the one before: spread evenly up to the next"
     return time_s + part * gap[group], [note]
 
 

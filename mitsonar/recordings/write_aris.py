@@ -11,7 +11,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, argument, counted
+from mitsonar.errors import MitsonarError, argument, count_noun
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.recordings.recording import CHUNK_BYTES, Bytes, Header, layout
 from mitsonar.recordings.sound_metrics import ARIS_CODING_DB as CODING_DB
@@ -485,7 +485,7 @@ def _form_of(frames: SonarFrames, beams: int | None) -> _Form:
     if turned:
         low, high = np.degrees(table.bearings[[0, -1]])
         notes.append(
-            f"{counted(len(frames.bearing_rad), 'beam')} interpolated to {table.beams}, from {low:.4g} to {high:.4g} deg"
+            f"{count_noun(len(frames.bearing_rad), 'beam')} interpolated to {table.beams}, from {low:.4g} to {high:.4g} deg"
         )
     elif deviation > np.radians(1e-3):
         notes.append(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mitsonar.errors import MitsonarError, explain_missing
+from mitsonar.errors import MitsonarError, missing_package_error
 from mitsonar.geometry.fan import CartesianMap, cartesian_map
 from mitsonar.instruments.views import directions
 from mitsonar.io.runs import refuse_to_replace
@@ -100,7 +100,7 @@ def _writer(file: object) -> Writer:
     try:
         from mcap.writer import CompressionType, Writer
     except ModuleNotFoundError as error:
-        raise explain_missing(error) from None
+        raise missing_package_error(error) from None
     return Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
 
 
@@ -480,5 +480,5 @@ def nanoseconds(time_s: Array) -> list[int]:
 
 def _ros_pose(pose: Array) -> tuple[Array, Rotation]:
     """Return the position and rotation of a pose ``(6,)`` in the convention of ROS."""
-    place, turn = CONVENTIONS["ros-enu"].from_ours(pose[None, :3], vehicle_rotation(pose))
+    place, turn = CONVENTIONS["ros-enu"].from_mitsonar(pose[None, :3], vehicle_rotation(pose))
     return place[0], turn[0]

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.files import write_whole
+from mitsonar.io.files import write_atomic
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.recordings.recording import Header, layout
 from mitsonar.records.soundings import Echogram
@@ -98,7 +98,7 @@ def write_xtf(path: str | Path, echogram: Echogram) -> None:
         for header, side in zip(channel, sides, strict=True):
             parts += [header.tobytes(), side[number].tobytes()]
         parts.append(padding)
-    write_whole(Path(path), b"".join(parts))
+    write_atomic(Path(path), b"".join(parts))
 
 
 def _file_header(echogram: Echogram, name: str) -> bytes:

@@ -18,7 +18,7 @@ import zarr
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.levels import decoded
-from mitsonar.errors import MitsonarError, shortened
+from mitsonar.errors import MitsonarError, short_repr
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import (
     FileArray,
@@ -32,10 +32,10 @@ from mitsonar.io.files import (
 )
 
 __all__ = [
-    "FEW_ROWS",
+    "ALWAYS_ACCEPTED_ROWS",
     "LABELS",
     "LEVELS",
-    "LONGEST_NPZ",
+    "MAX_NPZ_FRAMES",
     "Column",
     "FrameStore",
     "SonarFrames",
@@ -43,9 +43,9 @@ __all__ = [
     "ViewFrames",
     "arrays_in",
     "check_column",
+    "max_plausible_rows",
     "number_of",
     "open_group",
-    "rows_that_fit",
     "table_in",
     "text_of",
     "to_float32",
@@ -124,7 +124,7 @@ MAX_CHUNKS_PER_ROW = 64
 MAX_ROWS_PER_BYTE = 200
 """Largest number of rows per byte of a compressed array, since times and poses differ from row to row."""
 
-FEW_ROWS = 100_000
+ALWAYS_ACCEPTED_ROWS = 100_000
 """Number of rows that is accepted whatever the file size."""
 
 
@@ -258,7 +258,7 @@ def open_group(
     stored_bytes = sum(
         file.stat().st_size for file in (path / rows).rglob("*") if file.is_file() and file.name != "zarr.json"
     )
-    if count > rows_that_fit(stored_bytes):
+    if count > max_plausible_rows(stored_bytes):
         raise ValueError(f"{count:,} rows are more than the {stored_bytes:,} bytes of {rows} can hold")
     for name, array in arrays.items():
         _check_chunks(name, array)
@@ -296,9 +296,9 @@ def arrays_in(path: Path, mode: Literal["r", "r+"]) -> tuple[zarr.Group, dict[st
     return group, arrays
 
 
-def rows_that_fit(stored: int) -> int:
+def max_plausible_rows(stored: int) -> int:
     """Return the largest plausible number of rows in ``stored`` compressed bytes."""
-    return max(FEW_ROWS, MAX_ROWS_PER_BYTE * stored)
+    return max(ALWAYS_ACCEPTED_ROWS, MAX_ROWS_PER_BYTE * stored)
 
 
 def _check_chunks(name: str, array: StoredArray) -> None:
@@ -411,7 +411,7 @@ class SonarFrames:
                 f"{len(self.bearing_rad)}) after time_s, range_m and bearing_rad: got {self.image.shape}"
             )
         if self.level not in LEVELS:
-            raise MitsonarError(f"level must be one of {', '.join(LEVELS)}: got {shortened(self.level)}")
+            raise MitsonarError(f"level must be one of {', '.join(LEVELS)}: got {short_repr(self.level)}")
         for name in PER_FRAME:
             values = getattr(self, name)
             if values is not None and len(values) != frames:
@@ -633,7 +633,7 @@ def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
 # ---------------- Incremental storage on disk
 
 
-LONGEST_NPZ = 1000
+MAX_NPZ_FRAMES = 1000
 """Largest number of frames that a run packs into one ``frames.npz``. Longer runs remain as ``frames.zarr``."""
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.hydrophones import ChannelSonar
-from mitsonar.io.files import FileArray, PlainValue, read_npz, refuse_beyond_memory, write_whole
+from mitsonar.io.files import FileArray, PlainValue, read_npz, refuse_beyond_memory, write_atomic
 from mitsonar.records.frames import Column, StoredArray, check_column, open_group, table_in
 
 __all__ = ["ImpulseResponses"]
@@ -118,7 +118,7 @@ class ImpulseResponses:
             buffer = io.BytesIO()
             table: dict[str, StoredArray] = self.arrays()
             np.savez_compressed(buffer, **table)
-            write_whole(path, buffer.getvalue())
+            write_atomic(path, buffer.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> ImpulseResponses:

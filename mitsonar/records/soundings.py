@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import FEWEST_BEAMS, Sounder
 from mitsonar.instruments.views import directions
-from mitsonar.io.files import parse_json, read_npz, write_whole
+from mitsonar.io.files import parse_json, read_npz, write_atomic
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.records.frames import SonarFrames
 
@@ -26,7 +26,7 @@ __all__ = [
     "load_pings",
     "range_rates",
     "save_pings",
-    "velocity_of",
+    "solve_velocity",
 ]
 
 
@@ -108,7 +108,7 @@ class Soundings:
             raise MitsonarError(
                 f"no beam has an echo, and {path.name} would be empty: move the window, or the instrument closer"
             )
-        write_whole(path, writers[path.suffix]())
+        write_atomic(path, writers[path.suffix]())
         return None
 
     @classmethod
@@ -328,7 +328,7 @@ class DvlReadings:
         """Compute velocities from range rates ``(pings, beams)``, ignoring beams without an echo."""
         sounder = soundings.sounder
         valid_rates = np.where(soundings.found[..., 0], range_rate, np.nan)
-        return cls(soundings, valid_rates, *velocity_of(valid_rates, sounder.axes, sounder.beam_std_m_s))
+        return cls(soundings, valid_rates, *solve_velocity(valid_rates, sounder.axes, sounder.beam_std_m_s))
 
     @property
     def locked(self) -> NDArray[np.bool_]:
@@ -364,10 +364,10 @@ class DvlReadings:
         for time_s, locked, row in zip(self.soundings.time_s, self.locked, table, strict=True):
             cells = ["" if np.isnan(value) else f"{value:.6f}" for value in row]
             text.write(",".join([f"{time_s:.9f}", str(int(locked)), *cells]) + "\n")
-        write_whole(Path(path), text.getvalue().encode())
+        write_atomic(Path(path), text.getvalue().encode())
 
 
-def velocity_of(range_rate: Array, axes: Array, std_m_s: float) -> tuple[Array, Array]:
+def solve_velocity(range_rate: Array, axes: Array, std_m_s: float) -> tuple[Array, Array]:
     """Solve for velocities by least squares, where each range rate is minus the velocity along its beam.
 
     Args:
@@ -397,7 +397,7 @@ def save_pings(path: str | Path, sounder: Sounder, arrays: dict[str, NDArray[Any
     fields = sounder.model_dump(mode="json", exclude={"fan"}) | {"fan": sounder.fan.model_dump(mode="json")}
     table: dict[str, Any] = {"sounder": np.array(json.dumps(fields)), **arrays}
     np.savez_compressed(buffer, **table)
-    write_whole(Path(path), buffer.getvalue())
+    write_atomic(Path(path), buffer.getvalue())
 
 
 def load_pings(path: str | Path, names: tuple[str, ...]) -> tuple[Sounder, dict[str, NDArray[Any]]]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.materials import check_channel_mirrors
-from mitsonar.errors import MitsonarError, argument, nearest_names
+from mitsonar.errors import MitsonarError, argument, suggest_names
 from mitsonar.instruments.hydrophones import PADDING, ChannelSonar
 from mitsonar.motion.pose import refuse_beyond_reach
 from mitsonar.motion.trajectory import Trajectory, velocities
@@ -102,12 +102,12 @@ class Paths:
         Raises:
             MitsonarError: there is no such kind of path.
         """
-        if name not in self.ways:
-            raise MitsonarError(f"no kind of path is named {name!r}: {nearest_names(name, self.ways)}")
+        if name not in self.kinds:
+            raise MitsonarError(f"no kind of path is named {name!r}: {suggest_names(name, self.kinds)}")
         way = np.zeros(len(self.delay_s), np.int64) if self.way is None else self.way
-        selected = way == self.ways.index(name)
+        selected = way == self.kinds.index(name)
         return Paths(
-            self.delay_s[selected], self.amplitude[selected], self.doppler_hz[selected], 0, way[selected], self.ways
+            self.delay_s[selected], self.amplitude[selected], self.doppler_hz[selected], 0, way[selected], self.kinds
         )
 
 
@@ -156,7 +156,7 @@ class ChannelSimulator:
         self.reset()
 
     def __repr__(self) -> str:
-        shapes, paths = len(self._given[0].shapes()), ", ".join(self.ways[:4])
+        shapes, paths = len(self._given[0].shapes()), ", ".join(self.kinds[:4])
         return f"ChannelSimulator({self.sonar} in a scene of {shapes} shapes; paths {paths})"
 
     def _build(self, like: ChannelTracer | None = None) -> None:
@@ -172,7 +172,7 @@ class ChannelSimulator:
         self._without_mirrors = mirrors == "materials" and parts is None
         self.tracer: ChannelTracer = ChannelTracer(scene, sonar, like, parts)
         self.without_scatterer: MirrorPaths = MirrorPaths(self.tracer)
-        self.ways = tuple([path.name for path in self.tracer.paths] + self.without_scatterer.names)
+        self.kinds = tuple([path.name for path in self.tracer.paths] + self.without_scatterer.names)
 
     def _follow_scene(self) -> None:
         """Rebuild everything that depends on the scene if its parameters have changed."""
@@ -296,7 +296,7 @@ class ChannelSimulator:
         delay, size, phase, doppler = (received[name][keep].astype(float) for name in names)
         way = np.repeat(np.arange(len(parts)), [len(part["counts"]) for part in parts])[keep]
         beyond = int(np.count_nonzero(received["beyond"]))
-        return Paths(delay, size * np.exp(1j * phase), doppler, beyond, way, self.ways)
+        return Paths(delay, size * np.exp(1j * phase), doppler, beyond, way, self.kinds)
 
     def _channels(
         self, poses: NDArray[np.float64], velocity: NDArray[np.float64], first: int, threads: ThreadPoolExecutor

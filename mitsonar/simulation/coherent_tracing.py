@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.speckle import BLENDED, patch_amplitudes
+from mitsonar.acoustics.speckle import BLENDED_VARIANCE, patch_amplitudes
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit
@@ -104,7 +104,7 @@ class CoherentTracer:
         self.surfaces = surfaces_of(scene, sonar, motion)
         self.wavelength = sonar.sound_speed / sonar.frequency_hz
         self.pitch = point_pitch(sonar)
-        table = patch_amplitudes(None if sonar.speckle_nu is None else BLENDED * sonar.speckle_nu)
+        table = patch_amplitudes(None if sonar.speckle_nu is None else BLENDED_VARIANCE * sonar.speckle_nu)
         self.patch_entries, self.patches = len(table), mi.Float(np.resize(table, max(2, len(table))))
         # fixed point: scale such that no cell of the grid overflows
         nearest = max(former.first_range, sonar.bin_m)
@@ -186,8 +186,8 @@ class CoherentTracer:
         """Count the outcomes of the rays in the field of view; rays beside it only carry side lobes and skirts."""
         near, far = hit.valid & (hit.t < self.sonar.range_min), hit.valid & (hit.t >= self.sonar.range_max)
         for counter, outcome in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
-            counted = outcome & rays.inside
-            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(counter), counted, mode=ADD)
+            count_noun = outcome & rays.inside
+            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(counter), count_noun, mode=ADD)
         widest = mi.UInt32(COUNTED.index("widest"))
         dr.scatter_reduce(dr.ReduceOp.Max, counts, mi.UInt32(points.covered), widest, points.cut & rays.inside, mode=ADD)
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, suggest_names
 
 __all__ = [
     "VARIANTS",
@@ -70,7 +70,7 @@ def ensure_variant(name: str | None = None) -> str:
                 f'mi.set_variant("{variant}") first, or leave set_variant out'
             )
     if variant not in VARIANTS:
-        raise MitsonarError(f"unknown variant {variant!r}: {nearest_names(variant, VARIANTS)}")
+        raise MitsonarError(f"unknown variant {variant!r}: {suggest_names(variant, VARIANTS)}")
     if not (cuda if variant.startswith("cuda") else llvm):
         if variant.startswith("cuda"):
             raise MitsonarError(f"{variant} needs an NVIDIA driver, and none was found: use llvm_ad_mono")

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mitsonar.acoustics.water import delay_exact, delay_iterated
-from mitsonar.errors import MitsonarError, counted
+from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import Sounder
-from mitsonar.io.files import read_npz, write_whole
+from mitsonar.io.files import read_npz, write_atomic
 from mitsonar.io.runs import RunDirectory, RunKind
 from mitsonar.io.storage import refuse_codecs
 from mitsonar.motion.bodies import MovingBodies
@@ -135,8 +135,8 @@ def run_impulse(
         responses = ImpulseResponses.load(run.path / "responses.zarr")
         yield 0, {"warnings": [*simulator.notes, *_warnings(responses, spread)]}
         responses.about |= {"spread_factor": spread.factor}
-        write_whole(run.path / "response.png", figures.response_png(responses))
-        write_whole(run.path / "waterfall.png", figures.waterfall_png(responses))
+        write_atomic(run.path / "response.png", figures.response_png(responses))
+        write_atomic(run.path / "waterfall.png", figures.waterfall_png(responses))
         responses.save(run.path / "responses.npz")
 
     directory = write_run(CHANNEL_MEASUREMENT, settings, destination, steps, frames_done=0)
@@ -253,7 +253,7 @@ def _warnings(responses: ImpulseResponses, spread: Spread) -> list[str]:
             up = " (above 90: upwards)" if view.tilt_deg > 90 else ""
             pitch = "" if responses.poses is None else f" (pitched by {math.degrees(responses.poses[0, 3]):.3g} deg)"
             sentences.append(
-                f"receiver {receiver.name} has no echo in {silent} of {counted(len(responses), 'ping')}: check its "
+                f"receiver {receiver.name} has no echo in {silent} of {count_noun(len(responses), 'ping')}: check its "
                 f"direction (heading {view.heading_deg:g} deg, tilt {view.tilt_deg:g} deg from straight down{up}), "
                 f"the vehicle's pose{pitch} and range_max"
             )
@@ -340,7 +340,7 @@ def run_camera(simulator: CameraSimulator, flown: Trajectory, destination: Desti
         for number, picture in enumerate(simulator.pictures(flown.poses[done:], flown.time_s[done:], first=done), done):
             buffer = io.BytesIO()
             Image.fromarray(picture).save(buffer, format="PNG")
-            write_whole(files[number], buffer.getvalue())
+            write_atomic(files[number], buffer.getvalue())
             yield 1, {"frames_done": number + 1}
 
     write_run(PHOTOGRAPHS, settings, destination, steps, frames_done=0)
@@ -470,7 +470,7 @@ def _write_soundings(folder: Path, soundings: Soundings, parts: Mapping[str, NDA
         echogram.save(folder / "echogram.npz")
         if kind == "sidescan":
             write_xtf(folder / "sidescan.xtf", echogram)
-            figures.save_sounding_figure(figures.waterfall_figure_of(echogram), folder / "waterfall.png")
+            figures.save_sounding_figure(figures.side_scan_figure(echogram), folder / "waterfall.png")
         else:
             figures.save_sounding_figure(figures.echogram_figure(echogram, soundings), folder / "echogram.png")
     if not soundings.found.any():
@@ -492,7 +492,7 @@ def _write_dvl(folder: Path, soundings: Soundings) -> list[str]:
     if lost == len(readings.locked):
         return ["the DVL has no bottom lock in any ping: there is no sensors.csv"]
     save_sensors(folder / "sensors.csv", dvl_sensors(readings))
-    return [f"the DVL lost the bottom in {lost} of {counted(len(readings.locked), 'ping')}"] if lost else []
+    return [f"the DVL lost the bottom in {lost} of {count_noun(len(readings.locked), 'ping')}"] if lost else []
 
 
 def _write_points(folder: Path, soundings: Soundings) -> list[str]:

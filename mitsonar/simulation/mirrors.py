@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.materials import Material
 from mitsonar.acoustics.water import dot, length
-from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.errors import MitsonarError, short_repr, suggest_names
 from mitsonar.plugins.material_laws import material_of
 from mitsonar.plugins.surfaces import Hit, Surfaces, registry_index
 from mitsonar.simulation.device import DeviceArray
@@ -92,12 +92,12 @@ def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
     if isinstance(mirrors, str):
         mirrors = _material_parts(scene, mirrors)
     if not isinstance(mirrors, Mapping | None):
-        raise MitsonarError(f"mirrors must be mirror parts keyed by shape id, or `materials`: got {shortened(mirrors)}")
+        raise MitsonarError(f"mirrors must be mirror parts keyed by shape id, or `materials`: got {short_repr(mirrors)}")
     names = [shape.id() for shape in scene.shapes()]
     parts = Mirrors(np.zeros(len(names)), np.zeros(len(names)))
     for name, part in (mirrors or {}).items():
         if name not in names:
-            raise MitsonarError(f"mirrors: the scene has no shape {name}: {nearest_names(name, names)}")
+            raise MitsonarError(f"mirrors: the scene has no shape {name}: {suggest_names(name, names)}")
         reflection, roughness_m = _numbers_of(name, part)
         if not (-1 <= reflection <= 1 and 0 <= roughness_m <= ROUGHEST_M):
             raise MitsonarError(
@@ -117,7 +117,7 @@ def _numbers_of(name: str, part: MirrorPart) -> tuple[float, float]:
         reflection, roughness_m = (float(number) for number in part)
     except (TypeError, ValueError):
         raise MitsonarError(
-            f"mirrors: {name} needs a pair, reflection and rms height in m, such as (-1.0, 0.0): got {shortened(part)}"
+            f"mirrors: {name} needs a pair, reflection and rms height in m, such as (-1.0, 0.0): got {short_repr(part)}"
         ) from None
     return reflection, roughness_m
 

@@ -17,8 +17,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.motion.bodies import Moving, MovingBodies, VertexLaw
+from mitsonar.errors import MitsonarError, suggest_names
+from mitsonar.motion.bodies import Moving, MovingBodies, VertexFunction
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.simulation.device import DeviceArray
@@ -163,7 +163,7 @@ class SceneMotion:
         names = [shape.id() for shape in self.shapes]
         for name in bodies.shapes:
             if name not in names:
-                raise MitsonarError(f"moving: the scene has no shape {name}: {nearest_names(name, names)}")
+                raise MitsonarError(f"moving: the scene has no shape {name}: {suggest_names(name, names)}")
         instances = [shape.id() for shape in self.shapes if shape.class_name() == "Instance"]
         if instances:
             raise MitsonarError(
@@ -276,7 +276,7 @@ class DeformingMesh:
         MitsonarError: the shape is not a mesh.
     """
 
-    def __init__(self, shape: mi.Shape, law: VertexLaw) -> None:
+    def __init__(self, shape: mi.Shape, law: VertexFunction) -> None:
         if not isinstance(shape, mi.Mesh):
             raise MitsonarError(f"moving: only meshes can deform: {shape.id()} is not a mesh; give a PLY file")
         self.mesh, self.law = _copied(shape), law

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.levels import coded
-from mitsonar.errors import MitsonarError, counted
+from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import finite_number, whole_number
 from mitsonar.motion.pose import refuse_beyond_reach, vehicle_rotation
@@ -437,14 +437,14 @@ def empty_frames(
     hint = angle_hint(pose) or (buried and f"the sonar {buried}")
     if not any(rays[:3]):
         check = "check the pose (x, y, z in m; pitch > 0 looks down) and the scene's units"
-        text = f"no ray hit anything in {counted(empty, 'frame')}: {check}; in frame {number} {view_of(pose)}"
+        text = f"no ray hit anything in {count_noun(empty, 'frame')}: {check}; in frame {number} {view_of(pose)}"
         return f"{text}; {hint}" if hint else text
     inside, nearer, farther, missed = (percent(count / sum(rays)) for count in rays)
     returns_text = f" (returns at {returns[0]:.3g}..{returns[1]:.3g} m)" if returns else ""
     check = "check the pose (m, pitch > 0 looks down), the window and the scene's units"
     return (
-        f"empty: {empty} of {counted(frames, 'frame')}, frame {number} first: {inside} % of its rays meet something within "
-        f"the window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{returns_text}, {missed} % "
+        f"empty: {empty} of {count_noun(frames, 'frame')}, frame {number} first: {inside} % of its rays meet something "
+        f"within the window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{returns_text}, {missed} % "
         f"nothing; {view_of(pose)}; {hint or check}"
     )
 

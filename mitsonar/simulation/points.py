@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.speckle import BLENDED, patch_amplitudes
+from mitsonar.acoustics.speckle import BLENDED_VARIANCE, patch_amplitudes
 from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.simulation.device import DeviceArray, padded
@@ -349,7 +349,7 @@ class _Search:
         shape.set_id(name)  # Mitsuba renames it
         self.surfaces = Surfaces.from_scene(self.scene)
         self.pitch, self.patches = pitch, patches
-        self.table = None if patches is None else mi.Float(patch_amplitudes(BLENDED * patches.nu))
+        self.table = None if patches is None else mi.Float(patch_amplitudes(BLENDED_VARIANCE * patches.nu))
 
     def on_rays(self, cells: _Cells, side: int, key: DeviceArray, numbers: NDArray[np.uint32]) -> list[SurfacePoints]:
         """Return the points on the rays through some cells: at their first hits, their second hits, and so on."""

@@ -20,13 +20,13 @@ from PIL import Image
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar, TimedPath, overlap_notes, timed_path
-from mitsonar.io.files import write_whole
+from mitsonar.io.files import write_atomic
 from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fans import FanPictures, save_fan
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
-from mitsonar.records.frames import LONGEST_NPZ, FrameStore, SonarFrames, to_uint8
+from mitsonar.records.frames import MAX_NPZ_FRAMES, FrameStore, SonarFrames, to_uint8
 from mitsonar.simulation.device import ensure_variant, padded
 from mitsonar.simulation.pings import RenderedPings, Tally, constant_gain, labels_above, to_image
 
@@ -283,7 +283,7 @@ def _write_frames(source: Source, timed: TimedPath, options: RenderOptions, run:
     notes = [*source.notes, *overlap_notes(sonar, trajectory.time_s)]
     yield 0, {"warnings": [*notes, *tally.warnings(source, trajectory.poses)]}
     assert store is not None
-    if len(trajectory) <= LONGEST_NPZ:
+    if len(trajectory) <= MAX_NPZ_FRAMES:
         store.pack(folder / "frames.npz")
 
 
@@ -387,7 +387,7 @@ def _write_pictures(folder: Path, first: int, frames: SonarFrames, options: Rend
     for index, picture in enumerate(to_uint8(frames.image)):
         buffer = io.BytesIO()
         Image.fromarray(picture).save(buffer, format="PNG", compress_level=3)
-        write_whole(folder / "images" / f"{first + index:06d}.png", buffer.getvalue())
+        write_atomic(folder / "images" / f"{first + index:06d}.png", buffer.getvalue())
     if options.fan:
         (folder / "fan").mkdir(exist_ok=True)
         pictures = FanPictures(frames)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from mitsonar.errors import MitsonarError, argument, nearest_names
+from mitsonar.errors import MitsonarError, argument, suggest_names
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import refuse_beyond_memory
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MOST_FACES",
-    "Said",
+    "MotionSpec",
     "Triangles",
     "channel_sonar_in",
     "covered_squares_in",
@@ -42,13 +42,13 @@ __all__ = [
     "load_meshes",
     "load_motions",
     "load_scene",
+    "motion_specs_in",
+    "motion_specs_of",
     "motions_of",
     "object_names_in",
-    "read_said",
+    "read_motion_specs",
     "refuse_motion",
     "refuse_unread_motions",
-    "said_by",
-    "said_in",
     "scale_notes",
     "shape_boxes_in",
     "shape_names_in",
@@ -108,7 +108,7 @@ def find_scene(name_or_file: str | Path) -> Path:
         return shipped[str(name_or_file)]
     if os.path.isdir(path):
         raise MitsonarError(f"scene {path} is a folder: give the XML file in it")
-    names = nearest_names(path.stem, shipped)
+    names = suggest_names(path.stem, shipped)
     raise MitsonarError(f"no scene file {path}: give a Mitsuba XML file or the name of a shipped scene, {names}")
 
 
@@ -265,7 +265,7 @@ def _parameters(path: Path, error: BaseException) -> str:
     if unknown is None:
         return ""
     known = re.findall(r"<default\s+name=[\"'](\w+)[\"']", path.read_text(encoding="utf-8", errors="replace"))
-    return f"; {nearest_names(unknown[1], known)}" if known else "; the scene has no parameters"
+    return f"; {suggest_names(unknown[1], known)}" if known else "; the scene has no parameters"
 
 
 def _reason(error: BaseException) -> str:
@@ -381,7 +381,7 @@ BYTES_A_VERTEX = 12
 """Memory of one vertex: three float32 coordinates."""
 
 
-class Said(NamedTuple):
+class MotionSpec(NamedTuple):
     """Motion specification of one shape, before its files are read.
 
     Attributes:
@@ -403,7 +403,7 @@ def load_motions(file: str | Path) -> dict[str, Any]:
     Raises:
         MitsonarError: a file is unreadable, or has wrong keys.
     """
-    return read_said(said_in(file))
+    return read_motion_specs(motion_specs_in(file))
 
 
 def motions_of(scene: mi.Scene) -> dict[str, Any]:
@@ -412,15 +412,15 @@ def motions_of(scene: mi.Scene) -> dict[str, Any]:
     Raises:
         MitsonarError: a file is unreadable, or the scene has wrong keys.
     """
-    return read_said(said_by(scene))
+    return read_motion_specs(motion_specs_of(scene))
 
 
-def said_in(file: str | Path) -> list[Said]:
+def motion_specs_in(file: str | Path) -> list[MotionSpec]:
     """Return the motion specifications in a YAML file, without reading the files that they name."""
-    return [Said(name, motion, [Path(file).parent]) for name, motion in read_motions(file).items()]
+    return [MotionSpec(name, motion, [Path(file).parent]) for name, motion in read_motions(file).items()]
 
 
-def said_by(scene: mi.Scene) -> list[Said]:
+def motion_specs_of(scene: mi.Scene) -> list[MotionSpec]:
     """Return the motion specifications of the shapes of a scene, without reading the files that they name."""
     from mitsonar.plugins.trajectory_texture import MOTION
 
@@ -432,11 +432,11 @@ def said_by(scene: mi.Scene) -> list[Said]:
         fields = getattr(texture, "fields", None)
         if fields is None:
             raise MitsonarError(f"the texture {MOTION} of {shape.id()} must be a trajectory: see docs/guides/moving.md")
-        specs.append(Said(shape.id(), BodyMotion.create(shape.id(), fields), texture.folders))
+        specs.append(MotionSpec(shape.id(), BodyMotion.create(shape.id(), fields), texture.folders))
     return specs
 
 
-def read_said(specs: Sequence[Said]) -> dict[str, Any]:
+def read_motion_specs(specs: Sequence[MotionSpec]) -> dict[str, Any]:
     """Read the files that motion specifications name, and return the motions keyed by shape id.
 
     Raises:
@@ -451,7 +451,7 @@ def read_said(specs: Sequence[Said]) -> dict[str, Any]:
     return motions
 
 
-def digests_of(specs: Sequence[Said]) -> dict[str, str]:
+def digests_of(specs: Sequence[MotionSpec]) -> dict[str, str]:
     """Return a digest of each shape's motion, over its specification and its files, keyed by shape id."""
     digests: dict[str, str] = {}
     for name, motion, folders in specs:
@@ -474,7 +474,7 @@ def refuse_motion(scene: mi.Scene, what: str) -> None:
     Raises:
         MitsonarError: a shape moves.
     """
-    specs = said_by(scene)
+    specs = motion_specs_of(scene)
     if specs:
         raise MitsonarError(f"{what} need a still scene: {specs[0].name} has a trajectory; remove its texture motion")
 

@@ -28,7 +28,7 @@ from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.channel import ChannelSimulator
 from mitsonar.simulation.device import ensure_variant
 from mitsonar.simulation.moving import SceneMotion, SceneWatch, motion_in
-from mitsonar.simulation.scene import Said, motions_of
+from mitsonar.simulation.scene import MotionSpec, motions_of
 from mitsonar.simulation.simulator import Simulator
 from mitsonar.simulation.sounding import SounderSimulator
 
@@ -78,7 +78,7 @@ class VehicleFile(NamedTuple):
     """Sensors of a vehicle keyed by name, and the motion specifications of bodies in its file."""
 
     sensors: dict[str, Mounted]
-    motion_specs: list[Said]
+    motion_specs: list[MotionSpec]
 
 
 class VehicleSimulator:
@@ -208,7 +208,7 @@ def load_vehicle(file: str | Path) -> VehicleFile:
     sensors = {}
     for name, keys in recipe.sensors.items():
         sensors[name] = Mounted(_instrument(keys, folder, name), Pose.from_degrees(keys.mount))
-    return VehicleFile(sensors, [Said(name, motion, [folder]) for name, motion in recipe.moving.items()])
+    return VehicleFile(sensors, [MotionSpec(name, motion, [folder]) for name, motion in recipe.moving.items()])
 
 
 def _instrument(keys: SensorKeys, folder: Path, name: str) -> Instrument:

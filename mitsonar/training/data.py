@@ -214,7 +214,7 @@ def _about(pairs: Stored) -> JsonObject:
 
 def _part(recipe: TrainingRecipe, data: str | Path, part: str, **options: str) -> SonarPairs | ImpulsePairs:
     kind = ImpulsePairs if recipe.input.kind == "response" else SonarPairs
-    return kind(data, part=part, split=recipe.split_of, **{**recipe.arrangement(), **options})
+    return kind(data, part=part, split=recipe.resolved_split, **{**recipe.arrangement(), **options})
 
 
 def _in_used_part(recipe: TrainingRecipe, pairs: Stored) -> NDArray[np.bool_]:
@@ -250,7 +250,7 @@ def _rendered_validation(recipe: TrainingRecipe, world: Recipe, gain: float) -> 
     options = {**recipe.arrangement(), "labels": "raw", "seed": seed_of(recipe.seed, WORLDS) >> 33}
     per_sequence = world.flight.pings - recipe.input.frames + 1
     length = -(-count // (max(per_sequence, 1) * VALIDATION_WORLDS))
-    samples = RenderedPairs(world, gain=gain, length=count, buffer=1, sequences_a_world=length, **options)
+    samples = RenderedPairs(world, gain=gain, length=count, buffer=1, sequences_per_world=length, **options)
     return Validation(samples, list(samples.raw()), [*settings.noise, *recipe.noises])
 
 

@@ -18,17 +18,17 @@ from mitsonar.datasets.plan import modality_of
 from mitsonar.datasets.sample_index import split_for
 from mitsonar.datasets.samples import ImpulsePairs, SonarPairs
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError, counted
+from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.estimation.compare import Answers, chosen, markdown, rows_of
 from mitsonar.estimation.learned import ANGLE_OFF_DEG, HEIGHT_OFF, TrainedInstrument, answer_of, inputs_of, one_thread
 from mitsonar.instruments.hydrophones import ChannelSonar
-from mitsonar.io.files import write_json, write_whole
+from mitsonar.io.files import write_atomic, write_json
 from mitsonar.io.runs import refuse_to_replace
 from mitsonar.motion.errors import AXES, cluster_resamples
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.data import Array, JsonObject
 
-__all__ = ["NOISES", "evaluate", "predictions", "refuse_tables", "report_lines", "save_tables"]
+__all__ = ["NOISES", "check_no_tables", "evaluate", "predictions", "report_lines", "save_tables"]
 
 
 NOISES = ("none", "low", "high")
@@ -206,7 +206,12 @@ def samples_for(
         MitsonarError: the data set lacks an input of the network, or has no samples in that part.
     """
     recipe = DataStore.open(data).recipe
-    options = {"noise": noise, "labels": checkpoint.labels["kind"], "seed": seed, "one_a_sequence": recipe.recorded is None}
+    options = {
+        "noise": noise,
+        "labels": checkpoint.labels["kind"],
+        "seed": seed,
+        "one_per_sequence": recipe.recorded is None,
+    }
     if part is None:
         part = split_for(split, recipe).unseen
     if checkpoint.channel is not None:
@@ -356,7 +361,7 @@ def _channel_differences(trained: ChannelSonar, evaluated: ChannelSonar, name: s
 def _seen_note(checkpoint: Checkpoint, samples: SonarPairs | ImpulsePairs, subject: _Subject) -> list[str]:
     """Return a note on the number of pairs that training has seen, if any."""
     seen = int(checkpoint.learnt(samples)[subject.numbers].sum())
-    count = counted(len(subject.numbers), "pair")
+    count = count_noun(len(subject.numbers), "pair")
     return [f"training has seen {seen} of these {count}: errors on unseen pairs may be larger"] if seen else []
 
 
@@ -408,7 +413,7 @@ def report_lines(report: JsonObject) -> list[str]:
     return lines
 
 
-def refuse_tables(out: Path, *, overwrite: bool) -> None:
+def check_no_tables(out: Path, *, overwrite: bool) -> None:
     """Check that no tables in a folder would be replaced without ``overwrite``.
 
     Raises:
@@ -422,5 +427,5 @@ def refuse_tables(out: Path, *, overwrite: bool) -> None:
 def save_tables(out: Path, report: JsonObject) -> None:
     """Write ``table.md`` and ``table.json`` to a folder, which is created if it does not exist."""
     out.mkdir(parents=True, exist_ok=True)
-    write_whole(out / "table.md", ("\n".join(report_lines(report)) + "\n").encode())
+    write_atomic(out / "table.md", ("\n".join(report_lines(report)) + "\n").encode())
     write_json(out / "table.json", report)

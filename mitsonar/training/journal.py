@@ -25,7 +25,7 @@ from torch import Tensor
 
 from mitsonar.config.training import TrainingRecipe, TrainOptions
 from mitsonar.errors import MitsonarError
-from mitsonar.io.files import whole_number, write_whole
+from mitsonar.io.files import whole_number, write_atomic
 from mitsonar.io.runs import RUN_FILE, RunDirectory, RunKind
 from mitsonar.motion.errors import Axis
 from mitsonar.networks.checkpoint import Checkpoint
@@ -245,7 +245,7 @@ class Journal(Callback):
         return Checkpoint.of(
             self.module.network,
             self.material.samples,
-            noise=self.recipe.noise_said,
+            noise=self.recipe.noise_text,
             recipe=self.recipe.plain(),
             metrics=metrics,
             trained={**trained, "steps": row["step"], "seed": self.recipe.seed},
@@ -347,7 +347,7 @@ class StateFile(TorchCheckpointIO):
         """Write a state atomically: either all of it or nothing."""
         buffer = io.BytesIO()
         torch.save(checkpoint, buffer)
-        write_whole(path, buffer.getvalue())
+        write_atomic(path, buffer.getvalue())
 
     def load_checkpoint(
         self, path: str | Path, map_location: Callable[..., Any] | None = None, weights_only: bool | None = True
@@ -424,7 +424,7 @@ class RunFolder:
         self.run.start(**notes, machine=machine())
         if not (self.path / "recipe.yaml").is_file():
             text = yaml.safe_dump(recipe.plain(), sort_keys=False, allow_unicode=True)
-            write_whole(self.path / "recipe.yaml", text.encode())
+            write_atomic(self.path / "recipe.yaml", text.encode())
         return self.run if self.run.resumed else None
 
     def end(self, *, finished: bool, **notes: float) -> None:
@@ -441,12 +441,12 @@ class RunFolder:
         table.writerows(
             {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()} for row in rows
         )
-        write_whole(self.path / "log.csv", text.getvalue().encode())
+        write_atomic(self.path / "log.csv", text.getvalue().encode())
         if not drawn:
             return
         buffer = io.BytesIO()
         curve_figure(rows, zero, axes).savefig(buffer, format="png", dpi=110)
-        write_whole(self.path / "curve.png", buffer.getvalue())
+        write_atomic(self.path / "curve.png", buffer.getvalue())
 
 
 def machine() -> JsonObject:

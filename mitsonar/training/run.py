@@ -21,13 +21,13 @@ from torch.utils import deterministic
 
 from mitsonar.config.training import TrainOptions
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.io.runs import RunDirectory, other_versions
+from mitsonar.io.runs import RunDirectory, changed_versions
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.data import JsonObject, material_of
 from mitsonar.training.journal import EVENTS, Journal, RunFolder, StateFile, TrainingReport
 from mitsonar.training.step import NetworkTraining, network_for
 
-__all__ = ["leads", "train"]
+__all__ = ["is_main_process", "train"]
 
 MAX_COUNT = 1024
 """Largest valid number of threads or processes in the record of a run."""
@@ -49,7 +49,7 @@ def train(
     Raises:
         MitsonarError: options contradict each other, which is checked before training begins, or the loss is not finite.
     """
-    recipe, folder = options.changed_recipe(), RunFolder(Path(options.out), writes=leads())
+    recipe, folder = options.changed_recipe(), RunFolder(Path(options.out), writes=is_main_process())
     earlier = folder.earlier_run() if options.resume else None
     gain = None if earlier is None else earlier.amount("gain")
     threads = options.threads or (earlier.count("threads", MAX_COUNT) if earlier is not None else None)
@@ -115,7 +115,7 @@ def _position(state: Path | None, journal: Journal) -> tuple[int, float]:
     return state_dict["global_step"], float(state_dict["callbacks"][journal.state_key]["minutes"])
 
 
-def leads() -> bool:
+def is_main_process() -> bool:
     """Return whether this process is the one that writes and prints, if Lightning has started several."""
     return all(os.environ.get(name, "0") == "0" for name in ("LOCAL_RANK", "NODE_RANK", "SLURM_PROCID"))
 
@@ -190,7 +190,7 @@ def _warn_of_changes(earlier: RunDirectory | None, notes: JsonObject) -> None:
         for key in ("threads", "accelerator")
         if earlier.notes.get(key) != notes[key]
     ]
-    for change in changes + other_versions(earlier.versions, ("mitsonar", "torch")):
+    for change in changes + changed_versions(earlier.versions, ("mitsonar", "torch")):
         warnings.warn(
             f"the run was begun with {change}: it is resumed, but will not end with the same bits",
             MitsonarWarning,

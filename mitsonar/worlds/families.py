@@ -12,7 +12,7 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.errors import MitsonarError, short_repr, suggest_names
 from mitsonar.worlds.scene_check import SceneFile
 from mitsonar.worlds.sea import SeaSurface
 from mitsonar.worlds.world import (
@@ -393,7 +393,7 @@ def create_family(name: str, **fields: object) -> Family:
     """
     known: dict[str, type[Family]] = {**FAMILIES, SceneFile.called: SceneFile}
     if name not in known:
-        raise MitsonarError(f"unknown world {shortened(name)}: {nearest_names(name, known)}")
+        raise MitsonarError(f"unknown world {short_repr(name)}: {suggest_names(name, known)}")
     return known[name].create(**fields)
 
 

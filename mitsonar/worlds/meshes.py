@@ -15,23 +15,23 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from mitsonar.errors import MitsonarError, argument, meant
+from mitsonar.errors import MitsonarError, argument, did_you_mean
 from mitsonar.io.files import parse_json, whole_number
 from mitsonar.worlds.scene_check import check_counts
 from mitsonar.worlds.world import Floor, Mesh, Standpoint, World
 
 __all__ = [
     "FORMATS",
-    "MOST_TRIANGLES",
+    "MAX_TRIANGLES",
     "UNCOLOURED",
     "UP",
     "Piece",
     "merged",
     "mesh_world",
-    "one_number",
     "overview",
     "random_seabed",
     "read_pieces",
+    "reduce_colour",
     "reflectivity_of",
 ]
 
@@ -44,7 +44,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 UP = {"x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)), "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "z": np.eye(3)}
 """Rows of the rotation that turns each axis upwards; none of them mirrors."""
 
-MOST_TRIANGLES = 50_000_000
+MAX_TRIANGLES = 50_000_000
 """Largest number of triangles of a model, including all copies."""
 
 MAX_PIXELS = 2**26
@@ -97,7 +97,7 @@ def reflectivity_of(reflectivity: str | float) -> str | float:
     if not 0 <= number <= 1:
         raise MitsonarError(
             f"{argument('reflectivity')} must be red, luminance or a number 0..1: got {reflectivity!r}"
-            f"{meant(reflectivity, ('red', 'luminance'))}"
+            f"{did_you_mean(reflectivity, ('red', 'luminance'))}"
         )
     return number
 
@@ -199,8 +199,8 @@ def _check_copies(scene: trimesh.Scene) -> None:
             picture = getattr(material, name, None)
             if picture is not None and picture.width * picture.height > MAX_PIXELS:
                 raise ValueError(f"a picture has {picture.width:,} x {picture.height:,} pixels, more than {MAX_PIXELS:,}")
-    if total > MOST_TRIANGLES:
-        raise ValueError(f"it places {total:,} triangles, more than {MOST_TRIANGLES:,}")
+    if total > MAX_TRIANGLES:
+        raise ValueError(f"it places {total:,} triangles, more than {MAX_TRIANGLES:,}")
 
 
 def _piece(geometry: trimesh.Trimesh, value: str | float) -> Piece:
@@ -221,8 +221,8 @@ def _piece(geometry: trimesh.Trimesh, value: str | float) -> Piece:
     if visual.kind is None:
         return Piece(vertices, faces, np.full(len(faces), UNCOLOURED))
     if visual.kind == "vertex":
-        return Piece(vertices, faces, one_number(_colours(visual.vertex_colors), value)[faces].mean(axis=1))
-    return Piece(vertices, faces, one_number(_colours(visual.face_colors), value))
+        return Piece(vertices, faces, reduce_colour(_colours(visual.vertex_colors), value)[faces].mean(axis=1))
+    return Piece(vertices, faces, reduce_colour(_colours(visual.face_colors), value))
 
 
 def _tint(material: trimesh.visual.material.Material, value: str) -> float:
@@ -233,7 +233,7 @@ def _tint(material: trimesh.visual.material.Material, value: str) -> float:
         return float(colour[0] if value == "red" else colour @ LUMINANCE)
     if getattr(material, "image", None) is not None:
         return 1.0
-    return float(one_number(_colours(material.main_color), value)[0])
+    return float(reduce_colour(_colours(material.main_color), value)[0])
 
 
 def _colours(values: ArrayLike) -> NDArray[np.float64]:
@@ -243,7 +243,7 @@ def _colours(values: ArrayLike) -> NDArray[np.float64]:
     return np.clip(table[:, :3].astype(float) / scale, 0, 1)
 
 
-def one_number(colours: NDArray[np.float64], value: str) -> NDArray[np.float64]:
+def reduce_colour(colours: NDArray[np.float64], value: str) -> NDArray[np.float64]:
     """Reduce stored sRGB colours ``(..., 3)`` to one number each: the red channel, or the luminance of linear light."""
     if value == "red":
         return colours[..., 0]
@@ -253,7 +253,7 @@ def one_number(colours: NDArray[np.float64], value: str) -> NDArray[np.float64]:
 
 def _grey_png(picture: Image.Image, value: str, factor: float) -> bytes:
     """Return the reflectivity of a picture, times ``factor``, as a 16-bit grey PNG."""
-    grey = one_number(_colours(np.asarray(picture.convert("RGB")).reshape(-1, 3)), value) * factor
+    grey = reduce_colour(_colours(np.asarray(picture.convert("RGB")).reshape(-1, 3)), value) * factor
     pixels = np.rint(grey * 65535).astype(np.uint16).reshape(picture.height, picture.width)
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="PNG")
@@ -362,7 +362,7 @@ def _check_options(up: str, scale: float, floor_m: float | None) -> None:
         MitsonarError: an option is not allowed.
     """
     if up not in UP:
-        raise MitsonarError(f"{argument('up')} must be x, y or z: got {up!r}{meant(up, UP)}")
+        raise MitsonarError(f"{argument('up')} must be x, y or z: got {up!r}{did_you_mean(up, UP)}")
     if not (np.isfinite(scale) and scale > 0):
         raise MitsonarError(
             f"{argument('scale')} must be a finite number above 0, metres per unit of the file: got {scale:g}"

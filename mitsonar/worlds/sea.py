@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.files import write_whole
+from mitsonar.io.files import write_atomic
 from mitsonar.worlds.world import GRID_M, Family, Floor, Interval, Mesh, Standpoint, World, stream
 
 __all__ = [
@@ -198,7 +198,7 @@ def spreading(angle: NDArray[np.float64], exponent: float) -> NDArray[np.float64
 # ---------------- World ``sea-surface``
 
 
-MOST_TRIANGLES = 2_000_000
+MAX_TRIANGLES = 2_000_000
 """Largest number of triangles of a surface, the limit of mirrors in impulse responses."""
 
 MIN_STEPS = 8
@@ -262,10 +262,10 @@ class SeaSurface(Family):
             raise ValueError(
                 f"size_m must be at least {MIN_STEPS} step_m, {MIN_STEPS * self.step_m:g} m: got {self.size_m:g} m"
             )
-        if 2 * round(steps) ** 2 > MOST_TRIANGLES:
-            least = self.size_m / math.isqrt(MOST_TRIANGLES // 2)
+        if 2 * round(steps) ** 2 > MAX_TRIANGLES:
+            least = self.size_m / math.isqrt(MAX_TRIANGLES // 2)
             raise ValueError(
-                f"a surface has at most {MOST_TRIANGLES:,} triangles, and {self.size_m:g} m in steps of {self.step_m:g} m "
+                f"a surface has at most {MAX_TRIANGLES:,} triangles, and {self.size_m:g} m in steps of {self.step_m:g} m "
                 f"would have {2 * round(steps) ** 2:,}: give a step_m of at least {least:.2g} m, or a smaller size_m"
             )
         try:
@@ -313,7 +313,7 @@ class SeaSurface(Family):
             seed: seed of the waves.
             time_s: time of the surface [s]; default: that of the family.
         """
-        write_whole(path, self.surface(seed, time_s).ply())
+        write_atomic(path, self.surface(seed, time_s).ply())
 
     def surface(self, seed: int, time_s: float | None = None) -> Mesh:
         """Build the surface for a seed.

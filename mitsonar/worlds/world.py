@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from mitsonar.errors import MitsonarError, complaint
+from mitsonar.errors import MitsonarError, validation_message
 from mitsonar.io.checked_model import CheckedModel
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class Family(CheckedModel):
             MitsonarError: always; the message is the first of pydantic's complaints.
         """
         described = cls.described or f"`mitsonar world {cls.called} --help`"
-        raise MitsonarError(complaint(error, cls, cls.called, f" (see {described})")) from None
+        raise MitsonarError(validation_message(error, cls, cls.called, f" (see {described})")) from None
 
     def __str__(self) -> str:
         return repr(self)
@@ -105,7 +105,7 @@ class Family(CheckedModel):
         """Build the world for a seed; the same seed gives the same bytes."""
         raise NotImplementedError
 
-    def refuse_smaller(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+    def check_scene_extent(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Refuse a scene that is smaller than the square in which frames are taken; built worlds never are.
 
         Args:

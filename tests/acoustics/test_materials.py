@@ -22,7 +22,7 @@ from mitsonar.acoustics.materials import (
     Sediment,
     band_warning,
     depends_on_frequency,
-    hearing_notes,
+    frequency_notes,
     material,
     mirror_amplitude,
     mu_at,
@@ -403,15 +403,15 @@ def test_the_frequency_where_none_is_given() -> None:
 
 
 def test_what_users_are_told() -> None:
-    assert hearing_notes([material("steel"), Material(mu=0.1), TABULATED], 1e6) == []
-    assert hearing_notes([Material(mu=0.1), TABULATED], None) == []
-    (lacking,) = hearing_notes([material("sand")], None)
+    assert frequency_notes([material("steel"), Material(mu=0.1), TABULATED], 1e6) == []
+    assert frequency_notes([Material(mu=0.1), TABULATED], None) == []
+    (lacking,) = frequency_notes([material("sand")], None)
     assert "no frequency_hz" in lacking
     assert "31.62 kHz" in lacking
-    (outside,) = hearing_notes([material("sand")], 1e6)
+    (outside,) = frequency_notes([material("sand")], 1e6)
     assert "1,000 kHz is extrapolated" in outside
     loud = Material(name="loud", law="table", strength_db=(-30.0,) * 80 + (3.0,) * 11)
-    (clipped,) = hearing_notes([loud], 1e6)
+    (clipped,) = frequency_notes([loud], 1e6)
     assert "material loud" in clipped
     assert "from 80 to 90 deg" in clipped
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, special
 
-from mitsonar.acoustics.speckle import contrast, intensity_tail, patch_amplitudes, rician_information, score_shares
+from mitsonar.acoustics.speckle import contrast, intensity_tail, patch_amplitudes, rician_information, score_components
 
 
 @pytest.mark.parametrize("nu", [None, 0.5, 1.0, 2.0, 10.0])
@@ -74,7 +74,7 @@ def test_scores_of_cells_that_share_noise(q: float) -> None:
     echoes = np.sqrt(q), np.sqrt(q) * np.exp(1j * turned)
     scores = [score(np.abs(echo + noise), q, 1.0) for echo, noise in zip(echoes, (first, second), strict=True)]
     result = float(np.mean(scores[0] * scores[1]) / rician_information(q, 1.0))
-    part = score_shares(q, 1.0)
+    part = score_components(q, 1.0)
     expected = part.linear**2 * common * np.cos(turned) + (part.power**2 + part.double**2 * np.cos(2 * turned)) * common**2
     assert result == pytest.approx(float(expected), abs=0.01)
     assert 0.95 < float(part.linear**2 + part.power**2 + part.double**2) <= 1 + 1e-6

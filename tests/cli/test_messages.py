@@ -20,7 +20,7 @@ from drawn_frames import over_ground, sway
 from helpers import Command, essence, refused, run_python
 
 from mitsonar.cli.console import OPTIONS, answered, command_line, say_json
-from mitsonar.errors import MitsonarError, argument, meant
+from mitsonar.errors import MitsonarError, argument, did_you_mean
 from mitsonar.geometry.ground import attitude_of
 
 AMPHORA = Path(__file__).parents[1] / "scenes" / "meshes" / "amphora.ply"
@@ -164,9 +164,9 @@ def test_the_table_names_options_that_there_are() -> None:
 
 
 def test_a_name_that_is_near_none_is_not_guessed() -> None:
-    assert meant("quartz", ["none", "low", "high"]) == ""
-    assert meant("", ["none"]) == ""
-    assert meant("NONE", ["none"]) == "; did you mean none?"
+    assert did_you_mean("quartz", ["none", "low", "high"]) == ""
+    assert did_you_mean("", ["none"]) == ""
+    assert did_you_mean("NONE", ["none"]) == "; did you mean none?"
 
 
 # ---------------------------------------------------------------- commands that can be pasted

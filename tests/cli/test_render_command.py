@@ -259,7 +259,7 @@ def test_a_long_run_stays_zarr(scene: Path, tmp_path: Path, monkeypatch: pytest.
     simulator = Simulator(load_scene(scene))
     path = Trajectory(np.tile([0, 0, 2.5, np.radians(35), 0, 0], (5, 1)), np.arange(5.0))
     run(simulator, path, RenderOptions(NOISE_MODELS["none"]), Destination(tmp_path / "npz"))
-    monkeypatch.setattr(runs, "LONGEST_NPZ", 4)
+    monkeypatch.setattr(runs, "MAX_NPZ_FRAMES", 4)
     run(simulator, path, RenderOptions(NOISE_MODELS["none"]), Destination(tmp_path / "zarr"))
     assert not (tmp_path / "zarr" / "frames.npz").exists()
     np.testing.assert_array_equal(SonarFrames.load(tmp_path / "zarr").image, SonarFrames.load(tmp_path / "npz").image)

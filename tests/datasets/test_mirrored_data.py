@@ -13,7 +13,7 @@ from helpers import essence, impulse_recipe, tiny_recipe
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.config.data import Recipe
 from mitsonar.datasets.make import check, instrument_in, make_dataset
-from mitsonar.datasets.rendered import RenderedPairs, re_rendered
+from mitsonar.datasets.rendered import RenderedPairs, rerender
 from mitsonar.datasets.samples import SonarPairs
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
@@ -77,7 +77,7 @@ def test_re_rendering_and_bounds_use_the_mirrors_of_the_data_set(tmp_path: Path)
     url = str(tmp_path / "data.zarr")
     make_dataset(mirrored_recipe("physical"), url)
     pairs = SonarPairs(url, part="all", noise="none")
-    for number, frames in re_rendered(pairs, [0, 5]):
+    for number, frames in rerender(pairs, [0, 5]):
         np.testing.assert_array_equal(frames.image, pairs.sonar_frames(number).image)
     subject = subject_of_data(url, 1, part="all")
     noise = load_noise("low")
@@ -97,7 +97,9 @@ def test_re_rendering_and_bounds_use_the_mirrors_of_the_data_set(tmp_path: Path)
 
 def test_frames_that_are_rendered_in_training_have_mirrors() -> None:
     def sums(mirrors: object) -> float:
-        pairs = RenderedPairs(mirrored_recipe("physical", mirrors=mirrors), seed=1, gain=5e3, buffer=1, sequences_a_world=2)
+        pairs = RenderedPairs(
+            mirrored_recipe("physical", mirrors=mirrors), seed=1, gain=5e3, buffer=1, sequences_per_world=2
+        )
         return sum(float(image.sum()) for image, _ in itertools.islice(pairs, 2))
 
     assert sums(SURFACE) > 1.02 * sums(None)
@@ -118,7 +120,7 @@ def test_responses_are_those_of_the_simulator_with_mirrors(direct: bool, tmp_pat
     scene = store.scenes[0]
     path, _ = recipe.family(scene.group).prepare(scene.seed, tmp_path / "world")
     simulator = ChannelSimulator(load_scene(path), recipe.channel_sonar, mirrors={"surface": (-1.0, 1e-4)})
-    assert "surface-scatterer" in simulator.ways
+    assert "surface-scatterer" in simulator.kinds
     result = list(simulator.pings(store.read("pose"), store.read("velocity")))
     np.testing.assert_array_equal(store.read("response"), np.concatenate([part.response for part in result]))
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from helpers import Command, files_of, impulse_recipe, refused, run_python, tiny_recipe
 
-from mitsonar.acoustics.noise import snr_of
+from mitsonar.acoustics.noise import parse_snr
 from mitsonar.config.data import load_recipe, shipped_recipes
 from mitsonar.datasets.make import check, make_dataset
 from mitsonar.datasets.overview import info
 from mitsonar.datasets.plan import Plan, footprints_at, modality_of
-from mitsonar.datasets.responses import ImpulseSamples, Packing, displacement_labels, noise_power, packed, with_noise
+from mitsonar.datasets.responses import ImpulseSamples, Packing, displacement_labels, noise_power, pack_responses, with_noise
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.named import create_estimator
@@ -261,25 +261,25 @@ def test_packing_is_that_of_the_text() -> None:
     """5.2.5, column by column."""
     rng = np.random.default_rng(2)
     response = rng.normal(size=(5, 3, 2, 7)) + 1j * rng.normal(size=(5, 3, 2, 7))
-    matrix = packed(response)
+    matrix = pack_responses(response)
     assert matrix.shape == (5, 7, 2 * 2 * 3)
     for sample, receiver, ping in itertools.product(range(5), range(2), range(3)):
         unit = response[sample, ping, receiver] / np.abs(response[sample]).max()
         np.testing.assert_allclose(matrix[sample, :, 6 * receiver + ping], unit.real, rtol=1e-6)
         np.testing.assert_allclose(matrix[sample, :, 6 * receiver + 3 + ping], unit.imag, rtol=1e-6)
-    assert not packed(np.zeros((1, 2, 1, 4), complex)).any()
+    assert not pack_responses(np.zeros((1, 2, 1, 4), complex)).any()
 
 
 def test_samples_are_the_stored_pings(made: Path) -> None:
     samples = ImpulseSamples(made, part="all", labels="raw")
     assert len(samples) == 40
     for index in (0, 7, 39):
-        here = samples.frame_numbers(index)
+        here = samples.frame_slice(index)
         assert (here.start, here.stop) == (3 * index, 3 * index + 3)
         stored = samples.store.read("response", here)
         received = samples.responses(index)
         np.testing.assert_array_equal(received.response, stored)
-        np.testing.assert_array_equal(samples.matrix(index), packed(stored))
+        np.testing.assert_array_equal(samples.matrix(index), pack_responses(stored))
         assert received.poses is not None
         np.testing.assert_allclose(samples.target(index), motions(received.poses[[0, -1]])[0])
         np.testing.assert_allclose(received.time_s, [0, 0.025, 0.05])
@@ -320,11 +320,11 @@ def test_noise_has_the_ratio_that_is_said() -> None:
     assert abs((noise[0] * noise[1].conj()).mean()) < 0.01
     assert abs((noise[..., 1:] * noise[..., :-1].conj()).mean()) < 0.01
     assert with_noise(response, [5, 6], None, 1) is response
-    assert snr_of("12.5 dB") == 12.5
-    assert snr_of("none") is None
+    assert parse_snr("12.5 dB") == 12.5
+    assert parse_snr("none") is None
     for text in ("high", "12", "dB"):
         with pytest.raises(MitsonarError, match="'20 dB', or none: got"):
-            snr_of(text)
+            parse_snr(text)
 
 
 def test_noise_belongs_to_seed_and_ping(made: Path) -> None:
@@ -392,7 +392,7 @@ def test_estimators_are_compared_on_its_samples(mitsonar: Command, straight: Pat
     tables = json.loads((tmp_path / "out" / "table.json").read_text())["tables"]
     assert [table["noise"] for table in tables] == ["none", "20 dB"]
     for table in tables:
-        samples = ImpulseSamples(straight, part="all", noise=table["noise"], seed=3, one_a_sequence=True)
+        samples = ImpulseSamples(straight, part="all", noise=table["noise"], seed=3, one_per_sequence=True)
         answers = [create_estimator("correlation").estimate(samples.responses(k)) for k in range(len(samples))]
         output = np.array([one.motion[:2] if one.valid else (0, 0) for one in answers])
         expected = 1e3 * np.sqrt(((output - samples.targets()) ** 2).mean(axis=0))

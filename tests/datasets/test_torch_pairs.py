@@ -56,7 +56,7 @@ def test_a_sample_is_consecutive_frames_and_the_motion_between_them(made: Path) 
     image, pose = pairs.store.read("image"), pairs.store.read("pose")
     for index in range(0, len(pairs), 7):
         pixels, label = pairs[index]
-        first = pairs.frame_numbers(index).start
+        first = pairs.frame_slice(index).start
         assert pixels.dtype == label.dtype == torch.float32
         np.testing.assert_allclose(
             pixels[0].numpy(), np.hstack([image[first], image[first + 1]]) / np.float32(255), atol=1e-7
@@ -86,7 +86,7 @@ def test_samples_never_cross_from_one_sequence_to_the_next(made: Path) -> None:
     last = pairs.first + pairs.frames - 1
     np.testing.assert_array_equal(pairs.sequence[pairs.first], pairs.sequence[last])
     assert np.isfinite([pairs.target(index) for index in range(len(pairs))]).all()
-    one = SonarPairs(made, part="all", one_a_sequence=True)
+    one = SonarPairs(made, part="all", one_per_sequence=True)
     np.testing.assert_array_equal(one.sequence[one.first], np.arange(30))
     assert len(set(one.first % 5)) > 1  # not always the first pair
 
@@ -159,7 +159,7 @@ def test_noise_belongs_to_seed_epoch_and_frame(portions: Path, kind: str) -> Non
 def test_noise_on_stored_images_is_that_of_the_model(made: Path) -> None:
     noisy = SonarPairs(made, part="all", noise="high", layout="channels", seed=9)[20][0]
     plain = SonarPairs(made, part="all", layout="channels")
-    here = plain.frame_numbers(20)
+    here = plain.frame_slice(20)
     np.testing.assert_array_equal(noisy, HIGH.apply(plain[20][0].numpy(), seed=9, frames=np.arange(here.start, here.stop)))
 
 
@@ -188,7 +188,7 @@ def test_frames_for_estimators(made: Path) -> None:
     pairs = SonarPairs(made, part="all", noise="low", seed=2, layout="channels")
     frames = pairs.sonar_frames(17)
     np.testing.assert_array_equal(frames.image, pairs[17][0].numpy())
-    np.testing.assert_array_equal(frames.poses, pairs.store.read("pose")[pairs.frame_numbers(17)])
+    np.testing.assert_array_equal(frames.poses, pairs.store.read("pose")[pairs.frame_slice(17)])
     np.testing.assert_array_equal(frames.height_m, [2.5, 2.5])
     assert frames.sonar.beams == 12
 
@@ -223,7 +223,7 @@ def test_labels_quantised_and_in_ten() -> None:
 
 
 def frames_in(pairs: SonarPairs) -> set[int]:
-    return {number for index in range(len(pairs)) for number in range(*pairs.frame_numbers(index).indices(10**9))}
+    return {number for index in range(len(pairs)) for number in range(*pairs.frame_slice(index).indices(10**9))}
 
 
 @pytest.mark.parametrize("by", ["sequence", "scene"])
@@ -361,7 +361,7 @@ def test_rendered_samples_are_those_of_a_store_of_their_worlds(tmp_path: Path) -
     rendered = RenderedPairs(
         recipe,
         seed=5,
-        sequences_a_world=6,
+        sequences_per_world=6,
         buffer=1,
         length=48,
         gain=0.02,
@@ -389,7 +389,7 @@ def test_rendered_worlds_are_in_no_data_set_of_the_recipe(made: Path) -> None:
 
 def test_rendered_vectors_heights_and_epochs(variant: str) -> None:
     recipe = tiny_recipe(**DOWN, segments=["q1", "q3"], store="vectors", flight__height_m=[2.4, 2.6])
-    pairs = RenderedPairs(recipe, seed=1, length=12, sequences_a_world=3, buffer=4, gain=0.05, frames=1, noise="low")
+    pairs = RenderedPairs(recipe, seed=1, length=12, sequences_per_world=3, buffer=4, gain=0.05, frames=1, noise="low")
     first, again = list(pairs), list(pairs)
     assert all(torch.equal(a[0], b[0]) and torch.equal(a[1], b[1]) for a, b in zip(first, again, strict=True))
     assert len(first) == 12
@@ -403,7 +403,7 @@ def test_rendered_vectors_heights_and_epochs(variant: str) -> None:
 @pytest.mark.thorough
 def test_workers_render_worlds_of_their_own() -> None:
     """Two spawned workers share the epoch's length, and no sample is made twice."""
-    pairs = RenderedPairs(tiny_recipe(), seed=2, length=30, sequences_a_world=3, buffer=5, gain=0.02)
+    pairs = RenderedPairs(tiny_recipe(), seed=2, length=30, sequences_per_world=3, buffer=5, gain=0.02)
     batches = list(pairs.loader(5, workers=2))
     labels = torch.cat([label for _, label in batches])
     assert len(labels) == 30

@@ -25,7 +25,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
 ]
 
-from mitsonar.datasets.rendered import re_rendered  # noqa: E402
+from mitsonar.datasets.rendered import rerender  # noqa: E402
 from mitsonar.datasets.samples import SonarPairs  # noqa: E402
 from mitsonar.estimation.compare import (  # noqa: E402  # noqa: E402
     VARIATIONS,
@@ -64,7 +64,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pairs(made: Path) -> SonarPairs:
-    return SonarPairs(made, part="all", frames=2, one_a_sequence=True, noise="low")
+    return SonarPairs(made, part="all", frames=2, one_per_sequence=True, noise="low")
 
 
 class Oracle:
@@ -175,7 +175,7 @@ def test_a_network_gets_the_input_of_its_training(pairs: SonarPairs) -> None:
 def test_rendered_again_unchanged_is_what_is_stored(pairs: SonarPairs) -> None:
     """World, gain, jitter, noise: bit for bit."""
     numbers = [1, 5, 9]
-    seen = dict(re_rendered(pairs, numbers))
+    seen = dict(rerender(pairs, numbers))
     assert sorted(seen) == numbers
     for number, frames in seen.items():
         assert (frames.image == pairs.sonar_frames(number).image).all()
@@ -202,7 +202,7 @@ def test_a_prior_shrinks_what_is_unsure_and_leaves_what_is_sure() -> None:
 @pytest.mark.thorough
 def test_limits_are_below_what_is_reached(pairs: SonarPairs) -> None:
     """The bound by the rays' own noise at high noise is positive, and below direct's errors."""
-    loud = SonarPairs(pairs.store.place.url, part="all", frames=2, one_a_sequence=True, noise="high")
+    loud = SonarPairs(pairs.store.place.url, part="all", frames=2, one_per_sequence=True, noise="high")
     result = bounds_of_pairs(loud, [6], NOISE_MODELS["high"])
     assert (result["pixel"] > 0).all()
     assert (result["pixel"] < result["gaussian"]).all()

@@ -24,7 +24,7 @@ from mitsonar.geometry.ground import (
     GroundGeometry,
     attitude_of,
     echo_heights,
-    margin_of_light,
+    lit_margin,
     moved,
 )
 from mitsonar.instruments.beams import half_power
@@ -153,8 +153,8 @@ def test_a_height_beyond_both_ends_of_rising_ground_is_told(given_m: float | Non
 def test_unknown_heave_pitch_and_roll_widen_by_what_they_look_like(axis: int, change: float) -> None:
     """Frames that heave, pitch or roll, registered as if they did not: the error is the one that the covariance expects.
 
-    :meth:`GroundGeometry.motions_of_lean` tells that of heave and pitch; sideways and yaw share that of a roll as frames'
-    contrast decides. Pitch hardly shows, since it leaves ranges as they are, nor a roll where bearings are azimuths.
+    :meth:`GroundGeometry.motion_per_attitude` has that of heave and pitch; sideways and yaw share that of a roll by the
+    contrast of the frames. Pitch hardly shows, since it leaves ranges as they are, nor a roll where bearings are azimuths.
     """
     poses = np.tile([0.0, 0.0, 2.5, np.radians(35), 0.0, 0.0], (2, 1))
     poses[1, axis] += change
@@ -171,7 +171,8 @@ def test_unknown_heave_pitch_and_roll_widen_by_what_they_look_like(axis: int, ch
     if axis != 4:
         attitude = attitude_of(replace(frames, poses=blind), "a test", None, None)
         seen = (
-            attitude.ground(frames).motions_of_lean(12, np.radians(frames.sonar.elevation_fov_deg) / 2)[:, axis - 2] * change
+            attitude.ground(frames).motion_per_attitude(12, np.radians(frames.sonar.elevation_fov_deg) / 2)[:, axis - 2]
+            * change
         )
         np.testing.assert_allclose(error, seen, atol=0.25 * np.abs(seen).max() + 2e-4)
     assert error @ np.linalg.solve(unknown.covariance, error) < 2
@@ -182,7 +183,7 @@ def test_unknown_heave_pitch_and_roll_widen_by_what_they_look_like(axis: int, ch
 def test_heave_looks_like_a_step_along_the_grazing_ray() -> None:
     """Of a single range and a single beam, in closed form: d forward = -h / x d height."""
     narrow = GroundGeometry(np.array([4.0, 4.001]), np.array([-1e-6, 1e-6]), "azimuth", 2.4, np.radians(35))
-    seen = narrow.motions_of_lean(2, np.radians(7))
+    seen = narrow.motion_per_attitude(2, np.radians(7))
     assert seen[1, 0] == pytest.approx(-2.4 / 3.2, rel=1e-3)
 
 
@@ -346,7 +347,7 @@ def grazing(given_m: float | None = None, height_m: float = 0.32) -> tuple[Groun
 
 
 def first_lit_m(ground: GroundGeometry, attitude: Attitude) -> float:
-    margin = margin_of_light(ground, attitude, FOV_DEG)
+    margin = lit_margin(ground, attitude, FOV_DEG)
     assert margin is not None
     return float(ground.range_m[(margin[:, 0] > 0).argmax()])
 
@@ -354,7 +355,7 @@ def first_lit_m(ground: GroundGeometry, attitude: Attitude) -> float:
 def test_light_begins_where_the_steepest_rays_meet_the_ground() -> None:
     """The margin is 1 less the angle off the axis, as part of 0.9 of the half field of view."""
     ground, attitude = grazing()
-    margin = margin_of_light(ground, attitude, FOV_DEG)
+    margin = lit_margin(ground, attitude, FOV_DEG)
     assert margin is not None
     off_axis_deg = np.abs(np.degrees(np.arcsin(0.32 / ground.range_m)) - 4)
     np.testing.assert_allclose(margin[:, 0], 1 - off_axis_deg / 6.3, atol=1e-9)
@@ -374,12 +375,12 @@ def test_rocks_keep_the_outline_even_ground_and_dark_windows_do_not() -> None:
     """From 2.5 m, pitch 35 deg: 0.65 of the window 3.2 to 5.6 m is lit."""
     attitude = Attitude(2.5, 0.05, np.radians(35))
     ground = GroundGeometry(np.linspace(3.2, 5.6, 97), np.zeros(1), "azimuth", 2.5, attitude.pitch_rad)
-    assert margin_of_light(ground, attitude, FOV_DEG) is None
+    assert lit_margin(ground, attitude, FOV_DEG) is None
     even = Attitude(2.5, 0.05, np.radians(35), even=True)
-    assert margin_of_light(ground, even, FOV_DEG) is not None
+    assert lit_margin(ground, even, FOV_DEG) is not None
     wide = GroundGeometry(np.linspace(3.2, 12.0, 97), np.zeros(1), "azimuth", 2.5, attitude.pitch_rad)
-    assert margin_of_light(wide, attitude, FOV_DEG) is not None
-    assert margin_of_light(wide, attitude, FOV_DEG, mostly=0.0) is None
+    assert lit_margin(wide, attitude, FOV_DEG) is not None
+    assert lit_margin(wide, attitude, FOV_DEG, mostly=0.0) is None
 
 
 # ---------------------------------------------------------------- heights by the ends of the light: closed forms of planes

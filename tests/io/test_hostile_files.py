@@ -49,7 +49,7 @@ from zarr.registry import register_codec
 import mitsonar
 from mitsonar.acoustics.materials import material
 from mitsonar.bridges.model_import import imported_world
-from mitsonar.errors import MitsonarError, MitsonarWarning, shortened
+from mitsonar.errors import MitsonarError, MitsonarWarning, short_repr
 from mitsonar.io.storage import refuse_codecs
 from mitsonar.records.frames import SonarFrames
 from mitsonar.records.responses import ImpulseResponses
@@ -812,7 +812,7 @@ LONG = "long" * 2000
         *(("world.family", LONG), ("receivers", [{"name": f"{LONG} "}]), ("segments", [LONG]), ("sonar.quality", LONG)),
         *((f"sonar.{LONG}", 1), (f"flight.{LONG}", 1), (f"world.{LONG}", 1), ("sonar.preset", LONG)),
     ],
-    ids=lambda value: shortened(value)[:20],
+    ids=lambda value: short_repr(value)[:20],
 )
 def test_long_words_of_a_recipe_are_cut(key: str, value: Any) -> None:
     """A refusal repeated a stranger's word whole."""
@@ -860,7 +860,7 @@ def test_a_device_that_never_ends() -> None:
     assert "larger than" in refusal(lambda: read_yaml("/dev/zero", "recipe"))
 
 
-@pytest.mark.parametrize("value", ["3", 3.0, True, None, [3], 2**63, 10**5000, float("nan"), -1], ids=shortened)
+@pytest.mark.parametrize("value", ["3", 3.0, True, None, [3], 2**63, 10**5000, float("nan"), -1], ids=short_repr)
 def test_what_is_no_count_is_refused(value: Any) -> None:
     from mitsonar.io.files import whole_number
 
@@ -871,7 +871,7 @@ def test_what_is_no_count_is_refused(value: Any) -> None:
 NO_NUMBERS: list[Any] = ["3", True, None, [3.0], float("nan"), float("inf"), -float("inf"), 10**400, -(10**5000)]
 
 
-@pytest.mark.parametrize("value", NO_NUMBERS, ids=shortened)
+@pytest.mark.parametrize("value", NO_NUMBERS, ids=short_repr)
 def test_what_is_no_finite_number_is_refused(value: Any) -> None:
     from mitsonar.io.files import finite_number
 

@@ -21,12 +21,12 @@ from mitsonar.io.runs import (
     RUN_FILE,
     RunDirectory,
     RunKind,
+    changed_versions,
+    check_same_settings,
     differences,
     digest,
     file_digest,
     json_digest,
-    other_versions,
-    refuse_other,
     refuse_to_replace,
     versions,
 )
@@ -271,7 +271,7 @@ def test_differences_name_both_values() -> None:
     with pytest.raises(
         MitsonarError, match=r"^here was begun with a 0, not 1; .*; and 2 more: request the same settings \(so\), or"
     ):
-        refuse_other("here", dict.fromkeys("abcdef", 0), dict.fromkeys("abcdef", 1), " (so)")
+        check_same_settings("here", dict.fromkeys("abcdef", 0), dict.fromkeys("abcdef", 1), " (so)")
 
 
 def test_digests_are_of_contents(tmp_path: Path) -> None:
@@ -282,8 +282,8 @@ def test_digests_are_of_contents(tmp_path: Path) -> None:
 
 
 def test_versions_that_differ_are_named() -> None:
-    assert other_versions(versions(["numpy"]), ["numpy"]) == []
-    assert other_versions({"numpy": "1.0"}, ["numpy"]) == [f"numpy 1.0 (now {np.__version__})"]
+    assert changed_versions(versions(["numpy"]), ["numpy"]) == []
+    assert changed_versions({"numpy": "1.0"}, ["numpy"]) == [f"numpy 1.0 (now {np.__version__})"]
 
 
 def test_files_are_replaced_only_where_that_was_asked_for(tmp_path: Path) -> None:

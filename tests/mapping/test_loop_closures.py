@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.mapping.loops import Canvas, likenesses
+from mitsonar.mapping.loops import Canvas, match_views
 from mitsonar.mapping.odometry import Odometry, OdometryOptions, odometry
 from mitsonar.mapping.odometry_run import run_odometry
 from mitsonar.mapping.pose_graph import PoseEdges
@@ -90,11 +90,11 @@ def test_the_most_alike_shift_is_the_motion() -> None:
     assert views[0] is not None
     assert views[1] is not None
     turns = np.radians(np.arange(-12, 13, 3.0))
-    best = likenesses(views[0], views[1], turns, np.zeros(2), np.full(2, 1.0))[0]
+    best = match_views(views[0], views[1], turns, np.zeros(2), np.full(2, 1.0))[0]
     assert best.correlation > 0.6
     np.testing.assert_allclose(best.motion[:2], moved[:2], atol=canvas.view.edge)
     assert best.motion[2] == pytest.approx(moved[2], abs=np.radians(3))
-    exact = likenesses(views[0], views[0], np.zeros(1), np.zeros(2), np.full(2, 1.0))[0]
+    exact = match_views(views[0], views[0], np.zeros(1), np.zeros(2), np.full(2, 1.0))[0]
     assert exact.correlation == pytest.approx(1, abs=1e-3)
     np.testing.assert_allclose(exact.motion, 0, atol=1e-6)
 
@@ -158,7 +158,7 @@ def test_places_beyond_the_path_s_covariance_are_not_taken_for_one_another() -> 
     first, second = (canvas.draw(again.select(slice(k, k + 1))) for k in range(2))
     assert first is not None
     assert second is not None
-    assert likenesses(first, second, np.zeros(1), np.zeros(2), np.full(2, 0.3))[0].correlation > 0.95
+    assert match_views(first, second, np.zeros(1), np.zeros(2), np.full(2, 0.3))[0].correlation > 0.95
     result = odometry(frames, Drifting(path, period=14.0), LOOPS)
     assert result.graph is not None
     assert len(kept_loops(result).first) == 0

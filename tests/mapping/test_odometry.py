@@ -367,7 +367,7 @@ def test_what_cannot_be_driven_is_said(change: str, options: dict[str, Any], mes
 # ---------------------------------------------------------------- sources
 
 
-def counted(source: FrameSource) -> tuple[FrameSource, list[int]]:
+def count_noun(source: FrameSource) -> tuple[FrameSource, list[int]]:
     """A source that writes down how many frames are asked for."""
     sizes: list[int] = []
 
@@ -380,12 +380,12 @@ def counted(source: FrameSource) -> tuple[FrameSource, list[int]]:
 
 def test_few_frames_are_in_memory_at_a_time() -> None:
     path = sway(100)
-    source, sizes = counted(FrameSource.of(numbered(path)))
+    source, sizes = count_noun(FrameSource.of(numbered(path)))
     estimate_motions(source, Told(path.poses), np.arange(100))
     assert max(sizes) == PAIRS_A_BATCH + 1
     assert sum(sizes) < 100 + 100 / PAIRS_A_BATCH + 1
     big = replace(FrameSource.of(over_ground(sway(2))), time_s=np.arange(5000.0))
-    assert big.frames_a_chunk * SONAR.range_bins * SONAR.beams * 4 <= 8 * 2**20
+    assert big.frames_per_chunk * SONAR.range_bins * SONAR.beams * 4 <= 8 * 2**20
 
 
 def test_frames_are_the_same_wherever_they_lie(tmp_path: Path) -> None:

@@ -94,11 +94,11 @@ def test_angles_are_those_of_the_rotation(frame: str) -> None:
     convention = CONVENTIONS[frame]
     angles = random_poses(50)[:, 3:]
     theirs = Rotation.from_euler("ZYX", angles[:, [2, 0, 1]])
-    ours = np.column_stack([np.zeros((50, 3)), convention.angles_to_ours(angles)])
-    _, rotation = convention.to_ours(np.zeros((50, 3)), theirs)
+    ours = np.column_stack([np.zeros((50, 3)), convention.angles_to_mitsonar(angles)])
+    _, rotation = convention.to_mitsonar(np.zeros((50, 3)), theirs)
     expected = np.stack([np.array(axes(Pose(*row))).T for row in ours])
     np.testing.assert_allclose(rotation.as_matrix(), expected, atol=1e-12)
-    np.testing.assert_allclose(convention.angles_from_ours(ours[:, 3:]), angles, atol=1e-12)
+    np.testing.assert_allclose(convention.angles_from_mitsonar(ours[:, 3:]), angles, atol=1e-12)
 
 
 def test_the_case_that_was_misread(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_path_read_wrongly_is_warned_of(tmp_path: Path, pitch: float, written:
     poses = [Pose(k * np.sin(heading), k * np.cos(heading), 3, np.radians(pitch), 0.01, heading) for k in range(6)]
     path = tmp_path / "path.csv"
     rotation = Rotation.from_matrix([np.array(axes(pose)).T for pose in poses])
-    position, rotation = CONVENTIONS[written].from_ours(np.array(poses)[:, :3], rotation)
+    position, rotation = CONVENTIONS[written].from_mitsonar(np.array(poses)[:, :3], rotation)
     names = "time,x,y,z,qx,qy,qz,qw"
     np.savetxt(path, np.column_stack([np.arange(6), position, rotation.as_quat()]), delimiter=",", header=names, comments="")
     seen = bool(warned(path, read))

@@ -119,7 +119,7 @@ def test_only_our_networks_and_plain_values(checkpoint: Checkpoint) -> None:
 # ---------------------------------------------------------------- hostile files
 
 
-def packed(table: object) -> bytes:
+def pack_responses(table: object) -> bytes:
     buffer = io.BytesIO()
     torch.save(table, buffer)
     return buffer.getvalue()
@@ -147,7 +147,11 @@ class Evil:
 
 def test_nothing_in_a_file_is_executed(checkpoint: Checkpoint, tmp_path: Path) -> None:
     trap = tmp_path / "sprung"
-    contents = [packed(Evil(trap)), packed({**unpacked(checkpoint), "trained": Evil(trap)}), pickle.dumps(Evil(trap))]
+    contents = [
+        pack_responses(Evil(trap)),
+        pack_responses({**unpacked(checkpoint), "trained": Evil(trap)}),
+        pickle.dumps(Evil(trap)),
+    ]
     for content in contents:
         assert "that.ckpt" in refusal(content)
     assert not trap.exists()
@@ -164,10 +168,10 @@ def test_files_that_are_no_checkpoints(checkpoint: Checkpoint, tmp_path: Path) -
         assert "cut off" in refusal(whole[:end])
     at = whole.index(checkpoint.weights["regression.weight"].numpy().tobytes())
     assert "checksum" in refusal(whole[: at + 5] + bytes([whole[at + 5] ^ 1]) + whole[at + 6 :])
-    assert "something else" in refusal(packed({"state": torch.zeros(3)}))
-    assert "something else" in refusal(packed([1, 2]))
-    assert "that.ckpt is damaged" in refusal(packed(torch.nn.Linear(1, 1)))
-    assert "--resume" in refusal(packed({"pytorch-lightning_version": "2.6", "state_dict": {}}))
+    assert "something else" in refusal(pack_responses({"state": torch.zeros(3)}))
+    assert "something else" in refusal(pack_responses([1, 2]))
+    assert "that.ckpt is damaged" in refusal(pack_responses(torch.nn.Linear(1, 1)))
+    assert "--resume" in refusal(pack_responses({"pytorch-lightning_version": "2.6", "state_dict": {}}))
     locator = b"PK\x06\x07" + struct.pack("<LQL", 0, 0, 2)  # the end's place, on the first of two disks
     assert "that.ckpt" in refusal(whole[:-22] + locator + whole[-22:])
     foreign = io.BytesIO()
@@ -181,7 +185,7 @@ def test_files_that_are_no_checkpoints(checkpoint: Checkpoint, tmp_path: Path) -
 
 
 def test_a_later_format_is_named(checkpoint: Checkpoint) -> None:
-    output = refusal(packed({**unpacked(checkpoint), "format": 7, "version": "3.2.1", "news": 1}))
+    output = refusal(pack_responses({**unpacked(checkpoint), "format": 7, "version": "3.2.1", "news": 1}))
     assert "format 7" in output
     assert "mitsonar 3.2.1" in output
     assert "use the version that wrote it" in output
@@ -215,7 +219,7 @@ def test_a_later_format_is_named(checkpoint: Checkpoint) -> None:
     ],
 )
 def test_fields_are_checked(checkpoint: Checkpoint, change: dict[str, Any], words: str) -> None:
-    assert words in refusal(packed({**unpacked(checkpoint), **change}))
+    assert words in refusal(pack_responses({**unpacked(checkpoint), **change}))
 
 
 @pytest.mark.parametrize("change", ["format", "version", "options", "width", "size", "labels", "sonar", "more"])
@@ -238,25 +242,29 @@ def test_long_words_are_cut(checkpoint: Checkpoint, change: str) -> None:
         case _:
             table[long] = 1
     with pytest.raises(MitsonarError) as caught:
-        Checkpoint.from_bytes(packed(table)).build()
+        Checkpoint.from_bytes(pack_responses(table)).build()
     assert len(str(caught.value)) < 1000
 
 
 def test_fields_that_lack(checkpoint: Checkpoint) -> None:
     table = unpacked(checkpoint)
     for name in ("weights", "labels", "data_recipe"):
-        assert f"checkpoint lacks {name}" in refusal(packed({key: value for key, value in table.items() if key != name}))
+        assert f"checkpoint lacks {name}" in refusal(
+            pack_responses({key: value for key, value in table.items() if key != name})
+        )
 
 
 def test_weights_and_options_must_fit_the_network(checkpoint: Checkpoint) -> None:
     table = unpacked(checkpoint)
-    assert "unknown network 'posenot': did you mean posenet" in refusal(packed({**table, "network": "posenot"}))
-    assert "unknown option 'depth'" in refusal(packed({**table, "options": {"depth": 4}}))
-    assert "do not fit a posenet" in refusal(packed({**table, "options": {**table["options"], "width": 1 / 8}}))
-    assert "do not fit a posenet" in refusal(packed({**table, "weights": {}}))
+    assert "unknown network 'posenot': did you mean posenet" in refusal(pack_responses({**table, "network": "posenot"}))
+    assert "unknown option 'depth'" in refusal(pack_responses({**table, "options": {"depth": 4}}))
+    assert "do not fit a posenet" in refusal(pack_responses({**table, "options": {**table["options"], "width": 1 / 8}}))
+    assert "do not fit a posenet" in refusal(pack_responses({**table, "weights": {}}))
     less = {name: values for name, values in table["weights"].items() if name != "regression.bias"}
-    assert "regression.bias" in refusal(packed({**table, "weights": less}))
-    assert "no posenet has these options" in refusal(packed({**table, "options": {**table["options"], "width": 1e30}}))
+    assert "regression.bias" in refusal(pack_responses({**table, "weights": less}))
+    assert "no posenet has these options" in refusal(
+        pack_responses({**table, "options": {**table["options"], "width": 1e30}})
+    )
 
 
 def test_files_of_before_vectors_had_words_are_read(checkpoint: Checkpoint) -> None:

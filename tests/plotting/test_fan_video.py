@@ -10,7 +10,7 @@ import pytest
 from drawn_frames import over_ground, sway
 
 from mitsonar import MitsonarError
-from mitsonar.plotting.fans import coded_in_decibels, write_fan_video
+from mitsonar.plotting.fans import to_decibels, write_fan_video
 
 cv2 = pytest.importorskip("cv2")
 
@@ -63,12 +63,12 @@ def test_values_of_each_coding_become_decibels(level: str, value: float, decibel
     frames = over_ground(sway(3))
     sonar = frames.sonar.replace(coding_db=80.0, coding_gamma=0.5)
     frames = replace(frames, image=np.full_like(frames.image, value), level=level, sonar=sonar)
-    shown = coded_in_decibels(frames, 60)
+    shown = to_decibels(frames, 60)
     assert (shown.level, shown.sonar.coding_db) == ("dB", 60)
     assert shown.image == pytest.approx(0 if decibels is None else 1 + decibels / 60, abs=1e-6)
-    assert coded_in_decibels(replace(frames, image=np.zeros_like(frames.image)), 60).image.max() == 0
+    assert to_decibels(replace(frames, image=np.zeros_like(frames.image)), 60).image.max() == 0
 
 
 def test_a_span_that_cannot_be_is_refused() -> None:
     with pytest.raises(MitsonarError, match="the span must lie in"):
-        coded_in_decibels(over_ground(sway(3)), 0)
+        to_decibels(over_ground(sway(3)), 0)

@@ -62,7 +62,7 @@ def test_a_stopped_copy_goes_on_and_gives_the_same(
     frames: SonarFrames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, longest_npz: int
 ) -> None:
     monkeypatch.setattr(pictures, "CHUNK_BYTES", 2 * frames.image[0].nbytes)
-    monkeypatch.setattr(pictures, "LONGEST_NPZ", longest_npz)
+    monkeypatch.setattr(pictures, "MAX_NPZ_FRAMES", longest_npz)
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         write_frames(of(frames, stops_at=5), None, folder)

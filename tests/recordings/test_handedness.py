@@ -11,7 +11,7 @@ from drawn_frames import START, over_ground, sway
 
 from mitsonar import MitsonarError, Pose, Simulator, Trajectory, load_scene, load_sonar, open_recording
 from mitsonar.mapping.series import path_of
-from mitsonar.recordings.handedness import handedness_of
+from mitsonar.recordings.handedness import check_handedness
 from mitsonar.recordings.recording import Part
 from mitsonar.records.frames import SonarFrames
 
@@ -23,10 +23,10 @@ with_samples = pytest.mark.skipif(not REAL.exists(), reason="needs the recording
 def part_of(frames: SonarFrames, *, mirrored: bool = False) -> Part:
     """Frames as a part of a recording, whose pictures may be mirrored while its poses are not."""
     image = frames.image[:, :, ::-1] if mirrored else frames.image
-    return Part(like_of(frames), frames.time_s, image.__getitem__, poses=frames.poses)
+    return Part(empty_aris_frames(frames), frames.time_s, image.__getitem__, poses=frames.poses)
 
 
-def like_of(frames: SonarFrames) -> SonarFrames:
+def empty_aris_frames(frames: SonarFrames) -> SonarFrames:
     """Frames without images, and without what is of each frame."""
     return replace(frames.select(slice(0)), poses=None, height_m=None, about={})
 
@@ -39,7 +39,7 @@ def turning(frames: int, rate_deg: float, sideways: float = 0.0) -> Trajectory:
 
 @pytest.mark.parametrize(("mirrored", "verdict", "sign"), [(False, "agree", 1), (True, "mirrored", -1)])
 def test_drawn_frames_of_a_path_that_sways(mirrored: bool, verdict: str, sign: int) -> None:
-    result = handedness_of(part_of(over_ground(sway(60)), mirrored=mirrored))
+    result = check_handedness(part_of(over_ground(sway(60)), mirrored=mirrored))
     assert result.verdict == verdict
     assert result.correlation * sign > 0.9
     assert 0.6 < result.slope * sign < 1.2
@@ -50,10 +50,10 @@ def test_drawn_frames_of_a_path_that_sways(mirrored: bool, verdict: str, sign: i
 def test_an_even_turn_that_the_user_tells(rate_deg: float, mirrored: bool) -> None:
     part = replace(part_of(over_ground(turning(30, rate_deg)), mirrored=mirrored), poses=None)
     message = np.radians(rate_deg * 29)
-    assert handedness_of(part, message).verdict == ("mirrored" if mirrored else "agree")
-    assert handedness_of(part, -message).verdict == ("agree" if mirrored else "mirrored")
-    assert handedness_of(part).verdict == "unknown"
-    assert "the headings are unknown" in handedness_of(part).reason
+    assert check_handedness(part, message).verdict == ("mirrored" if mirrored else "agree")
+    assert check_handedness(part, -message).verdict == ("agree" if mirrored else "mirrored")
+    assert check_handedness(part).verdict == "unknown"
+    assert "the headings are unknown" in check_handedness(part).reason
 
 
 def test_headings_beyond_north_wrap() -> None:
@@ -61,7 +61,7 @@ def test_headings_beyond_north_wrap() -> None:
     poses = path.poses.copy()
     poses[:, 5] = (poses[:, 5] - poses[15, 5]) % (2 * np.pi)
     part = part_of(replace(over_ground(path), poses=poses))
-    assert handedness_of(part).verdict == "agree"
+    assert check_handedness(part).verdict == "agree"
 
 
 def test_uneven_bearings_and_pictures_in_db() -> None:
@@ -72,17 +72,17 @@ def test_uneven_bearings_and_pictures_in_db() -> None:
     coded = (1 + np.log10(np.clip(image, 1e-4, 1)) / 4).astype(np.float32)
     sonar = frames.sonar.replace(coding="dB", coding_db=40, pattern="two_way")
     changed = replace(frames, image=coded, bearing_rad=uneven, sonar=sonar, level="dB")
-    assert handedness_of(part_of(changed)).verdict == "agree"
-    assert handedness_of(part_of(changed, mirrored=True)).verdict == "mirrored"
+    assert check_handedness(part_of(changed)).verdict == "agree"
+    assert check_handedness(part_of(changed, mirrored=True)).verdict == "mirrored"
 
 
 def test_pictures_that_do_not_turn_tell_nothing() -> None:
     straight = over_ground(turning(40, 0.0))
-    result = handedness_of(part_of(straight))
+    result = check_handedness(part_of(straight))
     assert (result.verdict, result.pairs) == ("unknown", 0)
     assert "turn by" in result.reason
     noise = np.random.default_rng(5).normal(0, np.radians(1), 40)  # a compass that trembles on a sonar that does not
-    result = handedness_of(replace(part_of(straight), poses=None), noise)
+    result = check_handedness(replace(part_of(straight), poses=None), noise)
     assert result.verdict == "unknown"
     assert abs(result.correlation) < 0.4 or result.pairs < 60
 
@@ -93,18 +93,18 @@ def test_pictures_of_noise_alone_tell_nothing() -> None:
     verdicts = []
     for _ in range(6):
         image = rng.random((80, 32, 96)).astype(np.float32)
-        like = like_of(over_ground(turning(2, 0.0)))
+        like = empty_aris_frames(over_ground(turning(2, 0.0)))
         like = replace(like, image=np.zeros((0, 32, 96), np.float32), range_m=like.range_m[:32])
-        verdicts.append(handedness_of(Part(like, np.arange(80.0), image.__getitem__), heading).verdict)
+        verdicts.append(check_handedness(Part(like, np.arange(80.0), image.__getitem__), heading).verdict)
     assert verdicts == ["unknown"] * 6
 
 
 def test_headings_must_be_one_a_frame() -> None:
     part = part_of(over_ground(turning(10, 0.5)))
     with pytest.raises(MitsonarError, match="one for each of 10 frames"):
-        handedness_of(part, [0.0, 0.1])
+        check_handedness(part, [0.0, 0.1])
     with pytest.raises(MitsonarError, match="one finite number"):
-        handedness_of(part, np.full(10, np.nan))
+        check_handedness(part, np.full(10, np.nan))
 
 
 @pytest.mark.thorough
@@ -113,8 +113,8 @@ def test_simulated_frames_of_a_real_sonar() -> None:
     sonar = load_sonar("didson300").replace(range_bins=128)
     path = [Pose(0.02 * k, 0.05 * k, 2.5, np.radians(35), 0, np.radians(0.9 * k)) for k in range(16)]
     frames = Simulator(load_scene("objects"), sonar).render(path)
-    assert handedness_of(part_of(frames)).verdict == "agree"
-    assert handedness_of(part_of(frames, mirrored=True)).verdict == "mirrored"
+    assert check_handedness(part_of(frames)).verdict == "agree"
+    assert check_handedness(part_of(frames, mirrored=True)).verdict == "mirrored"
 
 
 @with_samples
@@ -128,8 +128,8 @@ def test_real_fans_turn_as_their_registration_says(name: str) -> None:
     path = REAL / f"marine-debris-aris3000/{name}.npz"
     heading = np.concatenate([[0], np.cumsum(np.radians(np.load(path)["approx_motion"][:, 0]))])
     part = open_recording(path).part()
-    assert handedness_of(part, heading).verdict == "agree"
-    assert handedness_of(part, -heading).verdict == "mirrored"
+    assert check_handedness(part, heading).verdict == "agree"
+    assert check_handedness(part, -heading).verdict == "mirrored"
 
 
 @with_samples
@@ -137,11 +137,11 @@ def test_real_fans_turn_as_their_registration_says(name: str) -> None:
 def test_a_fish_before_a_sonar_at_rest_tells_nothing(name: str) -> None:
     geometry = Path(__file__).with_name("geometries") / f"{name}.yaml"
     part = open_recording(REAL / f"didson-static-video/{name}_first30.npz", geometry).part()
-    assert handedness_of(part, np.radians(10)).verdict == "unknown"
-    assert handedness_of(part, np.radians(-10)).verdict == "unknown"
+    assert check_handedness(part, np.radians(10)).verdict == "unknown"
+    assert check_handedness(part, np.radians(-10)).verdict == "unknown"
 
 
 @with_samples
 def test_a_real_sonar_at_rest_tells_nothing() -> None:
     part = open_recording(REAL / "aris1200-sdk-sample/sample.aris").part()
-    assert handedness_of(part).verdict == "unknown"
+    assert check_handedness(part).verdict == "unknown"

@@ -13,7 +13,7 @@ from fans import drawn
 from mitsonar import MitsonarError, MitsonarWarning, SonarFrames, create_estimator, open_recording
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.sources import open_frames
-from mitsonar.recordings.open import format_of
+from mitsonar.recordings.open import detect_format
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"
 GEOMETRIES = Path(__file__).with_name("geometries")
@@ -121,7 +121,7 @@ def test_damaged_stacks_are_refused(tmp_path: Path, changed: dict[str, Any], rea
 def test_cut_files_and_frames_of_mitsonar_are_other_things(tmp_path: Path) -> None:
     whole = stack(tmp_path / "a.npz", **own())
     (tmp_path / "b.npz").write_bytes(whole.read_bytes()[:-200])
-    assert format_of(tmp_path / "b.npz") is None
+    assert detect_format(tmp_path / "b.npz") is None
     content = bytearray(whole.read_bytes())
     content[300:360] = bytes(60)
     (tmp_path / "c.npz").write_bytes(bytes(content))
@@ -131,4 +131,4 @@ def test_cut_files_and_frames_of_mitsonar_are_other_things(tmp_path: Path) -> No
     SonarFrames(np.zeros((1, 8, 4), np.float32), sonar.range_m, sonar.bearing_rad, np.zeros(1), sonar).save(
         tmp_path / "f.npz"
     )
-    assert format_of(tmp_path / "f.npz") is None
+    assert detect_format(tmp_path / "f.npz") is None

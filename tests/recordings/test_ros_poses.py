@@ -35,7 +35,7 @@ def expected(frame: str) -> NDArray[np.float64]:
 
 
 def in_ros(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    place, turn = CONVENTIONS["ros-enu"].from_ours(poses[:, :3], vehicle_rotation(poses))
+    place, turn = CONVENTIONS["ros-enu"].from_mitsonar(poses[:, :3], vehicle_rotation(poses))
     return place, turn.as_quat()
 
 

@@ -34,7 +34,7 @@ from mitsonar.reproduction.odometry_benchmark import (
     benchmark_lines,
     benchmark_odometry,
     dive_course,
-    measured_row,
+    measure_row,
 )
 from mitsonar.worlds.families import ShipHull
 from mitsonar.worlds.world import Floor, World, sloped
@@ -67,7 +67,7 @@ def run_of(frames: SonarFrames, tmp_path: Path) -> Path:
 
 def row_of(frames: SonarFrames, method: str, folder: Path, **options: Any) -> Row:
     case = Case("drawn", "recorded", "none", method)
-    return measured_row(case, FrameSource.of(frames), create_estimator(method), folder, **options)
+    return measure_row(case, FrameSource.of(frames), create_estimator(method), folder, **options)
 
 
 # ---------------------------------------------------------------- sets

@@ -24,7 +24,7 @@ from mitsonar.io.runs import RunDirectory
 from mitsonar.motion.errors import in_units
 from mitsonar.reproduction import tables
 from mitsonar.reproduction.tables import (
-    LOUD,
+    HIGHEST_NOISE,
     NOISES,
     Found,
     Reached,
@@ -165,7 +165,7 @@ def test_recipes_say_what_the_text_says() -> None:
         message = (recipe.batch, recipe.optimiser.kind, recipe.optimiser.rate, recipe.optimiser.halve_every, recipe.epochs)
         assert message == (4, "adam", 1e-4, 12, 32), name
         assert recipe.split == "sequence"  # tables deal pairs out as Almanza-Medina does, who trains for oneself does not
-        assert set(NOISES) - {LOUD} <= set(recipe.validation.noise)
+        assert set(NOISES) - {HIGHEST_NOISE} <= set(recipe.validation.noise)
         assert recipe.noise == ("low" if "low-noise" in name else "high" if "high-noise" in name else "none")
         assert recipe.labels == ("quantised" if "quantised" in name else "normx10")
         assert (recipe.loss.kind, recipe.loss.penalty) == ("mse", 100 if name == "posenet-penalty" else 0)
@@ -259,7 +259,7 @@ def test_a_table_shows_all_rows_and_the_scale_of_each() -> None:
     assert [cell.strip() for cell in line.strip("|").split("|")][2:5] == [
         *("5.00 / 2.50 / 0.100", "5.50 / 2.75 / 0.110", "6.00 / 3.00 / 0.120"),
     ]
-    loud = {"none": score(5.0), "high": score(7.0), LOUD: score(5.2)}  # echoes of five times the gain
+    loud = {"none": score(5.0), "high": score(7.0), HIGHEST_NOISE: score(5.2)}  # echoes of five times the gain
     gained = {"posenet-cartesian": result["posenet-cartesian"].model_copy(update={"validation": loud})}
     (line,) = [line for line in table_lines(table, gained) if line.startswith("| Cartesian") and "posenet" not in line]
     assert [cell.strip() for cell in line.strip("|").split("|")][7:] == ["5.20 / 2.60 / 0.104", "-"]
@@ -421,7 +421,7 @@ def test_unseen_scenes_are_evaluated_as_the_network_says(whole: Path) -> None:
     (seen,) = (path for path in (whole / "data").iterdir() if "unseen" not in path.name)
     from mitsonar.datasets.samples import SonarPairs
 
-    pairs, before = SonarPairs(url, part="all", one_a_sequence=True, labels="normx10"), SonarPairs(seen, part="all")
+    pairs, before = SonarPairs(url, part="all", one_per_sequence=True, labels="normx10"), SonarPairs(seen, part="all")
     assert pairs.recipe.seed != before.recipe.seed
     assert not set(map(tuple, pairs.pose)) & set(map(tuple, before.pose))
     network = Checkpoint.load(whole / "runs" / ROWS[0]).build()

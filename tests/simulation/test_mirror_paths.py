@@ -73,7 +73,7 @@ def decibels(got: NDArray[Any], wanted: NDArray[Any]) -> NDArray[np.float64]:
 
 def named(paths: Paths) -> list[str]:
     assert paths.way is not None
-    return [paths.ways[k] for k in paths.way]
+    return [paths.kinds[k] for k in paths.way]
 
 
 @pytest.mark.parametrize("bounces", [1, 2, 3])
@@ -255,7 +255,7 @@ def test_more_orders_of_planes_than_can_be_traced_are_refused() -> None:
     parts = dict.fromkeys(plates, (0.5, 0.0))
     with pytest.raises(MitsonarError, match=r"the 40 planes of the mirrors in 60,840 orders of 3: at most 20,000"):
         ChannelSimulator(unmerged(**plates), instrument(bounces=3), mirrors=parts)
-    assert len(ChannelSimulator(unmerged(**plates), instrument(bounces=1), mirrors=parts).ways) == 42
+    assert len(ChannelSimulator(unmerged(**plates), instrument(bounces=1), mirrors=parts).kinds) == 42
 
 
 def test_mirrors_that_do_not_fit_are_refused() -> None:

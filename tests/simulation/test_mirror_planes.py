@@ -82,7 +82,7 @@ def test_what_is_no_plane_with_waves_makes_no_ghosts(tmp_path: Path) -> None:
     assert result.notes_on(1) == []
     assert result.notes_on(2) == ["the mirror surface is not a plane with waves: it reflects once and makes no ghosts"]
     built = ChannelSimulator(scene, instrument(bounces=3), mirrors={"surface": (-1.0, 0.0)})
-    assert built.ways == ("scatterer", "surface")
+    assert built.kinds == ("scatterer", "surface")
 
 
 @pytest.mark.parametrize("out", essence([True, False], True))

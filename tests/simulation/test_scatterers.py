@@ -117,7 +117,7 @@ def test_energy_is_that_of_the_imaging_sonar() -> None:
 
 HEIGHT = 3.0
 
-LOOKS = (
+RECEIVER_HEADINGS_DEG = (
     Hydrophone(name="down", field=FieldOfView(shape="circular", tilt_deg=0.0, across_deg=40.0, taper=0.0)),
     Hydrophone(name="oblique", field=FieldOfView(shape="circular", tilt_deg=20.0, across_deg=10.0, taper=0.0)),
 )
@@ -149,7 +149,12 @@ def test_a_level_floor_returns_the_incoherent_level_and_rayleigh_statistics(surf
     the points straight below return 0.7, 2.3 and 6.1 dB more, cells of 15 mm 3.6 dB more, and aside 1.7 dB less."""
     density, texture = SURFACES[surface]
     sonar = ChannelSonar(
-        bandwidth_hz=19.2e3, sampling_hz=32e3, frequency_step_hz=80.0, range_max=4.0, receivers=LOOKS, points_per_m2=density
+        bandwidth_hz=19.2e3,
+        sampling_hz=32e3,
+        frequency_step_hz=80.0,
+        range_max=4.0,
+        receivers=RECEIVER_HEADINGS_DEG,
+        points_per_m2=density,
     )
     result = simulator(sonar, floor=floor(diffuse(texture or 0.5), 6.0))
     rng = np.random.default_rng(3)
@@ -158,7 +163,7 @@ def test_a_level_floor_returns_the_incoherent_level_and_rayleigh_statistics(surf
     response = np.concatenate([part.response for part in result.pings(poses)]).astype(np.complex128)
     power = np.abs(response) ** 2
     pulse = float((sonar.pulse(np.arange(-3000, 3000) / sonar.sampling_hz) ** 2).sum())
-    expected = pulse * np.array([incoherent(look.field) for look in LOOKS])
+    expected = pulse * np.array([incoherent(look.field) for look in RECEIVER_HEADINGS_DEG])
     level = 10 * np.log10(power.sum(axis=2).mean(axis=0) / expected)
     assert np.abs(level).max() < 0.3, f"{level} dB"
     mean = power.mean(axis=0)

@@ -14,7 +14,7 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.scene import (
     find_scene,
     load_scene,
-    said_by,
+    motion_specs_of,
     scale_notes,
     shipped_scenes,
     shipped_trajectory,
@@ -116,7 +116,7 @@ def test_a_trajectory_that_no_shape_reads_is_refused(shape: str, said: str, tmp_
         with pytest.raises(MitsonarError, match=said):
             load_scene(file)
     else:
-        assert [result.name for result in said_by(load_scene(file))] == ["fish"]
+        assert [result.name for result in motion_specs_of(load_scene(file))] == ["fish"]
 
 
 GLB = b"glTF\x02\x00\x00\x00" + bytes(100)

@@ -11,7 +11,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import Sounder, load_sounder
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.soundings import velocity_of
+from mitsonar.records.soundings import solve_velocity
 from mitsonar.simulation.sounding import SounderSimulator, dvl_readings
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
@@ -104,7 +104,7 @@ def test_a_janus_has_the_errors_of_its_formula() -> None:
     azimuth = np.radians([45, 135, 225, 315])
     axes = np.column_stack([np.sin(tilt) * np.sin(azimuth), np.sin(tilt) * np.cos(azimuth), np.full(4, -np.cos(tilt))])
     velocity = np.array([[0.1, 0.6, -0.05]])
-    result, covariance = velocity_of(-velocity @ axes.T, axes, 0.01)
+    result, covariance = solve_velocity(-velocity @ axes.T, axes, 0.01)
     assert np.allclose(result, velocity)
     expected = 0.01 / np.array([np.sqrt(2) * np.sin(tilt), np.sqrt(2) * np.sin(tilt), 2 * np.cos(tilt)])
     assert np.allclose(np.sqrt(covariance[0].diagonal()), expected)
@@ -115,7 +115,7 @@ def test_three_beams_suffice_and_two_do_not() -> None:
     velocity = np.array([0.1, 0.6, -0.05])
     rates = np.tile(-axes @ velocity, (2, 1))
     rates[0, 0], rates[1, :2] = np.nan, np.nan
-    result, _ = velocity_of(rates, axes, 0.01)
+    result, _ = solve_velocity(rates, axes, 0.01)
     assert np.allclose(result[0], velocity)
     assert np.isnan(result[1]).all()
 

@@ -39,7 +39,7 @@ from mitsonar.estimation.learned import (  # noqa: E402
 from mitsonar.estimation.named import create_estimator  # noqa: E402
 from mitsonar.networks.checkpoint import (  # noqa: E402
     Checkpoint,
-    onnx_of,
+    to_onnx,
 )
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
 from mitsonar.training.data import JsonObject  # noqa: E402
@@ -86,7 +86,7 @@ def run(checkpoint: Checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture(scope="module")
 def pairs(made: Path) -> SonarPairs:
-    return SonarPairs(made, part="all", one_a_sequence=True)
+    return SonarPairs(made, part="all", one_per_sequence=True)
 
 
 # ---------------------------------------------------------------- as an estimator
@@ -110,7 +110,7 @@ def test_it_sees_what_training_saw(pairs: SonarPairs, made: Path) -> None:
         "posenet_dual": {"coordinates": "both", "cartesian_rows": 64},
     }
     for name, words in arrangements.items():
-        local = SonarPairs(made, part="all", one_a_sequence=True, labels="quantised", **words)
+        local = SonarPairs(made, part="all", one_per_sequence=True, labels="quantised", **words)
         inputs, label = local[0]
         batch = tuple(part[None] for part in inputs) if isinstance(inputs, tuple) else inputs[None]
         torch.manual_seed(4)
@@ -354,10 +354,10 @@ def test_odometry_and_compare_take_checkpoints(
     done = mitsonar(*table, "-o", tmp_path / "table", "--json")
     assert done.returncode == 0, done.stderr
     _, row = json.loads(done.stdout)["tables"][0]["rows"]
-    truth = SonarPairs(made, part="all", one_a_sequence=True)
+    truth = SonarPairs(made, part="all", one_per_sequence=True)
     valid = [ImageNetwork(checkpoint).estimate(truth.sonar_frames(k)).valid for k in range(len(truth))]
     answers = np.where(np.array(valid)[:, None], SAYS, 0)  # frames of so few cells may hold too little to match
-    errors = in_units(answers - np.array([motions(truth.pose[truth.frame_numbers(k)])[0] for k in range(len(truth))]))
+    errors = in_units(answers - np.array([motions(truth.pose[truth.frame_slice(k)])[0] for k in range(len(truth))]))
     assert row["failures"] == valid.count(False) <= 2
     assert np.allclose(row["rmse"], np.sqrt((errors**2).mean(axis=0)), rtol=1e-5)
     again = mitsonar(*table, "-o", tmp_path / "table", "--json")
@@ -395,7 +395,7 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: 
     assert (result.report["pairs"], result.report["split"]["by"]) == (6, "scene")
     assert [row["learnt"] for row in result.rows] == [0, 0]
     assert not any("was trained on" in sentence for sentence in result.notes)
-    by_sequence = SonarPairs(made, part="train", split="sequence", one_a_sequence=True)
+    by_sequence = SonarPairs(made, part="train", split="sequence", one_per_sequence=True)
     mixed = sum(first in taught for first in by_sequence.first)
     assert 0 < mixed < len(by_sequence)
     words = ("--split", "sequence", "--part", "train", "--limit", 0, "--estimators", f"zero,{tmp_path / 'network.ckpt'}")
@@ -436,7 +436,7 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
     assert "training has seen 17 of these 18 pairs: errors on unseen pairs may be larger" in done.stderr
     assert "3 scenes only" in done.stderr
     report = json.loads((tmp_path / "out" / "table.json").read_text())
-    truth = SonarPairs(made, part="all", one_a_sequence=True)
+    truth = SonarPairs(made, part="all", one_per_sequence=True)
     motion = np.array([truth.target(k) for k in range(len(truth))])
     error, power = in_units(SAYS - motion), (motion**2).sum(axis=0)
     assert [table["noise"] for table in report["tables"]] == ["none", "high"]
@@ -497,14 +497,14 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     ),
 )
 def test_all_arrangements_are_evaluated(many: Callable[[str], Path], data: str, words: dict[str, Any]) -> None:
-    local = SonarPairs(many(data), part="all", labels="normx10", one_a_sequence=True, **words)
+    local = SonarPairs(many(data), part="all", labels="normx10", one_per_sequence=True, **words)
     report = evaluate(constant(local), many(data), noise=["low"], part="all")
     error = in_units(SAYS - np.array([local.target(k) for k in range(len(local))]))
     assert np.allclose(report["tables"][0]["rows"][0]["rmse"], np.sqrt((error**2).mean(axis=0)), rtol=1e-5)
 
 
 def test_heights_are_evaluated_in_mm(many: Callable[[str], Path], mitsonar: Command, tmp_path: Path) -> None:
-    local = SonarPairs(many("high"), part="all", labels="normx10", frames=1, one_a_sequence=True)
+    local = SonarPairs(many("high"), part="all", labels="normx10", frames=1, one_per_sequence=True)
     trained = constant(local, [2.5])
     trained.save(tmp_path / "network.ckpt")
     done = mitsonar("evaluate", tmp_path, many("high"), "--part", "all", "--noise", "none", "-o", tmp_path / "out")
@@ -525,7 +525,7 @@ def test_data_that_do_not_fit_are_refused(
     done = mitsonar("evaluate", run, many("other"))
     refused(done, "beams 16, not 48", "window 3.2..6 m, not 3.2..5.6 m", "--force", "didson300")
     # what any sonar may serve: the same network, made for sizes that fit
-    local = SonarPairs(many("other"), part="all", one_a_sequence=True)
+    local = SonarPairs(many("other"), part="all", one_per_sequence=True)
     second = replace(constant(local), sonar=checkpoint.sonar)
     with pytest.raises(MitsonarError, match="beams 16, not 48"):
         evaluate(second, many("other"), part="all")
@@ -598,7 +598,7 @@ def agrees(content: bytes, checkpoint: Checkpoint, batch: int) -> dict[str, str]
 @pytest.mark.thorough
 def test_onnx_says_the_same() -> None:
     checkpoint = trained_like("cnn4b")
-    about = agrees(onnx_of(checkpoint, 2), checkpoint, 2)
+    about = agrees(to_onnx(checkpoint, 2), checkpoint, 2)
     assert json.loads(about["labels"]) == checkpoint.labels
     assert json.loads(about["sonar"])["image"]["beams"] == 12
     assert (about["network"], about["mitsonar_version"]) == ("cnn4b", checkpoint.version)
@@ -626,15 +626,15 @@ def test_a_checkpoint_of_half_size_says_nearly_the_same(mitsonar: Command, tmp_p
 @pytest.mark.parametrize("name", ["posenet", "sfmnet", "cnn1b", "cnn4posenet", "posenet_dual"])
 def test_every_network_becomes_onnx(name: str) -> None:
     checkpoint = trained_like(name, coordinates="both" if name == "posenet_dual" else "polar", cartesian_rows=48)
-    agrees(onnx_of(checkpoint), checkpoint, 3)
-    agrees(onnx_of(checkpoint, 1), checkpoint, 1)
+    agrees(to_onnx(checkpoint), checkpoint, 3)
+    agrees(to_onnx(checkpoint, 1), checkpoint, 1)
 
 
 @pytest.mark.slow
 def test_the_geometry_goes_into_onnx(geometric: Checkpoint, made: Path) -> None:
     """Motion and covariance, for any number of samples, on ground that the tracer has not seen."""
     onnxruntime = pytest.importorskip("onnxruntime")
-    session = onnxruntime.InferenceSession(onnx_of(geometric, None), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(to_onnx(geometric, None), providers=["CPUExecutionProvider"])
     samples = samples_for(geometric, made, part="all")
     for numbers in ([3], [0, 4, 7, 9]):
         images, grounds = zip(*(samples[number][0] for number in numbers), strict=True)
@@ -666,6 +666,6 @@ def test_export_writes_a_file_once(mitsonar: Command, tmp_path: Path, monkeypatc
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "onnxscript" else find_spec(name))
     refused(mitsonar(*words, path, "--overwrite"), "writing ONNX needs onnxscript", "mitsonar[learn]")
     assert path.read_bytes() == before
-    monkeypatch.setattr("mitsonar.networks.checkpoint.onnx_of", lambda checkpoint, batch: b"new")
+    monkeypatch.setattr("mitsonar.networks.checkpoint.to_onnx", lambda checkpoint, batch: b"new")
     assert mitsonar(*words, path, "--overwrite").returncode == 0
     assert path.read_bytes() == b"new"

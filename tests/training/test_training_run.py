@@ -169,7 +169,7 @@ def test_recipes_say_what_they_leave_out(tmp_path: Path) -> None:
         1e-4,
         12,
     )
-    assert recipe(noise=["none", "high"]).noise_said == "none or high"
+    assert recipe(noise=["none", "high"]).noise_text == "none or high"
     assert (message.labels, message.validation.pairs, message.length(38_000)) == ("normx10", 7, 32 * 38_000)
     (tmp_path / "again.yaml").write_text(yaml.safe_dump(message.plain()))
     assert load_training_recipe(tmp_path / "again.yaml") == message
@@ -273,15 +273,15 @@ def test_batches_are_the_same_wherever_they_are_finished(made: Path) -> None:
 @pytest.mark.thorough
 def test_rendered_samples_are_skipped_without_rendering_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """Worlds that lie behind are not built again; what waited in the buffer is."""
-    words: dict[str, Any] = {"sequences_a_world": 3, "buffer": 6, "gain": 0.02, "noise": "none"}
+    words: dict[str, Any] = {"sequences_per_world": 3, "buffer": 6, "gain": 0.02, "noise": "none"}
     worlds: list[int] = []
     build = SceneRenderer.__init__
 
-    def counted(self: SceneRenderer, described: Any, scene: Any) -> None:
+    def count_noun(self: SceneRenderer, described: Any, scene: Any) -> None:
         worlds.append(scene.number)
         build(self, described, scene)
 
-    monkeypatch.setattr(SceneRenderer, "__init__", counted)
+    monkeypatch.setattr(SceneRenderer, "__init__", count_noun)
     pairs = RenderedPairs(tiny_recipe(), seed=1, **words)
     whole = list(itertools.islice(pairs.raw(), 46))
     assert worlds == list(range(5))
@@ -396,7 +396,7 @@ KILLED = """
                 die()
 
         if when == "writing":  # in the middle of the ninth state
-            states, write, sync = [], files.write_whole, os.fsync
+            states, write, sync = [], files.write_atomic, os.fsync
             def counted(number):
                 name = os.readlink(f"/proc/self/fd/{number}")
                 states.append(name) if "last.ckpt" in name else None

@@ -27,7 +27,7 @@ SHIP = link("ship", "0 0 5", "<ellipsoid><radii>10 60 5</radii></ellipsoid>")
 ROV = link("rov", "2 0 1", "<box><size>0.6 0.3 0.3</size></box>")
 
 
-def world_of(folder: Path, *parts: str, **options: list[str]) -> World:
+def world_numbers(folder: Path, *parts: str, **options: list[str]) -> World:
     (folder / "w.sdf").write_text(f'<sdf version="1.9"><world name="w">{"".join(parts)}</world></sdf>')
     return imported_world(folder / "w.sdf", **options)  # type: ignore[arg-type]
 
@@ -45,7 +45,7 @@ def world_of(folder: Path, *parts: str, **options: list[str]) -> World:
 def test_it_looks_at_the_objects_and_not_at_the_ground(
     parts: tuple[str, ...], target: tuple[float, ...], what: str, tmp_path: Path
 ) -> None:
-    world = world_of(tmp_path, *parts, own_axes=["rov"] if ROV in parts else [])
+    world = world_numbers(tmp_path, *parts, own_axes=["rov"] if ROV in parts else [])
     np.testing.assert_allclose(world.stand.target, target, atol=1e-6)
     near, far = world.stand.window
     away = np.linalg.norm(np.subtract(world.stand.origin, target))
@@ -55,7 +55,7 @@ def test_it_looks_at_the_objects_and_not_at_the_ground(
 
 def test_what_stands_before_an_object_turns_the_view(tmp_path: Path) -> None:
     """A screen to the south: the sonar stands elsewhere, 30 deg above the target all the same."""
-    free, turned = (world_of(tmp_path, GROUND, WALL, FAR_PILE, *more).stand for more in ((), (SCREEN,)))
+    free, turned = (world_numbers(tmp_path, GROUND, WALL, FAR_PILE, *more).stand for more in ((), (SCREEN,)))
     np.testing.assert_allclose(np.subtract(free.origin, free.target)[0], 0, atol=1e-9)
     seen = np.subtract(turned.origin, turned.target)
     assert turned.target == pytest.approx((6, 2, 1))
@@ -65,7 +65,7 @@ def test_what_stands_before_an_object_turns_the_view(tmp_path: Path) -> None:
 
 def test_of_a_ship_it_sees_a_part_from_nearby_and_says_so(tmp_path: Path) -> None:
     with pytest.warns(MitsonarWarning, match=r"looks at a part of ship::l from 5\.\d+ m; no shape is small enough"):
-        world = world_of(tmp_path, GROUND, SHIP)
+        world = world_numbers(tmp_path, GROUND, SHIP)
     place = np.divide(np.subtract(world.stand.target, (0, 0, 5)), (10, 60, 5))
     assert np.linalg.norm(place) == pytest.approx(1, abs=0.01)  # on the hull
     assert world.stand.window[1] <= REACH[world.stand.preset]

@@ -21,8 +21,8 @@ from scipy.sparse import csr_array
 
 from mitsonar.acoustics.levels import coding_slope
 from mitsonar.acoustics.noise import Information, NoiseModel, information, information_of_sums, refuse_noise
-from mitsonar.acoustics.speckle import rician_information, score_shares
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.acoustics.speckle import rician_information, score_components
+from mitsonar.errors import MitsonarError, suggest_names
 from mitsonar.instruments.sonar import Quality, Sonar
 from mitsonar.instruments.views import Segment, directions
 from mitsonar.motion.composition import Motion, compose
@@ -139,7 +139,7 @@ def laws_of(sonar: Sonar) -> dict[str, str]:
 def _check(kind: str, law: str, kinds: Sequence[str] = tuple(KINDS), laws: Sequence[str] = tuple(LAWS)) -> None:
     for label, word, names in (("kind", kind, kinds), ("law", law, laws)):
         if word not in names:
-            raise MitsonarError(f"unknown {label} {word!r}: {nearest_names(word, names)}")
+            raise MitsonarError(f"unknown {label} {word!r}: {suggest_names(word, names)}")
 
 
 def _terms(derivative: Derivative, noise: NoiseModel, kind: str, greys: int = 255) -> InformationTerms:
@@ -295,7 +295,7 @@ def varied(
         MitsonarError: an unknown name, a value outside its limits, or a sonar that looks past the floor to the horizon.
     """
     if name not in VARIABLES:
-        raise MitsonarError(f"unknown variable {name!r}: {nearest_names(name, VARIABLES)}")
+        raise MitsonarError(f"unknown variable {name!r}: {suggest_names(name, VARIABLES)}")
     if name == "window":
         near, far = value  # type: ignore[misc]
         return sonar.replace(range_min=near, range_max=far), poses
@@ -722,7 +722,7 @@ def grain_law(
     total = variance + rounding
     score_fraction = np.sqrt(variance / total)  # fraction of the score's standard deviation that is not rounding
     # the score is a sum of terms in the noise, in its power and in its square, each with its correlation
-    shares = score_shares(power, noise)
+    shares = score_components(power, noise)
     turn = np.exp(1j * np.angle(echo))
     parts = [
         (score_fraction * shares.linear * turn, shared),

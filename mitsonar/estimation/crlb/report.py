@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.noise import NoiseModel, load_noise, refuse_noise
 from mitsonar.config.data import MirrorKeys
 from mitsonar.datasets.make import SceneRenderer
-from mitsonar.datasets.store import DataStore, deal, world_of
+from mitsonar.datasets.store import DataStore, frames_in_part, world_numbers
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.estimation.crlb.image import Bound, bounds_at, laws_of, overall, varied
 from mitsonar.estimation.estimator import PlainTable
@@ -282,7 +282,9 @@ def subject_of_data(source: str, pairs: int, *, part: str | None = None, seed: i
     recipe = store.recipe
     scene, sequence, pose, height = (store.read(name) for name in ("scene", "sequence", "pose", "height_m"))
     part = part or recipe.split.unseen
-    in_part = np.flatnonzero(deal(world_of(recipe, store.scenes)[scene], sequence, recipe.split, part) & np.isfinite(height))
+    in_part = np.flatnonzero(
+        frames_in_part(world_numbers(recipe, store.scenes)[scene], sequence, recipe.split, part) & np.isfinite(height)
+    )
     first = in_part[np.unique(sequence[in_part], return_index=True)[1]]
     if not len(first):
         raise MitsonarError(f"{source} has no frame over ground in part {part!r}: give --part all")

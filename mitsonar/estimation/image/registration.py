@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from mitsonar.estimation.estimator import UNMEASURED, Excess, ambiguity, correlation_excess, correlation_of, spread_of
-from mitsonar.geometry.ground import Attitude, GroundGeometry, margin_of_light, moved, nearest_known
+from mitsonar.geometry.ground import Attitude, GroundGeometry, lit_margin, moved, nearest_known
 from mitsonar.motion.composition import Motion, inverse
 from mitsonar.records.frames import SonarFrames
 
@@ -227,10 +227,10 @@ def _linearised(
         pairs.append((resampled, second, inner) if back else (first, resampled, inner))
     # one scale for both directions, from the residuals of the first
     residuals = [after - before for before, after, _ in pairs]
-    counted = residuals[0][pairs[0][2]]
-    if counted.size < FEWEST_CELLS:
+    count_noun = residuals[0][pairs[0][2]]
+    if count_noun.size < FEWEST_CELLS:
         return None
-    scale = noise_of(counted[:: NOISE_STRIDE[0], :: NOISE_STRIDE[1]].ravel())
+    scale = noise_of(count_noun[:: NOISE_STRIDE[0], :: NOISE_STRIDE[1]].ravel())
     # weigh the residuals, then project the sums over patches onto the motion
     sides = [
         _weighted_pair(*pair, residual, cells, level, scale, last=last)
@@ -687,9 +687,9 @@ class GroundNodes:
     def shown(self) -> tuple[NDArray[np.bool_], bool]:
         """Return which nodes show ground to match ``(nodes, nodes)``, and whether the outline of the light is masked.
 
-        See :func:`mitsonar.geometry.ground.margin_of_light`.
+        See :func:`mitsonar.geometry.ground.lit_margin`.
         """
-        margin = margin_of_light(self.ground, self.attitude, self.frames.sonar.elevation_fov_deg)
+        margin = lit_margin(self.ground, self.attitude, self.frames.sonar.elevation_fov_deg)
         return (self.known, False) if margin is None else (self.known & (margin >= 0), True)
 
     @cached_property

@@ -225,7 +225,13 @@ def stride(sonar: Sonar) -> int:
 
 
 def accumulate(
-    seen: ViewEchoes, ping: mi.UInt32, pings: int, tracer: ViewTracer, more: mi.UInt64 | None = None, *, counted: bool = True
+    seen: ViewEchoes,
+    ping: mi.UInt32,
+    pings: int,
+    tracer: ViewTracer,
+    more: mi.UInt64 | None = None,
+    *,
+    counted: bool = True,
 ) -> mi.UInt64:
     """Sum the levels of a launch, in the same kernel that traces the echoes.
 

@@ -77,7 +77,7 @@ def test_range_levels_are_those_of_a_sonar_with_fewer_bins(portions: Path) -> No
     pairs = SonarPairs(portions, part="all", range_levels=10, layout="channels", views=["c2"])
     few = tiny_recipe(**PORTIONS, sonar__range_bins=10)
     renderer = SceneRenderer(few, scenes_of(few, few.sequences)[0])
-    here = pairs.frame_numbers(3)
+    here = pairs.frame_slice(3)
     (looks,) = renderer.render_views(pairs.pose[here], here.start)
     expected = looks[[view.name for view in renderer.simulator.views].index("c2")].levels.sum(axis=2)
     expected = expected * float(pairs.store.about["gain"])
