@@ -186,8 +186,8 @@ class CoherentTracer:
         """Count the outcomes of the rays in the field of view; rays beside it only carry side lobes and skirts."""
         near, far = hit.valid & (hit.t < self.sonar.range_min), hit.valid & (hit.t >= self.sonar.range_max)
         for counter, outcome in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
-            count_noun = outcome & rays.inside
-            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(counter), count_noun, mode=ADD)
+            counted = outcome & rays.inside
+            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(counter), counted, mode=ADD)
         widest = mi.UInt32(COUNTED.index("widest"))
         dr.scatter_reduce(dr.ReduceOp.Max, counts, mi.UInt32(points.covered), widest, points.cut & rays.inside, mode=ADD)
 

@@ -444,8 +444,8 @@ def empty_frames(
     check = "check the pose (m, pitch > 0 looks down), the window and the scene's units"
     return (
         f"empty: {empty} of {count_noun(frames, 'frame')}, frame {number} first: {inside} % of its rays meet something "
-        f"within the window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{returns_text}, {missed} % "
-        f"nothing; {view_of(pose)}; {hint or check}"
+        f"within the window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{returns_text}, "
+        f"{missed} % nothing; {view_of(pose)}; {hint or check}"
     )
 
 

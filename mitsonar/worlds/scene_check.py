@@ -566,14 +566,14 @@ class _Element:
     name: str
     count: int
     scalars: dict[str, str] = field(default_factory=dict)
-    count_noun: dict[str, str] = field(default_factory=dict)
+    counted: dict[str, str] = field(default_factory=dict)
 
     def dtype(self, order: str) -> np.dtype[np.void]:
         """Return the NumPy type of one row of a binary file; a list becomes a count and three values."""
         parts: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
         for name, kind in self.scalars.items():
-            if name in self.count_noun:
-                parts += [(f"count of {name}", order + self.count_noun[name]), (name, order + kind, (3,))]
+            if name in self.counted:
+                parts += [(f"count of {name}", order + self.counted[name]), (name, order + kind, (3,))]
             else:
                 parts.append((name, order + kind))
         return np.dtype(parts)
@@ -689,7 +689,7 @@ def check_counts(path: Path) -> None:
     with path.open("rb") as file:
         order, elements, start = _ply_header(file.read(MAX_PLY_HEADER_BYTES), strict=False)
     for element in elements:
-        kinds = [element.count_noun.get(name, kind) for name, kind in element.scalars.items()]
+        kinds = [element.counted.get(name, kind) for name, kind in element.scalars.items()]
         start += element.count * (2 * len(kinds) if order is None else sum(np.dtype(kind).itemsize for kind in kinds))
     size = path.stat().st_size
     if start > size + 1:
@@ -705,12 +705,12 @@ def _check_ply(content: bytes) -> None:
     rows = _ply_rows_of_text(content[start:], elements) if order is None else _ply_rows(content, start, elements, order)
     for element, table in zip(elements, rows, strict=False):
         for name, kind in element.scalars.items():
-            if name in element.count_noun and (table[f"count of {name}"] != 3).any():
+            if name in element.counted and (table[f"count of {name}"] != 3).any():
                 raise _FaultError(f"{element.name}: lists of {name} must have 3 entries, triangles")
             if kind.startswith("f") and element.name in ("vertex", "face"):
                 _check_mesh_numbers(table[name], f"{name} of a {element.name}")
         if element.name == "face":
-            _check_triangles(table[next(iter(element.count_noun))], counts["vertex"])
+            _check_triangles(table[next(iter(element.counted))], counts["vertex"])
 
 
 def _ply_header(content: bytes, strict: bool = True) -> tuple[str | None, list[_Element], int]:
@@ -731,8 +731,8 @@ def _ply_header(content: bytes, strict: bool = True) -> tuple[str | None, list[_
                 order = kind
             case ["element", name, count] if count.isascii() and count.isdigit() and len(count) < 20:
                 elements.append(_Element(name, int(count)))
-            case ["property", "list", count_noun, kind, name] if elements and {count_noun, kind} <= set(TYPES):
-                _add_property(elements[-1], name, TYPES[kind], TYPES[count_noun])
+            case ["property", "list", counted, kind, name] if elements and {counted, kind} <= set(TYPES):
+                _add_property(elements[-1], name, TYPES[kind], TYPES[counted])
             case ["property", kind, name] if elements and kind in TYPES:
                 _add_property(elements[-1], name, TYPES[kind])
             case _:
@@ -744,12 +744,12 @@ def _ply_header(content: bytes, strict: bool = True) -> tuple[str | None, list[_
     return (None if order == "ascii" else ORDERS[order]), elements, stop + 1
 
 
-def _add_property(element: _Element, name: str, kind: str, count_noun: str | None = None) -> None:
+def _add_property(element: _Element, name: str, kind: str, counted: str | None = None) -> None:
     if name in element.scalars:
         raise _FaultError(f"its header names {name} of {element.name} twice")
     element.scalars[name] = kind
-    if count_noun is not None:
-        element.count_noun[name] = count_noun
+    if counted is not None:
+        element.counted[name] = counted
 
 
 def _check_elements(elements: list[_Element]) -> None:
@@ -758,10 +758,10 @@ def _check_elements(elements: list[_Element]) -> None:
     if len(set(names)) < len(names):
         raise _FaultError("its header names an element twice")
     for element in elements:
-        if element.name == "vertex" and (element.count_noun or not {"x", "y", "z"} <= set(element.scalars)):
+        if element.name == "vertex" and (element.counted or not {"x", "y", "z"} <= set(element.scalars)):
             raise _FaultError("its vertices must have x, y and z, and no lists")
         if element.name == "face":
-            lists = list(element.count_noun)
+            lists = list(element.counted)
             if lists not in (["vertex_index"], ["vertex_indices"]) or element.scalars[lists[0]].startswith("f"):
                 raise _FaultError("its faces must have one list of whole numbers, vertex_index or vertex_indices")
 
@@ -775,11 +775,7 @@ def _ply_rows(content: bytes, start: int, elements: list[_Element], order: str) 
             raise _FaultError(f"{element.count:,} of {element.name} need more bytes than there are")
         rows.append(np.frombuffer(content, kind, element.count, start))
         start += element.count * kind.itemsize
-        if (
-            element.count_noun
-            and element.name != "face"
-            and (rows[-1][f"count of {next(iter(element.count_noun))}"] != 3).any()
-        ):
+        if element.counted and element.name != "face" and (rows[-1][f"count of {next(iter(element.counted))}"] != 3).any():
             raise _FaultError(f"lists of {element.name} must have 3 entries")
         if {"vertex", "face"} <= {one.name for one in elements[: len(rows)]}:
             break  # Mitsuba ignores what follows
@@ -792,7 +788,7 @@ def _ply_rows_of_text(text: bytes, elements: list[_Element]) -> list[NDArray[np.
     """Read the tables of a text file, up to its faces."""
     words, start, rows = text.split(), 0, list[NDArray[np.void]]()
     for element in elements:
-        width = len(element.scalars) + 3 * len(element.count_noun)
+        width = len(element.scalars) + 3 * len(element.counted)
         if element.count * width > len(words) - start:
             raise _FaultError(f"{element.count:,} of {element.name} need more numbers than there are")
         numbers = np.array(words[start : start + element.count * width], dtype=np.float64).reshape(element.count, width)
@@ -809,7 +805,7 @@ def _as_table(numbers: NDArray[np.float64], element: _Element) -> NDArray[np.voi
     """Return the numbers of an element as a table with named columns; check that integer columns are whole numbers."""
     kinds: list[tuple[str, type] | tuple[str, type, tuple[int]]] = []
     for name in element.scalars:
-        listed = name in element.count_noun
+        listed = name in element.counted
         kinds += [(f"count of {name}", np.float64), (name, np.float64, (3,))] if listed else [(name, np.float64)]
     table = np.ascontiguousarray(numbers).view(np.dtype(kinds)).reshape(-1)
     for name, kind in element.scalars.items():

@@ -277,11 +277,11 @@ def test_rendered_samples_are_skipped_without_rendering_them(monkeypatch: pytest
     worlds: list[int] = []
     build = SceneRenderer.__init__
 
-    def count_noun(self: SceneRenderer, described: Any, scene: Any) -> None:
+    def counted(self: SceneRenderer, described: Any, scene: Any) -> None:
         worlds.append(scene.number)
         build(self, described, scene)
 
-    monkeypatch.setattr(SceneRenderer, "__init__", count_noun)
+    monkeypatch.setattr(SceneRenderer, "__init__", counted)
     pairs = RenderedPairs(tiny_recipe(), seed=1, **words)
     whole = list(itertools.islice(pairs.raw(), 46))
     assert worlds == list(range(5))

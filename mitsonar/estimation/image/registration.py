@@ -227,10 +227,10 @@ def _linearised(
         pairs.append((resampled, second, inner) if back else (first, resampled, inner))
     # one scale for both directions, from the residuals of the first
     residuals = [after - before for before, after, _ in pairs]
-    count_noun = residuals[0][pairs[0][2]]
-    if count_noun.size < FEWEST_CELLS:
+    counted = residuals[0][pairs[0][2]]
+    if counted.size < FEWEST_CELLS:
         return None
-    scale = noise_of(count_noun[:: NOISE_STRIDE[0], :: NOISE_STRIDE[1]].ravel())
+    scale = noise_of(counted[:: NOISE_STRIDE[0], :: NOISE_STRIDE[1]].ravel())
     # weigh the residuals, then project the sums over patches onto the motion
     sides = [
         _weighted_pair(*pair, residual, cells, level, scale, last=last)

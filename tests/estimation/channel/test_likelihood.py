@@ -187,11 +187,11 @@ def test_linear_algebra_of_the_likelihood_uses_one_thread(monkeypatch: pytest.Mo
     """With two, which wait for each other, a pair took 11 to 52 s of processor time, not 1.3 s."""
     threads: list[int] = []
 
-    def count_noun(responses: ImpulseResponses) -> Pings:
+    def counted(responses: ImpulseResponses) -> Pings:
         threads.extend(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
         return pings_of(responses)
 
-    monkeypatch.setattr("mitsonar.estimation.channel.likelihood.pings_of", count_noun)
+    monkeypatch.setattr("mitsonar.estimation.channel.likelihood.pings_of", counted)
     quiet = replace(pair(MOTIONS[0]), response=np.zeros_like(pair(MOTIONS[0]).response))
     with threadpool_limits(2, "blas"):
         assert not Likelihood().estimate(quiet).valid
