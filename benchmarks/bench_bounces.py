@@ -71,7 +71,7 @@ def cost(scene: mi.Scene, bounces: int, pings: int) -> str:
     parts = list(result.pings(poses))
     spent = 1e3 * (time.process_time() - begun) / pings
     echoes = int(np.concatenate([part.echoes for part in parts]).mean())
-    return f"{len(result.kinds)} ways, {echoes:,} echoes, {spent:.1f} ms a response"
+    return f"{len(result.kinds)} kinds of paths, {echoes:,} echoes, {spent:.1f} ms a response"
 
 
 if __name__ == "__main__":

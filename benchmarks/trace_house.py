@@ -58,7 +58,7 @@ def main() -> None:
     """Print the tables, in Markdown."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--house", type=Path, default=Path(__file__).resolve().parents[1], help="a checkout of mitsonar")
-    parser.add_argument("--quick", action="store_true", help="only the first two ways")
+    parser.add_argument("--quick", action="store_true", help="only the first two paths")
     parser.add_argument("--child", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     house = arguments.house.resolve()

@@ -730,7 +730,7 @@ class _Bench:
 
     def finish(self, rows: list[PlainTable], notes: list[str]) -> PlainTable:
         """Write the table of all rows."""
-        report: PlainTable = {**self.run.asked, "loop": LOOP, "notes": [*self.opening_notes, *notes], "rows": rows}
+        report: PlainTable = {**self.run.settings, "loop": LOOP, "notes": [*self.opening_notes, *notes], "rows": rows}
         report |= versions(BENCHMARK.packages)
         write_atomic(self.out / "table.md", ("\n".join(benchmark_lines(rows)) + "\n").encode())
         write_json(self.out / "table.json", report)

@@ -385,7 +385,7 @@ class TableBuilder:
             buffer = io.BytesIO()
             figure.savefig(buffer, format="png", dpi=80)
             write_atomic(self.folder / f"table-{table.name}.png", buffer.getvalue())
-        report = {"version": version, **self.run.asked, "recipes": self.recipes}
+        report = {"version": version, **self.run.settings, "recipes": self.recipes}
         report["tables"] = {table.name: plain_table(table, results) for table in tables}
         write_atomic(self.folder / "table.md", ("\n".join(lines) + "\n").encode())
         write_json(self.folder / "table.json", report)

@@ -125,9 +125,9 @@ class Modality(Protocol):
         stored: arrays that are filled ping by ping, those with a shape first.
         axes: coordinates along their dimensions.
         attributes: of the store.
-        settled: names of the numeric attributes of the whole data set that are set before its first ping is recorded.
+        fixed_attributes: names of the numeric attributes of the whole data set that are set before its first ping is recorded.
         planned: arrays of the plan that are stored in addition to the poses.
-        decided_by: packages whose versions affect the recorded values, in addition to those that always do.
+        result_packages: packages whose versions affect the recorded values, in addition to those that always do.
         ping_bytes: approximate size of one ping [bytes].
         renderer_class: class that renders a scene of the recipe, as ``module:class``; see :func:`renderer_of`.
         samples_class: class that reads the samples on which estimators are compared, as ``module:class``.
@@ -137,9 +137,9 @@ class Modality(Protocol):
     """
 
     what: str
-    settled: tuple[str, ...]
+    fixed_attributes: tuple[str, ...]
     planned: tuple[str, ...]
-    decided_by: tuple[str, ...]
+    result_packages: tuple[str, ...]
     renderer_class: str
     samples_class: str
     estimators: str

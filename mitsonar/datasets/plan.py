@@ -371,9 +371,9 @@ class ImageModality:
     """
 
     what = "frame"
-    settled: tuple[str, ...] = ("gain", "level_scale")
+    fixed_attributes: tuple[str, ...] = ("gain", "level_scale")
     planned: tuple[str, ...] = ()
-    decided_by: tuple[str, ...] = ()
+    result_packages: tuple[str, ...] = ()
     renderer_class = "mitsonar.datasets.make:SceneRenderer"
     samples_class = "mitsonar.datasets.samples:SonarPairs"
     estimators = "zero,ecc,flow,phase,direct"
@@ -566,9 +566,9 @@ class ResponseModality:
     """
 
     what = "ping"
-    settled: tuple[str, ...] = ()
+    fixed_attributes: tuple[str, ...] = ()
     planned: tuple[str, ...] = ("velocity",)
-    decided_by: tuple[str, ...] = ("finufft",)
+    result_packages: tuple[str, ...] = ("finufft",)
     renderer_class = "mitsonar.datasets.make:ResponseRenderer"
     samples_class = "mitsonar.datasets.responses:ImpulseSamples"
     estimators = "zero,correlation,likelihood"

@@ -87,7 +87,7 @@ class DataStore:
             storage: location of the store.
             recipe: recipe of the data set.
             plan: all frames of the data set.
-            about: further attributes, at least those in the modality's ``settled``.
+            about: further attributes, at least those in the modality's ``fixed_attributes``.
         """
         modality, layout = modality_of(recipe), ShardLayout.of(recipe, plan)
         attributes = {

@@ -59,19 +59,19 @@ MAX_VALUE_LENGTH = 60
 # ---------------- Comparison of settings
 
 
-def check_same_settings(where: str | Path, had: Mapping[str, object], asked: Mapping[str, object], hint: str = "") -> None:
+def check_same_settings(where: str | Path, stored: Mapping[str, object], requested: Mapping[str, object], hint: str = "") -> None:
     """Refuse to resume a run with settings that differ from those that it was started with.
 
     Args:
         where: path of the run.
-        had: settings of the existing run.
-        asked: requested settings.
+        stored: settings of the existing run.
+        requested: requested settings.
         hint: how to request the same settings.
 
     Raises:
         MitsonarError: they differ; the message names each difference with both values.
     """
-    changes = differences(had, asked)
+    changes = differences(stored, requested)
     if changes:
         more = f"; and {len(changes) - MAX_DIFFERENCES} more" if len(changes) > MAX_DIFFERENCES else ""
         raise MitsonarError(
@@ -80,11 +80,11 @@ def check_same_settings(where: str | Path, had: Mapping[str, object], asked: Map
         )
 
 
-def differences(had: Mapping[str, object], asked: Mapping[str, object], within: str = "") -> list[str]:
+def differences(stored: Mapping[str, object], requested: Mapping[str, object], within: str = "") -> list[str]:
     """List the keys whose values differ, with dots between levels and both values: ``sonar.seed 0, not 5``."""
     texts: list[str] = []
-    for key in [*asked, *(key for key in had if key not in asked)]:
-        old, new = had.get(key), asked.get(key)
+    for key in [*requested, *(key for key in stored if key not in requested)]:
+        old, new = stored.get(key), requested.get(key)
         if isinstance(old, Mapping) and isinstance(new, Mapping):
             texts += differences(old, new, f"{within}{shown(key)}.")
         elif old != new:
@@ -140,10 +140,10 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
     return installed
 
 
-def changed_versions(had: Mapping[str, object], packages: Iterable[str]) -> list[str]:
+def changed_versions(stored: Mapping[str, object], packages: Iterable[str]) -> list[str]:
     """List the packages whose version has changed: ``mitsuba 3.8.0 (now 3.9.0)``."""
     return [
-        f"{name} {had.get(name)} (now {current})" for name, current in versions(packages).items() if had.get(name) != current
+        f"{name} {stored.get(name)} (now {current})" for name, current in versions(packages).items() if stored.get(name) != current
     ]
 
 
@@ -188,7 +188,7 @@ class RunDirectory:
     Attributes:
         path: path of the folder.
         kind: type of run.
-        asked: settings of the run, as JSON returns them; a run is resumed only with the same settings.
+        settings: settings of the run, as JSON returns them; a run is resumed only with the same settings.
         versions: versions of packages when the run was started.
         notes: progress of the run.
         finished: whether all outputs are complete.
@@ -197,7 +197,7 @@ class RunDirectory:
 
     path: Path
     kind: RunKind
-    asked: dict[str, Any]
+    settings: dict[str, Any]
     versions: dict[str, str]
     notes: dict[str, Any] = field(default_factory=dict)
     finished: bool = False
@@ -207,14 +207,14 @@ class RunDirectory:
 
     @classmethod
     def begin(
-        cls, path: str | Path, kind: RunKind, asked: Mapping[str, Any], *, resume: bool = False, overwrite: bool = False
+        cls, path: str | Path, kind: RunKind, settings: Mapping[str, Any], *, resume: bool = False, overwrite: bool = False
     ) -> RunDirectory:
         """Select a new or an existing run, without writing anything.
 
         Args:
             path: path of the folder.
             kind: type of run.
-            asked: all settings that determine the results.
+            settings: all settings that determine the results.
             resume: resume an existing run; without one, a new run is started.
             overwrite: replace an existing run.
 
@@ -224,7 +224,7 @@ class RunDirectory:
         """
         if resume and overwrite:
             raise MitsonarError("--resume and --overwrite contradict each other: give one")
-        new = cls(Path(path), kind, plain_json(asked), versions(kind.packages))
+        new = cls(Path(path), kind, plain_json(settings), versions(kind.packages))
         if not _contains_run(new.path):
             return new
         existing = _read(new.path, kind, only_kind=overwrite)
@@ -237,7 +237,7 @@ class RunDirectory:
                 "another -o"
             )
         deciding = [{name: run.versions.get(name) for name in kind.deciding} for run in (existing, new)]
-        check_same_settings(new.path, existing.asked | deciding[0], new.asked | deciding[1])
+        check_same_settings(new.path, existing.settings | deciding[0], new.settings | deciding[1])
         existing.resumed = True
         return existing
 
@@ -315,7 +315,7 @@ class RunDirectory:
         unknown = set(self.notes) - set(self.kind.notes)
         assert not unknown, f"RunKind.notes lacks {unknown}"
         about = {"kind": self.kind.name, "finished": self.finished, "replaces": self._replaces}
-        write_json(self.path / RUN_FILE, {**about, "asked": self.asked, "versions": self.versions, **self.notes})
+        write_json(self.path / RUN_FILE, {**about, "asked": self.settings, "versions": self.versions, **self.notes})
 
 
 # ---------------- Existing files and runs
@@ -367,7 +367,7 @@ def _read(path: Path, kind: RunKind, *, only_kind: bool = False) -> RunDirectory
         _check(content, kind)
     except MitsonarError as error:
         raise run.damage(error) from None
-    run.asked, run.versions, run.finished = content["asked"], content["versions"], content["finished"]
+    run.settings, run.versions, run.finished = content["asked"], content["versions"], content["finished"]
     run.notes = {key: content[key] for key in kind.notes if key in content}
     run._replaces, run._started = content["replaces"], True
     return run

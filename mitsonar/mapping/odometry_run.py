@@ -87,7 +87,7 @@ class OdometryFolder(EstimateStore):
         Raises:
             MitsonarError: ``run.json`` is damaged.
         """
-        height = self.run.asked.get("height_m")
+        height = self.run.settings.get("height_m")
         try:
             return None if height is None else finite_number(height, "height_m", above=0, below=1e6)
         except MitsonarError as error:

@@ -81,8 +81,8 @@ class Paths:
         amplitude: ``(n,)`` complex128, before the carrier's phase -2 pi f_c tau; real and positive in the model ``rays``.
         doppler_hz: Doppler shift of the carrier ``(n,)`` [Hz], positive where the path gets shorter.
         dropped: number of echoes from beyond ``range_max``.
-        way: kind of each path, as an index into ``ways`` ``(n,)``; by default all paths are of the first kind.
-        ways: kinds of paths, named after what they meet in turn: ``scatterer``, ``surface-scatterer``, ``direct``,
+        kind: kind of each path, as an index into ``kinds`` ``(n,)``; by default all paths are of the first kind.
+        kinds: kinds of paths, named after what they meet in turn: ``scatterer``, ``surface-scatterer``, ``direct``,
             ``surface-seabed`` ...
     """
 
@@ -90,24 +90,24 @@ class Paths:
     amplitude: NDArray[np.complex128]
     doppler_hz: NDArray[np.float64]
     dropped: int
-    way: NDArray[np.int64] | None = None
-    ways: tuple[str, ...] = ("scatterer",)
+    kind: NDArray[np.int64] | None = None
+    kinds: tuple[str, ...] = ("scatterer",)
 
     def by(self, name: str) -> Paths:
         """Return the paths of one kind.
 
         Args:
-            name: one of :attr:`ways`.
+            name: one of :attr:`kinds`.
 
         Raises:
             MitsonarError: there is no such kind of path.
         """
         if name not in self.kinds:
             raise MitsonarError(f"no kind of path is named {name!r}: {suggest_names(name, self.kinds)}")
-        way = np.zeros(len(self.delay_s), np.int64) if self.way is None else self.way
-        selected = way == self.kinds.index(name)
+        kind = np.zeros(len(self.delay_s), np.int64) if self.kind is None else self.kind
+        selected = kind == self.kinds.index(name)
         return Paths(
-            self.delay_s[selected], self.amplitude[selected], self.doppler_hz[selected], 0, way[selected], self.kinds
+            self.delay_s[selected], self.amplitude[selected], self.doppler_hz[selected], 0, kind[selected], self.kinds
         )
 
 
@@ -133,7 +133,7 @@ class ChannelSimulator:
             ``materials`` to use those of the shapes' materials.
 
     Attributes:
-        ways: kinds of paths, named after what they meet in turn: ``scatterer``, ``surface-scatterer``, ``direct``,
+        kinds: kinds of paths, named after what they meet in turn: ``scatterer``, ``surface-scatterer``, ``direct``,
             ``surface`` ...
 
     Raises:
@@ -294,9 +294,9 @@ class ChannelSimulator:
         keep = received["counts"].astype(bool)
         names = ("delay", "amplitude", "phase", "doppler")
         delay, size, phase, doppler = (received[name][keep].astype(float) for name in names)
-        way = np.repeat(np.arange(len(parts)), [len(part["counts"]) for part in parts])[keep]
+        kind = np.repeat(np.arange(len(parts)), [len(part["counts"]) for part in parts])[keep]
         beyond = int(np.count_nonzero(received["beyond"]))
-        return Paths(delay, size * np.exp(1j * phase), doppler, beyond, way, self.kinds)
+        return Paths(delay, size * np.exp(1j * phase), doppler, beyond, kind, self.kinds)
 
     def _channels(
         self, poses: NDArray[np.float64], velocity: NDArray[np.float64], first: int, threads: ThreadPoolExecutor

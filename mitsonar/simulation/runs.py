@@ -323,7 +323,7 @@ class StoredEchoes:
     def __init__(self, folder: str | Path, *, bins: int | None = None, window: tuple[float, float] | None = None) -> None:
         self.variant = ensure_variant()
         self.folder = Path(folder)
-        self.settings = RunDirectory.open(folder, RENDERING).asked
+        self.settings = RunDirectory.open(folder, RENDERING).settings
         if not (self.folder / "echoes").is_dir():
             raise MitsonarError(f"{folder} holds no echoes: render the run with --exr first")
         frames = SonarFrames.load(self.folder)

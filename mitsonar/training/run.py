@@ -175,7 +175,7 @@ def _workers(options: TrainOptions, earlier: RunDirectory | None, trainer: light
     cores = len(os.sched_getaffinity(0)) // max(1, trainer.world_size)
     on_cpu = trainer.strategy.root_device.type == "cpu"
     if options.render:
-        workers = None if earlier is None else earlier.asked.get("workers")
+        workers = None if earlier is None else earlier.settings.get("workers")
         default = max(1, cores // 2 if on_cpu else cores - 1)
         return workers if isinstance(workers, int) and 0 <= workers <= MAX_COUNT else default
     return (1 if cores > 2 else 0) if on_cpu else max(1, min(8, cores - 1))

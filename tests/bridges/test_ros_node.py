@@ -105,7 +105,7 @@ def test_a_pose_is_taken_and_a_wrong_one_refused(ros: Ros) -> None:
     ros.taken["pose"](Message(pose=Message(position=place, orientation=turn)))
     taken = mailbox.take(0)
     assert taken is not None
-    np.testing.assert_allclose(taken.asked.pose, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(taken.request.pose, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-12)
     ros.taken["pose"](Message(pose=Message(position=place, orientation=Message(x=0.0, y=0.0, z=0.0, w=0.0))))
     assert mailbox.take(0) is None
     assert ros.said[-1].startswith("invalid pose: the orientation")

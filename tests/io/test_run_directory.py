@@ -100,7 +100,7 @@ def test_a_replaced_run_loses_its_outputs_and_nothing_else(tmp_path: Path) -> No
     new.start(done=0)
     assert sorted(os.listdir(run.path)) == ["mine.txt", RUN_FILE]
     again = RunDirectory.open(run.path, KIND)
-    assert (again.asked, again.notes, again.finished) == ({"other": 1}, {"done": 0}, False)
+    assert (again.settings, again.notes, again.finished) == ({"other": 1}, {"done": 0}, False)
 
 
 def test_what_was_killed_while_it_replaced_a_run_begins_anew_when_resumed(tmp_path: Path) -> None:

@@ -72,8 +72,8 @@ def decibels(got: NDArray[Any], wanted: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def named(paths: Paths) -> list[str]:
-    assert paths.way is not None
-    return [paths.kinds[k] for k in paths.way]
+    assert paths.kind is not None
+    return [paths.kinds[k] for k in paths.kind]
 
 
 @pytest.mark.parametrize("bounces", [1, 2, 3])

@@ -82,8 +82,8 @@ def test_the_number_of_bounces_bounds_the_ways() -> None:
     names = []
     for bounces in (1, 2, 3):
         paths = ChannelSimulator(unmerged(**target()), instrument(bounces=bounces), mirrors=MIRRORS).paths(POSE)
-        assert paths.way is not None
-        names.append({paths.kinds[k] for k in paths.way} - {"surface", "wall", "surface-wall", "wall-surface"})
+        assert paths.kind is not None
+        names.append({paths.kinds[k] for k in paths.kind} - {"surface", "wall", "surface-wall", "wall-surface"})
     assert names[0] == {"scatterer"}
     assert names[1] - names[0] == {f"{m}-scatterer" for m in MIRRORS} | {f"scatterer-{m}" for m in MIRRORS}
     both = {f"{a}-scatterer-{b}" for a in MIRRORS for b in MIRRORS}
@@ -135,8 +135,8 @@ def test_a_ghost_is_in_the_field_of_view_of_its_direction() -> None:
     up = FieldOfView(shape="circular", tilt_deg=128.0, heading_deg=8.0, across_deg=30.0)
     sonar = instrument(receivers=(received_from(OFFSET, **up.model_dump()),))
     paths = ChannelSimulator(unmerged(**open_water()), sonar, mirrors={"surface": SURFACE}).paths(POSE)
-    assert paths.way is not None
-    assert {paths.kinds[k] for k in paths.way} == {"scatterer-surface", "surface-scatterer-surface"}
+    assert paths.kind is not None
+    assert {paths.kinds[k] for k in paths.kind} == {"scatterer-surface", "surface-scatterer-surface"}
 
 
 @pytest.mark.parametrize("velocity", [(1.0, 2.0, -0.5, 0.0), (0.0, 0.0, 0.0, 0.4)])
