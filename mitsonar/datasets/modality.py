@@ -125,7 +125,7 @@ class Modality(Protocol):
         stored: arrays that are filled ping by ping, those with a shape first.
         axes: coordinates along their dimensions.
         attributes: of the store.
-        fixed_attributes: names of the numeric attributes of the whole data set that are set before its first ping is recorded.
+        fixed_attributes: names of the numeric attributes of the whole data set set before its first ping is recorded.
         planned: arrays of the plan that are stored in addition to the poses.
         result_packages: packages whose versions affect the recorded values, in addition to those that always do.
         ping_bytes: approximate size of one ping [bytes].

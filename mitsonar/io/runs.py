@@ -59,7 +59,9 @@ MAX_VALUE_LENGTH = 60
 # ---------------- Comparison of settings
 
 
-def check_same_settings(where: str | Path, stored: Mapping[str, object], requested: Mapping[str, object], hint: str = "") -> None:
+def check_same_settings(
+    where: str | Path, stored: Mapping[str, object], requested: Mapping[str, object], hint: str = ""
+) -> None:
     """Refuse to resume a run with settings that differ from those that it was started with.
 
     Args:
@@ -143,7 +145,9 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
 def changed_versions(stored: Mapping[str, object], packages: Iterable[str]) -> list[str]:
     """List the packages whose version has changed: ``mitsuba 3.8.0 (now 3.9.0)``."""
     return [
-        f"{name} {stored.get(name)} (now {current})" for name, current in versions(packages).items() if stored.get(name) != current
+        f"{name} {stored.get(name)} (now {current})"
+        for name, current in versions(packages).items()
+        if stored.get(name) != current
     ]
 
 
