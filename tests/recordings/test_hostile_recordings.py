@@ -151,8 +151,9 @@ def test_mutants_are_read_or_refused(name: str, first: int, tmp_path: Path) -> N
     count = USUAL - FIRST if first else FEWER if "bag" in name or "mcap" in name else FIRST
     result = attack(name, tmp_path, count, first, READERS)
     assert result["read"] + result["refused"] == count
-    assert result["refused"] > 0
-    assert result["read"] > 0 or name == "mcap of a run"  # whose every byte has a checksum
+    if first:
+        assert result["refused"] > 0
+        assert result["read"] > 0 or name == "mcap of a run"  # whose every byte has a checksum
 
 
 @pytest.mark.slow
