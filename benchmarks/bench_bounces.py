@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def cost(scene: mi.Scene, bounces: int, pings: int) -> str:
-    """Return ways, echoes and processor time of a response."""
+    """Return kinds of paths, echoes and processor time of a response."""
     receiver = Hydrophone(name="one", position=(0.3, 0.2, 0.0), field=FieldOfView(shape="all"))
     poses = np.zeros((pings, 6))
     poses[:, 2] = 8.0

@@ -1,11 +1,11 @@
-"""Honest certainty: squared errors over the covariances, refusals and errors, on pairs of many kinds.
+"""Certainty: squared errors over the covariances, refusals and errors, on pairs of many kinds.
 
     python benchmarks/bench_certainty.py --out bench/certainty [--only hull,far130] [--noise none,high] [--seed 7301]
         [--methods direct,corrnet,flow] [--recordings FOLDER]
 
 Makes the data sets (one pair a sequence) and estimates each pair. What is there is kept. *nees*: squared error over the
 covariance, a third of it, of the valid estimates: its mean with a 95 % interval (bootstrap over scenes), and its median; 1
-and 0.79 are honest. With --recordings: sonars at rest, whose true motion is none, and loops of the chain, whose sum of 8
+and 0.79 are consistent. With --recordings: sonars at rest, whose true motion is none, and loops of the chain, whose sum of 8
 motions less the motion over 8 is none. `--quick` estimates two pairs of one set, kept nowhere.
 """
 
@@ -98,23 +98,23 @@ HEAD = """| set | noise | method | pairs | invalid | RMSE (mm, mm, deg) | median
 |---|---|---|---|---|---|---|---|---|---|"""
 
 
-def measure(asked: argparse.Namespace) -> None:
+def measure(arguments: argparse.Namespace) -> None:
     """Print a row for each set, noise and method."""
-    methods = asked.methods.split(",")
-    for name in filter(None, asked.only.split(",")):
-        for noise in asked.noise.split(","):
+    methods = arguments.methods.split(",")
+    for name in filter(None, arguments.only.split(",")):
+        for noise in arguments.noise.split(","):
             if name == SLOPE:
-                measure_slope(asked.out, noise, methods)
+                measure_slope(arguments.out, noise, methods)
             elif noise == "none" or "coherent" not in name:  # their noise is the receiver's
-                measure_kind(asked.out, name, KINDS[name], noise, methods, asked.seed)
-    folder = None if asked.recordings is None else recordings_folder(asked.recordings)
+                measure_kind(arguments.out, name, KINDS[name], noise, methods, arguments.seed)
+    folder = None if arguments.recordings is None else recordings_folder(arguments.recordings)
     if folder is not None:
         for method in methods:
             measure_recordings(folder, network_of(method, coherent=True))
 
 
 def network_of(method: str, *, coherent: bool) -> str:
-    """Return the network that was trained for frames with speckle, where that is asked for."""
+    """Return the network that was trained for frames with speckle, where that is requested."""
     return "corrnet-coherent" if coherent and method == "corrnet" else method
 
 
@@ -189,15 +189,15 @@ def report(name: str, noise: str, method: str, each: Pairs, estimator: AnyEstima
     print(f"| {name} | {noise} | {method} | {row(np.array(truth), np.array(scene), result)} |", flush=True)
 
 
-def row(truth: Array, scene: NDArray[np.int64], found: list[Estimate]) -> str:
+def row(truth: Array, scene: NDArray[np.int64], results: list[Estimate]) -> str:
     """Return the cells of a row."""
-    valid = np.array([one.valid for one in found])
-    motion = np.array([one.motion for one in found])
+    valid = np.array([one.valid for one in results])
+    motion = np.array([one.motion for one in results])
     errors = motion_errors(motion, truth, valid)
-    nees = np.array([normalised(one, true) for one, true in zip(found, truth, strict=True)])
+    nees = np.array([normalised(one, true) for one, true in zip(results, truth, strict=True)])
     known = np.isfinite(nees)
-    cells = f"{len(found)} | {(~valid).sum()} | {triple(errors.rmse)} | {triple(errors.median)}"
-    reasons = Counter(one.reason.split(":")[0][:60] for one in found if not one.valid)
+    cells = f"{len(results)} | {(~valid).sum()} | {triple(errors.rmse)} | {triple(errors.median)}"
+    reasons = Counter(one.reason.split(":")[0][:60] for one in results if not one.valid)
     why = "; ".join(f"{count} {reason}" for reason, count in reasons.most_common(2))
     if not known.any():
         return f"{cells} | - | - | {why}"
@@ -206,12 +206,12 @@ def row(truth: Array, scene: NDArray[np.int64], found: list[Estimate]) -> str:
     return f"{cells} | {nees[known].mean():.2f} ({low:.2f}..{high:.2f}) | {np.median(nees[known]):.2f} | {why}"
 
 
-def normalised(found: Estimate, true: Array) -> float:
+def normalised(results: Estimate, true: Array) -> float:
     """Return the squared error of an estimate over its covariance, a third of it; nan of one that is not valid."""
-    if not found.valid or found.covariance is None:
+    if not results.valid or results.covariance is None:
         return float("nan")
-    off = np.array(found.motion) - true
-    return float(off @ np.linalg.solve(found.covariance, off)) / 3
+    off = np.array(results.motion) - true
+    return float(off @ np.linalg.solve(results.covariance, off)) / 3
 
 
 def triple(values: Any) -> str:

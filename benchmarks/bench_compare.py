@@ -47,21 +47,32 @@ def main() -> None:
         compare_all(argparse.Namespace(**{**vars(arguments), **few}))
 
 
-def compare_all(asked: argparse.Namespace) -> None:
+def compare_all(arguments: argparse.Namespace) -> None:
     """Make the data sets and compare the estimators on each."""
-    asked.out.mkdir(parents=True, exist_ok=True)
-    for name in [asked.only] if asked.only else SETS:
-        data = asked.out / f"{name}.zarr"
-        changes = (*(SMALL if asked.quick else (SETS[name],)), "flight.pings=2")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for name in [arguments.only] if arguments.only else SETS:
+        data = arguments.out / f"{name}.zarr"
+        changes = (*(SMALL if arguments.quick else (SETS[name],)), "flight.pings=2")
         sets = [word for change in changes for word in ("--set", change)]
         run("dataset", "make", name, *sets, "--seed", SEED, "-o", data)
         common = (data, "--part", "all", "--reference", "direct")
-        levels = ("--noise", "high" if asked.quick else "none,low,high", "--limit", min(10, asked.pairs))
-        run("compare", *common, *levels, "--prior", "--estimators", METHODS, "--pairs", asked.pairs, "-o", asked.out / name)
-        if asked.perturbed:
-            few: tuple[object, ...] = ("--pairs", asked.perturbed, "--noise", "none", "--limit", 0, "--perturb")
+        levels = ("--noise", "high" if arguments.quick else "none,low,high", "--limit", min(10, arguments.pairs))
+        run(
+            "compare",
+            *common,
+            *levels,
+            "--prior",
+            "--estimators",
+            METHODS,
+            "--pairs",
+            arguments.pairs,
+            "-o",
+            arguments.out / name,
+        )
+        if arguments.perturbed:
+            few: tuple[object, ...] = ("--pairs", arguments.perturbed, "--noise", "none", "--limit", 0, "--perturb")
             few += () if name.endswith("physical") else ("--jitter",)  # the physical model's rays move already
-            run("compare", *common, *few, "--estimators", PERTURBED, "-o", asked.out / f"{name}-perturbed")
+            run("compare", *common, *few, "--estimators", PERTURBED, "-o", arguments.out / f"{name}-perturbed")
 
 
 def run(*words: object) -> None:

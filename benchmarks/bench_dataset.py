@@ -3,7 +3,7 @@
     python benchmarks/bench_dataset.py [--json] [--quick] [--only make,rendered,read,field]
 
 `make` runs `mitsonar dataset make` as a user would, for two sizes that build the same 30 worlds; the difference of the two
-gives the time of a further frame, and with it the time of 200,000 (said so in the table). Memory is the sum over the command
+gives the time of a further frame, and with it the time of 200,000 (the table marks it). Memory is the sum over the command
 and its workers (proportional set size: shared pages count once), sampled every three seconds.
 """
 

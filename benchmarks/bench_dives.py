@@ -79,7 +79,7 @@ def errors_of(out: Path, dive: SimulatedSet, texture: str, worlds: int, places: 
             assert frames.poses is not None
             true.append(motions(frames.poses)[0])
             for known in KNOWN:
-                answers[known].append(estimator_of(dive, known).estimate(told(frames, known)))
+                answers[known].append(estimator_of(dive, known).estimate(reported(frames, known)))
     unknown = np.full((3, 3), np.nan)
     return [
         motion_errors(
@@ -110,8 +110,12 @@ def vehicle(dive: SimulatedSet, places: int) -> Array:
     course = dive_course(600, DIVE_HZ, dive.seed, FLIGHTS[dive.flight])
     result = []
     for _ in range(places):
-        at = int(rng.integers(0, len(course) - 2))
-        pair, heading, place = course[at : at + 2].copy(), rng.uniform(0, 2 * np.pi), rng.uniform(-NEAR_M, NEAR_M, 2)
+        position = int(rng.integers(0, len(course) - 2))
+        pair, heading, place = (
+            course[position : position + 2].copy(),
+            rng.uniform(0, 2 * np.pi),
+            rng.uniform(-NEAR_M, NEAR_M, 2),
+        )
         turn = heading - pair[0, 5]
         turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         pair[:, :2] = place + (pair[:, :2] - pair[0, :2]) @ turned.T
@@ -121,7 +125,7 @@ def vehicle(dive: SimulatedSet, places: int) -> Array:
     return np.concatenate(result)
 
 
-def told(frames: SonarFrames, known: str) -> SonarFrames:
+def reported(frames: SonarFrames, known: str) -> SonarFrames:
     """Return the frames with what is known."""
     if known == "all":
         return frames
@@ -131,7 +135,7 @@ def told(frames: SonarFrames, known: str) -> SonarFrames:
 
 
 def estimator_of(dive: SimulatedSet, known: str) -> Direct:
-    """``direct``, told the pitch of the mount where that is all."""
+    """``direct``, given the pitch of the mount where nothing else is known."""
     return Direct(pitch_rad=float(np.radians(dive.pitch_deg))) if known == "pitch" else Direct()
 
 

@@ -47,7 +47,7 @@ WATCHED = "BENCH_PROGRESS"
 """Variable that names the file of times and memory in the process of the command."""
 
 TIMELESS = ("seconds", "pairs_in_these_seconds")
-"""What ``run.json`` tells of how the run went, not of what it found."""
+"""Keys of ``run.json`` that describe the run, not its results."""
 
 STAGES = ("pairs", "map", "writing")
 PART = 64

@@ -78,9 +78,11 @@ def tank() -> mi.Scene:
     """Return a tank of 6 x 7 m, 4 m deep, with a rough floor and three balls on it."""
     import mitsuba as mi
 
-    def plate(at: list[float], normal: list[float], reflectance: float) -> dict[str, Any]:
+    def plate(position: list[float], normal: list[float], reflectance: float) -> dict[str, Any]:
         up = [0, 1, 0] if normal[2] else [0, 0, 1]
-        look = mi.ScalarTransform4f().look_at(origin=at, target=[a + n for a, n in zip(at, normal, strict=True)], up=up)
+        look = mi.ScalarTransform4f().look_at(
+            origin=position, target=[a + n for a, n in zip(position, normal, strict=True)], up=up
+        )
         grey = {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
         return {"type": "rectangle", "to_world": look @ mi.ScalarTransform4f().scale(8), "bsdf": grey}
 
@@ -92,9 +94,9 @@ def tank() -> mi.Scene:
     ]
     scene: dict[str, Any] = {f"wall{number}": plate(*wall, 0.05) for number, wall in enumerate(walls)}
     scene |= {"floor": plate([0, 0, 0], [0, 0, 1], 0.05), "surface": plate([0, 0, 4], [0, 0, -1], 0.05)}
-    for number, at in enumerate(([-0.4, 3.0, 0.15], [0.3, 3.5, 0.15], [0.7, 2.8, 0.15])):
+    for number, position in enumerate(([-0.4, 3.0, 0.15], [0.3, 3.5, 0.15], [0.7, 2.8, 0.15])):
         grey = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.2}}
-        scene[f"ball{number}"] = {"type": "sphere", "center": at, "radius": 0.15, "bsdf": grey}
+        scene[f"ball{number}"] = {"type": "sphere", "center": position, "radius": 0.15, "bsdf": grey}
     loaded = mi.load_dict({"type": "scene", **scene}, optimize=False)  # merged meshes would lose their ids
     assert isinstance(loaded, mi.Scene)
     return loaded

@@ -139,7 +139,7 @@ def rate_of(simulator: ChannelSimulator, poses: NDArray[np.float64], velocity: N
 
 
 def direct_seconds(delay: NDArray[np.float64], amplitude: NDArray[np.complex128], sonar: ChannelSonar) -> float:
-    """Time of eq. 5.15 as it stands, frequency by frequency."""
+    """Time of eq. 5.15 as written, frequency by frequency."""
     frequency = sonar.carrier_hz + np.arange(-360, 361) * sonar.frequency_step_hz
     begun = time.perf_counter()
     for one in frequency[::8]:
@@ -189,7 +189,7 @@ def leak(sonar: ChannelSonar, samples: int, size: Size) -> None:
         simulator = ChannelSimulator(field_of(10 + seed, size), sonar)
         poses, velocity = flights(samples // 5, 100 + seed)
         response = np.concatenate([part.response for part in simulator.pings(poses, velocity)])
-        result += [most_alike(one, templates, tried) for one in response]
+        result += [most_similar(one, templates, tried) for one in response]
         true += list(velocity[:, :2])
     error = 1e3 * APART_S * (np.array(result) - np.array(true))
     zero = 1e3 * APART_S * np.array(true)
@@ -216,7 +216,7 @@ def templates_of(sonar: ChannelSonar, steps: int) -> tuple[NDArray[np.complex64]
     return response / np.linalg.norm(response, axis=2, keepdims=True), tried
 
 
-def most_alike(
+def most_similar(
     response: NDArray[np.complex64], templates: NDArray[np.complex64], tried: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the velocity whose template best correlates with a response ``(receivers, taps)``, with a parabola."""

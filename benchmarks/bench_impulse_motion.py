@@ -138,19 +138,19 @@ def workers(processes: int) -> AbstractContextManager[Pool]:
     return multiprocessing.get_context("spawn").Pool(processes)
 
 
-def recipe_of(asked: argparse.Namespace, name: str) -> Recipe:
+def recipe_of(arguments: argparse.Namespace, name: str) -> Recipe:
     """Return a recipe of scenes that no network has seen."""
-    rays = {"channel.rays": asked.rays[0]} if asked.model == "rays" else {}
-    return load_recipe(name, {"seed": SEED, "channel.model": asked.model, **rays, **(SMALL if asked.quick else {})})
+    rays = {"channel.rays": arguments.rays[0]} if arguments.model == "rays" else {}
+    return load_recipe(name, {"seed": SEED, "channel.model": arguments.model, **rays, **(SMALL if arguments.quick else {})})
 
 
 # ---------------------------------------------------------------- samples
 
 
-def made(asked: argparse.Namespace, name: str) -> list[ImpulseResponses]:
+def report(arguments: argparse.Namespace, name: str) -> list[ImpulseResponses]:
     """Load the samples of a data set from OUT, or make them."""
-    recipe, samples = recipe_of(asked, name), asked.samples
-    path = asked.out / f"{name}-{asked.model}-{samples}.npz"
+    recipe, samples = recipe_of(arguments, name), arguments.samples
+    path = arguments.out / f"{name}-{arguments.model}-{samples}.npz"
     if not path.exists():
         parts = list(fresh(recipe, samples))
         np.savez(
@@ -210,13 +210,13 @@ def estimate_of(work: tuple[str, dict[str, bool], ImpulseResponses]) -> list[flo
 
 
 def estimates(
-    asked: argparse.Namespace, label: str, name: str, samples: list[ImpulseResponses], **options: bool
+    arguments: argparse.Namespace, label: str, name: str, samples: list[ImpulseResponses], **options: bool
 ) -> NDArray[np.float64]:
     """Answers ``(samples, 8)``, from OUT or new."""
-    path = asked.out / f"{label}-{file_name(name)}.json"
+    path = arguments.out / f"{label}-{file_name(name)}.json"
     if not path.exists():
         work = [(name, options, one) for one in samples]
-        answers = asked.pool.map(estimate_of, work, chunksize=max(1, len(work) // (4 * asked.processes)))
+        answers = arguments.pool.map(estimate_of, work, chunksize=max(1, len(work) // (4 * arguments.processes)))
         path.write_text(json.dumps(answers))
     return np.array(json.loads(path.read_text()))
 
@@ -249,26 +249,30 @@ HEAD = (
 )
 
 
-def rows(asked: argparse.Namespace) -> None:
+def rows(arguments: argparse.Namespace) -> None:
     """Every row of table 5.2."""
     print(HEAD, flush=True)
-    for name in asked.only or ROWS:
-        samples = made(asked, name)
-        true, some = truth(samples), slice(1, 2) if asked.quick else slice(None, None, round(1 / COSTLY.get(name, 1.0)))
+    for name in arguments.only or ROWS:
+        samples = report(arguments, name)
+        true, some = truth(samples), slice(1, 2) if arguments.quick else slice(None, None, round(1 / COSTLY.get(name, 1.0)))
         turning = bool(np.abs(true[:, 2]).max() > 1e-9)
-        for estimator in asked.estimators.split(","):
+        for estimator in arguments.estimators.split(","):
             used = samples[some] if estimator == "likelihood" else samples
             options = {"yaw": True} if turning and estimator == "likelihood" else {}
-            answers = estimates(asked, f"{name}-{asked.model}-{asked.samples}", estimator, used, **options)
-            bound = bound_of(asked, name, used, turning) if estimator == "likelihood" and asked.model == "scatterers" else ""
+            answers = estimates(arguments, f"{name}-{arguments.model}-{arguments.samples}", estimator, used, **options)
+            bound = (
+                bound_of(arguments, name, used, turning)
+                if estimator == "likelihood" and arguments.model == "scatterers"
+                else ""
+            )
             figure = ROWS[name] if estimator == "likelihood" else ""
             mine = true[some] if estimator == "likelihood" else true
             print(f"| {name} ({len(used)}) | {estimator} | {cells_of(answers, mine)} | {figure} | {bound} |", flush=True)
 
 
-def bound_of(asked: argparse.Namespace, name: str, samples: list[ImpulseResponses], turning: bool) -> str:
+def bound_of(arguments: argparse.Namespace, name: str, samples: list[ImpulseResponses], turning: bool) -> str:
     """Root mean square of the local bound over some of the samples' motions, noiseless."""
-    path = asked.out / f"{name}-bound.json"
+    path = arguments.out / f"{name}-bound.json"
     if not path.exists():
         free = (0, 1, 2) if turning else (0, 1)
         stds = []
@@ -285,14 +289,14 @@ def bound_of(asked: argparse.Namespace, name: str, samples: list[ImpulseResponse
 # ---------------------------------------------------------------- noise, leaks, wrong words
 
 
-def noise(asked: argparse.Namespace) -> None:
+def noise(arguments: argparse.Namespace) -> None:
     """Evaluate the standard row and ten pings with noise, leaks and perturbations."""
     print(
         "| data | noise or change | estimator | RMSE | median | valid: RMSE | ms |\n|---|---|---|---|---|---|---|",
         flush=True,
     )
-    for name in asked.only or ("impulse-standard", "impulse-ten-80khz"):
-        samples = made(asked, name)
+    for name in arguments.only or ("impulse-standard", "impulse-ten-80khz"):
+        samples = report(arguments, name)
         true = truth(samples)
         cases: dict[str, list[ImpulseResponses]] = {}
         for snr in (30.0, 20.0, 10.0, 0.0):
@@ -302,18 +306,18 @@ def noise(asked: argparse.Namespace) -> None:
             strangers(one, samples[number - 2 * len(samples) // 5]) for number, one in enumerate(samples)
         ]
         for percent in (-5, 5):
-            cases[f"height told {percent:+d} %"] = [
+            cases[f"height given as {percent:+d} %"] = [
                 replace(one, height_m=one.height_m * (1 + percent / 100)) for one in samples if one.height_m is not None
             ]
         for percent in (-1, 1):
             sonar = samples[0].sonar.replace(sound_speed=1500 * (1 + percent / 100))
-            cases[f"sound speed told {percent:+d} %"] = [replace(one, sonar=sonar) for one in samples]
+            cases[f"sound speed given as {percent:+d} %"] = [replace(one, sonar=sonar) for one in samples]
         for case, changed in cases.items():
-            for estimator in asked.estimators.split(","):
+            for estimator in arguments.estimators.split(","):
                 if estimator == "zero":
                     continue
-                label = f"{name}-{asked.model}-{asked.samples}-{case.replace(' ', '_').replace('%', 'pc')}"
-                answers = estimates(asked, label, estimator, changed)
+                label = f"{name}-{arguments.model}-{arguments.samples}-{case.replace(' ', '_').replace('%', 'pc')}"
+                answers = estimates(arguments, label, estimator, changed)
                 print(f"| {name} | {case} | {estimator} | {cells_of(answers, true)} |", flush=True)
 
 
@@ -335,23 +339,23 @@ def strangers(one: ImpulseResponses, other: ImpulseResponses) -> ImpulseResponse
 # ---------------------------------------------------------------- courses
 
 
-def course_of(asked: argparse.Namespace, name: str, around: Pose) -> Trajectory:
+def course_of(arguments: argparse.Namespace, name: str, around: Pose) -> Trajectory:
     """Return a course, or its first positions."""
     flown = course(name, around)
-    return Trajectory(flown.poses[:9], flown.time_s[:9]) if asked.quick else flown
+    return Trajectory(flown.poses[:9], flown.time_s[:9]) if arguments.quick else flown
 
 
-def courses(asked: argparse.Namespace) -> None:
+def courses(arguments: argparse.Namespace) -> None:
     """Table 5.6: motion by motion, and where the path ends."""
     print(
         "| course | estimator | RMSE sideways mm / forward mm | valid | path m | end error cm | of the path |\n"
         "|---|---|---|---|---|---|---|",
         flush=True,
     )
-    recipe = recipe_of(asked, "impulse-standard")
-    for name in asked.only or COURSES:
-        flown, steps = course_of(asked, name, Pose(0, 0, 10)), asked.pings - 1
-        path = asked.out / f"course-{name}-{asked.model}-{asked.pings}.npz"
+    recipe = recipe_of(arguments, "impulse-standard")
+    for name in arguments.only or COURSES:
+        flown, steps = course_of(arguments, name, Pose(0, 0, 10)), arguments.pings - 1
+        path = arguments.out / f"course-{name}-{arguments.model}-{arguments.pings}.npz"
         if not path.exists():
             fine = flown.resample((len(flown) - 1) * steps + 1)
             simulator = simulator_of(recipe, scenes_of(recipe, recipe.sequences)[0])
@@ -360,11 +364,15 @@ def courses(asked: argparse.Namespace) -> None:
         pairs = [responses.select(slice(k * steps, (k + 1) * steps + 1)) for k in range(len(flown) - 1)]
         true = motions(flown.poses)
         length = float(np.hypot(*true[:, :2].T).sum())
-        for estimator in asked.estimators.split(","):
+        for estimator in arguments.estimators.split(","):
             if estimator == "zero":
                 continue
-            label = f"course-{name}-{asked.model}-{asked.pings}"
-            answers = driven(asked, label, estimator, responses) if steps == 1 else estimates(asked, label, estimator, pairs)
+            label = f"course-{name}-{arguments.model}-{arguments.pings}"
+            answers = (
+                driven(arguments, label, estimator, responses)
+                if steps == 1
+                else estimates(arguments, label, estimator, pairs)
+            )
             error = answers[:, :2] - true[:, :2]
             rmse, end = 1e3 * np.sqrt((error**2).mean(axis=0)), float(np.hypot(*error.sum(axis=0)))
             print(
@@ -374,28 +382,30 @@ def courses(asked: argparse.Namespace) -> None:
             )
 
 
-def driven(asked: argparse.Namespace, label: str, name: str, responses: ImpulseResponses) -> NDArray[np.float64]:
+def driven(arguments: argparse.Namespace, label: str, name: str, responses: ImpulseResponses) -> NDArray[np.float64]:
     """Estimate motions ``(n, 7)`` from ping to ping as odometry does. Neighbours resolve ambiguous motions, and invalid ones
     are bridged. The last column is the validity."""
-    path = asked.out / f"{label}-{file_name(name)}.json"
+    path = arguments.out / f"{label}-{file_name(name)}.json"
     if not path.exists():
-        result = odometry(ResponseSource(label, responses), create_estimator(name), OdometryOptions(workers=asked.processes))
+        result = odometry(
+            ResponseSource(label, responses), create_estimator(name), OdometryOptions(workers=arguments.processes)
+        )
         rows = np.column_stack([result.series.motions, np.zeros((len(result.series), 3)), result.valid])
         path.write_text(json.dumps(rows.tolist()))
     return np.array(json.loads(path.read_text()))
 
 
-def figure(asked: argparse.Namespace) -> None:
+def figure(arguments: argparse.Namespace) -> None:
     """Paths of the sinusoid: true, by impulse responses (after `courses`), by sonar images."""
     from matplotlib.figure import Figure
 
-    recipe = recipe_of(asked, "impulse-standard")
+    recipe = recipe_of(arguments, "impulse-standard")
     scene = simulator_of(recipe, scenes_of(recipe, recipe.sequences)[0]).tracer.scene
-    flown = course_of(asked, "sinusoid", Pose(0, 0, 2.5, pitch=np.radians(35)))
+    flown = course_of(arguments, "sinusoid", Pose(0, 0, 2.5, pitch=np.radians(35)))
     sonar = load_sonar("didson300").replace(frame_rate_hz=20.0)
     frames = Simulator(scene, sonar).render(flown)
     seen = odometry(frames, create_estimator("direct"), OdometryOptions(start=Pose.from_row(flown.poses[0])))
-    path = asked.out / f"course-sinusoid-{asked.model}-{asked.pings}-correlation.json"
+    path = arguments.out / f"course-sinusoid-{arguments.model}-{arguments.pings}-correlation.json"
     received = np.array(json.loads(path.read_text()))[:, :3]
     driven_by = {
         "impulse responses, correlation of ten pings": path_of(received, Pose.from_row(flown.poses[0]), flown.time_s).poses,
@@ -417,10 +427,10 @@ def figure(asked: argparse.Namespace) -> None:
     axes.set(xlabel="starboard (m)", ylabel="forward (m)", aspect="equal", title="Trajectory 5 (sinusoid), no noise")
     axes.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
     axes.grid(alpha=0.3)
-    drawn.savefig(asked.out / "sinusoid.png", dpi=110)
+    drawn.savefig(arguments.out / "sinusoid.png", dpi=110)
 
 
-def places(asked: argparse.Namespace) -> None:
+def places(arguments: argparse.Namespace) -> None:
     """Print errors and processor time of the guide's motion at many places."""
     import mitsuba as mi
 
@@ -435,7 +445,8 @@ def places(asked: argparse.Namespace) -> None:
         simulator = ChannelSimulator(scene, ChannelSonar(frame_rate_hz=180))
         for name in ("correlation", "likelihood"):
             print(
-                f"| {ground} | `{name}` | {place_cells(name, simulator, 5 if asked.quick else asked.samples)} |", flush=True
+                f"| {ground} | `{name}` | {place_cells(name, simulator, 5 if arguments.quick else arguments.samples)} |",
+                flush=True,
             )
 
 
@@ -466,14 +477,16 @@ ONE_BY_ONE = Split(by="sample", train=0.8, validation=0.2)
 """How Almanza-Medina deals out samples (5.4.1)."""
 
 
-def regressors(asked: argparse.Namespace) -> None:
+def regressors(arguments: argparse.Namespace) -> None:
     """Table 5.5: forward RMSE of ten regressors on pairs, and on one ping twice."""
     print("| regressor | rays | pairs, RMSE mm | one ping twice | no motion | learnt in s |\n" + 6 * "|---" + "|")
-    small = {**SMALL, "scenes": [{"count": 2, "sequences": 20}]} if asked.quick else {}
-    for rays in asked.rays[: 1 if asked.quick else None]:
-        path = asked.out / f"impulse-standard-{rays}.zarr"
-        make_dataset(load_recipe("impulse-standard", {"channel.rays": rays, **small}), str(path), workers=asked.processes)
-        names = list(REGRESSORS)[1:3] if asked.quick else list(REGRESSORS)
+    small = {**SMALL, "scenes": [{"count": 2, "sequences": 20}]} if arguments.quick else {}
+    for rays in arguments.rays[: 1 if arguments.quick else None]:
+        path = arguments.out / f"impulse-standard-{rays}.zarr"
+        make_dataset(
+            load_recipe("impulse-standard", {"channel.rays": rays, **small}), str(path), workers=arguments.processes
+        )
+        names = list(REGRESSORS)[1:3] if arguments.quick else list(REGRESSORS)
         for name in names:
             both = []
             for leak in LEAKS:

@@ -89,7 +89,7 @@ def benchmark(out: Path, square: Square, noises: list[str], seeds: int, *, coars
     if not file.exists():
         rendered(square.path, coarse=coarse).save(file)
     source = FrameSource.of(SonarFrames.load(file))
-    heads = "noise | gyroscope | loops | found | rejected | end mm | end % | ATE mm | heading deg | told mm"
+    heads = "noise | gyroscope | loops | found | rejected | end mm | end % | ATE mm | heading deg | reported mm"
     heads += " | nees, mean | nees, end | s"
     print(f"\n| {heads} |\n" + "|---" * (heads.count("|") + 1) + "|")
     for noise in noises:

@@ -4,7 +4,7 @@
     python benchmarks/bench_moving.py --quick            # 20,000 triangles, 3 pings
 
 A seabed of that many triangles and a body of as many, in the models physical and coherent: milliseconds a ping where the
-body stands still in the scene, and where it moves; medians, the two in turn. A frame of eight groups too.
+body is at rest in the scene, and where it moves; medians, the two in turn. A frame of eight groups too.
 Then bodies whose vertices move each ping, by their triangles.
 """
 

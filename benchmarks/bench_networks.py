@@ -57,27 +57,37 @@ def main() -> None:
             compare_all(argparse.Namespace(**{**vars(arguments), **few, "only": name}))
 
 
-def compare_all(asked: argparse.Namespace) -> None:
+def compare_all(arguments: argparse.Namespace) -> None:
     """Make the data sets and compare networks and estimators on each."""
-    asked.out.mkdir(parents=True, exist_ok=True)
-    elsewhere = ",".join(filter(None, ["zero", "ecc", "direct", asked.corrnet]))
-    networks = [name for name in asked.networks.split(",") if name]
-    for name in [asked.only] if asked.only else [*HOME, *ELSEWHERE]:
-        data = asked.out / f"{name}{'' if name in HOME else '-few'}.zarr"
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    elsewhere = ",".join(filter(None, ["zero", "ecc", "direct", arguments.corrnet]))
+    networks = [name for name in arguments.networks.split(",") if name]
+    for name in [arguments.only] if arguments.only else [*HOME, *ELSEWHERE]:
+        data = arguments.out / f"{name}{'' if name in HOME else '-few'}.zarr"
         common = (data, "--part", "all", "--reference", "direct")
         if name in HOME:
-            make(data, name, *(SMALL if asked.quick else (SETS[name],)), "flight.pings=2")
+            make(data, name, *(SMALL if arguments.quick else (SETS[name],)), "flight.pings=2")
             forced = "" if name == HOME[0] else ":force=1"  # the other model's bearing is a cone's
             methods = ",".join([elsewhere, *(network + forced for network in networks)])
-            levels = ("--noise", "high" if asked.quick else "none,low,high", "--limit", min(10, asked.pairs))
-            compare(asked.out / f"networks-{name}", *common, *levels, "--pairs", asked.pairs, "--estimators", methods)
-            if asked.perturbed:
-                few = ("--pairs", asked.perturbed, "--noise", "high", "--limit", 0, "--perturb")
-                compare(asked.out / f"networks-{name}-perturbed", *common, *few, "--estimators", methods)
-        elif asked.elsewhere:  # networks that know one geometry only would refuse these
-            make(data, *ELSEWHERE[name], *(SMALL if asked.quick else ()))
-            levels = ("--noise", "high" if asked.quick else "none,high", "--limit", min(5, asked.elsewhere))
-            compare(asked.out / f"networks-{name}", *common, *levels, "--pairs", asked.elsewhere, "--estimators", elsewhere)
+            levels = ("--noise", "high" if arguments.quick else "none,low,high", "--limit", min(10, arguments.pairs))
+            compare(
+                arguments.out / f"networks-{name}", *common, *levels, "--pairs", arguments.pairs, "--estimators", methods
+            )
+            if arguments.perturbed:
+                few = ("--pairs", arguments.perturbed, "--noise", "high", "--limit", 0, "--perturb")
+                compare(arguments.out / f"networks-{name}-perturbed", *common, *few, "--estimators", methods)
+        elif arguments.elsewhere:  # networks that know one geometry only would refuse these
+            make(data, *ELSEWHERE[name], *(SMALL if arguments.quick else ()))
+            levels = ("--noise", "high" if arguments.quick else "none,high", "--limit", min(5, arguments.elsewhere))
+            compare(
+                arguments.out / f"networks-{name}",
+                *common,
+                *levels,
+                "--pairs",
+                arguments.elsewhere,
+                "--estimators",
+                elsewhere,
+            )
 
 
 def make(data: Path, recipe: str, *changes: str) -> None:

@@ -48,7 +48,7 @@ Levels = NDArray[np.float64]
 
 
 def main() -> None:
-    """Print the table, and write it where asked."""
+    """Print the table, and write it if requested."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--write", action="store_true", help="keep the table with the package")
     parser.add_argument("--quick", action="store_true", help="two presets, fewer pings; writes nothing")

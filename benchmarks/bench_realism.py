@@ -116,7 +116,7 @@ def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFra
 
 
 def recorded(simulator: Simulator, poses: NDArray[np.float64], full_db: float, stage: Stage, folder: Path) -> SonarFrames:
-    """Return frames whose full scale stands for a level [dB], in 8 bit, after the recording's way."""
+    """Return frames whose full scale is a level [dB], in 8 bit, coded as the recording."""
     frames = simulator.render(poses, gain=float(10 ** (-full_db / 10)))
     image = np.rint(frames.image * 255).astype(np.float32) / 255
     frames.image = as_recorded(image, folder, stage.pictures, stage.video) if stage.pictures else image
@@ -139,13 +139,13 @@ def compare(real: SonarFrames, simulated: SonarFrames) -> list[Row]:
     return [Row(name, band, one[name][0], second[name][0]) for name, (_, band) in one.items()]
 
 
-def table(found: dict[str, list[Row]]) -> str:
+def table(results: dict[str, list[Row]]) -> str:
     """Return the statistics of all recordings in Markdown: real / simulated, bold where out of the band."""
-    lines = [f"| real / simulated | band | {' | '.join(found)} |", "|---" * (len(found) + 2) + "|"]
-    for rows in zip(*found.values(), strict=True):
+    lines = [f"| real / simulated | band | {' | '.join(results)} |", "|---" * (len(results) + 2) + "|"]
+    for rows in zip(*results.values(), strict=True):
         band = "" if rows[0].band is None else f"±{rows[0].band:g}"
         lines.append(f"| {rows[0].name} | {band} | {' | '.join(row.cell() for row in rows)} |")
-    judged = [row for rows in found.values() for row in rows if row.band is not None]
+    judged = [row for rows in results.values() for row in rows if row.band is not None]
     inside = sum(abs(row.simulated - row.real) <= row.band for row in judged if row.band is not None)
     return "\n".join([*lines, f"\n{inside} of {len(judged)} numbers with a band are in it; bold ones are out."])
 

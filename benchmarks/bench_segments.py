@@ -79,18 +79,18 @@ def main() -> None:
     PARTS[arguments.what](arguments)
 
 
-def quick(asked: argparse.Namespace) -> None:
+def quick(arguments: argparse.Namespace) -> None:
     """All parts on a few coarse pairs."""
     with tempfile.TemporaryDirectory() as folder:
         few = {"out": Path(folder), "sequences": 8, "physical": 8, "unseen": 2, "width": 0.05, "epochs": 0.2, "threads": 1}
-        asked = argparse.Namespace(**{**vars(asked), **few})
-        leak(asked)
-        asked.rows = "circular-512,circular-1024-physical"
-        ours(asked)
-        heights(asked)
-        asked.rows = str(asked.out / "runs" / "ours-circular-512")
-        paths(asked)
-        halves(asked)
+        arguments = argparse.Namespace(**{**vars(arguments), **few})
+        leak(arguments)
+        arguments.rows = "circular-512,circular-1024-physical"
+        ours(arguments)
+        heights(arguments)
+        arguments.rows = str(arguments.out / "runs" / "ours-circular-512")
+        paths(arguments)
+        halves(arguments)
 
 
 COARSE = {
@@ -105,54 +105,54 @@ COARSE_HULL = {
 """What `--quick` changes in data sets."""
 
 
-def coarse(asked: argparse.Namespace, changes: dict[str, object] = COARSE) -> dict[str, object]:
+def coarse(arguments: argparse.Namespace, changes: dict[str, object] = COARSE) -> dict[str, object]:
     """Return changes of the recipe of a data set."""
-    return changes if asked.quick else {}
+    return changes if arguments.quick else {}
 
 
-def short(asked: argparse.Namespace) -> dict[str, object]:
+def short(arguments: argparse.Namespace) -> dict[str, object]:
     """Return changes of the recipe of a training."""
-    return {"epochs": 1, "batch": 4} if asked.quick else {}
+    return {"epochs": 1, "batch": 4} if arguments.quick else {}
 
 
 # ---------------------------------------------------------------- data
 
 
-def data(asked: argparse.Namespace, name: str, sequences: int, **changes: object) -> Path:
+def data(arguments: argparse.Namespace, name: str, sequences: int, **changes: object) -> Path:
     """Make, or resume, vectors from 10 m up at 1024 levels."""
     words = {
         "store": "vectors",
         "segments": QUADRANTS + CONES,
         "name": name,
         "sonar.range_bins": 1024,
-        **coarse(asked),
+        **coarse(arguments),
         **changes,
     }
-    path: Path = asked.out / f"{name}.zarr"
-    make_dataset(load_recipe("looking-down-10m", words), str(path), sequences=sequences, workers=asked.workers)
+    path: Path = arguments.out / f"{name}.zarr"
+    make_dataset(load_recipe("looking-down-10m", words), str(path), sequences=sequences, workers=arguments.workers)
     return path
 
 
-def unseen(asked: argparse.Namespace, name: str = "unseen10", pairs: int | None = None, **changes: object) -> Path:
+def unseen(arguments: argparse.Namespace, name: str = "unseen10", pairs: int | None = None, **changes: object) -> Path:
     """Make pairs over other scenes, one a sequence."""
-    count = asked.unseen if asked.quick else pairs or asked.unseen
+    count = arguments.unseen if arguments.quick else pairs or arguments.unseen
     scenes = [{"count": -(-count // 50), "sequences": 50}]
-    return data(asked, name, count, **{"seed": 7919, "scenes": scenes, "flight.pings": 2, **changes})
+    return data(arguments, name, count, **{"seed": 7919, "scenes": scenes, "flight.pings": 2, **changes})
 
 
-def many(asked: argparse.Namespace) -> Path:
+def many(arguments: argparse.Namespace) -> Path:
     """Make the training data in the model `thesis`: 20,000 pairs."""
-    return data(asked, "many10", asked.sequences, scenes=groups(asked, asked.sequences, 125))
+    return data(arguments, "many10", arguments.sequences, scenes=groups(arguments, arguments.sequences, 125))
 
 
-def physical(asked: argparse.Namespace) -> Path:
+def physical(arguments: argparse.Namespace) -> Path:
     """And in the physical one."""
-    return data(asked, "phys10", asked.physical, scenes=groups(asked, asked.physical, 75), **PHYSICAL)
+    return data(arguments, "phys10", arguments.physical, scenes=groups(arguments, arguments.physical, 75), **PHYSICAL)
 
 
-def groups(asked: argparse.Namespace, sequences: int, each: int) -> list[dict[str, int]]:
+def groups(arguments: argparse.Namespace, sequences: int, each: int) -> list[dict[str, int]]:
     """Scenes of so many sequences each; two at least, since the split is by scene."""
-    each = sequences // 2 if asked.quick else each
+    each = sequences // 2 if arguments.quick else each
     return [{"count": -(-sequences // each), "sequences": each}]
 
 
@@ -163,13 +163,15 @@ PHYSICAL = {"sonar.model": "physical", "segments": CONES + QUADRANTS}
 
 
 def row(
-    asked: argparse.Namespace, name: str, recipe: TrainingRecipe, learnt: Path, judged: dict[str, tuple[Path, str]]
+    arguments: argparse.Namespace, name: str, recipe: TrainingRecipe, learnt: Path, judged: dict[str, tuple[Path, str]]
 ) -> None:
     """One training, and a line for each of what it is judged by."""
-    run = asked.out / "runs" / name
-    checkpoint = train(TrainOptions(recipe, learnt, run, resume=run.exists(), minutes=asked.minutes, threads=asked.threads))
+    run = arguments.out / "runs" / name
+    checkpoint = train(
+        TrainOptions(recipe, learnt, run, resume=run.exists(), minutes=arguments.minutes, threads=arguments.threads)
+    )
     for what, (where, part) in judged.items():
-        stored = asked.out / f"{name}-{what.replace(' ', '-')}.json"
+        stored = arguments.out / f"{name}-{what.replace(' ', '-')}.json"
         if not stored.exists():
             report = evaluate(checkpoint, where, part=part, noise=["none", "high"])
             stored.write_text(json.dumps(report))
@@ -181,31 +183,33 @@ def row(
         zero, slopes = (" / ".join(f"{v:.3g}" for v in mine[0][key]) for key in ("zero", "slope"))
         split = recipe.split if isinstance(recipe.split, str) else recipe.split["by"]
         pairs = json.loads((run / "run.json").read_text())["epoch_samples"]
-        where_said = f"{what} ({report['pairs']} pairs)"
+        split_text = f"{what} ({report['pairs']} pairs)"
         print(
-            f"| {name} | {split} | {pairs:,} | {where_said} | {output[0]} | {interval} | {slopes} | {output[1]} | {zero} | "
+            f"| {name} | {split} | {pairs:,} | {split_text} | {output[0]} | {interval} | {slopes} | {output[1]} | {zero} | "
             f"{mine[0]['ms']:.2g} |",
             flush=True,
         )
 
 
-def leak(asked: argparse.Namespace) -> None:
+def leak(arguments: argparse.Namespace) -> None:
     """Compare the validation of the chapter with a split by sequence."""
     print(HEAD)
-    learnt = data(asked, "thousand10", 6 if asked.quick else 250, segments=["whole", "starboard", *QUADRANTS, *CONES])
-    judged_by = unseen(asked, segments=["whole", "starboard", *QUADRANTS, *CONES])
+    learnt = data(
+        arguments, "thousand10", 6 if arguments.quick else 250, segments=["whole", "starboard", *QUADRANTS, *CONES]
+    )
+    judged_by = unseen(arguments, segments=["whole", "starboard", *QUADRANTS, *CONES])
     for by in ("sample", "sequence"):
         split = {"by": by, "train": 0.95, "validation": 0.05}
         words = {
             "split": split,
-            "network.width": asked.width,
+            "network.width": arguments.width,
             "input.range_levels": 512,
             "validate.every_minutes": 2,
-            **short(asked),
+            **short(arguments),
         }
         recipe = load_training_recipe("portion-circular-10m-vector", words)
         judged = {"validation": (learnt, "validation"), "unseen scenes": (judged_by, "all")}
-        row(asked, f"leak-{by}", recipe, learnt, judged)
+        row(arguments, f"leak-{by}", recipe, learnt, judged)
 
 
 class Ours(NamedTuple):
@@ -234,41 +238,43 @@ OURS = {
 }
 
 
-def ours(asked: argparse.Namespace) -> None:
+def ours(arguments: argparse.Namespace) -> None:
     """ProfileNet on many pairs."""
     print(HEAD)
     everything = ["whole", "starboard", *QUADRANTS, *CONES]
-    for name in asked.rows.split(",") if asked.rows else OURS:
+    for name in arguments.rows.split(",") if arguments.rows else OURS:
         result = OURS[name]
         words = {
             "input.views": result.views,
             "input.range_levels": result.levels,
             "network.lags": int(np.clip(result.levels // 128, 2, 6)),
             "noise": result.noise,
-            "epochs": asked.epochs * result.times,
+            "epochs": arguments.epochs * result.times,
             "split": {"by": "scene", "train": 0.95, "validation": 0.05},
-            **({"batch": 4} if asked.quick else {}),
+            **({"batch": 4} if arguments.quick else {}),
         }
         if result.model == "physical":
-            learnt, judged = physical(asked), {"unseen scenes": (unseen(asked, "unseenp10", 300, **PHYSICAL), "all")}
+            learnt, judged = physical(arguments), {"unseen scenes": (unseen(arguments, "unseenp10", 300, **PHYSICAL), "all")}
         else:
-            learnt = many(asked)
-            moving = unseen(asked, "jitter10", 300, **{"sonar.jitter": True})
-            judged = {"unseen scenes": (unseen(asked, segments=everything), "all"), "rays that move": (moving, "all")}
-        row(asked, f"ours-{name}", load_training_recipe("profilenet-circular-10m", words), learnt, judged)
+            learnt = many(arguments)
+            moving = unseen(arguments, "jitter10", 300, **{"sonar.jitter": True})
+            judged = {"unseen scenes": (unseen(arguments, segments=everything), "all"), "rays that move": (moving, "all")}
+        row(arguments, f"ours-{name}", load_training_recipe("profilenet-circular-10m", words), learnt, judged)
 
 
 # ---------------------------------------------------------------- heights
 
 
-def heights(asked: argparse.Namespace) -> None:
+def heights(arguments: argparse.Namespace) -> None:
     """Evaluate the direct estimator on frames of the height data sets of the chapter."""
     print("| data | noise | frames | RMSE cm | of the interval | median cm | bias cm | valid | ms |\n" + 9 * "|---" + "|")
     for recipe, interval in (("height-rocky", 9.0), ("height-hull", 0.35)):
-        path = asked.out / f"{recipe}.zarr"
-        changes = coarse(asked, COARSE if recipe == "height-rocky" else COARSE_HULL)
-        few = 10 if asked.quick else None
-        make_dataset(load_recipe(recipe, {"store": "vectors", **changes}), str(path), sequences=few, workers=asked.workers)
+        path = arguments.out / f"{recipe}.zarr"
+        changes = coarse(arguments, COARSE if recipe == "height-rocky" else COARSE_HULL)
+        few = 10 if arguments.quick else None
+        make_dataset(
+            load_recipe(recipe, {"store": "vectors", **changes}), str(path), sequences=few, workers=arguments.workers
+        )
         for noise in ("none", "high"):
             print(height_row(path, recipe, noise, interval), flush=True)
 
@@ -297,24 +303,26 @@ def height_row(path: Path, name: str, noise: str, interval_m: float) -> str:
 # ---------------------------------------------------------------- paths
 
 
-def paths(asked: argparse.Namespace) -> None:
+def paths(arguments: argparse.Namespace) -> None:
     """Estimate the two paths of 4.4.4 over each of two scenes, by networks of circular segments from 10 m."""
-    if not asked.rows:
+    if not arguments.rows:
         raise SystemExit("paths needs --rows: folders of trained networks of c1..c4 from 10 m, with commas between them")
-    path = asked.out / "runs10.zarr"
+    path = arguments.out / "runs10.zarr"
     make_dataset(
-        load_recipe("looking-down-runs", {"sonar.range_bins": 1024, **coarse(asked)}), str(path), workers=asked.workers
+        load_recipe("looking-down-runs", {"sonar.range_bins": 1024, **coarse(arguments)}),
+        str(path),
+        workers=arguments.workers,
     )
     print(
         "| network | path | pairs | valid | RMSE sideways / forward mm / yaw deg | end off, mm (of path) |\n"
         + 6 * "|---"
         + "|"
     )
-    for run in asked.rows.split(","):
+    for run in arguments.rows.split(","):
         network = ViewNetwork(Checkpoint.load(run))
-        for number, name in enumerate((("sideways_50", "sideways_54") * 2)[: 1 if asked.quick else None]):
+        for number, name in enumerate((("sideways_50", "sideways_54") * 2)[: 1 if arguments.quick else None]):
             source = open_views(str(path), network.views, network.kind, sequence=number)
-            out = asked.out / "paths" / f"{Path(run).name}-{number}"
+            out = arguments.out / "paths" / f"{Path(run).name}-{number}"
             result = run_odometry(source, run, network, out, overwrite=True)
             texts = dict((label, value) for label, value, _ in result.rows())
             rmse = " / ".join(f"{value:.3g}" for label, value in texts.items() if label.startswith("motion error RMSE"))
@@ -330,34 +338,38 @@ def paths(asked: argparse.Namespace) -> None:
 # ---------------------------------------------------------------- halves
 
 
-def halves(asked: argparse.Namespace) -> None:
+def halves(arguments: argparse.Namespace) -> None:
     """Two halves of a forward-looking sonar, learnt on simulated hulls with the chapter's noise (4.4.5)."""
     print(HEAD)
-    learnt = asked.out / "hulls.zarr"
-    hull = coarse(asked, {**COARSE_HULL, "scenes": [{"count": 2, "sequences": 4}]})
-    make_dataset(load_recipe("ship-hull", hull), str(learnt), sequences=8 if asked.quick else 300, workers=asked.workers)
-    second = asked.out / "hulls-unseen.zarr"
+    learnt = arguments.out / "hulls.zarr"
+    hull = coarse(arguments, {**COARSE_HULL, "scenes": [{"count": 2, "sequences": 4}]})
+    make_dataset(
+        load_recipe("ship-hull", hull), str(learnt), sequences=8 if arguments.quick else 300, workers=arguments.workers
+    )
+    second = arguments.out / "hulls-unseen.zarr"
     gain = DataStore.open(str(learnt)).about["gain"]  # one sonar
     words = {**hull, "seed": 7919, "name": "hulls-unseen", "gain": gain}
-    make_dataset(load_recipe("ship-hull", words), str(second), sequences=2 if asked.quick else 100, workers=asked.workers)
+    make_dataset(
+        load_recipe("ship-hull", words), str(second), sequences=2 if arguments.quick else 100, workers=arguments.workers
+    )
     noise = "0.04,0.02,0.04"
     given = {
         "input": {"kind": "vector", "halves": True},
         "noise": noise,
         "data": "ship-hull",
         "data_changes": {},
-        **short(asked),
+        **short(arguments),
     }
-    if asked.quick:
+    if arguments.quick:
         given["split"] = {"by": "scene", "train": 0.5, "validation": 0.5}
     for name, recipe in (
-        ("halves-posenetvec", load_training_recipe("portion-circular-vector", {**given, "network.width": asked.width})),
+        ("halves-posenetvec", load_training_recipe("portion-circular-vector", {**given, "network.width": arguments.width})),
         ("halves-profilenet", load_training_recipe("profilenet-quadrants", {"epochs": 60, **given})),
     ):
-        row(asked, name, recipe, learnt, {"unseen scenes": (second, "all")})
-        if asked.frames is not None:
-            network = create_estimator(f"{asked.out / 'runs' / name}:force=1")
-            frames = lamprey(asked.frames)
+        row(arguments, name, recipe, learnt, {"unseen scenes": (second, "all")})
+        if arguments.frames is not None:
+            network = create_estimator(f"{arguments.out / 'runs' / name}:force=1")
+            frames = lamprey(arguments.frames)
             pairs = [network.estimate(frames.select(slice(k, k + 2))) for k in range(len(frames) - 1)]
             motions = in_units(np.array([one.motion for one in pairs]))
             valid = sum(one.valid for one in pairs)

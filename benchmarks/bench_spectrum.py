@@ -7,9 +7,9 @@ noise (Knapp and Carter 1976): the sum over frequencies of (2 pi f)^2 S^2 / (N^2
 bins and 32 beams of the noiseless frames, N the noise of their pixels as a Gaussian of the same variance. Beside it, how
 much larger the errors of simple slopes are: they take the wrong weight of each frequency.
 
-With --poses the limit of the motion that follows: tiles tell shifts, and the geometry of level ground tells motions by them.
+With --poses the limit of the motion that follows: tiles give shifts, which the geometry of level ground turns into motions.
 S is then of the mean over many draws of the rays, and their variance in one ping is noise. Whoever knows the scene has
-S / (2 N) instead: the ratio of both is what not knowing it costs. Beside them stands the oracle of `mitsonar limit`.
+S / (2 N) instead: the ratio of both is what not knowing it costs. The last row is the oracle of `mitsonar limit`.
 `--quick` makes a small data set of its own and does both.
 """
 

@@ -140,14 +140,14 @@ def benchmark(args: argparse.Namespace, parts: list[str], table: Table) -> None:
         print("\n" + "\n".join(trajectory_table([row for row in results if row["part"] == "trajectories"])))
 
 
-def run_all(wanted: list[Job], out: Path) -> list[Result]:
+def run_all(expected: list[Job], out: Path) -> list[Result]:
     """Run the jobs, and return all results in their order. Results of an earlier call are read."""
     log = out / "results.jsonl"
     done = {}
     for line in log.read_text().splitlines() if log.exists() else []:
         row = json.loads(line)
         done[Job(**{key: row[key] for key in Job.__dataclass_fields__ if key in row})] = row
-    missing = [job for job in wanted if job not in done]
+    missing = [job for job in expected if job not in done]
     context, begun = multiprocessing.get_context("spawn"), time.perf_counter()
     with ProcessPoolExecutor(WORKERS, mp_context=context, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
         running = {pool.submit(run, job, out): job for job in missing}
@@ -158,7 +158,7 @@ def run_all(wanted: list[Job], out: Path) -> list[Result]:
                 file.write(json.dumps(row) + "\n")
             rmse = ", ".join(f"{value:.3g}" for value in row["rmse"])
             note(f"{number}/{len(missing)} after {time.perf_counter() - begun:.0f} s: {running[future].name}: {rmse}")
-    return [done[job] for job in wanted]
+    return [done[job] for job in expected]
 
 
 def run(job: Job, out: Path) -> Result:
@@ -231,14 +231,14 @@ def estimates_of(method: str, pairs: Iterable[SonarFrames]) -> tuple[list[Estima
     return result, 1e3 * float(np.median(taken))
 
 
-def scores(found: list[Estimate], true: Array) -> Result:
+def scores(results: list[Estimate], true: Array) -> Result:
     """Compute the errors of the tables. Invalid estimates count as zero motion."""
-    motion = np.array([one.motion for one in found])
-    valid = np.array([one.valid for one in found])
+    motion = np.array([one.motion for one in results])
+    valid = np.array([one.valid for one in results])
     unknown = np.full((3, 3), np.nan)
-    covariances = np.array([unknown if one.covariance is None else one.covariance for one in found])
+    covariances = np.array([unknown if one.covariance is None else one.covariance for one in results])
     errors = motion_errors(motion, true, valid, covariances)
-    heights = [one.about["height_m"] for one in found if "height_m" in one.about]
+    heights = [one.about["height_m"] for one in results if "height_m" in one.about]
     found_errors = {name: getattr(errors, name).tolist() for name in ("rmse", "median", "bias", "slope", "zero", "believed")}
     return found_errors | {
         "pairs": errors.pairs,
@@ -248,15 +248,15 @@ def scores(found: list[Estimate], true: Array) -> Result:
     }
 
 
-def keep(job: Job, out: Path, found: list[Estimate], true: Array) -> None:
+def keep(job: Job, out: Path, results: list[Estimate], true: Array) -> None:
     """Save the estimates for closer analysis."""
     unknown = np.full((3, 3), np.nan)
     np.savez_compressed(
         out / f"{job.name}.npz",
-        motion=[one.motion for one in found],
-        covariance=[unknown if one.covariance is None else one.covariance for one in found],
-        valid=[one.valid for one in found],
-        height_m=[one.about.get("height_m", np.nan) for one in found],
+        motion=[one.motion for one in results],
+        covariance=[unknown if one.covariance is None else one.covariance for one in results],
+        valid=[one.valid for one in results],
+        height_m=[one.about.get("height_m", np.nan) for one in results],
         true=true,
     )
 
@@ -353,20 +353,20 @@ def run_trajectory(job: Job, out: Path) -> Result:
     return row
 
 
-def smoothed(found: list[Estimate], time_s: Array) -> dict[str, MotionSeries]:
+def smoothed(results: list[Estimate], time_s: Array) -> dict[str, MotionSeries]:
     """Return the estimates without smoothing (invalid ones as no motion), and smoothed."""
-    series = MotionSeries.from_estimates(found, time_s)
+    series = MotionSeries.from_estimates(results, time_s)
     motion = np.where(series.is_valid[:, None], series.motions, 0)
     known = None if series.covariances is None else np.where(series.is_valid[:, None, None], series.covariances, 0)
     raw = MotionSeries(motion, time_s, known)
     return {"raw": raw, "Kalman": kalman_smoothed(series), "spline": spline_smoothed(series)}
 
 
-def mapped_paths(job: Job, frames: SonarFrames, found: list[Estimate]) -> dict[str, dict[str, float]]:
+def mapped_paths(job: Job, frames: SonarFrames, results: list[Estimate]) -> dict[str, dict[str, float]]:
     """Return the errors with a local map, and with a gyroscope beside it."""
     assert frames.poses is not None
     true = Trajectory(frames.poses, frames.time_s)
-    store = EstimateStore(dict(enumerate(found)))
+    store = EstimateStore(dict(enumerate(results)))
     sensors = {"map": None, "map, gyroscope": simulated_sensors(true, GYRO, seed=0)}
     paths = {
         name: odometry(frames, job.method, OdometryOptions(local_map=True, sensors=one), store=store)
@@ -381,7 +381,7 @@ def path_errors(path: Trajectory, true: Trajectory, covariances: Array | None) -
     length = min(1.0, 0.5 * errors.path_m)
     metre = assess(path, true, delta=length, unit="metres")
     off = path.poses[-1, :2] - true.poses[-1, :2]
-    estimated_end = {} if covariances is None else {"told_mm": 1e3 * float(np.sqrt(np.trace(covariances[-1, :2, :2])))}
+    estimated_end = {} if covariances is None else {"reported_mm": 1e3 * float(np.sqrt(np.trace(covariances[-1, :2, :2])))}
     return estimated_end | {
         "path_m": errors.path_m,
         "estimated_path_m": errors.estimated_path_m,
@@ -414,7 +414,7 @@ def trajectory_table(rows: list[Result]) -> Iterator[str]:
             cells += [f"{path['end_heading_deg']:+.2f}", f"{path['heading_deg_100m']:+.1f}", f"{path['ate_mm']:.0f}"]
             cells += [f"{path['rpe_mm']:.2f}", f"{path['rpe_deg']:.3f}", f"{path['rpe_metre_mm']:.1f}"]
             cells += [" / ".join(f"{value:.3f}" for value in slope), str(row["failures"])]
-            cells += [f"{path['told_mm']:.0f}" if "told_mm" in path else ""]
+            cells += [f"{path['reported_mm']:.0f}" if "reported_mm" in path else ""]
             yield f"| {' | '.join(cells)} |"
 
 

@@ -117,7 +117,10 @@ def aris1200(folder: Path) -> SonarFrames:
     (delay,), (period,) = struct.unpack_from("<I", data, head + 476), struct.unpack_from("<I", data, head + 452)
     (speed,) = struct.unpack_from("<f", data, head + 464)
     size = head + samples * beams
-    raw = [np.frombuffer(data, np.uint8, samples * beams, at + head) for at in range(head, len(data) - size + 1, size)]
+    raw = [
+        np.frombuffer(data, np.uint8, samples * beams, position + head)
+        for position in range(head, len(data) - size + 1, size)
+    ]
     image = np.stack(raw).reshape(-1, samples, beams)[:, :, ::-1].astype(np.float32) / 255
     near, step = delay * 0.5e-6 * speed, period * 0.5e-6 * speed
     sonar = Sonar.create(
@@ -135,14 +138,14 @@ def oculus(folder: Path) -> SonarFrames:
     (1.14 dB/m) make 34.1 dB.
     """
     data = (folder / "oculus-m1200d-three-pings" / "three_pings_8bit.raw").read_bytes()
-    images, at = [], 0
-    while at < len(data):
-        (payload,) = struct.unpack_from("<I", data, at + 10)
+    images, position = [], 0
+    while position < len(data):
+        (payload,) = struct.unpack_from("<I", data, position + 10)
         (step,), (bins, beams), (begin,) = (
-            struct.unpack_from(form, data, at + place) for form, place in (("<d", 98), ("<HH", 106), ("<I", 110))
+            struct.unpack_from(form, data, position + place) for form, place in (("<d", 98), ("<HH", 106), ("<I", 110))
         )
-        images.append(np.frombuffer(data, np.uint8, bins * beams, at + begin).reshape(bins, beams))
-        at += 16 + payload
+        images.append(np.frombuffer(data, np.uint8, bins * beams, position + begin).reshape(bins, beams))
+        position += 16 + payload
     sonar = preset("oculus-m1200d-2100khz").replace(
         **PLAIN | {"gain_absorption": True, "absorption_db_per_m": 1.14}, frequency_hz=2.1e6, beams=beams, range_min=0.0,
         range_max=bins * step, range_bins=bins, sound_speed=1490.66, gain_exponent=3, coding="gamma", coding_gamma=0.5,

@@ -86,7 +86,7 @@ def ground(size: tuple[float, float], step: float, rms: float, longest: float, s
     return trimesh.Trimesh(vertices, np.concatenate([one, second]), process=False)
 
 
-def beside(x: NDArray[np.float64], y: NDArray[np.float64], half: float, wander: float, seed: int) -> NDArray[np.float64]:
+def adjacent(x: NDArray[np.float64], y: NDArray[np.float64], half: float, wander: float, seed: int) -> NDArray[np.float64]:
     """Return how far a place lies outside a strip whose two edges wander [m]."""
     phase = np.random.default_rng(seed).uniform(0, 2 * math.pi, (2, 6))
     side = [sum(wander / k**1.2 * np.sin(1.1 * k**1.1 * y + phase[one, k - 1]) for k in range(1, 7)) for one in (0, 1)]
@@ -172,7 +172,7 @@ def river_bed(folder: Path) -> mi.Scene:
     """Make a gravel bed with a pit between two banks of mud, and stones with rims and shadows."""
 
     def outside(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        return beside(x - 0.05 * (y - 3), y, 0.75, 0.1, 11)
+        return adjacent(x - 0.05 * (y - 3), y, 0.75, 0.1, 11)
 
     def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         pit = np.hypot((x + 0.05) / 0.4, (y - 3.8) / 0.6)
@@ -193,7 +193,7 @@ def far_bed(folder: Path) -> mi.Scene:
     """Make a bed of bars across the flow between two banks of mud, with stones."""
 
     def outside(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        return beside(x - 0.35, y, 0.75, 0.2, 12)
+        return adjacent(x - 0.35, y, 0.75, 0.2, 12)
 
     def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         bars = 0.004 * np.sin(2 * math.pi * (y + 0.6 * x + 0.5 * np.sin(1.7 * x) + 0.3 * np.sin(2.3 * y)) / 0.45)
@@ -228,10 +228,12 @@ def sparse_bottom(folder: Path) -> mi.Scene:
     return loaded(parts, folder / "sparse")
 
 
-def placed(body: trimesh.Trimesh, at: tuple[float, float, float], turn_deg: tuple[float, float, float]) -> trimesh.Trimesh:
+def placed(
+    body: trimesh.Trimesh, position: tuple[float, float, float], turn_deg: tuple[float, float, float]
+) -> trimesh.Trimesh:
     """Turn a body about x, y, z and move it."""
     turn = Rotation.from_euler("xyz", turn_deg, degrees=True)
-    return trimesh.Trimesh(turn.apply(body.vertices) + np.asarray(at), body.faces, process=False)
+    return trimesh.Trimesh(turn.apply(body.vertices) + np.asarray(position), body.faces, process=False)
 
 
 def merged(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:

@@ -49,7 +49,7 @@ EARLIER = "earlier.json"
 
 
 def main() -> None:
-    """Write the page, after adding rows if asked to."""
+    """Write the page, after adding rows if requested."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["write", "add", "curve"], nargs="?", default="write")
     parser.add_argument("runs", type=Path, nargs="*", help="folders of `mitsonar reproduce`; of curve: of trainings")
@@ -157,14 +157,14 @@ def texts_of(row: TableRow, words: str, ours: Found) -> Texts:
     }
 
 
-def page(found: dict[str, Texts]) -> str:
+def page(results: dict[str, Texts]) -> str:
     """Format the page: every table and figure, and what was reached of each row."""
     lines = [HEAD]
     for table in contents():
         lines += [f"## {title(table)}", ""]
-        lines += scripted(table) if isinstance(table, ScriptedTable) else trained(table, found)
+        lines += scripted(table) if isinstance(table, ScriptedTable) else trained(table, results)
         lines.append("")
-    commands = [f"- {name}: `{texts['command']}`" for name, texts in sorted(found.items())]
+    commands = [f"- {name}: `{texts['command']}`" for name, texts in sorted(results.items())]
     return "\n".join([*lines, "## Commands", "", *commands, ""])
 
 
@@ -196,13 +196,13 @@ COLUMNS = {
 """What is shown of a row that was reached, and the heads of these columns."""
 
 
-def trained(table: DocumentTable, found: dict[str, Texts]) -> list[str]:
+def trained(table: DocumentTable, results: dict[str, Texts]) -> list[str]:
     """Format the rows of a table of networks."""
     heads = ["row", "Almanza-Medina", "its high noise", *COLUMNS.values()]
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for row in table.rows:
         printed = [row.format_errors(row.printed.get(noise)) for noise in ("none", "high")]
-        texts = found.get(row.name, {"by_pair": "not trained yet"})
+        texts = results.get(row.name, {"by_pair": "not trained yet"})
         lines.append(f"| {' | '.join([row.approach, *printed, *(texts.get(key, '-') for key in COLUMNS)])} |")
     return lines
 

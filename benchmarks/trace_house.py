@@ -166,7 +166,7 @@ def files_of(folder: Path) -> list[Path]:
 
 
 def named_any(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """How often `Any` stands in a signature."""
+    """Count `Any` in a signature."""
     local = function.args
     words = [*local.posonlyargs, *local.args, *local.kwonlyargs, *filter(None, (local.vararg, local.kwarg))]
     hints = [word.annotation for word in words] + [function.returns]

@@ -51,12 +51,14 @@ def tank() -> mi.Scene:
     import mitsuba as mi
 
     parts: dict[str, Any] = {}
-    for name, (at, normal) in PLATES.items():
+    for name, (position, normal) in PLATES.items():
         up = [0, 1, 0] if normal[2] else [0, 0, 1]
-        look = mi.ScalarTransform4f().look_at(origin=at, target=[a + n for a, n in zip(at, normal, strict=True)], up=up)
+        look = mi.ScalarTransform4f().look_at(
+            origin=position, target=[a + n for a, n in zip(position, normal, strict=True)], up=up
+        )
         parts[name] = {"type": "rectangle", "to_world": look @ mi.ScalarTransform4f().scale(8), "bsdf": grey(0.05)}
-    for number, at in enumerate(BALLS):
-        parts[f"ball{number}"] = {"type": "sphere", "center": at, "radius": 0.15, "bsdf": grey(0.2)}
+    for number, position in enumerate(BALLS):
+        parts[f"ball{number}"] = {"type": "sphere", "center": position, "radius": 0.15, "bsdf": grey(0.2)}
     loaded = mi.load_dict({"type": "scene", **parts}, optimize=False)
     assert isinstance(loaded, mi.Scene)
     return loaded

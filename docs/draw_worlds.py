@@ -1,4 +1,4 @@
-"""Draws docs/gallery/worlds.png: each world from above, lit from the side, and as the sonar that stands in it sees it.
+"""Draws docs/gallery/worlds.png: each world from above, lit from the side, and as a sonar in it sees it.
 
 python docs/draw_worlds.py            # into docs/gallery
 python docs/draw_worlds.py --quick    # coarse, into a folder that is removed: does it still work?

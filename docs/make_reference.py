@@ -71,7 +71,7 @@ GROUPS = {
 come last."""
 
 
-OPENING = """There are three ways to read something, by what it is:
+OPENING = """Names are read in three forms, by what it is:
 
 | it is | call | then |
 |---|---|---|

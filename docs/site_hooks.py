@@ -56,8 +56,8 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
 def on_page_content(content: str, **_: object) -> str:
     """Turn formulas into MathML, which browsers draw without a script, and roles of docstrings into code."""
 
-    def drawn(found: re.Match[str]) -> str:
-        return str(convert(html.unescape(found[3]).strip(), display="inline" if found[2] == "(" else "block"))
+    def drawn(results: re.Match[str]) -> str:
+        return str(convert(html.unescape(results[3]).strip(), display="inline" if results[2] == "(" else "block"))
 
     return ROLE.sub(r"<code>\1</code>", FORMULA.sub(drawn, content))
 
@@ -71,12 +71,12 @@ def relinked(markdown: str, source: str, place: str) -> str:
         place: where the page is on the site, below docs/.
     """
 
-    def link(found: re.Match[str]) -> str:
-        if "://" in found[1] or found[1].startswith("data:"):
-            return found[0]
-        target = posixpath.normpath(posixpath.join(posixpath.dirname(source), found[1]))
+    def link(results: re.Match[str]) -> str:
+        if "://" in results[1] or results[1].startswith("data:"):
+            return results[0]
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(source), results[1]))
         target = PAGES.get(target, target.removeprefix("docs/"))
-        return f"]({posixpath.relpath(target, posixpath.dirname(place) or '.')}{found[2] or ''})"
+        return f"]({posixpath.relpath(target, posixpath.dirname(place) or '.')}{results[2] or ''})"
 
     return LINK.sub(link, markdown)
 

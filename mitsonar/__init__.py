@@ -208,10 +208,10 @@ def __getattr__(name: str) -> object:
     if name not in _MODULES:
         raise AttributeError(f"module 'mitsonar' has no attribute {name!r}")
     try:
-        found: object = getattr(import_module(f"mitsonar.{_MODULES[name]}"), name)
+        attribute: object = getattr(import_module(f"mitsonar.{_MODULES[name]}"), name)
     except ModuleNotFoundError as error:
         raise missing_package_error(error) from None
-    return found
+    return attribute
 
 
 def __dir__() -> list[str]:

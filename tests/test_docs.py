@@ -43,7 +43,7 @@ HALVES = "split={by: scene, train: 0.5, validation: 0.5}"
 SHARED: dict[str, list[str]] = {
     "out/run": ["render", "pattern", "--trajectory", "shipped", "-D", "texture=photo_gravel"],
     "out/rocks.zarr": ["dataset", "make", "rocky-field", "--set", SMALL_FIELD, "--set", SMALL_SCENES, "--set", HALVES],
-    "out/heard.zarr": [
+    "out/responses.zarr": [
         *("dataset", "make", "impulse-standard", "--set", SMALL_FLOOR, "--set", SMALL_SCENES),
         *("--set", SMALL_CHANNEL, "--set", SMALL_FLIGHT, "--set", HALVES),
     ],

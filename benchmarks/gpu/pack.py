@@ -60,7 +60,7 @@ def main() -> None:
         for wheel in fetched.glob("mitsuba-*.whl"):
             slim(wheel, (*UNUSED, "libembree") if arguments.no_embree else UNUSED)
         loads(fetched, arguments.out, int(arguments.load_mib * MIB), int(arguments.part_mib * MIB))
-    print(told(arguments.out))
+    print(reported(arguments.out))
 
 
 def quick() -> None:
@@ -77,7 +77,7 @@ def quick() -> None:
             file.writestr("mitsuba-0.dist-info/RECORD", rows)
         slim(wheel, UNUSED)
         loads(wheels, out, 150, 100)
-        print(told(out))
+        print(reported(out))
         put_together(sorted(out.iterdir()), Path(folder))
         if Path(folder, wheel.name).read_bytes() != wheel.read_bytes():
             raise SystemExit("a wheel that was split and put together again is another one")
@@ -98,11 +98,11 @@ def listed(path: Path = HERE / "wheels.txt") -> dict[str, list[str]]:
     return result
 
 
-def fetch(wanted: list[str], out: Path) -> None:
-    """Download wheels for CPython 3.12, x86-64 Linux, and nothing that is not asked for."""
+def fetch(expected: list[str], out: Path) -> None:
+    """Download wheels for CPython 3.12, x86-64 Linux, and nothing else."""
     words = [word for platform in PLATFORMS for word in ("--platform", f"{platform}_x86_64")]
     words += ["--only-binary=:all:", "--no-deps", "--python-version", "3.12", "--implementation", "cp", "-d", str(out)]
-    subprocess.run([sys.executable, "-m", "pip", "download", "-q", *words, *wanted], check=True)
+    subprocess.run([sys.executable, "-m", "pip", "download", "-q", *words, *expected], check=True)
 
 
 def build(out: Path) -> None:
@@ -117,22 +117,22 @@ def build(out: Path) -> None:
 def slim(wheel: Path, unused: Iterable[str]) -> None:
     """Drop files of a wheel whose names contain one of these words, from its record too; compress the rest well."""
 
-    def kept(name: str) -> bool:
+    def stored(name: str) -> bool:
         return not name.endswith((".so", ".coeff")) or not any(word in Path(name).name for word in unused)
 
     result = wheel.with_suffix(".slim")
     with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(result, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as new:
         for item in old.infolist():
-            if kept(item.filename):
+            if stored(item.filename):
                 data = old.read(item)
-                new.writestr(item.filename, without_rows(data, kept) if item.filename.endswith("/RECORD") else data)
+                new.writestr(item.filename, without_rows(data, stored) if item.filename.endswith("/RECORD") else data)
     result.replace(wheel)
 
 
-def without_rows(record: bytes, kept: Callable[[str], bool]) -> bytes:
+def without_rows(record: bytes, stored: Callable[[str], bool]) -> bytes:
     """Return the RECORD of a wheel without the rows of removed files."""
     text = io.StringIO()
-    rows = [row for row in csv.reader(record.decode().splitlines()) if row and kept(row[0])]
+    rows = [row for row in csv.reader(record.decode().splitlines()) if row and stored(row[0])]
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue().encode()
 
@@ -190,7 +190,7 @@ def put_together(folders: Iterable[Path], out: Path) -> list[Path]:
     return built
 
 
-def told(out: Path) -> str:
+def reported(out: Path) -> str:
     """Sizes of the loads and of what is in them."""
     lines = []
     for folder in sorted(out.iterdir()):

@@ -45,11 +45,11 @@ TABLE_52 = (
 SMALL = 0.01
 """Scales below this one train small networks on coarse data, one row of each table: a check of the steps, no result."""
 
-ALIKE = 0.01
+TOLERANCE_RMS = 0.01
 """Largest difference of two devices, as a part of the rms. They round differently, and a ray on an edge changes its cell."""
 
 GRACE_S = 60.0
-"""Seconds that a command has to write its state once it was asked to stop."""
+"""Seconds that a command has to write its state after a request to stop."""
 
 
 Plain = dict[str, Any]
@@ -59,7 +59,7 @@ Saved = Any
 """A value of a checkpoint: a tensor, a dictionary, a list, or a plain value."""
 
 
-class Asked(NamedTuple):
+class Request(NamedTuple):
     """Arguments of a step.
 
     Attributes:
@@ -88,7 +88,7 @@ class Asked(NamedTuple):
 class Found(NamedTuple):
     """Result of a step; ``done`` is False if the next call continues it."""
 
-    said: Plain
+    summary: Plain
     done: bool = True
 
 
@@ -165,7 +165,7 @@ def go(names: list[str], out: Path, scale: float, device: str, minutes: float, a
         begun = time.monotonic()
         print(f"== {name}", flush=True)
         had["calls"] += 1
-        had.update(tried(name, Asked(out, scale, device, end)))
+        had.update(tried(name, Request(out, scale, device, end)))
         had["seconds"] += time.monotonic() - begun
         keep(out, state)
         print(f"{name}: {had['state']} after {had['seconds']:.0f} s in {had['calls']} calls", flush=True)
@@ -175,15 +175,15 @@ def go(names: list[str], out: Path, scale: float, device: str, minutes: float, a
     return states
 
 
-def tried(name: str, asked: Asked) -> Plain:
+def tried(name: str, arguments: Request) -> Plain:
     """Do a step, and return its state also if it fails."""
-    if asked.small and name not in IN_SMALL:
+    if arguments.small and name not in IN_SMALL:
         return {"state": "left out", "found": {"why": f"below a scale of {SMALL:g} one row of each table is tried"}}
     try:
-        result = STEPS[name](asked)
+        result = STEPS[name](arguments)
     except Exception as error:  # no step may stop the others
         return {"state": "failed", "found": {type(error).__name__: str(error)}}
-    return {"state": "done" if result.done else "open", "found": result.said}
+    return {"state": "done" if result.done else "open", "found": result.summary}
 
 
 def opened(out: Path, about: Plain) -> Plain:
@@ -216,7 +216,7 @@ def keep(out: Path, state: Plain) -> None:
 # ---------------------------------------------------------------- commands
 
 
-def command(asked: Asked, name: str, words: list[str], *, goes_on: bool = False, **environment: str) -> bool:
+def command(arguments: Request, name: str, words: list[str], *, goes_on: bool = False, **environment: str) -> bool:
     """Run Python with these words until the step's end; its output goes to OUT/logs/NAME.log.
 
     Returns:
@@ -225,17 +225,17 @@ def command(asked: Asked, name: str, words: list[str], *, goes_on: bool = False,
     Raises:
         Failed: it failed, or was stopped and cannot go on.
     """
-    log = asked.out / "logs" / f"{name}.log"
+    log = arguments.out / "logs" / f"{name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     paths = [str(ROOT / "benchmarks"), *filter(None, [os.environ.get("PYTHONPATH")])]
-    world = {**os.environ, "MITSONAR_VARIANT": asked.variant, "PYTHONPATH": os.pathsep.join(paths), **environment}
+    world = {**os.environ, "MITSONAR_VARIANT": arguments.variant, "PYTHONPATH": os.pathsep.join(paths), **environment}
     with log.open("ab") as file:
         file.write(f"$ {' '.join(words)}\n".encode())
         file.flush()
         run = subprocess.Popen(
-            [sys.executable, *words], cwd=asked.out, env=world, stdout=file, stderr=file, start_new_session=True
+            [sys.executable, *words], cwd=arguments.out, env=world, stdout=file, stderr=file, start_new_session=True
         )
-        ended = waited(run, asked.end)
+        ended = waited(run, arguments.end)
     if ended and run.returncode == 0:
         return True
     if not ended and goes_on:
@@ -268,7 +268,7 @@ def mitsonar(*words: object) -> list[str]:
 # ---------------------------------------------------------------- steps
 
 
-def look(asked: Asked) -> Found:
+def look(arguments: Request) -> Found:
     """Describe the machine, and list the missing wheels."""
     expected = [one.partition("==")[0] for wheels in pack.listed().values() for one in wheels]
     output: Plain = {"python": platform.python_version(), "cores": os.cpu_count()}
@@ -284,7 +284,7 @@ def look(asked: Asked) -> Found:
         "cufinufft loads": [sys.executable, "-c", "import torch, cufinufft; print(cufinufft.__version__)"],
         "doctor": [sys.executable, *mitsonar("doctor")],
     }.items():
-        output[name] = answer(words, asked)
+        output[name] = answer(words, arguments)
     return Found(output)
 
 
@@ -296,9 +296,9 @@ def version_of(name: str) -> str | None:
         return None
 
 
-def answer(words: list[str], asked: Asked) -> str:
+def answer(words: list[str], arguments: Request) -> str:
     """Return what a command prints, or why it prints nothing."""
-    world = {**os.environ, "MITSONAR_VARIANT": asked.variant}
+    world = {**os.environ, "MITSONAR_VARIANT": arguments.variant}
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=world)
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -316,29 +316,29 @@ RENDERS = {
 }
 
 
-def same(asked: Asked) -> Found:
-    """Render scenes twice on the device, with equal bits, and once on the CPU, equal within `ALIKE`."""
+def same(arguments: Request) -> Found:
+    """Render scenes twice on the device, with equal bits, and once on the CPU, equal within `TOLERANCE_RMS`."""
     output, wrong = {}, []
-    for name in ("thesis", "scatterers") if asked.small else RENDERS:
-        first, second, cpu = (made(asked, name, run) for run in ("first", "second", "cpu"))
+    for name in ("thesis", "scatterers") if arguments.small else RENDERS:
+        first, second, cpu = (report(arguments, name, run) for run in ("first", "second", "cpu"))
         for key in sorted(first):
             if not np.array_equal(first[key], second[key], equal_nan=True):
-                wrong.append(f"{name}.{key} twice on {asked.device}: {differ(first[key], second[key]):.2g} rms")
+                wrong.append(f"{name}.{key} twice on {arguments.device}: {differ(first[key], second[key]):.2g} rms")
             error = differ(first[key], cpu[key])
             equal = float(np.mean(first[key] == cpu[key])) if first[key].shape == cpu[key].shape else 0.0
             output[f"{name}.{key}"] = f"{error:.2g} rms from the CPU, {equal:.2%} of the values equal"
-            if not error <= ALIKE:
-                wrong.append(f"{name}.{key}: {error:.2g} rms from the CPU, more than {ALIKE:g}")
+            if not error <= TOLERANCE_RMS:
+                wrong.append(f"{name}.{key}: {error:.2g} rms from the CPU, more than {TOLERANCE_RMS:g}")
     if wrong:
         raise Failed(f"{'; '.join(wrong)}; found: {output}")
     return Found(output)
 
 
-def made(asked: Asked, name: str, run: str) -> dict[str, np.ndarray]:
+def report(arguments: Request, name: str, run: str) -> dict[str, np.ndarray]:
     """Render a small run, and return its arrays. That of the CPU is the reference."""
-    out = asked.out / "same" / f"{name}-{run}"
-    variant = "llvm_ad_mono" if run == "cpu" else asked.variant
-    command(asked, "same", mitsonar(*RENDERS[name], "--overwrite", "-o", out), MITSONAR_VARIANT=variant)
+    out = arguments.out / "same" / f"{name}-{run}"
+    variant = "llvm_ad_mono" if run == "cpu" else arguments.variant
+    command(arguments, "same", mitsonar(*RENDERS[name], "--overwrite", "-o", out), MITSONAR_VARIANT=variant)
     kinds = {"image", "response", "elevation", "elevation_rad", "shadow"}
     with np.load(next(out.glob("*.npz"))) as table:
         result = {key: table[key] for key in table.files if key in kinds}
@@ -355,14 +355,14 @@ def differ(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.abs(one.astype(np.complex128) - other) ** 2))) / (scale or 1.0)
 
 
-def tests(asked: Asked) -> Found:
+def tests(arguments: Request) -> Found:
     """Run the tests that need CUDA, or on a CPU those of the variant."""
     if importlib.util.find_spec("pytest") is None:
         raise Failed("pytest is missing: pack it with `pack.py --all`")
-    chosen = ["-m", "gpu", str(ROOT / "tests")] if asked.device == "cuda" else ["-k", "variant", str(ROOT / "tests")]
+    chosen = ["-m", "gpu", str(ROOT / "tests")] if arguments.device == "cuda" else ["-k", "variant", str(ROOT / "tests")]
     words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml"), *chosen]
-    command(asked, "tests", words if asked.device == "cuda" else [*words[:-1], str(variant_tests())])
-    return Found({"said": last_line(asked, "tests")})
+    command(arguments, "tests", words if arguments.device == "cuda" else [*words[:-1], str(variant_tests())])
+    return Found({"said": last_line(arguments, "tests")})
 
 
 def variant_tests() -> Path:
@@ -370,76 +370,76 @@ def variant_tests() -> Path:
     return next((ROOT / "tests").rglob("test_variant.py"))
 
 
-def last_line(asked: Asked, name: str) -> str:
+def last_line(arguments: Request, name: str) -> str:
     """Return the last line of a log."""
-    text = (asked.out / "logs" / f"{name}.log").read_text(encoding="utf-8", errors="replace")
+    text = (arguments.out / "logs" / f"{name}.log").read_text(encoding="utf-8", errors="replace")
     return next(line for line in reversed(text.splitlines()) if line.strip())
 
 
-def render_speed(asked: Asked) -> Found:
+def render_speed(arguments: Request) -> Found:
     """Measure the speed of rendering frames. The table is in the log."""
-    few = ["--quick"] if asked.small else ["--without-open3d"]
+    few = ["--quick"] if arguments.small else ["--without-open3d"]
     script = str(ROOT / "benchmarks" / "bench_render.py")
-    command(asked, "render_speed", [script, "--variant", asked.variant, *few])
-    return Found(rows_of(asked, "render_speed"))
+    command(arguments, "render_speed", [script, "--variant", arguments.variant, *few])
+    return Found(rows_of(arguments, "render_speed"))
 
 
-def coherent_speed(asked: Asked) -> Found:
+def coherent_speed(arguments: Request) -> Found:
     """Measure what a coherent ping costs. The table is in the log."""
     script = str(ROOT / "benchmarks" / "bench_coherent.py")
-    command(asked, "coherent_speed", [script, "--variant", asked.variant, *(["--quick"] if asked.small else [])])
-    return Found(rows_of(asked, "coherent_speed"))
+    command(arguments, "coherent_speed", [script, "--variant", arguments.variant, *(["--quick"] if arguments.small else [])])
+    return Found(rows_of(arguments, "coherent_speed"))
 
 
-def impulse_speed(asked: Asked) -> Found:
+def impulse_speed(arguments: Request) -> Found:
     """Measure the speed of impulse responses."""
     script = str(ROOT / "benchmarks" / "bench_impulse.py")
-    command(asked, "impulse_speed", [script, "--quick"] if asked.small else [script, "speed"])
-    return Found(rows_of(asked, "impulse_speed"))
+    command(arguments, "impulse_speed", [script, "--quick"] if arguments.small else [script, "speed"])
+    return Found(rows_of(arguments, "impulse_speed"))
 
 
-def rows_of(asked: Asked, name: str) -> dict[str, str]:
+def rows_of(arguments: Request, name: str) -> dict[str, str]:
     """Return the lines of a log that hold a result."""
-    text = (asked.out / "logs" / f"{name}.log").read_text(encoding="utf-8", errors="replace")
+    text = (arguments.out / "logs" / f"{name}.log").read_text(encoding="utf-8", errors="replace")
     mine = text.rpartition("\n$ ")[2].splitlines()[1:]
     return {f"line {k}": line for k, line in enumerate(line for line in mine if line.strip() and line[0] not in "{-")}
 
 
-def row(table: str, name: str) -> Callable[[Asked], Found]:
+def row(table: str, name: str) -> Callable[[Request], Found]:
     """Return the step of a row of a table, by `mitsonar reproduce`, which resumes where it was stopped."""
 
-    def work(asked: Asked) -> Found:
-        out = asked.out / f"table-{table}"
-        words: list[object] = ["reproduce", table, "--rows", name, "-o", out, *effort(asked, table)]
-        words += ["--accelerator", "gpu" if asked.device == "cuda" else "cpu", "--devices", 1]
-        words += ["--workers", 1 if asked.device == "cuda" or asked.small else os.cpu_count()]
-        if not command(asked, f"table-{table}-{name}", mitsonar(*words), goes_on=True):
-            return Found({"so far": last_line(asked, f"table-{table}-{name}")}, done=False)
+    def work(arguments: Request) -> Found:
+        out = arguments.out / f"table-{table}"
+        words: list[object] = ["reproduce", table, "--rows", name, "-o", out, *effort(arguments, table)]
+        words += ["--accelerator", "gpu" if arguments.device == "cuda" else "cpu", "--devices", 1]
+        words += ["--workers", 1 if arguments.device == "cuda" or arguments.small else os.cpu_count()]
+        if not command(arguments, f"table-{table}-{name}", mitsonar(*words), goes_on=True):
+            return Found({"so far": last_line(arguments, f"table-{table}-{name}")}, done=False)
         return Found(json.loads((out / "rows" / f"{name}.json").read_text(encoding="utf-8")))
 
     return work
 
 
-def effort(asked: Asked, table: str) -> list[object]:
+def effort(arguments: Request, table: str) -> list[object]:
     """Return the effort of a row: all epochs, or at a small scale some seconds on coarse data."""
-    bf16 = ["--set", "precision=bf16-mixed"] if asked.device == "cuda" else []
-    if not asked.small:
-        return ["--scale", asked.scale, "--minutes", 0, *bf16]
+    bf16 = ["--set", "precision=bf16-mixed"] if arguments.device == "cuda" else []
+    if not arguments.small:
+        return ["--scale", arguments.scale, "--minutes", 0, *bf16]
     rocks = "{family: rocky-field, size_m: 20, a_side: [5, 9]}"
     flat = "{family: flat-objects, size_m: 30, seabed_cells: 200, rectangles: 20, ellipses: 20}"
-    sequences = max(4, round(asked.scale * (40_000 if table == "3.2" else 3_000) / 4))
+    sequences = max(4, round(arguments.scale * (40_000 if table == "3.2" else 3_000) / 4))
     data = f"scenes: [{{count: 2, sequences: {sequences}}}], world: {rocks if table == '3.2' else flat}"
     changes = ["network.width=0.03", f"data_changes={{{data}}}"]
     return ["--scale", 1, "--minutes", 0.1, *(word for change in changes for word in ("--set", change))]
 
 
-def weights(asked: Asked) -> Found:
+def weights(arguments: Request) -> Found:
     """Save the networks of finished rows in OUT/weights, in bf16 and files below 16 MiB. `together` reads them."""
     import torch
 
     output: Plain = {}
-    for path in sorted(asked.out.glob("table-*/runs/*/network.ckpt")):
-        folder = asked.out / "weights" / path.parent.name
+    for path in sorted(arguments.out.glob("table-*/runs/*/network.ckpt")):
+        folder = arguments.out / "weights" / path.parent.name
         folder.mkdir(parents=True, exist_ok=True)
         for old in folder.iterdir():
             old.unlink()
@@ -454,7 +454,7 @@ def weights(asked: Asked) -> Found:
         output[path.parent.name] = (
             f"{len(list(folder.iterdir()))} files, {sum(p.stat().st_size for p in folder.iterdir()):,} bytes"
         )
-    finished = all((asked.out / "table-3.2" / "rows" / f"{name}.json").exists() for name in TABLE_32[:1])
+    finished = all((arguments.out / "table-3.2" / "rows" / f"{name}.json").exists() for name in TABLE_32[:1])
     return Found(output or {"networks": "none yet"}, done=finished and bool(output))
 
 
@@ -485,7 +485,7 @@ def together(folder: Path) -> Plain:
         return dict(full(torch.load(path, map_location="cpu", weights_only=True)))
 
 
-STEPS: dict[str, Callable[[Asked], Found]] = {
+STEPS: dict[str, Callable[[Request], Found]] = {
     "look": look,
     "same": same,
     "tests": tests,

@@ -22,12 +22,12 @@ __all__ = [
     "Detected",
     "LevelParts",
     "LocalContrast",
-    "alike",
     "coded",
     "coding_slope",
     "decoded",
     "first_echoes",
     "fitted_contrast",
+    "frame_correlation",
     "largest_level",
     "level",
     "strongest_echoes",
@@ -314,7 +314,7 @@ class LocalContrast:
         return np.asarray(np.clip(np.float32(0.5) + contrast / np.float32(SPREAD), 0, 1), dtype=np.float32)
 
 
-def alike(images: Images) -> float:
+def frame_correlation(images: Images) -> float:
     """Return the mean correlation of consecutive images ``(frames, bins, beams)``; 0 for fewer than two."""
     flat = images.reshape(len(images), -1).astype(np.float64)
     flat = flat - flat.mean(axis=1, keepdims=True)
@@ -335,7 +335,7 @@ def fitted_contrast(runs: Sequence[Images]) -> LocalContrast:
     best, best_correlation = LocalContrast(*SMOOTHINGS[0]), -1.0
     for bins, beams in SMOOTHINGS:
         candidate = LocalContrast(bins, beams)
-        correlation = float(np.mean([alike(candidate.apply(run)) for run in runs]))
+        correlation = float(np.mean([frame_correlation(candidate.apply(run)) for run in runs]))
         if correlation > best_correlation:
             best, best_correlation = candidate, correlation
         if correlation >= ENOUGH:

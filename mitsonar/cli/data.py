@@ -99,9 +99,9 @@ def make(
         raise MitsonarError("--workers and --scheduler contradict each other: a scheduler has its own workers")
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     report = _make_with_bar(described, out, sequences=sequences, workers=processes, scheduler=scheduler, verify=verify)
-    present = report.shards - report.made
+    present = report.shards - report.new_shards
     say(
-        f"{count_noun(report.frames, 'frame')} in {report.url}: {count_noun(report.made, 'shard')} made"
+        f"{count_noun(report.frames, 'frame')} in {report.url}: {count_noun(report.new_shards, 'shard')} made"
         + (f", {present} were already complete" if present else "")
     )
     say(f"show it: {command_line('dataset', 'show', report.url)}")

@@ -86,14 +86,14 @@ class GenerationReport:
     Attributes:
         url: of the store.
         frames: number of frames of the data set.
-        made: number of shards that this call wrote.
+        new_shards: number of shards that this call wrote.
         shards: number of shards of the data set.
         warnings: one sentence each.
     """
 
     url: str
     frames: int
-    made: int
+    new_shards: int
     shards: int
     warnings: list[str]
 

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from mitsonar.acoustics.levels import SMOOTHINGS, LocalContrast, alike, coded, decoded, fitted_contrast, largest_level, level
+from mitsonar.acoustics.levels import (
+    SMOOTHINGS,
+    LocalContrast,
+    coded,
+    decoded,
+    fitted_contrast,
+    frame_correlation,
+    largest_level,
+    level,
+)
 from mitsonar.instruments.sonar import Coding, Sonar
 from mitsonar.records.echoes import CHANNELS, Echoes
 
@@ -127,8 +136,8 @@ def test_the_picture_of_the_ground_hardly_depends_on_the_light() -> None:
 def test_two_grounds_in_one_light_are_not_alike() -> None:
     """Levels of other ground correlate by the light alone; that would pull estimates towards no motion."""
     levels = np.stack([ground(1) + light(), ground(2) + light()])
-    assert alike(levels) > 0.5
-    assert abs(alike(LocalContrast().apply(levels))) < 0.25
+    assert frame_correlation(levels) > 0.5
+    assert abs(frame_correlation(LocalContrast().apply(levels))) < 0.25
 
 
 def test_values_lie_in_0_to_1_around_a_half() -> None:
@@ -154,5 +163,5 @@ def test_noise_sets_the_smoothing() -> None:
 
 
 def test_fewer_than_two_pictures_are_not_alike() -> None:
-    assert alike(np.zeros((1, 4, 4), np.float32)) == 0
+    assert frame_correlation(np.zeros((1, 4, 4), np.float32)) == 0
     assert LocalContrast().apply(np.zeros((0, 4, 4), np.float32)).shape == (0, 4, 4)

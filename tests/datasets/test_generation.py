@@ -492,7 +492,7 @@ def test_stopped_between_the_last_file_and_its_seal(made: Path, tmp_path: Path) 
     (image.parent / "0.abc.partial").write_bytes(b"half a file")
     (url / store.key("image", 1)).unlink()
     report = make_dataset(tiny_recipe(), str(url))
-    assert report.made == 1
+    assert report.new_shards == 1
     assert image.stat().st_mtime_ns == before
     assert files_of(url) == files_of(made)
 
@@ -506,7 +506,7 @@ def test_a_truncated_shard_is_found_and_mended(made: Path, tmp_path: Path) -> No
     (fault,) = check(store)
     assert store.key("image", 0) in fault
     assert "damaged" in fault
-    assert make_dataset(tiny_recipe(), str(url)).made == 1
+    assert make_dataset(tiny_recipe(), str(url)).new_shards == 1
     assert files_of(url) == files_of(made)
     assert check(DataStore.open(url)) == []
 
@@ -521,8 +521,8 @@ def test_a_flipped_bit_is_found_and_mended(made: Path, tmp_path: Path) -> None:
     assert len(check(store)) == 1
     with pytest.raises(MitsonarError, match="image is damaged"):
         store.read("image", store.frames_of(0))
-    assert make_dataset(tiny_recipe(), str(url)).made == 0  # the size is right
-    assert make_dataset(tiny_recipe(), str(url), verify=True).made == 1
+    assert make_dataset(tiny_recipe(), str(url)).new_shards == 0  # the size is right
+    assert make_dataset(tiny_recipe(), str(url), verify=True).new_shards == 1
     assert files_of(url) == files_of(made)
 
 
@@ -617,7 +617,7 @@ def test_an_unfinished_data_set_is_not_read_by_accident(tmp_path: Path) -> None:
     assert info(store)["shards"] == f"1 of {store.shards}"
     (fault,) = check(store)
     assert f"not finished: {store.shards - 1} of {store.shards} shards are not written" in fault
-    assert make_dataset(recipe, url).made == store.shards - 1
+    assert make_dataset(recipe, url).new_shards == store.shards - 1
 
 
 @pytest.mark.thorough
@@ -758,7 +758,7 @@ def test_object_storage_holds_the_bytes_of_a_folder(made: Path, bucket: str) -> 
     place.write(damaged, place.read(damaged)[:100])
     place.fs.invalidate_cache()
     assert [fault for fault in check(store) if damaged in fault]
-    assert make_dataset(tiny_recipe(), url).made == 1
+    assert make_dataset(tiny_recipe(), url).new_shards == 1
     assert objects_of(url) == files_of(made)
     np.testing.assert_array_equal(store.read("image", slice(4, 9)), DataStore.open(made).read("image", slice(4, 9)))
 
