@@ -41,4 +41,4 @@ def test_words_that_are_avoided_stay_in_their_places() -> None:
 def test_a_word_of_the_dialect_is_found(tmp_path: Path) -> None:
     (tmp_path / "mitsonar").mkdir()
     (tmp_path / "mitsonar" / "new.py").write_text('def format_snr(told):\n    """It tells."""\n    found = told\n')
-    assert [use.word for use in glossary.uses_in(tmp_path)] == ["said", "told", "tells", "found", "told"]
+    assert [use.word for use in glossary.uses_in(tmp_path)] == ["told", "tells", "found", "told"]

@@ -145,8 +145,8 @@ def test_arguments_have_their_python_names_but_for_who_typed_options() -> None:
     error = MitsonarError(f"give {argument('height_m')} or {argument('sonar pitch_rad')}, not height_m")
     for one in (error, pickle.loads(pickle.dumps(error))):
         assert str(one) == "give height_m or sonar pitch_rad, not height_m"
-        assert one.said({"height_m": "--height"}) == "give --height or sonar pitch_rad, not height_m"
-        assert one.said({"pitch_rad": "--pitch-deg"}) == "give height_m or --pitch-deg, not height_m"
+        assert one.with_options({"height_m": "--height"}) == "give --height or sonar pitch_rad, not height_m"
+        assert one.with_options({"pitch_rad": "--pitch-deg"}) == "give height_m or --pitch-deg, not height_m"
 
 
 def test_the_table_names_options_that_there_are() -> None:

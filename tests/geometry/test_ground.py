@@ -244,7 +244,7 @@ def test_starboard_is_right_and_far_is_up() -> None:
 def test_wrong_shapes_and_orders_are_refused() -> None:
     with pytest.raises(MitsonarError, match=r"\(2, 3\)"):
         to_cartesian(np.zeros((3, 2)), [1, 2], [0, 1, 2])
-    with pytest.raises(MitsonarError, match="rise"):
+    with pytest.raises(MitsonarError, match="increase"):
         to_cartesian(np.zeros((2, 2)), [2, 1], [0, 1])
 
 

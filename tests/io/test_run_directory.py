@@ -171,7 +171,7 @@ def test_another_run_is_not_gone_on_with(tmp_path: Path) -> None:
     begun(tmp_path)
     before = (tmp_path / RUN_FILE).read_bytes()
     wide = {**ASKED, "sonar": {"beams": 32, "window": [1.0, 2.5]}, "noise": "low"}
-    with pytest.raises(MitsonarError, match=r"was begun with sonar\.beams 16, not 32; noise None, not low: ask for"):
+    with pytest.raises(MitsonarError, match=r"was begun with sonar\.beams 16, not 32; noise None, not low: request"):
         begun(tmp_path, wide, resume=True)
     rewritten(tmp_path, versions={"numpy": "1.0"})
     with pytest.raises(MitsonarError, match=rf"was begun with numpy 1\.0, not {np.__version__}"):

@@ -444,7 +444,7 @@ def wrong(change: str) -> SonarFrames:
         ("no poses", {}, "no poses"),
         ("no height", {}, "hold no height"),
         ("nan", {}, "finite"),
-        ("unsorted", {}, "rise"),
+        ("unsorted", {}, "increase"),
         ("below", {}, "above 0"),
         ("", {"poses": np.zeros((1, 5))}, r"\(frames, 6\)"),
         ("", {"poses": np.full((1, 6), np.inf)}, "finite"),

@@ -177,7 +177,7 @@ def test_sensors_of_other_times_share_a_file(tmp_path: Path) -> None:
         ("time_s,depth_m,depth_std_m\n1,1,1\n0,1,1\n", "column depth_m: times of readings must increase"),
         ("time_s,depth_m,depth_std_m\n0,,1\n", "hold no reading"),
         ("time_s,depth_m,depth_m,depth_std_m\n0,1,1,1\n", "more than once"),
-        ("time_s,depth_m,depth_std_m\n0,1\n", "words"),
+        ("time_s,depth_m,depth_std_m\n0,1\n", "cells"),
         ("time_s,reckoned_x_m\n0,1\n", "no column reckoned_y_m"),
     ],
 )

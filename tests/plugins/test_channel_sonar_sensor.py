@@ -158,7 +158,7 @@ def test_defaults_of_the_sensor_are_the_thesis() -> None:
         ('<float name="carier_hz" value="3"/>', "did you mean carrier_hz"),
         ('<string name="receivers" value="front right"/>', "separated by commas"),
         ('<string name="receivers" value="keel"/><float name="keel_heading_deg" value="3"/>', "give keel_position "),
-        ('<string name="front_position" value="0, ahead, 0"/>', "front_position is a point"),
+        ('<string name="front_position" value="0, ahead, 0"/>', "front_position must be a point"),
     ],
 )
 def test_mistakes_in_xml_are_answered(properties: str, said: str) -> None:

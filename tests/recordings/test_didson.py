@@ -135,7 +135,7 @@ def test_frames_of_one_time_are_spread_up_to_the_next(tmp_path: Path) -> None:
     recording = opened(tmp_path, second=np.array([5, 5, 5, 6, 6, 9]), hundredth=0)
     time_s = recording.part().time_s
     assert time_s - time_s[0] == pytest.approx([0, 1 / 3, 2 / 3, 1, 1 + 1 / 8, 4])
-    assert any("3 frames with the clock of the one before" in note for note in recording.notes)
+    assert any("3 frames with the time of the one before" in note for note in recording.notes)
 
 
 def test_attitude_and_height(tmp_path: Path) -> None:

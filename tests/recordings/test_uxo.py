@@ -97,7 +97,7 @@ def test_what_is_missing_or_damaged_is_left_out_and_told(tmp_path: Path) -> None
     [
         ("FrameIndex\n1\n", "has no column FrameTime"),
         ("", "holds no table"),
-        ("FrameIndex,FrameTime\n1\n", "row 2 of .* has 1 words"),
+        ("FrameIndex,FrameTime\n1\n", "row 2 of .* has 1 cells"),
         (
             "FrameIndex,FrameTime,PingMode,SamplePeriod,SampleStartDelay,SoundSpeed,SamplesPerBeam\n100,x,y,z,,nan,1e99\n",
             "no frame",

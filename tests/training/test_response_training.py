@@ -271,7 +271,7 @@ def test_a_checkpoint_estimates_what_evaluation_scores(made: Path, run: Path) ->
 def test_it_refuses_what_it_was_not_trained_for(made: Path, run: Path) -> None:
     pairs = ImpulsePairs(made, part="validation")
     estimator = create_estimator(str(run))
-    with pytest.raises(MitsonarError, match=r"given 3 pings: got 2"):
+    with pytest.raises(MitsonarError, match=r"takes 3 pings: got 2"):
         estimator.estimate(records(pairs, 0).select(slice(2)))
     with pytest.raises(MitsonarError, match=r"sound_speed 1480.0, not 1500.0; train on that one, use likelihood"):
         estimator.estimate(records(pairs, 0, sonar=pairs.sonar.replace(sound_speed=1480.0)))

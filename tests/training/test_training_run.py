@@ -344,7 +344,7 @@ def test_data_sets_that_cannot_be_joined_are_refused(made: Path, tmp_path: Path)
     make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 5}], sonar__beams=14), str(wider))
     with pytest.raises(MitsonarError, match=r"agree in .*made.*tiny.zarr has beams .*wider.zarr has"):
         material_of(recipe(), [made, wider], render=False)
-    with pytest.raises(MitsonarError, match="with --render one data set"):
+    with pytest.raises(MitsonarError, match="with --render at most one data set"):
         material_of(recipe(), [made, made], render=True)
 
 
