@@ -275,7 +275,7 @@ def test_bad_options_are_answered_by_one_sentence(mitsonar: Command, drawn: Path
     refused(mitsonar("odometry", drawn, "-o", out, "--every", 0), "every")
     refused(mitsonar("odometry", drawn, "-o", out, "--noise", "loud"), "noise", "low")
     refused(mitsonar("odometry", drawn, "-o", out, "--height", 2), "the frames have heights")
-    refused(mitsonar("odometry", drawn, "-o", out, "--sequence", 1), "no data set")
+    refused(mitsonar("odometry", drawn, "-o", out, "--sequence", 1), "neither a data set")
     refused(mitsonar("odometry", drawn, "-o", out, "--overwrite", "--resume"), "contradict")
     refused(mitsonar("odometry", drawn, "-o", drawn), "is a file and is kept")
     refused(mitsonar("odometry", drawn, "-o", drawn, "--overwrite"), "is a file and is kept")
