@@ -140,15 +140,15 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
     """Three steps in place of the real ones: one that ends, one that goes on once, one that fails."""
     done: Calls = []
 
-    def ends(asked: run.Asked) -> run.Found:
+    def ends(asked: run.Request) -> run.Found:
         done.append("ends")
         return run.Found({"speed": 3})
 
-    def goes_on(asked: run.Asked) -> run.Found:
+    def goes_on(asked: run.Request) -> run.Found:
         done.append("goes_on")
         return run.Found({"so far": done.count("goes_on")}, done=done.count("goes_on") > 1)
 
-    def fails(asked: run.Asked) -> run.Found:
+    def fails(asked: run.Request) -> run.Found:
         done.append("fails")
         raise ValueError("no such kernel")
 
@@ -187,7 +187,7 @@ def test_no_step_begins_when_the_time_is_over(calls: Calls, tmp_path: Path) -> N
 def test_a_kill_between_steps_loses_only_the_step_that_ran(
     calls: Calls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def killed(asked: run.Asked) -> run.Found:
+    def killed(asked: run.Request) -> run.Found:
         raise KeyboardInterrupt
 
     monkeypatch.setitem(run.STEPS, "goes_on", killed)
@@ -207,9 +207,9 @@ def test_a_folder_that_was_begun_otherwise_is_refused(calls: Calls, tmp_path: Pa
         work(tmp_path)
 
 
-def asked_of(tmp_path: Path, seconds: float) -> run.Asked:
+def asked_of(tmp_path: Path, seconds: float) -> run.Request:
     """A step that has so long."""
-    return run.Asked(tmp_path, 1.0, "cpu", time.monotonic() + seconds)
+    return run.Request(tmp_path, 1.0, "cpu", time.monotonic() + seconds)
 
 
 @pytest.mark.thorough

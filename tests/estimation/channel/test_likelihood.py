@@ -339,10 +339,10 @@ def test_parts_of_a_band_hold_all_of_it_and_tell_independently() -> None:
     whole = impulse_response(delay, [1.0, 0.5], wide)
     for part in parts:
         expected = impulse_response(delay, [1.0, 0.5], part.sonar)
-        np.testing.assert_allclose(part.of(whole)[100:], expected[100:], atol=2e-3 * np.abs(expected).max())
+        np.testing.assert_allclose(part.part_of(whole)[100:], expected[100:], atol=2e-3 * np.abs(expected).max())
     ground = [PointGround(seed, half_m=6.0) for seed in range(8)]
     received = np.array([run(wide, one, MOTIONS[0], pings=2, height_m=HEIGHT).response[0, 0] for one in ground])
-    low, high = (part.of(received)[:, 45:90] for part in parts[:2])
+    low, high = (part.part_of(received)[:, 45:90] for part in parts[:2])
     likeness = np.abs((low * high.conj()).sum(axis=0)) / np.sqrt((np.abs(low) ** 2).sum(0) * (np.abs(high) ** 2).sum(0))
     assert np.mean(likeness**2) < 2 / len(ground)
 
