@@ -364,7 +364,7 @@ def read_uxo(path: Path) -> Recording:
     # 2. Sort them by time, assign poses, and make a part of each run of frames with the same geometry.
     usable = plausible & has_picture
     order, order_notes = in_time_order(np.where(usable, headers["time_us"] * 1e-6, np.nan), headers["index"])
-    order_notes = [note for note in order_notes if "no valid time" not in note]
+    order_notes = [note for note in order_notes if "without a valid time" not in note]
     poses, pose_notes = _uxo_poses(path / ROTATOR, headers["index"][order])
     modes, samples = headers["ping_mode"][order].tolist(), headers["samples"][order].tolist()
     keys = [(*one, *window) for *one, window in zip(modes, samples, windows_of(headers[order]), strict=True)]
