@@ -171,7 +171,7 @@ def test_a_topic_is_chosen(mitsonar: Command, tmp_path: Path) -> None:
         (["convert", "FRAMES", "-o", "a.mcap", "--resume"], "--resume applies only to folders"),
         (["convert", "FRAMES", "-o", "a.mcap", "--part", "3"], "has no part 3"),
         (["convert", "FRAMES", "-o", "a", "--crop-bins", "20"], "--crop-bins is two whole numbers, first,end"),
-        (["convert", "FRAMES", "-o", "a", "--crop-beams", "90,97"], "--crop-beams is first,end of at least two beams"),
+        (["convert", "FRAMES", "-o", "a", "--crop-beams", "90,97"], "--crop-beams must be first,end of at least two beams"),
         (["convert", "FRAMES", "-o", "a", "--full"], "--full and --labels apply only to MCAP files"),
         (["video", "FRAMES", "-o", "a.mp4", "--rate", "0"], "--rate must lie"),
         (["show", "FRAMES", "-o", "a.png", "--span-db", "-1"], "the span must lie"),

@@ -212,7 +212,7 @@ def test_a_scene_without_materials_gathers_nothing() -> None:
     ids=["two materials", "a material beside a BSDF"],
 )
 def test_a_shape_has_one_material(bsdf: MitsubaDict) -> None:
-    with pytest.raises(MitsonarError, match=r"shape floor must have a single material .* sand"):
+    with pytest.raises(MitsonarError, match=r"shape floor must have a single material: .*sand"):
         Simulator(scene(floor=floor(bsdf)), SONAR)
 
 
