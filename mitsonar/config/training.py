@@ -1,4 +1,4 @@
-"""Training recipes and options of a training: their keys, and how they are read from YAML and validated.
+"""Training recipes and training options: their keys, and how they are read from YAML and validated.
 
 A recipe is shipped for each row of Almanza-Medina's tables.
 """
@@ -63,18 +63,20 @@ class Input(_Part):
     layout: Literal["side", "stack", "channels"] = Field("side", description="frames side by side, stacked, or channels")
     coordinates: Literal["polar", "cartesian", "both"] = Field("polar", description="as stored, fans in metres, or both")
     cartesian_rows: int = Field(512, ge=2, le=8192, description="pixels of a fan in the forward direction")
-    range_levels: int | None = Field(None, ge=1, description="bins of vectors, by adding neighbouring bins; null: as stored")
+    range_levels: int | None = Field(
+        None, ge=1, description="number of bins of vectors, by summing neighbours; null: as stored"
+    )
     halves: bool = Field(False, description="vectors of both halves of images (fig. 4.18)")
     ground: bool = Field(False, description="add the geometry of the ground, for networks that use it")
     leak: Literal["none", "one_ping", "strangers"] = Field(
-        "none", description="impulse responses without motion, as a test: what is still learnt is a leak"
+        "none", description="test with impulse responses without motion: anything still learnt is a leak"
     )
 
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
         defaults = Input.model_construct(kind=self.kind, frames=self.frames)
-        images = ("views", "layout", "coordinates", "cartesian_rows", "range_levels", "halves", "ground")
-        names = images if self.kind == "response" else ("leak",)
+        image_keys = ("views", "layout", "coordinates", "cartesian_rows", "range_levels", "halves", "ground")
+        names = image_keys if self.kind == "response" else ("leak",)
         misplaced = [name for name in names if getattr(self, name) != getattr(defaults, name)]
         if misplaced:
             raise ValueError(f"input.{misplaced[0]} does not apply to kind {self.kind}: leave it out")
@@ -92,7 +94,7 @@ class Input(_Part):
 
 
 class Loss(_Part):
-    """The loss that training minimises."""
+    """Loss function of training."""
 
     kind: Literal["mse", "likelihood"] = Field(
         "mse", description="eq. 3.1; or the likelihood of the motion, with its covariance"
@@ -109,7 +111,7 @@ class Loss(_Part):
         if self.bounds is not None and not self.bounds[0] < self.bounds[1]:
             raise ValueError(f"loss bounds must be low,high with low < high: got {self.bounds[0]:g},{self.bounds[1]:g}")
         if self.kind == "likelihood" and self.penalty:
-            raise ValueError("loss penalty belongs to kind mse: the likelihood has none")
+            raise ValueError("loss.penalty applies only to kind mse: omit it for kind likelihood")
         return self
 
 
@@ -124,17 +126,17 @@ class Optimiser(_Part):
     )
     halve_every: float = Field(12.0, gt=0, description="epochs between reductions of the rate")
     fall_to: float = Field(0.5, gt=0, le=1, description="factor of each reduction, with schedule halve")
-    warmup: int = Field(0, ge=0, description="steps over which the rate rises from 0 at the beginning")
+    warmup: int = Field(0, ge=0, description="steps over which the rate rises from 0 at the start")
     weight_decay: float = Field(0.0, ge=0, le=1)
-    clip: float | None = Field(None, gt=0, description="largest norm of the gradient; null: any")
+    clip: float | None = Field(None, gt=0, description="maximum norm of the gradient; null: unlimited")
 
     @model_validator(mode="after")
     def _check_steps(self) -> Self:
         epochs, rates = [epoch for epoch, _ in self.steps], [rate for _, rate in self.steps]
-        follow = epochs == sorted(set(epochs)) and all(0 < rate <= 10 for rate in rates)
-        if (self.schedule == "steps") != bool(self.steps) or not follow:
+        valid = epochs == sorted(set(epochs)) and all(0 < rate <= 10 for rate in rates)
+        if (self.schedule == "steps") != bool(self.steps) or not valid:
             raise ValueError(
-                "optimiser steps must be [epoch, rate] with increasing epochs and rates above 0 up to 10, for "
+                "optimiser steps must be [epoch, rate] pairs with increasing epochs and 0 < rate <= 10, for "
                 f"schedule steps only: got {self.steps} with schedule {self.schedule}"
             )
         return self
@@ -157,17 +159,17 @@ class Optimiser(_Part):
                 passed_rates = [rate for epoch, rate in self.steps if step >= epoch * epoch_steps]
                 return warmup_factor * (passed_rates[-1] if passed_rates else self.rate)
             case "cosine":
-                done = max(0, step - self.warmup) / max(1, steps - self.warmup)
-                return self.rate * warmup_factor * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+                progress = max(0, step - self.warmup) / max(1, steps - self.warmup)
+                return self.rate * warmup_factor * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
             case _:
                 return self.rate * warmup_factor
 
 
 class Validate(_Part):
-    """Validation during training, on which the updates of the weights do not depend."""
+    """Validation during training, which does not affect the updates of the weights."""
 
     noise: list[Noise] = Field(default=["none", "high"], min_length=1, description="noise levels")
-    pairs: int | None = Field(500, ge=1, description="number of samples, always the same ones; null: all of the part")
+    pairs: int | None = Field(500, ge=1, description="number of samples, the same each time; null: all of the part")
     every_minutes: float = Field(5.0, gt=0)
     every_steps: int | None = Field(None, ge=1, description="interval in steps, instead of minutes")
 
@@ -183,43 +185,43 @@ class TrainingRecipe(_Part):
     network: Keys = Field(description="name of the network, or name and options: {name: posenet, width: 0.25}")
     start: str | None = Field(None, description="checkpoint or run with the initial weights; null: random weights")
     data: str = Field("rocky-field", description="data set recipe, name or file, for --render and reproduce")
-    data_changes: Keys = Field(default_factory=dict, description="changed keys of that recipe: {sonar.range_bins: 256}")
+    data_changes: Keys = Field(default_factory=dict, description="overrides of that recipe: {sonar.range_bins: 256}")
     part_of_data: float = Field(
         1.0, gt=0, le=1, description="fraction of the frames, from the first, whose samples are used"
     )
     input: Input = Field(default_factory=Input)
-    labels: Literal["raw", "quantised", "normx10"] = Field("normx10", description="form of the network's outputs")
-    noise: Noise | list[Noise] = Field("none", description="noise in training; each sample draws one of a list")
+    labels: Literal["raw", "quantised", "normx10"] = Field("normx10", description="encoding of the network's outputs")
+    noise: Noise | list[Noise] = Field("none", description="noise in training; from a list, each sample draws one")
     augment: list[Literal["mirror", "reverse", "strangers"]] = Field(
-        default_factory=list, description="changes of samples, for networks that use the ground"
+        default_factory=list, description="augmentations of samples, for networks that use the ground"
     )
     split: str | Keys = Field("sequence", description="sequence, scene, sample, or keys of a data set recipe's split")
     loss: Loss = Field(default_factory=Loss)
     optimiser: Optimiser = Field(default_factory=Optimiser)
     batch: int = Field(4, ge=1, le=65_536, description="samples per step, over all devices")
     epochs: float | None = Field(32.0, gt=0, description="passes over all samples; or steps")
-    steps: int | None = Field(None, ge=1, description="steps of the optimiser, in place of epochs")
+    steps: int | None = Field(None, ge=1, description="steps of the optimiser, instead of epochs")
     precision: Precision = Field("32-true", description="precision, as named by Lightning")
     validate_: Validate = Field(default_factory=Validate, alias="validate")
-    seed: int = Field(0, ge=0, lt=2**31, description="seed of weights, order, noise and dropout")
+    seed: int = Field(0, ge=0, lt=2**31, description="seed for weights, order, noise and dropout")
 
     @model_validator(mode="before")
     @classmethod
     def _expand(cls, fields: object) -> object:
         if not isinstance(fields, dict):
             return fields
-        named = {"network": {"name": fields["network"]}} if isinstance(fields.get("network"), str) else {}
+        expanded = {"network": {"name": fields["network"]}} if isinstance(fields.get("network"), str) else {}
         kind = fields["input"].get("kind") if isinstance(fields.get("input"), dict) else None
         if kind == "response" and isinstance(fields.get("validate", {}), dict):
-            named["validate"] = {"noise": ["none"], **fields.get("validate", {})}
-        either = {"epochs": None} if fields.get("steps") is not None and "epochs" not in fields else {}
-        return {**fields, **named, **either}
+            expanded["validate"] = {"noise": ["none"], **fields.get("validate", {})}
+        unset = {"epochs": None} if fields.get("steps") is not None and "epochs" not in fields else {}
+        return {**fields, **expanded, **unset}
 
     @field_validator("network")
     @classmethod
     def _check_network(cls, network: Keys) -> Keys:
         if not isinstance(network.get("name"), str):
-            raise ValueError("give the name of a network, such as posenet, or name and options")
+            raise ValueError("network must be a name, such as posenet, or a name and options")
         return network
 
     @model_validator(mode="after")
@@ -228,10 +230,12 @@ class TrainingRecipe(_Part):
             raise ValueError(f"give either epochs or steps: got epochs {self.epochs}, steps {self.steps}")
         if isinstance(self.noise, list) and not self.noise:
             raise ValueError("noise must be a level or a list of levels, not an empty list: give 'none' for no noise")
-        decibels = self.input.kind == "response"
+        in_decibels = self.input.kind == "response"
         for level in {*self.noises, *self.validate_.noise} - {"none"}:
-            if level.endswith("dB") != decibels:
-                allowed = "a signal to noise ratio such as '20 dB'" if decibels else "low, high, chapter2 or mean,std,scale"
+            if level.endswith("dB") != in_decibels:
+                allowed = (
+                    "a signal to noise ratio such as '20 dB'" if in_decibels else "low, high, chapter2 or mean,std,scale"
+                )
                 raise ValueError(
                     f"noise of input.kind {self.input.kind} must be {allowed}, or none: got {short_repr(level)}"
                 )
@@ -302,7 +306,7 @@ def load_training_recipe(name_or_file: str | Path, changes: Keys | None = None) 
 
     Args:
         name_or_file: a file, such as ``mine.yaml``, or the name of a shipped recipe.
-        changes: values to change, keyed by dotted path: ``{"optimiser.rate": 1e-3}``.
+        changes: values to override, keyed by dotted path: ``{"optimiser.rate": 1e-3}``.
 
     Raises:
         MitsonarError: there is no such recipe, the file is not YAML, a key is unknown, or a value is outside its limits.
@@ -332,34 +336,34 @@ def training_recipe_from(fields: Keys) -> TrainingRecipe:
         raise MitsonarError(f"training recipe keys must be strings: {error}") from None
 
 
-# ---------------- Options of a training
+# ---------------- Training options
 
 
 STATE_MINUTES = 5.0
-"""Time between two states on disk, and so the training that a kill may cost [min]."""
+"""Interval between saved states, which bounds the training time lost if the process is killed [min]."""
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """What is trained, on which data, into which folder, and how; the options of ``mitsonar train``.
+    """Recipe, data, output folder and hardware of a training: the options of ``mitsonar train``.
 
     Attributes:
         recipe: training recipe, its name, or a YAML file.
-        data: path or URL of a data set, or of several data sets of one sonar, which are joined, such as one per model.
+        data: path or URL of a data set, or of several data sets of the same sonar to concatenate, such as one per model.
         out: folder of the run.
-        render: render samples during training, by the recipe of ``data`` or else by the one that ``recipe`` names.
+        render: render samples during training, with the recipe of ``data``, or else the one that ``recipe`` names.
         minutes: total duration after which training stops [min], including validation and earlier parts of a resumed run.
         resume: resume the run in ``out``, or start a new run if there is none.
         overwrite: replace a run in ``out``.
-        scale: fraction of the data to use, which multiplies ``part_of_data`` of the recipe.
-        pairs: length of the training in samples, which replaces that of the recipe.
+        scale: fraction of the data to use; multiplies ``part_of_data`` of the recipe.
+        pairs: length of the training in samples; overrides that of the recipe.
         accelerator: as in Lightning's trainer.
         devices: as in Lightning's trainer.
         strategy: as in Lightning's trainer.
-        precision: as in Lightning's trainer; replaces that of the recipe.
+        precision: as in Lightning's trainer; overrides that of the recipe.
         threads: number of CPU threads.
         workers: number of processes that read or render; by default it depends on the machine.
-        state_minutes: time between two states on disk [min].
+        state_minutes: interval between saved states [min].
 
     Raises:
         MitsonarError: a number is outside its limits.
@@ -387,16 +391,16 @@ class TrainOptions:
             raise MitsonarError(f"--scale must lie in 0..1: got {self.scale:g}")
         if self.minutes is not None and not self.minutes > 0:
             raise MitsonarError(f"--minutes must be above 0: got {self.minutes:g}")
-        for name, least in (("threads", 1), ("workers", 0)):
+        for name, minimum in (("threads", 1), ("workers", 0)):
             count = getattr(self, name)
-            if count is not None and count < least:
-                raise MitsonarError(f"--{name} must be at least {least}: got {count}")
+            if count is not None and count < minimum:
+                raise MitsonarError(f"--{name} must be at least {minimum}: got {count}")
 
     def changed_recipe(self) -> TrainingRecipe:
-        """Load the recipe and apply ``scale``, ``pairs`` and ``precision``; a run is of the result.
+        """Load the recipe and apply ``scale``, ``pairs`` and ``precision``; the run uses the result.
 
         Raises:
-            MitsonarError: there is no such recipe, or ``pairs`` is less than its batch.
+            MitsonarError: there is no such recipe, or ``pairs`` is less than its batch size.
         """
         recipe = self.recipe if isinstance(self.recipe, TrainingRecipe) else load_training_recipe(self.recipe)
         changes: Keys = {}
@@ -404,7 +408,7 @@ class TrainOptions:
             changes["part_of_data"] = self.scale * recipe.part_of_data
         if self.pairs is not None:
             if self.pairs < recipe.batch:
-                raise MitsonarError(f"--pairs must be at least a batch, {recipe.batch}: got {self.pairs}")
+                raise MitsonarError(f"--pairs must be at least the batch size, {recipe.batch}: got {self.pairs}")
             changes |= {"steps": self.pairs // recipe.batch, "epochs": None}
         if self.precision is not None:
             changes["precision"] = self.precision

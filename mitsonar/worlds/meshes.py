@@ -1,4 +1,4 @@
-"""How a model file (glTF, OBJ, STL, COLLADA, PLY) becomes geometries with reflectivities, and a world."""
+"""Read model files (glTF, OBJ, STL, COLLADA, PLY) as geometries with reflectivities, and build worlds from them."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ UNCOLOURED = 0.5
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 UP = {"x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)), "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "z": np.eye(3)}
-"""Rows of the rotation that turns each axis upwards; none of them mirrors."""
+"""Rows of the rotation that turns each axis upwards; none is a reflection."""
 
 MAX_TRIANGLES = 50_000_000
-"""Largest number of triangles of a model, including all copies."""
+"""Maximum number of triangles of a model, including all copies."""
 
 MAX_PIXELS = 2**26
-"""Largest number of pixels of a picture of a model."""
+"""Maximum number of pixels of a picture in a model."""
 
 MAX_FILE_BYTES = 2**32
-"""Largest size of a model file [bytes]."""
+"""Maximum size of a model file [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Piece:
         vertices: vertex positions ``(vertices, 3)``.
         faces: vertex indices of the triangles ``(faces, 3)``.
         reflectivity: reflectivity of each face ``(faces,)``, unless a picture gives it.
-        uv: texture coordinates ``(vertices, 2)``, v from the top row as in Mitsuba; only with a picture.
-        picture: reflectivity as a grey PNG file.
+        uv: texture coordinates ``(vertices, 2)``, v from the top row, as in Mitsuba; only with a picture.
+        picture: reflectivity as a greyscale PNG file.
     """
 
     vertices: NDArray[np.float64]
@@ -73,7 +73,7 @@ class Piece:
     picture: bytes | None = None
 
     def moved(self, turn: NDArray[np.float64], shift: NDArray[np.float64]) -> Self:
-        """Return the geometry with vertices ``turn @ v - shift``; triangles keep their front side where ``turn`` mirrors."""
+        """Return the geometry with vertices ``turn @ v - shift``; reflections keep the front sides of triangles."""
         faces = self.faces[:, ::-1] if np.linalg.det(turn) < 0 else self.faces
         return replace(self, vertices=self.vertices @ turn.T - shift, faces=faces)
 
@@ -125,9 +125,7 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
     if not os.path.isfile(path):
         raise MitsonarError(f"no model file {path}: give a {', '.join(FORMATS)} file")
     if path.suffix.lower() not in FORMATS:
-        raise MitsonarError(
-            f"cannot read models of type {path.suffix or 'without ending'}: {path}; known: {', '.join(FORMATS)}"
-        )
+        raise MitsonarError(f"cannot read models of type {path.suffix or '(none)'}: {path}; supported: {', '.join(FORMATS)}")
     if path.suffix.lower() == ".dae" and find_spec("collada") is None:
         raise MitsonarError(
             f"cannot read {path}: COLLADA needs the package pycollada, which is not installed; pip install "
@@ -140,14 +138,14 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
         geometries = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]
         for geometry in geometries:
             if np.shape(geometry.vertices)[1:] != (3,) or np.shape(geometry.faces)[1:] != (3,):
-                raise ValueError("a vertex or a triangle does not have three numbers")
+                raise ValueError("a vertex or a triangle does not have three components")
             if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
                 raise ValueError("a triangle refers to a vertex that does not exist")
     except Exception as error:  # readers of damaged files raise errors of any type
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MitsonarError(f"cannot read {path}: {reason}; export the model again") from None
     if not geometries:
-        raise MitsonarError(f"{path} holds no triangles: export a mesh, not points or lines")
+        raise MitsonarError(f"{path} contains no triangles: export a mesh, not points or lines")
     return geometries
 
 
@@ -155,7 +153,7 @@ def _check_file(path: Path) -> None:
     """Check the counts in a file against its size, before a reader allocates memory for them.
 
     Raises:
-        ValueError: the file is too large, or its header announces more data than it has.
+        ValueError: the file is too large, or its header declares more data than it contains.
     """
     size = path.stat().st_size
     if size > MAX_FILE_BYTES:
@@ -163,14 +161,14 @@ def _check_file(path: Path) -> None:
     kind = path.suffix.lower()
     if kind == ".ply":
         check_counts(path)
-    if kind == ".dae" and b"<!DOCTYPE" in path.read_bytes().replace(b"\0", b""):  # without zero bytes, to recognise UTF-16
-        raise ValueError("it has a document type (<!DOCTYPE>), which models do not need")
+    if kind == ".dae" and b"<!DOCTYPE" in path.read_bytes().replace(b"\0", b""):  # also matches UTF-16
+        raise ValueError("it has a document type declaration (<!DOCTYPE>), which models do not need")
     if kind in (".glb", ".gltf"):
         _check_gltf(path, size)
 
 
 def _check_gltf(path: Path, size: int) -> None:
-    """Check that the accessors and buffers of a glTF file fit into its bytes."""
+    """Check the sizes of accessors and buffers of a glTF file against the data available."""
     content = path.read_bytes()
     if path.suffix.lower() == ".glb":
         (length,) = struct.unpack_from("<I", content, 12)
@@ -180,12 +178,12 @@ def _check_gltf(path: Path, size: int) -> None:
         view = tree["bufferViews"][accessor["bufferView"]] if "bufferView" in accessor else {"byteLength": 16 * size}
         count = whole_number(accessor["count"], "count of an accessor", 0, 2**40)
         if count > whole_number(view["byteLength"], "byteLength", 0, 2**40):
-            raise ValueError(f"an accessor announces {count:,} values in {view['byteLength']:,} bytes")
+            raise ValueError(f"an accessor declares {count:,} values in {view['byteLength']:,} bytes")
     for buffer in tree.get("buffers", []):
         available = [size] if "uri" not in buffer or str(buffer["uri"]).startswith("data:") else []
         available += [(path.parent / str(buffer["uri"])).stat().st_size] if not available else []
         if whole_number(buffer["byteLength"], "byteLength", 0, 2**40) > available[0]:
-            raise ValueError(f"a buffer announces {buffer['byteLength']:,} bytes, but there are {available[0]:,}")
+            raise ValueError(f"a buffer declares {buffer['byteLength']:,} bytes, but its data has only {available[0]:,}")
 
 
 def _check_copies(scene: trimesh.Scene) -> None:
@@ -200,7 +198,7 @@ def _check_copies(scene: trimesh.Scene) -> None:
             if picture is not None and picture.width * picture.height > MAX_PIXELS:
                 raise ValueError(f"a picture has {picture.width:,} x {picture.height:,} pixels, more than {MAX_PIXELS:,}")
     if total > MAX_TRIANGLES:
-        raise ValueError(f"it places {total:,} triangles, more than {MAX_TRIANGLES:,}")
+        raise ValueError(f"it has {total:,} triangles with all copies, more than {MAX_TRIANGLES:,}")
 
 
 def _piece(geometry: trimesh.Trimesh, value: str | float) -> Piece:
@@ -226,7 +224,7 @@ def _piece(geometry: trimesh.Trimesh, value: str | float) -> Piece:
 
 
 def _tint(material: trimesh.visual.material.Material, value: str) -> float:
-    """Return the reflectivity 0..1 of a material's base colour, which multiplies a picture."""
+    """Return the reflectivity 0..1 of a material's base colour, a factor of its picture."""
     if isinstance(material, trimesh.visual.material.PBRMaterial):  # glTF: linear values; the default is white
         factor = material.baseColorFactor
         colour = np.ones(3) if factor is None else _colours(factor)[0]
@@ -237,7 +235,7 @@ def _tint(material: trimesh.visual.material.Material, value: str) -> float:
 
 
 def _colours(values: ArrayLike) -> NDArray[np.float64]:
-    """Convert 8-bit or fractional RGB(A) to RGB in 0..1 ``(n, 3)``."""
+    """Convert 8-bit or floating-point RGB(A) to RGB in 0..1 ``(n, 3)``."""
     table = np.atleast_2d(np.asarray(values))
     scale = 255 if np.issubdtype(table.dtype, np.integer) else 1
     return np.clip(table[:, :3].astype(float) / scale, 0, 1)
@@ -252,7 +250,7 @@ def reduce_colour(colours: NDArray[np.float64], value: str) -> NDArray[np.float6
 
 
 def _grey_png(picture: Image.Image, value: str, factor: float) -> bytes:
-    """Return the reflectivity of a picture, times ``factor``, as a 16-bit grey PNG."""
+    """Return the reflectivity of a picture, times ``factor``, as a 16-bit greyscale PNG."""
     grey = reduce_colour(_colours(np.asarray(picture.convert("RGB")).reshape(-1, 3)), value) * factor
     pixels = np.rint(grey * 65535).astype(np.uint16).reshape(picture.height, picture.width)
     buffer = io.BytesIO()
@@ -282,12 +280,12 @@ def merged(
     content: dict[str, bytes] = {}
     for picture, members in sorted(groups.items(), key=lambda group: group[0] is not None):  # untextured first
         vertices = np.concatenate([piece.vertices for _, piece in members])
-        first = np.cumsum([0, *(len(piece.vertices) for _, piece in members)])
-        faces = np.concatenate([piece.faces + start for (_, piece), start in zip(members, first, strict=False)])
+        offsets = np.cumsum([0, *(len(piece.vertices) for _, piece in members)])
+        faces = np.concatenate([piece.faces + offset for (_, piece), offset in zip(members, offsets, strict=False)])
         ids = np.concatenate([np.full(len(piece.faces), number) for number, piece in members])
         if picture is None:
-            values = np.concatenate([piece.reflectivity for _, piece in members if piece.reflectivity is not None])
-            meshes.append(Mesh(name, vertices, faces, values, ids, shape_id=shape_id))
+            reflectivity = np.concatenate([piece.reflectivity for _, piece in members if piece.reflectivity is not None])
+            meshes.append(Mesh(name, vertices, faces, reflectivity, ids, shape_id=shape_id))
         else:
             file = f"{textured}_{len(content)}"
             uv = np.concatenate([piece.uv for _, piece in members if piece.uv is not None])
@@ -297,7 +295,7 @@ def merged(
     return meshes, content
 
 
-# ---------------- World of a model
+# ---------------- Worlds from models
 
 
 LARGEST_M = 1e6
@@ -316,7 +314,7 @@ def mesh_world(
     floor: bool = True,
     floor_m: float | None = None,
 ) -> World:
-    """Build the world of a model file: scaled, z upwards, and centred above the origin with its lowest point at z = 0.
+    """Build a world from a model file: scaled, z upwards, and centred above the origin with its lowest point at z = 0.
 
     Args:
         path: glTF, OBJ, STL, COLLADA or PLY file.
@@ -324,22 +322,22 @@ def mesh_world(
         up: axis of the file that points up, x, y or z; default: y for glTF, z otherwise.
         reflectivity: ``luminance`` (of linear light, as Mitsuba computes it), ``red`` (the stored red channel, as in
             Almanza-Medina), or one number for the whole model.
-        floor: whether to add a seabed of random cells of 15 mm at z = 0.
-        floor_m: edge of that seabed [m]; default: three times the model's diagonal.
+        floor: whether to add a seabed of random 15 mm cells at z = 0.
+        floor_m: side length of that seabed [m]; default: three times the model's diagonal.
 
     Raises:
-        MitsonarError: the model is unreadable, broken or empty; or scale, axis or reflectivity is not allowed.
+        MitsonarError: the model is unreadable, damaged or empty; or scale, axis or reflectivity is invalid.
     """
-    # 1. Read the model. Only vertices that a triangle uses count for its extent.
+    # 1. Read the model. Only vertices of triangles count towards its extent.
     path = Path(path)
     up = up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z")
     _check_options(up, scale, floor_m)
     pieces = read_pieces(path, reflectivity_of(reflectivity))
     turn = np.array(UP[up], dtype=float) * scale
-    corners = np.concatenate([(piece.vertices @ turn.T)[np.unique(piece.faces)] for piece in pieces])
-    _check_extent(path, corners, scale)
+    vertices = np.concatenate([(piece.vertices @ turn.T)[np.unique(piece.faces)] for piece in pieces])
+    _check_extent(path, vertices, scale)
     # 2. Centre the model above the origin, on z = 0.
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
     shift = np.array([*(low + high)[:2] / 2, low[2]])
     meshes, content = merged([piece.moved(turn, shift) for piece in pieces])
     # 3. Add the seabed, and a sonar that sees the whole model.
@@ -359,7 +357,7 @@ def _check_options(up: str, scale: float, floor_m: float | None) -> None:
     """Check the options of :func:`mesh_world`.
 
     Raises:
-        MitsonarError: an option is not allowed.
+        MitsonarError: an option is invalid.
     """
     if up not in UP:
         raise MitsonarError(f"{argument('up')} must be x, y or z: got {up!r}{did_you_mean(up, UP)}")
@@ -371,42 +369,42 @@ def _check_options(up: str, scale: float, floor_m: float | None) -> None:
         raise MitsonarError(f"{argument('floor_m')} must lie in 0..10000 m: got {floor_m:g}")
 
 
-def _check_extent(path: Path, corners: NDArray[np.float64], scale: float) -> None:
-    """Check that the corners of a model ``(n, 3)`` [m] are finite, do not all coincide, and are not too far apart.
+def _check_extent(path: Path, vertices: NDArray[np.float64], scale: float) -> None:
+    """Check that the vertices of a model ``(n, 3)`` [m] are finite, do not all coincide, and are not too far apart.
 
     Raises:
         MitsonarError: a check fails.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        extent = float(np.ptp(corners, axis=0).max())
-    if not np.isfinite(corners).all() or extent <= 0:
-        raise MitsonarError(f"{path} is broken: its vertices are not finite or all in one place; export it again")
-    if not (extent <= LARGEST_M and np.abs(corners).max() <= FARTHEST_M):
+        extent = float(np.ptp(vertices, axis=0).max())
+    if not np.isfinite(vertices).all() or extent <= 0:
+        raise MitsonarError(f"{path} is damaged: its vertices are not finite or all coincide; export it again")
+    if not (extent <= LARGEST_M and np.abs(vertices).max() <= FARTHEST_M):
         raise MitsonarError(
-            f"{path} spans {extent:.4g} m with scale {scale:g}: a model spans at most {LARGEST_M:g} m; give the scale in "
+            f"{path} spans {extent:.4g} m with scale {scale:g}: a model may span at most {LARGEST_M:g} m; give the scale in "
             "metres per unit of the file"
         )
 
 
 def random_seabed(half_m: float, z_m: float = 0.0) -> Floor:
-    """Return a square seabed of random cells of 15 mm, with half an edge of ``half_m`` [m], at height ``z_m`` [m]."""
+    """Return a square seabed of random 15 mm cells, with half a side length of ``half_m`` [m], at height ``z_m`` [m]."""
     return Floor(half_m, Floor.cells(int(np.clip(round(2 * half_m / 0.015), 1, 2**20)), (0, 1), 0), z_m)
 
 
 def overview(radius: float, height: float, foot: ArrayLike = (0.0, 0.0, 0.0), *, nearest: float = 0.0) -> Standpoint:
     """Return a standpoint from which the sonar sees a whole model, looking down at 30 deg.
 
-    At its distance the model fills a field of view of 29 deg.
+    From there, the model fills a field of view of 29 deg.
 
     Args:
         radius: half the diagonal of the model's bounding box [m].
         height: height of the model [m].
-        foot: point below the model's centre, at its lowest height ``(3,)`` [m].
-        nearest: smallest distance of the sonar [m].
+        foot: point below the model's centre, at its lowest z ``(3,)`` [m].
+        nearest: minimum distance of the sonar [m].
     """
-    away = max(1.1 * radius / np.tan(np.radians(14.5)), nearest)
+    distance = max(1.1 * radius / np.tan(np.radians(14.5)), nearest)
     x, y, z = (float(value) for value in np.asarray(foot))
-    middle = z + height / 2
+    centre_z = z + height / 2
     sin, cos = np.sin(np.radians(30)), np.cos(np.radians(30))
-    window = (max(away - 1.5 * radius, 0.01), away + 2.5 * radius)
-    return Standpoint((x, y - away * cos, middle + away * sin), (x, y, middle), window=window)
+    window = (max(distance - 1.5 * radius, 0.01), distance + 2.5 * radius)
+    return Standpoint((x, y - distance * cos, centre_z + distance * sin), (x, y, centre_z), window=window)

@@ -1,4 +1,4 @@
-"""How a world is described in memory, and written as a Mitsuba XML scene with PLY meshes and textures."""
+"""Worlds in memory, and their export as a Mitsuba XML scene with PLY meshes and textures."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ __all__ = [
 ]
 
 
-def _rising(pair: tuple[float, float]) -> tuple[float, float]:
+def _check_interval(pair: tuple[float, float]) -> tuple[float, float]:
     if not (np.isfinite(pair).all() and pair[0] <= pair[1]):
-        raise ValueError(f"an interval is two finite numbers low,high with low <= high: got {pair[0]:g},{pair[1]:g}")
+        raise ValueError(f"an interval must be two finite numbers low,high with low <= high: got {pair[0]:g},{pair[1]:g}")
     return pair
 
 
-Interval = Annotated[tuple[float, float], AfterValidator(_rising)]
+Interval = Annotated[tuple[float, float], AfterValidator(_check_interval)]
 """Lowest and highest value of an interval, both finite."""
 
 
-def _counting(pair: tuple[int, int]) -> tuple[int, int]:
+def _check_counts(pair: tuple[int, int]) -> tuple[int, int]:
     if not 0 <= pair[0] <= pair[1] <= 10**6:
-        raise ValueError(f"a number to draw is low,high with 0 <= low <= high <= 1000000: got {pair[0]},{pair[1]}")
+        raise ValueError(f"a range of counts must be low,high with 0 <= low <= high <= 1000000: got {pair[0]},{pair[1]}")
     return pair
 
 
-Counts = Annotated[tuple[int, int], AfterValidator(_counting)]
+Counts = Annotated[tuple[int, int], AfterValidator(_check_counts)]
 """Lowest and highest number of objects; the number is drawn from this closed interval."""
 
 
@@ -70,7 +70,7 @@ SURFACE_MARGIN_M = 25.0
 class Family(CheckedModel):
     """A family of worlds: its fields are the options, and :meth:`build` makes a world from a seed.
 
-    An invalid option raises an error of one sentence that names the family and where its options are described.
+    An invalid option raises a one-sentence error that names the family and where its options are documented.
     """
 
     described: ClassVar[str] = ""
@@ -80,10 +80,10 @@ class Family(CheckedModel):
 
     @classmethod
     def refuse(cls, error: ValidationError) -> NoReturn:
-        """Raise a validation error of pydantic as an error of mitsonar.
+        """Raise a pydantic validation error as a :class:`~mitsonar.errors.MitsonarError`.
 
         Raises:
-            MitsonarError: always; the message is the first of pydantic's complaints.
+            MitsonarError: always; the message describes the first error that pydantic reports.
         """
         described = cls.described or f"`mitsonar world {cls.called} --help`"
         raise MitsonarError(validation_message(error, cls, cls.called, f" (see {described})")) from None
@@ -93,7 +93,7 @@ class Family(CheckedModel):
 
     @property
     def half_m(self) -> float:
-        """Return half the edge of the square around the origin in which the vehicle stays [m]."""
+        """Return half the side length of the square around the origin in which the vehicle stays [m]."""
         return self.size_m / 2
 
     @property
@@ -106,11 +106,11 @@ class Family(CheckedModel):
         raise NotImplementedError
 
     def check_scene_extent(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-        """Refuse a scene that is smaller than the square in which frames are taken; built worlds never are.
+        """Check that a scene covers the square in which frames are taken; generated worlds always do.
 
         Args:
-            low: smallest x, y, z of the scene ``(3,)`` [m].
-            high: largest x, y, z of the scene ``(3,)`` [m].
+            low: minimum x, y, z of the scene ``(3,)`` [m].
+            high: maximum x, y, z of the scene ``(3,)`` [m].
 
         Raises:
             MitsonarError: the scene is smaller.
@@ -129,7 +129,7 @@ def stream(seed: int, *purpose: int) -> np.random.Generator:
 def draw(rng: np.random.Generator, span: tuple[float, float], *shape: int) -> NDArray[np.float64]:
     """Draw uniform numbers from an interval, as an array of ``shape``.
 
-    Only the generator's plain doubles are used: their bits do not change between versions of NumPy.
+    Only the generator's plain doubles are used, because their bits are the same in all versions of NumPy.
     """
     low, high = span
     return np.asarray(low + (high - low) * rng.random(shape), dtype=np.float64)
@@ -140,7 +140,7 @@ def whole(rng: np.random.Generator, span: tuple[int, int]) -> int: ...
 @overload
 def whole(rng: np.random.Generator, span: tuple[int, int], first: int, /, *shape: int) -> NDArray[np.int64]: ...
 def whole(rng: np.random.Generator, span: tuple[int, int], *shape: int) -> int | NDArray[np.int64]:
-    """Draw integers from a closed interval: a single one without a shape, otherwise an array of that shape."""
+    """Draw integers from a closed interval: a scalar without a shape, otherwise an array of that shape."""
     values = span[0] + np.floor(rng.random(shape) * (span[1] + 1 - span[0])).astype(int)
     return values if shape else int(values)
 
@@ -149,16 +149,16 @@ def shifted_grid(half_m: float, a_side: int, rng: np.random.Generator) -> NDArra
     """Draw the vertices of a square grid, each displaced at random within one grid step (Almanza-Medina, 3.2.1).
 
     Args:
-        half_m: half the edge of the field [m].
-        a_side: vertices along an edge.
-        rng: generator of the displacements.
+        half_m: half the side length of the field [m].
+        a_side: number of vertices along each side.
+        rng: random number generator for the displacements.
 
     Returns:
-        Points of the field ``(a_side^2, 2)`` [m].
+        Points ``(a_side^2, 2)`` [m].
     """
     step = 2 * half_m / max(a_side, 1)
-    vertex = np.stack(np.meshgrid(*[np.arange(a_side)] * 2, indexing="ij"), -1).reshape(-1, 2) * step - half_m
-    return np.asarray(vertex + step * rng.random((a_side**2, 2)), dtype=np.float64)
+    corners = np.stack(np.meshgrid(*[np.arange(a_side)] * 2, indexing="ij"), -1).reshape(-1, 2) * step - half_m
+    return np.asarray(corners + step * rng.random((a_side**2, 2)), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ class Mesh:
         reflectivity: reflectivity of each face ``(faces,)`` 0..1, unless a texture gives it.
         object_id: number of the object that each face belongs to ``(faces,)``, counted from 1.
         uv: texture coordinates of each vertex ``(vertices, 2)``; only with a texture.
-        texture: picture of the reflectivity, a file within the world's folder.
+        texture: path of an image of the reflectivity, relative to the world's folder.
         shape_id: id of the shape; default: its name.
         material: name of an ``acoustic_material`` that gives the surface its scattering law; default: a diffuse surface.
     """
@@ -190,27 +190,29 @@ class Mesh:
     def ply(self) -> bytes:
         """Return the mesh as a binary PLY file, with the attribute names that Mitsuba reads."""
         # 1. Collect the columns of vertices and faces, and declare them in the header.
-        vertex = {"x": self.vertices[:, 0], "y": self.vertices[:, 1], "z": self.vertices[:, 2]}
+        vertex_columns = {"x": self.vertices[:, 0], "y": self.vertices[:, 1], "z": self.vertices[:, 2]}
         if self.uv is not None:
-            vertex |= {"u": self.uv[:, 0], "v": self.uv[:, 1]}
-        face: dict[str, NDArray[np.number]] = {}
+            vertex_columns |= {"u": self.uv[:, 0], "v": self.uv[:, 1]}
+        face_columns: dict[str, NDArray[np.number]] = {}
         if self.reflectivity is not None:
-            face["reflectivity_0"] = self.reflectivity
+            face_columns["reflectivity_0"] = self.reflectivity
         if self.object_id is not None:
-            face["id_0"] = self.object_id
-        head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(self.vertices)}"]
-        head += [f"property float {name}" for name in vertex]
-        head += [f"element face {len(self.faces)}", "property list uchar int vertex_indices"]
-        head += [f"property float {name}" for name in face]
+            face_columns["id_0"] = self.object_id
+        header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(self.vertices)}"]
+        header += [f"property float {name}" for name in vertex_columns]
+        header += [f"element face {len(self.faces)}", "property list uchar int vertex_indices"]
+        header += [f"property float {name}" for name in face_columns]
         # 2. Pack the columns into tables of little-endian rows.
-        points = np.empty(len(self.vertices), [(name, "<f4") for name in vertex])
-        for name, values in vertex.items():
-            points[name] = values
-        corners = np.empty(len(self.faces), [("count", "u1"), ("corners", "<i4", 3), *((name, "<f4") for name in face)])
-        corners["count"], corners["corners"] = 3, self.faces
-        for name, column in face.items():
-            corners[name] = column
-        return "\n".join([*head, "end_header", ""]).encode() + points.tobytes() + corners.tobytes()
+        vertex_rows = np.empty(len(self.vertices), [(name, "<f4") for name in vertex_columns])
+        for name, values in vertex_columns.items():
+            vertex_rows[name] = values
+        face_rows = np.empty(
+            len(self.faces), [("count", "u1"), ("corners", "<i4", 3), *((name, "<f4") for name in face_columns)]
+        )
+        face_rows["count"], face_rows["corners"] = 3, self.faces
+        for name, column in face_columns.items():
+            face_rows[name] = column
+        return "\n".join([*header, "end_header", ""]).encode() + vertex_rows.tobytes() + face_rows.tobytes()
 
     def xml(self) -> str:
         """Return the XML of the shape."""
@@ -238,10 +240,10 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Floor:
-    """A square plane around the origin, at height ``z_m``; ``texture`` is the XML of its reflectivity.
+    """A square plane centred on the origin, at height ``z_m``; ``texture`` is the XML of its reflectivity.
 
-    The plane rises along +y by ``slope_deg``. The rotation is about the x axis, which points to starboard, and follows the
-    translation to ``z_m``.
+    The plane rises along +y by ``slope_deg``. The rotation is about the x axis, which points to starboard, and is
+    applied after the translation to ``z_m``.
     """
 
     half_m: float
@@ -252,7 +254,7 @@ class Floor:
 
     @staticmethod
     def cells(count: int, span: tuple[float, float], seed: int) -> str:
-        """Return the XML of a texture of independent cells, ``count`` along each edge, uniformly drawn from ``span``."""
+        """Return the XML of a texture of independent cells, ``count`` along each side, drawn uniformly from ``span``."""
         return f"""<texture type="cell_noise" name="reflectance">
                 <float name="cells" value="{count}"/>
                 <float name="low" value="{span[0]!r}"/>
@@ -262,12 +264,12 @@ class Floor:
 
     def xml(self) -> str:
         """Return the XML of the shape."""
-        turn = f'\n            <rotate x="1" angle="{self.slope_deg!r}"/>' if self.slope_deg else ""
+        rotation = f'\n            <rotate x="1" angle="{self.slope_deg!r}"/>' if self.slope_deg else ""
         return f"""
     <shape type="rectangle" id="{self.name}">
         <transform name="to_world">
             <scale value="{self.half_m!r}"/>
-            <translate z="{self.z_m!r}"/>{turn}
+            <translate z="{self.z_m!r}"/>{rotation}
         </transform>
         <bsdf type="diffuse">
             {self.texture}
@@ -276,10 +278,10 @@ class Floor:
 
 
 class BuiltFamily(Family):
-    """A family whose worlds are built, optionally below a flat sea surface."""
+    """A family of generated worlds, optionally below a flat sea surface."""
 
     surface_m: float | None = Field(
-        None, gt=0, le=12_000, description="height of a flat sea surface, shape surface, over z = 0 [m]; without: none"
+        None, gt=0, le=12_000, description="height of a flat sea surface (shape surface) above z = 0 [m]; none if omitted"
     )
     surface_reflectivity: float = Field(0.0, ge=0, le=1, description="what the surface scatters; a mirror loses the rest")
 
@@ -287,7 +289,7 @@ class BuiltFamily(Family):
     def surface(self) -> Floor | None:
         """Return the sea surface, or None.
 
-        It extends :data:`SURFACE_MARGIN_M` beyond the world, so that it mirrors the world's border as well.
+        It extends :data:`SURFACE_MARGIN_M` beyond the world, so that it also reflects the world's edges.
         """
         if self.surface_m is None:
             return None
@@ -322,12 +324,12 @@ class World:
     """A world: meshes, a floor, a sea surface and an initial sonar.
 
     Attributes:
-        about: family and seed, written as a comment at the head of the file.
+        about: family and seed, written as a comment at the top of the file.
         meshes: meshes of the world.
         stand: initial position and window of the sonar.
         floor: plane below the meshes, if any.
         surface: sea surface above the meshes, if any; it is the last shape.
-        pictures: files to copy into the world's folder, keyed by their name there.
+        pictures: image files to copy into the world's folder, keyed by their name there.
         content: files to write into the world's folder, keyed by their name there.
     """
 
@@ -342,8 +344,8 @@ class World:
     @property
     def shape_names(self) -> tuple[str, ...]:
         """Return the ids of the shapes, in the order of the XML file."""
-        flat = ([one.name] if one else [] for one in (self.floor, self.surface))
-        below, above = flat
+        planes = ([plane.name] if plane else [] for plane in (self.floor, self.surface))
+        below, above = planes
         return (*below, *(mesh.shape_id or mesh.name for mesh in self.meshes), *above)
 
     @property
@@ -354,7 +356,7 @@ class World:
 
     @property
     def faces(self) -> int:
-        """Return the number of triangles of all meshes."""
+        """Return the total number of triangles of all meshes."""
         return sum(len(mesh.faces) for mesh in self.meshes)
 
     def xml(self) -> str:
@@ -374,7 +376,7 @@ class World:
     def write(self, folder: str | Path) -> Path:
         """Write ``meshes/``, ``textures/`` and, last, ``scene.xml`` into a folder; return the path of the scene.
 
-        The folder appears complete or not at all.
+        The write is atomic: the folder is either complete or absent.
 
         Raises:
             MitsonarError: the folder is not empty.
@@ -382,21 +384,21 @@ class World:
         folder = Path(folder)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise MitsonarError(f"{folder} exists and is kept as it is: choose another -o")
-        part = folder.with_name(f".{folder.name}.part")  # renamed at the end: the folder is complete or absent
-        shutil.rmtree(part, ignore_errors=True)
-        for below in ("meshes", "textures"):
-            (part / below).mkdir(parents=True)
+        temporary = folder.with_name(f".{folder.name}.part")  # renamed at the end, so that the folder is complete or absent
+        shutil.rmtree(temporary, ignore_errors=True)
+        for subfolder in ("meshes", "textures"):
+            (temporary / subfolder).mkdir(parents=True)
         for mesh in self.meshes:
-            (part / "meshes" / f"{mesh.name}.ply").write_bytes(mesh.ply())
+            (temporary / "meshes" / f"{mesh.name}.ply").write_bytes(mesh.ply())
         for name, source in self.pictures.items():
-            shutil.copyfile(source, part / name)
+            shutil.copyfile(source, temporary / name)
         for name, content in self.content.items():
-            (part / name).write_bytes(content)
-        (part / "scene.xml").write_text(self.xml(), encoding="utf-8")
-        for below in ("meshes", "textures"):
-            if not any((part / below).iterdir()):
-                (part / below).rmdir()
-        part.rename(folder)
+            (temporary / name).write_bytes(content)
+        (temporary / "scene.xml").write_text(self.xml(), encoding="utf-8")
+        for subfolder in ("meshes", "textures"):
+            if not any((temporary / subfolder).iterdir()):
+                (temporary / subfolder).rmdir()
+        temporary.rename(folder)
         return folder / "scene.xml"
 
 
@@ -410,12 +412,12 @@ def _numbers(values: tuple[float, ...]) -> str:
 def sloped(world: World, slope_deg: float) -> World:
     """Tilt a world so that its ground rises forward, along +y, by an angle [deg].
 
-    Floor and meshes turn about the x axis, which points to starboard. The sonar's standpoint and a sea surface do not move.
+    Floor and meshes are rotated about the x axis, which points to starboard. The sonar and a sea surface do not move.
     """
-    turn = Rotation.from_euler("x", slope_deg, degrees=True)
+    rotation = Rotation.from_euler("x", slope_deg, degrees=True)
 
     def tilted(mesh: Mesh) -> Mesh:
-        return replace(mesh, vertices=turn.apply(mesh.vertices))
+        return replace(mesh, vertices=rotation.apply(mesh.vertices))
 
     floor = None if world.floor is None else replace(world.floor, slope_deg=slope_deg)
     meshes = [tilted(mesh) for mesh in world.meshes]
@@ -426,7 +428,7 @@ def sloped(world: World, slope_deg: float) -> World:
 
 
 GRID_M = 1e-6
-"""Grid that vertices are rounded to [m]: it removes differences in the last bits between mathematics libraries."""
+"""Grid to which vertices are rounded [m], so that mathematics libraries that differ in the last bits give equal results."""
 
 
 @dataclass(frozen=True)
@@ -474,11 +476,11 @@ def cylinder(sections: int = 12, rings: int = 2) -> trimesh.Trimesh:
 
 
 def capsule(sections: int = 12) -> trimesh.Trimesh:
-    """Return a capsule along z, of two half spheres with two bands each: twice as long as wide, scaled to one unit."""
+    """Return a capsule along z, made of two hemispheres of two bands each: twice as long as wide, scaled to unit size."""
     import trimesh
 
-    turn = np.radians([-90, -45, 0])
-    low = np.column_stack([0.5 * np.cos(turn), (0.5 * np.sin(turn) - 0.5) / 2])
+    angle = np.radians([-90, -45, 0])
+    low = np.column_stack([0.5 * np.cos(angle), (0.5 * np.sin(angle) - 0.5) / 2])
     low[0, 0] = 0  # the pole lies on the axis
     return trimesh.creation.revolve([*low, *(low[::-1] * (1, -1))], sections=sections)
 
@@ -487,14 +489,14 @@ def place(shape: trimesh.Trimesh, size: ArrayLike, turn: Rotation, centre: Array
     """Copy a unit shape ``n`` times, each copy scaled, rotated and translated.
 
     Args:
-        shape: shape of one unit in each direction, centred on the origin.
-        size: edges of each copy, before the rotation ``(n, 3)`` [m].
+        shape: shape of unit size, centred on the origin.
+        size: dimensions of each copy before the rotation ``(n, 3)`` [m].
         turn: the n rotations.
         centre: centre of each copy ``(n, 3)`` [m].
     """
     size, centre = np.asarray(size, dtype=float), np.asarray(centre, dtype=float)
-    count, each = len(size), len(shape.vertices)
+    count, stride = len(size), len(shape.vertices)
     placed = (np.asarray(shape.vertices) * size[:, None]) @ turn.as_matrix().transpose(0, 2, 1) + centre[:, None]
-    faces = np.asarray(shape.faces) + (np.arange(count) * each)[:, None, None]
+    faces = np.asarray(shape.faces) + (np.arange(count) * stride)[:, None, None]
     vertices = np.rint(placed.reshape(-1, 3) / GRID_M) * GRID_M
     return Copies(vertices, faces.reshape(-1, 3), np.repeat(np.arange(count), len(shape.faces)), count)

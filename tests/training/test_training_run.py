@@ -189,7 +189,7 @@ def test_recipes_say_what_they_leave_out(tmp_path: Path) -> None:
         ({"epochs": 3}, "either epochs or steps"),
         ({"split": "world"}, "split must be sequence, scene"),
         ({"split": {"trian": 0.9}}, "did you mean train"),
-        ({"loss": {"kind": "likelihood", "penalty": 1}}, "penalty belongs to kind mse"),
+        ({"loss": {"kind": "likelihood", "penalty": 1}}, "penalty applies only to kind mse"),
         ({"network": {"width": 1}}, "name of a network"),
         ({"batch": "many"}, "batch"),
         ({"optimiser": {"rate": float("nan")}}, "optimiser.rate"),
@@ -611,7 +611,7 @@ def test_words_that_do_not_go_together_are_refused(made: Path, tmp_path: Path) -
     for words, sentence in (
         ({"minutes": 0}, "minutes must be above 0"),
         ({"scale": 2.0}, r"--scale must lie in 0\.\.1"),
-        ({"pairs": 3}, "--pairs must be at least a batch"),
+        ({"pairs": 3}, "--pairs must be at least the batch size"),
         ({"devices": 3, "accelerator": "cpu", "strategy": "ddp"}, "a batch of 8 cannot be shared by 3 devices"),
         ({"accelerator": "abacus"}, "do not work here"),
         ({"resume": True, "overwrite": True}, "contradict each other"),
