@@ -1,4 +1,4 @@
-"""What depends on the kind of instrument in a data set: how a ping is simulated, stored, checked, read and compared."""
+"""Interface to the kinds of instrument of data sets: how pings are simulated, stored, checked, read and compared."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ class StoredArray:
     """An array that is filled ping by ping.
 
     Attributes:
-        kind: its data type.
+        kind: data type.
         about: description, saved in the store.
-        shape: of the values of one ping.
+        shape: shape of the values of one ping.
         dims: names of the dimensions in ``shape``.
     """
 
@@ -69,7 +69,7 @@ class StoredArray:
 
 @dataclass(frozen=True)
 class StoredAxis:
-    """Coordinates along a dimension, known from the start."""
+    """Coordinates along a dimension, known before the first ping."""
 
     values: Array
     dim: str
@@ -83,7 +83,7 @@ class Scene:
     Attributes:
         number: index of the scene in the data set.
         group: index of its group in the recipe.
-        seed: of its world.
+        seed: seed of its world.
         sequences: number of its sequences.
     """
 
@@ -124,8 +124,8 @@ class Modality(Protocol):
         sonar: the instrument; every instrument has a name, a model and a frame rate.
         stored: arrays that are filled ping by ping, those with a shape first.
         axes: coordinates along their dimensions.
-        attributes: of the store.
-        fixed_attributes: names of the numeric attributes of the whole data set set before its first ping is recorded.
+        attributes: attributes of the store.
+        fixed_attributes: names of the numeric attributes that apply to the whole data set and are set before its first ping.
         planned: arrays of the plan that are stored in addition to the poses.
         result_packages: packages whose versions affect the recorded values, in addition to those that always do.
         ping_bytes: approximate size of one ping [bytes].
@@ -197,7 +197,7 @@ class Modality(Protocol):
 
 
 def renderer_of(modality: Modality) -> type[Renderer]:
-    """Import the class that renders scenes; importing it late means that reading a store loads no simulator."""
+    """Import the class that renders scenes; the import is deferred so that reading a store loads no simulator."""
     renderer: type[Renderer] = resolve_name(modality.renderer_class)
     return renderer
 
@@ -217,14 +217,14 @@ def samples_of(modality: Modality, url: str | Path, **options: Any) -> OpenedSam
 
 
 def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:
-    """Compute the corners ``(n, 2)`` [m] of the convex area in which rays meet the ground z = 0.
+    """Compute the corners ``(n, 2)`` [m] of the convex hull of the points where rays meet the ground z = 0.
 
-    Rays that meet the ground beyond ``range_max``, or never, end on the ground at that range.
+    Rays that meet the ground beyond ``range_max``, or never, are ended on the ground at that range.
 
     Args:
         eye: origin of the rays ``(3,)`` [m].
         directions: unit vectors ``(rays, 3)``.
-        range_max: of the instrument [m].
+        range_max: maximum range of the instrument [m].
 
     Raises:
         MitsonarError: the ground is out of range.
@@ -232,8 +232,8 @@ def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:
     height = float(eye[2])
     if height <= 0 or height >= range_max:
         raise MitsonarError(
-            f"the sonar sees no ground: it is {height:g} m over it, range_max is {range_max:g} m; lower height_m or "
-            "raise range_max"
+            f"the sonar cannot see the ground: it is {height:g} m above it, but range_max is {range_max:g} m; lower "
+            "height_m or raise range_max"
         )
     max_distance = math.sqrt(range_max**2 - height**2)
     horizontal = np.hypot(directions[:, 0], directions[:, 1])
@@ -246,16 +246,16 @@ def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:
 
 
 def empty_sentence(empty: Sequence[int], frames: int, checked: str = "") -> str:
-    """Write the warning about frames without echoes.
+    """Return the warning about frames without echoes.
 
     Args:
         empty: numbers of the empty frames.
         frames: number of frames that were checked.
-        checked: words for the frames that were checked, if not all.
+        checked: description of the frames that were checked, if not all.
     """
     which = ", ".join(f"{number:,}" for number in empty[:6]) + (" ..." if len(empty) > 6 else "")
     return (
-        f"{len(empty):,} of {frames:,} frames{checked} are empty, without a single echo ({which}): there the sonar sees "
+        f"{len(empty):,} of {frames:,} frames{checked} contain no echoes ({which}): in them, the sonar sees "
         "nothing of the scene within its window; check world.size_m, flight.height_m, mount, range_min and range_max, and "
-        "make another data set"
+        "make the data set again"
     )

@@ -1,5 +1,4 @@
-"""Project the cells of a sonar image onto level ground and the ground to a view from above, and estimate the sonar's height
-and attitude over it."""
+"""Geometry of a sonar image over level ground: projection to a view from above, and estimation of height and attitude."""
 
 from __future__ import annotations
 
@@ -54,8 +53,8 @@ class GroundGeometry:
         bearing_rad: bearings of the cells ``(beams,)`` [rad].
         bearing: type of bearing, ``azimuth`` or ``cone``.
         height_m: height of the sonar over the ground [m].
-        pitch_rad: > 0 points down.
-        roll_rad: > 0 puts starboard down.
+        pitch_rad: pitch, > 0 points down [rad].
+        roll_rad: roll, > 0 puts starboard down [rad].
     """
 
     range_m: NDArray[np.float64]
@@ -93,7 +92,7 @@ class GroundGeometry:
 
     @cached_property
     def derivative(self) -> NDArray[np.float64]:
-        """Return the derivative of range [m] and bearing [rad] of each cell's ground point by the motion, at zero motion.
+        """Return the derivative of range [m] and bearing [rad] of each ground point with respect to motion, at zero motion.
 
         The motion is sideways, forward [m], yaw [rad] (Almanza-Medina, eq. 3.4). Shape: ``(bins, beams, 2, 3)``.
         """
@@ -101,32 +100,32 @@ class GroundGeometry:
         s, f, u = self._in_sonar(self.points)
         radius = np.sqrt(s * s + f * f + u * u)
         # Rows: the gradients of range and bearing with respect to the ground point.
-        along = np.stack([x, y], axis=-1) / radius[..., None]
-        aside, ahead = self.turn[:2, 0], self.turn[:2, 1]
+        grad_range = np.stack([x, y], axis=-1) / radius[..., None]
+        starboard, forward = self.turn[:2, 0], self.turn[:2, 1]
         if self.bearing == "azimuth":
-            turning = (f[..., None] * aside - s[..., None] * ahead) / (s * s + f * f)[..., None]
+            grad_bearing = (f[..., None] * starboard - s[..., None] * forward) / (s * s + f * f)[..., None]
         else:
-            turning = (aside - (s / radius)[..., None] * along) / np.sqrt(radius * radius - s * s)[..., None]
-        # Chain rule with the derivative of the ground point by the motion.
+            grad_bearing = (starboard - (s / radius)[..., None] * grad_range) / np.sqrt(radius * radius - s * s)[..., None]
+        # Chain rule, with the derivative of the ground point with respect to the motion.
         ones, zeros = np.ones_like(x), np.zeros_like(x)
         point = np.stack([np.stack([-ones, zeros, -y], axis=-1), np.stack([zeros, -ones, x], axis=-1)], axis=-2)
-        return np.asarray(np.stack([along, turning], axis=-2) @ point)
+        return np.asarray(np.stack([grad_range, grad_bearing], axis=-2) @ point)
 
     @cached_property
     def derivative_by_height(self) -> NDArray[np.float64]:
-        """Return the derivative of range [m] and bearing [rad] of each cell's ground point by the sonar's height [m].
+        """Return the derivative of range [m] and bearing [rad] of each cell's ground point with respect to height [m].
 
         Shape: ``(bins, beams, 2)``.
         """
         s, f, u = self._in_sonar(self.points)
         radius = np.sqrt(s * s + f * f + u * u)
-        along = self.height_m / radius
-        aside, ahead = -self.turn[2, 0], -self.turn[2, 1]
+        grad_range = self.height_m / radius
+        starboard, forward = -self.turn[2, 0], -self.turn[2, 1]
         if self.bearing == "azimuth":
-            turning = (f * aside - s * ahead) / (s * s + f * f)
+            grad_bearing = (f * starboard - s * forward) / (s * s + f * f)
         else:
-            turning = (aside - (s / radius) * along) / np.sqrt(radius * radius - s * s)
-        return np.stack([along, turning], axis=-1)
+            grad_bearing = (starboard - (s / radius) * grad_range) / np.sqrt(radius * radius - s * s)
+        return np.stack([grad_range, grad_bearing], axis=-1)
 
     def motion_per_attitude(self, along: int, half_rad: float) -> NDArray[np.float64]:
         """Compute the apparent motion caused by a change of height, pitch or roll between two pings.
@@ -142,21 +141,21 @@ class GroundGeometry:
             Sideways, forward [m], yaw [rad] per metre of height and per radian of pitch and of roll, as columns ``(3, 3)``;
             0 if the lit ground does not determine a motion.
         """
-        # Sample a coarse grid of cells, of which only those on lit ground count.
+        # Sample a coarse grid of cells, and select those on lit ground.
         bin_m, beam_rad = (float(np.median(np.abs(np.diff(axis)))) for axis in (self.range_m, self.bearing_rad))
         ranges, bearings = (np.linspace(axis[0], axis[-1], along) for axis in (self.range_m, self.bearing_rad))
         coarse = replace(self, range_m=ranges, bearing_rad=bearings)
         lit = np.isfinite(coarse.points).all(axis=-1) & (np.abs(coarse.elevation(coarse.points)) <= half_rad)
         if lit.sum() < 3:
             return np.zeros((3, 3))
-        # Express derivatives by the motion in bins and beams, so that both have equal weight.
+        # Express the derivatives in bins and beams, so that both have equal weight.
         scale, points = np.array([bin_m, beam_rad]), coarse.points[lit]
         by_motion = coarse.derivative[lit] / scale[:, None]
-        # Differentiate numerically by height, pitch and roll, and fit the motion.
+        # Differentiate numerically with respect to height, pitch and roll, and fit the motion.
         changes = []
         for name in ("height_m", "pitch_rad", "roll_rad"):
-            ends = [replace(coarse, **{name: getattr(coarse, name) + sign * SMALL}).to_polar(points) for sign in (-1, 1)]
-            changes.append((np.stack(ends[1], axis=-1) - np.stack(ends[0], axis=-1)) / (2 * SMALL) / scale)
+            shifted = [replace(coarse, **{name: getattr(coarse, name) + sign * SMALL}).to_polar(points) for sign in (-1, 1)]
+            changes.append((np.stack(shifted[1], axis=-1) - np.stack(shifted[0], axis=-1)) / (2 * SMALL) / scale)
         motions = np.linalg.lstsq(by_motion.reshape(-1, 3), np.stack(changes, axis=-1).reshape(-1, 3), rcond=None)[0]
         return np.asarray(motions)
 
@@ -184,7 +183,7 @@ def arc_elevation(
     Args:
         bearing: type of bearing, ``azimuth`` or ``cone``.
         angle: bearings of the cells [rad].
-        rise: height of the plane over the sonar, as a fraction of the range of each cell; like ``angle``.
+        rise: height of the plane above the sonar, as a fraction of the range of each cell; shaped like ``angle``.
         upward: vertical components of the sonar's starboard, forward and up axes ``(..., 3)``.
 
     Returns:
@@ -192,14 +191,14 @@ def arc_elevation(
     """
     starboard, forward, up = np.moveaxis(np.asarray(upward), -1, 0)
     if bearing == "azimuth":
-        fixed, ahead, above = 0.0, starboard * np.sin(angle) + forward * np.cos(angle), np.broadcast_to(up, angle.shape)
+        c, a, b = 0.0, starboard * np.sin(angle) + forward * np.cos(angle), np.broadcast_to(up, angle.shape)
     else:
-        fixed, ahead, above = starboard * np.sin(angle), forward * np.cos(angle), up * np.cos(angle)
-    # solve fixed + ahead cos e + above sin e = rise for the elevation e
-    lean = np.arctan2(above, ahead)
+        c, a, b = starboard * np.sin(angle), forward * np.cos(angle), up * np.cos(angle)
+    # solve c + a cos e + b sin e = rise for the elevation e
+    centre = np.arctan2(b, a)
     with np.errstate(invalid="ignore", divide="ignore"):
-        swing = np.arccos((rise - fixed) / np.hypot(ahead, above))
-    first, second = ((lean + sign * swing + np.pi) % (2 * np.pi) - np.pi for sign in (-1, 1))
+        offset = np.arccos((rise - c) / np.hypot(a, b))
+    first, second = ((centre + sign * offset + np.pi) % (2 * np.pi) - np.pi for sign in (-1, 1))
     return np.asarray(np.where(np.abs(first) <= np.abs(second), first, second))
 
 
@@ -245,7 +244,7 @@ def moved(points: AnyArray, motion: AnyArray) -> AnyArray:
 
 
 MOSTLY = 0.5
-"""Fraction of the window that must show lit ground for the outline of the light to be retained."""
+"""Fraction of the window that must show lit ground for the outline of the lit area to be retained."""
 
 NEARLY_ALL = 0.85
 """Fraction of the window above which removing the outline costs little, as in a grazing view of a hull."""
@@ -257,7 +256,7 @@ LIT = 0.9
 def lit_margin(
     ground: GroundGeometry, attitude: Attitude, elevation_fov_deg: float, mostly: float = MOSTLY
 ) -> NDArray[np.float64] | None:
-    """Compute how far inside the light each cell's ground lies, if the outline must be excluded from matching.
+    """Compute how far inside the lit area each cell's ground lies, if the outline must be excluded from matching.
 
     The outline is excluded where the ground is even, where most of the fan is unlit, and where nearly all of it is lit.
     Otherwise rocks blur the outline, and those that rise beyond it improve the match.
@@ -269,7 +268,7 @@ def lit_margin(
         mostly: fraction of the window that must be lit for the outline to be retained.
 
     Returns:
-        Margin as a fraction of the half field of view ``(bins, beams)``, > 0 inside the light, -1 where a cell misses the
+        Margin as a fraction of the half field of view ``(bins, beams)``, > 0 inside the lit area, -1 where a cell misses the
         ground; None if the outline is retained.
     """
     margin = _margin(ground, elevation_fov_deg)
@@ -278,7 +277,7 @@ def lit_margin(
         return margin
     if lit <= NEARLY_ALL:
         return None
-    # on a hull, first echoes from tubes hide the height over the plate that carries the outline
+    # on a hull, first echoes from tubes hide the height over the plate on which the outline lies
     return _margin(replace(ground, height_m=attitude.floor_m), elevation_fov_deg)
 
 
@@ -299,7 +298,7 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 TOPS = 0.5
-"""Height of the contrast above the mean first echo, relative to the height of that mean above the lowest tenth.
+"""Height of the contrast above the mean first echo, relative to the height of that mean above the lowest decile.
 
 On rocky fields with 30 and 60 rocks of each kind per side, the error is 0.06 and 0.04 m rms. Where 130 rocks hide the floor
 it is 0.10 m.
@@ -312,7 +311,7 @@ BLUR = 2.0
 """Standard deviation of the blur along range [bins]."""
 
 CLEAR = 90
-"""Percentile over the beams of the height by last echoes; shadows of rocks end the light of other beams early."""
+"""Percentile, over the beams, of the height from last echoes; shadows of rocks end the other beams early."""
 
 NEAREST = 0.5
 """Smallest range at which the profile of a skirt is computed, as a fraction of that of the first echoes."""
@@ -326,7 +325,7 @@ FAINTEST = 1e-9
 """Level below which nothing counts as an echo, as a fraction of full scale."""
 
 SHARE, SHARE_OF_SKIRT = 0.15, 0.5
-"""Level of an echo as a fraction of that in the middle of the window.
+"""Threshold of an echo, as a fraction of the level in the middle of the window.
 
 The second is for beams with a skirt, whose side lobes look straight down and return echoes before the skirt.
 """
@@ -339,7 +338,7 @@ STEEP = 0.2
 
 
 class FirstEchoes(NamedTuple):
-    """Height by the first echoes, height of the contrast above their mean [m], and whether the ground is even."""
+    """Height from the first echoes, height of the contrast above their mean [m], and whether the ground is even."""
 
     height_m: float
     tops_m: float
@@ -347,13 +346,13 @@ class FirstEchoes(NamedTuple):
 
 
 class EchoHeights(NamedTuple):
-    """Heights [m] from both ends of the light; None if the window does not show them.
+    """Heights [m] from both ends of the lit area; None if the window does not show them.
 
     Attributes:
         first: result from the first echoes.
         last_m: mean from the last echoes.
         ends_m: mean from both.
-        last_clear_m: from the last echoes of the beams that are least cut by shadows.
+        last_clear_m: from the last echoes of the beams that shadows affect least.
     """
 
     first: FirstEchoes | None
@@ -365,7 +364,7 @@ class EchoHeights(NamedTuple):
 def echo_heights(frames: SonarFrames, pitch_rad: float, roll_rad: float) -> EchoHeights:
     """Measure how far below the sonar the steepest and shallowest rays of the beams end.
 
-    Levels are used, since codings such as ``dB`` and ``gamma`` raise the skirt of the light to a height similar to that of
+    Linear levels are used, since encodings such as ``dB`` and ``gamma`` raise the skirt of the light almost to the level of
     the ground.
 
     Args:
@@ -373,29 +372,28 @@ def echo_heights(frames: SonarFrames, pitch_rad: float, roll_rad: float) -> Echo
         pitch_rad: pitch of the sonar, > 0 points down.
         roll_rad: > 0 puts starboard down.
     """
-    import cv2  # of the extra odometry: rendering does without
+    import cv2  # from the extra odometry, which rendering does not need
 
     if frames.level == "contrast":
         return EchoHeights(None)  # dark contrast does not mean water without echoes
     hard_edged = frames.sonar.vertical_pattern == "box"
     image = frames.linear_values().mean(axis=0, dtype=np.float32)
-    across = (3, 0.5) if hard_edged else (13, 2.0)  # speckle crosses a threshold early, so average more of it
-    smooth = cv2.GaussianBlur(image, (across[0], 13), sigmaX=across[1], sigmaY=BLUR, borderType=cv2.BORDER_REPLICATE)
+    blur = (3, 0.5) if hard_edged else (13, 2.0)  # speckle crosses a threshold early, so average more of it
+    smooth = cv2.GaussianBlur(image, (blur[0], 13), sigmaX=blur[1], sigmaY=BLUR, borderType=cv2.BORDER_REPLICATE)
     steepest = _down(frames, pitch_rad, roll_rad, far=False)
     near = _ends(smooth, frames.range_m, steepest, SHARE if hard_edged else SHARE_OF_SKIRT)
     if not hard_edged and near.shown:
         near = near.scaled(_skirt(frames, pitch_rad, near))
     first = _first_echoes(near.received) if near.shown else None
     down = _down(frames, pitch_rad, roll_rad, far=True)
-    if (
-        np.median(down) < STEEP or not hard_edged
-    ):  # the light of a beam with a skirt fades, so its last echo is not informative
+    # The light of a beam with a skirt fades, so its last echo is not informative.
+    if np.median(down) < STEEP or not hard_edged:
         return EchoHeights(first)
     far = _ends(smooth[::-1], frames.range_m[::-1], down)
     if not far.shown:
         return EchoHeights(first)
-    both = float(np.concatenate([near.ended, far.ended]).mean())
-    return EchoHeights(first, float(far.ended.mean()), both, float(np.percentile(far.ended, CLEAR)))
+    both_ends_m = float(np.concatenate([near.ended, far.ended]).mean())
+    return EchoHeights(first, float(far.ended.mean()), both_ends_m, float(np.percentile(far.ended, CLEAR)))
 
 
 def _down(frames: SonarFrames, pitch: float, roll: float, *, far: bool) -> Doubles:
@@ -413,8 +411,8 @@ class _Ends(NamedTuple):
         ended: depths of beams whose first echo lies within the window.
         shown: whether there are enough of the latter.
         range_m: median range of the first echoes.
-        threshold: level of a first echo, as a fraction of the mean level in the middle of the window; both above the dark
-            level.
+        threshold: level of a first echo, as a fraction of the mean level in the middle of the window; both relative
+            to the dark level.
     """
 
     received: Doubles
@@ -435,10 +433,10 @@ def _ends(smooth: Floats, range_m: Doubles, down: Doubles, share: float = SHARE)
         smooth: levels ``(bins, beams)``, with rows in search order.
         range_m: ranges of the rows.
         down: downward component of each beam's ray ``(beams,)``.
-        share: level of an echo as a fraction of that in the middle of the window, both above the dark level.
+        share: threshold of an echo, as a fraction of the level in the middle of the window; both relative to the dark level.
     """
     bins = len(smooth)
-    # Set the threshold well above the spread of the bins without echoes, and at a share of the lit level.
+    # Set the threshold well above the spread of the bins without echoes, and at least at a fraction of the lit level.
     darkest, dark = (float(level) for level in np.percentile(smooth[:EDGE], [5, 25]))
     spread = (dark - darkest) / 0.97  # 25th minus 5th percentile of a Gaussian, in standard deviations
     bright = float(smooth[bins // 4 : 3 * bins // 4].mean())
@@ -448,22 +446,21 @@ def _ends(smooth: Floats, range_m: Doubles, down: Doubles, share: float = SHARE)
     first = over.argmax(axis=0)
     received = over.any(axis=0)
     ended = received & (first > 2)  # otherwise the window cuts off the light
-    drop = range_m[first] * down
+    depth = range_m[first] * down
     shown = bool(ended.sum() >= max(FEWEST_BEAMS, len(down) // 4))
     middle_m = float(np.median(range_m[first[received]])) if received.any() else 0.0
-    return _Ends(drop[received], drop[ended], shown, middle_m, over_dark / max(bright - dark, FAINTEST))
+    return _Ends(depth[received], depth[ended], shown, middle_m, over_dark / max(bright - dark, FAINTEST))
 
 
 def _skirt(frames: SonarFrames, pitch_rad: float, near: _Ends) -> float:
-    """Return the downward component of a first-echo ray over that of the edge of the light, for beams with a skirt.
+    """Return the ratio of downward components of the first-echo ray and the edge of the light, for beams with a skirt.
 
     The profile of level ground under the pattern of a uniform aperture, blurred like the frames, crosses the same threshold
     at some range. The height at which this range equals that of the frames is found by fixed-point iteration.
     """
     sonar, bin_m = frames.sonar, float(np.diff(frames.range_m).mean())
-    before = np.arange(frames.range_m[0] - bin_m, NEAREST * near.range_m, -bin_m)[
-        ::-1
-    ]  # a skirt may start before the window
+    # A skirt may start before the window.
+    before = np.arange(frames.range_m[0] - bin_m, NEAREST * near.range_m, -bin_m)[::-1]
     range_m, window = (
         np.append(before, frames.range_m),
         slice(len(before) + len(frames.range_m) // 4, -(len(frames.range_m) // 4)),
@@ -476,7 +473,7 @@ def _skirt(frames: SonarFrames, pitch_rad: float, near: _Ends) -> float:
     edge_down = math.sin(min(pitch_rad + half, math.pi / 2))
     height = near.range_m * edge_down
     for _ in range(ROUNDS):
-        # Compute the level profile of level ground at this height, blurred like the frames.
+        # Compute the echo profile of level ground at this height, blurred like the frames.
         sine = np.clip(height / range_m, 0.0, 0.999)
         off_axis = np.sin(pitch_rad - np.arcsin(sine)) / math.sin(half)
         pattern = np.abs(shaded_sinc(half_power((), power) * off_axis, ())) ** power
@@ -491,13 +488,13 @@ def _skirt(frames: SonarFrames, pitch_rad: float, near: _Ends) -> float:
     return height / (near.range_m * edge_down)
 
 
-def _first_echoes(drop: Doubles) -> FirstEchoes | None:
+def _first_echoes(depth: Doubles) -> FirstEchoes | None:
     """Return the height from the depths of first echoes below the sonar [m]; None if it is not positive."""
-    low, high, lowest = np.percentile(drop, [25, 75, 90])
-    height = float(drop.mean() - TOPS * (lowest - drop.mean()))
+    low, high, lowest = np.percentile(depth, [25, 75, 90])
+    height = float(depth.mean() - TOPS * (lowest - depth.mean()))
     if not height > 0:
         return None
-    return FirstEchoes(height, float(drop.mean()) - height, bool(high - low < EVEN * height))
+    return FirstEchoes(height, float(depth.mean()) - height, bool(high - low < EVEN * height))
 
 
 # ---------------- Attitude: measured and given heights
@@ -508,7 +505,7 @@ def _first_echoes(drop: Doubles) -> FirstEchoes | None:
 
 
 DOUBTFUL = 3.0
-"""Combined standard deviations beyond which first echoes contradict a given height and are ignored."""
+"""Number of combined standard deviations beyond which first echoes contradict a given height and are ignored."""
 
 MIN_CHANGE = 1e-9
 """Differences in height [m] and angle [rad] between frames that count as zero."""
@@ -526,7 +523,7 @@ and 0.43 in one of 130 deg. Level ground without relief gives -0.01 to 0.01, a s
 STD_RISING = 0.29
 """Additional standard deviation of the height over rising ground, as a fraction of the difference between the two ends.
 
-The height may have any value between both.
+The height may have any value between the two.
 """
 
 
@@ -570,9 +567,9 @@ class Attitude:
         doubt: how echoes contradict the given height, which is used unless the ground rises; empty if they agree.
         even: whether first echoes show ground without relief.
         given_m: given height over the ground [m]; None if not given.
-        first: height by first echoes; None if they do not show it, or contradict the given height.
+        first: height from first echoes; None if they do not show it, or contradict the given height.
         apart: deviations of each frame's height, pitch and roll from their mean; empty if unknown or all equal.
-        unsure: standard deviation of their change between the frames; 0 where it is known.
+        unsure: standard deviation of their change between the frames; 0 where the change is known.
     """
 
     height_m: float
@@ -624,7 +621,7 @@ class Attitude:
         return np.asarray(covariance + apparent @ apparent.T)
 
     def ground(self, frames: SonarFrames, number: int | None = None) -> GroundGeometry:
-        """Return the level ground that the cells show, for the mean attitude or that of one frame."""
+        """Return the geometry of the cells on level ground, for the mean attitude or that of one frame."""
         pose = (self.height_m, self.pitch_rad, self.roll_rad) if number is None else self.of_frame(number)
         return GroundGeometry(frames.range_m, frames.bearing_rad, frames.sonar.bearing, *pose)
 
@@ -645,7 +642,7 @@ def attitude_of(
         relief_m: mean height of the visible surface over the ground [m]; None: from the first echoes, if there are any.
 
     Raises:
-        MitsonarError: no pitch; a height that is neither given nor measured, or that is not above 0 or the relief.
+        MitsonarError: pitch or height is neither given nor measured, or the height is not above 0 and the relief.
     """
     pitch_roll = _pitch_roll(frames)
     mean_pitch_roll = None if pitch_roll is None else pitch_roll.mean(axis=0)
@@ -653,7 +650,7 @@ def attitude_of(
     given = height_m if height_m is not None else _mean(frames.height_m)
     if pitch is None or (given is None and relief_m is not None):
         raise MitsonarError(
-            f"{name} needs height and pitch, and the frames do not contain both: give {argument('height_m')} and "
+            f"{name} needs height and pitch, but the frames do not contain both: give {argument('height_m')} and "
             f"{argument('pitch_rad')}"
         )
     if given is not None and not 0 < given < np.inf:
@@ -661,18 +658,18 @@ def attitude_of(
     roll = 0.0 if mean_pitch_roll is None else float(mean_pitch_roll[1])
     half = np.radians(frames.sonar.elevation_fov_deg) / 2
     if given is not None and pitch + half > np.pi / 2:
-        reason = "the sonar looks past straight down: a cell shows two points of the ground"
+        reason = "the fan extends beyond straight down, where a cell shows two points of the ground"
         return Attitude(given, STD_GIVEN * given, pitch, roll, reason)
     if given is not None and relief_m is not None:
         if not given - relief_m > 0:
-            raise MitsonarError(f"the height over the visible surface must be above 0: got {given:g} m less {relief_m:g} m")
+            raise MitsonarError(f"the height over the visible surface must be above 0: got {given:g} m minus {relief_m:g} m")
         return Attitude(
             given - relief_m, STD_MEASURED * given, pitch, roll, apart=_deviations(frames), unsure=_change_std(frames)
         )
     heights = echo_heights(frames, pitch, roll)
     if given is None and heights.first is None:
         raise MitsonarError(
-            f"{name} needs height and pitch: the frames hold no height, and their window shows no first echoes; give "
+            f"{name} needs height and pitch: the frames contain no height, and their window shows no first echoes; give "
             f"{argument('height_m')}"
         )
     attitude = (
@@ -684,7 +681,7 @@ def attitude_of(
 
 
 def _rises(heights: EchoHeights, given_m: float | None) -> bool:
-    """Return whether the far end of the light lies so much higher than the near end that the ground must rise."""
+    """Return whether the far end of the lit area lies so much higher than the near end that the ground must rise."""
     if heights.last_clear_m is None:
         return False
     first_m = heights.first.height_m + heights.first.tops_m if heights.first is not None else given_m
@@ -694,7 +691,7 @@ def _rises(heights: EchoHeights, given_m: float | None) -> bool:
 
 
 def _over_rising(heights: EchoHeights, given_m: float | None, pitch: float, roll: float) -> Attitude:
-    """Return the attitude over rising ground, using the mean height of both ends of the light."""
+    """Return the attitude over rising ground, using the mean height of both ends of the lit area."""
     assert heights.ends_m is not None
     assert heights.last_m is not None
     first = heights.first
@@ -774,18 +771,18 @@ def _mean(values: NDArray[np.float64] | None) -> float | None:
 
 
 MOST_VIEW_CELLS = 2**20
-"""Largest number of cells of a view: a window of many metres has larger cells."""
+"""Maximum number of pixels of a view; large windows have larger pixels."""
 
 
 @dataclass(frozen=True)
 class GroundView:
-    """The part of the ground that a fan shows, as an image: row 0 farthest forward, column 0 most to port.
+    """View from above of the ground that a fan shows: row 0 is farthest forward, column 0 farthest to port.
 
     Args:
         frames: frames whose cells are projected.
         attitude: height over the visible surface, pitch, roll.
-        cell_m: edge of a pixel; larger where the view would have more than a million.
-        most_along: largest number of pixels along the longer side; pixels grow to keep within it.
+        cell_m: edge of a pixel [m]; larger if the view would have more than a million pixels.
+        most_along: maximum number of pixels along the longer side; pixels are enlarged to respect it.
     """
 
     frames: SonarFrames
@@ -801,15 +798,15 @@ class GroundView:
     def edge(self) -> float:
         """Edge of a pixel [m]."""
         left, right, near, far = self.reach
-        whole = float(np.sqrt((right - left) * (far - near) / MOST_VIEW_CELLS))
-        return max(self.cell_m, whole, max(right - left, far - near) / self.most_along)
+        min_edge = float(np.sqrt((right - left) * (far - near) / MOST_VIEW_CELLS))
+        return max(self.cell_m, min_edge, max(right - left, far - near) / self.most_along)
 
     @cached_property
     def reach(self) -> tuple[float, float, float, float]:
-        """Extent of the visible ground: starboard from, to, forward from, to [m]; all 0 if the fan meets no ground."""
+        """Extent of the visible ground: starboard min, max, forward min, max [m]; all 0 if the fan meets no ground."""
         f = self.frames
-        few = (f.range_m[::8], f.bearing_rad[::4]), (f.range_m[[0, -1]], f.bearing_rad)
-        geometries = [replace(self._geometry, range_m=ranges, bearing_rad=bearings) for ranges, bearings in few]
+        subsets = (f.range_m[::8], f.bearing_rad[::4]), (f.range_m[[0, -1]], f.bearing_rad)
+        geometries = [replace(self._geometry, range_m=ranges, bearing_rad=bearings) for ranges, bearings in subsets]
         points = np.concatenate([geometry.points.reshape(-1, 2) for geometry in geometries])
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
@@ -846,11 +843,11 @@ class GroundView:
         row, column, _ = self._pixel_positions[number if self.attitude.apart else 0]
         if not row.size:
             return np.zeros((0, 0), dtype=np.float32)
-        finer = self.edge / float(np.median(np.diff(self.frames.range_m)))
-        if finer > 1:  # smooth bins that are finer than pixels
+        bins_per_pixel = self.edge / float(np.median(np.diff(self.frames.range_m)))
+        if bins_per_pixel > 1:  # smooth bins that are finer than pixels
             border = cv2.BORDER_REPLICATE
             image = np.asarray(
-                cv2.GaussianBlur(image, (1, 0), sigmaX=1e-3, sigmaY=0.4 * finer, borderType=border), np.float32
+                cv2.GaussianBlur(image, (1, 0), sigmaX=1e-3, sigmaY=0.4 * bins_per_pixel, borderType=border), np.float32
             )
         return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), np.float32)
 
@@ -858,16 +855,16 @@ class GroundView:
         """Return the matrix ``(2, 3)`` that maps a pixel (column, row) of the first frame according to a motion."""
         corner = np.array([self.reach[0], self.reach[3]]) + self.edge / 2 * np.array([1, -1])
         pixels = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        there = moved(corner + pixels * [self.edge, -self.edge], motion)
-        there = (there - corner) / [self.edge, -self.edge]
-        return np.column_stack([there[1] - there[0], there[2] - there[0], there[0]]).astype(np.float32)
+        mapped = moved(corner + pixels * [self.edge, -self.edge], motion)
+        mapped = (mapped - corner) / [self.edge, -self.edge]
+        return np.column_stack([mapped[1] - mapped[0], mapped[2] - mapped[0], mapped[0]]).astype(np.float32)
 
     def motion(self, warp: NDArray[np.floating]) -> Motion:
         """Return the motion of a warp, the inverse of :meth:`warp`."""
         yaw = float(np.arctan2(warp[0, 1], warp[0, 0]))
-        still = self.warp(Motion(0.0, 0.0, yaw)).astype(float)
-        step = (warp[:, 2] - still[:, 2]) * self.edge
-        return Motion(float(-step[0]), float(step[1]), yaw)
+        rotation_only = self.warp(Motion(0.0, 0.0, yaw)).astype(float)
+        shift = (warp[:, 2] - rotation_only[:, 2]) * self.edge
+        return Motion(float(-shift[0]), float(shift[1]), yaw)
 
 
 def fan_places(
@@ -877,7 +874,7 @@ def fan_places(
 
     Args:
         ground: ground geometry of the frame, with its ranges and bearings.
-        sonar: the receiving sonar, which lights what is within the opening of its beams.
+        sonar: the receiving sonar, which lights what is within its elevation field of view.
         points: starboard, forward [m] ``(..., 2)``.
 
     Returns:

@@ -1,7 +1,7 @@
-"""Are pictures mirrored? The rotation that they show is compared with the rotation given by a compass or the user.
+"""Detect mirrored pictures: compare the rotation that they show with the rotation given by a compass or the user.
 
-To a sonar that turns to starboard, fixed objects move to port. In mirrored pictures they move to starboard. Each pair of
-frames is registered over bearing and range by cross-correlation. Bearings are searched symmetrically on both sides, up to
+When a sonar turns to starboard, fixed objects move to port. In mirrored pictures they move to starboard. Each pair of frames
+is registered over bearing and range by cross-correlation. Bearings are searched symmetrically on both sides, up to
 twice the largest given rotation. Sideways motion shifts bearings too, but with either sign. Over many pairs, the sign of the
 correlation between given and observed rotations therefore decides.
 """
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 STEPS = (1, 2, 4, 8, 16, 32, 64)
-"""Candidate frame distances within a pair; the smallest that gives enough pairs is used, or else the one that gives most."""
+"""Candidate frame distances within a pair; the smallest that gives enough pairs is used, or else that with the most."""
 
 MIN_TURN = 1.5
 """Minimum rotation of a pair, in units of the beam spacing."""
@@ -34,7 +34,7 @@ MAX_TURN = 0.25
 MAX_PAIRS = 120
 ENOUGH_PAIRS = 40
 MIN_PAIRS = 5
-"""Maximum number of pairs that are registered; number that is enough; minimum number for a verdict."""
+"""Maximum number of pairs to register; sufficient number; minimum number for a verdict."""
 
 MIN_CORRELATION, SIGMAS = 0.4, 3.0
 """Minimum correlation for a verdict, absolute and in standard deviations of the correlation of unrelated rotations."""
@@ -43,10 +43,10 @@ MIN_SLOPE = 0.25
 """Minimum ratio of observed to given rotation for a verdict."""
 
 MAX_TURN_RATIO = 2.0
-"""Largest rotation that is searched, as a multiple of the largest given one."""
+"""Maximum rotation that is searched, as a multiple of the largest given one."""
 
 MAX_RANGE_SHIFT = 0.15
-"""Largest shift over range that is searched, as a fraction of the number of bins."""
+"""Maximum shift over range that is searched, as a fraction of the number of bins."""
 
 MAX_ROWS = 192
 """Maximum number of rows to which pictures are averaged."""
@@ -81,7 +81,7 @@ def check_handedness(part: Part, heading_rad: ArrayLike | None = None) -> Handed
             to the last at a constant rate, > 0 to starboard. Default: headings of the poses, or else of the sonar's compass.
 
     Raises:
-        MitsonarError: if the number of headings is not that of frames, or pictures cannot be read.
+        MitsonarError: the numbers of headings and frames differ, or pictures cannot be read.
     """
     heading = _headings(part, heading_rad)
     if heading is None:
@@ -99,10 +99,10 @@ def check_handedness(part: Part, heading_rad: ArrayLike | None = None) -> Handed
     observed_turns = _observed_turns(part, pairs, MAX_TURN_RATIO * float(np.abs(given_turns).max()))
     measured = np.isfinite(observed_turns)
     given_turns, observed_turns = given_turns[measured], observed_turns[measured]
-    # 3. Correlate both about zero rather than about their means, which keeps the information of a turn to one side.
+    # 3. Correlate both about zero rather than about their means, which preserves the information in a turn to one side.
     energy = float(np.sum(given_turns**2)), float(np.sum(observed_turns**2))
     if len(given_turns) < MIN_PAIRS or min(energy) <= 0:
-        return _unknown("the pictures show no contrast that moves", len(given_turns))
+        return _unknown("the pictures show no moving contrast", len(given_turns))
     product = float(np.sum(given_turns * observed_turns))
     correlation, slope = product / math.sqrt(energy[0] * energy[1]), product / energy[0]
     # 4. Decide by the sign of the correlation, if it is significant: for unrelated rotations, its standard deviation is
@@ -177,7 +177,7 @@ def _observed_turns(part: Part, pairs: tuple[Index, Index], max_turn: float) -> 
         pairs: first and second frames.
         max_turn: largest rotation that is searched [rad].
     """
-    # 1. Average some pictures. What does not move with the scene, such as the beam pattern, would suggest no rotation.
+    # 1. Average some pictures. Stationary content, such as the beam pattern, would bias the result towards no rotation.
     bearing = part.like.bearing_rad
     frames = np.unique(np.concatenate(pairs))
     sampled = frames[np.unique(np.linspace(0, len(frames) - 1, min(MAX_PAIRS // 4, len(frames))).astype(np.intp))]
@@ -207,13 +207,13 @@ def _moving_content(image: NDArray[np.floating], stationary: NDArray[np.floating
     bins_per_row = -(-len(moving) // MAX_ROWS)
     moving = moving[: len(moving) // bins_per_row * bins_per_row].reshape(-1, bins_per_row, moving.shape[1]).mean(axis=1)
     # 2. Interpolate to even bearings, on which a rotation is the same shift in all columns.
-    place = np.interp(even, bearing, np.arange(len(bearing)))
-    left = np.minimum(place.astype(np.intp), len(bearing) - 2)
-    over = place - left
-    spread = moving[:, left] * (1 - over) + moving[:, left + 1] * over
+    position = np.interp(even, bearing, np.arange(len(bearing)))
+    left = np.minimum(position.astype(np.intp), len(bearing) - 2)
+    weight = position - left
+    resampled = moving[:, left] * (1 - weight) + moving[:, left + 1] * weight
     # 3. Remove the mean of each range and taper the borders, so that neither rings nor borders dominate the correlation.
-    spread -= spread.mean(axis=1, keepdims=True)
-    return np.asarray(spread * _taper(len(spread))[:, None] * _taper(len(even)), dtype=float)
+    resampled -= resampled.mean(axis=1, keepdims=True)
+    return np.asarray(resampled * _taper(len(resampled))[:, None] * _taper(len(even)), dtype=float)
 
 
 def _taper(count: int) -> Array:
@@ -221,7 +221,7 @@ def _taper(count: int) -> Array:
 
 
 def _shift(a: Array, b: Array, reach: int) -> float:
-    """Return the shift of ``b`` to starboard relative to ``a`` [columns], to subcolumn accuracy; nan without a peak inside.
+    """Return the shift of ``b`` to starboard relative to ``a`` [fractional columns]; nan without a peak inside the range.
 
     Args:
         a: first picture ``(rows, beams)``.

@@ -1,6 +1,6 @@
-"""Whether a scene is safe to load: its XML text, its parsed objects, and the files that they name.
+"""Check that a scene is safe to load: its XML text, its parsed objects, and the files that they refer to.
 
-Mitsuba ends the process, or allocates without limit, on some damaged scenes and files. The checks find these first.
+Some damaged scenes and files crash Mitsuba or make it allocate without limit. These checks detect them first.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ __all__ = [
 
 
 MAX_DEPTH = 100
-"""Largest depth of objects that contain or refer to each other."""
+"""Maximum depth of objects that contain or refer to each other."""
 
 MAX_PATHS = 10**8
-"""Largest number of paths along references from object to object; Mitsuba follows every one."""
+"""Maximum number of paths along references between objects; Mitsuba follows every one."""
 
 MAX_PIXELS = 2**28
-"""Largest number of pixels of all pictures of a scene."""
+"""Maximum number of pixels of all pictures of a scene."""
 
 BYTES_PER_PIXEL = 28
-"""Memory that Mitsuba needs to read a pixel [bytes]: its stored value, and its value in single precision."""
+"""Memory that Mitsuba needs per pixel [bytes]: for the stored value and for its conversion to single precision."""
 
 PICTURES = ("bitmap", "envmap")
 
@@ -73,8 +73,8 @@ def check_parsed(state: mi.parser.ParserState) -> None:
         state: parsed state of the scene.
 
     Raises:
-        MitsonarError: a plugin name is invalid, a number is not finite, objects refer to each other too often or in a
-            circle, a mesh or a picture is damaged, a named file is not a regular file, a bitmap has no file, or a group is
+        MitsonarError: a plugin name is invalid, a number is not finite, references are too many or
+            circular, a mesh or a picture is damaged, a named file is not a regular file, a bitmap has no file, or a group is
             empty.
     """
     import mitsuba as mi
@@ -96,7 +96,7 @@ def check_parsed(state: mi.parser.ParserState) -> None:
                 raise MitsonarError(f"{where}, {name[:60]}: {error}") from None
     if pixels > MAX_PIXELS:
         raise MitsonarError(
-            f"its pictures have {pixels:,} pixels, more than the {MAX_PIXELS:,} that are allowed: make them smaller"
+            f"its pictures have {pixels:,} pixels, more than the maximum of {MAX_PIXELS:,}: make them smaller"
         )
     refuse_beyond_memory(BYTES_PER_PIXEL * pixels, "its pictures")
 
@@ -117,8 +117,8 @@ def _check_numbers(props: mi.Properties, name: str) -> None:
         return
     numbers = np.array(value.matrix if kind == kinds.Transform else value, dtype=float)
     if not (np.abs(numbers) <= LARGEST_COORDINATE).all():
-        wrong = numbers[~(np.abs(numbers) <= LARGEST_COORDINATE)][0]
-        raise MitsonarError(f"got {wrong:g}; give finite numbers, of at most {LARGEST_COORDINATE:g}")
+        invalid = numbers[~(np.abs(numbers) <= LARGEST_COORDINATE)][0]
+        raise MitsonarError(f"got {invalid:g}; give finite numbers, with magnitudes up to {LARGEST_COORDINATE:g}")
 
 
 def _check_file(node: mi.parser.SceneNode, name: str) -> int:
@@ -157,12 +157,12 @@ def _check_ellipsoids(path: Path) -> None:
 def _named_files(value: str, name: str) -> Iterator[Path]:
     """Yield the files that Mitsuba finds for the value of a property."""
     if "\0" in value:
-        raise MitsonarError("a value holds a zero byte: remove it")
+        raise MitsonarError("a value contains a zero byte: remove it")
     values = [f"data/ior/{value}.{part}.spd" for part in ("eta", "k")] if name in REFRACTING else [value]
-    for one in values:
-        path = Path(str(file_resolver().resolve(one)))
+    for candidate in values:
+        path = Path(str(file_resolver().resolve(candidate)))
         try:
-            if one and path.exists():
+            if candidate and path.exists():
                 yield path
         except OSError:  # for example a name that is too long
             if name == "filename":
@@ -170,7 +170,7 @@ def _named_files(value: str, name: str) -> Iterator[Path]:
 
 
 def _refuse_incomplete(state: mi.parser.ParserState) -> None:
-    """Refuse objects that lack their parts: Mitsuba ends the process on them, or fails late."""
+    """Reject incomplete objects, on which Mitsuba crashes or fails late."""
     import mitsuba as mi
 
     kinds = mi.Properties.Type
@@ -178,9 +178,9 @@ def _refuse_incomplete(state: mi.parser.ParserState) -> None:
         plugin, types = node.props.plugin_name(), {name: node.props.type(name) for name in node.props}
         where = f"{plugin} {node.props.id()}".strip()[:100]
         if plugin == "bitmap" and types.get("filename") != kinds.String:
-            raise MitsonarError(f'{where} names no file: give <string name="filename" value="..."/>')
+            raise MitsonarError(f'{where} has no file: give <string name="filename" value="..."/>')
         if plugin in CONTAINERS and kinds.ResolvedReference not in types.values():
-            raise MitsonarError(f"{where} is empty: put a {CONTAINERS[plugin]} in it, or remove it")
+            raise MitsonarError(f"{where} is empty: add a {CONTAINERS[plugin]} to it, or remove it")
 
 
 def _check_references(state: mi.parser.ParserState) -> None:
@@ -204,7 +204,7 @@ def _check_references(state: mi.parser.ParserState) -> None:
                 references.append(int(ids[node.props[name].id()]))
         children.append(references)
     # 2. Count paths and depth of each object after those of its children: a depth-first search without recursion. An object
-    #    that is met again while it is `waiting` closes a circle.
+    #    that is reached again while it is `waiting` closes a cycle.
     path_counts, depths = [0] * len(children), [0] * len(children)
     for root in range(len(children)):
         path = [] if path_counts[root] else [(root, iter(children[root]))]
@@ -218,7 +218,7 @@ def _check_references(state: mi.parser.ParserState) -> None:
                 waiting.discard(number)
                 path.pop()
             elif child in waiting:
-                raise MitsonarError("its objects refer to each other in a circle: remove one of the references")
+                raise MitsonarError("its objects refer to each other in a cycle: remove one of the references")
             elif not path_counts[child]:
                 path.append((child, iter(children[child])))
                 waiting.add(child)
@@ -228,17 +228,17 @@ def _check_references(state: mi.parser.ParserState) -> None:
         raise MitsonarError(f"its objects refer to each other along more than {MAX_PATHS:,} paths: it is not a scene")
 
 
-# ---------------- World ``scene``: a file of the user
+# ---------------- World ``scene``: a user's own file
 
 
 class SceneFile(Family):
-    """An existing Mitsuba XML file of the user; the seed determines only the motion of the vehicle."""
+    """An existing Mitsuba XML file; the seed determines only the motion of the vehicle."""
 
     called: ClassVar[str] = "scene"
     described: ClassVar[str] = "docs/guides/data-sets.md, `A scene of your own`"
 
     file: str = Field(description="the XML file; in a recipe, relative to the recipe's folder")
-    size_m: float = Field(gt=0, le=1e6, description="edge of the square around the origin to stay inside [m]")
+    size_m: float = Field(gt=0, le=1e6, description="side length of the square around the origin to stay inside [m]")
     parameters: dict[str, str] = Field(default_factory=dict, description="values of the scene's $names")
 
     @property
@@ -247,32 +247,32 @@ class SceneFile(Family):
         return False
 
     def check_scene_extent(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-        """Refuse a ``size_m`` whose square reaches beyond the shapes of the file: frames there would be empty.
+        """Reject a ``size_m`` whose square extends beyond the shapes of the file, where frames would be empty.
 
         Args:
-            low: smallest x, y, z of the scene ``(3,)`` [m].
-            high: largest x, y, z of the scene ``(3,)`` [m].
+            low: minimum x, y, z of the scene ``(3,)`` [m].
+            high: maximum x, y, z of the scene ``(3,)`` [m].
 
         Raises:
             MitsonarError: the square is too large, or the scene has no shapes.
         """
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise MitsonarError(f"{self.file} holds nothing that a sonar could see: give a scene with shapes")
+            raise MitsonarError(f"{self.file} contains nothing that a sonar could see: give a scene with shapes")
         fits = 2 * max(0.0, float(min(-low[0], -low[1], high[0], high[1])))
         if self.size_m > fits * (1 + 1e-3):
             raise MitsonarError(
-                f"world.size_m, {self.size_m:g} m, is larger than what {self.file} holds, x {low[0]:.3g}..{high[0]:.3g} m "
-                f"and y {low[1]:.3g}..{high[1]:.3g} m: frames taken beyond it would be empty; give at most {fits:.3g} (a "
-                "square around the origin), or a larger ground"
+                f"world.size_m, {self.size_m:g} m, is too large for {self.file}, which covers x {low[0]:.3g}..{high[0]:.3g} "
+                f"m and y {low[1]:.3g}..{high[1]:.3g} m: frames taken beyond it would be empty; give at most {fits:.3g} (a "
+                "square around the origin), or enlarge the ground"
             )
 
     def build(self, seed: int) -> World:
-        """Raise an error: the scene exists already.
+        """Raise an error: the scene already exists.
 
         Raises:
             MitsonarError: always.
         """
-        raise MitsonarError(f"{self.file} is a scene already: there is nothing to build")
+        raise MitsonarError(f"{self.file} is already a scene: there is nothing to build")
 
     def prepare(self, seed: int, folder: Path) -> tuple[Path, dict[str, str]]:
         """Return the file and its parameters; nothing is written.
@@ -289,28 +289,28 @@ class SceneFile(Family):
 
 
 MAX_XML_BYTES = 2**28
-"""Largest size of a scene's XML, including all files that it includes [bytes]."""
+"""Maximum size of a scene's XML, including all files that it includes [bytes]."""
 
 MAX_SPECTRUM_BYTES = 2**22
-"""Largest size of a spectrum file [bytes]."""
+"""Maximum size of a spectrum file [bytes]."""
 
 MAX_ELEMENTS = 2_000_000
-"""Largest number of elements."""
+"""Maximum number of elements."""
 
 MAX_FILES = 1_000
-"""Largest number of files read, counting repeated includes."""
+"""Maximum number of files read, counting repeated includes."""
 
 MAX_INCLUDE_DEPTH = 15
-"""Largest depth of nested includes, the same as Mitsuba's limit."""
+"""Maximum depth of nested includes, equal to Mitsuba's limit."""
 
 MAX_PARAMETERS = 1_000
-"""Largest number of parameters; Mitsuba compares each with each."""
+"""Maximum number of parameters; Mitsuba compares all pairs."""
 
 MAX_VALUE_LENGTH = 2**16
-"""Largest length of an attribute after its parameters are replaced [characters]."""
+"""Maximum length of an attribute after parameter substitution [characters]."""
 
 MAX_WORK = 2**31
-"""Largest number of characters that Mitsuba may compare and move to replace parameters: about a second."""
+"""Maximum number of characters that Mitsuba may compare and move to substitute parameters; takes about a second."""
 
 SEARCH_COST = 300
 """Cost of one search for a parameter, as an equivalent number of characters."""
@@ -340,8 +340,8 @@ def check_text(path: Path, parameters: dict[str, str], folders: list[Path]) -> N
         folders: folders that Mitsuba searches for the files that the scene names.
 
     Raises:
-        MitsonarError: the text is malformed, nests too deeply, is too large, includes too much, or names something that is
-            not a regular file.
+        MitsonarError: the text is malformed, nests too deeply, is too large, includes too much, or refers to something
+            that is not a regular file.
     """
     _Text(dict(parameters)).check(path, folders, 0)
 
@@ -374,7 +374,7 @@ class _Text:
         """Check a file and its includes, and search ``folders`` for the files that it names; ``<path>`` adds a folder."""
         if depth >= MAX_INCLUDE_DEPTH:
             raise MitsonarError(
-                f"{path} is included {depth} files deep, the maximum is {MAX_INCLUDE_DEPTH}: does it include itself?"
+                f"{path} is included {depth} files deep, but the maximum is {MAX_INCLUDE_DEPTH}: does it include itself?"
             )
         self.files += 1
         if self.files > MAX_FILES:
@@ -384,56 +384,59 @@ class _Text:
         self.size += len(content)
         for name, attributes in self._elements(content, path):
             plain = b"$" not in attributes and b"&" not in attributes and name not in EVALUATED
-            given = {} if plain else self._expanded(attributes, path)
+            values = {} if plain else self._expanded(attributes, path)
             match name:
                 case b"default":
-                    self._add(given.get("name", ""), given.get("value", ""))
+                    self._add(values.get("name", ""), values.get("value", ""))
                 case b"include":
-                    inner = [path.parent, *folders]
-                    target = _find_file(given.get("filename", ""), inner)
+                    include_folders = [path.parent, *folders]
+                    target = _find_file(values.get("filename", ""), include_folders)
                     if target is not None:
-                        self.check(target, inner, depth + 1)
+                        self.check(target, include_folders, depth + 1)
                 case b"path":
-                    target = _find_file(given.get("value", ""), [path.parent, *folders])
+                    target = _find_file(values.get("value", ""), [path.parent, *folders])
                     folders[:0] = [target] if target is not None else []
                 case b"spectrum":
-                    target = _find_file(given.get("filename", ""), folders)
+                    target = _find_file(values.get("filename", ""), folders)
                     if target is not None:
                         refuse_irregular(target, "spectrum", MAX_SPECTRUM_BYTES)
 
     def _elements(self, content: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
         """Yield the name and the attributes of each element."""
-        opened: list[bytes] = []
-        before, place = self.elements, content.find(b"<")
-        while place >= 0:
-            marked = content[place + 1 : place + 2] in (b"!", b"?")
-            skipped = next((begin for begin in SKIPPED if marked and content.startswith(begin, place)), None)
+        open_elements: list[bytes] = []
+        elements_before, position = self.elements, content.find(b"<")
+        while position >= 0:
+            marked = content[position + 1 : position + 2] in (b"!", b"?")
+            skipped = next((begin for begin in SKIPPED if marked and content.startswith(begin, position)), None)
             if skipped is not None:
-                end = content.find(SKIPPED[skipped], place + len(skipped))
+                end = content.find(SKIPPED[skipped], position + len(skipped))
                 if end < 0:
-                    raise _malformed(path, content, place, f"a {skipped.decode()} does not end")
-                place = content.find(b"<", end)
+                    raise _malformed(path, content, position, f"a {skipped.decode()} is not terminated")
+                position = content.find(b"<", end)
                 continue
-            if (tag := OPENED.match(content, place)) is not None:
+            if (tag := OPENED.match(content, position)) is not None:
                 name, attributes, closed = tag.groups()
-                if not opened and self.elements > before:
-                    raise _malformed(path, content, place, "there is a second root element")
+                if not open_elements and self.elements > elements_before:
+                    raise _malformed(path, content, position, "there is a second root element")
                 self.elements += 1
                 if self.elements > MAX_ELEMENTS:
                     raise MitsonarError(f"{path} has more than {MAX_ELEMENTS:,} elements: put the shapes into mesh files")
                 if not closed:
-                    opened.append(name)
-                if len(opened) > MAX_DEPTH:
+                    open_elements.append(name)
+                if len(open_elements) > MAX_DEPTH:
                     raise MitsonarError(f"{path} nests its elements more than {MAX_DEPTH} levels deep: it is not a scene")
                 yield name, attributes
-            elif (tag := CLOSED.match(content, place)) is not None:
-                if not opened or opened.pop() != tag[1]:
-                    raise _malformed(path, content, place, "an element is closed that is not open")
-            elif opened or (tag := DOCTYPE.match(content, place)) is None:  # a longer document type may define entities
-                raise _malformed(path, content, place, "the XML of an element or of one of its attributes is malformed")
-            place = content.find(b"<", tag.end())
-        if opened:
-            raise _malformed(path, content, len(content), f"<{opened[-1].decode('utf-8', 'replace')[:40]}> is not closed")
+            elif (tag := CLOSED.match(content, position)) is not None:
+                if not open_elements or open_elements.pop() != tag[1]:
+                    raise _malformed(path, content, position, "a closing tag does not match an open element")
+            # A longer document type may define entities.
+            elif open_elements or (tag := DOCTYPE.match(content, position)) is None:
+                raise _malformed(path, content, position, "the XML of an element or of one of its attributes is malformed")
+            position = content.find(b"<", tag.end())
+        if open_elements:
+            raise _malformed(
+                path, content, len(content), f"<{open_elements[-1].decode('utf-8', 'replace')[:40]}> is not closed"
+            )
 
     def _expanded(self, attributes: bytes, path: Path) -> dict[str, str]:
         """Return attributes by name, with their parameters replaced as Mitsuba replaces them."""
@@ -448,29 +451,29 @@ class _Text:
 
     def _replaced(self, value: str, path: Path) -> str:
         for name in self.longest_first:
-            key, new, place = f"${name}", self.values[name], 0
+            key, new, position = f"${name}", self.values[name], 0
             self._work(len(value), path)
-            while (place := value.find(key, place)) >= 0:
-                if value[:place].endswith("\\"):
-                    place += len(key)
+            while (position := value.find(key, position)) >= 0:
+                if value[:position].endswith("\\"):
+                    position += len(key)
                     continue
-                value = value[:place] + new + value[place + len(key) :]
-                place += len(new)
+                value = value[:position] + new + value[position + len(key) :]
+                position += len(new)
                 self._work(len(value), path)
                 if len(value) > MAX_VALUE_LENGTH:
                     raise MitsonarError(
-                        f"{path} has a value that its parameters make longer than {MAX_VALUE_LENGTH:,} letters"
+                        f"{path} has a value that parameter substitution makes longer than {MAX_VALUE_LENGTH:,} characters"
                     )
         return value.replace("\\$", "$")
 
-    def _work(self, letters: int, path: Path) -> None:
-        self.work += letters + SEARCH_COST
+    def _work(self, characters: int, path: Path) -> None:
+        self.work += characters + SEARCH_COST
         if self.work > MAX_WORK:
-            raise MitsonarError(f"{path} uses its parameters too often: write the values themselves")
+            raise MitsonarError(f"{path} uses its parameters too often: write the values directly")
 
     def _count(self, parameters: int) -> None:
         if parameters > MAX_PARAMETERS:
-            raise MitsonarError(f"a scene may have {MAX_PARAMETERS:,} parameters: got more; write the values themselves")
+            raise MitsonarError(f"a scene may have at most {MAX_PARAMETERS:,} parameters: write the values directly")
 
     def _add(self, name: str, value: str) -> None:
         """Add the default of a parameter, unless the parameter already has a value."""
@@ -478,12 +481,12 @@ class _Text:
             return
         self.values[name] = value
         self._count(len(self.values))
-        place = next((k for k, other in enumerate(self.longest_first) if len(name) > len(other)), len(self.longest_first))
-        self.longest_first.insert(place, name)
+        position = next((k for k, other in enumerate(self.longest_first) if len(name) > len(other)), len(self.longest_first))
+        self.longest_first.insert(position, name)
 
 
 SPACES = bytes.maketrans(b"\t\r\n", b"   ")
-"""Translation of white space in an attribute to blanks."""
+"""Translation of whitespace in attributes to spaces."""
 
 EVALUATED = (b"default", b"include", b"path", b"spectrum")
 """Elements whose attributes the check evaluates."""
@@ -499,7 +502,7 @@ def _utf8(content: bytes, path: Path) -> bytes:
     elif LATIN.match(content):
         content = content.decode("latin-1").encode()
     if b"\0" in content:
-        raise MitsonarError(f"{path} holds a zero byte: it is damaged, or not text in UTF-8")
+        raise MitsonarError(f"{path} contains a zero byte: it is damaged, or not UTF-8 text")
     return content
 
 
@@ -537,7 +540,7 @@ LARGEST_COORDINATE = 1e12
 """Largest magnitude of vertices, normals and texture coordinates; beyond it single precision overflows."""
 
 MAX_PLY_HEADER_BYTES = 2**16
-"""Largest size of a PLY header [bytes]."""
+"""Maximum size of a PLY header [bytes]."""
 
 MESH_INFLATION = 1032
 """Largest possible ratio of inflated to deflated data."""
@@ -547,7 +550,7 @@ TYPES = {
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4"},
     **{"double": "f8", "float64": "f8"},
 }
-"""NumPy types by the names of PLY's types."""
+"""NumPy types, keyed by PLY type name."""
 
 ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 
@@ -582,7 +585,7 @@ class _Element:
 def check_mesh(path: str | Path, kind: str) -> None:
     """Check a mesh file: counts against the file's size, indices against the number of vertices, and finite numbers.
 
-    Mitsuba checks no indices, and a wrong index ends the process. An unchanged file is checked once per process.
+    Mitsuba does not check indices, and an invalid index crashes it. An unchanged file is checked once per process.
 
     Args:
         path: mesh file.
@@ -593,8 +596,8 @@ def check_mesh(path: str | Path, kind: str) -> None:
     """
     refuse_irregular(path, "mesh")
     try:
-        known = Path(path).stat()
-        _check_once(str(path), kind, known.st_size, known.st_mtime_ns)
+        status = Path(path).stat()
+        _check_once(str(path), kind, status.st_size, status.st_mtime_ns)
     except OSError as error:
         raise MitsonarError(f"cannot read mesh {path}: {error.strerror}; give a {kind} file") from None
 
@@ -616,17 +619,17 @@ FOREIGN_FORMATS = {
     **{"glb": "glTF", "gltf": "glTF", "dae": "COLLADA", "stl": "STL", "fbx": "FBX", "blend": "Blender", "3mf": "3MF"},
     **{"usd": "USD", "usda": "USD", "usdc": "USD", "usdz": "USD", "urdf": "URDF", "sdf": "SDF", "step": "STEP"},
 }
-"""Model formats that Mitsuba does not read, by file extension."""
+"""Model formats that Mitsuba does not read, keyed by file extension."""
 
 BEGINNINGS = {
     **{b"glTF": "glTF", b"ply": "PLY", b"solid": "STL", b"Kaydara FBX": "FBX", b"BLENDER": "Blender"},
     **{b"PXR-USDC": "USD", b"#usda": "USD", b"ISO-10303": "STEP"},
 }
-"""Model formats by the first bytes of a file."""
+"""Model formats, keyed by the first bytes of a file."""
 
 
 def refuse_foreign_format(kind: str, filename: str) -> None:
-    """Refuse a shape whose type is a model format that Mitsuba does not read, such as ``glb``.
+    """Reject a shape whose type is a model format that Mitsuba does not read, such as ``glb``.
 
     Raises:
         MitsonarError: the type is such a format; the message explains how to convert the file to a scene.
@@ -636,7 +639,7 @@ def refuse_foreign_format(kind: str, filename: str) -> None:
 
 
 def _format_of(path: Path, content: bytes) -> str:
-    """Return the format of a model by its content, else by its file extension; empty if unknown."""
+    """Return the format of a model from its content, or else from its file extension; empty if unknown."""
     for begin, name in BEGINNINGS.items():
         if content.startswith(begin):
             return name
@@ -652,24 +655,26 @@ def _format_of(path: Path, content: bytes) -> str:
 
 def _foreign(path: str, name: str, kind: str) -> str:
     """Return a message that explains what to do with a model in a format that Mitsuba's plugin does not read."""
-    reads = f"Mitsuba's shape {kind} does not read it" if kind in CHECKS else f"Mitsuba has no shape {kind}"
-    make = {
+    problem = f"Mitsuba's shape {kind} does not read it" if kind in CHECKS else f"Mitsuba has no shape {kind}"
+    remedies = {
         "PLY": "name the shape ply",
-        "USD": f"`mitsonar world import {path} -o FOLDER` makes a scene of it",
+        "USD": f"`mitsonar world import {path} -o FOLDER` converts it to a scene",
         "FBX": "export it as glTF, for `mitsonar world mesh`",
     }
-    make |= {"URDF": make["USD"], "SDF": make["USD"]} | dict.fromkeys(("Blender", "3MF", "STEP"), make["FBX"])
-    do = make.get(name, f"`mitsonar world mesh {path} -o FOLDER` makes a scene of it")
-    return f"mesh {path} is a file of {name}, and {reads}: the formats are ply, obj and serialized; {do}"
+    remedies |= {"URDF": remedies["USD"], "SDF": remedies["USD"]} | dict.fromkeys(
+        ("Blender", "3MF", "STEP"), remedies["FBX"]
+    )
+    advice = remedies.get(name, f"`mitsonar world mesh {path} -o FOLDER` converts it to a scene")
+    return f"mesh {path} is in the format {name}, and {problem}: supported formats are ply, obj and serialized; {advice}"
 
 
-def _check_triangles(indices: NDArray[np.generic], vertices: int, what: str = "a triangle names vertex") -> None:
+def _check_triangles(indices: NDArray[np.generic], vertices: int, what: str = "a triangle refers to vertex") -> None:
     """Check that indices, counted from 0, refer to existing vertices."""
     if not indices.size:
         raise _FaultError("it has no triangles")
     low, high = int(indices.min()), int(indices.max())
     if low < 0 or high >= vertices:
-        raise _FaultError(f"{what} {low if low < 0 else high:,}, there are {vertices:,} (counted from 0)")
+        raise _FaultError(f"{what} {low if low < 0 else high:,}, but there are {vertices:,} (counted from 0)")
 
 
 def _check_mesh_numbers(values: NDArray[np.generic], what: str) -> None:
@@ -681,7 +686,7 @@ def _check_mesh_numbers(values: NDArray[np.generic], what: str) -> None:
 
 
 def check_counts(path: Path) -> None:
-    """Check that a PLY file has at least as many bytes as its header announces; faces may have any number of corners.
+    """Check that a PLY file has at least as many bytes as its header declares; faces may have any number of corners.
 
     Raises:
         ValueError: the file is too short.
@@ -693,7 +698,7 @@ def check_counts(path: Path) -> None:
         start += element.count * (2 * len(kinds) if order is None else sum(np.dtype(kind).itemsize for kind in kinds))
     size = path.stat().st_size
     if start > size + 1:
-        raise _FaultError(f"its header announces at least {start:,} bytes, it has {size:,}")
+        raise _FaultError(f"its header declares at least {start:,} bytes, but it has {size:,}")
 
 
 def _check_ply(content: bytes) -> None:
@@ -718,11 +723,11 @@ def _ply_header(content: bytes, strict: bool = True) -> tuple[str | None, list[_
     end = content.find(b"end_header", 0, MAX_PLY_HEADER_BYTES)
     stop = content.find(b"\n", end)
     if not content.startswith(b"ply") or end < 0 or stop < 0 or content[end + 10 : stop].strip():
-        raise _FaultError("it has no header of PLY")
+        raise _FaultError("it has no PLY header")
     first, *lines = (line.split() for line in content[:end].decode("utf-8", "strict").splitlines())
     order, elements = "", list[_Element]()
     if first != ["ply"]:
-        raise _FaultError("it has no header of PLY")
+        raise _FaultError("it has no PLY header")
     for words in lines:
         match words:
             case [] | ["comment" | "obj_info", *_]:
@@ -736,7 +741,7 @@ def _ply_header(content: bytes, strict: bool = True) -> tuple[str | None, list[_
             case ["property", kind, name] if elements and kind in TYPES:
                 _add_property(elements[-1], name, TYPES[kind])
             case _:
-                raise _FaultError(f"its header has the line {' '.join(words)[:60]!r}")
+                raise _FaultError(f"its header has an invalid line, {' '.join(words)[:60]!r}")
     if strict:
         _check_elements(elements)
     if not order:
@@ -746,7 +751,7 @@ def _ply_header(content: bytes, strict: bool = True) -> tuple[str | None, list[_
 
 def _add_property(element: _Element, name: str, kind: str, counted: str | None = None) -> None:
     if name in element.scalars:
-        raise _FaultError(f"its header names {name} of {element.name} twice")
+        raise _FaultError(f"its header declares {name} of {element.name} twice")
     element.scalars[name] = kind
     if counted is not None:
         element.counted[name] = counted
@@ -756,14 +761,14 @@ def _check_elements(elements: list[_Element]) -> None:
     """Check that a header has the elements and properties of a triangle mesh."""
     names = [element.name for element in elements]
     if len(set(names)) < len(names):
-        raise _FaultError("its header names an element twice")
+        raise _FaultError("its header declares an element twice")
     for element in elements:
         if element.name == "vertex" and (element.counted or not {"x", "y", "z"} <= set(element.scalars)):
             raise _FaultError("its vertices must have x, y and z, and no lists")
         if element.name == "face":
             lists = list(element.counted)
             if lists not in (["vertex_index"], ["vertex_indices"]) or element.scalars[lists[0]].startswith("f"):
-                raise _FaultError("its faces must have one list of whole numbers, vertex_index or vertex_indices")
+                raise _FaultError("its faces must have one list of integers, vertex_index or vertex_indices")
 
 
 def _ply_rows(content: bytes, start: int, elements: list[_Element], order: str) -> list[NDArray[np.void]]:
@@ -772,7 +777,7 @@ def _ply_rows(content: bytes, start: int, elements: list[_Element], order: str) 
     for element in elements:
         kind = element.dtype(order)
         if element.count * kind.itemsize > len(content) - start:
-            raise _FaultError(f"{element.count:,} of {element.name} need more bytes than there are")
+            raise _FaultError(f"{element.count:,} rows of {element.name} need more bytes than the file has")
         rows.append(np.frombuffer(content, kind, element.count, start))
         start += element.count * kind.itemsize
         if element.counted and element.name != "face" and (rows[-1][f"count of {next(iter(element.counted))}"] != 3).any():
@@ -780,7 +785,7 @@ def _ply_rows(content: bytes, start: int, elements: list[_Element], order: str) 
         if {"vertex", "face"} <= {one.name for one in elements[: len(rows)]}:
             break  # Mitsuba ignores what follows
     if len(rows) == len(elements) and content[start:].strip(b" \t\r\n\0"):
-        raise _FaultError(f"{len(content) - start:,} bytes are left over after what its header announces")
+        raise _FaultError(f"{len(content) - start:,} bytes remain after the data that its header declares")
     return rows
 
 
@@ -790,19 +795,19 @@ def _ply_rows_of_text(text: bytes, elements: list[_Element]) -> list[NDArray[np.
     for element in elements:
         width = len(element.scalars) + 3 * len(element.counted)
         if element.count * width > len(words) - start:
-            raise _FaultError(f"{element.count:,} of {element.name} need more numbers than there are")
+            raise _FaultError(f"{element.count:,} rows of {element.name} need more numbers than the file has")
         numbers = np.array(words[start : start + element.count * width], dtype=np.float64).reshape(element.count, width)
         rows.append(_as_table(numbers, element))
         start += element.count * width
         if {"vertex", "face"} <= {one.name for one in elements[: len(rows)]}:
             break
     if len(rows) == len(elements) and start < len(words):
-        raise _FaultError(f"{len(words) - start:,} numbers are left over after what its header announces")
+        raise _FaultError(f"{len(words) - start:,} numbers remain after the data that its header declares")
     return rows
 
 
 def _as_table(numbers: NDArray[np.float64], element: _Element) -> NDArray[np.void]:
-    """Return the numbers of an element as a table with named columns; check that integer columns are whole numbers."""
+    """Return the numbers of an element as a table with named columns; check that integer columns have integer values."""
     kinds: list[tuple[str, type] | tuple[str, type, tuple[int]]] = []
     for name in element.scalars:
         listed = name in element.counted
@@ -810,7 +815,7 @@ def _as_table(numbers: NDArray[np.float64], element: _Element) -> NDArray[np.voi
     table = np.ascontiguousarray(numbers).view(np.dtype(kinds)).reshape(-1)
     for name, kind in element.scalars.items():
         if not kind.startswith("f") and (table[name] != np.rint(table[name])).any():
-            raise _FaultError(f"{name} of {element.name} must be whole numbers")
+            raise _FaultError(f"{name} of {element.name} must be integers")
     return table
 
 
@@ -829,7 +834,7 @@ def _check_obj(content: bytes) -> None:
     for name in (b"v", b"vt", b"vn"):
         fewest = 2 if name == b"vt" else 3
         if any(len(words) < fewest for words in lines[name]):
-            raise _FaultError(f"a line {name.decode()} has fewer than {fewest} numbers")
+            raise _FaultError(f"a line of {name.decode()} has fewer than {fewest} numbers")
         _check_mesh_numbers(
             np.array([words[:fewest] for words in lines[name]], dtype=np.float64), f"numbers of {name.decode()}"
         )
@@ -840,14 +845,14 @@ def _check_obj(content: bytes) -> None:
         raise _FaultError("a face must have 3 corners or more")
     corners = [corner.split(b"/") for words in lines[b"f"] for corner in words]
     if any(len(corner) > 3 for corner in corners):
-        raise _FaultError("a corner of a face is v, v/vt, v//vn or v/vt/vn")
+        raise _FaultError("a corner of a face must be v, v/vt, v//vn or v/vt/vn")
     for place, name in enumerate((b"v", b"vt", b"vn")):
         named = [corner[place] for corner in corners if len(corner) > place and (corner[place] or place == 0)]
         if any(len(word) > 12 for word in named):
             raise _FaultError("an index of a face is too large")
         if named:
             indices = np.array(named, dtype=np.int64) - 1
-            _check_triangles(indices, len(lines[name]), f"a face names, of its {name.decode()}, number")
+            _check_triangles(indices, len(lines[name]), f"a face refers to {name.decode()} number")
 
 
 # ---------------- Meshes: Mitsuba's serialized format
@@ -858,35 +863,35 @@ def _check_serialized(content: bytes) -> None:
     if len(content) < 8:
         raise _FaultError("it is too short")
     (count,) = struct.unpack_from("<I", content, len(content) - 4)
-    _, number = struct.unpack_from("<HH", content)
-    width = 8 if number >= 4 else 4
+    _, version = struct.unpack_from("<HH", content)
+    width = 8 if version >= 4 else 4
     table = len(content) - 4 - count * width
     if count < 1 or table < 4:
-        raise _FaultError(f"it announces {count:,} meshes, more than fit in it")
+        raise _FaultError(f"it declares {count:,} meshes, more than fit in it")
     starts = np.frombuffer(content, "<u8" if width == 8 else "<u4", count, table).tolist()
     for start, stop in zip(starts, [*starts[1:], table], strict=True):
         if not start + 4 < stop <= table:
-            raise _FaultError("its table of meshes points outside it")
+            raise _FaultError("its table of meshes points outside the file")
         _check_one_serialized(content[start:stop])
 
 
 def _check_one_serialized(content: bytes) -> None:
     """Check one serialized mesh: a version, then deflated flags, name, counts, columns of numbers and triangles."""
-    signature, number = struct.unpack_from("<HH", content)
-    if signature != 0x041C or number not in (3, 4):
+    signature, version = struct.unpack_from("<HH", content)
+    if signature != 0x041C or version not in (3, 4):
         raise _FaultError("it is not a serialized mesh of version 3 or 4")
     # 1. Inflate the data, up to the largest possible size.
-    unpack = zlib.decompressobj()
-    data = unpack.decompress(content[4:], max_length=MESH_INFLATION * len(content))
+    inflater = zlib.decompressobj()
+    data = inflater.decompress(content[4:], max_length=MESH_INFLATION * len(content))
     # 2. Read flags and counts; a mesh of version 4 has its name between them. The flags determine precision and columns.
     (flags,) = struct.unpack_from("<I", data)
-    start = 4 if number == 3 else data.index(b"\0", 4) + 1
+    start = 4 if version == 3 else data.index(b"\0", 4) + 1
     vertices, triangles = struct.unpack_from("<QQ", data, start)
     start += 16
     size = 8 if flags & 0x2000 else 4
     columns = 3 + 3 * bool(flags & 0x0001) + 2 * bool(flags & 0x0002) + 3 * bool(flags & 0x0008)
     if vertices * columns * size + triangles * 12 > len(data) - start:
-        raise _FaultError(f"{vertices:,} vertices and {triangles:,} triangles need more bytes than there are")
+        raise _FaultError(f"{vertices:,} vertices and {triangles:,} triangles need more bytes than the file has")
     # 3. Check the values.
     numbers = np.frombuffer(data, f"<f{size}", vertices * columns, start)
     _check_mesh_numbers(numbers, "its numbers")
@@ -894,24 +899,24 @@ def _check_one_serialized(content: bytes) -> None:
 
 
 CHECKS = {"ply": _check_ply, "obj": _check_obj, "serialized": _check_serialized}
-"""Checks of mesh files, by the name of the Mitsuba plugin that reads the file."""
+"""Checks of mesh files, keyed by the name of the Mitsuba plugin that reads them."""
 
 
-# ---------------- Pictures, grids and tables of tensors
-# Their headers are checked before Mitsuba allocates what they announce.
+# ---------------- Pictures, grids and tensor files
+# Their headers are checked before Mitsuba allocates what they declare.
 
 
 MAX_PICTURE_HEADER_BYTES = 2**20
-"""Bytes at the beginning of a picture that are searched for its size."""
+"""Number of bytes at the start of a picture that are searched for its size."""
 
 PICTURE_INFLATION = 1100
-"""Largest ratio of the pixels of a picture, at one bit of one channel each, to its file's size: that of deflated data."""
+"""Maximum ratio of the pixel data of a picture, at one bit per pixel, to its file size: that of deflate compression."""
 
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """JPEG markers of the segments that contain the size."""
 
 TENSORS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 8, 8: 8, 9: 2, 10: 4, 11: 8}
-"""Size of a value [bytes], by the type number in a table of tensors."""
+"""Size of a value [bytes], keyed by the type number in a tensor file."""
 
 
 def pixels_of(path: Path) -> int:
@@ -932,26 +937,26 @@ def pixels_of(path: Path) -> int:
         file.seek(max(0, size - 18))
         tail = file.read(18)
     try:
-        wide, high, channels = _shape(head, tail)
+        width, height, channels = _shape(head, tail)
     except (struct.error, ValueError, IndexError):
         raise MitsonarError(f"{path} is not a picture that Mitsuba reads: export it again as PNG, JPEG or OpenEXR") from None
-    if min(wide, high) < 1 or wide * high > 8 * PICTURE_INFLATION * size:
-        raise MitsonarError(f"picture {path} is damaged: {wide:,} x {high:,} pixels in {size:,} bytes; export it again")
-    return wide * high * max(1, (channels + 2) // 3)
+    if min(width, height) < 1 or width * height > 8 * PICTURE_INFLATION * size:
+        raise MitsonarError(f"picture {path} is damaged: {width:,} x {height:,} pixels in {size:,} bytes; export it again")
+    return width * height * max(1, (channels + 2) // 3)
 
 
 def _shape(head: bytes, tail: bytes) -> tuple[int, int, int]:
     """Return the width, height and number of channels of a picture from the first and last bytes of its file."""
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
-        wide, high = struct.unpack_from(">II", head, 16)
-        return wide, high, 3
+        width, height = struct.unpack_from(">II", head, 16)
+        return width, height, 3
     if head.startswith(b"\xff\xd8"):
         return _jpeg_shape(head)
     if head.startswith(b"\x76\x2f\x31\x01"):
         return _exr_shape(head)
     if head.startswith(b"BM"):
-        wide, high = struct.unpack_from("<ii", head, 18)
-        return wide, abs(high), 3
+        width, height = struct.unpack_from("<ii", head, 18)
+        return width, abs(height), 3
     if head.startswith((b"PF", b"Pf", b"P6")):
         words = re.findall(rb"[^\s#]+", re.sub(rb"#[^\n]*", b"", head[2:2000]))
         return int(words[0]), int(words[1]), 3
@@ -962,50 +967,50 @@ def _shape(head: bytes, tail: bytes) -> tuple[int, int, int]:
         return int(size_line[1]), int(size_line[2]), 3
     if tail != b"TRUEVISION-XFILE.\0":  # TGA is recognised by its footer
         raise ValueError
-    wide, high = struct.unpack_from("<HH", head, 12)
-    return wide, high, 3
+    width, height = struct.unpack_from("<HH", head, 12)
+    return width, height, 3
 
 
 def _jpeg_shape(head: bytes) -> tuple[int, int, int]:
-    place = 2
+    offset = 2
     while True:
-        if head[place] != 0xFF:
+        if head[offset] != 0xFF:
             raise ValueError
-        marker = head[place + 1]
+        marker = head[offset + 1]
         if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD7:  # padding, or a marker without a length
-            place += 1 if marker == 0xFF else 2
+            offset += 1 if marker == 0xFF else 2
             continue
-        length, _, high, wide, channels = struct.unpack_from(">HBHHB", head, place + 2)
+        length, _, height, width, channels = struct.unpack_from(">HBHHB", head, offset + 2)
         if marker in FRAMES:
-            return wide, high, channels
-        place += 2 + length
+            return width, height, channels
+        offset += 2 + length
 
 
 def _exr_shape(head: bytes) -> tuple[int, int, int]:
     """Return the width and height of the largest of data window, display window and tile, and the number of channels."""
     # Attributes follow the magic number and the version. Each has a name, a type, a length and a value; an empty name ends
     # the list.
-    place, wide, high, channels, tile = 8, 0, 0, 0, 0
-    while head[place] != 0:
-        name_end = head.index(b"\0", place)
+    offset, width, height, channels, tile = 8, 0, 0, 0, 0
+    while head[offset] != 0:
+        name_end = head.index(b"\0", offset)
         kind_end = head.index(b"\0", name_end + 1)
         (length,) = struct.unpack_from("<i", head, kind_end + 1)
-        name, value = head[place:name_end], kind_end + 5
+        name, value = head[offset:name_end], kind_end + 5
         if length < 0 or value + length > len(head):
             raise ValueError
         if name in (b"dataWindow", b"displayWindow"):
             left, top, right, bottom = struct.unpack_from("<4i", head, value)
             if right < left or bottom < top:
                 raise ValueError
-            wide, high = max(wide, right - left + 1), max(high, bottom - top + 1)
+            width, height = max(width, right - left + 1), max(height, bottom - top + 1)
         elif name == b"channels":
             inner = value
             while head[inner] != 0:
                 inner, channels = head.index(b"\0", inner) + 17, channels + 1
         elif name == b"tiles":
             tile = max(struct.unpack_from("<2I", head, value))
-        place = value + length
-    return max(wide, tile), max(high, tile), channels
+        offset = value + length
+    return max(width, tile), max(height, tile), channels
 
 
 def check_grid(path: Path) -> None:
@@ -1019,7 +1024,7 @@ def check_grid(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(48)
     if len(head) < 48 or head[:4] != b"VOL\x03":
-        raise MitsonarError(f"grid {path} is damaged: it has no header of VOL, version 3; export it again")
+        raise MitsonarError(f"grid {path} is damaged: it has no VOL header of version 3; export it again")
     kind, *counts = struct.unpack_from("<5i", head, 4)
     numbers = struct.unpack_from("<6f", head, 24)
     if kind != 1 or min(counts) < 1 or 4 * math.prod(counts) != size - 48 or not all(map(math.isfinite, numbers)):
@@ -1028,7 +1033,7 @@ def check_grid(path: Path) -> None:
 
 
 def check_tensors(path: Path) -> None:
-    """Check a table of tensors, as the BSDF ``measured`` reads it: offset and size of each against the size of the file.
+    """Check a tensor file, as the BSDF ``measured`` reads it: offset and size of each tensor against the size of the file.
 
     Raises:
         MitsonarError: the header is invalid, or a tensor extends beyond the end of the file.
@@ -1041,14 +1046,16 @@ def check_tensors(path: Path) -> None:
         if not head.startswith(b"tensor_file\0"):
             raise ValueError
         (count,) = struct.unpack_from("<I", head, 14)
-        place = 18
+        offset = 18
         for _ in range(count):
-            (length,) = struct.unpack_from("<H", head, place)
-            dimensions, kind, start = struct.unpack_from("<HBQ", head, place + 2 + length)
-            place += 13 + length
-            shape = struct.unpack_from(f"<{dimensions}Q", head, place)
-            place += 8 * dimensions
+            (length,) = struct.unpack_from("<H", head, offset)
+            dimensions, kind, start = struct.unpack_from("<HBQ", head, offset + 2 + length)
+            offset += 13 + length
+            shape = struct.unpack_from(f"<{dimensions}Q", head, offset)
+            offset += 8 * dimensions
             if start + math.prod(shape) * TENSORS[kind] > size:
                 raise ValueError
     except (struct.error, ValueError, KeyError):
-        raise MitsonarError(f"table {path} is damaged: its header announces more than it holds; fetch it again") from None
+        raise MitsonarError(
+            f"table {path} is damaged: its header declares more than it contains; download it again"
+        ) from None

@@ -45,7 +45,7 @@ def test_a_scene_smaller_than_its_recipe_says_is_refused_before_rendering(tmp_pa
     path = scene_file(tmp_path, 4.0)
     out = tmp_path / "x.zarr"
     with pytest.raises(
-        MitsonarError, match=r"world.size_m, 30 m, is larger than what .*scene.xml holds, x -4..4 m and y"
+        MitsonarError, match=r"world.size_m, 30 m, is too large for .*scene.xml, which covers x -4..4 m and y"
     ) as caught:
         make_dataset(own_scene(path, 30.0, gain=gain), str(out))
     assert "give at most 8 (a square around the origin)" in str(caught.value)
@@ -55,7 +55,7 @@ def test_a_scene_smaller_than_its_recipe_says_is_refused_before_rendering(tmp_pa
 
 def test_impulse_responses_are_refused_likewise(tmp_path: Path) -> None:
     world = {"family": "scene", "file": str(scene_file(tmp_path, 4.0)), "size_m": 30.0}
-    with pytest.raises(MitsonarError, match="is larger than what"):
+    with pytest.raises(MitsonarError, match="is too large for"):
         make_dataset(recipe_from({**HEARD, "world": world}), str(tmp_path / "x.zarr"))
 
 
@@ -68,7 +68,7 @@ def test_empty_frames_are_warned_of_and_are_faults(tmp_path: Path, kind: str) ->
     names = {"images": ["image"], "vectors": ["vector"], "both": ["image", "vector"]}[kind]
     empty = np.all([~store.read(name).reshape(24, -1).any(axis=1) for name in names], axis=0)
     assert 0 < empty.sum() <= 24
-    expected = f"{empty.sum()} of 24 frames are empty, without a single echo ({np.flatnonzero(empty)[0]}"
+    expected = f"{empty.sum()} of 24 frames contain no echoes ({np.flatnonzero(empty)[0]}"
     assert sum(sentence.startswith(expected) for sentence in result.warnings) == 1
     assert "check world.size_m" in next(sentence for sentence in result.warnings if sentence.startswith(expected))
     assert [fault.startswith(expected) for fault in check(store)] == [True]
@@ -80,10 +80,10 @@ def test_the_command_line_says_so(mitsonar: Command, tmp_path: Path) -> None:
     load_recipe(tmp_path / "mine.yaml")
     done = mitsonar("dataset", "make", tmp_path / "mine.yaml", "-o", tmp_path / "x.zarr", "--workers", 1)
     assert done.returncode == 0, done.stderr
-    assert "frames are empty" in done.stderr
+    assert "frames contain no echoes" in done.stderr
     checked = mitsonar("dataset", "check", tmp_path / "x.zarr")
     refused(checked, "1 faults", "empty frames stay until the recipe changes")
-    assert "frames are empty, without a single echo" in checked.stdout
+    assert "frames contain no echoes (" in checked.stdout
     small = {**yaml.safe_load((tmp_path / "mine.yaml").read_text())}
     small["world"]["size_m"] = 60.0
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(small))

@@ -95,7 +95,7 @@ def test_footprint_of_a_level_floor() -> None:
     corners = height / (np.cos(e) * np.cos(edge) * np.sin(pitch) - np.sin(e) * np.cos(pitch))
     np.testing.assert_allclose(slant, np.repeat(corners, 2), rtol=1e-12)
     assert slant[-1] == pytest.approx(5.54, abs=0.01)
-    with pytest.raises(MitsonarError, match="sees no ground"):
+    with pytest.raises(MitsonarError, match="cannot see the ground"):
         footprint(sonar, Pose(0, 0, 0, np.radians(35)), 6.0)
 
 

@@ -175,7 +175,7 @@ def test_what_receivers_see_stays_inside_the_scene(shape: str) -> None:
 def test_no_place_in_a_small_scene_is_one_sentence() -> None:
     with pytest.raises(MitsonarError, match="no place for a sequence found"):
         Plan.of(impulse_recipe(world={"size_m": 8.0}), 1)
-    with pytest.raises(MitsonarError, match="sees no ground: it is 9 m over it, range_max is 8 m"):
+    with pytest.raises(MitsonarError, match="cannot see the ground: it is 9 m above it, but range_max is 8 m"):
         Plan.of(impulse_recipe(flight={"height_m": 9.0}), 1)
 
 

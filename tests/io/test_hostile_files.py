@@ -252,7 +252,7 @@ def test_an_index_beyond_the_vertices_is_refused(index: int, order: str, tmp_pat
     (tmp_path / "good.ply").write_bytes(ply(order=order))
     check_mesh(tmp_path / "good.ply", "ply")
     (tmp_path / "bad.ply").write_bytes(ply(index, order=order))
-    assert "a triangle names vertex" in refusal(lambda: check_mesh(tmp_path / "bad.ply", "ply"))
+    assert "a triangle refers to vertex" in refusal(lambda: check_mesh(tmp_path / "bad.ply", "ply"))
 
 
 @pytest.mark.parametrize("how", NAMED)
@@ -264,7 +264,7 @@ def test_a_scene_names_a_bad_mesh(how: str, tmp_path: Path, variant: str) -> Non
     (tmp_path / "inner").mkdir()
     (tmp_path / "inner" / "part.xml").write_text(f'<scene version="3.0.0">{NAMED["plain"]}</scene>')
     (tmp_path / "scene.xml").write_text(SCENE.format(NAMED[how]))
-    assert "a triangle names vertex 100,000,000" in refusal_without_limit(lambda: load_scene(tmp_path / "scene.xml"))
+    assert "a triangle refers to vertex 100,000,000" in refusal_without_limit(lambda: load_scene(tmp_path / "scene.xml"))
     (tmp_path / "bad.ply").write_bytes(ply(3))
     load_scene(tmp_path / "scene.xml")
 
@@ -282,7 +282,7 @@ def test_a_parameter_names_a_bad_mesh(tmp_path: Path, variant: str) -> None:
     (tmp_path / "other.ply").write_bytes(ply(99))
     (tmp_path / "scene.xml").write_text(SCENE.format(NAMED["parameter"].replace("bad.ply", "good.ply")))
     load_scene(tmp_path / "scene.xml")
-    assert "names vertex 99" in refusal_without_limit(lambda: load_scene(tmp_path / "scene.xml", mesh="other.ply"))
+    assert "refers to vertex 99" in refusal_without_limit(lambda: load_scene(tmp_path / "scene.xml", mesh="other.ply"))
 
 
 @pytest.mark.parametrize("index", [10**5, 2 * 10**9])
@@ -290,14 +290,14 @@ def test_render_of_a_bad_mesh_is_one_sentence(index: int, mitsonar: Command, tmp
     """It was a segmentation fault, and a traceback."""
     (tmp_path / "bad.ply").write_bytes(ply(index))
     (tmp_path / "scene.xml").write_text(SCENE.format(NAMED["plain"]))
-    refused(mitsonar("render", "scene.xml", "-o", "out", cwd=tmp_path), "bad.ply", "names vertex")
+    refused(mitsonar("render", "scene.xml", "-o", "out", cwd=tmp_path), "bad.ply", "refers to vertex")
 
 
 @pytest.mark.thorough
 def test_render_of_a_bad_mesh_in_a_process_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "bad.ply").write_bytes(ply(10**8))
     (tmp_path / "scene.xml").write_text(SCENE.format(NAMED["plain"]))
-    refused(by_itself("render", "scene.xml", "-o", "out", cwd=tmp_path), "bad.ply", "names vertex")
+    refused(by_itself("render", "scene.xml", "-o", "out", cwd=tmp_path), "bad.ply", "refers to vertex")
 
 
 def test_amphora_mutants_never_end_mitsuba(tmp_path: Path) -> None:
@@ -361,7 +361,7 @@ def test_other_meshes_must_hold_what_they_promise(tmp_path: Path) -> None:
         "b.obj": (f"{corners}vt 0 0\nf 1/1 2/1 3/7\n".encode(), "names"),
         "c.obj": (f"{corners}f 1 2\n".encode(), "3 corners"),
         "d.obj": (b"v 0 0 nan\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", "finite"),
-        "e.serialized": (serialized(box, [[0, 1, 3]]), "names vertex 3"),
+        "e.serialized": (serialized(box, [[0, 1, 3]]), "refers to vertex 3"),
         "f.serialized": (serialized(box, [[0, 1, 2]], vertices=10**12), "more bytes"),
         "g.serialized": (serialized(box, [[0, 1, 2]], triangles=2**60), "more bytes"),
         "h.serialized": (serialized(box, [[0, 1, 2]])[:-4] + b"\xff\xff\xff\xff", "more than fit"),

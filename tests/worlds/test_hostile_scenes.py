@@ -38,13 +38,13 @@ def grown(times: int) -> str:
 
 
 TEXTS = {
-    "comments": (OPEN + "<!--" * 200_000, "a <!-- does not end"),
-    "instructions": (OPEN + "<?" * 300_000, r"a <\? does not end"),
+    "comments": (OPEN + "<!--" * 200_000, "a <!-- is not terminated"),
+    "instructions": (OPEN + "<?" * 300_000, r"a <\? is not terminated"),
     "tags": (OPEN + "<a " * 200_000, "malformed"),
     "values": (OPEN + '<a x="' * 150_000, "malformed"),
     "quotes": (OPEN + "<a x='\" " * 150_000, "malformed"),
     "attributes": (OPEN + "<a " + "x='' " * 200_000 + "y", "malformed"),
-    "data": (OPEN + "<![CDATA[" * 100_000, "does not end"),
+    "data": (OPEN + "<![CDATA[" * 100_000, "is not terminated"),
     "depth": (OPEN + "<shape>" * 200, "nests its elements more than 100 levels deep"),
     "parameters that grow": (grown(10), "longer than 65,536 letters"),
     "many parameters": (SCENE.format("".join(PARAMETER.format(k) for k in range(60_000))), "1,000 parameters"),
