@@ -1,4 +1,4 @@
-"""How well a trained network estimates motion on a data set, with a baseline and confidence intervals."""
+"""Evaluate a trained network on a data set, with a baseline and confidence intervals."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def predictions(
     """Estimate the targets of samples with a network.
 
     Args:
-        checkpoint: of the network.
+        checkpoint: checkpoint of the network.
         pairs: samples, arranged as in training; see :func:`samples_for`.
         batch: number of samples per batch.
-        numbers: numbers of the samples; default: all samples.
-        device: of the computation; default: a GPU, if there is one.
-        progress: called with the number of samples that were done.
+        numbers: indices of the samples; default: all samples.
+        device: device of the computation; default: a GPU, if available.
+        progress: called after each batch with its number of samples.
 
     Returns:
         Estimated targets ``(n, 3)`` [m, m, rad], ``(n, 2)`` [m] without yaw, or ``(n, 1)`` [m] for heights; and covariances
@@ -92,26 +92,26 @@ def evaluate(
     device: torch.device | str | None = None,
     begin: Callable[[int], Callable[[int], object]] = lambda total: lambda done: None,
 ) -> JsonObject:
-    """Evaluate a network on one sample of each sequence of a data set, in comparison with the constant estimate zero.
+    """Evaluate a network on one sample of each sequence of a data set, and compare it with the constant estimate zero.
 
     Args:
-        checkpoint: of the network.
+        checkpoint: checkpoint of the network.
         data: path or URL of the data set.
-        noise: noise levels, each of which gives a table; default: :data:`NOISES`, or none for impulse responses.
+        noise: noise levels, with one table each; default: :data:`NOISES`, or none for impulse responses.
         part: ``train``, ``validation``, ``test`` or ``all``; default: ``test`` if the split has one, else ``validation``.
-        split: default: that of the training, else that of the data set.
-        pairs: largest number of pairs; if there are more, pairs are drawn at random.
+        split: split of the data; default: that of the training, else that of the data set.
+        pairs: maximum number of pairs; from a larger set, pairs are drawn at random.
         force: allow a sonar that differs from that of training.
-        seed: of noise, choice of samples, and bootstrap.
+        seed: seed for noise, choice of samples, and bootstrap.
         batch: number of samples per batch.
-        device: of the computation; default: a GPU, if there is one. Times are always measured on one CPU core.
+        device: device of the computation; default: a GPU, if available. Times are always measured on one CPU core.
         begin: called with the total number of estimates; returns a function that is called with the number of new ones.
 
     Returns:
-        The report: facts about network and data, ``notes`` and ``tables``. ``notes`` are sentences that a reader of the
-        tables needs. ``tables`` has one table per noise level. Its rows are those of the network and of ``zero``, with the
+        The report: facts about network and data, ``notes`` and ``tables``. ``notes`` are remarks for readers of the
+        tables. ``tables`` has one table per noise level. Its rows are those of the network and of ``zero``, with the
         fields of :class:`~mitsonar.estimation.compare.BenchmarkRow` in mm, mm, deg (heights: mm), and ``thesis``, the RMSE
-        in mm, mm, 1/100 deg. ``beyond`` has the shares of true motions and of estimates outside the range of training,
+        in mm, mm, 1/100 deg. ``beyond`` has the fractions of true motions and of estimates outside the training range,
         ``correlations`` the correlations of the network's errors between any two axes.
 
     Raises:
@@ -119,13 +119,13 @@ def evaluate(
     """
     sonar_differences = _sonar_differences(checkpoint, DataStore.open(data).recipe)
     if sonar_differences and not force:
-        raise MitsonarError(f"{'; '.join(sonar_differences)}: evaluate on the sonar of training, or use --force")
+        raise MitsonarError(f"{'; '.join(sonar_differences)}: evaluate on the sonar used in training, or use --force")
     split = checkpoint.recipe.get("split") if split is None else split
     default_levels = NOISES[:1] if checkpoint.channel is not None else NOISES
     levels = list(dict.fromkeys(default_levels if noise is None else noise))
     samples = {level: samples_for(checkpoint, data, part=part, split=split, noise=level, seed=seed) for level in levels}
     subject = _Subject.of(samples[levels[0]], pairs, seed)
-    ms = _milliseconds(
+    ms = _time_per_sample(
         checkpoint, samples_for(checkpoint, data, part=part, split=split, seed=seed), subject.numbers[:TIMED_PAIRS]
     )
     progress, tables = begin(len(levels) * len(subject.numbers)), []
@@ -140,11 +140,11 @@ class _Subject:
     """The samples of an evaluation.
 
     Attributes:
-        numbers: numbers of the n samples.
+        numbers: indices of the n samples.
         truth: true targets ``(n, outputs)`` [m, rad].
         scenes: number of distinct scenes.
         resamples: indices of the samples in each bootstrap resample ``(resamples, n)``.
-        seed: of the choice of samples and of the bootstrap.
+        seed: seed for the choice of samples and the bootstrap.
     """
 
     numbers: list[int]
@@ -223,7 +223,7 @@ def _device(device: torch.device | str | None) -> torch.device:
     return torch.device(device if device is not None else "cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _milliseconds(checkpoint: Checkpoint, pairs: SonarPairs | ImpulsePairs, numbers: Sequence[int]) -> float:
+def _time_per_sample(checkpoint: Checkpoint, pairs: SonarPairs | ImpulsePairs, numbers: Sequence[int]) -> float:
     """Measure the median CPU time per sample on one core [ms], from the frames (and their geometry) to the estimate."""
     network = checkpoint.build()
     times_ms = []
@@ -243,18 +243,18 @@ def _table(checkpoint: Checkpoint, subject: _Subject, ms: float, estimates: Arra
     """Return the table of one noise level, with rows for the network and for the constant estimate zero."""
     truth, resamples = subject.truth, subject.resamples
     inputs, beyond = {checkpoint.network: inputs_of(checkpoint), "zero": "nothing"}, _beyond(checkpoint, truth, estimates)
-    # Motions: a missing yaw is filled with zeros, since the rows of a comparison have three axes, and is cut off again.
+    # Motions: a missing yaw is filled with zeros, since the rows of a comparison have three axes, and removed again.
     if truth.shape[1] >= 2:
         truth, estimates, axes = _with_yaw(truth), _with_yaw(estimates), truth.shape[1]
-        nan, valid = np.full((len(truth), 3, 3), np.nan), np.ones(len(truth), dtype=bool)
-        covariances = nan if covariances is None else covariances
+        no_covariances, valid = np.full((len(truth), 3, 3), np.nan), np.ones(len(truth), dtype=bool)
+        covariances = no_covariances if covariances is None else covariances
         answers = {
             checkpoint.network: Answers(estimates, valid, covariances, np.full(len(truth), ms)),
-            "zero": Answers(np.zeros_like(truth), valid, nan, np.zeros(len(truth))),
+            "zero": Answers(np.zeros_like(truth), valid, no_covariances, np.zeros(len(truth))),
         }
         rows = [_first_axes(row.plain(), axes) for row in rows_of(answers, inputs, truth, resamples, reference="zero")]
         scale = np.array([1, 1, 100])[:axes]
-    # Heights: the baseline is the middle of the training heights, since zero is no height.
+    # Heights: the baseline is the middle of the training heights, since zero is not a valid height.
     else:
         middle = np.full_like(truth, checkpoint.coder.low.mean() / 2 + checkpoint.coder.high.mean() / 2)
         by_method = {checkpoint.network: estimates, "zero": middle}
@@ -271,7 +271,7 @@ def _table(checkpoint: Checkpoint, subject: _Subject, ms: float, estimates: Arra
 
 
 def _correlations(error: Array, axes: int) -> dict[str, float | None]:
-    """Compute the correlations between the errors ``(n, axes)`` of any two axes; None for one sample, or without error."""
+    """Compute the correlations between the errors ``(n, axes)`` of any two axes; None if undefined, as for one sample."""
     table = np.full((axes, axes), np.nan)
     if len(error) > 1:
         with np.errstate(invalid="ignore"):
@@ -322,7 +322,7 @@ def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArr
 
 
 def _beyond(checkpoint: Checkpoint, truth: Array, estimates: Array) -> dict[str, float]:
-    """Compute the shares of true and of estimated targets that are outside the range of training on any axis."""
+    """Compute the fractions of true and of estimated targets that are outside the training range on any axis."""
     low, high = checkpoint.coder.low - 1e-9, checkpoint.coder.high + 1e-9
     return {
         name: float(((values < low) | (values > high)).any(axis=1).mean())
@@ -345,7 +345,7 @@ def _sonar_differences(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
         difference = TrainedInstrument.of(trained).unlike(TrainedInstrument.of(view.sonar))
         if difference:
             differences.append(
-                f"the {checkpoint.network} was trained on the sonar {trained.name}, the data set {recipe.name} is of "
+                f"the {checkpoint.network} was trained on the sonar {trained.name}, but the data set {recipe.name} uses "
                 f"{view.sonar.name}: {difference}"
             )
     return list(dict.fromkeys(differences))
@@ -355,7 +355,7 @@ def _channel_differences(trained: ChannelSonar, evaluated: ChannelSonar, name: s
     """Describe the differences between two channel sonars that change responses."""
     trained_fields, evaluated_fields = trained.model_dump(mode="json"), evaluated.model_dump(mode="json")
     changed = [key for key in trained_fields if trained_fields[key] != evaluated_fields[key] and key not in SAME_INSTRUMENT]
-    return [f"trained with another channel sonar than that of {name}: {', '.join(changed)} differ"] if changed else []
+    return [f"trained with a different channel sonar from that of {name}: {', '.join(changed)} differ"] if changed else []
 
 
 def _seen_note(checkpoint: Checkpoint, samples: SonarPairs | ImpulsePairs, subject: _Subject) -> list[str]:
@@ -366,7 +366,7 @@ def _seen_note(checkpoint: Checkpoint, samples: SonarPairs | ImpulsePairs, subje
 
 
 def _notes(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
-    """Describe other differences from training."""
+    """Describe other differences between training and evaluation."""
     notes = []
     model = modality_of(recipe).sonar.model
     if model not in checkpoint.model.split(" and "):
@@ -384,7 +384,7 @@ def _notes(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
     return notes
 
 
-# ---------------- Output of the tables
+# ---------------- Output
 
 
 COLUMNS = (
@@ -405,11 +405,13 @@ def report_lines(report: JsonObject) -> list[str]:
         beyond = table["beyond"]
         lines += ["", f"noise {table['noise']}", "", *markdown(table["rows"], COLUMNS), ""]
         lines.append(
-            f"beyond the targets of training: {beyond['true']:.1%} of the samples, {beyond['answers']:.1%} of the answers  "
+            f"outside the training range: {beyond['true']:.1%} of the samples, {beyond['answers']:.1%} of the estimates  "
         )
-        known = [f"{axes} {'-' if value is None else f'{value:.2f}'}" for axes, value in table["correlations"].items()]
-        if known:
-            lines.append(f"correlations of errors: {', '.join(known)}  ")
+        correlations = [
+            f"{axes} {'-' if value is None else f'{value:.2f}'}" for axes, value in table["correlations"].items()
+        ]
+        if correlations:
+            lines.append(f"correlations of errors: {', '.join(correlations)}  ")
     return lines
 
 

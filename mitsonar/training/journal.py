@@ -1,4 +1,4 @@
-"""What happens between the steps of a training: reports, validation, saving of state and best network, and the end."""
+"""Tasks between training steps: reports, validation, saving of the state and the best network, and stopping."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ __all__ = [
 
 
 LOG_SECONDS = 30.0
-"""Time between two rows of the log without a validation [s]."""
+"""Interval between log rows without validation [s]."""
 
 SMOOTH = 0.98
 """Decay per step of the weights in the running means of a report."""
@@ -58,9 +58,9 @@ class TrainingReport:
     """Progress of a training after a step.
 
     Attributes:
-        step: number of steps done.
-        steps: number of steps planned.
-        epoch: number of epochs done, with a fraction.
+        step: number of completed steps.
+        steps: number of planned steps.
+        epoch: number of completed epochs, including fractions.
         pairs: number of samples seen.
         minutes: duration of training, including earlier parts of a resumed run [min].
         per_second: samples per second in this process.
@@ -128,7 +128,7 @@ class Journal(Callback):
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Start the clock, and restore the handler of SIGTERM.
 
-        Lightning has replaced the handler by one that ends the process with code 0, and without a state. If the caller can
+        Lightning installs a handler that ends the process with code 0 and saves no state. If the caller can
         stop the training, the caller's handler is restored.
         """
         if self.stop is not None and threading.current_thread() is threading.main_thread():
@@ -158,7 +158,7 @@ class Journal(Callback):
             self._log(trainer, step, validate=validate, stopped=stopped)
         if self.progress is not None and trainer.is_global_zero:
             self.progress(self._report(step, validated=validate or stopped, logged=log))
-        if save and self._finite():  # every process takes part in writing
+        if save and self._finite():  # all processes take part in saving
             trainer.save_checkpoint(self.folder.state)
             self.saved = time.monotonic()
         if end:
@@ -169,7 +169,7 @@ class Journal(Callback):
             trainer.should_stop = True
 
     def _due(self, trainer: lightning.Trainer, step: int) -> tuple[bool, bool, bool]:
-        """Return whether training ends, validates, and saves its state; the first process decides for all."""
+        """Return whether to end, validate, and save the state; the first process decides for all."""
         time_s, schedule = time.monotonic(), self.recipe.validation
         stopped = self.stopped or (self.stop is not None and self.stop())
         out_of_time = self.options.minutes is not None and self.spent >= self.options.minutes
@@ -186,7 +186,7 @@ class Journal(Callback):
     def _log(self, trainer: lightning.Trainer, step: int, *, validate: bool, stopped: bool) -> None:
         """Add a row to the log; validate if that is due, and save the network if it is the best so far.
 
-        A stop also validates, but does not count for the choice of the best network. Its network is saved only if the run
+        A requested stop also validates, but does not compete for the best network. Its network is saved only if the run
         has none.
         """
         row: JsonObject = {
@@ -214,7 +214,7 @@ class Journal(Callback):
         self.logged = time.monotonic()
 
     def _columns(self, source: str, rmse: list[float] | None) -> JsonObject:
-        """Return the columns of an RMSE, keyed by name; None if there is no RMSE."""
+        """Return the columns of an RMSE, keyed by name; the values are None without an RMSE."""
         values = [None] * len(self.axes) if rmse is None else rmse
         return {column(source, axis): value for axis, value in zip(self.axes, values, strict=True)}
 
@@ -278,7 +278,7 @@ class _JournalState:
     """State of the journal that a resumed run needs.
 
     Attributes:
-        rows: of the log.
+        rows: rows of the log.
         loss_sum: sum of the losses since the last row.
         loss_count: number of steps since the last row.
         best: score of the best network.
@@ -312,19 +312,19 @@ def _score(rmse: list[Array], zero: Array) -> float:
     The score is the ratio of the RMSE to that of the constant estimate zero, as a geometric mean over axes and noise levels.
     The geometric mean gives equal weight to equal relative errors, even if one axis cannot be estimated.
     """
-    moves = zero > 0
-    parts = np.array([level[moves] / zero[moves] for level in rmse])
-    return float(np.exp(np.log(np.maximum(parts, 1e-9)).mean())) if moves.any() else float(np.mean(rmse))
+    varies = zero > 0
+    ratios = np.array([level[varies] / zero[varies] for level in rmse])
+    return float(np.exp(np.log(np.maximum(ratios, 1e-9)).mean())) if varies.any() else float(np.mean(rmse))
 
 
 # ---------------- Folder of a training run
 
 
 EVENTS = "tensorboard"
-"""Name of the folder for TensorBoard inside the folder of a training."""
+"""Name of the TensorBoard folder inside a run folder."""
 
 TRAINED = "training"
-"""Prefix of the log's columns that hold the RMSE on the training samples."""
+"""Prefix of the log columns of the RMSE on the training samples."""
 
 TRAINING = RunKind(
     "training",
@@ -337,14 +337,14 @@ TRAINING = RunKind(
 )
 
 LOG_AXIS_RATIO = 30
-"""Ratio of the last to the first number of samples seen from which their axis is logarithmic."""
+"""Ratio of the last to the first number of samples seen at which the axis becomes logarithmic."""
 
 
 class StateFile(TorchCheckpointIO):
-    """Reader and writer of Lightning's state, which writes atomically and executes nothing in the file."""
+    """Checkpoint I/O for Lightning that writes atomically and executes nothing from the file."""
 
     def save_checkpoint(self, checkpoint: JsonObject, path: str | Path, storage_options: object | None = None) -> None:
-        """Write a state atomically: either all of it or nothing."""
+        """Write a state atomically."""
         buffer = io.BytesIO()
         torch.save(checkpoint, buffer)
         write_atomic(path, buffer.getvalue())
@@ -362,7 +362,7 @@ class StateFile(TorchCheckpointIO):
             if not isinstance(state["state_dict"], dict):
                 raise ValueError("it is not a state")
             whole_number(state["global_step"], "global_step")
-        except Exception as error:  # a damaged zip or pickle raises whatever its bytes lead to
+        except Exception as error:  # a damaged zip or pickle raises errors of any type
             raise MitsonarError(
                 f"{path} is damaged ({str(error).splitlines()[0] if str(error) else type(error).__name__}): begin anew with "
                 "--overwrite"
@@ -372,10 +372,10 @@ class StateFile(TorchCheckpointIO):
 
 @dataclass
 class RunFolder:
-    """Folder of a training: recipe, state, best network, log and learning curve, each of them complete or absent.
+    """Folder of a training run: recipe, state, best network, log and learning curve, each of them complete or absent.
 
     Attributes:
-        path: of the folder.
+        path: path of the folder.
         writes: whether this process writes.
         run: arguments and progress; None before :meth:`begin`, or if another process writes.
     """
@@ -408,14 +408,14 @@ class RunFolder:
         """Create the folder, or resume the run in it, and return the resumed run.
 
         Args:
-            recipe: of the training.
+            recipe: training recipe.
             arguments: further arguments that a resumed run must repeat to reach the same weights.
             notes: other facts about the run.
             resume: resume a run in the folder.
             overwrite: replace a run in the folder.
 
         Raises:
-            MitsonarError: the folder has a run and neither is allowed, the arguments differ, or the folder has other files.
+            MitsonarError: the folder contains a run and neither is allowed, the arguments differ, or it has other files.
         """
         if not self.writes:
             return None
@@ -434,7 +434,7 @@ class RunFolder:
             self.run.note(**notes)
 
     def log(self, rows: list[JsonObject], zero: list[float], axes: tuple[Axis, ...], *, drawn: bool) -> None:
-        """Write ``log.csv``, and ``curve.png`` if it is to be drawn."""
+        """Write ``log.csv`` and, if ``drawn``, ``curve.png``."""
         text = io.StringIO()
         table = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
         table.writeheader()
@@ -464,7 +464,7 @@ def curve_figure(rows: list[JsonObject], zero: list[float], axes: tuple[Axis, ..
     """Draw the loss, and the RMSE of each axis in training and validation, against the number of samples seen.
 
     Args:
-        rows: of the log; at least one with a validation.
+        rows: rows of the log, at least one with a validation.
         zero: RMSE of the constant estimate of no motion, in the units of ``axes``.
         axes: names and units of the estimates.
     """

@@ -1,4 +1,4 @@
-"""How one step of training works: network, loss and augmentation, as a Lightning module."""
+"""One step of training: network, loss and augmentation, as a Lightning module."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def axes_of(labels: Labels) -> tuple[Axis, ...]:
 
 
 def estimates(output: NetworkOutput, labels: Labels) -> Array:
-    """Return the estimates of a network in SI units ``(batch, outputs)``; for a Gaussian head the mean, or its last one."""
+    """Return the estimates of a network in SI units ``(batch, outputs)``; for a Gaussian head, the last mean."""
     if isinstance(output, GaussianHead):
         mean = output.mean if output.mean.dim() == 2 else output.mean[-1]
         return np.asarray(mean.detach().cpu().double().numpy())
@@ -55,7 +55,7 @@ def estimates(output: NetworkOutput, labels: Labels) -> Array:
 
 
 def network_for(recipe: TrainingRecipe, material: Material) -> nn.Module:
-    """Create the network of a recipe, with initial weights drawn by its seed, and test it on two samples.
+    """Create the network of a recipe, with initial weights drawn from its seed, and check it with two samples.
 
     Raises:
         MitsonarError: the network or an option is unknown, or input, labels or loss do not fit the network.
@@ -88,9 +88,11 @@ def _check_recipe(name: str, recipe: TrainingRecipe) -> None:
             )
     if getattr(NETWORKS.get(name), "has_covariance", False) != (recipe.loss.kind == "likelihood"):
         expected = (
-            "likelihood, it estimates a covariance" if recipe.loss.kind == "mse" else "mse, it estimates no covariance"
+            "likelihood, because it estimates a covariance"
+            if recipe.loss.kind == "mse"
+            else "mse, because it estimates no covariance"
         )
-        raise MitsonarError(f"network {name} is trained with loss.kind {expected}: got {recipe.loss.kind}")
+        raise MitsonarError(f"network {name} needs loss.kind {expected}: got {recipe.loss.kind}")
     if recipe.loss.kind == "likelihood" and recipe.labels != "raw":
         raise MitsonarError(f"loss.kind likelihood needs motions in metres: set labels: raw, got {recipe.labels}")
 
@@ -114,7 +116,7 @@ def _check_shapes(network: nn.Module, name: str, inputs: NetworkInput, labels: T
         shape = (0, 0)  # a different number of labels cannot be decoded
     if shape != labels.shape:
         raise MitsonarError(
-            f"network {name} returns another number of values than the {labels.shape[1]} of the labels "
+            f"network {name} does not return the {labels.shape[1]} values of the labels "
             f"({', '.join(material.samples.labels.names)}): omit its option outputs, or set it to {labels.shape[1]}"
         )
 
@@ -123,30 +125,30 @@ def _load_weights(network: nn.Module, name: str, checkpoint: Checkpoint) -> None
     """Load the weights of a trained network from a checkpoint.
 
     Raises:
-        MitsonarError: the checkpoint is of another network, or has other options.
+        MitsonarError: the checkpoint belongs to a different network, or has different options.
     """
     options = network.options
     if checkpoint.network != name or checkpoint.options != options:
         raise MitsonarError(
-            f"start holds the weights of {checkpoint.network} {checkpoint.options}, the recipe has {name} {options}: give "
-            "a checkpoint of the same network"
+            f"start contains the weights of {checkpoint.network} {checkpoint.options}, but the recipe has {name} {options}: "
+            "give a checkpoint of the same network"
         )
     network.load_state_dict(checkpoint.build().state_dict())
 
 
 class NetworkTraining(lightning.LightningModule):
-    """Network in training; each step, including dropout, depends only on (recipe, step, weights).
+    """Training of a network; each step, including dropout, depends only on (recipe, step, weights).
 
     Args:
-        network: to be trained.
-        recipe: of the training.
-        material: data of the training.
+        network: network to train.
+        recipe: training recipe.
+        material: training and validation data.
 
     Attributes:
         epoch_steps: number of steps per epoch.
         steps: number of steps of the whole training.
         workers: number of processes that read or render.
-        squares: squared errors of the last step, as means over the batch [m^2, m^2, rad^2].
+        squares: mean squared errors of the last batch [m^2, m^2, rad^2].
     """
 
     def __init__(self, network: nn.Module, recipe: TrainingRecipe, material: Material) -> None:
@@ -159,7 +161,7 @@ class NetworkTraining(lightning.LightningModule):
         self.squares: Array = np.zeros(len(material.samples.labels.names))
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Return a loader of all batches from the next step to the end of training."""
+        """Return a loader for all batches from the next step to the end of training."""
         share = (self.trainer.global_rank, self.trainer.world_size)
         return batches(
             self.material, self.recipe, self.global_step, self.steps, device=self.device, workers=self.workers, share=share
@@ -168,8 +170,8 @@ class NetworkTraining(lightning.LightningModule):
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Create the optimiser, Adam or AdamW; its learning rate is set before each step."""
         settings = self.recipe.optimiser
-        kind: type[torch.optim.Adam] = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[settings.kind]
-        return kind(self.network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay, fused=True)
+        optimiser_class: type[torch.optim.Adam] = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[settings.kind]
+        return optimiser_class(self.network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay, fused=True)
 
     @property
     def rate(self) -> float:
@@ -195,17 +197,17 @@ class NetworkTraining(lightning.LightningModule):
         output = called(self.network, inputs)
         loss = self.loss(output, labels)
         if not math.isfinite(float(loss.detach())):
-            raise MitsonarError(self._not_finite(batch, float(loss.detach())))
+            raise MitsonarError(self._not_finite_message(batch, float(loss.detach())))
         truth = self.samples.labels.decode(labels.detach().cpu().double().numpy())
         self.squares = ((estimates(output, self.samples.labels) - truth) ** 2).mean(axis=0)
         return loss
 
-    def _not_finite(self, batch: Batch, loss: float) -> str:
+    def _not_finite_message(self, batch: Batch, loss: float) -> str:
         epoch, position = divmod(self.global_step, self.epoch_steps)
         frames = ", ".join(map(str, batch["frames"].tolist()[:16]))
         return (
             f"the loss became {loss} in epoch {epoch + 1}, step {position + 1} of {self.epoch_steps} (step "
-            f"{self.global_step + 1} in all), at learning rate {self.rate:.3g}, on the samples that begin at frames "
+            f"{self.global_step + 1} overall), at learning rate {self.rate:.3g}, on the samples that begin at frames "
             f"{frames}: check them with `mitsonar dataset check`, set a lower optimiser.rate, or optimiser.clip=1; the "
             "last good state is kept"
         )
@@ -225,11 +227,11 @@ def rmse_by_level(
     The network is evaluated in evaluation mode. Its mode is restored afterwards.
 
     Args:
-        network: to be validated.
+        network: network to validate.
         validation: validation samples.
         labels: encoding of the network's output.
         batch: number of samples per batch.
-        device: of the network.
+        device: device of the network.
         context: context manager for the precision of training.
     """
     squares: dict[str, list[Array]] = {level: [] for level in validation.arrangements}
@@ -266,8 +268,8 @@ def squared_error(
     """
     square = (estimates - labels).square()
     if penalty:
-        beyond = (low - estimates).clamp(min=0) + (estimates - high).clamp(min=0)
-        square = square + penalty * beyond.square()
+        excess = (low - estimates).clamp(min=0) + (estimates - high).clamp(min=0)
+        square = square + penalty * excess.square()
     return square.sum() / (2 * square.numel())
 
 
@@ -278,14 +280,14 @@ def create_loss(loss: Loss, labels: Labels) -> Callable[[NetworkOutput, Tensor],
     """
     if loss.kind == "likelihood":
         return _likelihood
-    low, high = (torch.from_numpy(labels.encode(end)) for end in (labels.low, labels.high))
+    low, high = (torch.from_numpy(labels.encode(limit)) for limit in (labels.low, labels.high))
     if loss.bounds is not None:
         low, high = (torch.full_like(low, bound) for bound in loss.bounds)
 
     def regression(estimates: NetworkOutput, target: Tensor) -> Tensor:
         assert isinstance(estimates, Tensor)
-        ends = {"low": low.to(estimates), "high": high.to(estimates)} if loss.penalty else {}
-        return squared_error(estimates, target, penalty=loss.penalty, **ends)
+        limits = {"low": low.to(estimates), "high": high.to(estimates)} if loss.penalty else {}
+        return squared_error(estimates, target, penalty=loss.penalty, **limits)
 
     return regression
 
@@ -299,16 +301,16 @@ def _likelihood(estimates: NetworkOutput, target: Tensor) -> Tensor:
 
 
 STRANGERS = 0.05
-"""Share of pairs whose second frame comes from another pair. Nothing matches there, so the covariance must be large."""
+"""Fraction of pairs whose second frame comes from another pair. These do not match, so their covariance must be large."""
 
 Augmented = tuple[Tensor, Ground, Tensor]
 """Images ``(batch, 2, bins, beams)``, geometry of the ground, and motions ``(batch, 3)`` [m, m, rad]."""
 
 
 def augmented(inputs: tuple[Tensor, Ground], labels: Tensor, kinds: Sequence[str]) -> tuple[tuple[Tensor, Ground], Tensor]:
-    """Augment the inputs and labels of a batch by random changes after which the motion is still known.
+    """Apply random augmentations, after which the motion is still known, to the inputs and labels of a batch.
 
-    The changes are drawn from torch's random generator.
+    Random numbers come from torch's default generator.
 
     Args:
         inputs: images ``(batch, 2, bins, beams)`` and the geometry of the ground.
@@ -324,7 +326,7 @@ def augmented(inputs: tuple[Tensor, Ground], labels: Tensor, kinds: Sequence[str
 
 
 def mirrored(batch: Augmented) -> Augmented:
-    """Exchange port and starboard in half of the pairs.
+    """Swap port and starboard in half of the pairs.
 
     This is valid for sonars without roll whose beams are symmetric about the axis.
     """
@@ -343,7 +345,7 @@ def reversed_(batch: Augmented) -> Augmented:
 
 
 def strange(batch: Augmented) -> Augmented:
-    """Replace the second frame by that of another pair in a share :data:`STRANGERS` of the pairs."""
+    """Replace the second frame by that of another pair in a fraction :data:`STRANGERS` of the pairs."""
     images, ground, labels = batch
     chosen = _random_mask(labels, STRANGERS)
     second = torch.where(chosen[:, None, None], images[:, 1].roll(1, dims=0), images[:, 1])
@@ -358,6 +360,6 @@ AUGMENTATIONS: dict[str, Callable[[Augmented], Augmented]] = {
 """Augmentations of a batch, keyed by name."""
 
 
-def _random_mask(labels: Tensor, part: float) -> Tensor:
+def _random_mask(labels: Tensor, fraction: float) -> Tensor:
     """Draw a mask ``(batch,)`` of the pairs to change."""
-    return torch.rand(len(labels), device=labels.device) < part
+    return torch.rand(len(labels), device=labels.device) < fraction

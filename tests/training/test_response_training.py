@@ -208,7 +208,7 @@ def test_errors_are_told_beside_no_motion(mitsonar: Command, made: Path, run: Pa
 def test_another_instrument_is_refused(made: Path, run: Path, tmp_path: Path) -> None:
     url = tmp_path / "other.zarr"
     make_dataset(impulse_recipe(scenes=[{"count": 1, "sequences": 2}], channel={"carrier_hz": 60e3}), str(url))
-    with pytest.raises(MitsonarError, match="another channel sonar than that of received: carrier_hz differ"):
+    with pytest.raises(MitsonarError, match="a different channel sonar from that of received: carrier_hz differ"):
         evaluate(Checkpoint.load(run), url, part="all")
 
 

@@ -569,7 +569,7 @@ def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
     output = str(caught.value)
     for part in (
         "the loss became nan in epoch 1",
-        f"step {step + 1} of 9 (step {step + 1} in all)",
+        f"step {step + 1} of 9 (step {step + 1} overall)",
         "at learning rate 0.001",
         f" {frame}",
         "lower optimiser.rate",
@@ -778,5 +778,5 @@ def test_a_training_begins_with_the_weights_that_it_is_told(made: Path, whole: P
     learnt = [name for name in stored if "running" not in name and "num_batches" not in name]
     assert all(torch.allclose(again[name], stored[name], atol=1e-9) for name in learnt)
     assert not all(torch.allclose(second[name], stored[name], atol=1e-3) for name in learnt)
-    with pytest.raises(MitsonarError, match="start holds the weights of posenet"):
+    with pytest.raises(MitsonarError, match="start contains the weights of posenet"):
         train(TrainOptions(recipe(**message, network={"name": "sfmnet", "width": 1 / 16}), made, tmp_path / "no"))
