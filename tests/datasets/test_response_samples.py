@@ -398,7 +398,7 @@ def test_estimators_are_compared_on_its_samples(mitsonar: Command, straight: Pat
         expected = 1e3 * np.sqrt(((output - samples.targets()) ** 2).mean(axis=0))
         row = next(row for row in table["rows"] if row["method"] == "correlation")
         np.testing.assert_allclose(row["rmse"][:2], expected, rtol=1e-9)
-    refused(mitsonar("compare", straight, "--part", "all", "--perturb"), "for data sets of images")
+    refused(mitsonar("compare", straight, "--part", "all", "--perturb"), "only to data sets of images")
     refused(mitsonar("odometry", straight, "-o", tmp_path / "path", "--estimator", "correlation"), "of impulse responses")
 
 
