@@ -327,19 +327,19 @@ def test_amphora_mutants_never_end_mitsuba(tmp_path: Path) -> None:
     ("content", "words"),
     [
         (ply(count=4), "lists of vertex_indices must have 3"),
-        (ply(vertices=10**9), "need more bytes than there are"),
-        (ply(faces=10**18), "need more bytes than there are"),
+        (ply(vertices=10**9), "need more bytes than the file has"),
+        (ply(faces=10**18), "need more bytes than the file has"),
         (ply(faces=0), "no triangles"),
         (ply(vertices=3), "bytes"),
         (ply(x=float("nan")), "finite"),
         (ply(x=float("inf")), "finite"),
-        (ply() + b"more", "left over"),
-        (b"ply\n", "no header"),
-        (b"", "no header"),
+        (ply() + b"more", "remain after"),
+        (b"ply\n", "no PLY header"),
+        (b"", "no PLY header"),
         (ply().replace(b"float x", b"float w"), "x, y and z"),
         (ply().replace(b"vertex_indices", b"vertex_indicos"), "vertex_index"),
-        (ply().replace(b"element vertex 4", b"element vertex -4"), "header has the line"),
-        (ply().replace(b"element vertex 4", b"element vertex " + b"4" * 5000), "header has the line"),
+        (ply().replace(b"element vertex 4", b"element vertex -4"), "header has an invalid line"),
+        (ply().replace(b"element vertex 4", b"element vertex " + b"4" * 5000), "header has an invalid line"),
     ],
 )
 def test_a_ply_must_hold_what_it_promises(content: bytes, words: str, tmp_path: Path) -> None:
@@ -357,8 +357,8 @@ def test_other_meshes_must_hold_what_they_promise(tmp_path: Path) -> None:
     corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\n"
     box = np.eye(3)
     files = {
-        "a.obj": (f"{corners}f 1 2 9\n".encode(), "names"),
-        "b.obj": (f"{corners}vt 0 0\nf 1/1 2/1 3/7\n".encode(), "names"),
+        "a.obj": (f"{corners}f 1 2 9\n".encode(), "refers to"),
+        "b.obj": (f"{corners}vt 0 0\nf 1/1 2/1 3/7\n".encode(), "refers to"),
         "c.obj": (f"{corners}f 1 2\n".encode(), "3 corners"),
         "d.obj": (b"v 0 0 nan\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", "finite"),
         "e.serialized": (serialized(box, [[0, 1, 3]]), "refers to vertex 3"),

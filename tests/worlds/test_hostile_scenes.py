@@ -46,7 +46,7 @@ TEXTS = {
     "attributes": (OPEN + "<a " + "x='' " * 200_000 + "y", "malformed"),
     "data": (OPEN + "<![CDATA[" * 100_000, "is not terminated"),
     "depth": (OPEN + "<shape>" * 200, "nests its elements more than 100 levels deep"),
-    "parameters that grow": (grown(10), "longer than 65,536 letters"),
+    "parameters that grow": (grown(10), "longer than 65,536 characters"),
     "many parameters": (SCENE.format("".join(PARAMETER.format(k) for k in range(60_000))), "1,000 parameters"),
     "used too often": (
         SCENE.format("".join(PARAMETER.format(k) for k in range(900)) + '<bsdf type="diffuse" id="$p1"/>' * 20_000),

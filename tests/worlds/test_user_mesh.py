@@ -114,7 +114,7 @@ def test_many_parts_become_one_mesh_with_a_number_each(tmp_path: Path) -> None:
         ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "triangles|cannot read"),
         ("broken.obj", b"v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "not finite|cannot read"),
         ("outside.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "cannot read"),
-        ("flat.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "all in one place|cannot read"),
+        ("flat.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "all coincide|cannot read"),
         ("junk.ply", b"ply\nformat ascii 1.0\nelement vertex 3\nend_header\n", "triangles|cannot read"),
         ("junk.stl", b"solid nothing\nendsolid nothing\n", "triangles|cannot read"),
         ("junk.dae", b"<COLLADA/>", "triangles|cannot read"),
