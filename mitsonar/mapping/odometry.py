@@ -341,7 +341,7 @@ class Odometry:
         rows += _by_axis("RMSE of always answering zero", errors.zero)
         rows += [(f"slope over the true {axis.name}", float(s), "") for axis, s in zip(AXES, errors.slope, strict=True)]
         if np.isfinite(errors.nees):
-            rows.append(("NEES (ideally 1)", errors.nees, ""))
+            rows.append(("NEES", errors.nees, ""))
         return rows + [(name, float(value), unit) for name, value, unit in assess(self.path, self.true).rows()]
 
     def warnings(self) -> list[str]:
