@@ -88,7 +88,7 @@ def test_the_command_line_says_so(mitsonar: Command, tmp_path: Path) -> None:
     small["world"]["size_m"] = 60.0
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(small))
     refused(
-        mitsonar("dataset", "make", tmp_path / "small.yaml", "-o", tmp_path / "y.zarr"), "world.size_m", "is larger than"
+        mitsonar("dataset", "make", tmp_path / "small.yaml", "-o", tmp_path / "y.zarr"), "world.size_m", "is too large for"
     )
 
 

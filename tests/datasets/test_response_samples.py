@@ -399,7 +399,7 @@ def test_estimators_are_compared_on_its_samples(mitsonar: Command, straight: Pat
         row = next(row for row in table["rows"] if row["method"] == "correlation")
         np.testing.assert_allclose(row["rmse"][:2], expected, rtol=1e-9)
     refused(mitsonar("compare", straight, "--part", "all", "--perturb"), "only to data sets of images")
-    refused(mitsonar("odometry", straight, "-o", tmp_path / "path", "--estimator", "correlation"), "of impulse responses")
+    refused(mitsonar("odometry", straight, "-o", tmp_path / "path", "--estimator", "correlation"), "holds impulse responses")
 
 
 # ---------------------------------------------------------------- regressors
