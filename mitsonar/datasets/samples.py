@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, format_snr, load_noise, parse_snr
 from mitsonar.config.data import Recipe, array_names
@@ -289,8 +289,11 @@ class _RawSamples(Dataset[RawSample]):
 GROUND = "ground/"
 """Prefix of the names of ground geometry arrays in a raw sample."""
 
-KEPT_BYTES = 2**28
-"""Largest array of vectors that is cached in memory [bytes]."""
+CACHED_BYTES = 2**31
+"""Largest array that is cached in memory [bytes]; processes that read for one training share it."""
+
+CACHED_FROM = 16
+"""An array is cached once one in so many of its frames has been read."""
 
 
 class ArrangementOptions(TypedDict, total=False):
@@ -512,7 +515,8 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         self.scene, self.sequence = self.chosen.scene, self.chosen.sequence
         self.pose, self.motion = self.chosen.pose, self.chosen.motion
         self._grounds: dict[int, RawSample] = {}
-        self._vectors: dict[str, Values] = {}
+        self._cached: dict[str, Values] = {}
+        self._read_frames: dict[str, int] = {}
 
     def __repr__(self) -> str:
         return (
@@ -559,17 +563,21 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         return sample
 
     def _read(self, name: str, here: slice) -> Values:
-        """Read frames of an array; vectors are small and cached, because reading each one costs more than training on it."""
-        levels = int(np.prod(self.store.modality.stored[name].shape))
-        if self.stored_kind != "vector" or 4 * levels * len(self.sequence) > KEPT_BYTES:
-            return self.store.read(name, here)
-        if name not in self._vectors:
-            self._vectors[name] = self.store.read(name)
-        return self._vectors[name][here]
+        """Read frames of an array, from memory once enough of them have been read: reading a frame from disk takes 0.8 ms."""
+        if name not in self._cached:
+            length = int(np.prod(self.store.modality.stored[name].shape)) * self.store.array(name).dtype.itemsize
+            worker = get_worker_info()
+            if length * len(self.sequence) > CACHED_BYTES // (worker.num_workers if worker else 1):
+                return self.store.read(name, here)
+            self._read_frames[name] = self._read_frames.get(name, 0) + here.stop - here.start
+            if CACHED_FROM * self._read_frames[name] < len(self.sequence):
+                return self.store.read(name, here)
+            self._cached[name] = self.store.read(name)
+        return self._cached[name][here]
 
     def __getstate__(self) -> Fields:
         """Return the state without cached arrays, because other processes read them themselves."""
-        return {**vars(self), "_vectors": {}}
+        return {**vars(self), "_cached": {}}
 
     def sonar_frames(self, index: int, image: Values | None = None) -> SonarFrames:
         """Read a sample of one view as :class:`SonarFrames` with noise, poses and heights, the input of estimators.

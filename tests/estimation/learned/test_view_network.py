@@ -118,14 +118,17 @@ def test_vectors_alone_lie_in_few_files(portions: Path) -> None:
     assert about["shard_frames"] == 8 * 5  # a scene
 
 
-def test_vectors_are_read_once(portions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_read_once(portions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And come out of memory as they lie on disk; other processes read for themselves."""
     pairs = SonarPairs(portions, part="all", views=["c3"])
-    once = pairs[4][0]
-    assert set(pairs._vectors) == {"vector_c3", "nonzero_c3"}
-    assert pickle.loads(pickle.dumps(pairs))._vectors == {}
-    monkeypatch.setattr("mitsonar.datasets.samples.KEPT_BYTES", 0)
-    torch.testing.assert_close(SonarPairs(portions, part="all", views=["c3"])[4][0], once, rtol=0, atol=0)
+    once, again = [[pairs[k][0] for k in (4, 5, 6)] for _ in range(2)]
+    assert set(pairs._cached) == {"vector_c3", "nonzero_c3"}
+    assert pickle.loads(pickle.dumps(pairs))._cached == {}
+    monkeypatch.setattr("mitsonar.datasets.samples.CACHED_BYTES", 0)
+    uncached = SonarPairs(portions, part="all", views=["c3"])
+    for k, cached in enumerate(zip(once, again, strict=True), 4):
+        torch.testing.assert_close(cached, (uncached[k][0],) * 2, rtol=0, atol=0)
+    assert not uncached._cached
 
 
 # ---------------------------------------------------------------- the network
