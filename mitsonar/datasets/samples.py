@@ -563,7 +563,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         return sample
 
     def _read(self, name: str, here: slice) -> Values:
-        """Read frames of an array, from memory once enough of them have been read: reading a frame from disk takes 0.8 ms."""
+        """Read frames of an array, from memory once enough of them have been read: a read from disk takes 0.8 ms."""
         if name not in self._cached:
             length = int(np.prod(self.store.modality.stored[name].shape)) * self.store.array(name).dtype.itemsize
             worker = get_worker_info()
