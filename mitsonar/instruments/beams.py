@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["SHADINGS", "Aperture", "Pattern", "Pulse", "Shading", "half_power", "series", "shaded_sinc"]
+__all__ = ["SHADINGS", "Aperture", "Pattern", "Pulse", "Shading", "Spectrum", "half_power", "series", "shaded_sinc"]
 
 
 Shading = Literal["uniform", "hann", "hamming", "taylor"]
@@ -27,8 +27,30 @@ SHADINGS: tuple[str, ...] = get_args(Shading)
 TAYLOR_LOBES, TAYLOR_DB = 4, 30.0
 """Parameters of the Taylor shading: three side lobes next to the main lobe, at about -30 dB."""
 
-FOCUS_PARTS = 257
-"""Number of elements that sample an aperture out of focus."""
+ELEMENTS, ELEMENTS_A_WAVELENGTH = 257, 8
+"""Number of elements that sample an aperture or a band, at least, and per wavelength."""
+
+
+class Spectrum(NamedTuple):
+    """Amplitudes of the waves that add up to a pattern or pulse: the sum of weight exp(2 j pi frequency x) at an offset x.
+
+    Attributes:
+        frequency: evenly spaced ``(n,)``, in the inverse unit of the offset.
+        weight: complex amplitudes ``(n,)``.
+    """
+
+    frequency: NDArray[np.float64]
+    weight: NDArray[np.complex128]
+
+    def at(self, offset: ArrayLike) -> NDArray[np.complex128]:
+        """Return the sum at some offsets, of the same shape."""
+        return np.asarray(np.exp(2j * math.pi * np.asarray(offset, dtype=float)[..., None] * self.frequency) @ self.weight)
+
+
+def _shaded(x: NDArray[np.float64], coefficients: tuple[float, ...]) -> NDArray[np.complex128]:
+    """Return a cosine series at places -0.5..0.5 ``(n,)``, such that its sum is 1."""
+    waves = [part * 2 * np.cos(2 * math.pi * m * x) for m, part in enumerate(coefficients, 1)]
+    return np.asarray((1 + sum(waves, np.zeros(len(x)))) / len(x), dtype=np.complex128)
 
 
 @cache
@@ -103,28 +125,24 @@ class Aperture:
         one_way = shaded_sinc(np.asarray(u, dtype=float) * self.length, series(self.shading))
         return one_way * one_way if self.two_way else one_way
 
-    def defocused(self, u: ArrayLike, curvature: float, wavelength: float) -> NDArray[np.complex128]:
-        """Return the complex pattern of an aperture focused at another range, in the Fresnel approximation.
+    def spectrum(self, bend: float = 0.0) -> Spectrum:
+        """Return the amplitudes along the aperture that give the pattern, in the Fresnel approximation out of focus.
 
         Args:
-            u: sine of the angle from the axis ``(...)``.
-            curvature: 1 / range - 1 / focal range [1/m].
-            wavelength: wavelength [m].
+            bend: wavelength times (1 / range - 1 / focal range); 0 in focus.
 
         Returns:
-            Amplitude ``(...)``; equal to the pattern for a curvature of 0.
+            Positions along the aperture [wavelengths] and amplitudes ``(n,)``. Those of a two-way pattern are the
+            convolution of the aperture with itself.
         """
-        x = (np.arange(FOCUS_PARTS) + 0.5) / FOCUS_PARTS - 0.5  # position along the aperture, relative to its length
-        # Shading as a cosine series.
-        weight = np.full(FOCUS_PARTS, 1 / FOCUS_PARTS)
-        for m, part in enumerate(series(self.shading), 1):
-            weight = weight + 2 * part / FOCUS_PARTS * np.cos(2 * math.pi * m * x)
-        # Quadratic phase of the wavefront curvature, then the sum over the elements in each direction.
-        bend = math.pi * (self.length * x) ** 2 * wavelength * curvature
-        u = np.asarray(u, dtype=float)
-        steer = np.exp(-2j * math.pi * self.length * u[..., None] * x)
-        one_way = (steer * (weight * np.exp(-1j * bend))).sum(axis=-1)
-        return np.asarray(one_way * one_way if self.two_way else one_way, dtype=np.complex128)
+        # 1. Shading as a cosine series, and the quadratic phase of the wavefront's curvature.
+        size = max(ELEMENTS, math.ceil(ELEMENTS_A_WAVELENGTH * self.length))
+        x = (np.arange(size) + 0.5) / size - 0.5  # position along the aperture, relative to its length
+        weight = _shaded(x, series(self.shading)) * np.exp(-1j * math.pi * (self.length * x) ** 2 * bend)
+        # 2. Out and back: the pattern is squared.
+        if not self.two_way:
+            return Spectrum(self.length * x, weight)
+        return Spectrum(2 * self.length * np.linspace(x[0], x[-1], 2 * size - 1), np.convolve(weight, weight))
 
     @cached_property
     def equivalent_width(self) -> float:
@@ -167,9 +185,19 @@ class Pulse:
         """Return the bandwidth that the pulse occupies [Hz], the inverse of :meth:`of_band`."""
         return half_power(HANN, 2) * sound_speed / self.resolution_m
 
+    @property
+    def lobes_per_m(self) -> float:
+        """Return the bandwidth as waves per metre of range; its inverse is the spacing of the pulse's zeros [1/m]."""
+        return 2 * half_power(HANN, 2) / self.resolution_m
+
     def shape(self, r: ArrayLike) -> NDArray[np.float64]:
         """Return the amplitude at a range offset ``r`` [m] from the echo, of the same shape; 1 at 0."""
-        return shaded_sinc(np.asarray(r, dtype=float) * (2 * half_power(HANN, 2) / self.resolution_m), HANN)
+        return shaded_sinc(np.asarray(r, dtype=float) * self.lobes_per_m, HANN)
+
+    def spectrum(self) -> Spectrum:
+        """Return the waves over range [1/m] that add up to the pulse, and their amplitudes."""
+        x = (np.arange(ELEMENTS) + 0.5) / ELEMENTS - 0.5
+        return Spectrum(self.lobes_per_m * x, _shaded(x, HANN))
 
     @cached_property
     def equivalent_m(self) -> float:

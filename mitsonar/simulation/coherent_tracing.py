@@ -3,7 +3,7 @@
 The field is a function of the sine of the bearing and the range. Each ray visits the lattice cells
 (:mod:`mitsonar.simulation.points`) within its cell of the surface. A point counts if its direction lies in the cell of
 that ray, so on a plane each point counts exactly once, for any set of rays. Its echo is zeta sqrt(C cos^2 dA) / R^2, times
-the pattern over elevation and exp(-2 j k R). Sums are 64-bit fixed point.
+the pattern over elevation and exp(-2 j k R). Sums are fixed point, so they do not depend on the order of the points.
 """
 
 from __future__ import annotations
@@ -22,23 +22,28 @@ from mitsonar.acoustics.speckle import BLENDED_VARIANCE, patch_amplitudes
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit
-from mitsonar.simulation.beams import BeamFormer, CommonFan, elevation_gain
+from mitsonar.simulation.beams import BeamFormer, CommonFan, elevation_gain, kernel_weights
 from mitsonar.simulation.device import DeviceArray, Frozen, replayed
 from mitsonar.simulation.mirrors import Mirrors, without_mirror_part
 from mitsonar.simulation.moving import SceneMotion, scene_at
 from mitsonar.simulation.points import LEAST_COSINE, HashedPoints, Point, pick
 from mitsonar.simulation.tracing import MovingSurfaces, surfaces_of
 
-__all__ = ["STRIP", "CoherentTracer", "FanRays", "FieldCounts", "add_waves", "elevation_gain"]
+__all__ = ["STRIP", "CoherentTracer", "FanRays", "FieldCounts", "FieldSums", "elevation_gain"]
 
-ADD = dr.ReduceMode.Local
-"""Mode of the scatter-additions; Dr.Jit's default assumes an unchanged number of threads when a launch is replayed."""
+ADD = dr.ReduceMode.Direct
+"""Mode of the scatter-additions: half the time of ``Local`` here. Dr.Jit's default assumes an unchanged number of threads
+when a launch is replayed."""
 
 STRIP = 8
 """Columns of a strip of rays, so that rays traced together are neighbours."""
 
+LARGEST_SUM = 2.0**14
+"""Largest sum at a node, as a multiple of the amplitude of one point that reflects everything. The sum of n points with
+random phases exceeds 6 sqrt(n) with a probability of 1e-15, and a resolution cell holds a few thousand at most."""
+
 MOST_IN_A_CELL = 2.0**16
-"""Number of points that one cell of the grid can hold without overflow."""
+"""Number of points in phase that one node can hold in 64-bit sums."""
 
 LARGEST_WEIGHT = 4.2
 """Largest amplitude of a weight: the square root of -log 2^-25."""
@@ -106,10 +111,10 @@ class CoherentTracer:
         self.pitch = point_pitch(sonar)
         table = patch_amplitudes(None if sonar.speckle_nu is None else BLENDED_VARIANCE * sonar.speckle_nu)
         self.patch_entries, self.patches = len(table), mi.Float(np.resize(table, max(2, len(table))))
-        # fixed point: scale such that no cell of the grid overflows
+        self.sums = FieldSums(former, LARGEST_SUM * float(table.max()) * self.pitch, packed=True)
+        # bound on the field of points that add up in phase, which other paths use
         nearest = max(former.first_range, sonar.bin_m)
-        loudest = LARGEST_WEIGHT * float(table.max()) * self.pitch / nearest**2
-        self.bits = 62 - math.ceil(math.log2(loudest * MOST_IN_A_CELL))
+        self.loudest = LARGEST_WEIGHT * float(table.max()) * self.pitch / nearest**2 * MOST_IN_A_CELL
         self.index = dr.arange(mi.UInt32, self.fan.rays)
         dr.make_opaque(self.index)
         dr.eval(self.patches)
@@ -117,7 +122,7 @@ class CoherentTracer:
         self.launch = self._compile()
 
     def field(self, pose: NDArray[np.float64], time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
-        """Return the field ``(sines, ranges)`` of one ping at a pose ``(6,)`` [m, rad] and a time [s], and its counts."""
+        """Return the field ``(ranges, sines)`` of one ping at a pose ``(6,)`` [m, rad] and a time [s], and its counts."""
         scene = scene_at(self.scene, self.motion, time_s)
         lines = to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64)
         if self.motion is not None:
@@ -125,9 +130,8 @@ class CoherentTracer:
         rows = mi.Float64(lines.ravel().tolist())
         inputs = self.index, scene, rows, self.surfaces.arrays(), self.patches, self.mirrors
         real, imag, counts = replayed(self.launch, *inputs)
-        shape = self.former.sines, self.former.ranges
-        field = np.empty(shape, np.complex64)
-        field.real, field.imag = (np.array(part, copy=False).reshape(shape) for part in (real, imag))
+        field = np.zeros((self.former.ranges, self.former.sines), np.complex64)
+        self.sums.add_to(field, (real, imag))
         return field, FieldCounts(*map(int, np.array(counts)))
 
     def _compile(self) -> Callable[..., Any]:
@@ -153,7 +157,7 @@ class CoherentTracer:
         return launch
 
     def _sums(self, rays: FanRays, hit: Hit, patches: mi.Float) -> tuple[Any, ...]:
-        """Sum the points of all rays; return real and imaginary part ``(sines * ranges,)``, and the counts."""
+        """Sum the points of all rays; return real and imaginary part ``(ranges * sines,)``, and the counts."""
         # 1. Select the rays whose cell on the surface may contribute to the grid.
         former = self.former
         place: DeviceArray = rays.origin + rays.d * hit.t
@@ -168,19 +172,19 @@ class CoherentTracer:
             patch=self.sonar.speckle_patch_m,
             seed=self.sonar.seed,
         )
-        real, imag = (dr.zeros(mi.UInt64, former.sines * former.ranges) for _ in range(2))
+        sums = self.sums.zeros()
         counts = dr.zeros(mi.UInt32, len(COUNTED))
         self._count(counts, rays, hit, points)
 
         # 3. Visit the cells of each ray in turn and deposit their points; rays end their loop independently.
         def step(number: mi.Int32) -> tuple[mi.Int32]:
-            self._deposit(rays, points, number, patches, (real, imag), counts)
+            self._deposit(rays, points, number, patches, sums, counts)
             return (number + 1,)
 
         begin = mi.Int32(0) + dr.zeros(mi.Int32, self.fan.rays)
         dr.while_loop((begin,), lambda number: number < points.count, step)
-        dr.eval(real, imag, counts)
-        return *(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in (real, imag)), counts
+        dr.eval(sums, counts)
+        return *self.sums.values(sums), counts
 
     def _count(self, counts: mi.UInt32, rays: FanRays, hit: Hit, points: HashedPoints) -> None:
         """Count the outcomes of the rays in the field of view; rays beside it only carry side lobes and skirts."""
@@ -197,10 +201,10 @@ class CoherentTracer:
         points: HashedPoints,
         number: mi.Int32,
         patches: mi.Float,
-        sums: tuple[mi.UInt64, mi.UInt64],
+        sums: list[mi.UInt64],
         counts: mi.UInt32,
     ) -> None:
-        """Add one point of each ray to the four cells of the grid around it."""
+        """Add one point of each ray to the nodes of the grid around it."""
         # 1. Position and weight of the point, and how the sonar sees it.
         point = points.point(number, patches, self.patch_entries)
         seen = rays.seen(points, point)
@@ -212,40 +216,82 @@ class CoherentTracer:
         level = level * elevation_gain(self.sonar, seen.tangent)
         # 4. Deposit, if the point lies in the cell of this ray.
         wave = seen.sine, seen.range_m, level, cos, sin
-        deposited = add_waves(self.former, self.bits, sums, wave, seen.in_cell & (number < points.count))
+        deposited = self.sums.add(sums, wave, seen.in_cell & (number < points.count))
         dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(COUNTED.index("points")), deposited, mode=ADD)
 
 
-def add_waves(
-    former: BeamFormer, bits: int, sums: tuple[mi.UInt64, mi.UInt64], wave: tuple[DeviceArray, ...], active: DeviceArray
-) -> DeviceArray:
-    """Add waves to the four cells of the grid around each, in fixed point; return which waves lie on the grid.
+class FieldSums:
+    """Sums of waves at the nodes of a beam former's grid, in fixed point.
+
+    Packed sums hold real and imaginary part in the halves of one 64-bit number, times the square of the range of the node:
+    that takes half as many additions, which are most of the time of a ping.
 
     Args:
         former: beam former, which defines the grid.
-        bits: number of fraction bits.
-        sums: real and imaginary part ``(sines * ranges,)``.
-        wave: sine of the bearing, range [m], amplitude, cosine and sine of the phase.
-        active: which waves to add.
+        largest: bound on the sum at a node; packed: times the square of its range.
+        packed: whether the sums are packed.
     """
-    # 1. Grid coordinates, and the lower of the two lines and ranges around each wave.
-    sine, range_m, level, cos, sin = wave
-    at_sine = (sine - former.first_sine) * (1 / former.sine_step)
-    at_range = mi.Float(range_m - former.first_range) * (1 / former.range_step)
-    line, cell = dr.floor(at_sine), dr.floor(at_range)
-    inside = active & (cell >= 0) & (cell < former.ranges - 1)
-    inside &= (line >= 0) & (line < former.sines - 1)
-    begin = mi.UInt32(dr.select(inside, line, 0)) * former.ranges + mi.UInt32(dr.select(inside, cell, 0))
-    # 2. Bilinear deposit; integer additions do not depend on the order of the rays.
-    part = at_sine - line, at_range - cell
-    for over_sine in (0, 1):
-        for over_range in (0, 1):
-            share = (part[0] if over_sine else 1 - part[0]) * (part[1] if over_range else 1 - part[1])
-            for total, turned in zip(sums, (cos, sin), strict=True):
-                value = mi.UInt64(mi.Int64(mi.Float64(level * share * turned) * 2.0**bits))
-                where = begin + over_sine * former.ranges + over_range
-                dr.scatter_reduce(dr.ReduceOp.Add, total, value, where, inside, mode=ADD)
-    return inside
+
+    def __init__(self, former: BeamFormer, largest: float, *, packed: bool = False) -> None:
+        self.former, self.packed = former, packed
+        self.bits = (31 if packed else 62) - math.ceil(math.log2(largest))
+
+    def zeros(self) -> list[mi.UInt64]:
+        """Return the sums of no wave, which :meth:`add` changes in place."""
+        return [dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(1 if self.packed else 2)]
+
+    def add(self, sums: list[mi.UInt64], wave: tuple[DeviceArray, ...], active: DeviceArray) -> DeviceArray:
+        """Add waves to the six nodes around each; return which waves lie on the grid.
+
+        Args:
+            sums: from :meth:`zeros`.
+            wave: sine of the bearing, range [m], amplitude, cosine and sine of the phase.
+            active: which waves to add.
+        """
+        # 1. Grid coordinates, the lower of both lines around each wave, and the nearest range.
+        former = self.former
+        sine, range_m, level, cos, sin = wave
+        at_sine = (sine - former.first_sine) * (1 / former.sine_step)
+        at_range = mi.Float(range_m - former.first_range) * (1 / former.range_step)
+        line, row = dr.floor(at_sine), dr.round(at_range)
+        inside = active & (row >= 1) & (row < former.ranges - 1) & (line >= 0) & (line < former.sines - 1)
+        node = mi.UInt32(dr.select(inside, row - 1, 0)) * former.sines + mi.UInt32(dr.select(inside, line, 0))
+        # 2. Amplitudes at three ranges, in units of the fixed point.
+        amplitude = [level * 2.0**self.bits * share for share in kernel_weights(at_range - row)]
+        if self.packed:
+            first = row * former.range_step + (former.first_range - former.range_step)
+            amplitude = [one * dr.square(first + k * former.range_step) for k, one in enumerate(amplitude)]
+        # 3. Linear shares of both lines; sums of integers do not depend on the order of the waves.
+        part = at_sine - line
+        for k, one in enumerate(amplitude):
+            for next_line, share in enumerate((1 - part, part)):
+                where = node + (k * former.sines + next_line)
+                for total, value in zip(sums, self._fixed(one * share * cos, one * share * sin), strict=True):
+                    dr.scatter_reduce(dr.ReduceOp.Add, total, value, where, inside, mode=ADD)
+        return inside
+
+    def _fixed(self, real: DeviceArray, imag: DeviceArray) -> list[mi.UInt64]:
+        if not self.packed:
+            return [mi.UInt64(mi.Int64(mi.Float64(part))) for part in (real, imag)]
+        high, low = (mi.Int64(mi.Int32(dr.round(part))) for part in (real, imag))
+        return [mi.UInt64((high << 32) + low)]
+
+    def values(self, sums: list[mi.UInt64]) -> tuple[mi.Float, mi.Float]:
+        """Return real and imaginary part of the sums ``(ranges * sines,)``, for :meth:`add_to`."""
+        if not self.packed:
+            real, imag = (mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in sums)
+            return real, imag
+        low = mi.Int32(mi.UInt32(sums[0] & mi.UInt64(0xFFFFFFFF)))
+        high = mi.Int32((mi.Int64(sums[0]) - mi.Int64(low)) >> 32)
+        return mi.Float(high) * 2.0**-self.bits, mi.Float(low) * 2.0**-self.bits
+
+    def add_to(self, field: NDArray[np.complex64], values: tuple[mi.Float, mi.Float]) -> None:
+        """Add :meth:`values` to a field ``(ranges, sines)``, in place."""
+        former = self.former
+        range_m = former.first_range + np.arange(former.ranges) * former.range_step
+        spreading = (range_m**-2 if self.packed else np.ones(former.ranges)).astype(np.float32)[:, None]
+        field.real += np.array(values[0], copy=False).reshape(field.shape) * spreading
+        field.imag += np.array(values[1], copy=False).reshape(field.shape) * spreading
 
 
 @dataclass

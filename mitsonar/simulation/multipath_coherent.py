@@ -42,7 +42,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.simulation.beams import BeamFormer, CommonFan, elevation_gain_of_ends
-from mitsonar.simulation.coherent_tracing import STRIP, CoherentTracer, FanRays, add_waves, elevation_gain
+from mitsonar.simulation.coherent_tracing import STRIP, CoherentTracer, FanRays, FieldSums, elevation_gain
 from mitsonar.simulation.device import DeviceArray, Frozen, padded, replayed
 from mitsonar.simulation.mirrors import Mirrors, SecondMirrors, parts_at, smooth_share, without_mirror_part
 from mitsonar.simulation.moving import SceneMotion, scene_at
@@ -119,7 +119,7 @@ class MirrorTracer:
         self.last = former.first_range + (former.ranges - 1) * former.range_step
         # fixed point: the amplitudes in a cell of the grid sum to less than k / pi times its solid angle, at most twice this
         loudest = 16 / self.wavelength * former.sine_step * self.fan.tangent
-        self.bits = 61 - math.ceil(math.log2(max(loudest, 1.0)))
+        self.sums = FieldSums(former, 2 * max(loudest, 1.0))
         self.index = dr.arange(mi.UInt32, self.fan.rays)
         dr.make_opaque(self.index)
         dr.eval(self.table)
@@ -127,8 +127,8 @@ class MirrorTracer:
         self.warned = False
 
     def field(self, pose: NDArray[np.float64]) -> NDArray[np.complex64]:
-        """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad]; see :meth:`add`."""
-        field = np.zeros((self.former.sines, self.former.ranges), np.complex64)
+        """Return the field of one ping ``(ranges, sines)`` at a pose ``(6,)`` [m, rad]; see :meth:`add`."""
+        field = np.zeros((self.former.ranges, self.former.sines), np.complex64)
         self.add(pose, field)
         return field
 
@@ -137,7 +137,7 @@ class MirrorTracer:
 
         Args:
             pose: pose of the sonar ``(6,)`` [m, rad].
-            field: field on the grid ``(sines, ranges)``.
+            field: field on the grid ``(ranges, sines)``.
             time_s: time that determines the poses of moving bodies [s].
 
         Warns:
@@ -152,9 +152,8 @@ class MirrorTracer:
         parts = self._parts(np.abs(desired[cell]))
         self._warn_if_coarse(desired[cell], parts)
         inputs = tuple(mi.UInt32(padded(part)) for part in _expanded(cell, parts))
-        real, imag = replayed(self.launch, inputs, scene, rows, self.surfaces.arrays(), self.table)
-        field.real += np.array(real, copy=False).reshape(field.shape)
-        field.imag += np.array(imag, copy=False).reshape(field.shape)
+        values = replayed(self.launch, inputs, scene, rows, self.surfaces.arrays(), self.table)
+        self.sums.add_to(field, values)
 
     def _parts(self, desired: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return the number of parts of cells in each direction: powers of two, reduced if there are too many rays."""
@@ -257,16 +256,14 @@ class MirrorTracer:
         @Frozen
         def launch(inputs: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
             rays = FinerRays(self.fan, self.sonar, inputs, rows_of(rows))
-            sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))
-            self._sum(scene, tables, rays, table, (sums[0], sums[1]))
+            sums = self.sums.zeros()
+            self._sum(scene, tables, rays, table, sums)
             dr.eval(sums)
-            return tuple(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in sums)
+            return self.sums.values(sums)
 
         return launch
 
-    def _sum(
-        self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]
-    ) -> None:
+    def _sum(self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: list[mi.UInt64]) -> None:
         """Add the echo of each ray's cell to the grid."""
         # 1. trace, and look up the mirror part
         hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
@@ -284,7 +281,7 @@ class MirrorTracer:
         turns = range_m * (2 / self.wavelength)
         sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + 0.25) * (2 * math.pi))
         wave = rays.sine, range_m, level, cos, sin
-        add_waves(self.former, self.bits, sums, wave, hit.valid & (reflection != 0) & (cosine > LAST))
+        self.sums.add(sums, wave, hit.valid & (reflection != 0) & (cosine > LAST))
 
 
 class FinerRays(FanRays):
@@ -403,19 +400,17 @@ class GhostTracer:
         self.last = self.former.first_range + (self.former.ranges - 1) * self.former.range_step
         self.second = SecondMirrors.from_scene(tracer.scene, mirrors, self.wavenumber) if self.sonar.bounces > 2 else None
         more = 0 if self.second is None else len(self.second.mirrors)
-        self.bits = tracer.bits - math.ceil(math.log2(PATHS + more))
+        self.sums = FieldSums(self.former, tracer.loudest * (PATHS + more))
         self.launch = self._compile()
 
     def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64], time_s: float = 0.0) -> None:
-        """Add the ghosts of one ping to its field ``(sines, ranges)``, in place, at a pose ``(6,)`` and a time [s]."""
+        """Add the ghosts of one ping to its field ``(ranges, sines)``, in place, at a pose ``(6,)`` and a time [s]."""
         direct = self.direct
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
         scene = scene_at(direct.scene, direct.motion, time_s)
         bodies = None if direct.motion is None else mi.Float64(direct.motion.body_lines(time_s).ravel().tolist())
         inputs = direct.index, scene, rows, direct.surfaces.arrays(), direct.patches, direct.mirrors, bodies
-        real, imag = replayed(self.launch, *inputs)
-        field.real += np.array(real, copy=False).reshape(field.shape)
-        field.imag += np.array(imag, copy=False).reshape(field.shape)
+        self.sums.add_to(field, replayed(self.launch, *inputs))
 
     def _compile(self) -> Callable[..., Any]:
         @Frozen
@@ -426,16 +421,16 @@ class GhostTracer:
             surfaces = replace(self.direct.surfaces, **tables)
             hit = surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d))
             mirrored = MirroredRays(rays, hit, mi.Float(1), mi.UInt32(0))
-            sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))
+            sums = self.sums.zeros()
             # 2. follow them from mirror to mirror, and sum the points that they meet
             for number in range(2, self.sonar.bounces + 1):
                 first = rays.origin + rays.d * mirrored.hit.t, mirrored.hit.n
                 mirrored = mirrored_on(scene, surfaces, mirrored, mirrors, self.wavenumber)
                 retro = number == 2 and self.sonar.bounces > 2
                 only_mirror = first if retro else None
-                self._sum(scene, rays, mirrored, mirrors, patches, (sums[0], sums[1]), first=only_mirror, bodies=bodies)
+                self._sum(scene, rays, mirrored, mirrors, patches, sums, first=only_mirror, bodies=bodies)
             dr.eval(sums)
-            return tuple(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in sums)
+            return self.sums.values(sums)
 
         return launch
 
@@ -446,7 +441,7 @@ class GhostTracer:
         mirrored: MirroredRays,
         mirrors: mi.Float,
         patches: mi.Float,
-        sums: tuple[mi.UInt64, mi.UInt64],
+        sums: list[mi.UInt64],
         *,
         first: tuple[DeviceArray, DeviceArray] | None,
         bodies: mi.Float64 | None,
@@ -522,7 +517,7 @@ class GhostTracer:
         views: tuple[FanRays, MirroredRays],
         points: HashedPoints,
         point: Point,
-        sums: tuple[mi.UInt64, mi.UInt64],
+        sums: list[mi.UInt64],
         active: tuple[DeviceArray, DeviceArray | None],
     ) -> None:
         """Add the paths of one point of each ray to the grid."""
@@ -561,7 +556,7 @@ class GhostTracer:
         path: tuple[MirroredRays, FanRays, DeviceArray],
         points: HashedPoints,
         point: Point,
-        sums: tuple[mi.UInt64, mi.UInt64],
+        sums: list[mi.UInt64],
         active: DeviceArray,
     ) -> None:
         """Add the path of one point of each ray that returns via another mirror; its reverse belongs to another ray."""
@@ -590,7 +585,7 @@ class GhostTracer:
 
     def _add(
         self,
-        sums: tuple[mi.UInt64, mi.UInt64],
+        sums: list[mi.UInt64],
         sine: DeviceArray,
         level: DeviceArray,
         wave: tuple[DeviceArray, ...],
@@ -598,7 +593,7 @@ class GhostTracer:
     ) -> None:
         """Add waves to the grid; ``wave`` holds half the path, and cosine and sine of the phase."""
         half, cos, sin = wave
-        add_waves(self.former, self.bits, sums, (sine, half, level, cos, sin), active)
+        self.sums.add(sums, (sine, half, level, cos, sin), active)
 
 
 def _any_of(returns: list[tuple[FanRays, DeviceArray, DeviceArray]]) -> DeviceArray:
@@ -773,16 +768,12 @@ class CornerTracer(MirrorTracer):
 
     # ---------------- Second launch: sum over the finer rays
 
-    def _sum(
-        self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]
-    ) -> None:
+    def _sum(self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: list[mi.UInt64]) -> None:
         """Add the echo of each ray's cell to the grid."""
         for mirrored, last in self._chains(scene, tables, rays, table):
             self._add_last(rays, mirrored, last, sums)
 
-    def _add_last(
-        self, rays: FinerRays, mirrored: MirroredRays, last: LastMirror, sums: tuple[mi.UInt64, mi.UInt64]
-    ) -> None:
+    def _add_last(self, rays: FinerRays, mirrored: MirroredRays, last: LastMirror, sums: list[mi.UInt64]) -> None:
         """Add what the last mirror sends back to the grid."""
         # 1. magnitude of the integral over the cell, see the class's docstring
         hit, d = mirrored.hit, mirrored.rays.d
@@ -804,4 +795,4 @@ class CornerTracer(MirrorTracer):
         turns = half * (2 / self.wavelength)
         sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + 0.25) * (2 * math.pi))
         valid = last.reflects_back & ahead & (steep + back < 2 * MOST_STRETCH * steep)
-        add_waves(self.former, self.bits, sums, (sine, half, level, cos, sin), valid)
+        self.sums.add(sums, (sine, half, level, cos, sin), valid)

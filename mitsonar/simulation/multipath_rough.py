@@ -21,7 +21,7 @@ from scipy.ndimage import uniform_filter
 from mitsonar.acoustics.noise import uniform
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit, Surfaces
-from mitsonar.simulation.beams import RANGES_A_PULSE, SINES_A_LOBE, elevation_gain_of_ends
+from mitsonar.simulation.beams import elevation_gain_of_ends
 from mitsonar.simulation.coherent_tracing import ADD, CoherentTracer, FanRays
 from mitsonar.simulation.device import DeviceArray, Frozen, replayed
 from mitsonar.simulation.mirrors import SecondMirrors, parts_at, smooth_share, without_mirror_part
@@ -283,6 +283,9 @@ def at_most_one(reflectivity: DeviceArray) -> DeviceArray:
 GRAIN = 0x64696666
 """Key that separates the speckle of these paths from noise and volume."""
 
+LINES_A_CELL = 3
+"""Grid lines in a coarse cell, in sine and in range: about as much as beam and pulse resolve."""
+
 SMOOTHED = 3
 """Number of coarse cells in each direction over which the energies of single rays are spread."""
 
@@ -303,7 +306,7 @@ class DiffuseField:
         former = tracer.former
         self.wavenumber = 2 * math.pi / tracer.wavelength
         self.nearest = max(former.first_range, tracer.sonar.bin_m)
-        self.shape = -(-former.sines // SINES_A_LOBE), -(-former.ranges // RANGES_A_PULSE)
+        self.shape = -(-former.ranges // LINES_A_CELL), -(-former.sines // LINES_A_CELL)
         fan = tracer.fan
         cell = 4 * fan.sine * fan.tangent / fan.rays
         loudest = MOST_OF_A_RAY * cell / self.nearest**2
@@ -311,14 +314,14 @@ class DiffuseField:
         self.launch = self._compile()
 
     def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64], time_s: float = 0.0) -> None:
-        """Add these paths of one ping to its field ``(sines, ranges)``, in place, at a pose ``(6,)`` and a time [s]."""
+        """Add these paths of one ping to its field ``(ranges, sines)``, in place, at a pose ``(6,)`` and a time [s]."""
         energy = self.energy(pose, time_s)
         if not energy.any():
             return
         smooth = uniform_filter(energy, SMOOTHED, mode="nearest")
-        nodes = SINES_A_LOBE * RANGES_A_PULSE
-        amplitude = np.sqrt(np.maximum(smooth, 0) * (self.former.preserved_power / nodes)).astype(np.float32)
-        grain = self._grain.reshape(self.shape[0], SINES_A_LOBE, self.shape[1], RANGES_A_PULSE)
+        nodes = LINES_A_CELL**2
+        amplitude = np.sqrt(np.maximum(smooth, 0) * (self.former.node_power / nodes)).astype(np.float32)
+        grain = self._grain.reshape(self.shape[0], LINES_A_CELL, self.shape[1], LINES_A_CELL)
         speckle = (grain * amplitude[:, None, :, None]).reshape(self._grain.shape)
         field += speckle[: field.shape[0], : field.shape[1]]
 
@@ -333,7 +336,7 @@ class DiffuseField:
     @cached_property
     def _grain(self) -> NDArray[np.complex64]:
         """Return complex Gaussian numbers with mean power 1 on all nodes of the coarse cells."""
-        shape = 1, self.shape[0] * SINES_A_LOBE, self.shape[1] * RANGES_A_PULSE
+        shape = 1, self.shape[0] * LINES_A_CELL, self.shape[1] * LINES_A_CELL
         first, second = uniform(shape, seed=self.sonar.seed ^ GRAIN, frames=np.array([0]), like=np.empty(0))
         return np.asarray(np.sqrt(-np.log(first[0])) * np.exp(2j * math.pi * second[0]), dtype=np.complex64)
 
@@ -404,9 +407,9 @@ class DiffuseField:
         self, sums: mi.UInt64, sine: DeviceArray, range_m: DeviceArray, level: DeviceArray, active: DeviceArray
     ) -> None:
         former = self.former
-        sine_cell = (sine - former.first_sine) * (1 / (former.sine_step * SINES_A_LOBE))
-        range_cell = (range_m - former.first_range) * (1 / (former.range_step * RANGES_A_PULSE))
-        inside = active & (sine_cell >= 0) & (sine_cell < self.shape[0]) & (range_cell >= 0) & (range_cell < self.shape[1])
-        where = mi.UInt32(dr.select(inside, sine_cell, 0)) * self.shape[1] + mi.UInt32(dr.select(inside, range_cell, 0))
+        sine_cell = (sine - former.first_sine) * (1 / (former.sine_step * LINES_A_CELL))
+        range_cell = (range_m - former.first_range) * (1 / (former.range_step * LINES_A_CELL))
+        inside = active & (range_cell >= 0) & (range_cell < self.shape[0]) & (sine_cell >= 0) & (sine_cell < self.shape[1])
+        where = mi.UInt32(dr.select(inside, range_cell, 0)) * self.shape[1] + mi.UInt32(dr.select(inside, sine_cell, 0))
         value = mi.UInt64(mi.Float64(level) * 2.0**self.bits)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, where, inside, mode=ADD)

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
 
 from mitsonar.acoustics.noise import uniform
 from mitsonar.acoustics.water import loss_of
-from mitsonar.instruments.beams import series, shaded_sinc
+from mitsonar.instruments.beams import Spectrum, series, shaded_sinc
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.beams import BeamFormer
+from mitsonar.simulation.beams import PULSE_LENGTHS, BeamFormer
 
 __all__ = ["PROCESSES", "ReceiverNoise", "with_crosstalk"]
 
@@ -117,13 +117,17 @@ class ReceiverNoise:
     def beam_correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return the beam correlations ``(beams, beams)`` of noise, volume reverberation, and speckle on even ground."""
         noise, volume = (self._plane_waves(passes).astype(float) for passes in (1, 2))
-        lines = self.former.over_sine.T.astype(float)
-        return noise.T @ noise, volume.T @ volume, _correlation(lines.T @ lines)
+        return noise.T @ noise, volume.T @ volume, _correlation(self.former.ground_correlation())
 
     def bin_correlation(self) -> csr_array[Any, Any]:
         """Return the bin correlation ``(bins, bins)`` due to the pulse, the same for noise, volume and speckle."""
-        rows = self._noise_ranges.astype(float)
-        return csr_array(rows @ rows.T)
+        size, pulse = self.sonar.range_bins, self.former.pulse
+        offset = np.arange(1 - size, size)
+        offset = offset[np.abs(offset) * self.sonar.bin_m <= 2 * PULSE_LENGTHS * pulse.resolution_m]
+        frequency, weight = pulse.spectrum()
+        value = Spectrum(frequency, weight * weight.conj()).at(offset * self.sonar.bin_m).real
+        value /= value.max()
+        return csr_array(diags_array(list(value), offsets=list(offset), shape=(size, size)))
 
     @cached_property
     def _noise_amplitude(self) -> NDArray[np.float64]:
@@ -149,16 +153,17 @@ class ReceiverNoise:
 
     def _white(self, ping: int, salt: int, passes: int) -> NDArray[np.complex64]:
         """Return complex Gaussian noise of unit power ``(bins, beams)``, filtered by the array and the matched filter."""
-        waves = self._plane_waves(passes)
-        shape = 1, self.former.ranges, len(waves)
-        first, second = uniform(shape, seed=self.sonar.seed ^ salt, frames=np.array([ping]), like=np.empty(0))
-        # 1. Draw complex Gaussian noise of every plane wave and range (Box-Muller), real and imaginary part side by side.
-        radius = np.sqrt(-np.log(first[0]))
-        white = np.concatenate([radius * np.cos(2 * math.pi * second[0]), radius * np.sin(2 * math.pi * second[0])], axis=1)
+        waves, over_range = self._plane_waves(passes), self.former.over_noise
+        shape = 1, over_range.columns, len(waves)
+        drawn = uniform(shape, seed=self.sonar.seed ^ salt, frames=np.array([ping]), like=np.empty(0))
+        first, second = (values[0].astype(np.float32) for values in drawn)
+        # 1. Draw complex Gaussian noise of every plane wave and range (Box-Muller).
+        radius, angle = np.sqrt(-np.log(first)), np.float32(2 * math.pi) * second
         # 2. Apply the matched filter over range, then the array over plane waves.
-        filtered = self._noise_ranges @ white.astype(np.float32)
-        real, imag = (np.ascontiguousarray(part) @ waves for part in np.split(filtered, 2, axis=1))
-        return np.asarray(real + 1j * imag, dtype=np.complex64)
+        filtered = [(over_range @ (radius * turn(angle))) @ waves for turn in (np.cos, np.sin)]
+        noise = np.empty(filtered[0].shape, np.complex64)
+        noise.real, noise.imag = filtered
+        return noise
 
     def _waves(self, passes: int) -> NDArray[np.float32]:
         """Return the amplitude of plane waves in each beam ``(waves, beams)``, for a one-way or two-way pattern.
@@ -172,13 +177,6 @@ class ReceiverNoise:
         amplitude = shaded_sinc(away * length, series(self.sonar.shading)) ** passes
         amplitude /= np.sqrt(np.square(amplitude).sum(axis=1, keepdims=True))
         return np.ascontiguousarray(amplitude.T, dtype=np.float32)
-
-    @cached_property
-    def _noise_ranges(self) -> csr_array[Any, Any]:
-        """Return the matched filter as a matrix ``(bins, ranges)`` with rows of unit power."""
-        rows = self.former.over_range
-        power = np.asarray(rows.multiply(rows).sum(axis=1)).ravel()
-        return csr_array(rows.multiply(1 / np.sqrt(power)[:, None]), dtype=np.float32)
 
 
 def _with_volume(receiver: ReceiverNoise, image: NDArray[Any], ping: int, side: int) -> NDArray[Any]:

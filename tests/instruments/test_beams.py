@@ -34,15 +34,15 @@ def test_taylor_is_scipys() -> None:
 def test_the_pattern_is_the_sum_over_the_aperture(shading: Shading) -> None:
     aperture = Aperture(0.02, shading, two_way=False)
     u = np.linspace(-0.1, 0.1, 201)
-    np.testing.assert_allclose(aperture.defocused(u, 0.0, 1e-3), aperture.pattern(u), atol=2e-4)
+    np.testing.assert_allclose(aperture.spectrum().at(u), aperture.pattern(u), atol=2e-4)
 
 
 def test_an_array_out_of_focus_is_wider_and_lower() -> None:
     aperture = Aperture(0.005)
-    sharp, blurred = (np.abs(aperture.defocused(np.linspace(-0.05, 0.05, 4001), bend, 8e-4)) for bend in (0.0, 0.4))
+    sharp, blurred = (np.abs(aperture.spectrum(bend * 8e-4).at(np.linspace(-0.05, 0.05, 4001))) for bend in (0.0, 0.4))
     assert blurred[2000] < 0.9 * sharp[2000]
     assert (blurred > blurred.max() / 2).sum() > 1.05 * (sharp > sharp.max() / 2).sum()
-    near = Aperture(0.005).defocused(0.0, 0.01, 8e-4)
+    near = complex(Aperture(0.005).spectrum(0.01 * 8e-4).at(0.0))
     assert abs(abs(near) - 1) < 2e-3  # far from the near field's edge nothing changes
 
 

@@ -66,7 +66,7 @@ def strength(kind: Kind, side: float, range_m: float, *, twist: float = 0.0, asi
     loaded = mi.load_dict({"type": "scene", "corner": corner(kind, side, turned, at)})
     assert isinstance(loaded, mi.Scene)
     imager = CoherentImager(loaded, sonar, {loaded.shapes()[0].id(): (1.0, 0.0)})
-    field = np.zeros((imager.former.sines, imager.former.ranges), np.complex64)
+    field = np.zeros((imager.former.ranges, imager.former.sines), np.complex64)
     for part in (imager.glints, imager.corners):
         if part is not None:
             part.add(np.zeros(6), field)

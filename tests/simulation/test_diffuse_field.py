@@ -45,7 +45,7 @@ def test_the_mean_is_that_of_the_model_physical(basin: mi.Scene, pattern: str, b
     for seed in range(3):
         diffuse_part = CoherentImager(basin, sonar.replace(seed=seed)).diffuse
         assert diffuse_part is not None
-        field = np.zeros((diffuse_part.former.sines, diffuse_part.former.ranges), np.complex64)
+        field = np.zeros((diffuse_part.former.ranges, diffuse_part.former.sines), np.complex64)
         diffuse_part.add(POSE, field)
         got += (np.abs(diffuse_part.former.beams(field)) ** 2).sum(axis=1) / 3
     assert got.sum() == pytest.approx(target.sum(), rel=0.04)

@@ -41,7 +41,7 @@ def fields(mirror: tuple[float, float], sonar: Sonar) -> tuple[complex, complex,
 
         tracer = imager.tracer
         tracer.sonar = local.replace(bounces=bounces)
-        field = np.zeros((imager.former.sines, imager.former.ranges), np.complex64)
+        field = np.zeros((imager.former.ranges, imager.former.sines), np.complex64)
         GhostTracer(tracer).add(np.zeros(6), field)
         result.append(complex(field.astype(complex).sum()))
     return direct, result[0], result[1] - result[0], at

@@ -96,7 +96,7 @@ def test_the_back_of_a_body_behind_its_front_is_found() -> None:
 
 
 def spread_over_grid(points: SurfacePoints, tracer: Any) -> NDArray[np.complex128]:
-    """The field of points that all lie in sight, written from the equations: waves, and shares of four cells."""
+    """The field of points that all lie in sight, written from the equations: waves, and shares of six nodes."""
     former, sonar, fan = tracer.former, tracer.sonar, tracer.fan
     matrix = to_world_matrices(POSE)[0]
     way = points.place.astype(float) - matrix[:3, 3]
@@ -107,19 +107,19 @@ def spread_over_grid(points: SurfacePoints, tracer: Any) -> NDArray[np.complex12
     cosine = np.abs((points.normal * way).sum(axis=1)) / range_m
     import mitsuba as mi
 
-    from mitsonar.simulation.beams import elevation_gain
+    from mitsonar.simulation.beams import elevation_gain, kernel_weights
 
     gain = np.array(elevation_gain(sonar, mi.Float(tangent.astype(np.float32))), dtype=float)
     size = np.sqrt(points.strength.astype(float)) * cosine / range_m**2 * gain
     wave = size * np.exp(1j * (points.phase.astype(float) - 4 * np.pi * range_m / tracer.wavelength))
     seen = (np.abs(sine) < fan.sine) & (np.abs(tangent) < fan.tangent) & (forward > 0)
     x, y = (sine - former.first_sine) / former.sine_step, (range_m - former.first_range) / former.range_step
-    seen &= (x >= 0) & (x < former.sines - 1) & (y >= 0) & (y < former.ranges - 1)
-    total = np.zeros((former.sines, former.ranges), complex)
-    i, j = np.floor(x[seen]).astype(int), np.floor(y[seen]).astype(int)
-    a, b = x[seen] - i, y[seen] - j
-    for k, m, share in ((0, 0, (1 - a) * (1 - b)), (1, 0, a * (1 - b)), (0, 1, (1 - a) * b), (1, 1, a * b)):
-        np.add.at(total, (i + k, j + m), share * wave[seen])
+    seen &= (x >= 0) & (x < former.sines - 1) & (y >= 0.5) & (y < former.ranges - 1.5)
+    total = np.zeros((former.ranges, former.sines), complex)
+    i, j = np.floor(x[seen]).astype(int), np.rint(y[seen]).astype(int)
+    for k, share in enumerate((i + 1 - x[seen], x[seen] - i)):
+        for m, over_range in zip((-1, 0, 1), kernel_weights(y[seen] - j), strict=True):
+            np.add.at(total, (j + m, i + k), share * over_range * wave[seen])
     return total
 
 

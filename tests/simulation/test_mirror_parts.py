@@ -100,7 +100,7 @@ def test_a_plane_is_a_mirror(range_m: float) -> None:
     grid = source.former
     sine = grid.first_sine + np.arange(grid.sines) * grid.sine_step
     beyond = grid.first_range + np.arange(grid.ranges) * grid.range_step - range_m
-    window = np.outer(*(np.cos(np.clip(x, 0, 1) * np.pi / 2) ** 2 for x in (np.abs(sine) / 0.4, beyond / 0.5)))
+    window = np.outer(*(np.cos(np.clip(x, 0, 1) * np.pi / 2) ** 2 for x in (beyond / 0.5, np.abs(sine) / 0.4)))
     total = complex((source.field(STILL).astype(complex) * window).sum())
     assert decibels(total, 1 / (2 * range_m)) == pytest.approx(0, abs=0.2)
     k = 2 * np.pi * 3e5 / sonar.sound_speed

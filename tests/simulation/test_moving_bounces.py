@@ -108,7 +108,7 @@ def test_a_moving_point_has_the_ghosts_of_image_sources() -> None:
         sums = []
         for bounces in (2, 3):
             imager.tracer.sonar = local.replace(bounces=bounces)
-            field = np.zeros((imager.former.sines, imager.former.ranges), np.complex64)
+            field = np.zeros((imager.former.ranges, imager.former.sines), np.complex64)
             GhostTracer(imager.tracer).add(np.zeros(6), field, time)
             sums.append(complex(field.astype(complex).sum()))
         for got, level, longer in (

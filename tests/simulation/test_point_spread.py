@@ -13,7 +13,8 @@ from helpers import Array, essence
 
 from mitsonar.instruments.beams import Pattern
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.simulation.beams import elevation_end
+from mitsonar.simulation.beams import BeamFormer, elevation_end
+from mitsonar.simulation.receiver_noise import ReceiverNoise
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
 
@@ -183,3 +184,48 @@ def test_focus_against_exact_ways_to_the_elements(name: str, focus_m: float) -> 
     assert np.abs(level - expected)[seen].max() < 0.5
     if focus_m != 4.4:
         assert expected.max() < -0.5
+
+
+# ---------------------------------------------------------------- the grid
+
+
+ERRORS = [("uniform", "receive", -42), ("hann", "two_way", -46.5), ("taylor", "receive", -46)]
+
+
+@pytest.mark.parametrize(("shading", "pattern", "error_db"), ERRORS)
+def test_waves_between_the_nodes_have_pattern_and_pulse(shading: str, pattern: str, error_db: float) -> None:
+    """Waves anywhere, spread and formed, against their patterns and pulses written down: power of the difference."""
+    import mitsuba as mi
+
+    from mitsonar.simulation.coherent_tracing import FieldSums
+
+    sonar = SONAR.replace(shading=shading, pattern=pattern, beams=96, azimuth_fov_deg=30.0, beam_width_deg=0.6)
+    sonar = sonar.replace(range_min=2.0, range_max=2.5, range_bins=100, pulse_m=0.01, source_level_db=0.0)
+    former = BeamFormer(sonar)
+    rng = np.random.default_rng(4)
+    count = 40
+    sine, range_m, phase = rng.uniform(-0.2, 0.2, count), rng.uniform(2.1, 2.4, count), rng.uniform(0, 6.28, count)
+    level = np.exp(rng.normal(size=count)) * 1e-3
+    wave = mi.Float(sine), mi.Float64(range_m), *map(mi.Float, (level, np.cos(phase), np.sin(phase)))
+    gain = math.sqrt(sonar.beam_width_rad / sonar.aperture.equivalent_width * sonar.bin_m / former.pulse.equivalent_m)
+    pulses = former.pulse.shape(sonar.range_m[:, None] - range_m) * (gain * level * np.exp(1j * phase))
+    expected = pulses @ sonar.aperture.pattern(np.sin(sonar.bearing_rad)[:, None] - sine).T
+    images = []
+    for packed in (True, False):
+        sums = FieldSums(former, 100.0, packed=packed)
+        grid, field = sums.zeros(), np.zeros((former.ranges, former.sines), np.complex64)
+        assert np.array(sums.add(grid, wave, mi.Bool(True))).all()
+        sums.add_to(field, sums.values(grid))
+        images.append(former.beams(field))
+        error = np.square(np.abs(images[-1] - expected)).sum() / np.square(np.abs(expected)).sum()
+        assert 10 * math.log10(error) < error_db
+    np.testing.assert_allclose(images[0], images[1], atol=1e-5 * np.abs(expected).max())
+
+
+def test_white_noise_has_unit_power_everywhere() -> None:
+    """After the pulse, for draws that are farther apart than its samples; and neighbouring bins correlate as it says."""
+    source = ReceiverNoise(SONAR, BeamFormer(SONAR))
+    over_range = source.former.over_noise
+    rows = over_range @ np.eye(over_range.columns, dtype=np.float32)
+    np.testing.assert_allclose(np.square(rows).sum(axis=1), 1, atol=2e-3)
+    np.testing.assert_allclose(rows @ rows.T, source.bin_correlation().toarray(), atol=2e-3)

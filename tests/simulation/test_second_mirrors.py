@@ -81,7 +81,7 @@ def test_one_point_has_the_ghost_of_two_image_sources(pattern: str, second: tupl
     direct = complex(imager.tracer.field(np.zeros(6))[0].astype(complex).sum())
     sums = []
     for parts in (None, mirror_of(loaded, mirrors)):
-        field = np.zeros((imager.former.sines, imager.former.ranges), np.complex64)
+        field = np.zeros((imager.former.ranges, imager.former.sines), np.complex64)
         GhostTracer(imager.tracer, parts).add(np.zeros(6), field)
         sums.append(complex(field.astype(complex).sum()))
     near, *far = (float(np.linalg.norm(at - image)) for image in (np.zeros(3), 2 * height, 2 * foot))
