@@ -36,7 +36,7 @@ from mitsonar.simulation.device import ensure_variant
 if TYPE_CHECKING:
     import mitsuba as mi
 
-TARGETS_MS = {"didson300, floor": 120, "oculus-m1200d-2100khz, floor": 300, "didson300, rocks": 250}
+TARGETS_MS = {"didson300, floor": 60, "oculus-m1200d-2100khz, floor": 150, "didson300, rocks": 110}
 """Processor time of a coherent ping that is to be kept on two cores."""
 
 

@@ -27,7 +27,7 @@ from mitsonar.bridges.live_client import LiveClient, image_of
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.scene import shipped_trajectory
 
-CASES = (("physical", "draft"), ("physical", "standard"), ("coherent", "draft"))
+CASES = (("physical", "draft"), ("physical", "standard"), ("coherent", "draft"), ("coherent", "standard"))
 
 
 def main() -> None:

@@ -1,9 +1,10 @@
-"""How the complex field of a coherent ping is summed over hashed scatterers, in one launch.
+"""How the complex field of a coherent ping is summed over hashed scatterers, in two launches.
 
-The field is a function of the sine of the bearing and the range. Each ray visits the lattice cells
-(:mod:`mitsonar.simulation.points`) within its cell of the surface. A point counts if its direction lies in the cell of
-that ray, so on a plane each point counts exactly once, for any set of rays. Its echo is zeta sqrt(C cos^2 dA) / R^2, times
-the pattern over elevation and exp(-2 j k R). Sums are fixed point, so they do not depend on the order of the points.
+The field is a function of the sine of the bearing and the range. In the first launch, each ray lists the points of the
+lattice (:mod:`mitsonar.simulation.points`) in or near its cell of the surface, a half to a fifth of those that it visits.
+The second launch sums them, without idle lanes. A point counts if its direction lies in the cell of that ray, so on a plane
+each point counts exactly once, for any set of rays. Its echo is zeta sqrt(C cos^2 dA) / R^2, times the pattern over
+elevation and exp(-2 j k R). Sums are fixed point, so they do not depend on the order of the points.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.beams import BeamFormer, CommonFan, elevation_gain, kernel_weights
-from mitsonar.simulation.device import DeviceArray, Frozen, replayed
+from mitsonar.simulation.device import DeviceArray, Frozen, padded, replayed
 from mitsonar.simulation.mirrors import Mirrors, without_mirror_part
 from mitsonar.simulation.moving import SceneMotion, scene_at
 from mitsonar.simulation.points import LEAST_COSINE, HashedPoints, Point, pick
@@ -41,6 +42,9 @@ STRIP = 8
 LARGEST_SUM = 2.0**14
 """Largest sum at a node, as a multiple of the amplitude of one point that reflects everything. The sum of n points with
 random phases exceeds 6 sqrt(n) with a probability of 1e-15, and a resolution cell holds a few thousand at most."""
+
+POINTS_A_RAY = 4.0
+"""Number of points to a ray for which there is room at first."""
 
 MOST_IN_A_CELL = 2.0**16
 """Number of points in phase that one node can hold in 64-bit sums."""
@@ -119,92 +123,116 @@ class CoherentTracer:
         dr.make_opaque(self.index)
         dr.eval(self.patches)
         self.mirrors = None if mirrors is None else mirrors.table()
-        self.launch = self._compile()
+        self.room: int = math.ceil(POINTS_A_RAY * self.fan.rays)
+        self.list, self.sum = self._compile_list(), self._compile_sum()
 
     def field(self, pose: NDArray[np.float64], time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
         """Return the field ``(ranges, sines)`` of one ping at a pose ``(6,)`` [m, rad] and a time [s], and its counts."""
+        # 1. Poses of the sonar, and the surfaces.
         scene = scene_at(self.scene, self.motion, time_s)
         lines = to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64)
         if self.motion is not None:
             lines = self.motion.sonar_lines(pose, time_s)
         rows = mi.Float64(lines.ravel().tolist())
-        inputs = self.index, scene, rows, self.surfaces.arrays(), self.patches, self.mirrors
-        real, imag, counts = replayed(self.launch, *inputs)
-        field = np.zeros((self.former.ranges, self.former.sines), np.complex64)
-        self.sums.add_to(field, (real, imag))
-        return field, FieldCounts(*map(int, np.array(counts)))
+        # 2. List the points near the rays; if there are more than room, make room and list them again.
+        listed, size, counts, hits = replayed(self.list, self.index, scene, rows, self.surfaces.arrays(), self.mirrors)
+        found = int(np.array(size)[0])
+        if found > self.room:
+            self.room, self.list = 2 * found, self._compile_list()
+            listed, size, counts, hits = replayed(self.list, self.index, scene, rows, self.surfaces.arrays(), self.mirrors)
+        # 3. Sum them.
+        field, outcomes = np.zeros((self.former.ranges, self.former.sines), np.complex64), np.array(counts)
+        if found:
+            inputs = [mi.UInt32(padded(np.array(part, copy=False)[:found])) for part in listed]
+            values, points = replayed(self.sum, *inputs, rows, hits, self.patches)
+            self.sums.add_to(field, values)
+            outcomes[COUNTED.index("points")] = int(np.array(points)[0])
+        return field, FieldCounts(*map(int, outcomes))
 
-    def _compile(self) -> Callable[..., Any]:
-        """Return the launch of one ping, recorded at its first call."""
+    # ---------------- First launch: list the points near each ray
 
+    def _compile_list(self) -> Callable[..., Any]:
         @Frozen
-        def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any) -> Any:
-            lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
-            rays = FanRays(self.fan, self.sonar, index, lines, self.side)
+        def launch(index: Any, scene: Any, rows: Any, tables: Any, mirrors: Any) -> Any:
+            # 1. Hits of the rays, in the axes of the body that is hit.
+            rays, body = self._rays(rows, index, mi.UInt32(0)), mi.UInt32(0)
             ray, surfaces = mi.Ray3f(rays.origin, rays.d), replace(self.surfaces, **tables)
-            if isinstance(surfaces, MovingSurfaces):  # everything below is in the axes of the body that is hit
+            if isinstance(surfaces, MovingSurfaces):
                 hit, body = surfaces.hit_in_body(scene, ray)
-                lines = [[dr.gather(mi.Float64, rows, body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
-                rays = FanRays(self.fan, self.sonar, index, lines, self.side)
+                rays = self._rays(rows, index, body)
             else:
                 hit = surfaces.hit(scene, ray)
             if mirrors is not None:
                 hit = without_mirror_part(mirrors, hit, rays.d, 2 * math.pi / self.wavelength)
             if isinstance(surfaces, MovingSurfaces):  # last: mirrors are looked up by shape
                 hit = replace(hit, shape_id=surfaces.scatterer_lattice(scene, hit, body))
-            return self._sums(rays, hit, patches)
+            # 2. Lattice cells around those that may contribute to the grid.
+            former = self.former
+            last = former.first_range + (former.ranges - 1) * former.range_step
+            reached = rays.on_side & hit.valid & (hit.reflectivity > 0) & rays.may_reach(hit, former.first_range, last)
+            points = self._points(rays, replace(hit, valid=reached))
+            counts = dr.zeros(mi.UInt32, len(COUNTED))
+            self._count(counts, rays, hit, points)
+            # 3. Visit them in turn, and list those near the cell of the ray; rays end their loop independently.
+            listed, size = [dr.empty(mi.UInt32, self.room) for _ in range(2)], dr.zeros(mi.UInt32, 1)
+
+            def step(number: mi.Int32) -> tuple[mi.Int32]:
+                near = (number < points.count) & points.near(number)
+                slot: DeviceArray = dr.scatter_inc(size, mi.UInt32(0), near)
+                for values, value in zip(listed, (index, mi.UInt32(number)), strict=True):
+                    dr.scatter(values, value, slot, near & (slot < self.room))
+                return (number + 1,)
+
+            begin = mi.Int32(0) + dr.zeros(mi.Int32, self.fan.rays)
+            dr.while_loop((begin,), lambda number: number < points.count, step)
+            hits = hit.t, hit.n, hit.reflectivity, mi.UInt32(hit.shape_id), body + dr.zeros(mi.UInt32, self.fan.rays)
+            dr.eval(listed, size, counts, hits)
+            return listed, size, counts, hits
 
         return launch
 
-    def _sums(self, rays: FanRays, hit: Hit, patches: mi.Float) -> tuple[Any, ...]:
-        """Sum the points of all rays; return real and imaginary part ``(ranges * sines,)``, and the counts."""
-        # 1. Select the rays whose cell on the surface may contribute to the grid.
-        former = self.former
+    def _rays(self, rows: Any, index: mi.UInt32, body: mi.UInt32) -> FanRays:
+        """Return rays in the axes of bodies; body 0 is the world, or the only one."""
+        lines = [[dr.gather(mi.Float64, rows, body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
+        return FanRays(self.fan, self.sonar, index, lines, self.side)
+
+    def _points(self, rays: FanRays, hit: Hit) -> HashedPoints:
+        """Return the lattice cells around the hits of rays."""
         place: DeviceArray = rays.origin + rays.d * hit.t
-        last = former.first_range + (former.ranges - 1) * former.range_step
-        reached = rays.on_side & hit.valid & (hit.reflectivity > 0) & rays.may_reach(hit, former.first_range, last)
-        # 2. Find the lattice cells around the hit of each ray.
-        points = HashedPoints(
-            replace(hit, valid=reached),
-            place,
-            *rays.steps_on(hit),
-            pitch=self.pitch,
-            patch=self.sonar.speckle_patch_m,
-            seed=self.sonar.seed,
-        )
-        sums = self.sums.zeros()
-        counts = dr.zeros(mi.UInt32, len(COUNTED))
-        self._count(counts, rays, hit, points)
-
-        # 3. Visit the cells of each ray in turn and deposit their points; rays end their loop independently.
-        def step(number: mi.Int32) -> tuple[mi.Int32]:
-            self._deposit(rays, points, number, patches, sums, counts)
-            return (number + 1,)
-
-        begin = mi.Int32(0) + dr.zeros(mi.Int32, self.fan.rays)
-        dr.while_loop((begin,), lambda number: number < points.count, step)
-        dr.eval(sums, counts)
-        return *self.sums.values(sums), counts
+        steps, seed = rays.steps_on(hit), self.sonar.seed
+        return HashedPoints(hit, place, *steps, pitch=self.pitch, patch=self.sonar.speckle_patch_m, seed=seed)
 
     def _count(self, counts: mi.UInt32, rays: FanRays, hit: Hit, points: HashedPoints) -> None:
         """Count the outcomes of the rays in the field of view; rays beside it only carry side lobes and skirts."""
         near, far = hit.valid & (hit.t < self.sonar.range_min), hit.valid & (hit.t >= self.sonar.range_max)
         for counter, outcome in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
             counted = outcome & rays.inside
-            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(counter), counted, mode=ADD)
-        widest = mi.UInt32(COUNTED.index("widest"))
-        dr.scatter_reduce(dr.ReduceOp.Max, counts, mi.UInt32(points.covered), widest, points.cut & rays.inside, mode=ADD)
+            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(counter), counted, mode=dr.ReduceMode.Local)
+        widest, cut = mi.UInt32(COUNTED.index("widest")), points.cut & rays.inside
+        dr.scatter_reduce(dr.ReduceOp.Max, counts, mi.UInt32(points.covered), widest, cut, mode=dr.ReduceMode.Local)
+
+    # ---------------- Second launch: sum the points
+
+    def _compile_sum(self) -> Callable[..., Any]:
+        @Frozen
+        def launch(index: Any, number: Any, rows: Any, hits: Any, patches: Any) -> Any:
+            # 1. The ray of each point, and its hit.
+            t, n, reflectivity, shape_id, body = (dr.gather(type(values), values, index) for values in hits)
+            rays, valid = self._rays(rows, index, body), mi.Bool(True)
+            hit = Hit(valid, t, n, reflectivity, mi.Int32(shape_id), mi.Float(0), mi.Int32(-1))
+            # 2. Sum those that lie in the cell of their ray.
+            sums = self.sums.zeros()
+            deposited = self._deposit(rays, self._points(rays, hit), mi.Int32(number), patches, sums)
+            points = dr.count(deposited)
+            dr.eval(sums, points)
+            return self.sums.values(sums), points
+
+        return launch
 
     def _deposit(
-        self,
-        rays: FanRays,
-        points: HashedPoints,
-        number: mi.Int32,
-        patches: mi.Float,
-        sums: list[mi.UInt64],
-        counts: mi.UInt32,
-    ) -> None:
-        """Add one point of each ray to the nodes of the grid around it."""
+        self, rays: FanRays, points: HashedPoints, number: mi.Int32, patches: mi.Float, sums: list[mi.UInt64]
+    ) -> DeviceArray:
+        """Add a point of each ray to the grid; return which lie in the cell of their ray, and on the grid."""
         # 1. Position and weight of the point, and how the sonar sees it.
         point = points.point(number, patches, self.patch_entries)
         seen = rays.seen(points, point)
@@ -215,9 +243,7 @@ class CoherentTracer:
         level = points.strength * seen.cosine * point.amplitude / dr.square(mi.Float(seen.range_m))
         level = level * elevation_gain(self.sonar, seen.tangent)
         # 4. Deposit, if the point lies in the cell of this ray.
-        wave = seen.sine, seen.range_m, level, cos, sin
-        deposited = self.sums.add(sums, wave, seen.in_cell & (number < points.count))
-        dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(COUNTED.index("points")), deposited, mode=ADD)
+        return self.sums.add(sums, (seen.sine, seen.range_m, level, cos, sin), seen.in_cell)
 
 
 class FieldSums:

@@ -42,6 +42,9 @@ __all__ = [
 LEAST_COSINE = 4e-3
 """Grazing cosine below which a ray's cell on the surface is not stretched further."""
 
+NEAR = 0.55
+"""Distance from the middle of a ray's cell within which points are evaluated, in sides of the cell on the tangent plane."""
+
 MOST_CANDIDATES = 4096
 """Largest number of lattice cells that one ray may visit."""
 
@@ -111,6 +114,7 @@ class HashedPoints:
         self.normal = pick(self.axis, hit.n)
         self.middle = pick(self.axis, place)
         across, down = pick(self.axis, over_column), pick(self.axis, over_row)
+        self.steps = across, down
         # 2. Bound the ray's cell by a rectangle of lattice cells: half a step each way, plus a margin for rounding.
         low, high = [], []
         for k in range(2):
@@ -128,6 +132,15 @@ class HashedPoints:
         side = dr.select(self.normal[2] > 0, mi.UInt32(1), mi.UInt32(0))
         self.key = lattice_key(mi.UInt32(hit.shape_id), self.axis, side, seed)
         self.strength = dr.sqrt(hit.reflectivity * (pitch * pitch) / dr.abs(self.normal[2]))
+
+    def near(self, number: DeviceArray) -> DeviceArray:
+        """Test whether the point in one of each ray's lattice cells lies in or near the ray's cell of the tangent plane."""
+        i, j = self.low[0] + number % self.wide, self.low[1] + number // self.wide
+        p, q, _ = place_in_cell(i, j, self.key, self.pitch)
+        across, down = self.steps
+        p, q, area = p - self.middle[0], q - self.middle[1], dr.abs(across[0] * down[1] - across[1] * down[0])
+        columns, rows = dr.abs(p * down[1] - q * down[0]), dr.abs(q * across[0] - p * across[1])
+        return (columns <= NEAR * area) & (rows <= NEAR * area)
 
     def point(self, number: DeviceArray, patches: mi.Float, entries: int) -> Point:
         """Return the point in one of each ray's lattice cells.

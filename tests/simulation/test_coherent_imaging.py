@@ -306,6 +306,16 @@ def test_threads_do_not_change_bits(flat: mi.Scene) -> None:
     np.testing.assert_array_equal(fields[0], fields[2])
 
 
+def test_room_for_points_grows(flat: mi.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More points than there is room for at first: the list is made again, and nothing is lost."""
+    expected, counts = imager(flat).tracer.field(POSE)
+    monkeypatch.setattr("mitsonar.simulation.coherent_tracing.POINTS_A_RAY", 0.01)
+    field, again = imager(flat).tracer.field(POSE)
+    np.testing.assert_array_equal(field, expected)
+    assert again == counts
+    assert again.points > 0.01 * imager(flat).tracer.fan.rays
+
+
 # ---------------------------------------------------------------- levels
 
 
