@@ -326,21 +326,25 @@ def small_tank(folder: Path) -> mi.Scene:
     return loaded(parts, folder / "small")
 
 
+DIDSON = {"absorption_db_per_m": 0.84, "ping_groups": 8, "looks": 2}
+ARIS_3000 = {"absorption_db_per_m": 2.34, "ping_groups": 8, "looks": 2}
+"""What fan pictures do not tell. Groups are those of the makers, 12 and 16 beams a ping."""
+
 STAGES = {
-    "DIDSON lamprey2": Stage(
-        river_bed, pose(0.9, 10), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey2", video=True, sway_m=RIVER_SWAY_M
-    ),
-    "DIDSON lamprey4": Stage(
-        far_bed, pose(1.9, 11.5), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey4", video=True, sway_m=RIVER_SWAY_M
-    ),
+    "DIDSON lamprey2": Stage(river_bed, pose(0.9, 10), STILL, DIDSON, pictures="lamprey2", video=True, sway_m=RIVER_SWAY_M),
+    "DIDSON lamprey4": Stage(far_bed, pose(1.9, 11.5), STILL, DIDSON, pictures="lamprey4", video=True, sway_m=RIVER_SWAY_M),
     "ARIS 1200": Stage(
-        sparse_bottom, pose(1.3, 7), STILL, {"elevation_fov_deg": 14.0, "absorption_db_per_m": 0.37}, volume_db=-45.0
+        sparse_bottom,
+        pose(1.3, 7),
+        STILL,
+        {"elevation_fov_deg": 14.0, "absorption_db_per_m": 0.37, "ping_groups": 3},
+        volume_db=-45.0,
     ),
     "ARIS 3000 tyre": Stage(
         tank_with_tyre,
         pose(1.3, 29),
         np.array([0.0, 0.0055, 0.0, 0.0, 0.0, math.radians(0.16)]),
-        {"absorption_db_per_m": 2.34},
+        ARIS_3000,
         pictures="translate_tyre",
         mirrors={"tyre": (0.15, 3e-6), "box": (0.2, 3e-6), "lid": (0.2, 3e-6), "wall": (0.7, 3e-6)},
     ),
@@ -348,7 +352,7 @@ STAGES = {
         tank_with_chain,
         pose(1.3, 29),
         np.array([0.0, 0.0068, 0.0, 0.0, 0.0, math.radians(0.09)]),
-        {"absorption_db_per_m": 2.34},
+        ARIS_3000,
         pictures="forward_chain",
         mirrors={"chain": (0.94, 3e-6), "beams": (0.2, 1e-5)},
     ),

@@ -1,9 +1,9 @@
-"""How a simulated sonar is fitted to a recording: noise, water, coding, stripes, crosstalk, speckle."""
+"""How a simulated sonar is fitted to a recording: its noise, water and coding, looks, resolution, stripes, speckle."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Container
+from collections.abc import Callable, Container
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Literal
@@ -17,6 +17,7 @@ from mitsonar.acoustics import statistics
 from mitsonar.acoustics.levels import decoded
 from mitsonar.acoustics.water import gain_of, loss_of
 from mitsonar.errors import MitsonarError
+from mitsonar.instruments.beams import Pulse
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.records.frames import SonarFrames
 
@@ -59,6 +60,9 @@ STRUCTURED_NU = 0.5
 
 NEAR_RAYLEIGH = 0.02
 """Excess of the squared contrast below which intensities are exponential: a nu of 100."""
+
+MOST_LOOKS = 16
+"""Largest number of looks that a fit gives."""
 
 GRAIN_PERCENTILE, LEAST_WINDOWS = 20.0, 8
 """Percentile of the windows' means below which the grain gives the coding, and the smallest number of windows."""
@@ -116,10 +120,12 @@ class SonarFit:
                 f"{100 * sonar.near_glow_still:.0f} % stay from ping to ping"
             )
         volume_text = "none seen" if sonar.volume_db is None else f"{sonar.volume_db:.1f} dB re 1/m"
+        pulse_text = f"{1e3 * sonar.resolution_m:.3g} mm" + (f", {sonar.looks} looks a bin" if sonar.looks > 1 else "")
         return [
             f"noise over full scale   {noise_text} (noise_level_db: {level})",
             f"99.9th percentile       {self.bright_db:.1f} dB over full scale",
             f"coding                  {coding.get(sonar.value_coding, 'linear')}; the grain suggests {grain}",
+            f"pulse, beam width       {pulse_text}; {math.degrees(sonar.beam_width_rad):.3g} deg",
             f"stripes_db              {sonar.stripes_db:.2f}",
             f"crosstalk_db            {crosstalk_text}",
             f"speckle_nu              {speckle_text}",
@@ -172,6 +178,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     # 2. the grain of dark windows gives a coding; with it, values become intensities
     span, gamma = (_span(value), None) if frames.level == "dB" else (None, _gamma(value))
     sonar = _with_coding(sonar, span, gamma, measure_coding, notes)
+    sonar = _with_resolution(sonar, value, None if measure_coding else span, given, notes)
     intensity = decoded(value, sonar)
     level = statistics.decibels(intensity, float(statistics.decibels(intensity[intensity > 0].min())) - 3)
     # 3. intensities before the gain give the noise, and the contrast of bright windows the speckle
@@ -303,6 +310,113 @@ def _with_coding(sonar: Sonar, span: float | None, gamma: float | None, measure:
             "coding (--measure-coding uses the grain's)"
         )
     return sonar
+
+
+# ---------------- Looks, pulse and beams
+
+
+LEAST_CORRELATION = 0.02
+"""Correlation of neighbouring cells below which pulse and beam width stay unknown."""
+
+RESOLUTIONS = (0.25, 8.0)
+"""Range of pulses in bins, and of beam widths in beams, that are tried."""
+
+
+LEAST_WIDTH = 0.7
+"""Width below which beams of one ping would leave gaps, in beams."""
+
+
+def _with_resolution(sonar: Sonar, value: Array, span: float | None, given: dict[str, Any], notes: list[str]) -> Sonar:
+    """Return the sonar with the pulse, looks and beam width at which the noise of neighbouring cells correlates as measured.
+
+    The grain of the darkest windows is noise that array and matched filter have passed, without texture of the bottom.
+
+    Args:
+        sonar: with its coding.
+        value: values of the frames ``(frames, bins, beams)``.
+        span: span of the coding at which the grain is that of one look [dB]; None: take one look.
+        given: known fields, which stay.
+        notes: of the fit, to which sentences are added.
+    """
+    rest = _grain_windows(value)[1]
+    if len(rest) < LEAST_WINDOWS:
+        return sonar
+    # 1. Correlation with the next bin and with the next beam, medians over windows.
+    tall, wide = (min(size, whole) for size, whole in zip(statistics.WINDOW, value.shape[1:], strict=True))
+    grain = rest.reshape(-1, tall, wide)
+    power = np.square(grain).mean(axis=(1, 2))
+    over_range = float(np.median((grain[:, 1:] * grain[:, :-1]).mean(axis=(1, 2)) / power))
+    over_beams = float(np.median((grain[:, :, 1:] * grain[:, :, :-1]).mean(axis=(1, 2)) / power))
+    exponent = {"dB": 0.0, "gamma": sonar.coding_gamma / 2}.get(sonar.value_coding, 1.0)
+    # 2. Looks from the spread of the grain in dB, then the pulse. Looks of a long pulse count as the fewer they resemble.
+    if "looks" not in given and span is not None:
+        sonar = sonar.replace(looks=min(MOST_LOOKS, round(_looks_of(statistics.RAYLEIGH_DB * sonar.coding_db / span))))
+    if "pulse_m" not in given and "bandwidth_hz" not in given:
+        step_m = sonar.bin_m / sonar.looks
+
+        def excess_over_range(bins: float) -> float:
+            squared = np.square(Pulse(bins * step_m).spectrum().coherence(np.arange(2 * sonar.looks) * step_m))
+            return _neighbours(squared, sonar.looks, exponent) - over_range
+
+        pulse_bins = _root(excess_over_range, over_range)
+        if pulse_bins is None:
+            notes.append(f"the noise of neighbouring bins correlates by {over_range:.2f}, which gives no pulse: it is kept")
+        else:
+            sonar = sonar.replace(bandwidth_hz=None, pulse_m=float(f"{pulse_bins * sonar.bin_m:.3g}"))
+    # 3. Beam width, if neighbouring beams belong to one ping.
+    if "beam_width_deg" not in given and sonar.ping_groups == 1:
+        spacing_deg = sonar.azimuth_fov_deg / sonar.beams
+        lags = np.array([0.0, np.median(np.diff(np.sin(sonar.bearing_rad)))])
+
+        def excess_over_beams(beams: float) -> float:
+            aperture = sonar.replace(beam_width_deg=beams * spacing_deg).aperture
+            return _neighbours(np.square(aperture.elements().coherence(lags)), 1, exponent) - over_beams
+
+        beams = _root(excess_over_beams, over_beams)
+        if beams is not None and beams >= LEAST_WIDTH:
+            sonar = sonar.replace(beam_width_deg=float(f"{beams * spacing_deg:.3g}"))
+        else:
+            notes.append(
+                f"the noise of neighbouring beams correlates by {over_beams:.2f}: beam_width_deg is kept; if it is little, "
+                "they belong to different pings, so give ping_groups (ARIS: a group for 16 beams; DIDSON: 12)"
+            )
+    return sonar
+
+
+def _looks_of(spread_db: float) -> float:
+    """Return the number of looks, at least 1, whose mean has a standard deviation in dB: 4.34 sqrt(trigamma(looks))."""
+
+    def excess(looks: float) -> float:
+        return 10 / math.log(10) * math.sqrt(float(special.polygamma(1, looks))) - spread_db
+
+    return float(optimize.brentq(excess, 1.0, 1000.0)) if excess(1.0) > 0 > excess(1000.0) else 1.0
+
+
+def _root(excess: Callable[[float], float], measured: float) -> float | None:
+    """Return the resolution in cells at which the model correlates as measured; None if there is none."""
+    if measured < LEAST_CORRELATION or not excess(RESOLUTIONS[0]) < 0 < excess(RESOLUTIONS[1]):
+        return None
+    return float(optimize.brentq(excess, *RESOLUTIONS, xtol=1e-3))
+
+
+def _neighbours(squared: Array, looks: int, exponent: float) -> float:
+    """Return the correlation of the values of neighbouring cells.
+
+    Powers I^a of one look correlate by (F(c^2) - 1) / (F(1) - 1) with F = 2F1(-a, -a; 1; .), their logarithms by
+    Li2(c^2) / (pi^2 / 6). Averages over several looks are taken as linear: the mean of c^2 over pairs.
+
+    Args:
+        squared: squared coherence c^2 of the field at lags of 0, 1 ... looks ``(2 * looks,)``.
+        looks: number of looks that a cell averages.
+        exponent: a, of the coding; 0 for dB.
+    """
+    if looks > 1:
+        lag = np.arange(looks)[None, :] - np.arange(looks)[:, None]
+        return float(squared[looks + lag].mean() / squared[np.abs(lag)].mean())
+    if exponent == 0:
+        return float(special.spence(1 - squared[1]) / (math.pi**2 / 6))
+    here, one = special.hyp2f1(-exponent, -exponent, 1, np.array([squared[1], 1.0]))
+    return float((here - 1) / (one - 1))
 
 
 # ---------------- Levels

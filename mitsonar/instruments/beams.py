@@ -46,6 +46,11 @@ class Spectrum(NamedTuple):
         """Return the sum at some offsets, of the same shape."""
         return np.asarray(np.exp(2j * math.pi * np.asarray(offset, dtype=float)[..., None] * self.frequency) @ self.weight)
 
+    def coherence(self, offset: ArrayLike) -> NDArray[np.float64]:
+        """Return the correlation of white noise that has passed it, at some distances, of the same shape."""
+        power = Spectrum(self.frequency, np.square(np.abs(self.weight)).astype(complex))
+        return np.asarray(power.at(offset).real / power.weight.real.sum(), dtype=np.float64)
+
 
 def _shaded(x: NDArray[np.float64], coefficients: tuple[float, ...]) -> NDArray[np.complex128]:
     """Return a cosine series at places -0.5..0.5 ``(n,)``, such that its sum is 1."""
@@ -125,24 +130,23 @@ class Aperture:
         one_way = shaded_sinc(np.asarray(u, dtype=float) * self.length, series(self.shading))
         return one_way * one_way if self.two_way else one_way
 
-    def spectrum(self, bend: float = 0.0) -> Spectrum:
-        """Return the amplitudes along the aperture that give the pattern, in the Fresnel approximation out of focus.
+    def elements(self, bend: float = 0.0) -> Spectrum:
+        """Return positions along the aperture [wavelengths] and the amplitudes of its elements, out of focus by ``bend``.
 
         Args:
-            bend: wavelength times (1 / range - 1 / focal range); 0 in focus.
-
-        Returns:
-            Positions along the aperture [wavelengths] and amplitudes ``(n,)``. Those of a two-way pattern are the
-            convolution of the aperture with itself.
+            bend: wavelength times (1 / range - 1 / focal range), in the Fresnel approximation; 0 in focus.
         """
-        # 1. Shading as a cosine series, and the quadratic phase of the wavefront's curvature.
         size = max(ELEMENTS, math.ceil(ELEMENTS_A_WAVELENGTH * self.length))
         x = (np.arange(size) + 0.5) / size - 0.5  # position along the aperture, relative to its length
-        weight = _shaded(x, series(self.shading)) * np.exp(-1j * math.pi * (self.length * x) ** 2 * bend)
-        # 2. Out and back: the pattern is squared.
+        curvature = np.exp(-1j * math.pi * (self.length * x) ** 2 * bend)
+        return Spectrum(self.length * x, _shaded(x, series(self.shading)) * curvature)
+
+    def spectrum(self, bend: float = 0.0) -> Spectrum:
+        """Return the waves that add up to the pattern: those of :meth:`elements`, convolved with themselves if two-way."""
+        place, weight = one_way = self.elements(bend)
         if not self.two_way:
-            return Spectrum(self.length * x, weight)
-        return Spectrum(2 * self.length * np.linspace(x[0], x[-1], 2 * size - 1), np.convolve(weight, weight))
+            return one_way
+        return Spectrum(2 * np.linspace(place[0], place[-1], 2 * len(place) - 1), np.convolve(weight, weight))
 
     @cached_property
     def equivalent_width(self) -> float:

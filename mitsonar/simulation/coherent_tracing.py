@@ -136,14 +136,14 @@ class CoherentTracer:
         rows = mi.Float64(lines.ravel().tolist())
         # 2. List the points near the rays; if there are more than room, make room and list them again.
         listed, size, counts, hits = replayed(self.list, self.index, scene, rows, self.surfaces.arrays(), self.mirrors)
-        found = int(np.array(size)[0])
-        if found > self.room:
-            self.room, self.list = 2 * found, self._compile_list()
+        total = int(np.array(size)[0])
+        if total > self.room:
+            self.room, self.list = 2 * total, self._compile_list()
             listed, size, counts, hits = replayed(self.list, self.index, scene, rows, self.surfaces.arrays(), self.mirrors)
         # 3. Sum them.
         field, outcomes = np.zeros((self.former.ranges, self.former.sines), np.complex64), np.array(counts)
-        if found:
-            inputs = [mi.UInt32(padded(np.array(part, copy=False)[:found])) for part in listed]
+        if total:
+            inputs = [mi.UInt32(padded(np.array(part, copy=False)[:total])) for part in listed]
             values, points = replayed(self.sum, *inputs, rows, hits, self.patches)
             self.sums.add_to(field, values)
             outcomes[COUNTED.index("points")] = int(np.array(points)[0])

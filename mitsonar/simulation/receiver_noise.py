@@ -18,7 +18,7 @@ from scipy.sparse import csr_array, diags_array
 
 from mitsonar.acoustics.noise import uniform
 from mitsonar.acoustics.water import loss_of
-from mitsonar.instruments.beams import Spectrum, series, shaded_sinc
+from mitsonar.instruments.beams import series, shaded_sinc
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.beams import PULSE_LENGTHS, BeamFormer
 
@@ -43,10 +43,11 @@ class ReceiverNoise:
     Args:
         sonar: a sonar of the model ``coherent``.
         former: its beamformer, whose aperture and pulse filter the noise as they filter echoes.
+        looks: number of looks that a bin averages; the sonar has a bin for each.
     """
 
-    def __init__(self, sonar: Sonar, former: BeamFormer) -> None:
-        self.sonar, self.former = sonar, former
+    def __init__(self, sonar: Sonar, former: BeamFormer, looks: int = 1) -> None:
+        self.sonar, self.former, self.looks = sonar, former, looks
         self._cached_waves: dict[int, NDArray[np.float32]] = {}
 
     def add(self, image: NDArray[Any], ping: int, side: int = 0) -> Image:
@@ -106,13 +107,15 @@ class ReceiverNoise:
         return self._white(ping, VOLUME ^ SIDE_SALT[side], 2) * amplitude[:, None]
 
     def noise_powers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the mean powers of noise and of volume reverberation, two arrays ``(bins,)``; 0 where there is none.
+        """Return the mean powers of noise and of volume in averaged bins, two arrays ``(bins,)``; 0 where there is none.
 
         Glow that differs from beam to beam is averaged over the beams.
         """
         sonar, none = self.sonar, np.zeros(self.sonar.range_bins)
-        noise = none if sonar.noise_level_db is None else np.square(self._noise_amplitude).mean(axis=1)
-        return noise, none if sonar.volume_db is None else np.square(self._volume_amplitude)
+        noise = none if sonar.noise_level_db is None else np.square(self._noise_amplitude).mean(axis=1) + none
+        volume = none if sonar.volume_db is None else np.square(self._volume_amplitude)
+        noise, volume = (power.reshape(-1, self.looks).mean(axis=1) for power in (noise, volume))
+        return noise, volume
 
     def beam_correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return the beam correlations ``(beams, beams)`` of noise, volume reverberation, and speckle on even ground."""
@@ -124,9 +127,7 @@ class ReceiverNoise:
         size, pulse = self.sonar.range_bins, self.former.pulse
         offset = np.arange(1 - size, size)
         offset = offset[np.abs(offset) * self.sonar.bin_m <= 2 * PULSE_LENGTHS * pulse.resolution_m]
-        frequency, weight = pulse.spectrum()
-        value = Spectrum(frequency, weight * weight.conj()).at(offset * self.sonar.bin_m).real
-        value /= value.max()
+        value = pulse.spectrum().coherence(offset * self.sonar.bin_m)
         return csr_array(diags_array(list(value), offsets=list(offset), shape=(size, size)))
 
     @cached_property
@@ -141,7 +142,7 @@ class ReceiverNoise:
         """Return the amplitude of the volume reverberation ``(bins,)``."""
         sonar = self.sonar
         assert sonar.volume_db is not None
-        volume = sonar.range_m**2 * sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m
+        volume = sonar.range_m**2 * sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m * self.looks
         power = 10 ** (sonar.volume_db / 10) * volume / sonar.range_m**4 * loss_of(sonar)
         return np.asarray(np.sqrt(power), dtype=np.float64)
 

@@ -127,6 +127,40 @@ def test_noise_that_does_not_show_is_not_invented(recordings: dict[str, SonarFra
     assert any("below the lowest level" in note for note in fit_sonar(frames).notes)
 
 
+RESOLUTIONS = [(2.2, 1.2, 1, "dB"), (1.3, 0.9, 2, "dB"), (1.0, 1.6, 3, "dB"), (1.8, 1.3, 1, "gamma")]
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.filterwarnings("ignore:no ray hit")
+@pytest.mark.parametrize(("bins", "beams", "looks", "coding"), essence(RESOLUTIONS, RESOLUTIONS[1]))
+def test_noise_gives_pulse_beam_width_and_looks(bins: float, beams: float, looks: int, coding: str) -> None:
+    """Of frames that hold noise alone: both resolutions within a tenth, looks exactly; those that are given are kept."""
+    from mitsonar.simulation.simulator import Simulator
+
+    spacing_deg = math.degrees(PLAIN.beam_spacing_rad)
+    sonar = PLAIN.replace(noise_level_db=-70.0, pulse_m=bins * PLAIN.bin_m, beam_width_deg=beams * spacing_deg, looks=looks)
+    sonar = sonar.replace(coding=coding, gain_exponent=0)
+    frames = Simulator(scene(floor=floor(diffuse(0.3))), sonar).render(np.array([[0, 0, 50.0, 0, 0, 0]] * 3))
+    frames.sonar = PLAIN.replace(coding=coding, gain_exponent=0)
+    fit = fit_sonar(frames).sonar
+    assert fit.looks == looks
+    assert fit.pulse_m == pytest.approx(sonar.pulse_m, rel=0.12)
+    assert fit.beam_width_deg == pytest.approx(sonar.beam_width_deg, rel=0.1)
+    known = fit_sonar(frames, pulse_m=0.02, beam_width_deg=0.5, looks=2).sonar
+    assert (known.pulse_m, known.beam_width_deg, known.looks) == (0.02, 0.5, 2)
+
+
+def test_beams_of_different_pings_are_noted() -> None:
+    """Noise that neighbouring beams do not share at all is no narrow beam: the width stays, and a note asks for groups."""
+    level = np.random.default_rng(2).gumbel(size=(3, 256, 48)) * -4.34
+    level = level + 0.05 * np.roll(level, 1, axis=2)
+    sonar = Sonar.create(beams=48, range_bins=256, coding="dB", coding_db=80.0)
+    frames = SonarFrames(level / 80 + 0.5, sonar.range_m, sonar.bearing_rad, np.arange(3.0), sonar, level="dB")
+    fit = fit_sonar(frames, frequency_hz=1.8e6, looks=1)
+    assert fit.sonar.beam_width_deg == frames.sonar.beam_width_deg
+    assert any("beams correlates by 0.0" in note and "ping_groups" in note for note in fit.notes)
+
+
 def blank(bins: int = 128, beams: int = 32, value: Array | float = 0.5) -> SonarFrames:
     sonar = Sonar.create(beams=beams, range_bins=bins)
     image = np.zeros((2, bins, beams), np.float32) + np.float32(value)

@@ -188,6 +188,27 @@ def test_neighbours_correlate_as_pattern_and_pulse_say(flat: mi.Scene) -> None:
             assert got == pytest.approx(truth**2, abs=0.03)
 
 
+@pytest.mark.parametrize("looks", essence([2, 3], 2))
+def test_looks_average_the_power_of_shorter_pulses(flat: mi.Scene, looks: int) -> None:
+    """The mean power stays: of ground, noise and water. The variance is the mean of c^2 over pairs of looks."""
+    parts = {
+        "ground": SONAR.replace(scatterers_per_cell=30.0),
+        "noise": SONAR.replace(noise_level_db=-60.0, range_min=0.1, range_max=0.9),
+        "water": SONAR.replace(volume_db=-40.0, range_min=0.6, range_max=1.0),
+    }
+    ahead = np.array([0.05, 0.03, 0, 0, 0, 0])
+    for name, sonar in parts.items():
+        several = imager(flat, sonar.replace(looks=looks))
+        levels = [np.stack([one.levels(POSE + k * ahead, k)[0] for k in range(6)]) for one in (imager(flat, sonar), several)]
+        assert levels[0].shape == levels[1].shape
+        assert 10 * np.log10(levels[1].mean() / levels[0].mean()) == pytest.approx(0, abs=0.25), name
+        for level, count in zip(levels, (1, looks), strict=True):
+            apart = (np.arange(count) - np.arange(count)[:, None]) * (sonar.bin_m / count)
+            pairs = Pulse(sonar.resolution_m / count).spectrum().coherence(apart) ** 2
+            relative = level / level.mean(axis=(0, 2), keepdims=True)
+            assert relative.std() == pytest.approx(pairs.mean() ** 0.5, rel=0.05), name
+
+
 def intensity_correlation(a: Array, b: Array) -> float:
     """Correlation of the intensities, each less its mean over the places."""
     x, y = (np.abs(v) ** 2 for v in (a, b))

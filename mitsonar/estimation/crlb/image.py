@@ -594,6 +594,8 @@ class SpeckleBounds:
     def __init__(self, simulator: Simulator, gain: float) -> None:
         if simulator.model.imager is None:
             raise MitsonarError(f"bounds of speckle are for the model coherent: got {simulator.sonar.model}")
+        if simulator.sonar.looks > 1:
+            raise MitsonarError(f"bounds of speckle are for one look: got {simulator.sonar.looks}; set looks to 1")
         self.sonar, self.gain = simulator.sonar, gain
         self.imager = simulator.model.imager
         self.halves = self.imager, self.imager.of_quality(OTHER_HALF_QUALITY[self.sonar.quality])

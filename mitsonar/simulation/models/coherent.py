@@ -114,6 +114,8 @@ class CoherentImager:
         motion: motion of the scene's bodies; default: nothing moves.
 
     Attributes:
+        sonar: as given.
+        sampled: the sonar with a bin for each look.
         sides: sides of the elevation that are rendered separately: 0 for the whole view, +1 and -1 for portions.
         notes: warnings about scene and sonar.
 
@@ -131,22 +133,23 @@ class CoherentImager:
     ) -> None:
         self.views = check_views(views or [Whole(sonar)], mirrors)
         self.sides = tuple(dict.fromkeys(side_of(view) for view in self.views))
-        self.sonar, self.former = sonar, BeamFormer(sonar)
-        self.receiver = ReceiverNoise(sonar, self.former)
+        self.sonar, self.sampled = sonar, sampled(sonar)
+        self.former = BeamFormer(self.sampled)
+        self.receiver = ReceiverNoise(self.sampled, self.former, sonar.looks)
         self._given = scene, mirrors, motion
         parts = None if mirrors is None else mirror_of(scene, mirrors)
-        self.tracers = {side: CoherentTracer(scene, sonar, self.former, parts, side, motion) for side in self.sides}
+        self.tracers = {side: CoherentTracer(scene, self.sampled, self.former, parts, side, motion) for side in self.sides}
         self.tracer = self.tracers[self.sides[0]]
-        self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts, motion=motion)
+        self.glints = None if parts is None else MirrorTracer(scene, self.sampled, self.former, parts, motion=motion)
         several = parts is not None and sonar.bounces > 1
         self.ghosts = GhostTracer(self.tracer, parts) if several else None
         self.diffuse = DiffuseField(self.tracer) if sonar.bounces > 1 else None
         cornered = parts if several else None
-        self.corners = None if cornered is None else CornerTracer(scene, sonar, self.former, cornered, motion=motion)
+        self.corners = None if cornered is None else CornerTracer(scene, self.sampled, self.former, cornered, motion=motion)
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
 
     def image(self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
-        """Return the complex image of one ping ``(bins, sides * beams)`` with its noise, and the counts of its rays.
+        """Return the complex image of one ping ``(bins * looks, sides * beams)`` with its noise, and the counts of its rays.
 
         Args:
             pose: sonar pose ``(6,)`` [m, rad].
@@ -160,7 +163,7 @@ class CoherentImager:
     def echoes(
         self, pose: NDArray[np.float64], side: int | None = None, time_s: float = 0.0
     ) -> tuple[NDArray[np.complex64], FieldCounts]:
-        """Return the complex image of the scene alone ``(bins, beams)``, and the ray counts.
+        """Return the complex image of the scene alone ``(bins * looks, beams)``, and the ray counts.
 
         The image has no noise, volume reverberation or stripes.
 
@@ -174,7 +177,7 @@ class CoherentImager:
         for further in (self.glints, self.ghosts, self.corners, self.diffuse):
             if further is not None:
                 further.add(pose, field, time_s)
-        # beams and bins, absorption, and the crosstalk of all beams
+        # beams and bins, absorption, and the crosstalk of all beams; each look has the power of a whole bin
         image = self.former.beams(field) * self._loss[:, None]
         return np.asarray(with_crosstalk(self.sonar, image), dtype=np.complex64), counts
 
@@ -198,6 +201,8 @@ class CoherentImager:
         """Return the levels of one ping after gain ``(bins, sides * beams)`` float32, its ray counts, and its cut rays."""
         image, counts = self.image(pose, ping, time_s)
         power = image.real * image.real + image.imag * image.imag
+        if self.sonar.looks > 1:
+            power = power.reshape(self.sonar.range_bins, self.sonar.looks, -1).mean(axis=1)
         rays = (np.array([[number]]) for number in (counts.inside, counts.nearer, counts.farther, counts.missed))
         return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), self._cut_rays(counts)
 
@@ -214,8 +219,21 @@ class CoherentImager:
 
     @cached_property
     def _loss(self) -> NDArray[np.float32]:
-        """Return the two-way amplitude factor of absorption ``(bins,)``."""
-        return np.asarray(np.sqrt(loss_of(self.sonar)), dtype=np.float32)
+        """Return the two-way amplitude factor of absorption, times that of a look, ``(bins * looks,)``."""
+        return np.asarray(np.sqrt(loss_of(self.sampled) * self.sonar.looks), dtype=np.float32)
+
+
+def sampled(sonar: Sonar) -> Sonar:
+    """Return the sonar with a bin for each look, and the same scatterers."""
+    if sonar.looks == 1:
+        return sonar
+    return sonar.replace(
+        looks=1,
+        range_bins=sonar.range_bins * sonar.looks,
+        pulse_m=None if sonar.pulse_m is None else sonar.pulse_m / sonar.looks,
+        bandwidth_hz=None if sonar.bandwidth_hz is None else sonar.bandwidth_hz * sonar.looks,
+        scatterers_per_cell=sonar.scatterers_per_cell / sonar.looks,
+    )
 
 
 def point_notes(sonar: Sonar) -> list[str]:
