@@ -66,7 +66,7 @@ def features(patch: Array) -> Array:
     # 4. Means of bins and of beams, and how they change from one to the next.
     means = (rest.mean(axis=1), rest.mean(axis=0))
     sides = [float(value) for mean in means for value in (mean.std(), np.diff(mean).std())]
-    return np.nan_to_num(np.array([*level, *grain, *correlation, *sides], dtype=float))
+    return np.asarray(np.nan_to_num([*level, *grain, *correlation, *sides]), dtype=np.float64)
 
 
 def accuracies(real: Array, simulated: Array, *, shuffled: int | None = None) -> dict[str, float]:

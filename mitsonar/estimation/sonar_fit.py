@@ -356,7 +356,7 @@ def _with_resolution(sonar: Sonar, value: Array, span: float | None, given: dict
 
         def excess_over_range(bins: float) -> float:
             squared = np.square(Pulse(bins * step_m).spectrum().coherence(np.arange(2 * sonar.looks) * step_m))
-            return _neighbours(squared, sonar.looks, exponent) - over_range
+            return _coded(_neighbours(squared, sonar.looks), sonar.looks, exponent) - over_range
 
         pulse_bins = _root(excess_over_range, over_range)
         if pulse_bins is None:
@@ -366,11 +366,11 @@ def _with_resolution(sonar: Sonar, value: Array, span: float | None, given: dict
     # 3. Beam width, if neighbouring beams belong to one ping.
     if "beam_width_deg" not in given and sonar.ping_groups == 1:
         spacing_deg = sonar.azimuth_fov_deg / sonar.beams
-        lags = np.array([0.0, np.median(np.diff(np.sin(sonar.bearing_rad)))])
+        lag = float(np.median(np.diff(np.sin(sonar.bearing_rad))))
 
         def excess_over_beams(beams: float) -> float:
             aperture = sonar.replace(beam_width_deg=beams * spacing_deg).aperture
-            return _neighbours(np.square(aperture.elements().coherence(lags)), 1, exponent) - over_beams
+            return _coded(float(aperture.elements().coherence(lag)) ** 2, sonar.looks, exponent) - over_beams
 
         beams = _root(excess_over_beams, over_beams)
         if beams is not None and beams >= LEAST_WIDTH:
@@ -399,23 +399,35 @@ def _root(excess: Callable[[float], float], measured: float) -> float | None:
     return float(optimize.brentq(excess, *RESOLUTIONS, xtol=1e-3))
 
 
-def _neighbours(squared: Array, looks: int, exponent: float) -> float:
-    """Return the correlation of the values of neighbouring cells.
-
-    Powers I^a of one look correlate by (F(c^2) - 1) / (F(1) - 1) with F = 2F1(-a, -a; 1; .), their logarithms by
-    Li2(c^2) / (pi^2 / 6). Averages over several looks are taken as linear: the mean of c^2 over pairs.
+def _neighbours(squared: Array, looks: int) -> float:
+    """Return the correlation of the powers of neighbouring bins: the mean of c^2 over pairs of their looks.
 
     Args:
         squared: squared coherence c^2 of the field at lags of 0, 1 ... looks ``(2 * looks,)``.
-        looks: number of looks that a cell averages.
+        looks: number of looks that a bin averages.
+    """
+    lag = np.arange(looks)[None, :] - np.arange(looks)[:, None]
+    return float(squared[looks + lag].mean() / squared[np.abs(lag)].mean())
+
+
+def _coded(correlation: float, looks: int, exponent: float) -> float:
+    """Return the correlation of values whose powers, of Gamma laws of as many looks, correlate.
+
+    Powers I^a of one look have (F(c) - 1) / (F(1) - 1), F = 2F1(-a, -a; 1; .). Logarithms have the sum of
+    c^k (k - 1)! / (k (L)_k) over trigamma(L), which is Li2(c) / (pi^2 / 6) for one look.
+
+    Args:
+        correlation: of the powers, c.
+        looks: L.
         exponent: a, of the coding; 0 for dB.
     """
-    if looks > 1:
-        lag = np.arange(looks)[None, :] - np.arange(looks)[:, None]
-        return float(squared[looks + lag].mean() / squared[np.abs(lag)].mean())
     if exponent == 0:
-        return float(special.spence(1 - squared[1]) / (math.pi**2 / 6))
-    here, one = special.hyp2f1(-exponent, -exponent, 1, np.array([squared[1], 1.0]))
+        k = np.arange(1, 400)
+        term = np.exp(special.gammaln(k) + special.gammaln(looks) - special.gammaln(looks + k)) / k
+        return float((correlation**k * term).sum() / term.sum())
+    if looks > 1:
+        return correlation
+    here, one = special.hyp2f1(-exponent, -exponent, 1, np.array([correlation, 1.0]))
     return float((here - 1) / (one - 1))
 
 

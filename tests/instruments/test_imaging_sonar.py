@@ -40,6 +40,7 @@ DEFAULTS = {
     "pulse_m": None,
     "pattern": None,
     "shading": "hann",
+    "looks": 1,
     "elevation_pattern": None,
     "bounces": 1,
     "ping_groups": 1,

@@ -74,7 +74,7 @@ def test_properties_are_those_of_a_sonar() -> None:
         **{"range_max": 2.5, "range_bins": 11, "sound_speed": 1480.0, "bearing": "cone", "beam_layout": "sine"},
         **{"beam_width_deg": 0.7, "rays_across": 3, "jitter": False, "seed": 4, "model": "thesis"},
         **{"gain_exponent": 2, "frame_rate_hz": 15.0, "quality": "fine", "thesis_rays": 6},
-        **{"frequency_hz": 1e6, "bandwidth_hz": 2e4, "pattern": "receive", "shading": "taylor", "focus_m": 4.0},
+        **{"frequency_hz": 1e6, "bandwidth_hz": 2e4, "pattern": "receive", "shading": "taylor", "focus_m": 4.0, "looks": 2},
         **{"elevation_pattern": "box", "scatterers_per_cell": 5.0, "scatterer_spacing_m": 0.01, "speckle_nu": 2.0},
         **{"speckle_patch_m": 0.2, "source_level_db": 210.0, "noise_level_db": 60.0, "absorption_db_per_m": 0.3},
         **{"temperature_c": 4.0, "salinity_psu": 0.5, "water_depth_m": 3.0, "ph": 7.0, "gain_absorption": True},
