@@ -10,7 +10,6 @@ the extra `bench`; its column may stay empty (`--without-open3d`, `--quick`).
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import platform
 import subprocess
@@ -19,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from datetime import date
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -77,8 +77,8 @@ def main() -> None:
         return render_for_memory(*args.frames_memory)
     ensure_variant(args.variant)
     size = QUICK if args.quick else FULL
-    if not (args.quick or args.without_open3d or has_open3d()):
-        parser.error("Open3D is missing: pip install 'mitsonar[bench]', or give --without-open3d")
+    if not (args.quick or args.without_open3d) and (fault := open3d_fault()):
+        parser.error(f"Open3D cannot be loaded ({fault}): pip install 'mitsonar[bench]', or give --without-open3d")
     seabed = rocky_seabed(size.a_side)
     scene = mitsuba_scene(seabed)
     result: Row = {"machine": machine(), "triangles": len(seabed.faces) + 2, "batch": [], "single": []}
@@ -166,7 +166,7 @@ def batch(scene: mi.Scene, seabed: Seabed, beams: int, rays: int, count: int, re
         "thesis": lambda: list(simulators[0].pings(poses)),
         "physical": lambda: list(simulators[1].pings(poses)),
     }
-    if has_open3d():
+    if open3d_fault() is None:
         open3d = open3d_frames(seabed, thesis)
         work["open3d"] = lambda: [open3d(pose) for pose in few]
     seconds = medians(work, repeats)
@@ -198,9 +198,14 @@ def single(scene: mi.Scene, beams: int, rays: int, repeats: int) -> Row:
     return {"grid": f"{beams} x {rays}", "ms": ms, **ratios}
 
 
-def has_open3d() -> bool:
-    """Whether frames can be compared with Open3D's."""
-    return importlib.util.find_spec("open3d") is not None
+@cache
+def open3d_fault() -> str | None:
+    """Return why Open3D, or a system library that it needs, cannot be loaded; None if it can."""
+    try:
+        import open3d  # noqa: F401
+    except (ImportError, OSError) as error:
+        return str(error).splitlines()[0]
+    return None
 
 
 def open3d_frames(seabed: Seabed, sonar: mitsonar.Sonar) -> Callable[[np.ndarray], np.ndarray]:

@@ -506,7 +506,7 @@ class Sonar(Instrument):
         None, gt=0, le=1e3, description="range resolution, half-power width of the compressed pulse [m]; default: one bin"
     )
     looks: int = Field(
-        1, ge=1, le=64, description="powers of shorter pulses that a bin averages, of pulse_m / looks each (coherent)"
+        1, ge=1, le=16, description="powers of shorter pulses that a bin averages, of pulse_m / looks each (coherent)"
     )
     pattern: Pattern | None = Field(
         None, description="of the beams: box, receive or two_way; default: two_way in the model coherent, else box"

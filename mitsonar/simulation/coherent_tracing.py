@@ -250,7 +250,7 @@ class FieldSums:
     """Sums of waves at the nodes of a beam former's grid, in fixed point.
 
     Packed sums hold real and imaginary part in the halves of one 64-bit number, times the square of the range of the node:
-    that takes half as many additions, which are most of the time of a ping.
+    that takes half as many additions.
 
     Args:
         former: beam former, which defines the grid.
