@@ -290,7 +290,7 @@ GROUND = "ground/"
 """Prefix of the names of ground geometry arrays in a raw sample."""
 
 CACHED_BYTES = 2**31
-"""Largest array that is cached in memory [bytes]; processes that read for one training share it."""
+"""Size of the arrays of a data set that are cached in memory [bytes]; processes that read for one training share it."""
 
 CACHED_FROM = 16
 """An array is cached once one in so many of its frames has been read."""
@@ -567,7 +567,8 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         if name not in self._cached:
             length = int(np.prod(self.store.modality.stored[name].shape)) * self.store.array(name).dtype.itemsize
             worker = get_worker_info()
-            if length * len(self.sequence) > CACHED_BYTES // (worker.num_workers if worker else 1):
+            room = CACHED_BYTES // (worker.num_workers if worker else 1) - sum(one.nbytes for one in self._cached.values())
+            if length * len(self.sequence) > room:
                 return self.store.read(name, here)
             self._read_frames[name] = self._read_frames.get(name, 0) + here.stop - here.start
             if CACHED_FROM * self._read_frames[name] < len(self.sequence):

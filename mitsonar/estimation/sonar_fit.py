@@ -321,7 +321,6 @@ LEAST_CORRELATION = 0.02
 RESOLUTIONS = (0.25, 8.0)
 """Range of pulses in bins, and of beam widths in beams, that are tried."""
 
-
 LEAST_WIDTH = 0.7
 """Width below which beams of one ping would leave gaps, in beams."""
 
@@ -349,8 +348,11 @@ def _with_resolution(sonar: Sonar, value: Array, span: float | None, given: dict
     over_beams = float(np.median((grain[:, :, 1:] * grain[:, :, :-1]).mean(axis=(1, 2)) / power))
     exponent = {"dB": 0.0, "gamma": sonar.coding_gamma / 2}.get(sonar.value_coding, 1.0)
     # 2. Looks from the spread of the grain in dB, then the pulse. Looks of a long pulse count as the fewer they resemble.
+    assert sonar.frequency_hz is not None
+    shortest_m = 1.001 * Pulse.of_band(2 * sonar.frequency_hz, sonar.sound_speed).resolution_m
     if "looks" not in given and span is not None:
-        sonar = sonar.replace(looks=min(MOST_LOOKS, round(_looks_of(statistics.RAYLEIGH_DB * sonar.coding_db / span))))
+        looks = round(_looks_of(statistics.RAYLEIGH_DB * sonar.coding_db / span))
+        sonar = sonar.replace(looks=max(1, min(looks, MOST_LOOKS, int(sonar.resolution_m / shortest_m))))
     if "pulse_m" not in given and "bandwidth_hz" not in given:
         step_m = sonar.bin_m / sonar.looks
 
@@ -362,7 +364,8 @@ def _with_resolution(sonar: Sonar, value: Array, span: float | None, given: dict
         if pulse_bins is None:
             notes.append(f"the noise of neighbouring bins correlates by {over_range:.2f}, which gives no pulse: it is kept")
         else:
-            sonar = sonar.replace(bandwidth_hz=None, pulse_m=float(f"{pulse_bins * sonar.bin_m:.3g}"))
+            pulse_m = max(pulse_bins * sonar.bin_m, sonar.looks * shortest_m)
+            sonar = sonar.replace(bandwidth_hz=None, pulse_m=float(f"{pulse_m:.3g}"))
     # 3. Beam width, if neighbouring beams belong to one ping.
     if "beam_width_deg" not in given and sonar.ping_groups == 1:
         spacing_deg = sonar.azimuth_fov_deg / sonar.beams
@@ -484,6 +487,7 @@ def _nu(flat: Array, value: Array, noise: float) -> float | None:
     clipped = statistics.window_values(value >= FULL_SCALE, FLAT_WINDOW).mean(axis=1)
     mean = levels.mean(axis=1)
     bright = (mean > (1 + FLAT_NOISE_RATIO) * noise) & (clipped <= MOST_CLIPPED) & (mean > 0)
+    bright &= np.isfinite(parts).all(axis=1)  # not where whole rows are empty
     if not bright.any():
         return None
     # excess of the squared contrast over that of exponential intensities, corrected for the noise

@@ -372,6 +372,9 @@ RAYS = ("rays_per_beam", "rays_across")
 LEAST_APERTURE = 0.5
 """Shortest aperture that has a beam pattern [wavelengths]."""
 
+MOST_BINS = 1_000_000
+"""Largest number of range bins."""
+
 MOST_COHERENT_DEG = 170
 """Largest field of view of the coherent model, whose rays are evenly spaced in the sine and tangent of angles [deg]."""
 
@@ -446,7 +449,7 @@ class Sonar(Instrument):
     beams: int = Field(96, ge=1, le=65_536, description="number of beams")
     range_min: float = Field(3.2, ge=0, le=1e5, description="start of the window [m]")
     range_max: float = Field(5.6, gt=0, le=1e5, description="end of the window [m], beyond range_min")
-    range_bins: int = Field(512, ge=1, le=1_000_000, description="range bins of the window")
+    range_bins: int = Field(512, ge=1, le=MOST_BINS, description="range bins of the window")
     sound_speed: float = Field(1500.0, gt=0, le=1e4, description="sound speed [m/s]")
     bearing: Bearing = Field("azimuth", description="what a beam's angle is: azimuth, or the cone of a line array")
     beam_layout: Literal["even", "sine"] = Field(
@@ -630,12 +633,17 @@ class Sonar(Instrument):
             )
         if self.beam_pattern == "box":
             raise ValueError("the model coherent needs a pattern of the beams: give pattern receive or two_way")
-        band = Pulse(self.resolution_m).bandwidth_hz(self.sound_speed)
+        band = Pulse(self.resolution_m / self.looks).bandwidth_hz(self.sound_speed)
         if band > 2 * self.frequency_hz:
+            several = f" by {self.looks} looks" if self.looks > 1 else ""
             raise ValueError(
-                f"a range resolution of {self.resolution_m:.3g} m takes a band of {band:.3g} Hz, more than twice the "
-                f"carrier: got frequency_hz {self.frequency_hz:g}; give it in Hz, at least {band / 2:.3g}, or a larger "
-                "pulse_m"
+                f"a range resolution of {self.resolution_m:.3g} m{several} takes a band of {band:.3g} Hz, more than twice "
+                f"the carrier: got frequency_hz {self.frequency_hz:g}; give it in Hz, at least {band / 2:.3g}, or a larger "
+                f"pulse_m{' or fewer looks' if several else ''}"
+            )
+        if self.range_bins * self.looks > MOST_BINS:
+            raise ValueError(
+                f"range_bins times looks are at most {MOST_BINS:,}: got {self.range_bins:,} x {self.looks}; lower looks"
             )
 
     def _check_aperture(self) -> None:

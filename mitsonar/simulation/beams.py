@@ -174,12 +174,17 @@ class BeamFormer:
 
     def _banded(self, amplitude: Callable[[NDArray[np.float64]], NDArray[np.float64]], lines: int, step: float) -> Banded:
         """Return a function of the distance between bin and line [m] as a matrix ``(bins, lines)``."""
-        sonar = self.sonar
-        away = sonar.range_m[:, None] - (self.first_range + np.arange(lines) * step)
-        near = np.abs(away) <= PULSE_LENGTHS * self.pulse.resolution_m
-        matrix = np.zeros(away.shape, np.float32)
-        matrix[near] = amplitude(away[near])
-        return Banded.of_matrix(matrix)
+        places = self.sonar.range_m
+        reach = PULSE_LENGTHS * self.pulse.resolution_m
+        blocks = []
+        for begin in range(0, len(places), BLOCK):  # block by block, because the whole matrix grows with the square of bins
+            rows = places[begin : begin + BLOCK]
+            first = max(0, math.ceil((rows[0] - reach - self.first_range) / step))
+            last = min(lines, math.floor((rows[-1] + reach - self.first_range) / step) + 1)
+            away = rows[:, None] - (self.first_range + np.arange(first, last) * step)
+            block = np.where(np.abs(away) <= reach, amplitude(away), 0)
+            blocks.append((first, block.astype(np.float32)))
+        return Banded(len(places), blocks, lines)
 
     @cached_property
     def _gain(self) -> float:

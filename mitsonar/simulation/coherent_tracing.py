@@ -24,7 +24,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.beams import BeamFormer, CommonFan, elevation_gain, kernel_weights
-from mitsonar.simulation.device import DeviceArray, Frozen, padded, replayed
+from mitsonar.simulation.device import DeviceArray, Frozen, replayed
 from mitsonar.simulation.mirrors import Mirrors, without_mirror_part
 from mitsonar.simulation.moving import SceneMotion, scene_at
 from mitsonar.simulation.points import LEAST_COSINE, HashedPoints, Point, pick
@@ -143,7 +143,8 @@ class CoherentTracer:
         # 3. Sum them.
         field, outcomes = np.zeros((self.former.ranges, self.former.sines), np.complex64), np.array(counts)
         if total:
-            inputs = [mi.UInt32(padded(np.array(part, copy=False)[:total])) for part in listed]
+            inputs = [dr.gather(mi.UInt32, part, dr.arange(mi.UInt32, total)) for part in listed]
+            dr.eval(inputs)
             values, points = replayed(self.sum, *inputs, rows, hits, self.patches)
             self.sums.add_to(field, values)
             outcomes[COUNTED.index("points")] = int(np.array(points)[0])

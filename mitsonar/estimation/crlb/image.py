@@ -588,7 +588,7 @@ class SpeckleBounds:
         gain: gain of the frames.
 
     Raises:
-        MitsonarError: another model.
+        MitsonarError: another model, or several looks.
     """
 
     def __init__(self, simulator: Simulator, gain: float) -> None:
