@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage, optimize, stats
+from scipy import ndimage
 
 __all__ = [
     "RAYLEIGH_DB",
@@ -296,20 +296,12 @@ def _leaking_rows(intensity: Array) -> _Rows | None:
     return _Rows(excess, lift, level, top, float(1.25 * spread / np.sqrt(LEAK_ROWS)))
 
 
-def _steady_power(median: float) -> float:
-    """Return the power of a steady wave that raises the median of exponential intensities of mean 1 to ``median``."""
-    if median <= np.log(2):
-        return 0.0
-    miss = lambda power: stats.ncx2.median(2, 2 * power) / 2 - median  # noqa: E731
-    return float(optimize.brentq(miss, 0.0, median + 10))
-
-
 def leak_power(intensity: ArrayLike, limit: float = np.inf) -> float:
     """Return the power that leaks into every beam, relative to the summed intensity of all beams.
 
-    In rows with a strong target, the quiet beams are compared with the same beams in rows before and behind. The median of
-    complex Gaussian noise plus a steady wave determines the power of the wave. Rows with a cell at or above ``limit`` are
-    excluded, since their clipped intensity is unknown.
+    In rows with a strong target, the quiet beams are compared with the same beams in rows before and behind. The leak has
+    another phase and amplitude in every beam, so it raises their median as it raises their mean. Rows with a cell at or
+    above ``limit`` are excluded, since their clipped intensity is unknown.
 
     Returns:
         The median over the strongest rows; 0 if quiet beams rise by no more than chance.
@@ -320,7 +312,7 @@ def leak_power(intensity: ArrayLike, limit: float = np.inf) -> float:
         return 0.0
     if np.median(rows.lift[below_limit]) < np.log(2) + LEAK_SURE * rows.chance:
         return 0.0
-    leaked = np.array([_steady_power(one) for one in rows.lift[below_limit]]) * rows.level[below_limit]
+    leaked = np.maximum(0, rows.lift[below_limit] / np.log(2) - 1) * rows.level[below_limit]
     return float(np.median(leaked / rows.excess[below_limit]))
 
 

@@ -18,7 +18,7 @@ from mitsonar.acoustics.levels import decoded
 from mitsonar.acoustics.water import gain_of, loss_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.beams import Pulse
-from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sonar import Sonar, group_of_beams
 from mitsonar.records.frames import SonarFrames
 
 __all__ = [
@@ -187,10 +187,10 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     nu = _nu(flat, value, noise or 0.0)
     if nu is not None and nu < STRUCTURED_NU:
         notes.append(f"a speckle_nu of {nu:g} is more than the texture of a bottom: it includes objects and edges")
-    # 4. a steady rise of quiet beams next to a strong echo is crosstalk, normalised by the beam pattern
-    leak = statistics.leak_power(intensity[:, statistics.GLOW_BINS :], limit=float(decoded(FULL_SCALE, sonar))) / _lobe_sum(
-        sonar
-    )
+    # 4. a rise of quiet beams of the same ping next to a strong echo is crosstalk
+    limit, group = float(decoded(FULL_SCALE, sonar)), group_of_beams(sonar)
+    parts = [intensity[:, statistics.GLOW_BINS :, group == one] for one in range(sonar.ping_groups)]
+    leak = float(np.mean([statistics.leak_power(part, limit) for part in parts]))
     fitted: dict[str, Any] = {
         **{"near_glow_db": 0.0, "near_glow_edge_db": 0.0, "near_glow_spread_db": 0.0, "near_glow_still": 0.0},
         "volume_db": None,
@@ -494,16 +494,6 @@ def _nu(flat: Array, value: Array, noise: float) -> float | None:
     excess = (parts[bright] ** 2).mean(axis=1) / (2 * parts[bright].mean(axis=1) ** 2) - 1
     inverse_nu = float(np.median(excess * (mean[bright] / (mean[bright] - noise)) ** 2))
     return None if inverse_nu < NEAR_RAYLEIGH else round(float(np.clip(1 / inverse_nu, 0.1, 100)), 2)
-
-
-def _lobe_sum(sonar: Sonar) -> float:
-    """Return the power of the sum over beams divided by the sum of their powers, for a point and for speckle.
-
-    It is the squared integral of the pattern over that of its square, in beams.
-    """
-    spacing = float(np.diff(np.sin(sonar.bearing_rad)).mean())
-    u = np.linspace(-40, 40, 400_001) / sonar.aperture.length
-    return float(np.trapezoid(sonar.aperture.pattern(u), u) ** 2 / sonar.aperture.equivalent_width / spacing)
 
 
 # ---------------- Near glow and volume scattering

@@ -1,4 +1,4 @@
-"""How noise is added to a coherent ping: crosstalk of the beams, volume scattering, receiver noise with glow, stripes.
+"""How a receiver changes a coherent ping: crosstalk of the beams, volume scattering, receiver noise with glow, stripes.
 
 :data:`PROCESSES` names what is added after the echoes, in the order of the instrument. A process is a function
 ``process(receiver, image, ping, side) -> image`` of the complex image ``(bins, beams)``. Its draws are functions of (seed,
@@ -19,16 +19,20 @@ from scipy.sparse import csr_array, diags_array
 from mitsonar.acoustics.noise import uniform
 from mitsonar.acoustics.water import loss_of
 from mitsonar.instruments.beams import series, shaded_sinc
-from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sonar import Sonar, group_of_beams
 from mitsonar.simulation.beams import PULSE_LENGTHS, BeamFormer
 
-__all__ = ["PROCESSES", "ReceiverNoise", "with_crosstalk"]
+__all__ = ["PROCESSES", "ReceiverNoise", "crosstalk"]
 
 Image = NDArray[np.complex64]
 """A complex image ``(bins, beams)``: amplitudes relative to the source at 1 m."""
 
-STRIPES, NOISE, VOLUME, GLOW = 0x57121, 0x6E6F6973, 0x766F6C75, 0x676C6F77
-"""Salts of the seed that make the draws of stripes, noise, volume and glow independent."""
+STRIPES, NOISE, VOLUME, GLOW, CROSSTALK = 0x57121, 0x6E6F6973, 0x766F6C75, 0x676C6F77, 0x63726F73
+"""Salts of the seed that make the draws of stripes, noise, volume, glow and crosstalk independent."""
+
+CROSSTALK_FALL = 1 / 3
+"""Exponent by which the amplitude of crosstalk falls with the distance between channels. The kernel of a DIDSON, by which
+Teixeira et al. (2018, doi 10.1109/iros.2018.8594128) undo its crosstalk, is 1, 0.80, 0.68, 0.60 at distances 1 to 4."""
 
 MEDIAN_SQUARE = 0.25
 """Median of the squared bearing over evenly spaced beams, relative to the outermost beam."""
@@ -200,11 +204,30 @@ PROCESSES: tuple[Callable[[ReceiverNoise, NDArray[Any], int, int], NDArray[Any]]
 """Processes that act on the echoes of a ping, in the order of the instrument."""
 
 
-def with_crosstalk(sonar: Sonar, image: NDArray[Any]) -> NDArray[Any]:
-    """Return echoes ``(bins, beams)`` with the sum of all beams, weighted by ``crosstalk_db``, added to each beam."""
+def crosstalk(sonar: Sonar, groups: NDArray[np.int64] | None = None) -> NDArray[np.complex64] | None:
+    """Return the amplitudes with which beams leak into each other ``(from, to)``; None if they do not.
+
+    Each pair of beams of one ping group has a complex gain, drawn from the seed, that falls with the distance between their
+    channels. Over all pairs of a group, their mean square is ``crosstalk_db``.
+
+    Args:
+        sonar: the instrument.
+        groups: ping group of each beam ``(beams,)``; default: those of the sonar.
+    """
     if sonar.crosstalk_db is None:
-        return image
-    return np.asarray(image + np.float32(10 ** (sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True))
+        return None
+    groups = group_of_beams(sonar) if groups is None else groups
+    parts = np.random.default_rng([abs(sonar.seed), CROSSTALK]).normal(0, math.sqrt(0.5), (2, sonar.beams, sonar.beams))
+    gain = np.zeros((sonar.beams, sonar.beams), np.complex64)
+    for group in np.unique(groups):
+        beams = np.flatnonzero(groups == group)
+        channel = np.arange(len(beams))
+        away = np.abs(channel[:, None] - channel)
+        fall = np.where(away > 0, np.maximum(away, 1.0) ** -CROSSTALK_FALL, 0)
+        if len(beams) > 1:
+            fall *= 10 ** (sonar.crosstalk_db / 20) / math.sqrt(np.square(fall).sum() / (len(beams) * (len(beams) - 1)))
+        gain[np.ix_(beams, beams)] = fall * (parts[0] + 1j * parts[1])[np.ix_(beams, beams)]
+    return gain
 
 
 def _correlation(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

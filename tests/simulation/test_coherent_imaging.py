@@ -21,6 +21,7 @@ from mitsonar.instruments.beams import Pulse, series, shaded_sinc
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose, to_world_matrices
 from mitsonar.simulation import beams
+from mitsonar.simulation.receiver_noise import crosstalk
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.families import RockyField
@@ -437,11 +438,35 @@ def test_bright_speckle_stays_and_noise_changes(flat: mi.Scene) -> None:
 
 def test_crosstalk_and_stripes(flat: mi.Scene) -> None:
     plain = imager(flat).image(POSE, 0)[0]
-    leaky = imager(flat, SONAR.replace(crosstalk_db=-30.0)).image(POSE, 0)[0]
-    np.testing.assert_allclose(leaky - plain, np.repeat(plain.sum(axis=1, keepdims=True), 48, axis=1) * 10**-1.5, atol=1e-9)
+    leaky = imager(flat, sonar := SONAR.replace(crosstalk_db=-30.0))
+    np.testing.assert_allclose(leaky.image(POSE, 0)[0] - plain, plain @ crosstalk(sonar), atol=1e-9)
+    np.testing.assert_array_equal(leaky.image(POSE, 0)[0], imager(flat, sonar).image(POSE, 0)[0])
     striped = np.abs(imager(flat, SONAR.replace(stripes_db=0.5)).image(POSE, 0)[0] / plain)
     np.testing.assert_allclose(striped, striped[:1] + 0 * striped, rtol=1e-5)
     assert 0.3 < (20 * np.log10(striped[0])).std() < 0.8
+
+
+@pytest.mark.parametrize("groups", [1, 8])
+def test_crosstalk_falls_with_distance_and_stays_in_a_ping_group(groups: int) -> None:
+    sonar = SONAR.replace(beams=96, crosstalk_db=-40.0, ping_groups=groups)
+    power = np.mean([np.abs(np.asarray(crosstalk(sonar.replace(seed=seed)))) ** 2 for seed in range(200)], axis=0)
+    away = np.abs(np.arange(96)[:, None] - np.arange(96))
+    same = (away % groups == 0) & (away > 0)
+    assert not power[~same].any()
+    assert 10 * np.log10(power[same].mean()) == pytest.approx(-40, abs=0.1)
+    near, far = (10 * np.log10(power[away == channels * groups].mean()) for channels in (1, 8))
+    assert near - far == pytest.approx(20 / 3 * math.log10(8), abs=0.5)
+
+
+def test_groups_leak_only_among_themselves(flat: mi.Scene) -> None:
+    """A frame of groups at rest is that of one ping, with the crosstalk of each group."""
+    sonar = SONAR.replace(crosstalk_db=-20.0, coding="linear", ping_groups=4)
+    frame = next(iter(Simulator(flat, sonar).pings(POSE))).levels[0]
+    plain, one = imager(flat, SONAR), imager(flat, sonar.replace(ping_groups=1))
+    image = plain.image(POSE, 0)[0]
+    target = np.abs(image + image @ crosstalk(sonar)) ** 2 * plain.gain[:, None]
+    np.testing.assert_allclose(frame, target, rtol=1e-3, atol=1e-5 * target.max())
+    assert np.abs(one.image(POSE, 0)[0] - image - image @ crosstalk(sonar)).max() > 0.01 * np.abs(image).max()
 
 
 def test_elevation_pattern_is_three_db_down_at_the_field_of_view(flat: mi.Scene) -> None:

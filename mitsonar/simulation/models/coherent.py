@@ -24,7 +24,7 @@ from mitsonar.simulation.multipath_coherent import CornerTracer, GhostTracer, Mi
 from mitsonar.simulation.multipath_rough import DiffuseField
 from mitsonar.simulation.pings import Counts, CutRays, RenderedPings
 from mitsonar.simulation.points import MOST_CANDIDATES
-from mitsonar.simulation.receiver_noise import ReceiverNoise, with_crosstalk
+from mitsonar.simulation.receiver_noise import ReceiverNoise, crosstalk
 from mitsonar.simulation.tracing import surfaces_of, tracer_of
 
 if TYPE_CHECKING:
@@ -44,7 +44,10 @@ class CoherentModel:
 
     Implements :class:`~mitsonar.simulation.models.create.PingModel`.
 
-    The arguments are those of :func:`~mitsonar.simulation.models.create.create_model`.
+    The arguments are those of :func:`~mitsonar.simulation.models.create.create_model`, and:
+
+    Args:
+        groups: ping group of each beam ``(beams,)``, for crosstalk, if the sonar is that of one ping.
 
     Attributes:
         imager: renderer of the complex images.
@@ -61,8 +64,9 @@ class CoherentModel:
         mirrors: Mirroring,
         motion: SceneMotion | None,
         rays_per_launch: int,
+        groups: NDArray[np.int64] | None = None,
     ) -> None:
-        self.imager = CoherentImager(scene, sonar, mirrors, views, motion)
+        self.imager = CoherentImager(scene, sonar, mirrors, views, motion, groups)
         self.tracer, self._rays_per_launch = tracer_of(scene, sonar, motion), rays_per_launch
         self.views, self.notes = self.imager.views, self.imager.notes
 
@@ -112,6 +116,7 @@ class CoherentImager:
         mirrors: mirror parts of shapes, keyed by shape id, or ``"materials"``; default: none.
         views: the whole field of view or portions of it; default: the whole.
         motion: motion of the scene's bodies; default: nothing moves.
+        groups: ping group of each beam ``(beams,)``, within which beams leak; default: those of the sonar.
 
     Attributes:
         sonar: as given.
@@ -130,13 +135,15 @@ class CoherentImager:
         mirrors: Mirroring = None,
         views: Sequence[View] | None = None,
         motion: SceneMotion | None = None,
+        groups: NDArray[np.int64] | None = None,
     ) -> None:
         self.views = check_views(views or [Whole(sonar)], mirrors)
         self.sides = tuple(dict.fromkeys(side_of(view) for view in self.views))
         self.sonar, self.sampled = sonar, sampled(sonar)
         self.former = BeamFormer(self.sampled)
         self.receiver = ReceiverNoise(self.sampled, self.former, sonar.looks)
-        self._given = scene, mirrors, motion
+        self.crosstalk = crosstalk(sonar, groups)
+        self._given = scene, mirrors, motion, groups
         parts = None if mirrors is None else mirror_of(scene, mirrors)
         self.tracers = {side: CoherentTracer(scene, self.sampled, self.former, parts, side, motion) for side in self.sides}
         self.tracer = self.tracers[self.sides[0]]
@@ -179,12 +186,12 @@ class CoherentImager:
                 further.add(pose, field, time_s)
         # beams and bins, absorption, and the crosstalk of all beams; each look has the power of a whole bin
         image = self.former.beams(field) * self._loss[:, None]
-        return np.asarray(with_crosstalk(self.sonar, image), dtype=np.complex64), counts
+        return image if self.crosstalk is None else image + image @ self.crosstalk, counts
 
     def of_quality(self, quality: Quality) -> CoherentImager:
         """Return a renderer of the same scatterers with the number of rays of another quality."""
-        scene, mirrors, motion = self._given
-        return CoherentImager(scene, self.sonar.replace(quality=quality), mirrors, motion=motion)
+        scene, mirrors, motion, groups = self._given
+        return CoherentImager(scene, self.sonar.replace(quality=quality), mirrors, motion=motion, groups=groups)
 
     def in_views(self, pings: RenderedPings) -> list[RenderedPings]:
         """Split pings of all :attr:`sides` ``(pings, bins, sides * beams)`` into one part for each view."""

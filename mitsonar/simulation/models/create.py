@@ -108,7 +108,8 @@ def create_model(
     if sonar.model == "coherent":
         from mitsonar.simulation.models.coherent import CoherentModel
 
-        model = CoherentModel(scene, ping_sonar, views, mirrors, motion, rays_per_launch)
+        groups = None if scans(sonar) else group_of_beams(sonar)
+        model = CoherentModel(scene, ping_sonar, views, mirrors, motion, rays_per_launch, groups)
     elif sonar.model == "physical":
         from mitsonar.simulation.models.physical import PhysicalModel
 
