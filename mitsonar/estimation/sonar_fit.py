@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Container
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -64,6 +65,12 @@ NEAR_RAYLEIGH = 0.02
 MOST_LOOKS = 16
 """Largest number of looks that a fit gives."""
 
+OFFSETS = (0.03, 3.0)
+"""Range of the detector's offset relative to the noise that a fit gives."""
+
+SPREAD_ERROR, SKEWNESS_ERROR = 0.1, 0.15
+"""Errors of the measured spread, as a fraction, and skewness of noise in dB."""
+
 GRAIN_PERCENTILE, LEAST_WINDOWS = 20.0, 8
 """Percentile of the windows' means below which the grain gives the coding, and the smallest number of windows."""
 
@@ -120,6 +127,7 @@ class SonarFit:
                 f"{100 * sonar.near_glow_still:.0f} % stay from ping to ping"
             )
         volume_text = "none seen" if sonar.volume_db is None else f"{sonar.volume_db:.1f} dB re 1/m"
+        offset_text = "none seen" if sonar.detector_offset_db is None else f"{sonar.detector_offset_db:.1f} dB"
         pulse_text = f"{1e3 * sonar.resolution_m:.3g} mm" + (f", {sonar.looks} looks a bin" if sonar.looks > 1 else "")
         return [
             f"noise over full scale   {noise_text} (noise_level_db: {level})",
@@ -131,6 +139,7 @@ class SonarFit:
             f"speckle_nu              {speckle_text}",
             f"near glow over noise    {glow_text}",
             f"volume_db               {volume_text}",
+            f"detector_offset_db      {offset_text}",
         ]
 
     def yaml(self, *, only: Container[str] | None = None, leave: Container[str] = ()) -> str:
@@ -178,7 +187,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     # 2. the grain of dark windows gives a coding; with it, values become intensities
     span, gamma = (_span(value), None) if frames.level == "dB" else (None, _gamma(value))
     sonar = _with_coding(sonar, span, gamma, measure_coding, notes)
-    sonar = _with_resolution(sonar, value, None if measure_coding else span, given, notes)
+    sonar = _with_resolution(sonar, value, frames.level == "dB" and not measure_coding, given, notes)
     intensity = decoded(value, sonar)
     level = statistics.decibels(intensity, float(statistics.decibels(intensity[intensity > 0].min())) - 3)
     # 3. intensities before the gain give the noise, and the contrast of bright windows the speckle
@@ -197,12 +206,17 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         "stripes_db": round(statistics.beam_stripes_db(level), 2),
         "crosstalk_db": round(float(np.clip(10 * math.log10(leak), -120, 0)), 1) if leak > 0 else None,
         "speckle_nu": nu,
+        "detector_offset_db": None,
     }
     scale_notes: list[str] = []
     full_scale_db = _full_scale_db(frames, sonar, flat, scale_notes)
     # 5. what exceeds the noise near the sonar is glow; what is new in every frame is volume
     if noise is not None:
         fitted |= _water(flat, level, noise, sonar, full_scale_db, notes)
+        if frames.level == "dB" and (ratio := _offset_of(_grain_windows(value)[1] * sonar.coding_db, sonar.looks)) > 0:
+            fitted["noise_level_db"] -= 10 * math.log10(1 + ratio)  # dark bins hold noise and offset
+            fitted["detector_offset_db"] = round(fitted["noise_level_db"] + 10 * math.log10(ratio), 1)
+            fitted["noise_level_db"] = round(fitted["noise_level_db"], 1)
         notes += scale_notes
     middle = float(gain_of(sonar)[len(frames.range_m) // 2])
     return SonarFit(
@@ -272,6 +286,15 @@ def _grain_windows(value: Array) -> tuple[Array, Array]:
     return parts[dark], rest[dark]
 
 
+def _bright_windows(value: Array, sonar: Sonar) -> Array:
+    """Return detrended values ``(windows, cells)`` of windows far above the darkest, hardly clipped, in dB."""
+    parts, rest = (statistics.window_values(one) for one in (value, statistics.detrended(value)))
+    inside = ((parts > 0) & (parts < FULL_SCALE)).mean(axis=1) > 1 - MOST_CLIPPED
+    mean = parts.mean(axis=1)
+    above = np.percentile(mean, NOISE_PERCENTILE) + 10 * math.log10(FLAT_NOISE_RATIO) / sonar.coding_db
+    return np.asarray(rest[inside & (mean > above)])
+
+
 def _span(value: Array) -> float:
     """Return the span of the coding dB at which the grain of dark windows has 5.57 dB."""
     rest = _grain_windows(value)[1]
@@ -325,7 +348,7 @@ LEAST_WIDTH = 0.7
 """Width below which beams of one ping would leave gaps, in beams."""
 
 
-def _with_resolution(sonar: Sonar, value: Array, span: float | None, given: dict[str, Any], notes: list[str]) -> Sonar:
+def _with_resolution(sonar: Sonar, value: Array, several: bool, given: dict[str, Any], notes: list[str]) -> Sonar:
     """Return the sonar with the pulse, looks and beam width at which the noise of neighbouring cells correlates as measured.
 
     The grain of the darkest windows is noise that array and matched filter have passed, without texture of the bottom.
@@ -333,7 +356,7 @@ def _with_resolution(sonar: Sonar, value: Array, span: float | None, given: dict
     Args:
         sonar: with its coding.
         value: values of the frames ``(frames, bins, beams)``.
-        span: span of the coding at which the grain is that of one look [dB]; None: take one look.
+        several: whether to find the number of looks, for a known coding in dB; otherwise it stays.
         given: known fields, which stay.
         notes: of the fit, to which sentences are added.
     """
@@ -350,8 +373,8 @@ def _with_resolution(sonar: Sonar, value: Array, span: float | None, given: dict
     # 2. Looks from the spread of the grain in dB, then the pulse. Looks of a long pulse count as the fewer they resemble.
     assert sonar.frequency_hz is not None
     shortest_m = 1.001 * Pulse.of_band(2 * sonar.frequency_hz, sonar.sound_speed).resolution_m
-    if "looks" not in given and span is not None:
-        looks = round(_looks_of(statistics.RAYLEIGH_DB * sonar.coding_db / span))
+    if "looks" not in given and several:
+        looks = _looks_of(rest * sonar.coding_db, _bright_windows(value, sonar) * sonar.coding_db)
         sonar = sonar.replace(looks=max(1, min(looks, MOST_LOOKS, int(sonar.resolution_m / shortest_m))))
     if "pulse_m" not in given and "bandwidth_hz" not in given:
         step_m = sonar.bin_m / sonar.looks
@@ -386,13 +409,64 @@ def _with_resolution(sonar: Sonar, value: Array, span: float | None, given: dict
     return sonar
 
 
-def _looks_of(spread_db: float) -> float:
-    """Return the number of looks, at least 1, whose mean has a standard deviation in dB: 4.34 sqrt(trigamma(looks))."""
+def _looks_of(grain_db: Array, bright_db: Array) -> int:
+    """Return the number of looks, 1 to 16, by the spread and skewness of dark noise, to which a detector may add a constant.
 
-    def excess(looks: float) -> float:
-        return 10 / math.log(10) * math.sqrt(float(special.polygamma(1, looks))) - spread_db
+    Args:
+        grain_db: detrended levels of dark windows ``(windows, cells)`` [dB].
+        bright_db: the same of windows far above the noise, where texture may raise the spread.
+    """
+    spread, skewness = _mode(grain_db.std(axis=1, ddof=1)), _skewness(grain_db)
+    # Bright windows have at least the spread of their looks.
+    fewest = 1
+    if len(bright_db) >= LEAST_WINDOWS:
+        at_most = _mode(bright_db.std(axis=1, ddof=1))
+        fewest = max(looks for looks in range(1, MOST_LOOKS + 1) if looks == 1 or _grain(looks - 0.5, 0.0)[0] > at_most)
 
-    return float(optimize.brentq(excess, 1.0, 1000.0)) if excess(1.0) > 0 > excess(1000.0) else 1.0
+    def miss(looks: int, ratio: float) -> float:
+        model = _grain(looks, ratio)
+        return (math.log(model[0] / spread) / SPREAD_ERROR) ** 2 + ((model[1] - skewness) / SKEWNESS_ERROR) ** 2
+
+    ratios = [0.0, *np.geomspace(*OFFSETS, 24)]
+    return min(range(fewest, MOST_LOOKS + 1), key=lambda looks: min(miss(looks, ratio) for ratio in ratios))
+
+
+def _offset_of(grain_db: Array, looks: int) -> float:
+    """Return the constant that the detector adds to each bin, relative to the mean of the noise; 0 where none is seen.
+
+    The logarithm of noise alone is skewed to low levels, and a constant cuts that tail.
+
+    Args:
+        grain_db: detrended levels of dark windows ``(windows, cells)`` [dB].
+        looks: number of looks, which determines the law of the noise.
+    """
+    if len(grain_db) < LEAST_WINDOWS:
+        return 0.0
+    # Some texture, symmetric in dB, adds to the spread and not to the third moment; but that has its maximum at skewness 0.
+    skewness = _skewness(grain_db)
+    power = 3 if skewness < 0 else 0
+    measured = skewness * float(np.median(grain_db.std(axis=1))) ** power
+
+    def excess(log_ratio: float) -> float:
+        spread, skewness = _grain(looks, math.exp(log_ratio))
+        return skewness * spread**power - measured
+
+    ends = [math.log(ratio) for ratio in OFFSETS]
+    return math.exp(optimize.brentq(excess, *ends)) if excess(ends[0]) < 0 < excess(ends[1]) else 0.0
+
+
+def _skewness(grain_db: Array) -> float:
+    """Return the skewness of detrended levels ``(windows, cells)``, the median over windows."""
+    return float(np.median((grain_db**3).mean(axis=1) / np.square(grain_db).mean(axis=1) ** 1.5))
+
+
+@cache
+def _grain(looks: float, ratio: float) -> tuple[float, float]:
+    """Return standard deviation [dB] and skewness of 10 log10(I + ratio), I of a Gamma law of mean 1."""
+    level = statistics.decibels(special.gammaincinv(looks, (np.arange(2000) + 0.5) / 2000) / looks + ratio)
+    away = level - level.mean()
+    spread = float(np.sqrt(np.square(away).mean()))
+    return spread, float((away**3).mean()) / spread**3
 
 
 def _root(excess: Callable[[float], float], measured: float) -> float | None:

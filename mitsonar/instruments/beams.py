@@ -27,8 +27,11 @@ SHADINGS: tuple[str, ...] = get_args(Shading)
 TAYLOR_LOBES, TAYLOR_DB = 4, 30.0
 """Parameters of the Taylor shading: three side lobes next to the main lobe, at about -30 dB."""
 
-ELEMENTS, ELEMENTS_A_WAVELENGTH = 257, 8
-"""Number of elements that sample an aperture or a band, at least, and per wavelength."""
+SAMPLES, SAMPLES_A_WAVELENGTH = 257, 8
+"""Number of samples of an aperture or a band, at least, and per wavelength."""
+
+ELEMENTS_A_WAVELENGTH, ARRAY = 2, 0x61727279
+"""Number of elements of an array per wavelength, and the salt of the seed of their errors."""
 
 
 class Spectrum(NamedTuple):
@@ -114,11 +117,16 @@ class Aperture:
         width: full beam width at half power, as a difference of sines of the angle.
         shading: amplitude weighting over the aperture.
         two_way: whether the array both transmits and receives, so that the pattern is squared.
+        error: rms error of its elements, complex and relative to their amplitude. Elements half a wavelength apart with
+            weights w, whose sum is 1, give lobes of a mean power of error^2 sum w^2 at all angles.
+        seed: seed of these errors.
     """
 
     width: float
     shading: Shading = "hann"
     two_way: bool = True
+    error: float = 0.0
+    seed: int = 0
 
     @cached_property
     def length(self) -> float:
@@ -126,7 +134,7 @@ class Aperture:
         return 2 * half_power(series(self.shading), 4 if self.two_way else 2) / self.width
 
     def pattern(self, u: ArrayLike) -> NDArray[np.float64]:
-        """Return the amplitude at a sine of the angle ``u`` from the axis, of the same shape; 1 on the axis."""
+        """Return the amplitude at a sine of the angle ``u`` from the axis, same shape; 1 on the axis; without errors."""
         one_way = shaded_sinc(np.asarray(u, dtype=float) * self.length, series(self.shading))
         return one_way * one_way if self.two_way else one_way
 
@@ -136,10 +144,15 @@ class Aperture:
         Args:
             bend: wavelength times (1 / range - 1 / focal range), in the Fresnel approximation; 0 in focus.
         """
-        size = max(ELEMENTS, math.ceil(ELEMENTS_A_WAVELENGTH * self.length))
+        size = max(SAMPLES, math.ceil(SAMPLES_A_WAVELENGTH * self.length))
         x = (np.arange(size) + 0.5) / size - 0.5  # position along the aperture, relative to its length
         curvature = np.exp(-1j * math.pi * (self.length * x) ** 2 * bend)
-        return Spectrum(self.length * x, _shaded(x, series(self.shading)) * curvature)
+        weight = _shaded(x, series(self.shading)) * curvature
+        if self.error > 0:
+            elements = math.ceil(ELEMENTS_A_WAVELENGTH * self.length)
+            real, imag = np.random.default_rng([abs(self.seed), ARRAY]).normal(0, self.error / math.sqrt(2), (2, elements))
+            weight *= 1 + (real + 1j * imag)[((x + 0.5) * elements).astype(int)]
+        return Spectrum(self.length * x, weight)
 
     def spectrum(self, bend: float = 0.0) -> Spectrum:
         """Return the waves that add up to the pattern: those of :meth:`elements`, convolved with themselves if two-way."""
@@ -200,7 +213,7 @@ class Pulse:
 
     def spectrum(self) -> Spectrum:
         """Return the waves over range [1/m] that add up to the pulse, and their amplitudes."""
-        x = (np.arange(ELEMENTS) + 0.5) / ELEMENTS - 0.5
+        x = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
         return Spectrum(self.lobes_per_m * x, _shaded(x, HANN))
 
     @cached_property

@@ -562,9 +562,15 @@ class Sonar(Instrument):
     ph: float = Field(8.0, ge=6, le=9, description="acidity of the water")
     gain_absorption: bool = Field(False, description="the gain undoes absorption there and back too")
     crosstalk_db: float | None = Field(
-        None, ge=-120, le=0, description="every beam leaks into all others at this level [dB] (coherent); default: none"
+        None, ge=-120, le=0, description="rms leak of a beam into another of its ping group [dB] (coherent); default: none"
     )
     stripes_db: float = Field(0.0, ge=0, le=20, description="spread of the beams' gains, by the seed [dB] (coherent)")
+    array_error: float = Field(
+        0.0, ge=0, le=1, description="rms error of the array's elements, relative to their amplitude, by the seed (coherent)"
+    )
+    detector_offset_db: float | None = Field(
+        None, ge=-300, le=300, description="constant power that the detector adds [dB re 1 uPa] (coherent); default: none"
+    )
     coding: Coding | None = Field(
         None,
         description="how image values encode levels (with a pattern): linear, dB, gamma; default: coherent dB, else linear",
@@ -683,7 +689,8 @@ class Sonar(Instrument):
     @property
     def aperture(self) -> Aperture:
         """Return the aperture of the array across the beams."""
-        return Aperture(self.beam_width_rad, self.shading, self.beam_pattern != "receive")
+        error = self.array_error if self.model == "coherent" else 0.0
+        return Aperture(self.beam_width_rad, self.shading, self.beam_pattern != "receive", error, self.seed)
 
     @property
     def resolution_m(self) -> float:

@@ -209,7 +209,7 @@ class BeamFormer:
 
     @cached_property
     def over_sine(self) -> Banded:
-        """Return the pattern as a matrix ``(beams, sines)`` without the spectrum of the shares, for focus at every range."""
+        """Return the pattern as a matrix ``(beams, sines)`` without the spectrum of the shares, in focus, without errors."""
         return Banded.of_matrix(self._over_sine().real.astype(np.float32))
 
     def _over_sine(self, curvature: float = 0.0) -> NDArray[np.complex128]:
@@ -227,9 +227,10 @@ class BeamFormer:
 
     @cached_property
     def focused(self) -> list[tuple[slice, NDArray[np.complex64]]]:
-        """Return blocks of bins and their pattern matrices ``(beams, sines)``, for an array focused at one range."""
+        """Return blocks of bins and their pattern matrices ``(beams, sines)``, complex out of focus or with array errors."""
         sonar = self.sonar
-        assert sonar.focus_m is not None
+        if sonar.focus_m is None:
+            return [(slice(0, sonar.range_bins), self._over_sine().astype(np.complex64))]
         blocks = []
         for part in np.array_split(np.arange(sonar.range_bins), min(FOCUS_BLOCKS, sonar.range_bins)):
             curvature = float(np.mean(1 / sonar.range_m[part])) - 1 / sonar.focus_m
@@ -238,7 +239,7 @@ class BeamFormer:
 
     def beams(self, field: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Compute the complex image ``(bins, beams)`` of a field ``(ranges, sines)``."""
-        if self.sonar.focus_m is None:
+        if self.sonar.focus_m is None and self.sonar.array_error == 0:
             # beams first, which are fewer than lines; real and imaginary part apart, because both matrices are real
             beams = self.over_sine.of_rows(np.concatenate([field.real, field.imag]))  # (2 ranges, beams)
             real, imag = (self.over_range @ part for part in np.split(beams, 2))

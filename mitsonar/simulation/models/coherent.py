@@ -210,6 +210,8 @@ class CoherentImager:
         power = image.real * image.real + image.imag * image.imag
         if self.sonar.looks > 1:
             power = power.reshape(self.sonar.range_bins, self.sonar.looks, -1).mean(axis=1)
+        if self.sonar.detector_offset_db is not None:
+            power = power + np.float32(10 ** ((self.sonar.detector_offset_db - self.sonar.source_level_db) / 10))
         rays = (np.array([[number]]) for number in (counts.inside, counts.nearer, counts.farther, counts.missed))
         return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), self._cut_rays(counts)
 
