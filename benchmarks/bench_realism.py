@@ -32,6 +32,7 @@ from mitsonar.acoustics.levels import decoded
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.sonar_fit import SonarFit, fit_sonar
 from mitsonar.geometry.fan import to_cartesian
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.device import ensure_variant
 from mitsonar.simulation.simulator import Simulator
@@ -148,10 +149,10 @@ def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFra
         scene = stage.build(Path(result))
         if sonar.volume_db is not None and sonar.noise_level_db is not None:
             scale_db = (sonar.volume_db if stage.volume_db is None else stage.volume_db) - sonar.volume_db
-            sonar = sonar.replace(volume_db=sonar.volume_db + scale_db, noise_level_db=sonar.noise_level_db + scale_db)
+            sonar = with_noise(sonar, sonar.noise_level_db + scale_db).replace(volume_db=sonar.volume_db + scale_db)
             full_db = fit.full_scale_db + scale_db - sonar.source_level_db
             return recorded(Simulator(scene, sonar, mirrors=stage.mirrors), poses, full_db, stage, folder)
-        quiet = sonar.replace(noise_level_db=None, near_glow_db=0.0)
+        quiet = sonar.replace(noise_level_db=None, near_glow_db=0.0, detector_offset_db=None)
         silent = Simulator(scene, quiet, mirrors=stage.mirrors)
         bright = np.percentile(next(iter(silent.pings(poses[:1]))).levels[:, statistics.GLOW_BINS :], 99.9)
         assert silent.model.imager is not None
@@ -159,11 +160,18 @@ def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFra
         full_db = 10 * math.log10(bright) - fit.bright_db
         for few in (2, frames):  # pictures dim glints of single cells: full scale moves by what is missing
             if fit.noise_db is not None:
-                level = full_db - middle_db + fit.noise_db + sonar.source_level_db
-                sonar = sonar.replace(noise_level_db=level)
+                sonar = with_noise(sonar, full_db - middle_db + fit.noise_db + sonar.source_level_db)
             made_frames = recorded(Simulator(scene, sonar, mirrors=stage.mirrors), poses[:few], full_db, stage, folder)
             full_db += np.percentile(levels(made_frames)[:, statistics.GLOW_BINS :], 99.9) - fit.bright_db
     return made_frames
+
+
+def with_noise(sonar: Sonar, noise_level_db: float) -> Sonar:
+    """Return a sonar with another level of noise, and of the detector's offset with it."""
+    offset_db, noise_db = sonar.detector_offset_db, sonar.noise_level_db
+    if offset_db is not None and noise_db is not None:
+        offset_db += noise_level_db - noise_db
+    return sonar.replace(noise_level_db=noise_level_db, detector_offset_db=offset_db)
 
 
 def recorded(simulator: Simulator, poses: NDArray[np.float64], full_db: float, stage: Stage, folder: Path) -> SonarFrames:

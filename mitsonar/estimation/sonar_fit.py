@@ -213,10 +213,11 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     # 5. what exceeds the noise near the sonar is glow; what is new in every frame is volume
     if noise is not None:
         fitted |= _water(flat, level, noise, sonar, full_scale_db, notes)
+        # 6. dark bins contain noise and the detector's offset
         if frames.level == "dB" and (ratio := _offset_of(_grain_windows(value)[1] * sonar.coding_db, sonar.looks)) > 0:
-            fitted["noise_level_db"] -= 10 * math.log10(1 + ratio)  # dark bins hold noise and offset
-            fitted["detector_offset_db"] = round(fitted["noise_level_db"] + 10 * math.log10(ratio), 1)
-            fitted["noise_level_db"] = round(fitted["noise_level_db"], 1)
+            noise /= 1 + ratio
+            fitted["noise_level_db"] = round(float(statistics.decibels(noise)) + full_scale_db, 1)
+            fitted["detector_offset_db"] = round(float(statistics.decibels(noise * ratio)) + full_scale_db, 1)
         notes += scale_notes
     middle = float(gain_of(sonar)[len(frames.range_m) // 2])
     return SonarFit(
