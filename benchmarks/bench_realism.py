@@ -17,9 +17,12 @@ import json
 import math
 import tempfile
 import warnings
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +39,9 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.device import ensure_variant
 from mitsonar.simulation.simulator import Simulator
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 SHOWN_DB = 50.0
 """Span of the pictures below the 99.9th percentile [dB]."""
@@ -123,20 +129,78 @@ def classified(pairs: dict[str, tuple[Levels, Levels]]) -> str:
 PULSES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 """Pulses that are tried for recordings in pictures, in bins."""
 
+SHORTER = (0.7, 0.85, 1.0)
+"""Pulses that are tried for others, relative to that of the dark noise."""
+
+CROSSTALK_DB = (None, -45.0, -40.0, -36.0, -33.0, -30.0, -27.0, -24.0)
+OFFSET_DB = (None, -13.0, -10.0, -7.0, -4.0)
+"""Crosstalk and offset of the detector, relative to the noise, that are tried."""
+
+RANKS = (0, 10, 30, 50, 70, 90, 100)
+"""Percentiles of the windows' means, between which grain is compared."""
+
 
 def fitted(name: str, real: SonarFrames, folder: Path) -> SonarFit:
-    """Fit the sonar of a recording; in pictures, which smooth, take the pulse at which rendered ones correlate as much."""
+    """Fit the sonar of a recording, then pulse, crosstalk and offset at which rendered grain is most alike."""
     stage = STAGES[name]
     fit = fit_sonar(real, **stage.sonar)
-    if not stage.pictures:
+    sonar, target = real.sonar, grain(real)
+    pulses: list[dict[str, Any]]
+    if stage.pictures:  # which smooth
+        pulses = [{"pulse_m": bins * sonar.bin_m, "beam_width_deg": sonar.beam_width_deg} for bins in PULSES]
+    else:
+        width = fit.sonar.beam_width_deg
+        pulses = [{"pulse_m": part * fit.sonar.resolution_m, "beam_width_deg": width} for part in SHORTER]
+    fit = nearest([fit_sonar(real, **stage.sonar, **known) for known in pulses], stage, target, folder)
+    for _ in range(2):
+        leaks = [replace(fit, sonar=fit.sonar.replace(crosstalk_db=level)) for level in CROSSTALK_DB]
+        fit = nearest([fit, *leaks], stage, target, folder)
+        fit = nearest([fit, *(with_offset(fit, level) for level in OFFSET_DB)], stage, target, folder)
+        fit = nearest([fit, *(replace(fit, sonar=fit.sonar.replace(**known)) for known in pulses)], stage, target, folder)
+    return fit
+
+
+def nearest(fits: list[SonarFit], stage: Stage, target: NDArray[np.float64], folder: Path) -> SonarFit:
+    """Return the fit whose rendered grain is most alike."""
+    miss = [float(np.abs(grain(simulate(stage, fit, 1, folder)) - target).mean()) for fit in fits]
+    return fits[int(np.argmin(miss))]
+
+
+def grain(frames: SonarFrames) -> NDArray[np.float64]:
+    """Return spread and correlation of the grain of windows by the rank of their level, in units of their bands."""
+    rest = statistics.detrended(level := levels(frames))
+    mean = statistics.window_values(level).mean(axis=1)
+    shape = [min(size, whole) for size, whole in zip(statistics.WINDOW, rest.shape[1:], strict=True)]
+    windows = statistics.window_values(rest).reshape(-1, *shape)
+    power = np.square(windows).mean(axis=(1, 2)) + 1e-9
+    over_range = [(windows[:, lag:] * windows[:, :-lag]).mean(axis=(1, 2)) / power for lag in (1, 2)]
+    over_beams = (windows[:, :, 1:] * windows[:, :, :-1]).mean(axis=(1, 2)) / power
+    numbers = np.stack([np.sqrt(power) / 0.7, *(one / 0.1 for one in (*over_range, over_beams))])
+    ends = np.percentile(mean, RANKS)
+    parts = [(mean >= low) & (mean <= high) for low, high in pairwise(ends)]
+    return np.array([np.median(numbers[:, part], axis=1) for part in parts])
+
+
+def with_offset(fit: SonarFit, offset_db: float | None) -> SonarFit:
+    """Return the fit with another offset of the detector, relative to the noise [dB], and the same dark level."""
+    sonar, noise_db = fit.sonar, fit.noise_db
+    if sonar.noise_level_db is None or noise_db is None:
         return fit
-    expected = statistics.autocorrelation(levels(real), 1)
-    best = math.inf, fit
-    for bins in PULSES:
-        tried = fit_sonar(real, **stage.sonar, pulse_m=bins * real.sonar.bin_m, beam_width_deg=real.sonar.beam_width_deg)
-        rendered = statistics.autocorrelation(levels(simulate(stage, tried, 1, folder)), 1)
-        best = min(best, (float(np.abs(rendered - expected).sum()), tried), key=lambda one: one[0])
-    return best[1]
+    now = 0.0 if sonar.detector_offset_db is None else 10 ** ((sonar.detector_offset_db - sonar.noise_level_db) / 10)
+    then = 0.0 if offset_db is None else 10 ** (offset_db / 10)
+    change_db = 10 * math.log10((1 + now) / (1 + then))
+    noise_level_db = sonar.noise_level_db + change_db
+    known = None if offset_db is None else noise_level_db + offset_db
+    return replace(
+        fit, sonar=sonar.replace(noise_level_db=noise_level_db, detector_offset_db=known), noise_db=noise_db + change_db
+    )
+
+
+@cache
+def built(build: Callable[[Path], mi.Scene]) -> mi.Scene:
+    """Build a scene once."""
+    with tempfile.TemporaryDirectory() as folder:
+        return build(Path(folder))
 
 
 def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFrames:
@@ -145,24 +209,23 @@ def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFra
     poses = stage.start + np.arange(frames)[:, None] * stage.step
     poses[:, :3] += np.random.default_rng(SEED).normal(0, stage.sway_m, (frames, 3))
     sonar = fit.sonar.replace(**stage.sonar, speckle_nu=None)  # the fitted one counts objects and edges
-    with tempfile.TemporaryDirectory() as result:
-        scene = stage.build(Path(result))
-        if sonar.volume_db is not None and sonar.noise_level_db is not None:
-            scale_db = (sonar.volume_db if stage.volume_db is None else stage.volume_db) - sonar.volume_db
-            sonar = with_noise(sonar, sonar.noise_level_db + scale_db).replace(volume_db=sonar.volume_db + scale_db)
-            full_db = fit.full_scale_db + scale_db - sonar.source_level_db
-            return recorded(Simulator(scene, sonar, mirrors=stage.mirrors), poses, full_db, stage, folder)
-        quiet = sonar.replace(noise_level_db=None, near_glow_db=0.0, detector_offset_db=None)
-        silent = Simulator(scene, quiet, mirrors=stage.mirrors)
-        bright = np.percentile(next(iter(silent.pings(poses[:1]))).levels[:, statistics.GLOW_BINS :], 99.9)
-        assert silent.model.imager is not None
-        middle_db = 10 * math.log10(silent.model.imager.gain[sonar.range_bins // 2])
-        full_db = 10 * math.log10(bright) - fit.bright_db
-        for few in (2, frames):  # pictures dim glints of single cells: full scale moves by what is missing
-            if fit.noise_db is not None:
-                sonar = with_noise(sonar, full_db - middle_db + fit.noise_db + sonar.source_level_db)
-            made_frames = recorded(Simulator(scene, sonar, mirrors=stage.mirrors), poses[:few], full_db, stage, folder)
-            full_db += np.percentile(levels(made_frames)[:, statistics.GLOW_BINS :], 99.9) - fit.bright_db
+    scene = built(stage.build)
+    if sonar.volume_db is not None and sonar.noise_level_db is not None:
+        scale_db = (sonar.volume_db if stage.volume_db is None else stage.volume_db) - sonar.volume_db
+        sonar = with_noise(sonar, sonar.noise_level_db + scale_db).replace(volume_db=sonar.volume_db + scale_db)
+        full_db = fit.full_scale_db + scale_db - sonar.source_level_db
+        return recorded(Simulator(scene, sonar, mirrors=stage.mirrors), poses, full_db, stage, folder)
+    quiet = sonar.replace(noise_level_db=None, near_glow_db=0.0, detector_offset_db=None)
+    silent = Simulator(scene, quiet, mirrors=stage.mirrors)
+    bright = np.percentile(next(iter(silent.pings(poses[:1]))).levels[:, statistics.GLOW_BINS :], 99.9)
+    assert silent.model.imager is not None
+    middle_db = 10 * math.log10(silent.model.imager.gain[sonar.range_bins // 2])
+    full_db = 10 * math.log10(bright) - fit.bright_db
+    for few in (2, frames):  # pictures dim glints of single cells: full scale moves by what is missing
+        if fit.noise_db is not None:
+            sonar = with_noise(sonar, full_db - middle_db + fit.noise_db + sonar.source_level_db)
+        made_frames = recorded(Simulator(scene, sonar, mirrors=stage.mirrors), poses[:few], full_db, stage, folder)
+        full_db += np.percentile(levels(made_frames)[:, statistics.GLOW_BINS :], 99.9) - fit.bright_db
     return made_frames
 
 

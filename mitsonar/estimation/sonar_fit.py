@@ -68,6 +68,9 @@ MOST_LOOKS = 16
 OFFSETS = (0.03, 3.0)
 """Range of the detector's offset relative to the noise that a fit gives."""
 
+LEAST_NOISE = 0.75
+"""Part of the spread of dark windows that noise must have; the rest is texture, and structures if there is more."""
+
 SPREAD_ERROR, SKEWNESS_ERROR = 0.1, 0.15
 """Errors of the measured spread, as a fraction, and skewness of noise in dB."""
 
@@ -453,7 +456,10 @@ def _offset_of(grain_db: Array, looks: int) -> float:
         return skewness * spread**power - measured
 
     ends = [math.log(ratio) for ratio in OFFSETS]
-    return math.exp(optimize.brentq(excess, *ends)) if excess(ends[0]) < 0 < excess(ends[1]) else 0.0
+    if not excess(ends[0]) < 0 < excess(ends[1]):
+        return 0.0
+    ratio = math.exp(optimize.brentq(excess, *ends))
+    return ratio if _grain(looks, ratio)[0] > LEAST_NOISE * np.median(grain_db.std(axis=1)) else 0.0
 
 
 def _skewness(grain_db: Array) -> float:

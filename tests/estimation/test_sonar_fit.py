@@ -150,6 +150,29 @@ def test_noise_gives_pulse_beam_width_and_looks(bins: float, beams: float, looks
     assert (known.pulse_m, known.beam_width_deg, known.looks) == (0.02, 0.5, 2)
 
 
+OFFSETS = [(1, -10.0), (1, -3.0), (2, -5.0), (2, None), (3, -8.0)]
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.filterwarnings("ignore:no ray hit")
+@pytest.mark.parametrize(("looks", "offset_db"), essence(OFFSETS, OFFSETS[2]))
+def test_dark_noise_gives_the_offset_of_the_detector(looks: int, offset_db: float | None) -> None:
+    """Noise within 1 dB, offset within 2 dB, and looks in spite of it."""
+    from mitsonar.simulation.simulator import Simulator
+
+    sonar = PLAIN.replace(noise_level_db=-70.0, pulse_m=1.2 * PLAIN.bin_m, looks=looks, gain_exponent=0)
+    sonar = sonar.replace(detector_offset_db=None if offset_db is None else -70.0 + offset_db)
+    frames = Simulator(scene(floor=floor(diffuse(0.3))), sonar).render(np.array([[0, 0, 50.0, 0, 0, 0]] * 3))
+    frames.sonar = PLAIN.replace(gain_exponent=0)
+    fit = fit_sonar(frames).sonar
+    assert fit.looks == looks
+    assert fit.noise_level_db == pytest.approx(-70, abs=1.0)
+    if offset_db is None:
+        assert fit.detector_offset_db is None
+    else:
+        assert fit.detector_offset_db == pytest.approx(-70 + offset_db, abs=2.0)
+
+
 def test_beams_of_different_pings_are_noted() -> None:
     """Noise that neighbouring beams do not share at all is no narrow beam: the width stays, and a note asks for groups."""
     level = np.random.default_rng(2).gumbel(size=(3, 256, 48)) * -4.34

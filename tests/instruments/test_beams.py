@@ -46,6 +46,20 @@ def test_an_array_out_of_focus_is_wider_and_lower() -> None:
     assert abs(abs(near) - 1) < 2e-3  # far from the near field's edge nothing changes
 
 
+@pytest.mark.parametrize("shading", SHADINGS)
+def test_array_errors_raise_lobes_everywhere(shading: Shading) -> None:
+    """Beside the main lobe the mean power is error^2 sum w^2 of elements half a wavelength apart, each a short sinc."""
+    aperture, u = Aperture(0.02, shading, two_way=False), np.linspace(-0.6, 0.6, 490)
+    lobes = [Aperture(0.02, shading, False, 0.2, seed).spectrum().at(u) - aperture.pattern(u) for seed in range(60)]
+    elements = round(2 * aperture.length)
+    x = (np.arange(elements) + 0.5) / elements - 0.5
+    weight = sum((2 * part * np.cos(2 * np.pi * m * x) for m, part in enumerate(series(shading), 1)), np.ones(elements))
+    floor = 0.2**2 * np.square(weight / weight.sum()).sum() * np.sinc(u / 2) ** 2
+    ratio = np.square(np.abs(lobes)).mean(axis=0) / floor
+    assert 10 * np.log10(ratio.reshape(-1, 49).mean(axis=1)) == pytest.approx(0, abs=1.0)
+    assert np.square(np.abs(lobes)).sum(axis=0).mean() / floor.mean() / 60 == pytest.approx(1, abs=0.05)
+
+
 def test_equivalent_width_is_the_integral() -> None:
     # of sinc(x)^2, both ways sinc(x)^4: 1 and 2/3 of a wavelength over the aperture
     assert Aperture(0.01, "uniform", False).equivalent_width * Aperture(0.01, "uniform", False).length == pytest.approx(

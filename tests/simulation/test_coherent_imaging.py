@@ -446,6 +446,13 @@ def test_crosstalk_and_stripes(flat: mi.Scene) -> None:
     assert 0.3 < (20 * np.log10(striped[0])).std() < 0.8
 
 
+def test_the_detector_adds_a_constant_to_the_power(flat: mi.Scene) -> None:
+    sonar = SONAR.replace(noise_level_db=-90.0, source_level_db=180.0, gain_exponent=2)
+    plain, _, _ = imager(flat, sonar).levels(POSE, 0)
+    result, _, _ = imager(flat, sonar.replace(detector_offset_db=-95.0)).levels(POSE, 0)
+    np.testing.assert_allclose(result, plain + 10**-27.5 * sonar.range_m[:, None] ** 2, rtol=1e-5)
+
+
 @pytest.mark.parametrize("groups", [1, 8])
 def test_crosstalk_falls_with_distance_and_stays_in_a_ping_group(groups: int) -> None:
     sonar = SONAR.replace(beams=96, crosstalk_db=-40.0, ping_groups=groups)

@@ -49,6 +49,20 @@ def test_point_spread(shading: str, pattern: str) -> None:
             assert level[part].max() == pytest.approx(expected[part].max(), abs=1.0)
 
 
+def test_a_point_shows_the_lobes_of_an_array_with_errors() -> None:
+    sonar = SONAR.replace(pattern="receive", elevation_pattern="box", beams=256, azimuth_fov_deg=20.0, beam_width_deg=0.4)
+    loaded, fields, _ = one_point()
+    source = imager(loaded, sonar.replace(array_error=0.3, **fields))
+    result = np.abs(source.image(np.zeros(6), 0)[0]).astype(float)
+    line = result[result.max(axis=1).argmax()]
+    axis = np.sin(sonar.bearing_rad)
+    shape = lambda away: np.abs(source.sonar.aperture.spectrum().at(away))  # noqa: E731
+    truth = best_fit(line, axis, shape)
+    beside = np.abs(axis - axis[truth.argmax()]) > 0.03
+    assert 20 * np.log10(truth[beside].max() / truth.max()) > -35  # ideal lobes lie below -60 dB there
+    assert np.abs(line - truth).max() < 0.01 * truth.max()
+
+
 def best_fit(line: Array, axis: Array, shape: Shape) -> Array:
     """The shape at the place between samples where it fits best."""
     step = axis[1] - axis[0]

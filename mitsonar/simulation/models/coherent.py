@@ -186,7 +186,9 @@ class CoherentImager:
                 further.add(pose, field, time_s)
         # beams and bins, absorption, and the crosstalk of all beams; each look has the power of a whole bin
         image = self.former.beams(field) * self._loss[:, None]
-        return image if self.crosstalk is None else image + image @ self.crosstalk, counts
+        if self.crosstalk is not None:
+            image = image + image @ self.crosstalk
+        return np.asarray(image, dtype=np.complex64), counts
 
     def of_quality(self, quality: Quality) -> CoherentImager:
         """Return a renderer of the same scatterers with the number of rays of another quality."""
