@@ -11,7 +11,8 @@ a^2 / 4).
 The cells of a plane join exactly. On curved bodies and at edges the cells of the common fan are too coarse, and a first
 launch finds where. It divides a cell until it is at most a quarter of the Fresnel radius sqrt(lambda a R / (2 (a + R))),
 where a is the radius of curvature from the normals of neighbouring hits. Cells at edges that face the sonar are divided
-most. A second launch traces these finer rays. Bodies between the rays of the fan are not found.
+most. So are all cells that may contain a mirror narrower than four columns, which rays of the fan may pass by
+(:mod:`mitsonar.simulation.narrow_mirrors`). A second launch traces these finer rays.
 
 Facets of meshes are treated as planes, and vertex normals are ignored. A mesh that approximates a curved body needs facets
 below half the Fresnel radius: larger ones glint like the faces of a polyhedron.
@@ -46,6 +47,7 @@ from mitsonar.simulation.coherent_tracing import STRIP, CoherentTracer, FanRays,
 from mitsonar.simulation.device import DeviceArray, Frozen, padded, replayed
 from mitsonar.simulation.mirrors import Mirrors, SecondMirrors, parts_at, smooth_share, without_mirror_part
 from mitsonar.simulation.moving import SceneMotion, scene_at
+from mitsonar.simulation.narrow_mirrors import NarrowMirrors
 from mitsonar.simulation.points import HashedPoints, Point
 from mitsonar.simulation.tracing import MovingSurfaces, going_on, hidden, mirrored_lines, overlap, reflected, surfaces_of
 
@@ -87,6 +89,9 @@ LEVEL_PART = 0.3
 MOST_RAYS = 2**20
 """Largest number of rays in the second launch."""
 
+MOST_NARROW_RAYS = 2**18
+"""Largest number of rays through all cells of narrow mirrors."""
+
 
 class MirrorTracer:
     """Tracer that sums the echoes of mirrors.
@@ -124,7 +129,7 @@ class MirrorTracer:
         dr.make_opaque(self.index)
         dr.eval(self.table)
         self.survey, self.launch = self._compile_survey(), self._compile_sum()
-        self.warned = False
+        self.narrow, self.warned = NarrowMirrors.from_scene(scene, mirrors), False
 
     def field(self, pose: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Return the field of one ping ``(ranges, sines)`` at a pose ``(6,)`` [m, rad]; see :meth:`add`."""
@@ -141,11 +146,13 @@ class MirrorTracer:
             time_s: time that determines the poses of moving bodies [s].
 
         Warns:
-            MitsonarWarning: once, if cells exceed half the Fresnel radius and no finer ones were traced.
+            MitsonarWarning: once, if cells exceed half the Fresnel radius, or a mirror is narrower than four of the finest.
         """
-        rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
+        lines = to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64)
+        rows = mi.Float64(lines.ravel().tolist())
         scene = scene_at(self.scene, self.motion, time_s)
         desired = np.array(replayed(self.survey, self.index, scene, rows, self.surfaces.arrays(), self.table))
+        self._divide_narrow(desired, lines)
         cell = np.flatnonzero(desired)
         if not len(cell):
             return
@@ -154,6 +161,23 @@ class MirrorTracer:
         inputs = tuple(mi.UInt32(padded(part)) for part in _expanded(cell, parts))
         values = replayed(self.launch, inputs, scene, rows, self.surfaces.arrays(), self.table)
         self.sums.add_to(field, values)
+
+    def _divide_narrow(self, desired: NDArray[np.float32], lines: NDArray[np.float64]) -> None:
+        """Divide the cells of narrow mirrors most, in place; if they are many, only those that the survey left out."""
+        cells, narrowest = self.narrow.cells(self.fan, lines, cone=self.sonar.bearing == "cone", finest=self.finest)
+        column, row = cells.T
+        index = column // STRIP * (STRIP * self.fan.rows) + row * STRIP + column % STRIP
+        few = len(index) * self.finest**2 <= MOST_NARROW_RAYS
+        index = index[(desired[index] <= self.finest) & (few | (desired[index] == 0))]
+        desired[index] = -float(self.finest)
+        if narrowest and not self.warned:
+            self.warned = True
+            warnings.warn(
+                f"{', '.join(narrowest)} is narrower than four of the finest rays, so its mirrored echo may be missing or "
+                "wrong: choose a finer quality, a nearer pose, or a larger mirror",
+                MitsonarWarning,
+                stacklevel=4,
+            )
 
     def _parts(self, desired: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return the number of parts of cells in each direction: powers of two, reduced if there are too many rays."""

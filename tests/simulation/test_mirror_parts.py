@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+import trimesh
 from helpers import Array, box, diffuse, essence, floor, plate, scene, sphere
 
 from mitsonar.acoustics.materials import Material, material, mirror_amplitude
@@ -64,12 +66,12 @@ def tilted(tilt_deg: float, about: str) -> Array:
     return np.array([0, -RANGE * math.cos(tilt), RANGE * math.sin(tilt), tilt, 0, 0])
 
 
-def kirchhoff(size: float, pose: Array, step: float = 4e-4) -> complex:
+def kirchhoff(size: float, pose: Array, step: float = 4e-4, k: float = K) -> complex:
     """Kirchhoff's integral over a square plate in y = 0, V = 1."""
     n = max(200, math.ceil(size / step))
     x = ((np.arange(n) + 0.5) / n - 0.5) * size
     r = np.sqrt((x[:, None] - pose[0]) ** 2 + pose[1] ** 2 + (x - pose[2]) ** 2)
-    return complex((1j * K / (2 * np.pi) * abs(pose[1]) / r**3 * np.exp(-2j * K * r)).sum() * (size / n) ** 2)
+    return complex((1j * k / (2 * np.pi) * abs(pose[1]) / r**3 * np.exp(-2j * k * r)).sum() * (size / n) ** 2)
 
 
 @pytest.mark.parametrize("size", essence([0.02, 0.05, 0.1, 0.2, 0.3], 0.05, 0.3))
@@ -82,6 +84,49 @@ def test_plates_are_those_of_the_integral(size: float) -> None:
             ratio = echo(source, pose) / kirchhoff(size, pose)
             assert decibels(ratio, 1) == pytest.approx(0, abs=0.5), (tilt, about)
             assert np.angle(ratio) == pytest.approx(0, abs=0.1)
+
+
+WIDE = SONAR.replace(frequency_hz=4.5e5, beams=24, azimuth_fov_deg=60.0, beam_width_deg=4.0, range_min=4.0, range_max=8.0,
+                     pattern="receive")  # fmt: skip
+"""Rays of this sonar are 9 cm apart at 5 m."""
+
+
+@pytest.mark.parametrize("size", [0.05, 0.1])
+def test_mirrors_between_two_rays_are_found(size: float) -> None:
+    """Wherever the fan looks, a plate narrower than a column is that of the integral: 1 dB."""
+    source = tracer(scene(target=plate([0, 0, 0], [0, -1, 0], half=size / 2)), WIDE, target=(1.0, 0.0))
+    expected = kirchhoff(size, tilted(0, "z"), k=K / 4)
+    for turned in np.linspace(0, 0.02, 7):
+        pose = tilted(0, "z") + np.array([0, 0, 0, turned / 2, 0, turned])
+        assert decibels(echo(source, pose), expected) == pytest.approx(0, abs=1.0)
+
+
+@pytest.mark.parametrize("tilt_deg", [14.0, 22.0])
+def test_edges_of_small_plates_echo_far_from_the_normal(tilt_deg: float) -> None:
+    sonar = WIDE.replace(frequency_hz=4.5e4)
+    source = tracer(scene(target=plate([0, 0, 0], [0, -1, 0], half=0.125)), sonar, target=(1.0, 0.0))
+    pose = tilted(tilt_deg, "z")
+    assert decibels(echo(source, pose), kirchhoff(0.25, pose, k=K / 40)) == pytest.approx(0, abs=1.0)
+
+
+def test_a_mirror_narrower_than_the_finest_rays_is_warned_of() -> None:
+    source = tracer(scene(target=plate([0, 0, 0], [0, -1, 0], half=0.005)), WIDE, target=(1.0, 0.0))
+    with pytest.warns(MitsonarWarning, match=r"target is narrower than four of the finest rays.*choose a finer quality"):
+        source.field(tilted(0, "z"))
+
+
+def test_pieces_of_a_mesh_are_narrow_each_by_its_own_width(tmp_path: Path) -> None:
+    """Two balls 3 m apart in one mesh, and a rod: second extents, not the box around all."""
+    from mitsonar.simulation.mirrors import Mirrors
+    from mitsonar.simulation.narrow_mirrors import NarrowMirrors
+
+    balls = [trimesh.creation.icosphere(radius=0.1).apply_translation([x, 5, 0]) for x in (-1.5, 1.5)]
+    rod = trimesh.creation.cylinder(0.02, 2.0).apply_translation([0, 5, 0])
+    trimesh.util.concatenate([*balls, rod]).export(path := tmp_path / "bodies.ply")
+    loaded = scene(bodies={"type": "ply", "filename": str(path)})
+    found = NarrowMirrors.from_scene(loaded, Mirrors(np.ones(1), np.zeros(1)))
+    assert sorted(found.width) == pytest.approx([0.02 * math.sqrt(6), 0.2, 0.2], rel=0.02)
+    assert len(found.corners) == len(balls[0].faces) * 2 + len(rod.faces)
 
 
 def test_a_mesh_is_the_plate_that_its_face_is() -> None:

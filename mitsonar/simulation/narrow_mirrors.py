@@ -1,0 +1,156 @@
+"""Which cells of a fan of rays contain mirrors that are narrower than a few of its columns.
+
+Rays may pass by such mirrors, so a launch that compares neighbouring rays does not find them. Their triangles are projected
+into the fan instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from mitsonar.simulation.beams import CommonFan
+from mitsonar.simulation.mirrors import FLAT, Mirrors
+
+__all__ = ["NarrowMirrors"]
+
+COLUMNS = 4.0
+"""Width below which a mirror is narrow, in columns or rows of the fan."""
+
+MOST_FACETS = 200_000
+"""Number of triangles above which a shape is not divided into pieces, which takes seconds."""
+
+MOST_SAMPLES = 128
+"""Largest number of samples along the side of a triangle."""
+
+
+@dataclass(frozen=True)
+class NarrowMirrors:
+    """Connected pieces of a scene's mirrors; those of shapes without a mesh are boxes around them.
+
+    Attributes:
+        names: id of the shape of each piece.
+        centre, radius: sphere around each piece ``(pieces, 3)``, ``(pieces,)`` [m].
+        width: second of three extents of each piece along its principal axes ``(pieces,)`` [m].
+        corners: corners of all triangles ``(triangles, 3, 3)`` [m].
+        piece: index of the piece of each triangle ``(triangles,)``.
+    """
+
+    names: list[str]
+    centre: NDArray[np.float64]
+    radius: NDArray[np.float64]
+    width: NDArray[np.float64]
+    corners: NDArray[np.float64]
+    piece: NDArray[np.int64]
+
+    @classmethod
+    def from_scene(cls, scene: mi.Scene, mirrors: Mirrors) -> NarrowMirrors:
+        """Find the pieces of a scene's mirrors."""
+        names: list[str] = []
+        parts: list[NDArray[np.float64]] = []
+        for shape, reflection in zip(scene.shapes(), mirrors.reflection, strict=True):
+            if reflection != 0:
+                found = _pieces(_triangles(shape))
+                names += [shape.id()] * len(found)
+                parts += found
+        spheres = [_sphere_and_width(part) for part in parts]
+        return cls(
+            names,
+            np.array([centre for centre, _, _ in spheres]).reshape(-1, 3),
+            np.array([radius for _, radius, _ in spheres]),
+            np.array([width for _, _, width in spheres]),
+            np.concatenate([np.empty((0, 3, 3)), *parts]),
+            np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
+        )
+
+    def cells(
+        self, fan: CommonFan, lines: NDArray[np.float64], *, cone: bool, finest: int
+    ) -> tuple[NDArray[np.int64], list[str]]:
+        """Return columns and rows of the cells that narrow mirrors may cover, and the names of the narrowest mirrors.
+
+        Args:
+            fan: fan of the rays.
+            lines: first three rows of the sonar's ``to_world`` ``(3, 4)``.
+            cone: whether bearings are cones.
+            finest: largest number of parts of a cell in each direction.
+
+        Returns:
+            Columns and rows ``(cells, 2)``, and the ids of shapes in the fan that are narrower than four of the
+            finest parts.
+        """
+        # 1. Pieces that are narrow from here.
+        step = np.array([2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows])
+        apart = np.linalg.norm(self.centre - lines[:, 3], axis=1)
+        cell = step.max() * np.maximum(apart - self.radius, 0)
+        narrow = self.width < COLUMNS * cell
+        if not narrow.any():
+            return np.empty((0, 2), dtype=np.int64), []
+        # 2. Corners of their triangles in cells of the fan; those behind the sonar are left out.
+        chosen = narrow[self.piece]
+        piece = self.piece[chosen]
+        port, up, forward = np.moveaxis((self.corners[chosen] - lines[:, 3]) @ lines[:, :3], -1, 0)
+        level, whole = np.hypot(port, forward), np.sqrt(port**2 + up**2 + forward**2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            place = np.stack([-port / (whole if cone else level), -up / (forward if cone else level)], axis=-1)
+        place = (place + np.array([fan.sine, fan.tangent])) / step
+        size = np.array([fan.columns, fan.rows])
+        low, high = place.min(axis=1), place.max(axis=1)
+        with np.errstate(invalid="ignore"):
+            inside = (forward > 0).all(axis=1) & (high > -1).all(axis=1) & (low < size + 1).all(axis=1)
+        place, piece = place[inside], piece[inside]
+        # 3. Cells of points on the triangles at most a cell apart, and their neighbours.
+        samples = 2 ** np.ceil(np.log2(np.clip((high - low)[inside].max(axis=1, initial=0.0), 1, MOST_SAMPLES))).astype(int)
+        covered = [np.empty((0, 2), dtype=np.int64)]
+        for count in np.unique(samples):
+            weight = np.array([(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)]) / count
+            cells = np.floor(np.einsum("sc,tcd->tsd", weight, place[samples == count])).astype(np.int64)
+            covered.append(np.unique(cells.reshape(-1, 2), axis=0))
+        around = np.array([(over, down) for over in (-1, 0, 1) for down in (-1, 0, 1)])
+        cells = np.unique((np.concatenate(covered)[:, None] + around).reshape(-1, 2), axis=0)
+        hidden = self.width[piece] < COLUMNS * cell[piece] / finest
+        return cells[((cells >= 0) & (cells < size)).all(axis=1)], sorted({self.names[k] for k in piece[hidden]})
+
+
+def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
+    """Return the triangles of a mesh, of the square of a rectangle or disk, or of the box around another shape [m]."""
+    if isinstance(shape, mi.Mesh):
+        vertices = np.array(shape.vertex_positions_buffer(), dtype=float).reshape(-1, 3)
+        return np.asarray(vertices[np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)])
+    if shape.class_name() in FLAT:
+        matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=float).reshape(4, 4, -1)[..., 0]
+        square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) @ matrix[:3, :3].T + matrix[:3, 3]
+        return np.asarray(square[[[0, 1, 2], [0, 2, 3]]])
+    box = shape.bbox()
+    low, high = (np.array(end, dtype=float).ravel() for end in (box.min, box.max))
+    solid = trimesh.creation.box(bounds=[low, high])
+    return np.asarray(solid.vertices[solid.faces], dtype=np.float64)
+
+
+def _pieces(corners: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Divide triangles ``(n, 3, 3)`` into those that are connected by edges."""
+    if not 0 < len(corners) <= MOST_FACETS:
+        return [corners] if len(corners) else []
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+    mesh.merge_vertices()
+    label = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(corners))
+    order = np.argsort(label, kind="stable")
+    return np.split(corners[order], np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def _sphere_and_width(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
+    """Return centre and radius of a sphere around triangles, and their second extent along their principal axes [m].
+
+    Extents are those of a body with the same variances, evenly distributed along each axis.
+    """
+    points = corners.reshape(-1, 3)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    weight = area / max(float(area.sum()), 1e-30)
+    away = corners - weight @ corners.mean(axis=1)
+    moments = np.einsum("tci,tcj->tij", away, away) + np.einsum("tci,tdj->tij", away, away)
+    variance = np.linalg.eigvalsh(np.einsum("t,tij->ij", weight / 12, moments))
+    return centre, float(np.linalg.norm(points - centre, axis=1).max()), float(np.sqrt(12 * max(variance[1], 0.0)))
