@@ -6,6 +6,7 @@ into the fan instead.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -136,7 +137,8 @@ def _pieces(corners: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         return [corners] if len(corners) else []
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
     mesh.merge_vertices()
-    label = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(corners))
+    labels: Callable[..., NDArray[np.int32]] = trimesh.graph.connected_component_labels
+    label = labels(mesh.face_adjacency, node_count=len(corners))
     order = np.argsort(label, kind="stable")
     return np.split(corners[order], np.flatnonzero(np.diff(label[order])) + 1)
 

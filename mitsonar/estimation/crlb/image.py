@@ -490,12 +490,14 @@ class ScoreCovariance:
     of C are products of a correlation over bins and one over beams.
 
     Attributes:
-        parts: weights w ``(bins, beams)`` with the correlation R.
+        parts: weights w ``(bins * looks, beams)`` with the correlation R of the looks.
         uncorrelated: variance of each cell that is uncorrelated with others ``(bins, beams)``, so that all have variance 1.
+        looks: number of looks that a cell averages.
     """
 
     parts: list[tuple[NDArray[Any], CellCorrelation]]
     uncorrelated: Floats
+    looks: int = 1
 
     @classmethod
     def from_parts(cls, parts: list[tuple[NDArray[Any], CellCorrelation]], shape: tuple[int, int]) -> ScoreCovariance:
@@ -508,13 +510,43 @@ class ScoreCovariance:
         shared = sum((np.abs(weight) ** 2 for weight, _ in parts), np.zeros(shape))
         return cls(parts, np.maximum(1 - shared, 1e-6))
 
+    @classmethod
+    def of_looks(
+        cls, parts: list[tuple[NDArray[Any], CellCorrelation]], looks: int, more: ArrayLike = 0.0
+    ) -> tuple[Floats, ScoreCovariance]:
+        """Return the variance of the means of looks ``(bins, beams)``, and the covariance of these means over its root.
+
+        Args:
+            parts: weights ``(bins * looks, beams)`` and the correlation of the looks.
+            looks: number of looks that a cell averages.
+            more: further variance of each cell, uncorrelated with others ``(bins, beams)``.
+        """
+        variance = 0.0
+        for weight, correlation in parts:
+            split = weight.reshape(-1, looks, weight.shape[1])
+            for apart in range(looks):
+                # looks of one cell a number of bins apart; both orders count
+                along = correlation.over_bins.diagonal(apart)
+                along = np.append(along, np.zeros(apart)).reshape(-1, looks, 1)[:, : looks - apart]
+                products = (np.conj(split[:, : looks - apart]) * along * split[:, apart:]).real.sum(axis=1)
+                variance = variance + (1 if apart == 0 else 2) * products / looks**2
+        total = np.asarray(variance + np.asarray(more), dtype=np.float64)
+        safe = np.where(total > 0, total, 1.0)
+        root = np.repeat(np.sqrt(safe), looks, axis=0)
+        scaled = [(weight / root, correlation) for weight, correlation in parts]
+        return total, cls(scaled, np.maximum(1 - variance / safe, 1e-6), looks)
+
     def __matmul__(self, values: Floats) -> Floats:
         """Apply to maps ``(k, bins, beams)``."""
         product = self.uncorrelated * values
         for weight, correlation in self.parts:
             for total, one in zip(product, values, strict=True):
-                total += (np.conj(weight) * (correlation @ (weight * one))).real
+                each = one if self.looks == 1 else np.repeat(one / self.looks, self.looks, axis=0)
+                total += self._mean((np.conj(weight) * (correlation @ (weight * each))).real)
         return product
+
+    def _mean(self, each: Floats) -> Floats:
+        return each if self.looks == 1 else each.reshape(-1, self.looks, each.shape[1]).mean(axis=1)
 
     def solve(self, values: Floats) -> Floats:
         """Return C^-1 of maps ``(k, bins, beams)``, by conjugate gradients.
@@ -583,19 +615,19 @@ class SpeckleBounds:
     respects: speckle correlates as on even ground, though a dark cell beside a bright one shows the grain of the bright one;
     and it leaves out patches of ``speckle_nu``, which belong to the grain.
 
+    With several looks, a pixel is the mean of as many powers, and its score is its deviation from the expected mean.
+
     Args:
         simulator: of the model ``coherent``.
         gain: gain of the frames.
 
     Raises:
-        MitsonarError: another model, or several looks.
+        MitsonarError: another model.
     """
 
     def __init__(self, simulator: Simulator, gain: float) -> None:
         if simulator.model.imager is None:
             raise MitsonarError(f"bounds of speckle are for the model coherent: got {simulator.sonar.model}")
-        if simulator.sonar.looks > 1:
-            raise MitsonarError(f"bounds of speckle are for one look: got {simulator.sonar.looks}; set looks to 1")
         self.sonar, self.gain = simulator.sonar, gain
         self.imager = simulator.model.imager
         self.halves = self.imager, self.imager.of_quality(OTHER_HALF_QUALITY[self.sonar.quality])
@@ -633,14 +665,18 @@ class SpeckleBounds:
         # two independent estimates of the derivative, by two sets of rays
         step = np.array(step_for(self.sonar, GRAIN_STEP))
         jacobian = np.stack([_power_slopes(imager, pose, step, pings or GRAIN_PINGS) for imager in self.halves])
+        looks = self.sonar.looks
         echo, other_echo = (imager.echoes(pose)[0].astype(np.complex128) for imager in self.halves)
-        level = np.abs(echo) ** 2 + self.noise
+        power, apart, together = (
+            _mean_of_looks(np.abs(field) ** 2, looks) for field in (echo, echo - other_echo, echo + other_echo)
+        )
+        level = power + self.noise
         # leave out clipped pixels and echoes on which the rays disagree; rounding adds variance
         scale = self.gain * self.imager.gain.astype(float)[:, None]
         slope = coding_slope(level * scale, self.sonar) * scale
-        used = (slope > 0) & (np.abs(echo - other_echo) < MAX_RELATIVE_DEVIATION * np.abs(echo + other_echo) / 2)
+        used = (slope > 0) & (np.sqrt(apart) < MAX_RELATIVE_DEVIATION * np.sqrt(together) / 2)
         rounding = np.divide(1 / (12 * GREYS**2), slope**2, out=np.full_like(slope, np.inf), where=used)
-        return CellScores(jacobian, *grain_law(echo, self.noise, self.noise_correlation, rounding))
+        return CellScores(jacobian, *grain_law(echo, self.noise, self.noise_correlation, rounding, looks))
 
     def ground(self, pose: Floats, pings: int | None = None, first: int = FIRST_PING) -> CellScores:
         """Return the information of cells about the motion if the expected level is known.
@@ -667,7 +703,12 @@ class SpeckleBounds:
             (noise_share, self.noise_correlation * self.noise_correlation),
         ]
         jacobian = derivative.jacobian[..., 0, :] / safe[..., None]
-        return CellScores(jacobian, known.astype(float), ScoreCovariance.from_parts(parts, level.shape))
+        looks = self.sonar.looks
+        if looks == 1:
+            return CellScores(jacobian, known.astype(float), ScoreCovariance.from_parts(parts, level.shape))
+        repeated = [(np.repeat(weight, looks, axis=0), correlation) for weight, correlation in parts]
+        variance, covariance = ScoreCovariance.of_looks(repeated, looks)
+        return CellScores(jacobian, np.divide(1, variance, out=np.zeros_like(variance), where=known), covariance)
 
 
 class CellScores(NamedTuple):
@@ -695,15 +736,16 @@ class CellScores(NamedTuple):
 
 
 def grain_law(
-    echo: Complex, noise: Floats, shared: CellCorrelation, rounding: ArrayLike = 0.0
+    echo: Complex, noise: Floats, shared: CellCorrelation, rounding: ArrayLike = 0.0, looks: int = 1
 ) -> tuple[Floats, ScoreCovariance]:
     """Compute the information of amplitudes about the power of an echo whose noiseless field is known.
 
     Args:
-        echo: the noiseless field ``(bins, beams)``.
+        echo: the noiseless field ``(bins * looks, beams)``.
         noise: mean power of the noise ``(bins, beams)``; all 0: only rounding is left.
-        shared: correlation of the noise of two cells.
+        shared: correlation of the noise of two looks.
         rounding: variance of the power by rounding ``(bins, beams)``; inf where a pixel is not to be used.
+        looks: number of looks that a bin averages; with more than one, the score is the deviation from the mean power.
 
     Returns:
         The information of each cell ``(bins, beams)`` and the covariance of their scores.
@@ -712,14 +754,20 @@ def grain_law(
         MitsonarError: neither noise nor rounding.
     """
     power = np.abs(echo) ** 2
-    rounding = np.broadcast_to(np.asarray(rounding, dtype=float), power.shape)
+    rounding = np.broadcast_to(np.asarray(rounding, dtype=float), noise.shape)
     # without noise only rounding limits the information
     if not (noise > 0).all():
         if not (rounding > 0).all():
             raise MitsonarError(
                 "without noise, amplitudes determine the motion without limit: give the sonar noise_level_db"
             )
-        return 1 / rounding, ScoreCovariance([], np.ones(power.shape))
+        return 1 / rounding, ScoreCovariance([], np.ones(noise.shape))
+    if looks > 1:
+        each = np.repeat(noise, looks, axis=0)
+        unused = np.isinf(rounding)
+        parts = [(np.sqrt(2 * each) * echo, shared), (each, shared * shared)]
+        total, covariance = ScoreCovariance.of_looks(parts, looks, np.where(unused, 0.0, rounding))
+        return np.where(unused, 0.0, 1 / total), covariance
     variance = 1 / rician_information(power, noise)
     total = variance + rounding
     score_fraction = np.sqrt(variance / total)  # fraction of the score's standard deviation that is not rounding
@@ -740,6 +788,11 @@ def expected_sonar(sonar: Sonar) -> Sonar:
     return sonar.replace(model="physical", quality="fine", **patterns)
 
 
+def _mean_of_looks(power: Floats, looks: int) -> Floats:
+    """Average powers ``(bins * looks, beams)`` over the looks of each bin."""
+    return power if looks == 1 else np.asarray(power.reshape(-1, looks, power.shape[1]).mean(axis=1))
+
+
 def _power_slopes(imager: CoherentImager, pose: Floats, step: Floats, pings: int) -> Floats:
     """Return the derivative of the power of echoes by the motion ``(bins, beams, 3)``: mean over places within the step."""
     offsets = evenly(pings) * step
@@ -750,5 +803,6 @@ def _power_slopes(imager: CoherentImager, pose: Floats, step: Floats, pings: int
                 moved = motion.copy()
                 moved[axis] = side * step[axis]
                 echo = imager.echoes(np.array(compose(Pose.from_row(pose), Motion(*moved))))[0]
-                slopes[..., axis] += side * (echo.real.astype(float) ** 2 + echo.imag.astype(float) ** 2)
+                power = echo.real.astype(float) ** 2 + echo.imag.astype(float) ** 2
+                slopes[..., axis] += side * _mean_of_looks(power, imager.sonar.looks)
     return slopes / (2 * step * pings)
