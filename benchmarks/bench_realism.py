@@ -91,7 +91,7 @@ def main() -> None:
         real = RECORDINGS[name](folder)
         if arguments.quick:
             real = real.select(slice(2))
-        fit = fitted(name, real, folder)
+        fit = fitted(name, real, folder, 0 if arguments.quick else 2)
         simulated = simulate(STAGES[name], fit, len(real), folder)
         print(f"\n{name}, fitted:\n" + "\n".join(f"    {line}" for line in [*fit.lines(), *fit.notes]), flush=True)
         drawn[name] = real, simulated
@@ -110,7 +110,9 @@ def held_out(name: str, folder: Path, quick: bool) -> tuple[Levels, Levels]:
     real = real.select(slice(4)) if quick else real
     half = len(real) // 2
     first, second = real.select(slice(half)), real.select(slice(half, None))
-    return levels(second), levels(simulate(STAGES[name], fitted(name, first, folder), len(second), folder))
+    return levels(second), levels(
+        simulate(STAGES[name], fitted(name, first, folder, 0 if quick else 2), len(second), folder)
+    )
 
 
 def classified(pairs: dict[str, tuple[Levels, Levels]]) -> str:
@@ -132,7 +134,7 @@ PULSES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 SHORTER = (0.7, 0.85, 1.0)
 """Pulses that are tried for others, relative to that of the dark noise."""
 
-CROSSTALK_DB = (None, -45.0, -40.0, -36.0, -33.0, -30.0, -27.0, -24.0)
+CROSSTALK_DB = (None, -45.0, -40.0, -35.0, -31.0, -28.0, -25.0, -22.0, -19.0)
 OFFSET_DB = (None, -13.0, -10.0, -7.0, -4.0)
 """Crosstalk and offset of the detector, relative to the noise, that are tried."""
 
@@ -140,7 +142,7 @@ RANKS = (0, 10, 30, 50, 70, 90, 100)
 """Percentiles of the windows' means, between which grain is compared."""
 
 
-def fitted(name: str, real: SonarFrames, folder: Path) -> SonarFit:
+def fitted(name: str, real: SonarFrames, folder: Path, rounds: int = 2) -> SonarFit:
     """Fit the sonar of a recording, then pulse, crosstalk and offset at which rendered grain is most alike."""
     stage = STAGES[name]
     fit = fit_sonar(real, **stage.sonar)
@@ -152,7 +154,7 @@ def fitted(name: str, real: SonarFrames, folder: Path) -> SonarFit:
         width = fit.sonar.beam_width_deg
         pulses = [{"pulse_m": part * fit.sonar.resolution_m, "beam_width_deg": width} for part in SHORTER]
     fit = nearest([fit_sonar(real, **stage.sonar, **known) for known in pulses], stage, target, folder)
-    for _ in range(2):
+    for _ in range(rounds):
         leaks = [replace(fit, sonar=fit.sonar.replace(crosstalk_db=level)) for level in CROSSTALK_DB]
         fit = nearest([fit, *leaks], stage, target, folder)
         fit = nearest([fit, *(with_offset(fit, level) for level in OFFSET_DB)], stage, target, folder)

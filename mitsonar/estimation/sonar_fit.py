@@ -196,7 +196,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     # 3. intensities before the gain give the noise, and the contrast of bright windows the speckle
     flat = intensity / gain_of(sonar)[:, None]
     noise = _noise(flat, value, level, notes)
-    nu = _nu(flat, value, noise or 0.0)
+    nu = _nu(flat, value, noise or 0.0, sonar)
     if nu is not None and nu < STRUCTURED_NU:
         notes.append(f"a speckle_nu of {nu:g} is more than the texture of a bottom: it includes objects and edges")
     # 4. a rise of quiet beams of the same ping next to a strong echo is crosstalk
@@ -367,18 +367,17 @@ def _with_resolution(sonar: Sonar, value: Array, several: bool, given: dict[str,
     rest = _grain_windows(value)[1]
     if len(rest) < LEAST_WINDOWS:
         return sonar
-    # 1. Correlation with the next bin and with the next beam, medians over windows.
-    tall, wide = (min(size, whole) for size, whole in zip(statistics.WINDOW, value.shape[1:], strict=True))
-    grain = rest.reshape(-1, tall, wide)
-    power = np.square(grain).mean(axis=(1, 2))
-    over_range = float(np.median((grain[:, 1:] * grain[:, :-1]).mean(axis=(1, 2)) / power))
-    over_beams = float(np.median((grain[:, :, 1:] * grain[:, :, :-1]).mean(axis=(1, 2)) / power))
+    # 1. Correlation with the next bin and with the next beam. Texture only adds to it, so bright windows may show less.
+    over_range, over_beams = _next_correlation(rest, value.shape)
+    bright = _bright_windows(value, sonar) if several else rest[:0]
+    if len(bright) >= LEAST_WINDOWS:
+        over_range, over_beams = np.minimum((over_range, over_beams), _next_correlation(bright, value.shape))
     exponent = {"dB": 0.0, "gamma": sonar.coding_gamma / 2}.get(sonar.value_coding, 1.0)
     # 2. Looks from the spread of the grain in dB, then the pulse. Looks of a long pulse count as the fewer they resemble.
     assert sonar.frequency_hz is not None
     shortest_m = 1.001 * Pulse.of_band(2 * sonar.frequency_hz, sonar.sound_speed).resolution_m
     if "looks" not in given and several:
-        looks = _looks_of(rest * sonar.coding_db, _bright_windows(value, sonar) * sonar.coding_db)
+        looks = _looks_of(rest * sonar.coding_db, bright * sonar.coding_db)
         sonar = sonar.replace(looks=max(1, min(looks, MOST_LOOKS, int(sonar.resolution_m / shortest_m))))
     if "pulse_m" not in given and "bandwidth_hz" not in given:
         step_m = sonar.bin_m / sonar.looks
@@ -411,6 +410,21 @@ def _with_resolution(sonar: Sonar, value: Array, several: bool, given: dict[str,
                 "they belong to different pings, so give ping_groups (ARIS: a group for 16 beams; DIDSON: 12)"
             )
     return sonar
+
+
+def _next_correlation(grain: Array, shape: tuple[int, ...]) -> tuple[float, float]:
+    """Return the correlation with the next bin and with the next beam, medians over windows.
+
+    Args:
+        grain: detrended values of windows ``(windows, cells)``.
+        shape: frames, bins and beams from which the windows were cut.
+    """
+    tall, wide = (min(size, whole) for size, whole in zip(statistics.WINDOW, shape[1:], strict=True))
+    windows = grain.reshape(-1, tall, wide)
+    power = np.square(windows).mean(axis=(1, 2))
+    over_range = np.median((windows[:, 1:] * windows[:, :-1]).mean(axis=(1, 2)) / power)
+    over_beams = np.median((windows[:, :, 1:] * windows[:, :, :-1]).mean(axis=(1, 2)) / power)
+    return float(over_range), float(over_beams)
 
 
 def _looks_of(grain_db: Array, bright_db: Array) -> int:
@@ -557,10 +571,11 @@ def _full_scale_db(frames: SonarFrames, sonar: Sonar, flat: Array, notes: list[s
     return float(10 * np.log10(face / bright)) - loss_db + sonar.source_level_db
 
 
-def _nu(flat: Array, value: Array, noise: float) -> float | None:
+def _nu(flat: Array, value: Array, noise: float, sonar: Sonar) -> float | None:
     """Return the shape of the K law in bright, flat windows; None if intensities are exponential or nothing is bright.
 
-    For a K law with noise N and signal S the mean square is 2 (S + N)^2 (1 + (S / (S + N))^2 / nu).
+    For a K law of L looks with noise N and signal S the mean square is (1 + 1 / L) (S + N)^2 (1 + (S / (S + N))^2 / nu).
+    Looks that correlate count as the fewer that vary as much.
     """
     # remove the trend along range, and keep bright windows without clipping
     smooth = ndimage.uniform_filter1d(flat.mean(axis=(0, 2)), statistics.WINDOW[0], mode="nearest")
@@ -571,8 +586,11 @@ def _nu(flat: Array, value: Array, noise: float) -> float | None:
     bright &= np.isfinite(parts).all(axis=1)  # not where whole rows are empty
     if not bright.any():
         return None
-    # excess of the squared contrast over that of exponential intensities, corrected for the noise
-    excess = (parts[bright] ** 2).mean(axis=1) / (2 * parts[bright].mean(axis=1) ** 2) - 1
+    # excess of the squared contrast over that of speckle alone, corrected for the noise
+    step_m, lag = sonar.bin_m / sonar.looks, np.arange(sonar.looks)
+    squared = np.square(Pulse(sonar.resolution_m / sonar.looks).spectrum().coherence(lag * step_m))
+    law = 1 + float(squared[np.abs(lag[:, None] - lag)].mean())
+    excess = (parts[bright] ** 2).mean(axis=1) / (law * parts[bright].mean(axis=1) ** 2) - 1
     inverse_nu = float(np.median(excess * (mean[bright] / (mean[bright] - noise)) ** 2))
     return None if inverse_nu < NEAR_RAYLEIGH else round(float(np.clip(1 / inverse_nu, 0.1, 100)), 2)
 

@@ -19,7 +19,7 @@ from mitsonar.records.frames import SonarFrames
 PLAIN = Sonar.create(model="coherent", frequency_hz=1.8e6, range_min=1.4, range_max=5.6, bearing="cone", gain_exponent=2,
                      beam_width_deg=0.3, absorption_db_per_m=0.0)  # fmt: skip
 
-FITTED = {"noise_level_db": None, "stripes_db": 0.0, "crosstalk_db": None, "speckle_nu": None,
+FITTED = {"looks": 1, "noise_level_db": None, "stripes_db": 0.0, "crosstalk_db": None, "speckle_nu": None,
           "near_glow_db": 0.0, "volume_db": None}  # fmt: skip
 
 
@@ -53,6 +53,7 @@ TRUE: dict[str, dict[str, Any]] = {
     "dB": {"noise_level_db": -98.0, "stripes_db": 0.5, "crosstalk_db": -45.0, "speckle_nu": 2.0},
     "70 dB": {"noise_level_db": -102.0, "stripes_db": 1.0, "crosstalk_db": -50.0, "speckle_nu": 1.0, "coding_db": 70.0},
     "gamma": {"noise_level_db": -95.0, "stripes_db": 0.3, "coding": "gamma", "coding_gamma": 0.5},
+    "two looks": {"noise_level_db": -98.0, "looks": 2, "speckle_nu": 2.0},
     "linear": {"noise_level_db": -98.0, "coding": "linear", "absorption_db_per_m": 0.5, "gain_absorption": True},
 }
 
@@ -82,7 +83,8 @@ def test_what_was_put_in_comes_out(recordings: dict[str, SonarFrames], name: str
     assert result.bright_db == pytest.approx(10 * math.log10(0.9), abs=0.5)
     assert result.noise_db is not None
     assert -50 < result.noise_db < -25
-    assert result.notes == []
+    assert sonar.looks == true.get("looks", 1)
+    assert result.notes == [] or (sonar.looks > 1 and "several looks" in result.notes[0])
 
 
 @pytest.mark.thorough
