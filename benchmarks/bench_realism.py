@@ -4,7 +4,8 @@
 
 Recordings are read from the folder, or from the one that MITSONAR_RECORDINGS names. Their sonars are fitted
 (`mitsonar sonar fit`), and the model coherent renders scenes that resemble theirs. Noise and gain are set so that noise and
-brightest thousandth lie as far below full scale as in the recording. Where volume is bright, the fit says the gain.
+brightest thousandth lie as far below full scale as in the recording. Where volume is bright, the fit says the gain. Pulse,
+crosstalk and the detector's offset are those whose rendered grain is most alike.
 `--classify` fits on the first half of the frames instead, and prints how well a logistic regression separates as many
 simulated frames from the second half: it learns on patches of one half of the beams, and is tested on the other. A guess
 has 0.5.
