@@ -33,7 +33,7 @@ SLIPS = [
         "--model: input should be 'coherent', 'physical' or 'thesis'",
         "did you mean physical?",
     ),
-    ("render flat_floor --sonar didson30", "did you mean didson300?"),
+    ("render flat_floor --sonar didson30", "did you mean didson300"),
     ("render flat_floor --trajectory shiped", "did you mean shipped?"),
     ("render flat_floor --frame end", "unknown frame 'end' of poses: did you mean ned?"),
     ("render pattern -D textur=rings", "did you mean texture?"),
@@ -63,7 +63,7 @@ SLIPS = [
     ("height none.npz --by drect", "got 'drect'; did you mean direct?"),
     ("mosaic none.npz treu", "or `true`; did you mean true?"),
     ("sonar fit none.npz", "there are no frames at none.npz"),
-    ("sonar fit none.npz --sonar didson30", "did you mean didson300?"),
+    ("sonar fit none.npz --sonar didson30", "did you mean didson300"),
     ("sonar fit none.npz --set frequency_hz", "--set takes KEY=VALUE"),
     (f"world mesh {AMPHORA} --reflectivity luminence", "--reflectivity must be", "did you mean luminance?"),
 ]
