@@ -565,6 +565,12 @@ class Sonar(Instrument):
         None, ge=-120, le=0, description="rms leak of a beam into another of its ping group [dB] (coherent); default: none"
     )
     stripes_db: float = Field(0.0, ge=0, le=20, description="spread of the beams' gains, by the seed [dB] (coherent)")
+    taper_db: float = Field(
+        0.0,
+        ge=-60,
+        le=60,
+        description="gain of the middle beam over the outermost, as the square of the bearing [dB] (coherent)",
+    )
     array_error: float = Field(
         0.0, ge=0, le=1, description="rms error of the array's elements, relative to their amplitude, by the seed (coherent)"
     )

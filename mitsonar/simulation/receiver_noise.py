@@ -68,9 +68,15 @@ class ReceiverNoise:
 
     @cached_property
     def stripes(self) -> NDArray[np.float32]:
-        """Return the amplitude gain of each beam ``(beams,)``, drawn from the seed."""
-        rng = np.random.default_rng([abs(self.sonar.seed), STRIPES])
-        return np.asarray(10 ** (rng.normal(0, self.sonar.stripes_db, self.sonar.beams) / 20), dtype=np.float32)
+        """Return the amplitude gain of each beam ``(beams,)``: drawn from the seed, less the taper."""
+        drawn_db = np.random.default_rng([abs(self.sonar.seed), STRIPES]).normal(0, self.sonar.stripes_db, self.sonar.beams)
+        return np.asarray(10 ** ((drawn_db - self.sonar.taper_db * self._aside**2) / 20), dtype=np.float32)
+
+    @property
+    def _aside(self) -> NDArray[np.float64]:
+        """Return the sine of the bearing of each beam, relative to the outermost ``(beams,)``."""
+        sine = np.sin(self.sonar.bearing_rad)
+        return np.asarray(sine / max(float(np.abs(sine).max()), 1e-12), dtype=np.float64)
 
     # ---------------- Noise and volume reverberation
 
@@ -98,9 +104,8 @@ class ReceiverNoise:
         fall = (sonar.near_glow_db * (1 - sonar.range_m / sonar.near_glow_m))[:, None]
         if sonar.near_glow_db == 0 or (sonar.near_glow_edge_db == 0 and sonar.near_glow_spread_db == 0):
             return np.asarray(np.maximum(0, fall), dtype=np.float64)
-        bearing = np.sin(sonar.bearing_rad) / np.sin(np.abs(sonar.bearing_rad).max())
         drawn = np.random.default_rng([abs(sonar.seed), GLOW]).normal(0, sonar.near_glow_spread_db, sonar.beams)
-        return np.asarray(np.maximum(0, fall - sonar.near_glow_edge_db * (bearing**2 - MEDIAN_SQUARE) + drawn))
+        return np.asarray(np.maximum(0, fall - sonar.near_glow_edge_db * (self._aside**2 - MEDIAN_SQUARE) + drawn))
 
     def volume(self, ping: int, side: int = 0) -> NDArray[np.complex64]:
         """Return the volume reverberation of one ping ``(bins, beams)``, drawn anew for each ping.
@@ -193,7 +198,8 @@ def _with_noise(receiver: ReceiverNoise, image: NDArray[Any], ping: int, side: i
 
 
 def _with_stripes(receiver: ReceiverNoise, image: NDArray[Any], ping: int, side: int) -> NDArray[Any]:
-    return image * receiver.stripes if receiver.sonar.stripes_db > 0 else image
+    sonar = receiver.sonar
+    return image * receiver.stripes if sonar.stripes_db > 0 or sonar.taper_db != 0 else image
 
 
 PROCESSES: tuple[Callable[[ReceiverNoise, NDArray[Any], int, int], NDArray[Any]], ...] = (

@@ -68,6 +68,7 @@ DEFAULTS = {
     "gain_absorption": False,
     "crosstalk_db": None,
     "stripes_db": 0.0,
+    "taper_db": 0.0,
     "array_error": 0.0,
     "detector_offset_db": None,
     "coding": None,

@@ -88,7 +88,13 @@ def test_properties_are_those_of_a_sonar() -> None:
             "near_glow_db": 30.0,
             "near_glow_m": 0.4,
         },
-        **{"near_glow_edge_db": 12.0, "near_glow_spread_db": 2.0, "near_glow_still": 0.9, "array_error": 0.1},
+        **{
+            "near_glow_edge_db": 12.0,
+            "near_glow_spread_db": 2.0,
+            "near_glow_still": 0.9,
+            "array_error": 0.1,
+            "taper_db": 3.0,
+        },
         **{"detector_offset_db": -60.0},
         **{"crosstalk_db": -49.0, "stripes_db": 0.5, "coding": "gamma", "coding_db": 90.0, "coding_gamma": 0.6},
     }

@@ -446,6 +446,13 @@ def test_crosstalk_and_stripes(flat: mi.Scene) -> None:
     assert 0.3 < (20 * np.log10(striped[0])).std() < 0.8
 
 
+def test_taper_falls_with_the_square_of_the_bearing(flat: mi.Scene) -> None:
+    sonar = SONAR.replace(noise_level_db=-90.0)
+    ratio = np.abs(imager(flat, sonar.replace(taper_db=11.0)).image(POSE, 0)[0] / imager(flat, sonar).image(POSE, 0)[0])
+    sine = np.sin(sonar.bearing_rad)
+    np.testing.assert_allclose(20 * np.log10(ratio), np.tile(-11 * (sine / sine.max()) ** 2, (len(ratio), 1)), atol=1e-3)
+
+
 def test_the_detector_adds_a_constant_to_the_power(flat: mi.Scene) -> None:
     sonar = SONAR.replace(noise_level_db=-90.0, source_level_db=180.0, gain_exponent=2)
     plain, _, _ = imager(flat, sonar).levels(POSE, 0)
