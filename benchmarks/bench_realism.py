@@ -5,7 +5,7 @@
 Recordings are read from the folder, or from the one that MITSONAR_RECORDINGS names. Their sonars are fitted
 (`mitsonar sonar fit`), and the model coherent renders scenes that resemble theirs. Noise and gain are set so that noise and
 brightest thousandth lie as far below full scale as in the recording. Where volume is bright, the fit says the gain. Pulse,
-crosstalk and the detector's offset are those whose rendered grain is most alike.
+crosstalk and the detector's offset are those whose rendered grain is nearest to the recording's.
 `--classify` fits on the first half of the frames instead, and prints how well a logistic regression separates as many
 simulated frames from the second half: it learns on patches of one half of the beams, and is tested on the other. A guess
 has 0.5.
@@ -144,7 +144,7 @@ RANKS = (0, 10, 30, 50, 70, 90, 100)
 
 
 def fitted(name: str, real: SonarFrames, folder: Path, rounds: int = 2) -> SonarFit:
-    """Fit the sonar of a recording, then pulse, crosstalk and offset at which rendered grain is most alike."""
+    """Fit the sonar of a recording; choose pulse, crosstalk and offset by the rendered grain."""
     stage = STAGES[name]
     fit = fit_sonar(real, **stage.sonar)
     sonar, target = real.sonar, grain(real)
@@ -164,7 +164,7 @@ def fitted(name: str, real: SonarFrames, folder: Path, rounds: int = 2) -> Sonar
 
 
 def nearest(fits: list[SonarFit], stage: Stage, target: NDArray[np.float64], folder: Path) -> SonarFit:
-    """Return the fit whose rendered grain is most alike."""
+    """Return the fit whose rendered grain is nearest to the target."""
     miss = [float(np.abs(grain(simulate(stage, fit, 1, folder)) - target).mean()) for fit in fits]
     return fits[int(np.argmin(miss))]
 
@@ -189,9 +189,9 @@ def with_offset(fit: SonarFit, offset_db: float | None) -> SonarFit:
     sonar, noise_db = fit.sonar, fit.noise_db
     if sonar.noise_level_db is None or noise_db is None:
         return fit
-    now = 0.0 if sonar.detector_offset_db is None else 10 ** ((sonar.detector_offset_db - sonar.noise_level_db) / 10)
-    then = 0.0 if offset_db is None else 10 ** (offset_db / 10)
-    change_db = 10 * math.log10((1 + now) / (1 + then))
+    before = 0.0 if sonar.detector_offset_db is None else 10 ** ((sonar.detector_offset_db - sonar.noise_level_db) / 10)
+    after = 0.0 if offset_db is None else 10 ** (offset_db / 10)
+    change_db = 10 * math.log10((1 + before) / (1 + after))
     noise_level_db = sonar.noise_level_db + change_db
     known = None if offset_db is None else noise_level_db + offset_db
     return replace(
