@@ -71,8 +71,8 @@ class ImagingSonar(mi.Sensor):
     ``absorption_db_per_m``, ``temperature_c`` [10], ``salinity_psu`` [35], ``water_depth_m`` [m, 10], ``ph`` [8],
     ``gain_absorption`` [false], ``crosstalk_db``, ``stripes_db`` [0], ``taper_db`` [0], ``array_error`` [0],
     ``detector_offset_db``, ``coding``, ``coding_db`` [80], ``coding_gamma`` [0.5] (docs/guides/coherent.md); ``preset``:
-    name of a preset, whose values the other properties override; ``ping`` [0]: index of the jitter's draw; ``to_world``. A film
-    is optional. If given, it must have the size that follows from beams and rays.
+    name of a preset, whose values the other properties override; ``ping`` [0]: index of the jitter's draw; ``to_world``. A
+    film is optional. If given, it must have the size that follows from beams and rays.
 
     Its rays are those of the models ``physical`` and ``thesis``. The model ``coherent`` traces a separate fan, with beam
     patterns and side lobes. In all models, the sonar is stationary during a ping.

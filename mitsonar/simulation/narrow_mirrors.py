@@ -55,9 +55,9 @@ class NarrowMirrors:
         parts: list[NDArray[np.float64]] = []
         for shape, reflection in zip(scene.shapes(), mirrors.reflection, strict=True):
             if reflection != 0:
-                found = _pieces(_triangles(shape))
-                names += [shape.id()] * len(found)
-                parts += found
+                pieces = _pieces(_triangles(shape))
+                names += [shape.id()] * len(pieces)
+                parts += pieces
         spheres = [_sphere_and_width(part) for part in parts]
         return cls(
             names,

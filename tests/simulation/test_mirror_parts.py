@@ -92,7 +92,7 @@ WIDE = SONAR.replace(frequency_hz=4.5e5, beams=24, azimuth_fov_deg=60.0, beam_wi
 
 
 @pytest.mark.parametrize("size", [0.05, 0.1])
-def test_mirrors_between_two_rays_are_found(size: float) -> None:
+def test_mirrors_between_two_rays_echo(size: float) -> None:
     """Wherever the fan looks, a plate narrower than a column is that of the integral: 1 dB."""
     source = tracer(scene(target=plate([0, 0, 0], [0, -1, 0], half=size / 2)), WIDE, target=(1.0, 0.0))
     expected = kirchhoff(size, tilted(0, "z"), k=K / 4)
@@ -124,9 +124,9 @@ def test_pieces_of_a_mesh_are_narrow_each_by_its_own_width(tmp_path: Path) -> No
     rod = trimesh.creation.cylinder(0.02, 2.0).apply_translation([0, 5, 0])
     trimesh.util.concatenate([*balls, rod]).export(path := tmp_path / "bodies.ply")
     loaded = scene(bodies={"type": "ply", "filename": str(path)})
-    found = NarrowMirrors.from_scene(loaded, Mirrors(np.ones(1), np.zeros(1)))
-    assert sorted(found.width) == pytest.approx([0.02 * math.sqrt(6), 0.2, 0.2], rel=0.02)
-    assert len(found.corners) == len(balls[0].faces) * 2 + len(rod.faces)
+    narrow = NarrowMirrors.from_scene(loaded, Mirrors(np.ones(1), np.zeros(1)))
+    assert sorted(narrow.width) == pytest.approx([0.02 * math.sqrt(6), 0.2, 0.2], rel=0.02)
+    assert len(narrow.corners) == len(balls[0].faces) * 2 + len(rod.faces)
 
 
 def test_a_mesh_is_the_plate_that_its_face_is() -> None:
