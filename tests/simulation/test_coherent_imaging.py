@@ -483,6 +483,14 @@ def test_groups_leak_only_among_themselves(flat: mi.Scene) -> None:
     assert np.abs(one.image(POSE, 0)[0] - image - image @ crosstalk(sonar)).max() > 0.01 * np.abs(image).max()
 
 
+def test_pings_at_rest_share_their_echoes(flat: mi.Scene) -> None:
+    """Two pings from one pose differ in noise only, as if each were traced."""
+    source = imager(flat, SONAR.replace(noise_level_db=-90.0))
+    first, second, again = (source.image(POSE, ping, again=again)[0] for ping, again in ((0, False), (1, False), (1, True)))
+    np.testing.assert_array_equal(second, again)
+    np.testing.assert_allclose(first - source.receiver.noise(0), second - source.receiver.noise(1), atol=1e-9)
+
+
 def test_elevation_pattern_is_three_db_down_at_the_field_of_view(flat: mi.Scene) -> None:
     """Skirts instead of edges: the level at the upper edge's range is 3 dB below that without pattern."""
     wide = {"range_min": 3.2, "range_max": 6.4, "range_bins": 512, "elevation_fov_deg": 14.0}

@@ -69,6 +69,7 @@ class CoherentModel:
         self.imager = CoherentImager(scene, sonar, mirrors, views, motion, groups)
         self.tracer, self._rays_per_launch = tracer_of(scene, sonar, motion), rays_per_launch
         self.views, self.notes = self.imager.views, self.imager.notes
+        self._grouped = groups is not None and groups.max() > 0 and motion is None
 
     @cached_property
     def _expected(self) -> ThesisModel:
@@ -97,7 +98,9 @@ class CoherentModel:
             raise MitsonarError("portions have no labels in the model coherent: leave labels out, or use physical")
         for index, number in enumerate(numbers):
             pose, time = poses[index : index + 1], time_s[index : index + 1]
-            levels, counts, cut = self.imager.levels(pose[0], number, time[0])
+            # pings of one frame from a sonar at rest, in a scene at rest, have the same echoes
+            again = self._grouped and index > 0 and bool((pose == poses[index - 1]).all())
+            levels, counts, cut = self.imager.levels(pose[0], number, time[0], again=again)
             if labels:
                 pings = next(self._expected.render(pose, time, [number], True))[0]
                 pings.levels, pings.expected, pings.cut = levels[None], pings.echoes, cut
@@ -143,6 +146,7 @@ class CoherentImager:
         self.former = BeamFormer(self.sampled)
         self.receiver = ReceiverNoise(self.sampled, self.former, sonar.looks)
         self.crosstalk = crosstalk(sonar, groups)
+        self._latest: list[tuple[NDArray[np.complex64], FieldCounts]] = []
         self._given = scene, mirrors, motion, groups
         parts = None if mirrors is None else mirror_of(scene, mirrors)
         self.tracers = {side: CoherentTracer(scene, self.sampled, self.former, parts, side, motion) for side in self.sides}
@@ -155,16 +159,21 @@ class CoherentImager:
         self.corners = None if cornered is None else CornerTracer(scene, self.sampled, self.former, cornered, motion=motion)
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
 
-    def image(self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
+    def image(
+        self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0, *, again: bool = False
+    ) -> tuple[NDArray[np.complex64], FieldCounts]:
         """Return the complex image of one ping ``(bins * looks, sides * beams)`` with its noise, and the counts of its rays.
 
         Args:
             pose: sonar pose ``(6,)`` [m, rad].
             ping: ping number, which determines the noise.
             time_s: time at which moving bodies are placed [s].
+            again: use the echoes of the latest image, since neither sonar nor scene has moved; the noise is new.
         """
-        silent, counts = zip(*(self.echoes(pose, side, time_s) for side in self.sides), strict=True)
-        images = [self.receiver.add(image, ping, side) for image, side in zip(silent, self.sides, strict=True)]
+        if not again:
+            self._latest = [self.echoes(pose, side, time_s) for side in self.sides]
+        silent, counts = zip(*self._latest, strict=True)
+        images = [self.receiver.add(image.copy(), ping, side) for image, side in zip(silent, self.sides, strict=True)]
         return np.concatenate(images, axis=1) if len(images) > 1 else images[0], FieldCounts.joined(counts)
 
     def echoes(
@@ -205,10 +214,13 @@ class CoherentImager:
         return parts
 
     def levels(
-        self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0
+        self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0, *, again: bool = False
     ) -> tuple[NDArray[np.float32], Counts, CutRays]:
-        """Return the levels of one ping after gain ``(bins, sides * beams)`` float32, its ray counts, and its cut rays."""
-        image, counts = self.image(pose, ping, time_s)
+        """Return the levels of one ping after gain ``(bins, sides * beams)`` float32, its ray counts, and its cut rays.
+
+        Arguments as for :meth:`image`.
+        """
+        image, counts = self.image(pose, ping, time_s, again=again)
         power = image.real * image.real + image.imag * image.imag
         if self.sonar.looks > 1:
             power = power.reshape(self.sonar.range_bins, self.sonar.looks, -1).mean(axis=1)
