@@ -139,6 +139,9 @@ CROSSTALK_DB = (None, -45.0, -40.0, -35.0, -31.0, -28.0, -25.0, -22.0, -19.0)
 OFFSET_DB = (None, -13.0, -10.0, -7.0, -4.0)
 """Crosstalk and offset of the detector, relative to the noise, that are tried."""
 
+SMEAR_BAND_DB = 0.5
+"""Weight of the smear, which a glance at a picture sees: 3 dB count as 6 bands."""
+
 RANKS = (0, 10, 30, 50, 70, 90, 100)
 """Percentiles of the windows' means, between which grain is compared."""
 
@@ -165,12 +168,15 @@ def fitted(name: str, real: SonarFrames, folder: Path, rounds: int = 2) -> Sonar
 
 def nearest(fits: list[SonarFit], stage: Stage, target: NDArray[np.float64], folder: Path) -> SonarFit:
     """Return the fit whose rendered grain is nearest to the target."""
-    miss = [float(np.abs(grain(simulate(stage, fit, 1, folder)) - target).mean()) for fit in fits]
+    miss = [float(np.abs(grain(simulate(stage, fit, 1, folder)) - target).sum()) for fit in fits]
     return fits[int(np.argmin(miss))]
 
 
 def grain(frames: SonarFrames) -> NDArray[np.float64]:
-    """Return spread and correlation of the grain of windows by the rank of their level, in units of their bands."""
+    """Return what pulse, crosstalk and offset change ``(25,)``, in units of bands.
+
+    These are spread and correlation of the grain of windows, by the rank of their level, and the smear of the brightest.
+    """
     rest = statistics.detrended(level := levels(frames))
     mean = statistics.window_values(level).mean(axis=1)
     shape = [min(size, whole) for size, whole in zip(statistics.WINDOW, rest.shape[1:], strict=True)]
@@ -181,7 +187,8 @@ def grain(frames: SonarFrames) -> NDArray[np.float64]:
     numbers = np.stack([np.sqrt(power) / 0.7, *(one / 0.1 for one in (*over_range, over_beams))])
     ends = np.percentile(mean, RANKS)
     parts = [(mean >= low) & (mean <= high) for low, high in pairwise(ends)]
-    return np.array([np.median(numbers[:, part], axis=1) for part in parts])
+    by_rank = np.array([np.median(numbers[:, part], axis=1) for part in parts])
+    return np.append(by_rank, statistics.smear_db(level) / SMEAR_BAND_DB)
 
 
 def with_offset(fit: SonarFit, offset_db: float | None) -> SonarFit:
