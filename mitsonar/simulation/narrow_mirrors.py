@@ -6,13 +6,13 @@ into the fan instead.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from mitsonar.simulation.beams import CommonFan
 from mitsonar.simulation.mirrors import FLAT, Mirrors
@@ -24,6 +24,10 @@ COLUMNS = 4.0
 
 MOST_FACETS = 200_000
 """Number of triangles above which a shape is not divided into pieces, which takes seconds."""
+
+BOX_FACES = [[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+             [1, 3, 7], [1, 7, 5]]  # fmt: skip
+"""Triangles of a box, whose corner number holds the end along axis k in bit k."""
 
 MOST_SAMPLES = 128
 """Largest number of samples along the side of a triangle."""
@@ -126,19 +130,19 @@ def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
         square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) @ matrix[:3, :3].T + matrix[:3, 3]
         return np.asarray(square[[[0, 1, 2], [0, 2, 3]]])
     box = shape.bbox()
-    low, high = (np.array(end, dtype=float).ravel() for end in (box.min, box.max))
-    solid = trimesh.creation.box(bounds=[low, high])
-    return np.asarray(solid.vertices[solid.faces], dtype=np.float64)
+    ends = np.array([np.array(end, dtype=float).ravel() for end in (box.min, box.max)])
+    corners = np.array([[ends[(corner >> axis) & 1, axis] for axis in range(3)] for corner in range(8)])
+    return np.asarray(corners[BOX_FACES], dtype=np.float64)
 
 
 def _pieces(corners: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Divide triangles ``(n, 3, 3)`` into those that are connected by edges."""
+    """Divide triangles ``(n, 3, 3)`` into those that are connected by vertices."""
     if not 0 < len(corners) <= MOST_FACETS:
         return [corners] if len(corners) else []
-    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
-    mesh.merge_vertices()
-    labels: Callable[..., NDArray[np.int32]] = trimesh.graph.connected_component_labels
-    label = labels(mesh.face_adjacency, node_count=len(corners))
+    vertices, index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    first, second, third = index.reshape(-1, 3).T
+    edges = np.concatenate([first, second]), np.concatenate([second, third])
+    label = connected_components(coo_array((np.ones(len(edges[0])), edges), (len(vertices),) * 2), directed=False)[1][first]
     order = np.argsort(label, kind="stable")
     return np.split(corners[order], np.flatnonzero(np.diff(label[order])) + 1)
 
