@@ -232,6 +232,7 @@ def test_rendering_works_without_torch() -> None:
         from mitsonar.simulation.device import ensure_variant
         ensure_variant()
         import mitsuba as mi
+        import mitsonar.simulation.models.coherent
         warnings.simplefilter("ignore", mitsonar.MitsonarWarning)
         floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100), "bsdf": {"type": "diffuse"}}
         simulator = mitsonar.Simulator(mi.load_dict({"type": "scene", "floor": floor}), mitsonar.Sonar(beams=4))

@@ -129,7 +129,8 @@ class MirrorTracer:
         dr.make_opaque(self.index)
         dr.eval(self.table)
         self.survey, self.launch = self._compile_survey(), self._compile_sum()
-        self.narrow, self.warned = NarrowMirrors.from_scene(scene, mirrors), False
+        self.narrow = NarrowMirrors.from_scene(scene, mirrors)
+        self.warned, self.warned_narrow = False, False
 
     def field(self, pose: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Return the field of one ping ``(ranges, sines)`` at a pose ``(6,)`` [m, rad]; see :meth:`add`."""
@@ -170,10 +171,10 @@ class MirrorTracer:
         few = len(index) * self.finest**2 <= MOST_NARROW_RAYS
         index = index[(desired[index] <= self.finest) & (few | (desired[index] == 0))]
         desired[index] = -float(self.finest)
-        if narrowest and not self.warned:
-            self.warned = True
+        if narrowest and not self.warned_narrow:
+            self.warned_narrow = True
             warnings.warn(
-                f"{', '.join(narrowest)} is narrower than four of the finest rays, so its mirrored echo may be missing or "
+                f"{', '.join(narrowest)}: narrower than four of the finest rays, so the mirrored echo may be missing or "
                 "wrong: choose a finer quality, a nearer pose, or a larger mirror",
                 MitsonarWarning,
                 stacklevel=4,

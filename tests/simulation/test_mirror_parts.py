@@ -111,7 +111,7 @@ def test_edges_of_small_plates_echo_far_from_the_normal(tilt_deg: float) -> None
 
 def test_a_mirror_narrower_than_the_finest_rays_is_warned_of() -> None:
     source = tracer(scene(target=plate([0, 0, 0], [0, -1, 0], half=0.005)), WIDE, target=(1.0, 0.0))
-    with pytest.warns(MitsonarWarning, match=r"target is narrower than four of the finest rays.*choose a finer quality"):
+    with pytest.warns(MitsonarWarning, match=r"target: narrower than four of the finest rays.*choose a finer quality"):
         source.field(tilted(0, "z"))
 
 

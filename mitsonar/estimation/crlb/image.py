@@ -542,11 +542,8 @@ class ScoreCovariance:
         for weight, correlation in self.parts:
             for total, one in zip(product, values, strict=True):
                 each = one if self.looks == 1 else np.repeat(one / self.looks, self.looks, axis=0)
-                total += self._mean((np.conj(weight) * (correlation @ (weight * each))).real)
+                total += _mean_of_looks((np.conj(weight) * (correlation @ (weight * each))).real, self.looks)
         return product
-
-    def _mean(self, each: Floats) -> Floats:
-        return each if self.looks == 1 else each.reshape(-1, self.looks, each.shape[1]).mean(axis=1)
 
     def solve(self, values: Floats) -> Floats:
         """Return C^-1 of maps ``(k, bins, beams)``, by conjugate gradients.
@@ -788,9 +785,9 @@ def expected_sonar(sonar: Sonar) -> Sonar:
     return sonar.replace(model="physical", quality="fine", **patterns)
 
 
-def _mean_of_looks(power: Floats, looks: int) -> Floats:
-    """Average powers ``(bins * looks, beams)`` over the looks of each bin."""
-    return power if looks == 1 else np.asarray(power.reshape(-1, looks, power.shape[1]).mean(axis=1))
+def _mean_of_looks(values: Floats, looks: int) -> Floats:
+    """Average values ``(bins * looks, beams)`` over the looks of each bin."""
+    return values if looks == 1 else np.asarray(values.reshape(-1, looks, values.shape[1]).mean(axis=1))
 
 
 def _power_slopes(imager: CoherentImager, pose: Floats, step: Floats, pings: int) -> Floats:
