@@ -217,7 +217,16 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     if noise is not None:
         fitted |= _water(flat, level, noise, sonar, full_scale_db, notes)
         # 6. dark bins contain noise and the detector's offset
-        if frames.level == "dB" and (ratio := _offset_of(_grain_windows(value)[1] * sonar.coding_db, sonar.looks)) > 0:
+        dark_db = _grain_windows(value)[1] * sonar.coding_db
+        ratio = _offset_of(dark_db, sonar.looks) if frames.level == "dB" else 0.0
+        least_db = _grain(sonar.looks, OFFSETS[1])[0]
+        if frames.level == "dB" and len(dark_db) and (spread_db := float(np.median(dark_db.std(axis=1)))) < least_db:
+            notes.append(
+                f"dark cells vary by {spread_db:.2g} dB, less than noise of {sonar.looks} looks does: a constant or a "
+                "compression covers the noise, so noise_level_db, pulse and beam width are not the instrument's; give "
+                "them by --set"
+            )
+        if ratio > 0:
             noise /= 1 + ratio
             fitted["noise_level_db"] = round(float(statistics.decibels(noise)) + full_scale_db, 1)
             fitted["detector_offset_db"] = round(float(statistics.decibels(noise * ratio)) + full_scale_db, 1)
