@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from coherent_scenes import BOXES, HEIGHT, PITCH, POSE, SONAR, imager
 from helpers import Array, diffuse, essence, floor, scene, sphere
+from numpy.typing import NDArray
 from scipy import stats
 
 from mitsonar.acoustics.noise import NOISE_MODELS
@@ -20,8 +21,7 @@ from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.beams import Pulse, series, shaded_sinc
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose, to_world_matrices
-from mitsonar.simulation import beams
-from mitsonar.simulation.receiver_noise import crosstalk
+from mitsonar.simulation import beams, receiver_noise
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.families import RockyField
@@ -39,6 +39,13 @@ Shape: TypeAlias = Callable[[Array], Array]
 @pytest.fixture(scope="module")
 def flat(variant: str) -> mi.Scene:
     return scene(floor=floor(diffuse(0.5)))
+
+
+def crosstalk(sonar: Sonar) -> NDArray[np.complex64]:
+    """Amplitudes between beams ``(from, to)`` of a sonar that has crosstalk."""
+    gains = receiver_noise.crosstalk(sonar)
+    assert gains is not None
+    return gains
 
 
 def images(source: CoherentImager, count: int, apart: float = 0.7) -> Array:
@@ -463,7 +470,7 @@ def test_the_detector_adds_a_constant_to_the_power(flat: mi.Scene) -> None:
 @pytest.mark.parametrize("groups", [1, 8])
 def test_crosstalk_falls_with_distance_and_stays_in_a_ping_group(groups: int) -> None:
     sonar = SONAR.replace(beams=96, crosstalk_db=-40.0, ping_groups=groups)
-    power = np.mean([np.abs(np.asarray(crosstalk(sonar.replace(seed=seed)))) ** 2 for seed in range(200)], axis=0)
+    power = np.mean([np.abs(crosstalk(sonar.replace(seed=seed))) ** 2 for seed in range(200)], axis=0)
     away = np.abs(np.arange(96)[:, None] - np.arange(96))
     same = (away % groups == 0) & (away > 0)
     assert not power[~same].any()

@@ -122,7 +122,9 @@ def test_pieces_of_a_mesh_are_narrow_each_by_its_own_width(tmp_path: Path) -> No
 
     balls = [trimesh.creation.icosphere(radius=0.1).apply_translation([x, 5, 0]) for x in (-1.5, 1.5)]
     rod = trimesh.creation.cylinder(0.02, 2.0).apply_translation([0, 5, 0])
-    trimesh.util.concatenate([*balls, rod]).export(path := tmp_path / "bodies.ply")
+    bodies = trimesh.util.concatenate([*balls, rod])
+    assert isinstance(bodies, trimesh.Trimesh)
+    bodies.export(path := tmp_path / "bodies.ply")
     loaded = scene(bodies={"type": "ply", "filename": str(path)})
     narrow = NarrowMirrors.from_scene(loaded, Mirrors(np.ones(1), np.zeros(1)))
     assert sorted(narrow.width) == pytest.approx([0.02 * math.sqrt(6), 0.2, 0.2], rel=0.02)
