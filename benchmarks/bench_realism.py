@@ -5,7 +5,7 @@
 Recordings are read from the folder, or from the one that MITSONAR_RECORDINGS names. Their sonars are fitted
 (`mitsonar sonar fit`), and the model coherent renders scenes that resemble theirs. Noise and gain are set so that noise and
 brightest thousandth lie as far below full scale as in the recording. Where volume is bright, the fit says the gain. Pulse,
-crosstalk and the detector's offset are those whose rendered grain is nearest to the recording's.
+crosstalk, tails and the detector's offset are those whose rendered grain is nearest to the recording's.
 `--classify` fits on the first half of the frames instead, and prints how well a logistic regression separates as many
 simulated frames from the second half: it learns on patches of one half of the beams, and is tested on the other. A guess
 has 0.5.
@@ -139,15 +139,18 @@ CROSSTALK_DB = (None, -45.0, -40.0, -35.0, -31.0, -28.0, -25.0, -22.0, -19.0)
 OFFSET_DB = (None, -13.0, -10.0, -7.0, -4.0)
 """Crosstalk and offset of the detector, relative to the noise, that are tried."""
 
-SMEAR_BAND_DB = 0.5
-"""Weight of the smear, which a glance at a picture sees: 3 dB count as 6 bands."""
+TAILS = ((None, 10), *((level, bins) for level in (-22.0, -18.0, -14.0, -10.0) for bins in (10, 30)))
+"""Tails that are tried: power of an echo's tail, relative to it [dB], and its range [bins]."""
+
+SMEAR_BAND_DB, TAIL_BAND_DB = 0.5, 2.0
+"""Weights of smear and tails of the brightest, which a glance at a picture sees: 3 dB of smear count as 6 bands."""
 
 RANKS = (0, 10, 30, 50, 70, 90, 100)
 """Percentiles of the windows' means, between which grain is compared."""
 
 
 def fitted(name: str, real: SonarFrames, folder: Path, rounds: int = 2) -> SonarFit:
-    """Fit the sonar of a recording; choose pulse, crosstalk and offset by the rendered grain."""
+    """Fit the sonar of a recording; choose pulse, crosstalk, tails and offset by the rendered grain."""
     stage = STAGES[name]
     fit = fit_sonar(real, **stage.sonar)
     sonar, target = real.sonar, grain(real)
@@ -161,6 +164,8 @@ def fitted(name: str, real: SonarFrames, folder: Path, rounds: int = 2) -> Sonar
     for _ in range(rounds):
         leaks = [replace(fit, sonar=fit.sonar.replace(crosstalk_db=level)) for level in CROSSTALK_DB]
         fit = nearest([fit, *leaks], stage, target, folder)
+        tails = [replace(fit, sonar=fit.sonar.replace(tail_db=level, tail_m=bins * sonar.bin_m)) for level, bins in TAILS]
+        fit = nearest([fit, *tails], stage, target, folder)
         fit = nearest([fit, *(with_offset(fit, level) for level in OFFSET_DB)], stage, target, folder)
         fit = nearest([fit, *(replace(fit, sonar=fit.sonar.replace(**known)) for known in pulses)], stage, target, folder)
     return fit
@@ -173,9 +178,9 @@ def nearest(fits: list[SonarFit], stage: Stage, target: NDArray[np.float64], fol
 
 
 def grain(frames: SonarFrames) -> NDArray[np.float64]:
-    """Return what pulse, crosstalk and offset change ``(25,)``, in units of bands.
+    """Return what pulse, crosstalk, tails and offset change ``(28,)``, in units of bands.
 
-    These are spread and correlation of the grain of windows, by the rank of their level, and the smear of the brightest.
+    These are spread and correlation of the grain of windows, by the rank of their level, smear and tails of the brightest.
     """
     rest = statistics.detrended(level := levels(frames))
     mean = statistics.window_values(level).mean(axis=1)
@@ -188,7 +193,8 @@ def grain(frames: SonarFrames) -> NDArray[np.float64]:
     ends = np.percentile(mean, RANKS)
     parts = [(mean >= low) & (mean <= high) for low, high in pairwise(ends)]
     by_rank = np.array([np.median(numbers[:, part], axis=1) for part in parts])
-    return np.append(by_rank, statistics.smear_db(level) / SMEAR_BAND_DB)
+    tails = np.nan_to_num(statistics.tail_db(level)) / TAIL_BAND_DB
+    return np.concatenate([by_rank.ravel(), [statistics.smear_db(level) / SMEAR_BAND_DB], tails])
 
 
 def with_offset(fit: SonarFit, offset_db: float | None) -> SonarFit:
@@ -289,6 +295,7 @@ def measured(frames: SonarFrames) -> dict[str, tuple[float, float | None]]:
     over_range, over_beams = (statistics.autocorrelation(level, axis) for axis in (1, 2))
     rise, fall = statistics.edge_steps_db(level)
     glow = statistics.near_glow_db(level)
+    behind = dict(zip(statistics.BEHIND_BINS, statistics.tail_db(level).tolist(), strict=True))
     profile = statistics.range_profile_db(level)
     third = [float(part.mean() - profile.max()) for part in np.array_split(profile, 3)]
     result: dict[str, tuple[float, float | None]] = {
@@ -306,6 +313,7 @@ def measured(frames: SonarFrames) -> dict[str, tuple[float, float | None]]:
         "beams, lag 2": (float(over_beams[1]), 0.1),
         "stripes, dB": (statistics.beam_stripes_db(level), None),
         "smear of the brightest, dB": (statistics.smear_db(level), None),
+        **{f"{bins} bins behind the brightest, dB": (value, None) for bins, value in behind.items()},
         "99.9 % over median, dB": (statistics.bright_over_median_db(level), None),
         "near glow, dB": (float(glow.max()), None),
         "steepest rise in 5 % of range, dB": (rise, None),

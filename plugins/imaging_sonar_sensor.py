@@ -69,8 +69,9 @@ class ImagingSonar(mi.Sensor):
     ``speckle_nu``, ``speckle_patch_m`` [m, 0.1], ``source_level_db`` [0], ``noise_level_db``, ``near_glow_db`` [0],
     ``near_glow_m`` [m, 0.5], ``near_glow_edge_db`` [0], ``near_glow_spread_db`` [0], ``near_glow_still`` [0], ``volume_db``,
     ``absorption_db_per_m``, ``temperature_c`` [10], ``salinity_psu`` [35], ``water_depth_m`` [m, 10], ``ph`` [8],
-    ``gain_absorption`` [false], ``crosstalk_db``, ``stripes_db`` [0], ``taper_db`` [0], ``array_error`` [0],
-    ``detector_offset_db``, ``coding``, ``coding_db`` [80], ``coding_gamma`` [0.5] (docs/guides/coherent.md); ``preset``:
+    ``gain_absorption`` [false], ``tail_db``, ``tail_m`` [m, 0.1], ``crosstalk_db``, ``saturation_db``, ``stripes_db`` [0],
+    ``group_stripes_db`` [0], ``taper_db`` [0], ``array_error`` [0], ``detector_offset_db``, ``detector_spread_db`` [0],
+    ``coding``, ``coding_db`` [80], ``coding_gamma`` [0.5] (docs/guides/coherent.md); ``preset``:
     name of a preset, whose values the other properties override; ``ping`` [0]: index of the jitter's draw; ``to_world``. A
     film is optional. If given, it must have the size that follows from beams and rays.
 

@@ -6,6 +6,7 @@ the local mean of the levels over :data:`WINDOW` cells is subtracted, which leav
 
 from __future__ import annotations
 
+import math
 import warnings
 from itertools import pairwise
 from typing import NamedTuple
@@ -33,6 +34,8 @@ __all__ = [
     "percentile_span_db",
     "range_profile_db",
     "smear_db",
+    "stripes_by_group_db",
+    "tail_db",
     "window_values",
     "zero_share",
 ]
@@ -198,13 +201,67 @@ def beam_stripes_db(level_db: ArrayLike, window: int = 9) -> float:
     The gain of a beam is the median of its levels over a block of bins, relative to its neighbours. Only the part shared by
     different blocks counts, since speckle differs from block to block.
     """
+    return math.sqrt(_shared_variance(_beam_gains_db(level_db, window)) * window / (window - 1))
+
+
+def stripes_by_group_db(level_db: ArrayLike, groups: ArrayLike, window: int = 9) -> tuple[float, float]:
+    """Return the standard deviations of the gains of beams within their ping group, and of ping groups [dB].
+
+    Args:
+        level_db: ``(frames, bins, beams)``.
+        groups: ping group of each beam ``(beams,)``.
+        window: neighbours to which a beam is compared; at least the number of groups.
+    """
+    member = np.asarray(groups)[:, None] == np.unique(groups)
+    count = member.sum(axis=0)
+    window = max(window, 2 * (member.shape[1] // 2) + 1)
+    whole = beam_stripes_db(level_db, window) ** 2
+    if member.shape[1] < 2 or count.min() < 2:
+        return math.sqrt(whole), 0.0
+    # a group's mean gain varies by that of the group, and by those of its beams
+    mean = _beam_gains_db(level_db, window) @ (member / count)
+    size = float(count.mean())
+    of_groups = (size * _shared_variance(mean) - whole) / (size - 1)
+    of_groups = min(max(of_groups, 0.0), whole)
+    return math.sqrt(whole - of_groups), math.sqrt(of_groups)
+
+
+def _beam_gains_db(level_db: ArrayLike, window: int) -> Array:
+    """Return the level of each beam relative to its neighbours in blocks of bins ``(blocks, beams)`` [dB]."""
     level = np.asarray(level_db, dtype=float).mean(axis=0)
     blocks = np.stack([np.median(part, axis=0) for part in np.array_split(level, STRIPE_BLOCKS)])
     blocks = blocks - ndimage.uniform_filter1d(blocks, window, axis=1, mode="nearest")
-    blocks -= blocks.mean(axis=1, keepdims=True)
+    return np.asarray(blocks - blocks.mean(axis=1, keepdims=True))
+
+
+def _shared_variance(blocks: Array) -> float:
+    """Return the variance that different blocks share ``(blocks, n)``: the median of their covariances, at least 0."""
+    if len(blocks) < 2:
+        return 0.0
     products = blocks @ blocks.T / blocks.shape[1]
-    shared = float(np.median(products[np.triu_indices(len(blocks), 1)])) if len(blocks) > 1 else 0.0
-    return float(np.sqrt(max(shared, 0.0) * window / (window - 1)))
+    return max(float(np.median(products[np.triu_indices(len(blocks), 1)])), 0.0)
+
+
+BEHIND_BINS, BRIGHT_SHARE = (10, 25, 50), 0.3
+"""Distances behind the brightest cells at which their tail is measured [bins], and the share of the brightest cells [%]."""
+
+
+def tail_db(level_db: ArrayLike) -> Array:
+    """Return the median level behind the brightest cells of each frame, relative to them, :data:`BEHIND_BINS` ``(3,)`` [dB].
+
+    Distances beyond the image are NaN.
+    """
+    level = np.asarray(level_db, dtype=float)
+    falls: list[list[float]] = [[] for _ in BEHIND_BINS]
+    for frame in level:
+        bins, beams = np.nonzero(frame >= np.percentile(frame, 100 - BRIGHT_SHARE))
+        for fall, behind in zip(falls, BEHIND_BINS, strict=True):
+            inside = bins + behind < len(frame)
+            if inside.any():
+                fall.append(
+                    float(np.median(frame[bins[inside] + behind, beams[inside]] - frame[bins[inside], beams[inside]]))
+                )
+    return np.array([np.mean(fall) if fall else np.nan for fall in falls])
 
 
 def range_profile_db(level_db: ArrayLike) -> Array:

@@ -131,13 +131,14 @@ class SonarFit:
             )
         volume_text = "none seen" if sonar.volume_db is None else f"{sonar.volume_db:.1f} dB re 1/m"
         offset_text = "none seen" if sonar.detector_offset_db is None else f"{sonar.detector_offset_db:.1f} dB"
+        groups_text = f" (of beams; group_stripes_db: {sonar.group_stripes_db:.2f})" if sonar.ping_groups > 1 else ""
         pulse_text = f"{1e3 * sonar.resolution_m:.3g} mm" + (f", {sonar.looks} looks a bin" if sonar.looks > 1 else "")
         return [
             f"noise over full scale   {noise_text} (noise_level_db: {level})",
             f"99.9th percentile       {self.bright_db:.1f} dB over full scale",
             f"coding                  {coding.get(sonar.value_coding, 'linear')}; the grain suggests {grain}",
             f"pulse, beam width       {pulse_text}; {math.degrees(sonar.beam_width_rad):.3g} deg",
-            f"stripes_db              {sonar.stripes_db:.2f}",
+            f"stripes_db              {sonar.stripes_db:.2f}" + groups_text,
             f"crosstalk_db            {crosstalk_text}",
             f"speckle_nu              {speckle_text}",
             f"near glow over noise    {glow_text}",
@@ -203,10 +204,11 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     limit, group = float(decoded(FULL_SCALE, sonar)), group_of_beams(sonar)
     parts = [intensity[:, statistics.GLOW_BINS :, group == one] for one in range(sonar.ping_groups)]
     leak = float(np.mean([statistics.leak_power(part, limit) for part in parts]))
+    stripes = statistics.stripes_by_group_db(level, group)
     fitted: dict[str, Any] = {
         **{"near_glow_db": 0.0, "near_glow_edge_db": 0.0, "near_glow_spread_db": 0.0, "near_glow_still": 0.0},
         "volume_db": None,
-        "stripes_db": round(statistics.beam_stripes_db(level), 2),
+        **dict(zip(("stripes_db", "group_stripes_db"), np.round(stripes, 2).tolist(), strict=True)),
         "crosstalk_db": round(float(np.clip(10 * math.log10(leak), -120, 0)), 1) if leak > 0 else None,
         "speckle_nu": nu,
         "detector_offset_db": None,
@@ -791,7 +793,8 @@ Layout = Literal["even", "sine"]
 
 NOISE_FIELDS = (
     *("noise_level_db", "volume_db", "near_glow_db", "near_glow_m", "near_glow_edge_db", "near_glow_spread_db"),
-    *("near_glow_still", "stripes_db", "crosstalk_db", "detector_offset_db", "speckle_nu", "speckle_patch_m"),
+    *("near_glow_still", "stripes_db", "group_stripes_db", "crosstalk_db", "detector_offset_db"),
+    *("speckle_nu", "speckle_patch_m"),
 )
 """Fields of a sonar that describe noise, water and grain, not the instrument's geometry."""
 

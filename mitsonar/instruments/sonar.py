@@ -571,11 +571,24 @@ class Sonar(Instrument):
         le=60,
         description="gain of the middle beam over the outermost, as the square of the bearing [dB] (coherent)",
     )
+    group_stripes_db: float = Field(
+        0.0, ge=0, le=20, description="spread of the ping groups' gains, by the seed [dB] (coherent)"
+    )
+    tail_db: float | None = Field(
+        None, ge=-120, le=0, description="power of what follows an echo, relative to it [dB] (coherent); default: none"
+    )
+    tail_m: float = Field(0.1, gt=0, le=100, description="range over which tails fall by the factor e of power [m]")
+    saturation_db: float | None = Field(
+        None, ge=-300, le=300, description="level at which the array's elements clip [dB re 1 uPa] (coherent); default: none"
+    )
     array_error: float = Field(
         0.0, ge=0, le=1, description="rms error of the array's elements, relative to their amplitude, by the seed (coherent)"
     )
     detector_offset_db: float | None = Field(
         None, ge=-300, le=300, description="constant power that the detector adds [dB re 1 uPa] (coherent); default: none"
+    )
+    detector_spread_db: float = Field(
+        0.0, ge=0, le=20, description="spread of the beams' detector_offset_db, by the seed [dB] (coherent)"
     )
     coding: Coding | None = Field(
         None,

@@ -1,4 +1,4 @@
-"""How a receiver changes a coherent ping: crosstalk of the beams, volume scattering, receiver noise with glow, stripes.
+"""How a receiver changes a coherent ping: tails and crosstalk, volume scattering, noise with glow, saturation, stripes.
 
 :data:`PROCESSES` names what is added after the echoes, in the order of the instrument. A process is a function
 ``process(receiver, image, ping, side) -> image`` of the complex image ``(bins, beams)``. Its draws are functions of (seed,
@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft, special
 from scipy.sparse import csr_array, diags_array
 
 from mitsonar.acoustics.noise import uniform
@@ -22,17 +23,25 @@ from mitsonar.instruments.beams import series, shaded_sinc
 from mitsonar.instruments.sonar import Sonar, group_of_beams
 from mitsonar.simulation.beams import PULSE_LENGTHS, BeamFormer
 
-__all__ = ["PROCESSES", "ReceiverNoise", "crosstalk"]
+__all__ = ["PROCESSES", "EchoTail", "ReceiverNoise", "crosstalk"]
 
 Image = NDArray[np.complex64]
 """A complex image ``(bins, beams)``: amplitudes relative to the source at 1 m."""
 
 STRIPES, NOISE, VOLUME, GLOW, CROSSTALK = 0x57121, 0x6E6F6973, 0x766F6C75, 0x676C6F77, 0x63726F73
-"""Salts of the seed that make the draws of stripes, noise, volume, glow and crosstalk independent."""
+TAIL, DISTORTION, GROUPS, OFFSET = 0x7461696C, 0x636C6970, 0x67726F75, 0x6F666673
+"""Salts of the seed that make the draws of the processes independent."""
 
 CROSSTALK_FALL = 1 / 3
 """Exponent by which the amplitude of crosstalk falls with the distance between channels. The kernel of a DIDSON, by which
 Teixeira et al. (2018, doi 10.1109/iros.2018.8594128) undo its crosstalk, is 1, 0.80, 0.68, 0.60 at distances 1 to 4."""
+
+TAPS, TAP_SPREAD = 16, 1.0
+"""Number of taps of a beam's tail, and the standard deviation of the logarithm of their amplitudes, beyond that of complex
+Gaussian ones: few taps are strong, so a tail is patchy, as behind targets in real frames."""
+
+TAIL_LENGTHS = 6.0
+"""Range at which a tail ends, relative to ``tail_m``."""
 
 MEDIAN_SQUARE = 0.25
 """Median of the squared bearing over evenly spaced beams, relative to the outermost beam."""
@@ -48,10 +57,12 @@ class ReceiverNoise:
         sonar: a sonar of the model ``coherent``.
         former: its beamformer, whose aperture and pulse filter the noise as they filter echoes.
         looks: number of looks that a bin averages; the sonar has a bin for each.
+        groups: ping group of each beam ``(beams,)``; default: those of the sonar.
     """
 
-    def __init__(self, sonar: Sonar, former: BeamFormer, looks: int = 1) -> None:
+    def __init__(self, sonar: Sonar, former: BeamFormer, looks: int = 1, groups: NDArray[np.int64] | None = None) -> None:
         self.sonar, self.former, self.looks = sonar, former, looks
+        self.groups = group_of_beams(sonar) if groups is None else groups
         self._cached_waves: dict[int, NDArray[np.float32]] = {}
 
     def add(self, image: NDArray[Any], ping: int, side: int = 0) -> Image:
@@ -68,9 +79,21 @@ class ReceiverNoise:
 
     @cached_property
     def stripes(self) -> NDArray[np.float32]:
-        """Return the amplitude gain of each beam ``(beams,)``: drawn from the seed, less the taper."""
-        drawn_db = np.random.default_rng([abs(self.sonar.seed), STRIPES]).normal(0, self.sonar.stripes_db, self.sonar.beams)
-        return np.asarray(10 ** ((drawn_db - self.sonar.taper_db * self._aside**2) / 20), dtype=np.float32)
+        """Return the amplitude gain of each beam ``(beams,)``, by the seed for beams and ping groups, and by the taper."""
+        sonar = self.sonar
+        drawn_db = np.random.default_rng([abs(sonar.seed), STRIPES]).normal(0, sonar.stripes_db, sonar.beams)
+        of_group = np.random.default_rng([abs(sonar.seed), GROUPS]).normal(0, sonar.group_stripes_db, self.groups.max() + 1)
+        gain_db = drawn_db + of_group[self.groups] - sonar.taper_db * self._aside**2
+        return np.asarray(10 ** (gain_db / 20), dtype=np.float32)
+
+    @cached_property
+    def offset(self) -> NDArray[np.float32]:
+        """Return the constant power that the detector adds to each beam ``(beams,)``."""
+        sonar = self.sonar
+        if sonar.detector_offset_db is None:
+            return np.zeros(sonar.beams, np.float32)
+        drawn_db = np.random.default_rng([abs(sonar.seed), OFFSET]).normal(0, sonar.detector_spread_db, sonar.beams)
+        return np.asarray(10 ** ((sonar.detector_offset_db + drawn_db - sonar.source_level_db) / 10), dtype=np.float32)
 
     @property
     def _aside(self) -> NDArray[np.float64]:
@@ -114,6 +137,30 @@ class ReceiverNoise:
         """
         amplitude = np.asarray(self._volume_amplitude * (math.sqrt(0.5) if side else 1), np.float32)
         return self._white(ping, VOLUME ^ SIDE_SALT[side], 2) * amplitude[:, None]
+
+    def clipped(self, image: NDArray[Any], ping: int, side: int = 0) -> NDArray[np.complex64]:
+        """Return an image ``(bins, beams)`` whose elements clip amplitudes at ``saturation_db``.
+
+        The elements receive the sum of what comes from all bearings, a complex Gaussian signal. A soft limiter multiplies it
+        by a gain and adds a distortion that is independent of it (Bussgang 1952), here spread evenly over the beams: echoes
+        are compressed, and all beams are brighter at their ranges.
+        """
+        sonar = self.sonar
+        # 1. Power of the elements, relative to the limit.
+        power = np.square(np.abs(image)).mean(axis=1)
+        received = power * (sonar.beams * sonar.beam_spacing_rad / sonar.beam_width_rad)
+        assert sonar.saturation_db is not None
+        limit = 10 ** ((sonar.saturation_db - sonar.source_level_db) / 10)
+        clips = received > LEAST_CLIPPED * limit
+        result = np.array(image, dtype=np.complex64)
+        if not clips.any():
+            return result
+        # 2. Gain and distortion.
+        gain, distortion = limiter(limit / received[clips])
+        amplitude = np.sqrt(power[clips] * distortion)
+        noise = self._white(ping, DISTORTION ^ SIDE_SALT[side], 1)[clips]
+        result[clips] = result[clips] * gain[:, None].astype(np.float32) + noise * amplitude[:, None].astype(np.float32)
+        return result
 
     def noise_powers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the mean powers of noise and of volume in averaged bins, two arrays ``(bins,)``; 0 where there is none.
@@ -197,17 +244,75 @@ def _with_noise(receiver: ReceiverNoise, image: NDArray[Any], ping: int, side: i
     return image if receiver.sonar.noise_level_db is None else image + receiver.noise(ping, side)
 
 
+def _with_saturation(receiver: ReceiverNoise, image: NDArray[Any], ping: int, side: int) -> NDArray[Any]:
+    return image if receiver.sonar.saturation_db is None else receiver.clipped(image, ping, side)
+
+
 def _with_stripes(receiver: ReceiverNoise, image: NDArray[Any], ping: int, side: int) -> NDArray[Any]:
     sonar = receiver.sonar
-    return image * receiver.stripes if sonar.stripes_db > 0 or sonar.taper_db != 0 else image
+    even = sonar.stripes_db == 0 and sonar.group_stripes_db == 0 and sonar.taper_db == 0
+    return image if even else image * receiver.stripes
 
 
 PROCESSES: tuple[Callable[[ReceiverNoise, NDArray[Any], int, int], NDArray[Any]], ...] = (
     _with_volume,
     _with_noise,
+    _with_saturation,
     _with_stripes,
 )
 """Processes that act on the echoes of a ping, in the order of the instrument."""
+
+
+LEAST_CLIPPED = 0.05
+"""Power of the elements, relative to the limit, below which they do not clip: their distortion is below -100 dB."""
+
+
+def limiter(limit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what a soft limiter of the envelope does to complex Gaussian signals: gain, and power of the distortion.
+
+    Args:
+        limit: squared largest amplitude, relative to the mean power of each signal.
+
+    Returns:
+        Amplitude gain of the signal, and power of the distortion relative to that of the signal.
+    """
+    root = np.sqrt(limit)
+    gain = -np.expm1(-limit) + math.sqrt(math.pi) / 2 * root * special.erfc(root)
+    return gain, np.maximum(-np.expm1(-limit) - gain**2, 0)
+
+
+class EchoTail:
+    """Tails of echoes: ringing of the transducer and paths by way of the ground near a target.
+
+    Each beam has :data:`TAPS` taps with delays and complex gains by the seed, the same in all pings. Delays have an
+    exponential law; over all beams, the power of the taps is ``tail_db``.
+
+    Args:
+        sonar: a sonar with a tail, and a bin for each look.
+
+    Attributes:
+        response: what follows an echo of amplitude 1 in bin 0 ``(bins, beams)``.
+    """
+
+    def __init__(self, sonar: Sonar) -> None:
+        assert sonar.tail_db is not None
+        rng = np.random.default_rng([abs(sonar.seed), TAIL])
+        longest = min(sonar.range_bins - 1, math.ceil(TAIL_LENGTHS * sonar.tail_m / sonar.bin_m))
+        delay_m = sonar.resolution_m + rng.exponential(sonar.tail_m, (TAPS, sonar.beams))
+        bins = np.maximum(np.rint(delay_m / sonar.bin_m).astype(int), 1)
+        real, imag = rng.normal(size=(2, TAPS, sonar.beams))
+        gain = (real + 1j * imag) * np.exp(rng.normal(0, TAP_SPREAD, (TAPS, sonar.beams)))
+        gain *= 10 ** (sonar.tail_db / 20) / math.sqrt(float(np.square(np.abs(gain)).sum(axis=0).mean()))
+        gain[bins > longest] = 0
+        self.response = np.zeros((longest + 1, sonar.beams), np.complex64)
+        np.add.at(self.response, (np.minimum(bins, longest), np.arange(sonar.beams)), gain)
+        self._length = fft.next_fast_len(sonar.range_bins + longest)
+        self._spectrum = fft.fft(self.response, self._length, axis=0)
+
+    def add(self, image: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """Return an image ``(bins, beams)`` with the tails of its echoes."""
+        tails = fft.ifft(fft.fft(image, self._length, axis=0) * self._spectrum, axis=0)[: len(image)]
+        return np.asarray(image + tails, dtype=np.complex64)
 
 
 def crosstalk(sonar: Sonar, groups: NDArray[np.int64] | None = None) -> NDArray[np.complex64] | None:

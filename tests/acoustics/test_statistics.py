@@ -109,6 +109,27 @@ def test_stripes_are_told_from_speckle(spread: float) -> None:
     assert statistics.beam_stripes_db(level) == pytest.approx(spread, abs=0.1)
 
 
+@pytest.mark.parametrize(("within", "between"), [(0.3, 0.8), (0.5, 0.0), (0.0, 0.6)])
+def test_stripes_of_beams_are_told_from_those_of_ping_groups(within: float, between: float) -> None:
+    rng, group = np.random.default_rng(4), np.arange(256) % 16
+    gains, of_group = rng.normal(size=256), rng.normal(size=16)
+    gains -= np.array([gains[group == one].mean() for one in group])
+    gains *= within / gains.std()
+    of_group *= between / of_group.std()
+    level = decibels(intensity((3, 600, 256))) + gains + of_group[group]
+    assert statistics.stripes_by_group_db(level, group) == pytest.approx((within, between), abs=0.16)
+    whole = statistics.beam_stripes_db(level)
+    assert statistics.stripes_by_group_db(level, np.zeros(256)) == pytest.approx((whole, 0))
+
+
+def test_tails_behind_the_brightest() -> None:
+    """Echoes whose power falls by 0.8 dB a bin; what lies beyond the picture is left out."""
+    level = np.full((2, 200, 300), -90.0)
+    level[:, 60:160, 7::100] = -0.8 * np.arange(100)[:, None]
+    assert statistics.tail_db(level) == pytest.approx(-0.8 * np.array([10, 25, 50]), abs=1e-6)
+    assert np.isnan(statistics.tail_db(level[:, :40])).tolist() == [False, False, True]
+
+
 def test_profile_glow_and_edges() -> None:
     level = np.zeros((2, 400, 30)) - 40
     level[:, 100:300] = 0  # a lit patch, from one bin to the next

@@ -95,7 +95,8 @@ def test_properties_are_those_of_a_sonar() -> None:
             "array_error": 0.1,
             "taper_db": 3.0,
         },
-        **{"detector_offset_db": -60.0},
+        **{"detector_offset_db": -60.0, "detector_spread_db": 0.5, "group_stripes_db": 0.25},
+        **{"tail_db": -17.0, "tail_m": 0.08, "saturation_db": -20.0},
         **{"crosstalk_db": -49.0, "stripes_db": 0.5, "coding": "gamma", "coding_db": 90.0, "coding_gamma": 0.6},
     }
     assert set(fields) == set(Sonar.model_fields) - {"name", "pulse_m"}  # the band says it

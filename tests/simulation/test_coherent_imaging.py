@@ -19,9 +19,10 @@ from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.acoustics.speckle import contrast
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.beams import Pulse, series, shaded_sinc
-from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sonar import Sonar, group_of_beams
 from mitsonar.motion.pose import Pose, to_world_matrices
 from mitsonar.simulation import beams, receiver_noise
+from mitsonar.simulation.receiver_noise import TAPS, EchoTail, ReceiverNoise
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.simulator import Simulator
 from mitsonar.worlds.families import RockyField
@@ -465,6 +466,86 @@ def test_the_detector_adds_a_constant_to_the_power(flat: mi.Scene) -> None:
     plain, _, _ = imager(flat, sonar).levels(POSE, 0)
     result, _, _ = imager(flat, sonar.replace(detector_offset_db=-95.0)).levels(POSE, 0)
     np.testing.assert_allclose(result, plain + 10**-27.5 * sonar.range_m[:, None] ** 2, rtol=1e-5)
+
+
+def test_beams_and_ping_groups_have_gains_and_offsets_of_their_own(flat: mi.Scene) -> None:
+    """Spreads as drawn from 100 seeds; a frame of groups differs from an even one by the gains of the groups."""
+    sonar = SONAR.replace(ping_groups=4, coding="linear", gain_exponent=0, source_level_db=180.0)
+    spread = sonar.replace(group_stripes_db=0.8, detector_offset_db=-90.0, detector_spread_db=0.5)
+    group, gains, offsets = group_of_beams(spread), [], []
+    for seed in range(100):
+        receiver = ReceiverNoise(spread.replace(seed=seed), beams.BeamFormer(spread))
+        gain_db = 20 * np.log10(receiver.stripes)
+        assert all(np.ptp(gain_db[group == one]) < 1e-5 for one in range(4))
+        gains.append([gain_db[group == one][0] for one in range(4)])
+        offsets.append(10 * np.log10(receiver.offset))
+    assert np.std(gains) == pytest.approx(0.8, rel=0.1)
+    assert np.std(offsets) == pytest.approx(0.5, rel=0.05)
+    assert np.mean(offsets) == pytest.approx(-270, abs=0.05)
+    even, result = (next(iter(Simulator(flat, each).pings(POSE))).levels[0] for each in (sonar, spread))
+    receiver = ReceiverNoise(spread, beams.BeamFormer(spread))
+    np.testing.assert_allclose(result, even * receiver.stripes**2 + receiver.offset, rtol=1e-3)
+
+
+def test_tails_are_sparse_and_have_the_power_and_length_that_are_given() -> None:
+    """Over 60 seeds, the power of a beam's taps is tail_db, and a share exp(-x / tail_m) of it is farther than x."""
+    sonar = SONAR.replace(tail_db=-17.0, tail_m=0.1)
+    power = np.stack([np.abs(EchoTail(sonar.replace(seed=seed)).response) ** 2 for seed in range(60)])
+    assert 10 * np.log10(power.sum(axis=1).mean()) == pytest.approx(-17, abs=0.3)
+    assert power[:, 0].max() == 0
+    behind = np.arange(power.shape[1]) * sonar.bin_m
+    farther = np.array([power[:, behind > x].sum() for x in (0.05, 0.1, 0.2)]) / power.sum()
+    np.testing.assert_allclose(farther, np.exp(-(np.array([0.05, 0.1, 0.2]) - sonar.resolution_m) / 0.1), rtol=0.2)
+    assert (power > 0).sum(axis=1).max() <= TAPS
+
+
+def test_tails_follow_echoes_as_a_causal_filter(flat: mi.Scene) -> None:
+    sonar = SONAR.replace(tail_db=-12.0, tail_m=0.05)
+    plain, result = (imager(flat, each).echoes(POSE)[0] for each in (SONAR, sonar))
+    response = EchoTail(sonar).response
+    response[0] = 1
+    target = [np.convolve(beam, taps)[: SONAR.range_bins] for beam, taps in zip(plain.T, response.T, strict=True)]
+    np.testing.assert_allclose(result, np.array(target).T, atol=1e-5 * float(np.abs(plain).max()))
+
+
+def test_a_limiter_of_gaussian_signals() -> None:
+    """Gain E y z* and power E |y|^2 of clipped draws, as the closed forms say."""
+    real, imag = np.random.default_rng(1).normal(0, math.sqrt(0.5), (2, 400_000))
+    z = real + 1j * imag
+    limit = np.array([0.02, 0.3, 1.0, 4.0, 20.0])
+    gain, distortion = receiver_noise.limiter(limit)
+    clipped = [z * np.minimum(1, math.sqrt(u) / np.abs(z)) for u in limit]
+    np.testing.assert_allclose(gain, [(y * z.conj()).mean().real for y in clipped], rtol=5e-3)
+    np.testing.assert_allclose(gain**2 + distortion, [(np.abs(y) ** 2).mean() for y in clipped], rtol=5e-3)
+
+
+@pytest.mark.parametrize("over_db", essence([20.0, 6.0, -3.0], 6.0))
+def test_a_saturated_receiver_has_the_power_that_clipping_leaves(over_db: float) -> None:
+    """Noise of all beams, over_db above the limit of the elements, keeps the share 1 - exp(-u) of its power."""
+    wide = SONAR.replace(source_level_db=180.0, noise_level_db=100.0)
+    elements_db = 100 + 10 * math.log10(SONAR.beams * SONAR.beam_spacing_rad / SONAR.beam_width_rad)
+    sonar = wide.replace(saturation_db=elements_db - over_db)
+    receiver = ReceiverNoise(sonar, beams.BeamFormer(sonar))
+    noise = np.stack([receiver.noise(ping) for ping in range(20)])
+    result = np.stack([receiver.clipped(image, ping) for ping, image in enumerate(noise)])
+    kept = -np.expm1(-(10 ** (-over_db / 10)))
+    assert np.square(np.abs(result)).mean() / np.square(np.abs(noise)).mean() == pytest.approx(kept, rel=0.03)
+    quiet = receiver.noise(0) * np.complex64(0.01)
+    np.testing.assert_array_equal(receiver.clipped(quiet, 0), quiet)
+
+
+def test_a_glint_that_saturates_lights_all_beams_at_its_range(flat: mi.Scene) -> None:
+    """Its own echo is compressed; other ranges keep their bits."""
+    sonar = SONAR.replace(source_level_db=180.0)
+    image = imager(flat, sonar).image(POSE, 0)[0]
+    image[100, 20] = 1e4 * np.abs(image).max()
+    power_db = 10 * math.log10(float(np.square(np.abs(image[100])).mean())) + 180
+    saturated = sonar.replace(saturation_db=power_db + 10 * math.log10(SONAR.beams) - 10)
+    result = ReceiverNoise(saturated, beams.BeamFormer(saturated)).add(image.copy(), 0)
+    others = np.arange(SONAR.beams) != 20
+    assert np.abs(result[100, 20]) < 0.5 * np.abs(image[100, 20])
+    assert np.median(np.abs(result[100, others])) > 10 * np.median(np.abs(image[100, others]))
+    np.testing.assert_array_equal(np.delete(result, 100, axis=0), np.delete(image, 100, axis=0))
 
 
 @pytest.mark.parametrize("groups", [1, 8])

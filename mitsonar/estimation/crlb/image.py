@@ -619,12 +619,17 @@ class SpeckleBounds:
         gain: gain of the frames.
 
     Raises:
-        MitsonarError: another model.
+        MitsonarError: another model, or a sonar that saturates.
     """
 
     def __init__(self, simulator: Simulator, gain: float) -> None:
         if simulator.model.imager is None:
             raise MitsonarError(f"bounds of speckle are for the model coherent: got {simulator.sonar.model}")
+        if simulator.sonar.saturation_db is not None:
+            raise MitsonarError(
+                f"bounds do not know the distortion of a receiver that saturates: got saturation_db"
+                f" {simulator.sonar.saturation_db:g}; leave it out"
+            )
         self.sonar, self.gain = simulator.sonar, gain
         self.imager = simulator.model.imager
         self.halves = self.imager, self.imager.of_quality(OTHER_HALF_QUALITY[self.sonar.quality])

@@ -1,4 +1,4 @@
-"""Model ``coherent``: field, beams, losses, crosstalk, noise and gain of a ping, in the order of the instrument."""
+"""Model ``coherent``: field, beams, losses, tails, crosstalk, noise and gain of a ping, in the order of the instrument."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mitsonar.simulation.multipath_coherent import CornerTracer, GhostTracer, Mi
 from mitsonar.simulation.multipath_rough import DiffuseField
 from mitsonar.simulation.pings import Counts, CutRays, RenderedPings
 from mitsonar.simulation.points import MOST_CANDIDATES
-from mitsonar.simulation.receiver_noise import ReceiverNoise, crosstalk
+from mitsonar.simulation.receiver_noise import EchoTail, ReceiverNoise, crosstalk
 from mitsonar.simulation.tracing import surfaces_of, tracer_of
 
 if TYPE_CHECKING:
@@ -144,7 +144,8 @@ class CoherentImager:
         self.sides = tuple(dict.fromkeys(side_of(view) for view in self.views))
         self.sonar, self.sampled = sonar, sampled(sonar)
         self.former = BeamFormer(self.sampled)
-        self.receiver = ReceiverNoise(self.sampled, self.former, sonar.looks)
+        self.receiver = ReceiverNoise(self.sampled, self.former, sonar.looks, groups)
+        self.tail = None if sonar.tail_db is None else EchoTail(self.sampled)
         self.crosstalk = crosstalk(sonar, groups)
         self._latest: list[tuple[NDArray[np.complex64], FieldCounts]] = []
         self._given = scene, mirrors, motion, groups
@@ -193,8 +194,10 @@ class CoherentImager:
         for further in (self.glints, self.ghosts, self.corners, self.diffuse):
             if further is not None:
                 further.add(pose, field, time_s)
-        # beams and bins, absorption, and the crosstalk of all beams; each look has the power of a whole bin
+        # beams and bins, absorption, tails, and the crosstalk of all beams; each look has the power of a whole bin
         image = self.former.beams(field) * self._loss[:, None]
+        if self.tail is not None:
+            image = self.tail.add(image)
         if self.crosstalk is not None:
             image = image + image @ self.crosstalk
         return np.asarray(image, dtype=np.complex64), counts
@@ -225,7 +228,7 @@ class CoherentImager:
         if self.sonar.looks > 1:
             power = power.reshape(self.sonar.range_bins, self.sonar.looks, -1).mean(axis=1)
         if self.sonar.detector_offset_db is not None:
-            power = power + np.float32(10 ** ((self.sonar.detector_offset_db - self.sonar.source_level_db) / 10))
+            power = power + np.tile(self.receiver.offset, len(self.sides))
         rays = (np.array([[number]]) for number in (counts.inside, counts.nearer, counts.farther, counts.missed))
         return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), self._cut_rays(counts)
 

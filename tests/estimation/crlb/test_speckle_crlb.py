@@ -252,6 +252,11 @@ def test_grain_tells_far_more_than_ground_and_noise_hides_both() -> None:
         cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["low"], 1e-3)
     with pytest.raises(MitsonarError, match="unknown law 'rays'"):
         cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["none"], 1e-3, law="rays")
+    from mitsonar.simulation.simulator import Simulator
+
+    saturated = Simulator(simulator.tracer.scene, simulator.sonar.replace(saturation_db=-40.0))
+    with pytest.raises(MitsonarError, match="got saturation_db -40; leave it out"):
+        SpeckleBounds(saturated, 1.0)
 
 
 @pytest.mark.thorough
