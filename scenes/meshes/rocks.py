@@ -1,6 +1,6 @@
-"""Generate `rocks.ply`: stones strewn over the seabed around the sunken ship, half of them near its hull.
+"""Generate `rocks.ply` and `debris.ply`: stones strewn around the sunken ship, and rubble, planks and rods in heaps.
 
-Needs trimesh. The seed is fixed, so the same bytes come out each time; `--quick` compares them with the shipped file.
+Needs trimesh. The seeds are fixed, so the same bytes come out each time; `--quick` compares them with the shipped files.
 """
 
 import argparse
@@ -31,25 +31,67 @@ def rocks(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(vertices), np.concatenate(faces)
 
 
+HEAPS, PIECES = 40, 520
+HEAP_M = 1.6
+"""Standard deviation of the places in a heap."""
+
+SPREAD_M = (11.0, 9.0)
+"""Standard deviation of the heaps' places along x and y."""
+
+STONE_M, LENGTH_M = (0.06, 0.5), (0.4, 3.0)
+"""Smallest and largest edge of a stone, and length of a plank or rod."""
+
+
+def debris(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices ``(n, 3)`` [m] and triangles ``(m, 3)``: stones, planks and rods in heaps, sunk into the floor z = 0."""
+    ball, box = trimesh.creation.icosphere(subdivisions=0), trimesh.creation.box()
+    heaps = rng.normal(0, SPREAD_M, (HEAPS, 2))
+    vertices, faces, count = [], [], 0
+    for _ in range(PIECES):
+        long = rng.uniform() < 0.3
+        turned = trimesh.transformations.euler_matrix(*rng.normal(0, 0.15, 2), rng.uniform(0, 2 * np.pi))[:3, :3]
+        if long:
+            length = LENGTH_M[0] * (LENGTH_M[1] / LENGTH_M[0]) ** rng.uniform() ** 2
+            width, thick = length * rng.uniform(0.03, 0.15), rng.uniform(0.03, 0.1)
+            body, size = box, np.array([length, width, min(width, thick)])
+            points = body.vertices * size
+        else:
+            edge = STONE_M[0] * (STONE_M[1] / STONE_M[0]) ** rng.uniform() ** 2
+            body = ball
+            points = body.vertices * rng.uniform(0.7, 1.2, (len(body.vertices), 1)) * edge * rng.uniform(0.4, 0.7, 3)
+        low = (points := points @ turned.T)[:, 2].min()
+        place = heaps[rng.integers(HEAPS)] + rng.normal(0, HEAP_M, 2)
+        points = points + np.array([*place, -low * rng.uniform(0.2, 1.0)])
+        vertices.append(points)
+        faces.append(body.faces + count)
+        count += len(points)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+MESHES = {"rocks.ply": (rocks, 5), "debris.ply": (debris, 7)}
+"""What makes each file, and its seed."""
+
+
 def main() -> None:
-    """Write the mesh into a folder, or compare it with the one that is shipped.
+    """Write the meshes into a folder, or compare them with those that are shipped.
 
     Raises:
-        SystemExit: it differs.
+        SystemExit: one differs.
     """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path, nargs="?", help="folder for the PLY file")
-    parser.add_argument("--quick", action="store_true", help="compare with the shipped file instead")
+    parser.add_argument("out", type=Path, nargs="?", help="folder for the PLY files")
+    parser.add_argument("--quick", action="store_true", help="compare with the shipped files instead")
     arguments = parser.parse_args()
     if arguments.out is None and not arguments.quick:
         parser.error("a folder is missing: give OUT, or --quick")
-    vertices, faces = rocks(np.random.default_rng(5))
     with tempfile.TemporaryDirectory() as folder:
-        result = (arguments.out or Path(folder)) / "rocks.ply"
-        save(result, vertices, faces)
-        if arguments.quick and result.read_bytes() != (Path(__file__).resolve().parent / "rocks.ply").read_bytes():
-            raise SystemExit("rocks.ply is not what is made now: run `python rocks.py .`")
-    print(f"rocks.ply: {len(faces)} faces, {vertices.min(axis=0)} to {vertices.max(axis=0)}")
+        for name, (make, seed) in MESHES.items():
+            vertices, faces = make(np.random.default_rng(seed))
+            result = (arguments.out or Path(folder)) / name
+            save(result, vertices, faces)
+            if arguments.quick and result.read_bytes() != (Path(__file__).resolve().parent / name).read_bytes():
+                raise SystemExit(f"{name} is not what is made now: run `python rocks.py .`")
+            print(f"{name}: {len(faces)} faces, {vertices.min(axis=0)} to {vertices.max(axis=0)}")
 
 
 if __name__ == "__main__":
