@@ -14,6 +14,7 @@ The reflectivity of a surface is one number in 0..1; colours are converted to lu
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
@@ -41,7 +42,7 @@ from mitsonar.plugins.bsdf_reflectance import (
 )
 from mitsonar.plugins.material_laws import law_rows, material_of, mirror_rows, weighed
 
-__all__ = ["Hit", "Surfaces", "facet_points", "registry_index"]
+__all__ = ["Hit", "Surfaces", "facet_points", "grain_key", "registry_index"]
 
 
 @dataclass
@@ -78,6 +79,7 @@ class Surfaces:
             triangle; a single 0 if no mesh has the attribute.
         laws: scattering laws of the materials, for the sonar of :meth:`at_frequency_of`; a single 0 without a sonar.
         mirrors: by material, reflection coefficient at normal incidence and rms height [m]; zeros without a mirror part.
+        grains: by number of shape, key of its scatterers; see :func:`grain_key`.
         materials: one BSDF per material, by number.
         lawful: whether the laws are evaluated.
         textured: whether any shape has a reflectivity that varies within a triangle.
@@ -92,6 +94,7 @@ class Surfaces:
     objects: mi.Float
     laws: mi.Float
     mirrors: mi.Float
+    grains: mi.UInt32
     materials: list[AcousticMaterial]
     lawful: bool
     textured: bool
@@ -147,6 +150,7 @@ class Surfaces:
             objects=_object_ids(tabled),
             laws=dr.zeros(mi.Float, 1),
             mirrors=mirror_rows([one.material for one in materials]) if materials else dr.zeros(mi.Float, 1),
+            grains=mi.UInt32([grain_key(shape.id(), number) for number, shape in enumerate(shapes)] or [0]),
             materials=materials,
             lawful=False,
             textured=bool(corners),
@@ -183,7 +187,7 @@ class Surfaces:
 
     def arrays(self) -> dict[str, DeviceArray]:
         """Return the tables by name, as inputs of a launch."""
-        names = ("facets", "corners", "shapes", "constant", "objects", "laws", "mirrors")
+        names = ("facets", "corners", "shapes", "constant", "objects", "laws", "mirrors", "grains")
         return {name: getattr(self, name) for name in names}
 
     def at_frequency_of(self, sonar: Sonar) -> Surfaces:
@@ -203,6 +207,10 @@ class Surfaces:
         """Return the reflection coefficient at normal incidence and rms height [m] of materials; 0 for number -1."""
         pair = dr.gather(mi.Vector2f, self.mirrors, mi.UInt32(dr.select(material >= 0, material, 0)), material >= 0)
         return pair.x, pair.y
+
+    def grain(self, hit: Hit) -> DeviceArray:
+        """Return the key of the scatterers of the shapes that are hit."""
+        return dr.gather(mi.UInt32, self.grains, mi.UInt32(hit.shape_id), hit.valid & (hit.shape_id >= 0))
 
     def hit(self, scene: mi.Scene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
         """Trace rays to the nearest surface, without evaluation, so that later operations join the same kernel."""
@@ -269,6 +277,15 @@ class Surfaces:
         si.shape, si.prim_index = intersection.shape, intersection.prim_index
         si.wi = mi.Vector3f(0, 0, -dr.dot(normal, ray.d))
         return si
+
+
+def grain_key(name: str, number: int) -> int:
+    """Return the key of the scatterers of a shape: a hash of its name up to a colon, or its number if it has none.
+
+    Scatterers therefore stay where they are when shapes are added to a scene, or a mesh is divided into ``hull:1`` and
+    ``hull:2``.
+    """
+    return zlib.crc32(name.split(":")[0].encode()) >> 4 if name else number
 
 
 def registry_index(shape: mi.Shape) -> int:

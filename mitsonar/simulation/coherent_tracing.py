@@ -3,8 +3,10 @@
 The field is a function of the sine of the bearing and the range. In the first launch, each ray lists the points of the
 lattice (:mod:`mitsonar.simulation.points`) in or near its cell of the surface, a half to a fifth of those that it visits.
 The second launch sums them, without idle lanes. A point counts if its direction lies in the cell of that ray, so on a plane
-each point counts exactly once, for any set of rays. Its echo is zeta sqrt(C cos^2 dA) / R^2, times the pattern over
-elevation and exp(-2 j k R). Sums are fixed point, so they do not depend on the order of the points.
+each point counts exactly once, for any set of rays. Shapes with parts narrower than a few rays have a launch of their own,
+with a ray to each of their points (:mod:`mitsonar.simulation.thin_shapes`). The echo of a point is zeta sqrt(C cos^2 dA) /
+R^2, times the pattern over elevation and exp(-2 j k R). Sums are fixed point, so they do not depend on the order of the
+points.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ from mitsonar.simulation.beams import BeamFormer, CommonFan, elevation_gain, ker
 from mitsonar.simulation.device import DeviceArray, Frozen, replayed
 from mitsonar.simulation.mirrors import Mirrors, without_mirror_part
 from mitsonar.simulation.moving import SceneMotion, scene_at
-from mitsonar.simulation.points import LEAST_COSINE, HashedPoints, Point, pick
+from mitsonar.simulation.points import LEAST_COSINE, HashedPoints, Patches, Point, pick
+from mitsonar.simulation.thin_shapes import ThinShapes
 from mitsonar.simulation.tracing import MovingSurfaces, surfaces_of
 
 __all__ = ["STRIP", "CoherentTracer", "FanRays", "FieldCounts", "FieldSums", "elevation_gain"]
@@ -51,6 +54,9 @@ MOST_IN_A_CELL = 2.0**16
 
 LARGEST_WEIGHT = 4.2
 """Largest amplitude of a weight: the square root of -log 2^-25."""
+
+SEEN, ROUNDING = 3e-5, 4e-6
+"""Largest distance between a point of a thin shape and what its ray meets, as a fraction of range and of coordinates."""
 
 COUNTED = ("inside", "nearer", "farther", "missed", "cut", "points", "widest")
 
@@ -124,7 +130,12 @@ class CoherentTracer:
         dr.eval(self.patches)
         self.mirrors = None if mirrors is None else mirrors.table()
         self.room: int = math.ceil(POINTS_A_RAY * self.fan.rays)
-        self.list, self.sum = self._compile_list(), self._compile_sum()
+        # thin shapes, whose points have rays of their own; a moving scene has none
+        patches = None if sonar.speckle_nu is None else Patches(sonar.speckle_nu, sonar.speckle_patch_m)
+        still = motion is None
+        thin = ThinShapes.from_scene(scene, self.fan, sonar.range_max, self.pitch, sonar.seed, patches) if still else None
+        self.is_thin, self.thin_points = (None, None) if thin is None else (mi.Bool(thin.thin), thin.inputs())
+        self.list, self.sum, self.sum_thin = self._compile_list(), self._compile_sum(), self._compile_thin()
 
     def field(self, pose: NDArray[np.float64], time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
         """Return the field ``(ranges, sines)`` of one ping at a pose ``(6,)`` [m, rad] and a time [s], and its counts."""
@@ -135,12 +146,16 @@ class CoherentTracer:
             lines = self.motion.sonar_lines(pose, time_s)
         rows = mi.Float64(lines.ravel().tolist())
         # 2. List the points near the rays; if there are more than room, make room and list them again.
-        listed, size, counts, hits = replayed(self.list, self.index, scene, rows, self.surfaces.arrays(), self.mirrors)
+        listed, size, counts, hits = replayed(
+            self.list, self.index, scene, rows, self.surfaces.arrays(), self.mirrors, self.is_thin
+        )
         total = int(np.array(size)[0])
         if total > self.room:
             self.room, self.list = 2 * total, self._compile_list()
-            listed, size, counts, hits = replayed(self.list, self.index, scene, rows, self.surfaces.arrays(), self.mirrors)
-        # 3. Sum them.
+            listed, size, counts, hits = replayed(
+                self.list, self.index, scene, rows, self.surfaces.arrays(), self.mirrors, self.is_thin
+            )
+        # 3. Sum them, and those of thin shapes.
         field, outcomes = np.zeros((self.former.ranges, self.former.sines), np.complex64), np.array(counts)
         if total:
             inputs = [dr.gather(mi.UInt32, part, dr.arange(mi.UInt32, total)) for part in listed]
@@ -148,13 +163,17 @@ class CoherentTracer:
             values, points = replayed(self.sum, *inputs, rows, hits, self.patches)
             self.sums.add_to(field, values)
             outcomes[COUNTED.index("points")] = int(np.array(points)[0])
+        if self.thin_points is not None:
+            values, points = replayed(self.sum_thin, self.thin_points, scene, rows, self.surfaces.arrays(), self.mirrors)
+            self.sums.add_to(field, values)
+            outcomes[COUNTED.index("points")] += int(np.array(points)[0])
         return field, FieldCounts(*map(int, outcomes))
 
     # ---------------- First launch: list the points near each ray
 
     def _compile_list(self) -> Callable[..., Any]:
         @Frozen
-        def launch(index: Any, scene: Any, rows: Any, tables: Any, mirrors: Any) -> Any:
+        def launch(index: Any, scene: Any, rows: Any, tables: Any, mirrors: Any, thin: Any) -> Any:
             # 1. Hits of the rays, in the axes of the body that is hit.
             rays, body = self._rays(rows, index, mi.UInt32(0)), mi.UInt32(0)
             ray, surfaces = mi.Ray3f(rays.origin, rays.d), replace(self.surfaces, **tables)
@@ -165,13 +184,15 @@ class CoherentTracer:
                 hit = surfaces.hit(scene, ray)
             if mirrors is not None:
                 hit = without_mirror_part(mirrors, hit, rays.d, 2 * math.pi / self.wavelength)
-            if isinstance(surfaces, MovingSurfaces):  # last: mirrors are looked up by shape
-                hit = replace(hit, shape_id=surfaces.scatterer_lattice(scene, hit, body))
+            moves = isinstance(surfaces, MovingSurfaces)
+            grain = surfaces.grain_on(scene, hit, body) if moves else surfaces.grain(hit)
             # 2. Lattice cells around those that may contribute to the grid.
             former = self.former
             last = former.first_range + (former.ranges - 1) * former.range_step
             reached = rays.on_side & hit.valid & (hit.reflectivity > 0) & rays.may_reach(hit, former.first_range, last)
-            points = self._points(rays, replace(hit, valid=reached))
+            if thin is not None:
+                reached &= ~dr.gather(mi.Bool, thin, mi.UInt32(hit.shape_id), reached)
+            points = self._points(rays, replace(hit, valid=reached, shape_id=grain))
             counts = dr.zeros(mi.UInt32, len(COUNTED))
             self._count(counts, rays, hit, points)
             # 3. Visit them in turn, and list those near the cell of the ray; rays end their loop independently.
@@ -186,7 +207,7 @@ class CoherentTracer:
 
             begin = mi.Int32(0) + dr.zeros(mi.Int32, self.fan.rays)
             dr.while_loop((begin,), lambda number: number < points.count, step)
-            hits = hit.t, hit.n, hit.reflectivity, mi.UInt32(hit.shape_id), body + dr.zeros(mi.UInt32, self.fan.rays)
+            hits = hit.t, hit.n, hit.reflectivity, grain, body + dr.zeros(mi.UInt32, self.fan.rays)
             dr.eval(listed, size, counts, hits)
             return listed, size, counts, hits
 
@@ -218,9 +239,9 @@ class CoherentTracer:
         @Frozen
         def launch(index: Any, number: Any, rows: Any, hits: Any, patches: Any) -> Any:
             # 1. The ray of each point, and its hit.
-            t, n, reflectivity, shape_id, body = (dr.gather(type(values), values, index) for values in hits)
+            t, n, reflectivity, grain, body = (dr.gather(type(values), values, index) for values in hits)
             rays, valid = self._rays(rows, index, body), mi.Bool(True)
-            hit = Hit(valid, t, n, reflectivity, mi.Int32(shape_id), mi.Float(0), mi.Int32(-1))
+            hit = Hit(valid, t, n, reflectivity, grain, mi.Float(0), mi.Int32(-1))
             # 2. Sum those that lie in the cell of their ray.
             sums = self.sums.zeros()
             deposited = self._deposit(rays, self._points(rays, hit), mi.Int32(number), patches, sums)
@@ -237,14 +258,51 @@ class CoherentTracer:
         # 1. Position and weight of the point, and how the sonar sees it.
         point = points.point(number, patches, self.patch_entries)
         seen = rays.seen(points, point)
-        # 2. Phase in turns; whole turns are removed in double precision, since R is many wavelengths.
+        # 2. Deposit, if the point lies in the cell of this ray.
+        return self._add(seen, points.strength * point.amplitude, point.turn, sums, seen.in_cell)
+
+    def _add(
+        self, seen: SeenPoint, strength: DeviceArray, turn: DeviceArray, sums: list[mi.UInt64], active: DeviceArray
+    ) -> DeviceArray:
+        """Add the echoes of points to the grid; return which lie on the grid."""
+        # 1. Phase in turns; whole turns are removed in double precision, since R is many wavelengths.
         turns = seen.range_m * (2 / self.wavelength)
-        sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + point.turn) * (2 * math.pi))
-        # 3. Amplitude: strength, cosine, weight, two-way spreading and pattern over elevation.
-        level = points.strength * seen.cosine * point.amplitude / dr.square(mi.Float(seen.range_m))
-        level = level * elevation_gain(self.sonar, seen.tangent)
-        # 4. Deposit, if the point lies in the cell of this ray.
-        return self.sums.add(sums, (seen.sine, seen.range_m, level, cos, sin), seen.in_cell)
+        sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + turn) * (2 * math.pi))
+        # 2. Amplitude: strength, cosine, two-way spreading and pattern over elevation.
+        level = strength * seen.cosine / dr.square(mi.Float(seen.range_m)) * elevation_gain(self.sonar, seen.tangent)
+        return self.sums.add(sums, (seen.sine, seen.range_m, level, cos, sin), active)
+
+    # ---------------- Points of thin shapes
+
+    def _compile_thin(self) -> Callable[..., Any]:
+        @Frozen
+        def launch(listed: Any, scene: Any, rows: Any, tables: Any, mirrors: Any) -> Any:
+            # 1. A ray to each point.
+            place, normal, rounded = mi.Point3f(listed["place"]), listed["normal"], listed["reflectivity"] > 0
+            rays = self._rays(rows, dr.zeros(mi.UInt32, dr.width(listed["turn"])), mi.UInt32(0))
+            away = place - rays.origin
+            range_m = dr.norm(away)
+            ray = mi.Ray3f(rays.origin, away / range_m)
+            hit = replace(self.surfaces, **tables).hit(scene, ray)
+            if mirrors is not None:
+                hit = without_mirror_part(mirrors, hit, ray.d, 2 * math.pi / self.wavelength)
+            # 2. Points that it meets, in the fan; of round shapes those that face the sonar, and that nothing else hides.
+            size = dr.abs(place.x) + dr.abs(place.y) + dr.abs(place.z)
+            own = hit.valid & (hit.shape_id == listed["shape"])
+            met = own & (dr.abs(hit.t - range_m) <= SEEN * range_m + ROUNDING * size)
+            faces = (dr.dot(normal, away) < 0) & (own | ~hit.valid | (hit.t > range_m))
+            met, reflectivity = dr.select(rounded, faces, met), dr.select(own, hit.reflectivity, listed["reflectivity"])
+            seen = rays.seen_at(place, normal)
+            met &= seen.ahead if self.side == 0 else seen.ahead & ((seen.tangent > 0) == (self.side > 0))
+            strength = listed["strength"] * dr.sqrt(reflectivity)
+            # 3. Sum them.
+            sums = self.sums.zeros()
+            deposited = self._add(seen, strength, listed["turn"], sums, met & (reflectivity > 0))
+            points = dr.count(deposited)
+            dr.eval(sums, points)
+            return self.sums.values(sums), points
+
+        return launch
 
 
 class FieldSums:
@@ -433,21 +491,26 @@ class FanRays:
 
     def seen(self, points: HashedPoints, point: Point) -> SeenPoint:
         """Return range, direction and cosine of points, and whether their direction lies in the cell of the ray."""
+        return self._seen(points.axis, (point.p, point.q, point.a), points.normal)
+
+    def seen_at(self, place: mi.Point3f, normal: DeviceArray) -> SeenPoint:
+        """Return the same for points at any place in world axes [m]."""
+        return self._seen(mi.UInt32(2), (place.x, place.y, place.z), (normal.x, normal.y, normal.z))
+
+    def _seen(self, axis: DeviceArray, place: Sequence[DeviceArray], normal: Sequence[DeviceArray]) -> SeenPoint:
         # 1. Line of sight and range, in double precision because the phase needs fractions of a wavelength.
-        origin = pick(points.axis, mi.Vector3d(*(line[3] for line in self.lines)))
-        exact = [
-            mi.Float64(coordinate) - begin for coordinate, begin in zip((point.p, point.q, point.a), origin, strict=True)
-        ]
+        origin = pick(axis, mi.Vector3d(*(line[3] for line in self.lines)))
+        exact = [mi.Float64(coordinate) - begin for coordinate, begin in zip(place, origin, strict=True)]
         range_m = dr.sqrt(sum(value * value for value in exact))
         line_of_sight = [mi.Float(value) for value in exact]
         # 2. Direction in the axes of the sonar.
-        starboard, up, forward = (self._along(points, line_of_sight, column) for column in (0, 1, 2))
+        starboard, up, forward = (self._along(axis, line_of_sight, column) for column in (0, 1, 2))
         starboard, radius = -starboard, mi.Float(range_m)
         level = dr.sqrt(starboard * starboard + forward * forward)
         sine = starboard / (radius if self.cone else level)
         tangent = up / (forward if self.cone else level)
         # 3. Cosine of the angle of incidence.
-        cosine = dr.abs(sum(n * v for n, v in zip(points.normal, line_of_sight, strict=True))) / radius
+        cosine = dr.abs(sum(n * v for n, v in zip(normal, line_of_sight, strict=True))) / radius
         # 4. Column and row of the fan, to compare with those of the ray: this assigns each point to one ray.
         column = mi.Int32(dr.floor((sine + self.fan.sine) * (1 / self.sine_step)))
         row = mi.Int32(dr.floor((self.fan.tangent - tangent) * (1 / self.tangent_step)))
@@ -455,9 +518,9 @@ class FanRays:
         ahead = (forward > 0) & (dr.abs(sine) <= self.fan.sine) & (dr.abs(tangent) <= self.fan.tangent)
         return SeenPoint(range_m, sine, tangent, cosine, in_cell, ahead)
 
-    def _along(self, points: HashedPoints, vector: list[DeviceArray], column: int) -> DeviceArray:
+    def _along(self, lattice_axis: DeviceArray, vector: list[DeviceArray], column: int) -> DeviceArray:
         """Return the component of vectors along one axis of the sensor."""
-        axis = pick(points.axis, mi.Vector3f(*(mi.Float(line[column]) for line in self.lines)))
+        axis = pick(lattice_axis, mi.Vector3f(*(mi.Float(line[column]) for line in self.lines)))
         return sum(component * part for component, part in zip(axis, vector, strict=True))
 
 

@@ -497,15 +497,17 @@ class GhostTracer:
                     (beyond, path.factor, path.is_open & facing & self._within((hit.t + path.distance) * 0.5, mirrored))
                 )
         # 2. points are anchored to bodies: everything below is in the axes of the body that is hit
-        if bodies is not None:
+        if bodies is None:
+            hit = replace(hit, shape_id=self.direct.surfaces.grain(hit))
+        else:
             assert isinstance(self.direct.surfaces, MovingSurfaces)
             turn = [[dr.gather(mi.Float64, bodies, mirrored.body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
             rays, mirrored = in_body(turn, rays), replace(mirrored, rays=in_body(turn, mirrored.rays))
             returns = [(in_body(turn, beyond), factor, is_open) for beyond, factor, is_open in returns]
             normal = [mi.Float(row[0]) * hit.n.x + mi.Float(row[1]) * hit.n.y + mi.Float(row[2]) * hit.n.z for row in turn]
-            lattice = self.direct.surfaces.scatterer_lattice(scene, hit, mirrored.body)
+            grain = self.direct.surfaces.grain_on(scene, hit, mirrored.body)
             hit, place = (
-                replace(hit, n=mi.Normal3f(*normal), shape_id=lattice),
+                replace(hit, n=mi.Normal3f(*normal), shape_id=grain),
                 mirrored.rays.origin + mirrored.rays.d * hit.t,
             )
         # 3. add the waves of all points in each ray's cell

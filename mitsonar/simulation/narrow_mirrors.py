@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from mitsonar.simulation.beams import CommonFan
 from mitsonar.simulation.mirrors import FLAT, Mirrors
 
-__all__ = ["NarrowMirrors"]
+__all__ = ["COLUMNS", "NarrowMirrors", "pieces_of", "sphere_and_width", "triangles_of"]
 
 COLUMNS = 4.0
 """Width below which a mirror is narrow, in columns or rows of the fan."""
@@ -59,10 +59,10 @@ class NarrowMirrors:
         parts: list[NDArray[np.float64]] = []
         for shape, reflection in zip(scene.shapes(), mirrors.reflection, strict=True):
             if reflection != 0:
-                pieces = _pieces(_triangles(shape))
+                pieces = pieces_of(triangles_of(shape))
                 names += [shape.id()] * len(pieces)
                 parts += pieces
-        spheres = [_sphere_and_width(part) for part in parts]
+        spheres = [sphere_and_width(part) for part in parts]
         return cls(
             names,
             np.array([centre for centre, _, _ in spheres]).reshape(-1, 3),
@@ -120,7 +120,7 @@ class NarrowMirrors:
         return cells[((cells >= 0) & (cells < size)).all(axis=1)], sorted({self.names[k] for k in piece[hidden]})
 
 
-def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
+def triangles_of(shape: mi.Shape) -> NDArray[np.float64]:
     """Return the triangles of a mesh, of the square of a rectangle or disk, or of the box around another shape [m]."""
     if isinstance(shape, mi.Mesh):
         vertices = np.array(shape.vertex_positions_buffer(), dtype=float).reshape(-1, 3)
@@ -135,7 +135,7 @@ def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
     return np.asarray(corners[BOX_FACES], dtype=np.float64)
 
 
-def _pieces(corners: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def pieces_of(corners: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Divide triangles ``(n, 3, 3)`` into those that are connected by vertices."""
     if not 0 < len(corners) <= MOST_FACETS:
         return [corners] if len(corners) else []
@@ -147,7 +147,7 @@ def _pieces(corners: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     return np.split(corners[order], np.flatnonzero(np.diff(label[order])) + 1)
 
 
-def _sphere_and_width(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
+def sphere_and_width(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
     """Return centre and radius of a sphere around triangles, and their second extent along their principal axes [m].
 
     Extents are those of a body with the same variances, evenly distributed along each axis.

@@ -82,7 +82,7 @@ class HashedPoints:
     """Lattice cells around the points where rays hit surfaces.
 
     Args:
-        hit: hits of the rays.
+        hit: hits of the rays, the keys of their grain in place of shapes.
         place: the points hit [m].
         over_column, over_row: displacement of the point for one step to the next ray, on the tangent plane [m].
         pitch: pitch of the lattice [m].
@@ -167,16 +167,16 @@ def nearest_axis(normal: DeviceArray) -> DeviceArray:
     return dr.select((leans.z >= leans.x) & (leans.z >= leans.y), mi.UInt32(2), others)
 
 
-def lattice_key(shape: DeviceArray, axis: DeviceArray, side: DeviceArray, seed: int) -> DeviceArray:
+def lattice_key(grain: DeviceArray, axis: DeviceArray, side: DeviceArray, seed: int) -> DeviceArray:
     """Return a 32-bit key that selects the hash of a lattice.
 
     Args:
-        shape: index of the shape in the scene.
+        grain: key of the shape's scatterers, from :func:`mitsonar.plugins.surfaces.grain_key`.
         axis: world axis nearest to its normal, 0 to 2.
         side: 1 where the normal points along that axis, 0 where it points against it.
         seed: seed of the hash.
     """
-    return _mixed(shape * 8 + axis * 2 + side + mi.UInt32(seed * 7919 & 0xFFFFFFFF))
+    return _mixed(grain * 8 + axis * 2 + side + mi.UInt32(seed * 7919 & 0xFFFFFFFF))
 
 
 def place_in_cell(
@@ -309,7 +309,9 @@ def lattice_size(shape: mi.Shape, pitch: float) -> float:
     return sum(2.0 * cells.wide * cells.tall for cells in _cells_of(shape, pitch))
 
 
-def lattice_points(shape: mi.Shape, number: int, pitch: float, seed: int, patches: Patches | None = None) -> SurfacePoints:
+def lattice_points(
+    shape: mi.Shape, grain: int, pitch: float, seed: int, patches: Patches | None = None, *, weighed: bool = True
+) -> SurfacePoints:
     """Find all points that the hashed lattice places on one shape, those that coherent images find with their rays.
 
     Rays along each world axis pass through the positions that the hash draws. Where they hit a surface whose normal is
@@ -317,16 +319,17 @@ def lattice_points(shape: mi.Shape, number: int, pitch: float, seed: int, patche
 
     Args:
         shape: any shape that can be traced.
-        number: index of the shape in its scene.
+        grain: key of its scatterers, from :func:`mitsonar.plugins.surfaces.grain_key`.
         pitch: pitch of the lattice [m].
         seed: seed of the hash.
         patches: patches of unequal strength; default: none.
+        weighed: whether strengths contain the reflectivity.
     """
-    search = _Search(shape, pitch, patches)
+    search = _Search(shape, pitch, patches, weighed)
     parts = []
     for cells in _cells_of(shape, pitch):
         for side in (1, 0):
-            key = lattice_key(mi.UInt32(number), mi.UInt32(cells.axis), mi.UInt32(side), seed)
+            key = lattice_key(mi.UInt32(grain), mi.UInt32(cells.axis), mi.UInt32(side), seed)
             count = cells.wide * cells.tall
             for begin in range(0, count, AT_A_TIME):
                 parts += search.on_rays(cells, side, key, np.arange(begin, min(begin + AT_A_TIME, count), dtype=np.uint32))
@@ -356,12 +359,12 @@ def _reach(shape: mi.Shape) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 class _Search:
     """Search for the points of one shape, by rays that pass through all of its surfaces."""
 
-    def __init__(self, shape: mi.Shape, pitch: float, patches: Patches | None) -> None:
+    def __init__(self, shape: mi.Shape, pitch: float, patches: Patches | None, weighed: bool) -> None:
         name = shape.id()
         self.scene: mi.Scene = load_dict({"type": "scene", "shape": shape})
         shape.set_id(name)  # Mitsuba renames it
         self.surfaces = Surfaces.from_scene(self.scene)
-        self.pitch, self.patches = pitch, patches
+        self.pitch, self.patches, self.weighed = pitch, patches, weighed
         self.table = None if patches is None else mi.Float(patch_amplitudes(BLENDED_VARIANCE * patches.nu))
 
     def on_rays(self, cells: _Cells, side: int, key: DeviceArray, numbers: NDArray[np.uint32]) -> list[SurfacePoints]:
@@ -401,7 +404,9 @@ class _Search:
         """Return the hits on scattering surfaces whose normal is nearest to the axis and points to the given side."""
         along = pick(mi.UInt32(axis), hit.n)[2]
         suitable = hit.valid & (nearest_axis(hit.n) == axis) & ((along > 0) == bool(side)) & (hit.reflectivity > 0)
-        strength = hit.reflectivity * (self.pitch * self.pitch) / dr.abs(along) * weight[0] * weight[0]
+        strength = (self.pitch * self.pitch) / dr.abs(along) * weight[0] * weight[0]
+        if self.weighed:
+            strength *= hit.reflectivity
         positions = _along(axis, *place)
         dr.eval(suitable, positions, hit.n, strength, weight[1])
         keep = np.flatnonzero(np.array(suitable))

@@ -22,7 +22,7 @@ from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.plugins.bsdf_reflectance import is_black, reflectances_of, reflectivity_at
 from mitsonar.plugins.cell_noise import CellNoise
 from mitsonar.plugins.hashed_texture import ROUNDS
-from mitsonar.plugins.surfaces import Surfaces, registry_index
+from mitsonar.plugins.surfaces import Surfaces, grain_key, registry_index
 from mitsonar.simulation.device import DeviceArray, Frozen, LaunchTables, padded, replayed
 from mitsonar.simulation.mirrors import (
     ROW,
@@ -779,7 +779,7 @@ def _on_lattice(shape: mi.Shape, sonar: ChannelSonar, number: int) -> SurfacePoi
     advice = "lower points_per_m2" if sonar.scatterer_spacing_m is None else "raise scatterer_spacing_m"
     _check_count(shape, cells, f"{advice}; a spacing of {enough:.2g} m is enough")
     patches = None if sonar.speckle_nu is None else Patches(sonar.speckle_nu, sonar.speckle_patch_m)
-    return lattice_points(shape, number, pitch, sonar.seed, patches)
+    return lattice_points(shape, grain_key(shape.id(), number), pitch, sonar.seed, patches)
 
 
 def _scattering_points(

@@ -229,13 +229,11 @@ class MovingSurfaces(Surfaces):
 
     Attributes:
         first_object: object number just below that of the first body.
-        shape_count: number of shapes in the scene.
         motion: motion of the scene.
         versions: version of each deforming mesh at which its normals were last read.
     """
 
     first_object: int = 0
-    shape_count: int = 0
     motion: SceneMotion | None = None
     versions: tuple[int, ...] = ()
 
@@ -244,7 +242,7 @@ class MovingSurfaces(Surfaces):
         """Return the tables of the scene that a motion belongs to, for one sonar's frequency and model."""
         tables = cls.from_scene(motion.scene, motion.shapes).at_frequency_of(sonar)
         assert isinstance(tables, MovingSurfaces)
-        return replace(tables, first_object=motion.first_objects, shape_count=len(motion.shapes), motion=motion)
+        return replace(tables, first_object=motion.first_objects, motion=motion)
 
     def arrays(self) -> dict[str, DeviceArray]:
         """Return the tables by name, after updating the normals of meshes that have deformed."""
@@ -274,13 +272,13 @@ class MovingSurfaces(Surfaces):
         object_id = dr.select(numbered, mi.Float(body) + float(self.first_object), hit.object_id)
         return replace(hit, object_id=object_id), body
 
-    def scatterer_lattice(self, scene: MovingScene, hit: Hit, body: DeviceArray) -> DeviceArray:
-        """Return the scatterer lattice of each hit: the shape's number, or a unique one for further bodies of one shape."""
-        number, first = hit.shape_id, 1
+    def grain_on(self, scene: MovingScene, hit: Hit, body: DeviceArray) -> DeviceArray:
+        """Return the key of the scatterers of each hit: that of the shape, or a new one for further bodies of one shape."""
+        key, first = self.grain(hit), 1
         for copies in scene.copies:
-            number = dr.select((body > first) & (body < first + copies), self.shape_count + mi.Int32(body), number)
+            key = dr.select((body > first) & (body < first + copies), key + mi.UInt32(body) * mi.UInt32(0x9E3779), key)
             first += copies
-        return number
+        return key
 
 
 class MovingTracer(Tracer):

@@ -36,14 +36,16 @@ def imager(loaded: mi.Scene, sonar: Sonar = SONAR) -> CoherentImager:
 def one_point(half: float = 0.01) -> tuple[mi.Scene, dict[str, float], Array]:
     """A small plate 4.4 m ahead of the origin that carries one lattice point: scene, fields of a sonar, the point's place.
 
-    Seeds are tried until exactly one point lies on the plate.
+    Seeds are tried until exactly one point lies on the plate, far from its edge and not weak.
     """
+    from mitsonar.plugins.surfaces import grain_key
     from mitsonar.simulation.points import lattice_points
 
     at = np.array([0, 4.4, 0])
     loaded = scene(target=plate(at, (0, -1, 0), half=half, bsdf=diffuse(0.5)))
     for seed in range(200):
-        place = lattice_points(loaded.shapes()[0], 0, 3 * half, seed).place
-        if len(place) == 1:
+        points = lattice_points(loaded.shapes()[0], grain_key("target", 0), 3 * half, seed)
+        place, weight = points.place, points.strength / (0.5 * (3 * half) ** 2)
+        if len(place) == 1 and np.abs(place[0] - at).max() < 0.6 * half and weight[0] > 0.5:
             return loaded, {"scatterer_spacing_m": 3 * half, "seed": seed}, place[0].astype(float)
     raise AssertionError("no seed puts one point on the plate")

@@ -133,16 +133,16 @@ def test_rays_change_nothing_on_a_plane(flat: mi.Scene) -> None:
 
 @pytest.mark.thorough
 def test_rocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Silhouettes: twice the rays leave intensities correlated by 0.98, eight times by 0.97; energy as physical, 0.2 dB."""
+    """Silhouettes: twice the rays leave intensities correlated by 0.97, eight times by 0.95; energy as physical, 0.2 dB."""
     loaded = load_scene(RockyField(size_m=12, a_side=(24, 24)).build(3).write(tmp_path / "world"))
     one, second = (
         np.abs(imager(loaded, SONAR.replace(quality=name)).image(POSE, 0)[0]) ** 2 for name in ("standard", "fine")
     )
-    assert np.corrcoef(one.ravel(), second.ravel())[0, 1] > 0.97
+    assert np.corrcoef(one.ravel(), second.ravel())[0, 1] > 0.95
     with monkeypatch.context() as patch:
         patch.setattr(beams, "COLUMNS_A_BEAM", {"standard": 8})
         twice = np.abs(imager(loaded).image(POSE, 0)[0]) ** 2
-    assert np.corrcoef(one.ravel(), twice.ravel())[0, 1] > 0.98
+    assert np.corrcoef(one.ravel(), twice.ravel())[0, 1] > 0.97
     places = POSE + np.arange(8)[:, None] * np.array([0.2, 0.15, 0, 0, 0, 0])
     result = sum(
         float((np.abs(imager(loaded, SONAR.replace(seed=seed)).image(pose, 0)[0]) ** 2).sum())

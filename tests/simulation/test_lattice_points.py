@@ -179,3 +179,26 @@ def test_a_texture_of_cells_joins_the_field() -> None:
 def test_too_fine_a_lattice_is_refused() -> None:
     with pytest.raises(MitsonarError, match="scatterer_spacing_m"):
         simulator(ChannelSonar(scatterer_spacing_m=1e-4), floor=floor(diffuse(), 8.0))
+
+
+def test_grain_stays_when_shapes_are_added_or_divided() -> None:
+    """It follows the name of a shape up to a colon: another object, or a plate in two halves, changes nothing else."""
+    from mitsonar.simulation.models.coherent import CoherentImager
+
+    whole = plate((0, 3, 0), (0, -1, 0), 0.5, diffuse(0.5))
+    ball = sphere((4.0, 3, 0), 0.1, diffuse(0.5))
+    import mitsuba as mi
+
+    turned = mi.ScalarTransform4f().translate([0, 3, 0]).rotate([1, 0, 0], 90)
+    halves = {
+        f"hull:{side}": {
+            "type": "rectangle",
+            "to_world": turned.translate([side * 0.25, 0, 0]).scale([0.25, 0.5, 1]),
+            "bsdf": diffuse(0.5 + 1e-6 * side),  # Mitsuba joins shapes of one BSDF, which leaves them without a name
+        }
+        for side in (-1, 1)
+    }
+    scenes = [scene(hull=whole), scene(another=ball, hull=whole), mi.load_dict({"type": "scene", **halves})]
+    first, second, third = (CoherentImager(one, SONAR).echoes(np.zeros(6))[0] for one in scenes)
+    np.testing.assert_array_equal(first, second)
+    assert np.abs(third - first).max() < 0.05 * np.abs(first).max()
