@@ -70,7 +70,7 @@ class ThinShapes:
         step = max(2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows)
         areas = {}
         for number, shape in enumerate(scene.shapes()):
-            if shape.bsdf() is None:  # an instance
+            if shape.class_name() == "Instance":
                 continue
             corners = triangles_of(shape)
             area = float(

@@ -102,3 +102,12 @@ def test_the_largest_shapes_are_left_to_the_rays(monkeypatch: pytest.MonkeyPatch
     assert np.array(source.is_thin).tolist() == [True, True]
     monkeypatch.setattr("mitsonar.simulation.thin_shapes.MOST_POINTS", 300)
     assert np.array(imager(loaded, FAN).tracer.is_thin).tolist() == [True, False]
+
+
+def test_instances_are_left_to_the_rays() -> None:
+    group = {"type": "shapegroup", "rod": rod(0.01)}
+    loaded = scene(group=group, one={"type": "instance", "group": {"type": "ref", "id": "group"}}, other=rod(0.004))
+    source = imager(loaded, FAN)
+    names = [shape.class_name() for shape in loaded.shapes()]
+    assert np.array(source.tracer.is_thin).tolist() == [name != "Instance" for name in names]
+    assert source.echoes(np.zeros(6))[1].points > 50
