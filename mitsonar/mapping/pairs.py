@@ -24,6 +24,7 @@ from scipy.special import logsumexp
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, Record, rejected
+from mitsonar.estimation.image.ping_groups import estimate_pair
 from mitsonar.mapping.open_source import Source
 from mitsonar.mapping.sources import without_height
 from mitsonar.motion.composition import Motion, MotionPrior
@@ -169,7 +170,7 @@ def _estimates(estimator: AnyEstimator, frames: Record, priors: Priors) -> list[
     """Estimate each pair of consecutive frames or pings."""
     pairs = [frames.select(slice(k, k + 2)) for k in range(len(frames) - 1)]
     return [
-        rejected("no height was found in the frames") if without_height(pair) else estimator.estimate(pair, prior)
+        rejected("no height was found in the frames") if without_height(pair) else estimate_pair(estimator, pair, prior)
         for pair, prior in zip(pairs, priors, strict=True)
     ]
 

@@ -134,7 +134,8 @@ class CoherentTracer:
         patches = None if sonar.speckle_nu is None else Patches(sonar.speckle_nu, sonar.speckle_patch_m)
         still = motion is None
         thin = ThinShapes.from_scene(scene, self.fan, sonar.range_max, self.pitch, sonar.seed, patches) if still else None
-        self.is_thin, self.thin_points = (None, None) if thin is None else (mi.Bool(thin.thin), thin.inputs())
+        self.is_thin = None if thin is None else mi.Bool(thin.thin)
+        self.thin_points = None if thin is None else thin.inputs()
         self.list, self.sum, self.sum_thin = self._compile_list(), self._compile_sum(), self._compile_thin()
 
     def field(self, pose: NDArray[np.float64], time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
@@ -184,8 +185,9 @@ class CoherentTracer:
                 hit = surfaces.hit(scene, ray)
             if mirrors is not None:
                 hit = without_mirror_part(mirrors, hit, rays.d, 2 * math.pi / self.wavelength)
-            moves = isinstance(surfaces, MovingSurfaces)
-            grain = surfaces.grain_on(scene, hit, body) if moves else surfaces.grain(hit)
+            grain = surfaces.grain(hit)
+            if isinstance(surfaces, MovingSurfaces):
+                grain = surfaces.grain_on(scene, hit, body)
             # 2. Lattice cells around those that may contribute to the grid.
             former = self.former
             last = former.first_range + (former.ranges - 1) * former.range_step
@@ -282,7 +284,7 @@ class CoherentTracer:
             rays = self._rays(rows, dr.zeros(mi.UInt32, dr.width(listed["turn"])), mi.UInt32(0))
             away = place - rays.origin
             range_m = dr.norm(away)
-            ray = mi.Ray3f(rays.origin, away / range_m)
+            ray = mi.Ray3f(rays.origin, mi.Vector3f(away / range_m))
             hit = replace(self.surfaces, **tables).hit(scene, ray)
             if mirrors is not None:
                 hit = without_mirror_part(mirrors, hit, ray.d, 2 * math.pi / self.wavelength)

@@ -404,7 +404,7 @@ class _Search:
         """Return the hits on scattering surfaces whose normal is nearest to the axis and points to the given side."""
         along = pick(mi.UInt32(axis), hit.n)[2]
         suitable = hit.valid & (nearest_axis(hit.n) == axis) & ((along > 0) == bool(side)) & (hit.reflectivity > 0)
-        strength = (self.pitch * self.pitch) / dr.abs(along) * weight[0] * weight[0]
+        strength: DeviceArray = dr.square(weight[0] * self.pitch) / dr.abs(along)
         if self.weighed:
             strength *= hit.reflectivity
         positions = _along(axis, *place)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from convert import save
+from scipy.spatial.transform import Rotation
 
 COUNT = 140
 HALF_EXTENT_M = 30.0
@@ -43,13 +44,14 @@ STONE_M, LENGTH_M = (0.06, 0.5), (0.4, 3.0)
 
 
 def debris(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices ``(n, 3)`` [m] and triangles ``(m, 3)``: stones, planks and rods in heaps, sunk into the floor z = 0."""
+    """Return vertices ``(n, 3)`` [m] and triangles ``(m, 3)``: stones, planks and rods in heaps, sunk into z = 0."""
     ball, box = trimesh.creation.icosphere(subdivisions=0), trimesh.creation.box()
     heaps = rng.normal(0, SPREAD_M, (HEAPS, 2))
     vertices, faces, count = [], [], 0
     for _ in range(PIECES):
         long = rng.uniform() < 0.3
-        turned = trimesh.transformations.euler_matrix(*rng.normal(0, 0.15, 2), rng.uniform(0, 2 * np.pi))[:3, :3]
+        tilt = rng.normal(0, 0.15, 2)
+        turned = Rotation.from_euler("xyz", [tilt[0], tilt[1], rng.uniform(0, 2 * np.pi)]).as_matrix()
         if long:
             length = LENGTH_M[0] * (LENGTH_M[1] / LENGTH_M[0]) ** rng.uniform() ** 2
             width, thick = length * rng.uniform(0.03, 0.15), rng.uniform(0.03, 0.1)

@@ -26,7 +26,7 @@ SHADED = [("uniform", "receive"), ("hann", "two_way"), ("taylor", "receive")]
 
 @pytest.mark.parametrize(("shading", "pattern"), essence(SHADED, ("hann", "two_way")))
 def test_point_spread(shading: str, pattern: str) -> None:
-    """Across beams and over range: 0.5 dB down to -25 dB, -47 dB of the peak below that, and the tops of the first two side lobes."""
+    """Across beams and over range: 0.5 dB down to -25 dB, within -47 dB of the peak, and the tops of two side lobes."""
     narrow = {"beams": 256, "azimuth_fov_deg": 10.0, "beam_width_deg": 0.4, "range_min": 4.2, "range_max": 4.6}
     sonar = SONAR.replace(shading=shading, pattern=pattern, range_bins=256, pulse_m=0.02, elevation_pattern="box", **narrow)
     loaded, fields, _ = one_point()

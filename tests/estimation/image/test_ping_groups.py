@@ -1,0 +1,88 @@
+"""Frames whose beams ping one after another: drawn ground at known places, and what the estimators make of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import Array, essence
+from scipy import ndimage
+
+from mitsonar.estimation.image.ping_groups import at_one_moment, estimate_pair
+from mitsonar.estimation.named import create_estimator
+from mitsonar.instruments.sonar import Sonar, group_of_beams, ping_interval_s
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose
+from mitsonar.records.frames import SonarFrames
+
+HEIGHT, STEP_M = 2.5, 0.02
+SONAR = Sonar.create(beams=96, azimuth_fov_deg=29.0, range_min=3.0, range_max=7.0, range_bins=300, bearing="cone",
+                     ping_groups=8, frame_rate_hz=10.0)  # fmt: skip
+GROUND = ndimage.gaussian_filter(np.random.default_rng(3).normal(size=(600, 600)), 2.5, mode="wrap")
+GROUND = 0.4 + 0.1 * GROUND / GROUND.std()
+
+
+def drawn(poses: Array) -> Array:
+    """The brightness that each beam sees from a pose of its own ``(beams, 6)``, as an image ``(bins, beams)``."""
+    r, bearing = SONAR.range_m[:, None], SONAR.bearing_rad
+    starboard = r * np.sin(bearing)
+    forward = np.sqrt(r**2 - HEIGHT**2 - starboard**2)
+    sin, cos = np.sin(poses[:, 5]), np.cos(poses[:, 5])
+    x, y = poses[:, 0] + forward * sin + starboard * cos, poses[:, 1] + forward * cos - starboard * sin
+    return np.asarray(ndimage.map_coordinates(GROUND, [x / STEP_M, y / STEP_M], order=3, mode="grid-wrap"))
+
+
+def pair_of(motion: Motion, *, grouped: bool) -> SonarFrames:
+    """Two frames whose middles are a motion apart, 0.1 s; grouped beams ping on the way."""
+    share = (group_of_beams(SONAR) - 3.5) * ping_interval_s(SONAR) / 0.1 * grouped
+    images = []
+    for middle in (Pose(0, 0, HEIGHT, 0.5), compose(Pose(0, 0, HEIGHT, 0.5), motion)):
+        poses = [compose(middle, Motion(*(part * np.array(motion)))) for part in share]
+        images.append(drawn(np.array(poses, dtype=float)))
+    known = np.array([[0, 0, HEIGHT, 0.5, 0, 0]] * 2)
+    time_s = np.array([0.0, 0.1])
+    image = np.array(images, dtype=np.float32)
+    heights = np.full(2, HEIGHT)
+    return SonarFrames(image, SONAR.range_m, SONAR.bearing_rad, time_s, SONAR, poses=known, height_m=heights)
+
+
+MOTIONS = {
+    "forward": Motion(0.0, 0.04, 0.0),
+    "sideways": Motion(0.03, 0.01, 0.0),
+    "yaw": Motion(0.0, 0.0, 0.01),
+    "all": Motion(-0.02, 0.04, 0.008),
+}
+
+
+@pytest.mark.parametrize("kind", essence(MOTIONS, "all"))
+def test_frames_of_one_moment_are_those_of_a_single_ping(kind: str) -> None:
+    """Places are known, so what is left is the interpolation: a third of the difference or less."""
+    inner = np.s_[:, 20:-20, 6:-6]
+    motion = MOTIONS[kind]
+    truth, grouped = (pair_of(motion, grouped=grouped) for grouped in (False, True))
+    before, after = (np.std((one.image - truth.image)[inner]) for one in (grouped, at_one_moment(grouped, motion)))
+    assert after < 0.33 * before
+    for changed in (replace(grouped, height_m=None), replace(grouped, image=np.rint(255 * grouped.image).astype(np.uint8))):
+        assert np.std((at_one_moment(changed, motion).image - truth.image)[inner]) < 0.5 * before
+
+
+@pytest.mark.parametrize("kind", essence(MOTIONS, "all"))
+@pytest.mark.parametrize("name", essence(["direct", "flow"], "direct"))
+def test_estimates_are_those_of_single_pings(kind: str, name: str) -> None:
+    motion, estimator = MOTIONS[kind], create_estimator(name)
+    grouped = pair_of(motion, grouped=True)
+    unit = np.array([1e-3, 1e-3, 2e-4])
+    raw, result = (
+        np.array(estimate.motion) - np.array(motion)
+        for estimate in (estimator.estimate(grouped), estimate_pair(estimator, grouped))
+    )
+    assert np.abs(result / unit).max() < 1
+    assert np.linalg.norm(result / unit) < 0.5 * np.linalg.norm(raw / unit) + 0.2
+
+
+def test_other_frames_are_estimated_once() -> None:
+    single = pair_of(MOTIONS["forward"], grouped=False)
+    single = replace(single, sonar=SONAR.replace(ping_groups=1))
+    estimator = create_estimator("direct")
+    assert estimate_pair(estimator, single).motion == estimator.estimate(single).motion
