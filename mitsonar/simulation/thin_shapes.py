@@ -133,10 +133,10 @@ def _points(
         for side in (1, 0):
             chosen = (axis == view) & ((normal[:, view] > 0) == bool(side))
             key = lattice_key(mi.UInt32(grain), mi.UInt32(view), mi.UInt32(side), seed)
-            found = _on_triangles(corners[chosen], normal[chosen], view, key, pitch, patches)
-            if found is None:
+            points = _on_triangles(corners[chosen], normal[chosen], view, key, pitch, patches)
+            if points is None:
                 return None
-            parts.append(found)
+            parts.append(points)
     place, normals, strength, turn = (np.concatenate(values) for values in zip(*parts, strict=True))
     return place, normals, strength, turn, np.zeros_like(turn)
 
