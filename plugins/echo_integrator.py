@@ -10,7 +10,6 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.sonar import Sonar
 from mitsonar.plugins.imaging_sonar_sensor import Fan, ImagingSonar, is_imaging_sonar
 from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.records.echoes import CHANNELS, Echoes
@@ -66,13 +65,20 @@ class Echo(ADIntegrator):
             raise MitsonarError(f"the integrator echo has no properties: got {', '.join(given)}; leave them out")
         super().__init__(props)  # type: ignore[no-untyped-call]  # Mitsuba's own class has no types
         self._fan: Fan | None = None
-        self._edges = False
-        self._sonar: Sonar | None = None
+        self._sensor: ImagingSonar | None = None
+        self._position = mi.Point2f(0)
         self._origin = mi.Point3f(0)
 
     @staticmethod
     def measure(
-        scene: mi.Scene, surfaces: Surfaces, ray: mi.Ray3f, fan: Fan, skipped: DeviceArray = 0.0, *, edges: bool = False
+        scene: mi.Scene,
+        surfaces: Surfaces,
+        ray: mi.Ray3f,
+        fan: Fan,
+        skipped: DeviceArray = 0.0,
+        *,
+        edges: bool = False,
+        attached: bool = False,
     ) -> Echoes:
         """Return the echoes of rays as arrays that are not evaluated yet.
 
@@ -86,8 +92,10 @@ class Echo(ADIntegrator):
             fan: the same rays; ``lift`` and ``side`` in world axes.
             skipped: distance from the sonar to where each ray starts [m].
             edges: whether grazing edges of cells are traced (:func:`_meets`), as sums over footprints require.
+            attached: whether echoes carry derivatives by ray, geometry and reflectance, along each ray: silhouettes do not
+                move, and traced edges do not either.
         """
-        hit = surfaces.hit(scene, ray)
+        hit = surfaces.hit(scene, ray, attached=attached)
         valid = hit.valid
         # Cosine of incidence, clipped against rounding, and the ranges of the cell's edges on the tangent plane.
         toward = dr.dot(hit.n, ray.d)
@@ -143,28 +151,31 @@ class Echo(ADIntegrator):
         half: DeviceArray = 0.5
         ray, weight = sensor.sample_ray_differential(time=time, sample1=half, sample2=position, sample3=mi.Point2f(0.5))
         if is_imaging_sonar(sensor):
-            sonar = cast(ImagingSonar, sensor)
-            self._fan, self._edges = sonar.film_fan(position).carried(sonar.lines()), sonar.sonar.model == "physical"
-            self._sonar = sonar.sonar
+            self._sensor, self._position, self._origin = cast(ImagingSonar, sensor), position, ray.o
         else:
             self._fan = Fan(ray.d, mi.Vector3f(0), mi.Vector3f(0), *(mi.Float(0) for _ in range(5)))
-            self._edges, self._sonar = False, None
-        self._origin = mi.Point3f(sensor.world_transform().translation())
+            self._sensor = None
+            self._origin = mi.Point3f(sensor.world_transform().translation())
         return ray, weight, mi.Vector2f(mi.Vector2u(column, row)) + mi.Vector2f(sensor.film().crop_offset())
 
     def sample(  # type: ignore[override]  # ADIntegrator.sample overrides its own parent with other arguments
         self, mode: object, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, **_: object
     ) -> tuple[mi.Spectrum, DeviceArray, list[DeviceArray], None]:
         """Return values, validity, channels and no state, as ``ADIntegrator`` expects them."""
-        surfaces = Surfaces.from_scene(scene)
-        if self._sonar is not None:
-            surfaces = surfaces.at_frequency_of(self._sonar)
+        attached, sonar = mode != dr.ADMode.Primal, self._sensor
+        surfaces, fan, place = Surfaces.from_scene(scene), self._fan, mi.Ray3f(ray)
+        if sonar is not None:
+            # the rays of sample_rays have no derivatives by the pose of the sensor
+            surfaces, lines = surfaces.at_frequency_of(sonar.sonar), sonar.lines()
+            fan = sonar.film_fan(self._position).carried(lines)
+            place.o, place.d = mi.Point3f(*(line.w for line in lines)), fan.d
         for note in surfaces.notes:
             mi.Log(mi.LogLevel.Warn, note)  # type: ignore[operator]  # an `object` to Mitsuba's stubs
-        assert self._fan is not None
+        assert fan is not None
         offset: DeviceArray = ray.o - self._origin
         skipped = dr.dot(offset, ray.d)
-        echoes = self.measure(scene, surfaces, mi.Ray3f(ray), self._fan, skipped, edges=self._edges)
+        edges = sonar is not None and sonar.sonar.model == "physical"
+        echoes = self.measure(scene, surfaces, place, fan, skipped, edges=edges, attached=attached)
         value = mi.Spectrum(echoes.reflectivity * echoes.cosine)
         return value, echoes.hit > 0, [getattr(echoes, name) for name in CHANNELS], None
 

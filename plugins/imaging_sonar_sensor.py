@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -97,15 +98,33 @@ class ImagingSonar(mi.Sensor):
             props["film"] = self._film()
         super().__init__(props)
         self._check_film()
+        self.to_world = mi.Transform4f(self.world_transform())
         self.pose  # noqa: B018  rejects a to_world with scaling
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose ``to_world`` to ``mi.traverse``, besides what every sensor has."""
+        super().traverse(callback)
+        callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        """Check ``to_world`` after a change.
+
+        Raises:
+            MitsonarError: it scales, shears or mirrors.
+        """
+        super().parameters_changed(list(keys))
+        self.pose  # noqa: B018  rejects scaling
 
     @property
     def pose(self) -> Pose:
         """Return the pose of the sonar, from ``to_world``."""
-        return pose_from_to_world(np.array(self.world_transform().matrix, dtype=float).reshape(4, 4))
+        return pose_from_to_world(np.array(dr.detach(self.to_world.matrix), dtype=float).reshape(4, 4))
 
     def lines(self) -> list[mi.Vector4f]:
-        """Return the first three rows of ``to_world``, for :func:`carried`."""
+        """Return the first three rows of ``to_world``, for :func:`carried`; with derivatives, where it has them."""
+        matrix: DeviceArray = self.to_world.matrix
+        if dr.grad_enabled(matrix):
+            return [mi.Vector4f(*(matrix[row, column] for column in range(4))) for row in range(3)]
         return [mi.Vector4f(*map(float, row)) for row in to_world_matrices(self.pose)[0, :3].astype(np.float32)]
 
     # ---------------- Directions of the rays

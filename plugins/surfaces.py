@@ -212,12 +212,27 @@ class Surfaces:
         """Return the key of the scatterers of the shapes that are hit."""
         return dr.gather(mi.UInt32, self.grains, mi.UInt32(hit.shape_id), hit.valid & (hit.shape_id >= 0))
 
-    def hit(self, scene: mi.Scene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
-        """Trace rays to the nearest surface, without evaluation, so that later operations join the same kernel."""
-        coherent: DeviceArray = True
-        return self.read(scene.ray_intersect_preliminary(ray, coherent=coherent, active=active), ray, active)
+    def hit(self, scene: mi.Scene, ray: mi.Ray3f, active: DeviceArray = True, *, attached: bool = False) -> Hit:
+        """Trace rays to the nearest surface, without evaluation, so that later operations join the same kernel.
 
-    def read(self, intersection: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
+        Args:
+            scene: scene to trace.
+            ray: rays.
+            active: which rays to trace.
+            attached: whether the results carry derivatives by ray, geometry and reflectance.
+        """
+        coherent: DeviceArray = True
+        intersection = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+        return self.read(intersection, ray, active, attached=attached)
+
+    def read(
+        self,
+        intersection: mi.PreliminaryIntersection3f,
+        ray: mi.Ray3f,
+        active: DeviceArray = True,
+        *,
+        attached: bool = False,
+    ) -> Hit:
         """Return the surface at given intersections; rays and intersections are in the axes of the shape's scene."""
         # 1. Find the shape, and read normal and reflectivity of its facet from the table.
         valid = intersection.is_valid() & active
@@ -225,7 +240,7 @@ class Surfaces:
         known = valid & (index * 4 < dr.width(self.shapes))
         shape = dr.gather(mi.Vector4i, self.shapes, index, known)
         first = dr.select(known, shape.x, -1)
-        tabled = first >= 0
+        tabled = (first >= 0) & (not attached)  # tables have no derivatives
         row = dr.gather(mi.Vector4f, self.facets, mi.UInt32(first) + intersection.prim_index, tabled)
         normal: DeviceArray = mi.Normal3f(row.x, row.y, row.z)
         reflectivity: DeviceArray = row.w
@@ -237,11 +252,13 @@ class Surfaces:
             reflectance: DeviceArray = reduce_colour(intersection.shape.bsdf().eval_diffuse_reflectance(si, evaluated))
             reflectivity = dr.select(evaluated, unit(reflectance), reflectivity)
         # 3. Let Mitsuba evaluate shapes that are not in the tables. An instance counts as one shape of the scene.
-        if self.foreign:
+        t: DeviceArray = intersection.t
+        if self.foreign or attached:
             evaluated = valid & ~tabled
             si = intersection.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, evaluated)
             fixed = dr.select(known, dr.gather(mi.Float, self.constant, index, known), -1)
             reflectance = reduce_colour(si.bsdf().eval_diffuse_reflectance(si, evaluated & (fixed < 0)))
+            t = si.t if attached else t
             normal = dr.select(tabled, normal, si.n)
             reflectivity = dr.select(tabled, reflectivity, unit(dr.select(fixed < 0, reflectance, fixed)))
             top: DeviceArray = dr.reinterpret_array(mi.UInt32, intersection.instance)
@@ -253,9 +270,9 @@ class Surfaces:
             cosine: DeviceArray = dr.abs(dr.dot(normal, ray.d))
             reflectivity = weighed(self.laws, material, reflectivity, dr.select(cosine < 1, cosine, 1))
         # 5. Read the object number of the facet.
-        numbered = tabled & (dr.width(self.objects) > 1)
+        numbered = (first >= 0) & (dr.width(self.objects) > 1)
         object_id = dr.gather(mi.Float, self.objects, mi.UInt32(first) + intersection.prim_index, numbered)
-        return Hit(valid, intersection.t, normal, reflectivity, shape_id, object_id, material)
+        return Hit(valid, t, normal, reflectivity, shape_id, object_id, material)
 
     def _on_facet(
         self,

@@ -254,9 +254,12 @@ class MovingSurfaces(Surfaces):
             self.versions = versions
         return super().arrays()
 
-    def hit(self, scene: mi.Scene | MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
-        """Trace rays to the nearest surface and return the hit in world axes."""
+    def hit(
+        self, scene: mi.Scene | MovingScene, ray: mi.Ray3f, active: DeviceArray = True, *, attached: bool = False
+    ) -> Hit:
+        """Trace rays to the nearest surface and return the hit in world axes; bodies that move have no derivatives."""
         assert isinstance(scene, MovingScene)
+        assert not attached
         return self.hit_and_body(scene, ray, active)[0]
 
     def hit_and_body(self, scene: MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[Hit, DeviceArray]:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 from helpers import MitsubaDict, box, diffuse, essence, floor, floor_levels, scene, sphere
 
+from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Receiver
-from mitsonar.motion.pose import Pose
+from mitsonar.motion.pose import Pose, to_world_matrices
 from mitsonar.records.echoes import CHANNELS
 from mitsonar.simulation.simulator import Simulator
 
@@ -215,3 +218,67 @@ def test_a_receiver_hears_a_whole_floor_too() -> None:
     few, many = result
     assert (few > 0).all()
     assert np.percentile(np.abs(10 * np.log10(few / many)), 95) < 0.5
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+def relief(folder: Path) -> MitsubaDict:
+    """Gentle waves under a sonar that sees nothing else."""
+    ground = trimesh.creation.box((10, 10, 0.1)).subdivide().subdivide().subdivide()
+    ground.vertices[:, 2] += 0.04 * np.sin(2 * ground.vertices[:, 0]) * np.cos(1.5 * ground.vertices[:, 1])
+    ground.export(folder / "ground.ply")
+    return {"type": "ply", "filename": str(folder / "ground.ply"), "face_normals": True, "bsdf": diffuse(0.4)}
+
+
+@pytest.mark.parametrize("moved", ["ground", "sonar"])
+def test_ranges_have_the_derivatives_of_central_differences(tmp_path: Path, moved: str) -> None:
+    """Of the sums of ranges, ends of cells and heights of points, by the height of the ground and of the sonar."""
+    pose = to_world_matrices(np.array([[0, -3, 2.0, 0.6, 0, 0]]))[0]
+    sensor = {"type": "imaging_sonar", "beams": 24, "rays_per_beam": 40, "to_world": mi.ScalarTransform4f(pose)}
+    loaded = mi.load_dict({"type": "scene", "integrator": {"type": "echo"}, "sonar": sensor, "ground": relief(tmp_path)})
+    params = mi.traverse(loaded)
+    place, stood = mi.Float(params["ground.vertex_positions"]), mi.Transform4f(params["sonar.to_world"])
+
+    def rendered(height: mi.Float) -> mi.TensorXf:
+        if moved == "ground":
+            upward = dr.arange(mi.UInt32, dr.width(place)) % 3 == 2
+            params["ground.vertex_positions"] = dr.select(upward, place + height, place)
+        else:
+            params["sonar.to_world"] = mi.Transform4f().translate(mi.Vector3f(0, 0, height)) @ stood
+        params.update()
+        return mi.render(loaded, params, spp=1)
+
+    height = mi.Float(0)
+    dr.enable_grad(height)
+    image = rendered(height)
+    dr.forward(height)
+    slope = np.array(dr.grad(image))
+    above, below = (np.array(rendered(mi.Float(step))).astype(float) for step in (1e-3, -1e-3))
+    assert (above[..., 1] == 1).all()
+    for name in ("range_m", "near_m", "far_m", *(["z"] if moved == "ground" else [])):
+        channel = 1 + CHANNELS.index(name)
+        truth = (above - below)[..., channel].sum() / 2e-3
+        assert slope[..., channel].sum() == pytest.approx(truth, rel=1e-3)
+
+
+def test_reflectivity_has_derivatives_by_the_reflectance(tmp_path: Path) -> None:
+    sensor = {"type": "imaging_sonar", "beams": 8, "rays_per_beam": 16}
+    shapes = {"ground": relief(tmp_path), "sonar": {**sensor, "to_world": mi.ScalarTransform4f().look_at(
+        origin=[0, 0, 3], target=[0, 2, 0], up=[0, 0, 1])}}  # fmt: skip
+    loaded = mi.load_dict({"type": "scene", "integrator": {"type": "echo"}, **shapes})
+    params = mi.traverse(loaded)
+    (key,) = (name for name in params.keys() if "reflectance" in name)  # noqa: SIM118
+    dr.enable_grad(params[key])
+    image = mi.render(loaded, params, spp=1)
+    level = dr.sum(image.array[dr.arange(mi.UInt32, dr.prod(image.shape[:2])) * image.shape[2]])
+    dr.backward(level)
+    assert float(dr.sum(dr.grad(params[key]), axis=None)[0]) == pytest.approx(float(level[0]) / 0.4, rel=1e-4)
+
+
+def test_a_pose_that_scales_is_refused() -> None:
+    loaded = mi.load_dict({"type": "scene", "integrator": {"type": "echo"}, "sonar": {"type": "imaging_sonar"}})
+    params = mi.traverse(loaded)
+    params["sonar.to_world"] = mi.Transform4f().scale(2)
+    with pytest.raises(MitsonarError, match="may only rotate and translate"):
+        params.update()
