@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from mitsonar.records.responses import ImpulseResponses
     from mitsonar.records.soundings import Echogram, Soundings, range_rates
     from mitsonar.reproduction.tables import Effort, load_tables, reproduce
+    from mitsonar.simulation.attached_levels import expected_levels
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.scene import load_meshes, load_motions, load_scene, shipped_trajectory, sonar_in
     from mitsonar.simulation.simulator import Simulator
@@ -97,6 +98,7 @@ __all__ = [
     "compare",
     "cramer_rao_bound",
     "create_estimator",
+    "expected_levels",
     "fishing_net_mesh",
     "illumination",
     "load_checkpoint",
@@ -167,6 +169,7 @@ _MODULES = {
     "compare": "estimation.compare",
     "cramer_rao_bound": "estimation.crlb.image",
     "create_estimator": "estimation.named",
+    "expected_levels": "simulation.attached_levels",
     "fishing_net_mesh": "worlds.sea",
     "illumination": "mapping.mosaic",
     "load_checkpoint": "estimation.named",
