@@ -164,7 +164,7 @@ def measured_errors() -> tuple[str, dict[str, dict[str, Measured]]]:
 # pings.
 
 
-GroupOrder: TypeAlias = Literal["interleaved", "sequential"]
+GroupOrder: TypeAlias = Literal["interleaved", "interleaved_starboard", "sequential"]
 
 
 def check_groups(sonar: Sonar) -> None:
@@ -188,7 +188,9 @@ def scans(sonar: Sonar) -> bool:
 def group_of_beams(sonar: Sonar) -> NDArray[np.int64]:
     """Return the index of the ping group of each beam ``(beams,)``; groups ping in the order of their indices."""
     beam = np.arange(sonar.beams)
-    return beam % sonar.ping_groups if sonar.group_order == "interleaved" else beam * sonar.ping_groups // sonar.beams
+    if sonar.group_order == "sequential":
+        return beam * sonar.ping_groups // sonar.beams
+    return (beam if sonar.group_order == "interleaved" else beam[::-1]) % sonar.ping_groups
 
 
 def ping_interval_s(sonar: Sonar) -> float:
@@ -479,7 +481,9 @@ class Sonar(Instrument):
     frame_rate_hz: float = Field(10.0, gt=0, le=1e6, description="pings a second [Hz]")
     ping_groups: int = Field(1, ge=1, le=65_536, description="groups of beams that ping one after another in a frame")
     group_order: GroupOrder = Field(
-        "interleaved", description="beam k in group k mod ping_groups, or sequential: neighbours in one group"
+        "interleaved",
+        description="beam k, from port or (interleaved_starboard) from starboard, in group k mod ping_groups; sequential: "
+        "neighbours in one group",
     )
     group_interval_s: float | None = Field(
         None, ge=0, le=1e3, description="from the ping of a group to the next [s]; default: 2 range_max / sound_speed"

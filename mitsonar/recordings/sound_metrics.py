@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +129,7 @@ FRAME = layout(
         "index": (0, "<u4"), "time_us": (4, "<u8"), "signature": (12, "S4"), "sonar_time_us": (20, "<u8"),
         "window_start_m": (52, "<f4"), "window_length_m": (56, "<f4"), "gain_db": (68, "<u4"), "temperature_c": (224, "<f4"),
         "ping_mode": (436, "<u4"), "high_frequency": (440, "<u4"), "pulse_us": (444, "<u4"),
-        "sample_period_us": (452, "<u4"), "transmits": (456, "<u4"),
+        "cycle_us": (448, "<u4"), "sample_period_us": (452, "<u4"), "transmits": (456, "<u4"),
         "frame_rate_hz": (460, "<f4"), "sound_speed": (464, "<f4"), "samples": (468, "<u4"), "start_delay_us": (476, "<u4"),
         "large_lens": (480, "<u4"), "system": (484, "<u4"), "serial": (488, "<u4"), "reordered": (516, "<u4"),
         "salinity": (520, "<u4"),
@@ -349,6 +349,7 @@ def empty_aris_frames(headers: Header, samples: int, beams: int) -> SonarFrames:
         frame_rate_hz=_rate(headers),
         coding="dB",
         coding_db=ARIS_CODING_DB,
+        **_groups(first, _rate(headers)),
     )
     return SonarFrames(
         image=np.zeros((0, samples, beams), np.uint8),
@@ -358,6 +359,14 @@ def empty_aris_frames(headers: Header, samples: int, beams: int) -> SonarFrames:
         sonar=sonar,
         level="dB",
     )
+
+
+def _groups(first: Any, rate_hz: float) -> Facts:
+    """Return the fields of a sonar that say how the beams of an ARIS ping; none where the header contradicts itself."""
+    pings, cycle_s = PINGS.get(int(first["ping_mode"]), 1), float(first["cycle_us"]) * 1e-6
+    if pings == 1 or not 0 < pings * cycle_s <= 1.05 / rate_hz:
+        return {}
+    return {"ping_groups": pings, "group_order": "interleaved_starboard", "group_interval_s": cycle_s}
 
 
 def _rate(headers: Header) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, argument, count_noun
-from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sonar import Sonar, ping_interval_s
 from mitsonar.recordings.recording import CHUNK_BYTES, Bytes, Header, layout
 from mitsonar.recordings.sound_metrics import ARIS_CODING_DB as CODING_DB
 from mitsonar.recordings.sound_metrics import (
@@ -27,6 +27,7 @@ from mitsonar.recordings.sound_metrics import (
     FRAME,
     KINDS,
     MAX_SAMPLES,
+    PINGS,
     SIGNATURE,
     TABLES,
     aris_bearings,
@@ -459,6 +460,8 @@ class _Form:
             "samples": window.samples, "start_delay_us": window.delay_us, "large_lens": table.lens, "system": table.system,
             "reordered": 1, "salinity": min(SALINITIES, key=lambda one: abs(one - sonar.salinity_psu)),
         }  # fmt: skip
+        if sonar.ping_groups == PINGS[MODES[table.beams]] and sonar.group_order == "interleaved_starboard":
+            fields["cycle_us"] = round(1e6 * ping_interval_s(sonar))
         attitude = frames.attitude_rad if frames.attitude_rad is not None else frames.poses
         if attitude is not None:
             pitch, roll, heading = np.degrees(attitude[:, -3:]).T

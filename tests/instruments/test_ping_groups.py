@@ -30,6 +30,8 @@ def test_groups_of_a_didson_and_of_neighbours() -> None:
     assert (np.bincount(group_of_beams(sonar)) == 12).all()
     np.testing.assert_array_equal(np.nonzero(group_of_beams(sonar) == 3)[0], 3 + 8 * np.arange(12))
     np.testing.assert_array_equal(group_of_beams(sonar.replace(group_order="sequential")), np.arange(96) // 12)
+    back = group_of_beams(sonar.replace(group_order="interleaved_starboard"))
+    np.testing.assert_array_equal(back, group_of_beams(sonar)[::-1])
 
 
 def test_one_ping_a_frame_leaves_a_path_as_it_is() -> None:

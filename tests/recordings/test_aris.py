@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 from recording_files import aris_file
 
 from mitsonar import MitsonarError, open_recording
+from mitsonar.instruments.sonar import Sonar, group_of_beams
 from mitsonar.mapping.sources import open_frames
 from mitsonar.recordings.recording import in_time_order, runs_of
-from mitsonar.recordings.sound_metrics import in_beam_order
+from mitsonar.recordings.sound_metrics import BEAMS, PINGS, in_beam_order
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"
 SAMPLE = REAL / "aris1200-sdk-sample/sample.aris"
@@ -37,6 +38,8 @@ def test_the_sample_is_what_its_readme_says() -> None:
     assert (np.diff(frames.bearing_rad) > 0).all()
     assert np.diff(frames.time_s).min() > 0.1524
     assert np.diff(frames.time_s).max() < 0.1535
+    assert (frames.sonar.ping_groups, frames.sonar.group_order) == (3, "interleaved_starboard")
+    assert frames.sonar.group_interval_s == pytest.approx(2 * 23.4 / 1436, rel=0.02)  # an echo's time
     assert frames.attitude_rad is not None
     pitch, roll, heading = np.degrees(frames.attitude_rad).T
     assert 2.0 <= pitch.min() <= pitch.max() <= 2.45  # its compass says -2.0 to -2.4: nose down
@@ -64,6 +67,16 @@ def test_live_streams_are_put_in_the_order_of_beams_bit_for_bit(name: str, mode:
     folder = REAL / "aris-reorder-fixtures"
     given, expected = (np.fromfile(folder / f"{kind}_pingmode_{name}.dat", np.uint8) for kind in ("input", "expected"))
     assert (in_beam_order(given.reshape(-1, beams), mode) == expected.reshape(-1, beams)).all()
+
+
+@pytest.mark.parametrize("mode", PINGS)
+def test_ping_groups_are_those_of_a_live_stream(mode: int) -> None:
+    """Samples that hold the number of their ping, put in the order of beams, beam 0 at starboard."""
+    pings = PINGS[mode]
+    stream = np.repeat(np.arange(pings, dtype=np.uint8), 10 * 16).reshape(10, -1)
+    groups = in_beam_order(stream, mode)[0, ::-1]
+    sonar = Sonar.create(beams=BEAMS[mode], ping_groups=pings, group_order="interleaved_starboard")
+    np.testing.assert_array_equal(groups, group_of_beams(sonar))
 
 
 def test_the_order_of_other_ping_modes_is_refused() -> None:

@@ -59,7 +59,17 @@ def test_the_sample_comes_back_bit_for_bit(tmp_path: Path) -> None:
     raw, result = (np.fromfile(path, np.uint8)[1024:].reshape(6, -1) for path in (ARIS, tmp_path / "a.aris"))
     assert (raw[:, 1024:] == result[:, 1024:]).all()
     heads = [np.frombuffer(content[:, :1024].tobytes(), FRAME) for content in (raw, result)]
-    same = ("index", "time_us", "ping_mode", "high_frequency", "sample_period_us", "start_delay_us", "samples", "large_lens")
+    same = (
+        "index",
+        "time_us",
+        "ping_mode",
+        "cycle_us",
+        "high_frequency",
+        "sample_period_us",
+        "start_delay_us",
+        "samples",
+        "large_lens",
+    )
     for name in (*same, "system", "sound_speed", "heading_deg", "reordered"):
         assert heads[0][name] == pytest.approx(heads[1][name], abs=1e-4), name
 
