@@ -299,8 +299,8 @@ class Surfaces:
 def grain_key(name: str, number: int) -> int:
     """Return the key of the scatterers of a shape: a hash of its name up to a colon, or its number if it has none.
 
-    Scatterers therefore stay where they are when shapes are added to a scene, or a mesh is divided into ``hull:1`` and
-    ``hull:2``.
+    Scatterers of named shapes therefore stay where they are when shapes are added to a scene, or a mesh is divided into
+    ``hull:1`` and ``hull:2``. Shapes that Mitsuba merges have no name.
     """
     return zlib.crc32(name.split(":")[0].encode()) >> 4 if name else number
 

@@ -209,10 +209,13 @@ def stripes_by_group_db(level_db: ArrayLike, groups: ArrayLike, window: int = 9)
 
     Args:
         level_db: ``(frames, bins, beams)``.
-        groups: ping group of each beam ``(beams,)``.
-        window: neighbours to which a beam is compared; at least the number of groups.
+        groups: ping group of each beam ``(beams,)``; interleaved, or else groups count as one.
+        window: neighbours to which a beam is compared; raised to the number of groups.
     """
-    member = np.asarray(groups)[:, None] == np.unique(groups)
+    group = np.asarray(groups)
+    if (np.diff(group) == 0).any():  # the mean of neighbours in one group hides its gain
+        group = np.zeros_like(group)
+    member = group[:, None] == np.unique(group)
     count = member.sum(axis=0)
     window = max(window, 2 * (member.shape[1] // 2) + 1)
     whole = beam_stripes_db(level_db, window) ** 2

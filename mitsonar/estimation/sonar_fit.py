@@ -794,6 +794,7 @@ Layout = Literal["even", "sine"]
 NOISE_FIELDS = (
     *("noise_level_db", "volume_db", "near_glow_db", "near_glow_m", "near_glow_edge_db", "near_glow_spread_db"),
     *("near_glow_still", "stripes_db", "group_stripes_db", "crosstalk_db", "detector_offset_db"),
+    *("detector_spread_db", "tail_db", "tail_m", "saturation_db"),
     *("speckle_nu", "speckle_patch_m"),
 )
 """Fields of a sonar that describe noise, water and grain, not the instrument's geometry."""

@@ -36,9 +36,9 @@ CROSSTALK_FALL = 1 / 3
 """Exponent by which the amplitude of crosstalk falls with the distance between channels. The kernel of a DIDSON, by which
 Teixeira et al. (2018, doi 10.1109/iros.2018.8594128) undo its crosstalk, is 1, 0.80, 0.68, 0.60 at distances 1 to 4."""
 
-TAPS, TAP_SPREAD = 16, 1.0
+TAPS, TAP_SPREAD = 64, 0.5
 """Number of taps of a beam's tail, and the standard deviation of the logarithm of their amplitudes, beyond that of complex
-Gaussian ones: few taps are strong, so a tail is patchy, as behind targets in real frames."""
+Gaussian ones. Tails are patchy, as behind targets in real frames; with 16 taps they are rows of dots."""
 
 TAIL_LENGTHS = 6.0
 """Range at which a tail ends, relative to ``tail_m``."""

@@ -82,7 +82,8 @@ class Simulator:
         self.sonar, self.mirrors = sonar, mirrors
         self._given = scene, views, moving, rays_per_launch
         self._build()
-        self._watch = SceneWatch(scene, places=bool(self.motion or mirrors))
+        thin = self.model.imager is not None and self.model.imager.has_thin_shapes
+        self._watch = SceneWatch(scene, places=bool(self.motion or mirrors or thin))
         self._stepped, self._gain_from, self._issued = 0, "", set[str]()
         self.gain: float | None = None
 

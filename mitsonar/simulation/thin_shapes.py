@@ -27,8 +27,11 @@ Array = NDArray[np.float64]
 MOST_POINTS = 200_000
 """Largest number of points of all thin shapes; those with the most points are left to the rays."""
 
-MOST_CANDIDATES = 50
-"""Largest number of lattice cells to search, as a multiple of :data:`MOST_POINTS`."""
+MOST_CANDIDATES = 4_000_000
+"""Largest number of lattice cells to search for a shape's points, some seconds: slanted triangles cover many cells."""
+
+CANDIDATES_AT_A_TIME = 2**19
+"""Number of lattice cells that are searched at a time."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,8 @@ class ThinShapes:
         place, normal: positions [m] and unit normals ``(points, 3)``.
         strength: amplitude of the weight times the root of the area that a point represents ``(points,)`` [m].
         turn: phase of the weight in turns ``(points,)``.
-        reflectivity: that of spheres and cylinders, which rays may miss by rounding; 0 of other shapes ``(points,)``.
+        reflectivity: that of round shapes, all but meshes and flat ones, which rays may miss by rounding; 0 of others
+            ``(points,)``.
         shape: number of the shape of each point ``(points,)``.
     """
 
@@ -83,8 +87,8 @@ class ThinShapes:
         for number in sorted(areas, key=areas.__getitem__):
             shape = scene.shapes()[number]
             points = _points(shape, grain_key(shape.id(), number), pitch, seed, patches)
-            if points is None or len(points[0]) > room:
-                break
+            if points is None or not 0 < len(points[0]) <= room:
+                continue
             count = len(points[0])
             room, thin[number] = room - count, True
             parts.append((*points, np.full(count, number)))
@@ -119,6 +123,10 @@ def _points(
         place, normal, power, phase = (values.astype(float) for values in weighed)
         alone = lattice_points(shape, grain, pitch, seed, patches, weighed=False).strength.astype(float)
         reflectivity = np.zeros_like(power) if shape.class_name() in FLAT else power / alone
+        # normals of round shapes point outwards, whatever the scene says
+        box = shape.bbox()
+        outward = ((place - np.array(box.center(), dtype=float).ravel()) * normal).sum(axis=1)
+        normal *= np.where(outward < 0, -1, 1)[:, None]
         return place, normal, np.sqrt(alone), phase / (2 * np.pi), reflectivity
     corners = triangles_of(shape)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -137,22 +145,34 @@ def _points(
             if points is None:
                 return None
             parts.append(points)
-    place, normals, strength, turn = (np.concatenate(values) for values in zip(*parts, strict=True))
+    place, normals, strength, turn = _joined(parts)
     return place, normals, strength, turn, np.zeros_like(turn)
+
+
+def _joined(parts: list[tuple[Array, Array, Array, Array]]) -> tuple[Array, Array, Array, Array]:
+    place, normals, strength, turn = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return place, normals, strength, turn
 
 
 def _on_triangles(
     corners: Array, normal: Array, view: int, key: mi.UInt32, pitch: float, patches: Patches | None
 ) -> tuple[Array, Array, Array, Array] | None:
     """Return places, normals, strengths and turns of the lattice points on triangles that are seen along one axis."""
-    # 1. Lattice cells that the triangles may cover.
+    # 1. Lattice cells that the triangles may cover, some triangles at a time.
     order = [(view + 1) % 3, (view + 2) % 3, view]
     flat = corners[:, :, order]
     low, high = (np.floor(end / pitch).astype(np.int64) for end in (flat[:, :, :2].min(axis=1), flat[:, :, :2].max(axis=1)))
     wide, tall = (high - low + 1).T if len(low) else np.zeros((2, 0), dtype=np.int64)
     count = wide * tall
-    if count.sum() > MOST_CANDIDATES * MOST_POINTS:
+    if count.sum() > MOST_CANDIDATES:
         return None
+    if len(count) > 1 and count.sum() > CANDIDATES_AT_A_TIME:
+        middle = len(count) // 2
+        halves = [
+            _on_triangles(corners[part], normal[part], view, key, pitch, patches)
+            for part in (slice(middle), slice(middle, None))
+        ]
+        return _joined([half for half in halves if half is not None])
     triangle = np.repeat(np.arange(len(count)), count)
     if not len(triangle):
         return np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0)

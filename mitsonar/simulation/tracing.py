@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.instruments.sonar import Sonar, group_of_beams
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins import echo_integrator, imaging_sonar_sensor, surfaces
 from mitsonar.plugins.echo_integrator import steep
@@ -83,8 +83,12 @@ class Rays:
         # 2. Pose: one for each ping, or one for each group of beams of a ping.
         self.moment = self.ping
         if sonar.ping_groups > 1:
-            groups = mi.UInt32(group_of_beams(sonar).astype(np.uint32))
-            self.moment = self.ping * sonar.ping_groups + dr.gather(mi.UInt32, groups, self.beam)
+            # as in group_of_beams
+            beam, groups = self.beam, sonar.ping_groups
+            if sonar.group_order == "interleaved_starboard":
+                beam = sonar.beams - 1 - beam
+            group = beam * groups // sonar.beams if sonar.group_order == "sequential" else beam % groups
+            self.moment = self.ping * groups + group
         self.film = self.row * sonar.columns + self.column
 
     @staticmethod

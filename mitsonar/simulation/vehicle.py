@@ -183,14 +183,15 @@ def sensors_in(scene: mi.Scene, vehicle: Pose) -> dict[str, Mounted]:
         check_sensor_name(name)
         if name in sensors:
             raise MitsonarError(f"two sensors of the scene have the id {name}: give them different ids")
-        sensor_pose = pose_from_to_world(np.array(sensor.world_transform().matrix, dtype=float).reshape(4, 4))
+        untyped: Any = sensor
+        matrix = np.array(sensor.world_transform().matrix, dtype=float).reshape(4, 4)
+        sensor_pose = untyped.pose if is_imaging_sonar(sensor) else pose_from_to_world(matrix)
         distance_m = math.dist(sensor_pose[:3], vehicle[:3])
         if distance_m > FARTHEST_M:
             raise MitsonarError(
                 f"the sensor {name} is {distance_m:.3g} m from the path's first pose: the scene must show the vehicle "
                 "there; move the sensors, or the path"
             )
-        untyped: Any = sensor
         sonar = is_imaging_sonar(sensor) or is_channel_sonar(sensor)
         sensors[name] = Mounted(untyped.sonar if sonar else sensor, mount_between(vehicle, sensor_pose))
     if not sensors:

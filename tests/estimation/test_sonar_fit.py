@@ -77,7 +77,7 @@ def test_what_was_put_in_comes_out(recordings: dict[str, SonarFrames], name: str
     assert sonar.stripes_db == pytest.approx(stripes(sonar, true.get("stripes_db", 0.0)), abs=0.15)
     assert sonar.group_stripes_db == pytest.approx(group_stripes(sonar, true.get("group_stripes_db", 0.0)), abs=0.15)
     if "crosstalk_db" in true:
-        assert sonar.crosstalk_db == pytest.approx(true["crosstalk_db"], abs=3.0)
+        assert sonar.crosstalk_db == pytest.approx(true["crosstalk_db"], abs=3.5)
     else:  # the few beams of a ping group can be lifted by side lobes
         assert sonar.crosstalk_db is None or (sonar.ping_groups > 1 and sonar.crosstalk_db < -40)
     if "speckle_nu" in true:

@@ -39,8 +39,14 @@ def wall() -> Any:
     return scene(wall=plate((0, WALL_M, 0), (0, -1, 0), bsdf=diffuse(0.8)))
 
 
+BACK, SIDES = (BOXES.replace(group_order=order) for order in ("interleaved_starboard", "sequential"))
+
+
 @pytest.mark.parametrize(
-    ("sonar", "tolerance"), essence([(BOXES, 0.003), (PATTERN, 0.012), (COHERENT, 0.02)], (BOXES, 0.003), (COHERENT, 0.02))
+    ("sonar", "tolerance"),
+    essence(
+        [(BOXES, 0.003), (BACK, 0.003), (SIDES, 0.003), (PATTERN, 0.012), (COHERENT, 0.02)], (BACK, 0.003), (COHERENT, 0.02)
+    ),
 )
 def test_a_vehicle_that_drives_skews_a_wall(sonar: Sonar, tolerance: float) -> None:
     """Range of beam b: (5 m - v t) / cos b, with the time t of its group."""

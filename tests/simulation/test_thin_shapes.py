@@ -12,6 +12,8 @@ import trimesh
 from coherent_scenes import SONAR, imager
 from helpers import Array, diffuse, essence, plate, scene
 
+from mitsonar.simulation.simulator import Simulator
+
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
 
 AHEAD, LENGTH = 4.45, 0.3
@@ -111,3 +113,41 @@ def test_instances_are_left_to_the_rays() -> None:
     names = [shape.class_name() for shape in loaded.shapes()]
     assert np.array(source.tracer.is_thin).tolist() == [name != "Instance" for name in names]
     assert source.echoes(np.zeros(6))[1].points > 50
+
+
+def test_shapes_without_points_are_left_to_the_rays() -> None:
+    black = {**rod(0.004), "bsdf": diffuse(0.0)}
+    source = imager(scene(rod=black), FAN)
+    assert source.tracer.thin_points is None
+    assert not source.echoes(np.zeros(6))[0].any()
+
+
+def test_flipped_normals_change_nothing() -> None:
+    plain, flipped = (imager(scene(rod={**rod(0.018), "flip_normals": flip}), FAN) for flip in (False, True))
+    power = [(np.abs(one.echoes(np.zeros(6))[0]) ** 2).sum(axis=1) for one in (plain, flipped)]
+    centroid = [float((FAN.range_m * one).sum() / one.sum()) for one in power]
+    assert centroid == pytest.approx([AHEAD - 0.008] * 2, abs=0.004)
+
+
+@pytest.mark.parametrize("mesh", [True, False])
+def test_a_thin_shape_moves_between_pings(tmp_path: Path, mesh: bool) -> None:
+    """By its vertices or its transform, as any other shape of a live scene."""
+    import mitsuba as mi
+
+    loaded = scene(rod=rod(0.004, tmp_path if mesh else None))
+    simulator = Simulator(loaded, FAN.replace(coding="linear"))
+    pose = np.zeros((1, 6))
+    before = next(iter(simulator.pings(pose))).levels[0]
+    params = mi.traverse(loaded)
+    if mesh:
+        place = np.array(params["rod.vertex_positions"]).reshape(-1, 3) + np.array([0, 0.2, 0])
+        params["rod.vertex_positions"] = place.ravel()
+    else:
+        matrix = mi.ScalarTransform4f(np.array(params["rod.to_world"].matrix, dtype=float).reshape(4, 4))
+        params["rod.to_world"] = mi.ScalarTransform4f().translate([0, 0.2, 0]) @ matrix
+    params.update()
+    after = next(iter(simulator.pings(pose))).levels[0]
+    fresh = next(iter(Simulator(loaded, FAN.replace(coding="linear")).pings(pose))).levels[0]
+    np.testing.assert_array_equal(after, fresh)
+    assert after.sum() > 0.1 * before.sum()
+    assert abs(int(after.sum(axis=1).argmax()) - int(before.sum(axis=1).argmax())) > 30

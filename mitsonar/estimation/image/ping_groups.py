@@ -45,11 +45,16 @@ def estimate_pair(estimator: AnyEstimator, pair: Record, prior: MotionPrior | No
     return result
 
 
+LEAST_SHARE = 0.05
+"""Duration of a frame's pings, relative to the time between both frames, below which they count as one ping."""
+
+
 def _in_groups(pair: Record) -> TypeGuard[SonarFrames]:
-    """Test for two frames whose beams ping in groups at known times; the sweep of a turning head is not one frame."""
+    """Test for two frames whose pings last a part of the time between them; the sweep of a turning head is not one frame."""
     if not isinstance(pair, SonarFrames) or pair.sonar.ping_groups == 1 or scans(pair.sonar):
         return False
-    return len(pair.bearing_rad) == pair.sonar.beams and _interval_s(pair) > 0
+    duration_s = pair.sonar.ping_groups * ping_interval_s(pair.sonar)
+    return len(pair.bearing_rad) == pair.sonar.beams and 0 < LEAST_SHARE * _interval_s(pair) < duration_s
 
 
 def _interval_s(pair: SonarFrames) -> float:
@@ -69,9 +74,11 @@ def at_one_moment(pair: SonarFrames, motion: Motion) -> SonarFrames:
     share = (group_of_beams(pair.sonar) - (groups - 1) / 2) * (ping_interval_s(pair.sonar) / _interval_s(pair))
     images = np.asarray(pair.image, dtype=np.float32) / (255 if pair.image.dtype == np.uint8 else 1)
     heights = np.full(len(pair), np.nan) if pair.height_m is None else pair.height_m
-    pitches = np.zeros(len(pair)) if pair.poses is None else pair.poses[:, 3]
+    attitude = pair.attitude_rad if pair.attitude_rad is not None else None if pair.poses is None else pair.poses[:, 3:]
+    pitches = np.zeros(len(pair)) if attitude is None else np.nan_to_num(attitude[:, 0])
+    cone = pair.sonar.bearing == "cone"
     moved = [
-        _moved(image, pair.range_m, pair.bearing_rad, _depth(pair.range_m, *known), share, motion)
+        _moved(image, pair.range_m, pair.bearing_rad, _depth(pair.range_m, *known), share, motion, cone)
         for image, *known in zip(images, heights, pitches, strict=True)
     ]
     return replace(pair, image=np.stack(moved))
@@ -91,17 +98,21 @@ def _moved(
     depth_m: Array,
     share: NDArray[np.floating],
     motion: Motion,
+    cone: bool,
 ) -> NDArray[np.float32]:
-    """Return an image ``(bins, beams)`` whose beams have moved to the middle of the frame."""
+    """Return an image ``(bins, beams)`` whose beams have moved to the middle of the frame; cells without ground stay."""
     # 1. Where a cell of each beam lies from its ping, and from the middle of the frame: starboard and forward.
-    starboard = range_m[:, None] * np.sin(bearing_rad)
     level = np.sqrt(np.maximum(range_m**2 - depth_m**2, 0))[:, None]
-    forward = np.sqrt(np.maximum(level**2 - starboard**2, 0))
+    starboard = (range_m[:, None] if cone else level) * np.sin(bearing_rad)
+    square = level**2 - starboard**2
+    forward = np.sqrt(np.maximum(square, 0)) * np.where(np.cos(bearing_rad) < 0, -1, 1)
     sin, cos = np.sin(share * motion.yaw), np.cos(share * motion.yaw)
     aside = share * motion.sideways + starboard * cos + forward * sin
     ahead = share * motion.forward - starboard * sin + forward * cos
-    there = np.sqrt(aside**2 + ahead**2 + depth_m[:, None] ** 2)
-    seen_at = np.arcsin(np.clip(aside / there, -1, 1))
+    on_ground = (square >= 0) & (level > 0)
+    there = np.where(on_ground, np.sqrt(aside**2 + ahead**2 + depth_m[:, None] ** 2), range_m[:, None])
+    seen_at = np.arcsin(np.clip(aside / there, -1, 1)) if cone else np.arctan2(aside, ahead)
+    seen_at = np.where(on_ground, seen_at, bearing_rad)
     # 2. Each beam, at the ranges that its cells have from the middle.
     bins = np.clip(np.interp(2 * range_m[:, None] - there, range_m, np.arange(len(range_m))), 0, len(range_m) - 1)
     low = np.minimum(bins.astype(np.intp), len(range_m) - 2)

@@ -83,6 +83,8 @@ class CoherentModel:
 
     def adopt(self, scene: mi.Scene) -> bool:
         """Take over the surface tables of a changed scene at rest; return False if the model must be rebuilt."""
+        if self.imager.has_thin_shapes:  # their points stand in tables
+            return False
         tables = [self.tracer.surfaces, *(one.surfaces for one in self.imager.tracers.values())]
         return all(one.adopt(surfaces_of(scene, self.imager.sonar, None)) for one in tables)
 
@@ -159,6 +161,11 @@ class CoherentImager:
         cornered = parts if several else None
         self.corners = None if cornered is None else CornerTracer(scene, self.sampled, self.former, cornered, motion=motion)
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
+
+    @property
+    def has_thin_shapes(self) -> bool:
+        """Return whether the scene has shapes whose points are listed once."""
+        return any(tracer.thin_points is not None for tracer in self.tracers.values())
 
     def image(
         self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0, *, again: bool = False

@@ -86,3 +86,26 @@ def test_other_frames_are_estimated_once() -> None:
     single = replace(single, sonar=SONAR.replace(ping_groups=1))
     estimator = create_estimator("direct")
     assert estimate_pair(estimator, single).motion == estimator.estimate(single).motion
+
+
+@pytest.mark.parametrize("bearing", ["cone", "azimuth"])
+def test_without_motion_nothing_moves(bearing: str) -> None:
+    """Nor do cells without ground: the water column, and borders of a wide fan."""
+    sonar = SONAR.replace(bearing=bearing, range_min=1.0, azimuth_fov_deg=130.0)
+    image = np.random.default_rng(1).random((2, 300, 96), dtype=np.float32)
+    known = np.array([[0, 0, HEIGHT, 0.5, 0, 0]] * 2)
+    pair = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.array([0.0, 0.1]), sonar, poses=known)
+    for heights in (np.full(2, HEIGHT), np.full(2, np.nan), None):
+        still = at_one_moment(replace(pair, height_m=heights), Motion(0.0, 0.0, 0.0))
+        np.testing.assert_allclose(still.image, image, atol=1e-4)
+    moved = at_one_moment(replace(pair, height_m=np.full(2, HEIGHT)), MOTIONS["all"])
+    water = sonar.range_m < HEIGHT
+    np.testing.assert_allclose(moved.image[:, water], image[:, water], atol=1e-6)
+
+
+def test_frames_far_apart_in_time_are_estimated_once() -> None:
+    """Pings of 75 ms do not matter over 10 s, between frames that close a loop."""
+    pair = pair_of(MOTIONS["all"], grouped=True)
+    far = replace(pair, time_s=np.array([0.0, 10.0]))
+    estimator = create_estimator("direct")
+    assert estimate_pair(estimator, far).motion == estimator.estimate(far).motion
