@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from mitsonar.simulation.beams import CommonFan
 from mitsonar.simulation.mirrors import FLAT, Mirrors
 
-__all__ = ["COLUMNS", "NarrowMirrors", "pieces_of", "sphere_and_width", "triangles_of"]
+__all__ = ["COLUMNS", "MOST_FACETS", "NarrowMirrors", "pieces_of", "sphere_and_width", "triangles_of"]
 
 COLUMNS = 4.0
 """Width below which a mirror is narrow, in columns or rows of the fan."""

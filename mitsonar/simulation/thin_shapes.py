@@ -17,7 +17,7 @@ from mitsonar.plugins.surfaces import grain_key
 from mitsonar.simulation.beams import CommonFan
 from mitsonar.simulation.device import DeviceArray, padded
 from mitsonar.simulation.mirrors import FLAT
-from mitsonar.simulation.narrow_mirrors import COLUMNS, pieces_of, sphere_and_width, triangles_of
+from mitsonar.simulation.narrow_mirrors import COLUMNS, MOST_FACETS, pieces_of, sphere_and_width, triangles_of
 from mitsonar.simulation.points import Patches, lattice_key, lattice_points, patch_weight, place_in_cell, weight_of
 
 __all__ = ["ThinShapes"]
@@ -74,7 +74,7 @@ class ThinShapes:
         step = max(2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows)
         areas = {}
         for number, shape in enumerate(scene.shapes()):
-            if shape.class_name() == "Instance":
+            if shape.class_name() == "Instance" or (isinstance(shape, mi.Mesh) and shape.face_count() > MOST_FACETS):
                 continue
             corners = triangles_of(shape)
             area = float(
