@@ -41,6 +41,7 @@ __all__ = [
     "one_beam",
     "overlap_notes",
     "ping_interval_s",
+    "ping_offsets_s",
     "rays_across",
     "rays_over_elevation",
     "scanned",
@@ -203,6 +204,11 @@ def ping_interval_s(sonar: Sonar) -> float:
     return 2 * sonar.range_max / sonar.sound_speed + sonar.group_overhead_s
 
 
+def ping_offsets_s(sonar: Sonar) -> NDArray[np.float64]:
+    """Return the times of the groups' pings relative to the middle of their frame ``(groups,)`` [s]."""
+    return (np.arange(sonar.ping_groups) - (sonar.ping_groups - 1) / 2) * ping_interval_s(sonar)
+
+
 def frame_period_s(sonar: Sonar) -> float:
     """Return the time between frames [s]: the length of a sweep for a rotating head, else the inverse of the frame rate."""
     return sonar.ping_groups * ping_interval_s(sonar) if scans(sonar) else 1 / sonar.frame_rate_hz
@@ -288,7 +294,7 @@ def timed_path(sonar: Sonar, path: Trajectory) -> TimedPath:
     if sonar.ping_groups == 1:
         return TimedPath(path, path.time_s, path.poses)
     # Times of the pings relative to the time of their frame.
-    offsets = (np.arange(sonar.ping_groups) - (sonar.ping_groups - 1) / 2) * ping_interval_s(sonar)
+    offsets = ping_offsets_s(sonar)
     due = path.time_s
     if scans(sonar) and len(path) > 1:
         sweep = ping_interval_s(sonar) * sonar.ping_groups

@@ -37,7 +37,7 @@ def expected_levels(image: mi.TensorXf, sonar: Sonar) -> mi.TensorXf:
     if sonar.model != "physical" or sonar.beam_pattern != "box" or sonar.bounces != 1:
         raise MitsonarError(
             f"levels with derivatives are those of the model physical without pattern and bounces: got model {sonar.model}, "
-            f"beam pattern {sonar.beam_pattern}, bounces {sonar.bounces}"
+            f"beam pattern {sonar.beam_pattern}, bounces {sonar.bounces}; load the scene with model=physical"
         )
     if tuple(image.shape) != shape:
         raise MitsonarError(

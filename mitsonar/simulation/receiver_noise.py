@@ -23,7 +23,7 @@ from mitsonar.instruments.beams import series, shaded_sinc
 from mitsonar.instruments.sonar import Sonar, group_of_beams
 from mitsonar.simulation.beams import PULSE_LENGTHS, BeamFormer
 
-__all__ = ["PROCESSES", "EchoTail", "ReceiverNoise", "crosstalk"]
+__all__ = ["PROCESSES", "EchoTail", "ReceiverNoise", "crosstalk", "saturation_notes"]
 
 Image = NDArray[np.complex64]
 """A complex image ``(bins, beams)``: amplitudes relative to the source at 1 m."""
@@ -265,6 +265,16 @@ PROCESSES: tuple[Callable[[ReceiverNoise, NDArray[Any], int, int], NDArray[Any]]
 
 LEAST_CLIPPED = 0.05
 """Power of the elements, relative to the limit, below which they do not clip: their distortion is below -100 dB."""
+
+
+def saturation_notes(sonar: Sonar) -> list[str]:
+    """Return a one-sentence note if the elements clip noise alone, which leaves no picture."""
+    if sonar.saturation_db is None or sonar.noise_level_db is None or sonar.saturation_db > sonar.noise_level_db:
+        return []
+    return [
+        f"saturation_db {sonar.saturation_db:g} is below the noise, {sonar.noise_level_db:g} dB, so all is clipped: it "
+        "is a level at the elements, dB re 1 uPa; give one above the noise, or leave it out"
+    ]
 
 
 def limiter(limit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

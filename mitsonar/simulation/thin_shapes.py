@@ -18,7 +18,15 @@ from mitsonar.simulation.beams import CommonFan
 from mitsonar.simulation.device import DeviceArray, padded
 from mitsonar.simulation.mirrors import FLAT
 from mitsonar.simulation.narrow_mirrors import COLUMNS, MOST_FACETS, pieces_of, sphere_and_width, triangles_of
-from mitsonar.simulation.points import Patches, lattice_key, lattice_points, patch_weight, place_in_cell, weight_of
+from mitsonar.simulation.points import (
+    Patches,
+    lattice_key,
+    lattice_points,
+    nearest_axis,
+    patch_weight,
+    place_in_cell,
+    weight_of,
+)
 
 __all__ = ["ThinShapes"]
 
@@ -119,23 +127,23 @@ def _points(
 ) -> tuple[Array, Array, Array, Array, Array] | None:
     """Return the attributes of all lattice points of a shape, place to reflectivity; None if they take too long to find."""
     if not isinstance(shape, mi.Mesh):
-        weighed = lattice_points(shape, grain, pitch, seed, patches)
-        place, normal, power, phase = (values.astype(float) for values in weighed)
-        alone = lattice_points(shape, grain, pitch, seed, patches, weighed=False).strength.astype(float)
-        reflectivity = np.zeros_like(power) if shape.class_name() in FLAT else power / alone
+        alone = lattice_points(shape, grain, pitch, seed, patches, weighed=False)
+        place, normal, power, phase = (values.astype(float) for values in alone)
+        reflectivity = np.zeros_like(power)
+        if shape.class_name() not in FLAT:
+            reflectivity = lattice_points(shape, grain, pitch, seed, patches).strength.astype(float) / power
         # normals of round shapes point outwards, whatever the scene says
         box = shape.bbox()
         outward = ((place - np.array(box.center(), dtype=float).ravel()) * normal).sum(axis=1)
         normal *= np.where(outward < 0, -1, 1)[:, None]
-        return place, normal, np.sqrt(alone), phase / (2 * np.pi), reflectivity
+        return place, normal, np.sqrt(power), phase / (2 * np.pi), reflectivity
     corners = triangles_of(shape)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     whole = np.linalg.norm(normal, axis=1)
     corners, normal = corners[whole > 0], normal[whole > 0] / whole[whole > 0, None]
-    # the axis of nearest_axis
-    leans = np.abs(normal)
-    others = np.where(leans[:, 0] >= leans[:, 1], 0, 1)
-    axis = np.where((leans[:, 2] >= leans[:, 0]) & (leans[:, 2] >= leans[:, 1]), 2, others)
+    if not len(normal):
+        return None
+    axis = np.array(nearest_axis(mi.Vector3f(*(mi.Float(padded(column.astype(np.float32))) for column in normal.T))))
     parts = []
     for view in range(3):
         for side in (1, 0):
@@ -188,7 +196,7 @@ def _on_triangles(
     at = np.stack([np.array(p), np.array(q)], axis=1).astype(float)
     # 3. Those inside the triangles, by barycentric coordinates.
     first, second, third = (flat[triangle, corner] for corner in range(3))
-    u, v, w = (end[:, :2] - first[:, :2] for end in (second, third, at + np.zeros((1, 2))))
+    u, v, w = (end[:, :2] - first[:, :2] for end in (second, third, at))
     area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         by_second = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area

@@ -534,6 +534,15 @@ def test_a_saturated_receiver_has_the_power_that_clipping_leaves(over_db: float)
     np.testing.assert_array_equal(receiver.clipped(quiet, 0), quiet)
 
 
+def test_a_limit_below_the_noise_is_told(flat: mi.Scene) -> None:
+    loud = SONAR.replace(source_level_db=180.0, noise_level_db=80.0)
+    assert not any("saturation_db" in note for note in imager(flat, loud.replace(saturation_db=100.0)).notes)
+    assert any(
+        "saturation_db -20 is below the noise, 80 dB" in note
+        for note in imager(flat, loud.replace(saturation_db=-20.0)).notes
+    )
+
+
 def test_a_glint_that_saturates_lights_all_beams_at_its_range(flat: mi.Scene) -> None:
     """Its own echo is compressed; other ranges keep their bits."""
     sonar = SONAR.replace(source_level_db=180.0)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, Record
-from mitsonar.instruments.sonar import group_of_beams, ping_interval_s, scans
+from mitsonar.instruments.sonar import group_of_beams, ping_interval_s, ping_offsets_s, scans
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
 
@@ -69,9 +69,8 @@ def at_one_moment(pair: SonarFrames, motion: Motion) -> SonarFrames:
         pair: two frames of a sonar with ping groups.
         motion: motion from the first to the second, which lasts through both.
     """
-    # 1. Share of the motion from the middle of the frame to the ping of each beam.
-    groups = pair.sonar.ping_groups
-    share = (group_of_beams(pair.sonar) - (groups - 1) / 2) * (ping_interval_s(pair.sonar) / _interval_s(pair))
+    # share of the motion from the middle of the frame to the ping of each beam
+    share = ping_offsets_s(pair.sonar)[group_of_beams(pair.sonar)] / _interval_s(pair)
     images = np.asarray(pair.image, dtype=np.float32) / (255 if pair.image.dtype == np.uint8 else 1)
     heights = np.full(len(pair), np.nan) if pair.height_m is None else pair.height_m
     attitude = pair.attitude_rad if pair.attitude_rad is not None else None if pair.poses is None else pair.poses[:, 3:]
@@ -96,7 +95,7 @@ def _moved(
     range_m: Array,
     bearing_rad: Array,
     depth_m: Array,
-    share: NDArray[np.floating],
+    share: Array,
     motion: Motion,
     cone: bool,
 ) -> NDArray[np.float32]:

@@ -24,7 +24,7 @@ from mitsonar.simulation.multipath_coherent import CornerTracer, GhostTracer, Mi
 from mitsonar.simulation.multipath_rough import DiffuseField
 from mitsonar.simulation.pings import Counts, CutRays, RenderedPings
 from mitsonar.simulation.points import MOST_CANDIDATES
-from mitsonar.simulation.receiver_noise import EchoTail, ReceiverNoise, crosstalk
+from mitsonar.simulation.receiver_noise import EchoTail, ReceiverNoise, crosstalk, saturation_notes
 from mitsonar.simulation.tracing import surfaces_of, tracer_of
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ class CoherentImager:
         self.diffuse = DiffuseField(self.tracer) if sonar.bounces > 1 else None
         cornered = parts if several else None
         self.corners = None if cornered is None else CornerTracer(scene, self.sampled, self.former, cornered, motion=motion)
-        self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
+        self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar), *saturation_notes(sonar)]
 
     @property
     def has_thin_shapes(self) -> bool:
