@@ -206,7 +206,8 @@ def ping_interval_s(sonar: Sonar) -> float:
 
 def ping_offsets_s(sonar: Sonar) -> NDArray[np.float64]:
     """Return the times of the groups' pings relative to the middle of their frame ``(groups,)`` [s]."""
-    return (np.arange(sonar.ping_groups) - (sonar.ping_groups - 1) / 2) * ping_interval_s(sonar)
+    middle = (sonar.ping_groups - 1) / 2
+    return np.asarray((np.arange(sonar.ping_groups) - middle) * ping_interval_s(sonar), dtype=np.float64)
 
 
 def frame_period_s(sonar: Sonar) -> float:
