@@ -52,8 +52,8 @@ if TYPE_CHECKING:
     from mitsonar.records.responses import ImpulseResponses
     from mitsonar.records.soundings import Echogram, Soundings, range_rates
     from mitsonar.reproduction.tables import Effort, load_tables, reproduce
-    from mitsonar.simulation.attached_levels import expected_levels
     from mitsonar.simulation.channel import ChannelSimulator
+    from mitsonar.simulation.differentiable import DifferentiableSimulator
     from mitsonar.simulation.scene import load_meshes, load_motions, load_scene, shipped_trajectory, sonar_in
     from mitsonar.simulation.simulator import Simulator
     from mitsonar.simulation.sounding import SounderSimulator
@@ -67,6 +67,7 @@ __all__ = [
     "ComparisonOptions",
     "DataStore",
     "Deforming",
+    "DifferentiableSimulator",
     "Echogram",
     "Effort",
     "Estimate",
@@ -98,7 +99,6 @@ __all__ = [
     "compare",
     "cramer_rao_bound",
     "create_estimator",
-    "expected_levels",
     "fishing_net_mesh",
     "illumination",
     "load_checkpoint",
@@ -138,6 +138,7 @@ _MODULES = {
     "ComparisonOptions": "estimation.compare",
     "DataStore": "datasets.store",
     "Deforming": "motion.bodies",
+    "DifferentiableSimulator": "simulation.differentiable",
     "Echogram": "records.soundings",
     "Effort": "reproduction.tables",
     "Estimate": "estimation.estimator",
@@ -169,7 +170,6 @@ _MODULES = {
     "compare": "estimation.compare",
     "cramer_rao_bound": "estimation.crlb.image",
     "create_estimator": "estimation.named",
-    "expected_levels": "simulation.attached_levels",
     "fishing_net_mesh": "worlds.sea",
     "illumination": "mapping.mosaic",
     "load_checkpoint": "estimation.named",

@@ -93,7 +93,7 @@ class Echo(ADIntegrator):
             skipped: distance from the sonar to where each ray starts [m].
             edges: whether grazing edges of cells are traced (:func:`_meets`), as sums over footprints require.
             attached: whether echoes carry derivatives by ray, geometry and reflectance, along each ray: silhouettes do not
-                move, and traced edges do not either.
+                move.
         """
         hit = surfaces.hit(scene, ray, attached=attached)
         valid = hit.valid
@@ -104,7 +104,8 @@ class Echo(ADIntegrator):
         low, high = _interval(fan, hit, range_m)
         # At grazing incidence the tangent plane may leave the body, so trace the edges.
         if edges:
-            low, high = _meets(scene, ray, fan, hit, fan.below, low), _meets(scene, ray, fan, hit, fan.above, high)
+            low = _meets(scene, ray, fan, hit, fan.below, low, attached)
+            high = _meets(scene, ray, fan, hit, fan.above, high, attached)
         point = ray.o + ray.d * hit.t
 
         def masked(value: DeviceArray) -> DeviceArray:
@@ -197,7 +198,15 @@ def _interval(fan: Fan, hit: Hit, range_m: DeviceArray) -> tuple[DeviceArray, De
     return middle + slope * fan.below, middle + slope * fan.above
 
 
-def _meets(scene: mi.Scene, ray: mi.Ray3f, fan: Fan, hit: Hit, angle: DeviceArray, otherwise: DeviceArray) -> DeviceArray:
+def _meets(
+    scene: mi.Scene,
+    ray: mi.Ray3f,
+    fan: Fan,
+    hit: Hit,
+    angle: DeviceArray,
+    otherwise: DeviceArray,
+    attached: bool,
+) -> DeviceArray:
     """Return where a grazing edge of a cell meets the surface that its ray met [m], or else ``otherwise``.
 
     The point on the edge counts if the line to it lies within :data:`LEVEL` of the tangent plane. An edge is the same ray
@@ -206,10 +215,14 @@ def _meets(scene: mi.Scene, ray: mi.Ray3f, fan: Fan, hit: Hit, angle: DeviceArra
     direction = edge_direction(fan, angle)
     grazing = hit.valid & flatter(hit.n, ray.d, direction)
     coherent: DeviceArray = True
-    intersection = scene.ray_intersect_preliminary(mi.Ray3f(ray.o, direction, ray.time), coherent=coherent, active=grazing)
-    along: DeviceArray = direction * intersection.t - ray.d * hit.t
+    edge = mi.Ray3f(ray.o, direction, ray.time)
+    intersection = scene.ray_intersect_preliminary(edge, coherent=coherent, active=grazing)
+    valid, t = grazing & intersection.is_valid(), intersection.t
+    if attached:
+        t = intersection.compute_surface_interaction(edge, mi.RayFlags.Minimal, valid).t
+    along: DeviceArray = direction * t - ray.d * hit.t
     level = dr.abs(dr.dot(hit.n, along)) <= LEVEL * dr.norm(along)
-    return dr.select(grazing & intersection.is_valid() & level, intersection.t, otherwise)
+    return dr.select(valid & level, t, otherwise)
 
 
 mi.register_integrator("echo", Echo)

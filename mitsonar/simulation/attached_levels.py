@@ -1,64 +1,179 @@
-"""Sonar images with derivatives: the channels of the integrator ``echo``, binned as by the model ``physical``."""
+"""Expected levels of a ping with derivatives: its rays, and what edges sweep."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsonar.acoustics.levels import level
-from mitsonar.errors import MitsonarError
+from mitsonar.acoustics.water import sonar_absorption
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.records.echoes import CHANNELS, Echoes
+from mitsonar.plugins.echo_integrator import Echo
+from mitsonar.plugins.imaging_sonar_sensor import Fan
+from mitsonar.records.echoes import Echoes
+from mitsonar.simulation.beams import angles_of, beam_at, elevation_gain
 from mitsonar.simulation.device import DeviceArray
+from mitsonar.simulation.edges import EdgePieces, Edges, crossings, edges_of, pieces_of
+from mitsonar.simulation.models.physical import ExpectedFormer
+from mitsonar.simulation.models.thesis import footprint
+from mitsonar.simulation.tracing import Rays, Tracer
 
-__all__ = ["expected_levels"]
+__all__ = ["AttachedLevels"]
+
+ASIDE_RAD = 2e-6
+"""Angle between an edge and the rays on both of its sides [rad]."""
+
+NEARER = 1e-3
+"""Distance at which a ray beside an edge may hit, relative to that of the edge, without hiding it."""
+
+STEP = 1e-3
+"""Relative step of the difference that gives the derivative of beam patterns by their width."""
 
 
-def expected_levels(image: mi.TensorXf, sonar: Sonar) -> mi.TensorXf:
-    """Compute the expected levels of a sonar image from a rendering of its echoes, with the derivatives that it carries.
+@dataclass(frozen=True)
+class AttachedLevels:
+    """Levels of a scene at rest with derivatives, for one sonar of the model ``physical``.
 
-    The levels are those of ``Simulator`` in the model ``physical`` before the gain of the run: C cos dOmega / R^2 times the
-    gain over range, spread evenly over the ranges of each ray's cell. Derivatives are along rays; silhouettes stay.
-
-    Args:
-        image: result of ``mi.render`` with the integrator ``echo`` and an ``imaging_sonar`` ``(rows, columns, channels)``.
-        sonar: this sonar, from :func:`mitsonar.sonar_in`.
-
-    Returns:
-        Levels ``(bins, beams)``.
-
-    Raises:
-        MitsonarError: another model, a beam pattern, several reflections, or an image of another sonar or integrator.
+    Attributes:
+        scene: the scene.
+        sonar: the sonar.
+        edge_points: number of points on edges; 0 leaves edges out.
     """
-    from mitsonar.simulation.models.thesis import footprint  # needs a variant
 
-    # 1. Channels of the rays, in double precision.
-    shape = (sonar.rays_per_beam, sonar.columns, 1 + len(CHANNELS))
-    if sonar.model != "physical" or sonar.beam_pattern != "box" or sonar.bounces != 1:
-        raise MitsonarError(
-            f"levels with derivatives are those of the model physical without pattern and bounces: got model {sonar.model}, "
-            f"beam pattern {sonar.beam_pattern}, bounces {sonar.bounces}; load the scene with model=physical"
-        )
-    if tuple(image.shape) != shape:
-        raise MitsonarError(
-            f"the image must be (rays over elevation, rays across, channels of echo) = {shape}: got {tuple(image.shape)}; "
-            "render the sonar with the integrator echo and spp=1"
-        )
-    ray = dr.arange(mi.UInt32, shape[0] * shape[1])
-    values = {name: dr.gather(mi.Float, image.array, ray * shape[2] + (1 + k)) for k, name in enumerate(CHANNELS)}
-    echoes = Echoes(**{name: mi.Float64(value) for name, value in values.items()})
-    hit, beam = echoes.hit > 0, ray % sonar.columns // sonar.across
-    # 2. Density of each footprint, and its ends in the window.
-    begin, end, length = footprint(echoes, sonar)
-    density = dr.select(hit, level(echoes, sonar, dr.select) / length, 0)
-    # 3. A footprint is a step up at its begin and a step down at its end; their running sum is the share of each bin.
-    steps = dr.zeros(mi.Float64, (sonar.range_bins + 2) * sonar.beams)
-    for place, height in ((begin, density), (end, -density)):
-        inside: DeviceArray = dr.clip(place, 0, sonar.range_bins)
-        first, part = dr.floor(inside), inside - dr.floor(inside)
-        for offset, share in ((0, 1 - part), (1, part)):
-            where = (mi.UInt32(first) + offset) * sonar.beams + beam
-            dr.scatter_reduce(dr.ReduceOp.Add, steps, height * share, where, hit)
-    tensor: DeviceArray = dr.tensor_t(mi.Float64)
-    sums = dr.cumsum(tensor(steps, (sonar.range_bins + 2, sonar.beams)), axis=0)
-    return mi.TensorXf(mi.Float(sums.array), sums.shape)[: sonar.range_bins]
+    scene: mi.Scene
+    sonar: Sonar
+    edge_points: int
+
+    @cached_property
+    def former(self) -> ExpectedFormer | None:
+        """Return the operator of beam pattern and pulse; None without a pattern."""
+        return None if self.sonar.beam_pattern == "box" else ExpectedFormer(self.sonar)
+
+    @cached_property
+    def traced(self) -> Sonar:
+        """Return the sonar whose boxes are traced."""
+        return self.sonar if self.former is None else self.former.traced
+
+    @cached_property
+    def tracer(self) -> Tracer:
+        """Return the tracer of its rays."""
+        return Tracer(self.scene, self.traced)
+
+    @cached_property
+    def edges(self) -> list[Edges]:
+        """Return the edges of the scene."""
+        return edges_of(self.scene)
+
+    def levels(self, pose: list[mi.Float], ping: int, given: dict[str, mi.Float]) -> mi.TensorXf:
+        """Compute the levels ``(bins, beams)`` of a ping.
+
+        Args:
+            pose: x, y, z [m], pitch, roll, heading [rad].
+            ping: number of the ping, for the jitter.
+            given: properties of the instrument in place of those of the sonar.
+        """
+        lines = to_world(pose)
+        # 1. Trace one echo for each ray.
+        tracer, key = self.tracer, dr.opaque(mi.UInt32, self.tracer.sensor.key(ping))
+        rays = Rays(self.traced, Rays.numbered(self.traced, 1))
+        fan = tracer.sensor.fan(rays.column, rays.row, key).carried(lines)
+        ray = mi.Ray3f(mi.Point3f(*(line.w for line in lines)), fan.d)
+        echoes = Echo.measure(self.scene, tracer.surfaces, ray, fan, edges=True, attached=True)
+        steps = self._steps(echoes, fan.elevation, rays.beam, given)
+        # 2. Add what edges sweep, which is 0 and has derivatives.
+        if self.edge_points and dr.grad_enabled(echoes.range_m, echoes.cosine):
+            still = [dr.detach(line) for line in lines]
+            pieces = pieces_of(self.edges, self.traced, lines, self.edge_points)
+            for part in pieces + crossings(self.scene, tracer, lines, key):
+                steps += self._swept(part, still, given)
+        # 3. Each footprint is a step up at its begin and a step down at its end: their running sum is the share of each bin.
+        shape = (self.traced.range_bins + 2, self.traced.beams)
+        sums: DeviceArray = dr.cumsum(dr.tensor_t(mi.Float64)(steps, shape), axis=0)
+        boxes = mi.TensorXf(mi.Float(sums.array), shape)[: shape[0] - 2]
+        return self._formed(boxes, given)
+
+    def _steps(self, echoes: Echoes, elevation: DeviceArray, beam: DeviceArray, given: dict[str, mi.Float]) -> DeviceArray:
+        """Return densities of levels as steps ``(bins + 2, beams)``, flat: up where footprints begin, down at the end."""
+        sonar, stretch = self.traced, 1.0
+        if "sound_speed" in given:
+            stretch = sonar.sound_speed / mi.Float64(given["sound_speed"])
+        exact = Echoes(**{field.name: mi.Float64(getattr(echoes, field.name)) for field in fields(Echoes)})
+        begin, end, length = footprint(replace(exact, near_m=exact.near_m * stretch, far_m=exact.far_m * stretch), sonar)
+        gain = elevation_gain(self.sonar, dr.tan(elevation), given.get("elevation_fov_deg"))
+        density = dr.select(exact.hit > 0, level(exact, sonar, dr.select) * mi.Float64(gain * gain) / length, 0)
+        steps = dr.zeros(mi.Float64, (sonar.range_bins + 2) * sonar.beams)
+        for place, height in ((begin, density), (end, -density)):
+            inside: DeviceArray = dr.clip(place, 0, sonar.range_bins)
+            first, part = dr.floor(inside), inside - dr.floor(inside)
+            for offset, share in ((0, 1 - part), (1, part)):
+                where = (mi.UInt32(first) + offset) * sonar.beams + beam
+                dr.scatter_reduce(dr.ReduceOp.Add, steps, height * share, where, exact.hit > 0)
+        return steps
+
+    def _swept(self, pieces: EdgePieces, lines: list[mi.Vector4f], given: dict[str, mi.Float]) -> DeviceArray:
+        """Return the steps of what edges sweep: what lies on one side grows, and what lies on the other side shrinks."""
+        # 1. Cell of each piece in the fan.
+        sonar, middle = self.traced, pieces.direction
+        bearing, elevation = angles_of(sonar, -middle.x, middle.z, middle.y)
+        beam, inside = beam_at(sonar, bearing)
+        inside &= dr.abs(elevation) <= math.radians(sonar.elevation_fov_deg) / 2
+        # 2. Echoes on both sides. What lies at the edge has its range, so that rounding moves nothing to another bin.
+        origin, sides = mi.Point3f(*(line.w for line in lines)), []
+        for side in (-1, 1):
+            direction = dr.normalize(middle + pieces.across * (side * ASIDE_RAD))
+            zero, none = mi.Float(0), mi.Vector3f(0)
+            fan = Fan(direction, none, none, zero, zero, zero, mi.Float(1), elevation).carried(lines)
+            with dr.suspend_grad():
+                echoes = Echo.measure(self.scene, self.tracer.surfaces, mi.Ray3f(origin, fan.d), fan, attached=True)
+            behind = echoes.range_m - pieces.distance
+            inside &= (echoes.hit == 0) | (behind >= -NEARER * pieces.distance)
+            range_m = dr.select(behind > NEARER * pieces.distance, echoes.range_m, pieces.distance)
+            echoes = replace(echoes, range_m=range_m, near_m=range_m, far_m=range_m)
+            sides.append(replace(echoes, solid_angle_sr=-side * pieces.swept))
+        dr.eval(inside, beam, elevation, sides)  # smaller kernels compile faster
+        # 3. Their levels, by the solid angle that is swept.
+        one, other = (replace(echoes, hit=dr.select(inside, echoes.hit, 0)) for echoes in sides)
+        return self._steps(one, elevation, beam, given) + self._steps(other, elevation, beam, given)
+
+    def _formed(self, boxes: mi.TensorXf, given: dict[str, mi.Float]) -> mi.TensorXf:
+        """Apply pattern, pulse, losses and taper to levels in boxes."""
+        sonar, former, levels = self.sonar, self.former, boxes
+        # 1. Beam pattern and pulse; the sonar's absorption is part of the latter.
+        if former is not None:
+            pattern = mi.TensorXf(former.over_beams)
+            if "beam_width_deg" in given:
+                width = given["beam_width_deg"]
+                value = float(dr.detach(width)[0])
+                low, middle, high = (former.pattern_over_beams(value * (1 + step)) for step in (-STEP, 0, STEP))
+                slope = mi.TensorXf(np.asarray((high - low) / (2 * STEP * value), dtype=np.float32))
+                pattern = mi.TensorXf(middle) + slope * mi.TensorXf(width - dr.detach(width), shape=(1, 1))
+            levels = mi.TensorXf(former.over_bins) @ levels @ pattern
+        # 2. Losses by range, and taper across the fan.
+        if "absorption_db_per_m" in given:
+            more = given["absorption_db_per_m"] - (sonar_absorption(sonar) if former is not None else 0.0)
+            loss_db = mi.TensorXf((-2 * sonar.range_m).astype(np.float32)[:, None]) * mi.TensorXf(more, shape=(1, 1))
+            levels = levels * dr.exp(loss_db * (math.log(10) / 10))
+        if "taper_db" in given:
+            sine = np.square(np.sin(sonar.bearing_rad))
+            fall_db = mi.TensorXf((-sine / max(float(sine.max()), 1e-12)).astype(np.float32)[None])
+            levels = levels * dr.exp(fall_db * mi.TensorXf(given["taper_db"], shape=(1, 1)) * (math.log(10) / 10))
+        return levels
+
+
+def to_world(pose: list[mi.Float]) -> list[mi.Vector4f]:
+    """Return the first three rows of ``to_world`` of a pose, with derivatives."""
+    (sin_p, cos_p), (sin_r, cos_r), (sin_h, cos_h) = (dr.sincos(angle) for angle in pose[3:])
+
+    def turned(starboard: float, forward: float, up: float) -> tuple[DeviceArray, ...]:
+        # roll, starboard side down; pitch, bow down; heading, to starboard
+        x, z = cos_r * starboard + sin_r * up, cos_r * up - sin_r * starboard
+        y, z = cos_p * forward + sin_p * z, cos_p * z - sin_p * forward
+        return cos_h * x + sin_h * y, cos_h * y - sin_h * x, z
+
+    columns = [turned(-1, 0, 0), turned(0, 0, 1), turned(0, 1, 0), tuple(pose[:3])]  # +x port, +y up, +z forward
+    return [mi.Vector4f(*(column[row] for column in columns)) for row in range(3)]

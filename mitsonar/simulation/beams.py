@@ -453,15 +453,20 @@ def phasors(
 # ---------------- Pattern over elevation
 
 
-def elevation_gain(sonar: Sonar, tangent: DeviceArray) -> DeviceArray:
+def elevation_gain(sonar: Sonar, tangent: DeviceArray, fov_deg: DeviceArray = None) -> DeviceArray:
     """Return the amplitude of the pattern over elevation at a tangent of the elevation, a ``mi.Float``.
 
     The pattern is that of a uniform aperture with half power at the edges of the field of view, or 1 without a pattern.
+
+    Args:
+        sonar: the instrument.
+        tangent: tangent of the elevation.
+        fov_deg: field of view over elevation, with derivatives [deg]; default: that of the sonar.
     """
     pattern = sonar.vertical_pattern
     if pattern == "box":
         return mi.Float(1)
-    one_way = _one_way(sonar, tangent)
+    one_way = _one_way(sonar, tangent, fov_deg)
     return one_way * one_way if pattern == "two_way" else one_way
 
 
@@ -482,8 +487,10 @@ def elevation_gain_of_ends(sonar: Sonar, arrival: DeviceArray, departure: Device
     return gain * _one_way(sonar, departure) if pattern == "two_way" else gain
 
 
-def _one_way(sonar: Sonar, tangent: DeviceArray) -> DeviceArray:
+def _one_way(sonar: Sonar, tangent: DeviceArray, fov_deg: DeviceArray = None) -> DeviceArray:
     """Return the one-way amplitude sinc(x) of the uniform aperture at a tangent of the elevation."""
-    half = math.sin(math.radians(sonar.elevation_fov_deg) / 2)
+    half: DeviceArray = math.sin(math.radians(sonar.elevation_fov_deg) / 2)
+    if fov_deg is not None:
+        half = dr.sin(fov_deg * (math.pi / 360))
     x = tangent * dr.rsqrt(1 + tangent * tangent) * (ELEVATION_HALF[sonar.vertical_pattern] * math.pi / half)
     return dr.select(dr.abs(x) > 1e-4, dr.sin(x) / x, 1)

@@ -200,15 +200,21 @@ class ExpectedFormer:
     @cached_property
     def over_beams(self) -> NDArray[np.float32]:
         """Return the fraction of each box's level that each beam receives ``(boxes, beams)``."""
+        return self.pattern_over_beams()
+
+    def pattern_over_beams(self, beam_width_deg: float | None = None) -> NDArray[np.float32]:
+        """Compute the matrix of :attr:`over_beams`, for beams of another width or for those of the sonar."""
         # Sample each box evenly in angle, and weight by the derivative of the sine: the integral is over sines.
         sonar, traced = self.sonar, self.traced
         aperture, width = sonar.aperture, traced.beam_width_rad
+        if beam_width_deg is not None:
+            aperture = replace(aperture, width=math.radians(beam_width_deg))
         share = (np.arange(PARTS) + 0.5) / PARTS - 0.5
         line = np.sin(traced.bearing_rad[:, None] + share * width)
         slope = np.cos(traced.bearing_rad[:, None] + share * width)  # derivative of the sine by the angle
         away = np.sin(sonar.bearing_rad)[None, :, None] - line[:, None, :]
         power = (aperture.pattern(away) ** 2 * slope[:, None, :]).mean(axis=2)
-        return np.asarray(power * sonar.beam_width_rad / aperture.equivalent_width, dtype=np.float32)
+        return np.asarray(power * aperture.width / aperture.equivalent_width, dtype=np.float32)
 
     @cached_property
     def over_bins(self) -> NDArray[np.float32]:
