@@ -219,6 +219,9 @@ def mosaic(
     geometry: Geometry = None,
     noise: Noise = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
+    stored_height: Annotated[
+        bool, typer.Option("--stored-height", help="Side-scans: heights of the recording (default: by the first return).")
+    ] = False,
     declination: Annotated[
         float, typer.Option(help="Side-scans: magnetic declination to add to headings [deg], > 0 is east.")
     ] = 0.0,
@@ -241,10 +244,12 @@ def mosaic(
         of_frames = {"--view": view, "--geometry": geometry, "--noise": noise != "none", "--pitch-deg": pitch_deg}
         refuse_options(frames, {**of_frames, "--blend": blend != "weighted"})
         paths, _ = _paths(trajectory, true, frame)
-        lay_side_scan(scan, MosaicRequest(out, quality, paths, sequence, cell_mm, height, declination, flatten))
+        lay_side_scan(
+            scan, MosaicRequest(out, quality, paths, sequence, cell_mm, height, stored_height, declination, flatten)
+        )
         return
-    if declination:
-        raise MitsonarError(f"--declination applies only to side-scans: got {frames}; leave it out")
+    if declination or stored_height:
+        raise MitsonarError(f"--declination and --stored-height apply only to side-scans: got {frames}; leave them out")
     cell_mm = 10.0 if cell_mm is None else cell_mm
     options = MosaicOptions(cell_mm / 1e3, blend, centre_beams)  # type: ignore[arg-type]  # other words are refused
     paths, path_height = _paths(trajectory, true, frame)

@@ -64,7 +64,7 @@ def recordings() -> typer.Typer:
     app = typer.Typer(help="Show and convert recordings of real sonars, and runs.", no_args_is_help=True)
     for command in (
         info,
-        show,
+        answered(show, {"height_m": "--height"}),
         video,
         answered(convert, {"beams": "--beams", "crop_bins": "--crop-bins", "crop_beams": "--crop-beams"}),
     ):
@@ -118,7 +118,6 @@ def info(
         )
 
 
-@answered
 def show(
     file: File,
     out: Annotated[Path, typer.Option("-o", "--out", help="PNG to write.")],
@@ -133,6 +132,9 @@ def show(
     height: Annotated[
         float | None, typer.Option(help="Side-scans: height over the ground [m] (default: by the first return).")
     ] = None,
+    stored_height: Annotated[
+        bool, typer.Option("--stored-height", help="Side-scans: heights of the recording (default: by the first return).")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Draw one frame as a fan, or all pings of a side-scan as a waterfall, with axes in metres and a colour bar in dB."""
@@ -141,11 +143,19 @@ def show(
     scan = side_scan_at(file)
     if scan is not None:
         refuse_options(file, {"--frame": frame, "--topic": topic, "--geometry": geometry})
-        words = {"part": part, "span_db": span_db, "ground_range": ground_range, "height": height, "overwrite": overwrite}
-        show_side_scan(scan, out, **words)  # type: ignore[arg-type]
+        show_side_scan(
+            scan,
+            out,
+            part=part,
+            span_db=span_db,
+            ground_range=ground_range,
+            height=height,
+            stored_height=stored_height,
+            overwrite=overwrite,
+        )
         return
-    if ground_range or height is not None:
-        raise MitsonarError(f"--ground-range and --height apply only to side-scans: got {file}; leave them out")
+    if ground_range or stored_height or height is not None:
+        raise MitsonarError(f"--ground-range and heights apply only to side-scans: got {file}; leave them out")
     refuse_to_replace(out, overwrite=overwrite)
     recording = _opened(file, topic, geometry)
     frames = to_decibels(recording.part(part).read([frame]), span_db)

@@ -57,10 +57,11 @@ def show_side_scan(
     span_db: float,
     ground_range: bool,
     height: float | None,
+    stored_height: bool,
     overwrite: bool,
 ) -> None:
     """Draw a waterfall over slant range, with its first return, or over ground range."""
-    from mitsonar.geometry.side_scan import ground_lines, to_ground_range, track_bottom
+    from mitsonar.geometry.side_scan import ground_lines, to_ground_range
     from mitsonar.plotting.figures import ground_range_figure, save_sounding_figure, side_scan_figure
 
     refuse_to_replace(out, overwrite=overwrite)
@@ -68,19 +69,41 @@ def show_side_scan(
     echogram = recording.part(part).read()
     title = f"{recording.name}: {echogram.sounder.name}, {count_noun(len(echogram), 'ping')}"
     if ground_range:
-        height_m = np.full(len(echogram), height) if height is not None else track_bottom(echogram).height_m
+        height_m = _heights(echogram, height, stored=stored_height)
         figure = ground_range_figure(to_ground_range(echogram, height_m), span_db=span_db, title=title)
     else:
         try:
-            nearest_m = ground_lines(echogram.poses, height).nearest_m if height else track_bottom(echogram).range_m
+            nearest_m = ground_lines(echogram.poses, _heights(echogram, height, stored=stored_height)).nearest_m
         except MitsonarError as error:
-            if height:
+            if height is not None or stored_height:
                 raise
             warn(f"drawn without the first return: {error}")
             nearest_m = None
         figure = side_scan_figure(echogram, nearest_m, span_db=span_db, title=title)
     save_sounding_figure(figure, out)
     say(f"picture: {out}")
+
+
+def _heights(echogram: Echogram, height: float | None, *, stored: bool) -> NDArray[np.float64]:
+    """Return heights over the ground ``(pings,)`` [m]: the given one, those of the recording, or those by first returns.
+
+    Raises:
+        MitsonarError: both are requested, or the file states no heights, or no bottom can be tracked.
+    """
+    if height is not None and stored:
+        raise MitsonarError("--height and --stored-height exclude each other: leave one out")
+    if height is not None:
+        return np.full(len(echogram), height)
+    if stored:
+        known = np.flatnonzero(np.isfinite(echogram.height_m))
+        if not len(known):
+            raise MitsonarError(
+                "the recording states no height over the ground: leave out --stored-height, or give --height"
+            )
+        return np.interp(np.arange(len(echogram)), known, echogram.height_m[known])
+    from mitsonar.geometry.side_scan import track_bottom
+
+    return track_bottom(echogram).height_m
 
 
 def convert_side_scan(recording: SideScan, out: Path, *, part: int | None, overwrite: bool) -> None:
@@ -115,6 +138,7 @@ class MosaicRequest(NamedTuple):
         part: part of the recording.
         cell_mm: size of a cell [mm]; None for the default.
         height: height over the ground [m]; None to track the first return.
+        stored_height: whether heights are those of the recording.
         declination: angle to add to headings [deg].
         flatten: whether levels are made even over angles.
     """
@@ -125,24 +149,22 @@ class MosaicRequest(NamedTuple):
     part: int | None
     cell_mm: float | None
     height: float | None
+    stored_height: bool
     declination: float
     flatten: bool
 
 
 def lay_side_scan(recording: SideScan, request: MosaicRequest) -> None:
     """Build the mosaic of a side-scan, write it and print its size."""
-    from mitsonar.geometry.side_scan import track_bottom
     from mitsonar.mapping.mosaic import MosaicOptions, save_geotiff
     from mitsonar.mapping.side_scan_mosaic import CELL_M, build_side_scan_mosaic
     from mitsonar.motion.trajectory import Trajectory
 
     _say_notes(recording)
     echogram = _with_poses(recording.part(request.part).read(), request)
-    if request.height is None:
-        height_m = track_bottom(echogram).height_m
+    height_m = _heights(echogram, request.height, stored=request.stored_height)
+    if request.height is None and not request.stored_height:
         _say_height(echogram, height_m)
-    else:
-        height_m = np.full(len(echogram), request.height)
     options = MosaicOptions(cell_m=CELL_M if request.cell_mm is None else request.cell_mm / 1e3)
     with progress_bar("laying", len(echogram), "pings") as progress:
         ground_map = build_side_scan_mosaic(echogram, height_m, options, flatten=request.flatten, progress=progress)

@@ -42,7 +42,7 @@ LEAST_REACH_DB = 5.0
 NEIGHBOURS = 15
 """Number of pings over which the levels of water and bottom are taken."""
 
-STEP_COST = 1.0
+STEP_COST = 0.5
 """Cost of a change of the first return by one bin from ping to ping, in bins of contrary evidence."""
 
 LEAST_CONTRAST = 0.25
@@ -133,7 +133,9 @@ def _track(level: Floats, water_db: Array, bottom_db: Array, share: float, behin
     # 2. evidence of a first return at the lower edge of every bin
     total = np.zeros((len(level), evidence.shape[1] + 1), np.float32)
     np.cumsum(evidence, axis=1, out=total[:, 1:])
-    place = _best_path(total[:, behind:] - 2 * total[:, :-behind])
+    window = total[:, behind:] - total[:, :-behind]
+    dead = window.max(axis=1) <= 0  # pings without any bottom have no say
+    place = _best_path(np.where(dead[:, None], 0, window - total[:, :-behind]))
     # 3. contrast of the bins behind the first return and before it
     rows, near = np.arange(len(place)), np.maximum(place - behind, 0)
     bright = (total[rows, place + behind] - total[rows, place]) / behind

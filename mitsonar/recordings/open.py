@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, count_noun
+from mitsonar.recordings.jsf import is_jsf, read_jsf
 from mitsonar.recordings.oculus import is_oculus, read_oculus
 from mitsonar.recordings.pictures import (
     holds_pictures,
@@ -120,6 +121,7 @@ class SideScanFormat(NamedTuple):
 
 SIDE_SCANS: tuple[SideScanFormat, ...] = (
     SideScanFormat("XTF (.xtf)", is_xtf, read_xtf),
+    SideScanFormat("JSF (.jsf)", is_jsf, read_jsf),
     SideScanFormat("echograms of mitsonar (.npz, folders of runs)", holds_echogram, read_echogram),
 )
 """All formats of side-scans, in the order in which they are tried."""
@@ -187,7 +189,7 @@ def open_side_scan(path: str | Path) -> SideScan:
     """Open a recording of a side-scan sonar, real or simulated; samples are read part by part.
 
     Args:
-        path: an XTF file, the echogram of a simulated side-scan, or the folder of its run (docs/guides/side-scan.md).
+        path: an XTF or JSF file, the echogram of a simulated side-scan, or the folder of its run (docs/guides/side-scan.md).
 
     Raises:
         MitsonarError: if the path does not exist, has no known format, is damaged, or holds no pings of both sides.
@@ -212,8 +214,8 @@ Summary: TypeAlias = dict[str, Any]
 GAP_RATIO = 2.5
 """A time step between frames counts as a gap if it exceeds this multiple of the median step."""
 
-DATES_FROM_S = 946_684_800.0
-"""Times from this one on are shown as dates: 2000-01-01 [s since 1970]."""
+DATES_FROM_S, DATES_TO_S = 946_684_800.0, 32_503_680_000.0
+"""Times from the first to the second are shown as dates: 2000-01-01 to 3000-01-01 [s since 1970]."""
 
 
 def summary_of(recording: Recording | SideScan) -> Summary:
@@ -365,7 +367,7 @@ def _part_rows(part: Summary) -> list[tuple[str, str]]:
 
 def _format_time(time_s: float) -> str:
     """Format a time: as a date in UTC if it is one, otherwise in seconds."""
-    if time_s < DATES_FROM_S:
+    if not DATES_FROM_S <= time_s < DATES_TO_S:
         return f"{time_s:.6g} s"
     return datetime.fromtimestamp(time_s, UTC).isoformat(sep=" ", timespec="milliseconds").removesuffix("+00:00")
 

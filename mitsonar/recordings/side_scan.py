@@ -61,6 +61,12 @@ VELOCITY_S = 5.0
 SHORTEST_TRACK_M = 1.0
 """A track must be longer than this to give a course."""
 
+LEAST_COURSE_M = 20.0
+"""A track must be longer than this for its course to be compared with headings."""
+
+UNUSUAL_DRIFT_DEG = 10.0
+"""Mean difference of course and heading from which a note mentions it."""
+
 
 @dataclass(frozen=True)
 class SideScanPart:
@@ -162,6 +168,8 @@ def read_echogram(path: Path) -> SideScan:
     echogram = Echogram.load(path / ECHOGRAM if os.path.isdir(path) else path)
     if echogram.sounder.kind != "sidescan":
         raise MitsonarError(f"{path} is the echogram of a {echogram.sounder.kind}, not of a side-scan")
+    if (np.diff(echogram.time_s) <= 0).any():
+        raise MitsonarError(f"{path} has pings that are not in order of time: it is damaged")
     part = SideScanPart(
         echogram.time_s,
         echogram.poses,
@@ -250,8 +258,10 @@ def place_pings(pings: PingHeaders) -> Placed:
     if heading is None:
         heading = _course(time_s, xy)
         notes.append("the file states no heading: headings are the course of the track")
-    elif origin is not None and len(rows):
-        heading = heading - origin.convergence_rad(origin.to_degrees(xy[:1]))[0]
+    else:
+        if origin is not None and len(rows):
+            heading = heading - origin.convergence_rad(origin.to_degrees(xy[:1]))[0]
+        notes += _heading_note(time_s, xy, heading)
     pitch, roll, depth = (
         np.zeros(len(rows)) if (values := _filled(stated[rows])) is None else values
         for stated in (-np.radians(pings.pitch_deg), np.radians(pings.roll_deg), pings.depth_m)
@@ -344,6 +354,20 @@ def _course(time_s: Array, xy: Array) -> Array:
     ahead, behind = (np.column_stack([np.interp(time_s + dt, time_s, one) for one in xy.T]) for dt in (half, -half))
     east, north = (ahead - behind).T
     return np.unwrap(np.arctan2(east, north))
+
+
+def _heading_note(time_s: Array, xy: Array, heading: Array) -> list[str]:
+    """Return a sentence if headings differ much from the course of the track."""
+    if len(xy) < 2 or np.linalg.norm(np.ptp(xy, axis=0)) < LEAST_COURSE_M:
+        return []
+    difference = np.angle(np.exp(1j * (_course(time_s, xy) - heading)))
+    middle = float(np.degrees(np.angle(np.exp(1j * difference).mean())))
+    if abs(middle) < UNUSUAL_DRIFT_DEG:
+        return []
+    return [
+        f"the track lies {middle:+.0f} deg from the headings in the mean: they may be magnetic (mosaic --declination), or a "
+        "current sets the vehicle"
+    ]
 
 
 def _filled(values: Array, turns: bool = False) -> Array | None:

@@ -308,24 +308,26 @@ def _sides(view: memoryview, at: int, size: int, count: int, channels: list[Chan
 def _ping_headers(table: Header, *, in_degrees: bool) -> tuple[PingHeaders, list[str]]:
     """Return what the headers ``(pings,)`` state, and sentences on what was assumed."""
     notes = []
-    # 1. positions: the sonar's, or the ship's where the file has none of the sonar
+    names = ("heading_deg", "pitch_deg", "roll_deg", "depth_m")
+    without_attitude = np.all([table[name] == 0 for name in names], axis=0)
+    # 1. positions: the sonar's, or the ship's where the file has none of the sonar; zeros are none, except in local metres
     sonar, ship = (np.column_stack([table[f"{whose}y"], table[f"{whose}x"]]) for whose in ("", "ship_"))
-    position = np.where((sonar != 0).any(axis=1)[:, None], sonar, np.nan)
-    if not np.isfinite(position).any() and (ship != 0).any():
-        position = np.where((ship != 0).any(axis=1)[:, None], ship, np.nan)
+    if not (sonar != 0).any() and (ship != 0).any():
+        sonar = ship
         notes.append("positions are those of the ship")
+    zero = (sonar == 0).all(axis=1)
+    without = zero if in_degrees or zero.all() else zero & without_attitude
+    position = np.where(without[:, None], np.nan, sonar)
     if (table["layback_m"] != 0).any():
         notes.append("the file states a layback, which positions do not include")
-    without = ~np.isfinite(position).all(axis=1)
-    position[without] = np.nan
     # 2. sensors: a ping without a position and without any attitude states nothing; a column of zeros states nothing
-    names = ("heading_deg", "pitch_deg", "roll_deg", "depth_m")
-    silent = without & np.all([table[name] == 0 for name in names], axis=0)
-    values = {name: np.where(silent | ~(np.abs(table[name]) < 1e5), np.nan, table[name]).astype(float) for name in names}
+    silent = without & without_attitude
+    values = {name: _floats(table, name) for name in names}
+    values = {name: np.where(silent | ~(np.abs(stated) < 1e5), np.nan, stated) for name, stated in values.items()}
     if not np.nansum(np.abs(values["heading_deg"])):
-        gyro = table["gyro_deg"].astype(float)
+        gyro = _floats(table, "gyro_deg")
         values["heading_deg"] = np.where((np.abs(gyro) < 1e5) & (gyro != 0).any(), gyro, np.nan)
-    first, second = table["altitude_m"].astype(float), table["second_altitude_m"].astype(float)
+    first, second = _floats(table, "altitude_m"), _floats(table, "second_altitude_m")
     height_m = np.where(first > 0, first, second)
     return (
         PingHeaders(
@@ -340,6 +342,12 @@ def _ping_headers(table: Header, *, in_degrees: bool) -> tuple[PingHeaders, list
         ),
         notes,
     )
+
+
+def _floats(table: Header, name: str) -> Array:
+    """Return a field of headers as doubles; nan of damaged bytes may be of the kind that signals."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(table[name].astype(np.float64))
 
 
 def _times(table: Header) -> Array:
@@ -360,7 +368,7 @@ def _sound_speed(table: Header) -> tuple[float, list[str]]:
 
     The field holds half of the sound speed by the format, since echoes go there and back; some programs store all of it.
     """
-    stated, computed = table["half_sound_speed"].astype(float), table["sound_speed"].astype(float)
+    stated, computed = _floats(table, "half_sound_speed"), _floats(table, "sound_speed")
     low, high = SOUND_SPEEDS
     for candidates in (np.where(stated < high / 2, 2 * stated, stated), computed):
         plausible = candidates[(candidates >= low) & (candidates <= high)]
@@ -378,8 +386,8 @@ def _band(
     """Return the pings of a pair of channels."""
     raw = b"".join(data[line.port.header : line.port.header + PING_CHANNEL.itemsize].tobytes() for line in lines)
     table = np.frombuffer(raw, PING_CHANNEL)
-    slant, delay = table["slant_range_m"].astype(float), table["delay_s"].astype(float)
-    duration = np.where((table["duration_s"] > 0) & (table["duration_s"] < 1e3), table["duration_s"], np.nan)
+    slant, delay, duration = (_floats(table, name) for name in ("slant_range_m", "delay_s", "duration_s"))
+    duration = np.where((duration > 0) & (duration < 1e3), duration, np.nan)
     far = np.where((slant > 0) & (slant <= 1e5), slant, np.nan_to_num(duration * sound_speed / 2))
     near = np.where((delay > 0) & (delay < 1e3), delay, 0) * sound_speed / 2
     near = np.where(near < far, near, 0.0)
@@ -433,9 +441,9 @@ class _Samples:
             for row, ping in enumerate(pings):
                 at = int(self.begin[ping, side])
                 raw = np.frombuffer(self.data[at : at + bins * kind.itemsize].tobytes(), kind)
-                levels[row, side] = np.abs(raw.astype(np.float64))
-                if kind.kind == "f" and not (levels[row, side] < LARGEST_SAMPLE).all():
+                if kind.kind == "f" and not (np.abs(raw) < LARGEST_SAMPLE).all():
                     raise MitsonarError(f"ping {ping} has samples that are no finite amplitudes: the file is damaged")
+                levels[row, side] = np.abs(raw.astype(np.float64))
             levels[:, side] = np.square(levels[:, side] / np.float32(channel.full_scale))
         levels[:, 0] = levels[:, 0, ::-1]  # port is stored from its outermost sample inwards
         return levels

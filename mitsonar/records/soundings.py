@@ -232,8 +232,10 @@ class Echogram:
         """
         sounder, arrays = load_pings(path, ("levels", "height_m"), constants=("origin",))
         levels, height_m = arrays["levels"].astype(np.float32, copy=False), arrays["height_m"]
-        if height_m.ndim != 1 or not np.isfinite(levels).all() or (levels < 0).any():
-            raise MitsonarError(f"{path} is damaged: levels must be finite and not negative, with one height a ping")
+        if height_m.ndim != 1 or (height_m <= 0).any() or not np.isfinite(levels).all() or (levels < 0).any():
+            raise MitsonarError(
+                f"{path} is damaged: levels must be finite and not negative, with one height above 0 or nan for each ping"
+            )
         origin = None
         if "origin" in arrays:
             if arrays["origin"].shape != (4,):
@@ -434,7 +436,8 @@ def load_pings(
     except MitsonarError:
         raise
     except Exception as error:  # damaged bytes raise many types of errors
-        raise MitsonarError(f"cannot read {path}: {error}; give a file that `mitsonar sound` wrote") from None
+        reason = " ".join(str(error).split())[:160]
+        raise MitsonarError(f"cannot read {path}: {reason}; give a file that `mitsonar sound` wrote") from None
     missing = [name for name in (*names, "sounder", "time_s", "poses") if name not in table]
     if missing:
         raise MitsonarError(f"{path} lacks {missing[0]}: give a file that `mitsonar sound` wrote")
@@ -449,6 +452,8 @@ def load_pings(
             raise MitsonarError(f"{path} is damaged: {name} must be {pings} rows of numbers")
     if arrays["poses"].shape != (pings, 6) or not pings:
         raise MitsonarError(f"{path} is damaged: poses must be (pings, 6), got {arrays['poses'].shape}")
+    if not (np.isfinite(arrays["poses"]).all() and np.isfinite(arrays["time_s"]).all()):
+        raise MitsonarError(f"{path} is damaged: poses and times must be finite")
     for name in set(constants) & set(table):
         if table[name].dtype.kind != "f" or not np.isfinite(table[name]).all():
             raise MitsonarError(f"{path} is damaged: {name} must be finite numbers")
