@@ -43,6 +43,9 @@ ANGLES = 90
 FLATTENING_PINGS = 2000
 """Number of pings, spread over the recording, that determine the level at each angle."""
 
+LEAST_PINGS = 0.1
+"""Share of these pings, on both sides, that must have echoes at an angle."""
+
 LARGEST_REACH = 1e6
 """Positions are at most so far from each other [m]."""
 
@@ -145,23 +148,33 @@ class _Levels:
         return np.arccos(np.clip(sine, 0, 1)) * (2 / np.pi * ANGLES) - 0.5
 
     def _median_over_angles(self) -> Array:
-        """Return the median level at each angle ``(2, ANGLES)``, less the median of all."""
+        """Return the median level at each angle ``(2, ANGLES)``, less the median of all.
+
+        Both sides share one curve, so that the shadow of a long object on one side does not bend it, and differ by a
+        constant. Levels of 0 are no echoes, and do not count. An angle with few echoes takes the level of its neighbours.
+        """
         some = range(0, len(self.level), max(1, len(self.level) // FLATTENING_PINGS))
-        values: list[list[Floats]] = [[] for _ in range(ANGLES)]
         slant = self.near + (np.arange(self.bins) + 0.5) * self.step
-        for ping in some:
+        values = np.full((len(some), 2, ANGLES), np.nan)
+        for row, ping in enumerate(some):
             first = int(np.searchsorted(slant, self.nearest_m[ping]))
-            place = np.clip(np.rint(self._angle_index(self.nearest_m[ping] / slant[first:])), 0, ANGLES - 1)
-            edges = np.searchsorted(place, np.arange(ANGLES + 1))  # angles grow with range
+            place = np.rint(self._angle_index(self.nearest_m[ping] / slant[first:]))
+            edges = first + np.searchsorted(place, np.arange(ANGLES + 1))  # angles grow with range
             for angle in range(ANGLES):
-                if edges[angle] < edges[angle + 1]:
-                    values[angle].append(
-                        np.median(self.level[ping, :, first + edges[angle] : first + edges[angle + 1]], axis=1)
-                    )
-        known = [angle for angle in range(ANGLES) if values[angle]]
-        medians = np.array([np.median(values[angle], axis=0) for angle in known]).T
-        profile = np.stack([np.interp(np.arange(ANGLES), known, side) for side in medians])
-        return np.asarray(profile - np.median(medians))
+                for side, level in enumerate(self.level[ping, :, edges[angle] : edges[angle + 1]]):
+                    echoes = level[level > 0]
+                    if echoes.size:
+                        values[row, side, angle] = np.median(echoes)
+        known = np.flatnonzero(np.isfinite(values).sum(axis=(0, 1)) >= LEAST_PINGS * 2 * len(some))
+        if not len(known):
+            return np.zeros((2, ANGLES))
+        both = np.nanmedian(values[:, :, known], axis=(0, 1))
+        profile = np.tile(np.interp(np.arange(ANGLES), known, both) - np.median(both), (2, 1))
+        for side in range(2):
+            difference = values[:, side, known] - both
+            if np.isfinite(difference).any():
+                profile[side] += np.nanmedian(difference)
+        return profile
 
 
 def _followed(lines: GroundLines, heading: Array) -> NDArray[np.bool_]:

@@ -289,7 +289,7 @@ def _side_scan_summary(part: SideScanPart) -> Summary:
             name: _limits(np.degrees(values))
             for name, values in zip(("pitch_deg", "roll_deg", "heading_deg"), attitude.T, strict=True)
         },
-        "depth_m": _limits(-part.poses[:, 2]),
+        "depth_m": _limits(-part.poses[:, 2]) if (part.poses[:, 2] < 0).any() else None,
         "height_m": _limits(part.height_m),
         "path_m": float(np.linalg.norm(np.diff(part.poses[:, :3], axis=0), axis=1).sum()),
     }
