@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -164,3 +166,41 @@ def jsf_file(pings: int = 5, samples: int = 30, **fields: Any) -> bytes:
         }  # fmt: skip
         parts += [jsf_trace(counts * (1 + side), channel=side, **(common | fields)) for side in (0, 1)]
     return b"".join(parts)
+
+
+def pingverter_folder(folder: Path, echogram: Echogram, *, reversed_port: bool = False) -> None:
+    """The files that PINGVerter 2.1 writes from a log of 8 bits, by their published code."""
+    folder.mkdir(parents=True)
+    amplitude = np.sqrt(echogram.levels / echogram.levels.max())
+    counts = np.rint(255 * amplitude).astype("<u2") * 257
+    if reversed_port:
+        counts[:, 0] = counts[:, 0, ::-1].copy()
+    origin = echogram.origin or UtmOrigin(16, False, 5e5, 4e6)
+    degrees = origin.to_degrees(echogram.poses[:, :2])
+    heading = np.degrees(echogram.poses[:, 5] + origin.convergence_rad(degrees))
+    fan, size = echogram.sounder.fan, counts[0, 0].nbytes
+    frames = []
+    for ping in range(len(echogram)):
+        sides = [
+            {
+                "channelId": channel, "sampleOffset": (2 * ping + side) * size, "sampleCount": fan.range_bins,
+                "byteLength": size, "minRangeMeters": 0, "maxRangeMeters": fan.range_max,
+                "bottomDepthMeters": float(echogram.height_m[ping]),
+            }
+            for side, channel in enumerate((2, 3))
+        ]  # fmt: skip
+        frames.append(
+            {
+                "frameIndex": ping, "sequenceCount": ping, "timeSeconds": float(echogram.time_s[ping]),
+                "lat": degrees[ping, 0], "lon": degrees[ping, 1], "headingDegrees": heading[ping], "channels": sides,
+            }
+        )  # fmt: skip
+    listed = [
+        {"channelId": channel, "orientation": side, "startFrequencyHz": 455, "endFrequencyHz": 455}
+        for channel, side in ((2, "Port"), (3, "Starboard"))
+    ]
+    samples = {"path": "samples.u16le", "encoding": "uint16-le"}
+    manifest = {"formatVersion": 2, "frames": "frames.jsonl", "samples": samples, "channels": listed}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    (folder / "frames.jsonl").write_text("".join(json.dumps(frame) + "\n" for frame in frames))
+    (folder / "samples.u16le").write_bytes(counts.tobytes())

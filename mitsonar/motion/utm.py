@@ -1,7 +1,7 @@
 """How do latitudes and longitudes become metres, east and north? By Universal Transverse Mercator (UTM) on WGS 84.
 
 Source: Karney, Transverse Mercator with an accuracy of a few nanometers, J. Geodesy 85 (2011), 475-485: the series of
-Krueger to the fourth order in the third flattening, which are exact to a micrometre within a zone.
+Krueger to the fourth order in the third flattening, which are good to some micrometres within a zone.
 """
 
 from __future__ import annotations

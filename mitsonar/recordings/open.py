@@ -25,6 +25,7 @@ from mitsonar.recordings.pictures import (
     read_picture_stack,
     read_picture_video,
 )
+from mitsonar.recordings.pingverter import is_pingverter, read_pingverter
 from mitsonar.recordings.public_sets import is_canoe, is_neusis, is_uxo, read_canoe, read_neusis, read_uxo
 from mitsonar.recordings.recording import Part, Recording
 from mitsonar.recordings.ros_messages import is_ros_bag
@@ -122,6 +123,7 @@ class SideScanFormat(NamedTuple):
 SIDE_SCANS: tuple[SideScanFormat, ...] = (
     SideScanFormat("XTF (.xtf)", is_xtf, read_xtf),
     SideScanFormat("JSF (.jsf)", is_jsf, read_jsf),
+    SideScanFormat("folders of PINGVerter", is_pingverter, read_pingverter),
     SideScanFormat("echograms of mitsonar (.npz, folders of runs)", holds_echogram, read_echogram),
 )
 """All formats of side-scans, in the order in which they are tried."""
@@ -189,7 +191,8 @@ def open_side_scan(path: str | Path) -> SideScan:
     """Open a recording of a side-scan sonar, real or simulated; samples are read part by part.
 
     Args:
-        path: an XTF or JSF file, the echogram of a simulated side-scan, or the folder of its run (docs/guides/side-scan.md).
+        path: an XTF or JSF file, a folder of PINGVerter, the echogram of a simulated side-scan, or the folder of its run
+            (docs/guides/side-scan.md).
 
     Raises:
         MitsonarError: if the path does not exist, has no known format, is damaged, or holds no pings of both sides.

@@ -33,8 +33,8 @@ CHANNEL = layout(
 FILE = layout(
     {
         "format": (0, "u1"), "system": (1, "u1"), "program": (2, "S8"), "version": (10, "S8"), "sonar": (18, "S16"),
-        "note": (36, "S64"), "file": (100, "S64"), "nav_units": (164, "<u2"), "sonar_channels": (166, "<u2"),
-        "other_channels": (168, "3<u2"),
+        "sensor": (34, "<u2"), "note": (36, "S64"), "file": (100, "S64"), "nav_units": (164, "<u2"),
+        "sonar_channels": (166, "<u2"), "bathymetry_channels": (168, "<u2"),
     },
     256,
 )  # fmt: skip
@@ -59,6 +59,7 @@ PING_CHANNEL = layout(
     {
         "channel": (0, "<u2"), "slant_range_m": (4, "<f4"), "delay_s": (12, "<f4"), "duration_s": (16, "<f4"),
         "ping_s": (20, "<f4"), "frequency_khz": (26, "<u2"), "samples": (42, "<u4"), "millivolts": (46, "<u2"),
+        "weight": (58, "<i2"),
     },
     64,
 )  # fmt: skip

@@ -67,7 +67,13 @@ FORMATS = {2: "<i4", 3: "<i2", 5: "<f4", 8: "i1"}
 FULL_SCALES = {1: 255.0, 2: float(FULL_COUNT), 4: float(2**31 - 1)}
 """Count of full scale for integers of so many bytes; floats count as they are."""
 
-LARGEST_SAMPLE = 1e15
+WEIGHTED = (24, 35, 38, 48)
+"""Sonars, by their code in the file header, whose samples are scaled by 2^-N with a weight N in each channel's header."""
+
+MOST_WEIGHT = 30
+"""Larger weights are damage, and are ignored."""
+
+LARGEST_SAMPLE = 1e8
 """Amplitudes of floats must stay below this."""
 
 
@@ -111,7 +117,8 @@ def read_xtf(path: Path) -> SideScan:
     name = " ".join(_text(head[key]) for key in ("program", "sonar")).strip()
     parts: list[SideScanPart] = []
     for pair, lines in packets.pairs.items():
-        parts += parts_of(_band(data, channels, pair, lines, name, sound_speed), placed)
+        band = _band(data, channels, pair, lines, name, sound_speed, weighted=int(head["sensor"]) in WEIGHTED)
+        parts += parts_of(band, placed)
     facts: Facts = {"recorded by": " ".join(_text(head[key]) for key in ("program", "version")), **placed.facts}
     if note := _text(head["note"]):
         facts["text"] = note
@@ -159,7 +166,7 @@ def _channels(data: Bytes, head: np.void, name: str) -> tuple[list[Channel], int
     Raises:
         MitsonarError: if there are no channels, too many, or more than the file can hold.
     """
-    count = int(head["sonar_channels"]) + int(head["other_channels"].astype(int).sum())
+    count = int(head["sonar_channels"]) + int(head["bathymetry_channels"])
     steps = max(0, -(-(count - CHANNELS_IN_HEADER) // CHANNELS_IN_STEP))
     start = HEADER_BYTES * (1 + steps)
     if not 1 <= count <= MOST_CHANNELS or start > len(data):
@@ -381,11 +388,19 @@ def _sound_speed(table: Header) -> tuple[float, list[str]]:
 
 
 def _band(
-    data: Bytes, channels: list[Channel], pair: tuple[int, int], lines: list[Line], name: str, sound_speed: float
+    data: Bytes,
+    channels: list[Channel],
+    pair: tuple[int, int],
+    lines: list[Line],
+    name: str,
+    sound_speed: float,
+    *,
+    weighted: bool,
 ) -> Band:
     """Return the pings of a pair of channels."""
-    raw = b"".join(data[line.port.header : line.port.header + PING_CHANNEL.itemsize].tobytes() for line in lines)
-    table = np.frombuffer(raw, PING_CHANNEL)
+    table, starboard = (_channel_headers(data, [getattr(line, side) for line in lines]) for side in ("port", "starboard"))
+    weight = np.column_stack([table["weight"], starboard["weight"]]) * weighted
+    weight[np.abs(weight) > MOST_WEIGHT] = 0
     slant, delay, duration = (_floats(table, name) for name in ("slant_range_m", "delay_s", "duration_s"))
     duration = np.where((duration > 0) & (duration < 1e3), duration, np.nan)
     far = np.where((slant > 0) & (slant <= 1e5), slant, np.nan_to_num(duration * sound_speed / 2))
@@ -402,13 +417,19 @@ def _band(
         range_min=near[usable],
         range_max=far[usable],
         frequency_hz=np.where(stated < HERTZ_FROM, 1e3 * stated, stated)[usable],
-        levels=_Samples(data, begin[usable], samples[usable], (channels[pair[0]], channels[pair[1]])),
+        levels=_Samples(data, begin[usable], samples[usable], weight[usable], (channels[pair[0]], channels[pair[1]])),
         name=name,
         sound_speed=sound_speed,
         azimuth_fov_deg=along,
         elevation_fov_deg=across,
         tilt_deg=tilt,
     )
+
+
+def _channel_headers(data: Bytes, sides: list[Side]) -> Header:
+    """Return the headers of channels ``(n,)``."""
+    raw = b"".join(data[one.header : one.header + PING_CHANNEL.itemsize].tobytes() for one in sides)
+    return np.frombuffer(raw, PING_CHANNEL)
 
 
 @dataclass(frozen=True)
@@ -419,12 +440,14 @@ class _Samples:
         data: the whole file.
         begin: offsets of the port and starboard samples ``(n, 2)`` [bytes].
         samples: number of samples of a side ``(n,)``.
+        weight: exponents N of a scale 2^-N ``(n, 2)``.
         sides: the channels.
     """
 
     data: Bytes
     begin: NDArray[np.int64]
     samples: NDArray[np.int64]
+    weight: NDArray[np.int16]
     sides: tuple[Channel, Channel]
 
     def __call__(self, pings: Index) -> Levels:
@@ -443,7 +466,7 @@ class _Samples:
                 raw = np.frombuffer(self.data[at : at + bins * kind.itemsize].tobytes(), kind)
                 if kind.kind == "f" and not (np.abs(raw) < LARGEST_SAMPLE).all():
                     raise MitsonarError(f"ping {ping} has samples that are no finite amplitudes: the file is damaged")
-                levels[row, side] = np.abs(raw.astype(np.float64))
-            levels[:, side] = np.square(levels[:, side] / np.float32(channel.full_scale))
-        levels[:, 0] = levels[:, 0, ::-1]  # port is stored from its outermost sample inwards
+                scale = 2.0 ** -float(self.weight[ping, side]) / channel.full_scale
+                levels[row, side] = np.square(raw.astype(np.float64) * scale)
+        levels[:, 0] = levels[:, 0, ::-1].copy()  # port is stored from its outermost sample inwards
         return levels

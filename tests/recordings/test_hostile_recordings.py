@@ -19,7 +19,16 @@ from drawn_frames import over_ground, sway
 from helpers import essence
 from hostile_readers import Reader, attack, read_recording
 from mutations import Rng, changed_bytes, changed_text, outcome
-from recording_files import aris_file, didson_file, jsf_file, oculus_log, oculus_ping, side_scan_echogram, some_pings
+from recording_files import (
+    aris_file,
+    didson_file,
+    jsf_file,
+    oculus_log,
+    oculus_ping,
+    pingverter_folder,
+    side_scan_echogram,
+    some_pings,
+)
 
 from mitsonar import MitsonarError, open_recording
 from mitsonar.instruments.sonar import Sonar
@@ -68,6 +77,7 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "ros 2 bag, mcap": lambda folder: _bag(folder / "a_mcap"),
     "xtf": lambda folder: write_xtf(folder / "a.xtf", side_scan_echogram(origin=UtmOrigin(19, False, 512724.0, 5365826.0))),
     "jsf": lambda folder: (folder / "a.jsf").write_bytes(jsf_file()),
+    "pingverter": lambda folder: pingverter_folder(folder / "log", side_scan_echogram()),
     "mcap of a run": lambda folder: write_mcap([over_ground(sway(3), SMALL)], folder / "a.mcap"),
 }
 """What writes a small recording of each format into an empty folder: one file, or one folder of files."""

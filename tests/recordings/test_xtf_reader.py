@@ -269,6 +269,34 @@ def test_samples_of_every_type(tmp_path: Path, kind: str, code: int, unipolar: i
     np.testing.assert_allclose(levels[3, 0], levels[3, 1, ::-1])
 
 
+def test_weights_scale_the_samples_of_some_sonars(tmp_path: Path) -> None:
+    """EdgeTech's: 2^-N for each ping; of other sonars the field means nothing."""
+    file = Changed(tmp_path)
+    plain = file.open().part().read().levels
+    file.headers(range(3), weight=2).headers(range(3, 6), weight=-1)
+    np.testing.assert_array_equal(file.open().part().read().levels, plain)
+    scaled = file.file(sensor=38).open().part().read().levels
+    np.testing.assert_allclose(scaled[:3], plain[:3] / 16, rtol=1e-6)
+    np.testing.assert_allclose(scaled[3:], plain[3:] * 4, rtol=1e-6)
+
+
+def test_more_than_six_channels_enlarge_the_header(tmp_path: Path) -> None:
+    """Port and starboard behind six other channels; samples of the others are not in the pings."""
+    file = Changed(tmp_path)
+    described = bytes(file.data[256 : 256 + 2 * 128])
+    others = bytes(6 * 128)
+    header = bytes(file.data[:256]) + others + described
+    pings = bytearray(file.data[1024:])
+    for ping in range(6):
+        for side in range(2):
+            at = ping * file.size + 256 + side * 144
+            pings[at : at + 2] = struct.pack("<H", 6 + side)
+    file.data = bytearray(header.ljust(2048, b"\0") + pings)
+    recording = file.file(sonar_channels=8).open()
+    assert len(recording) == 6
+    assert not recording.notes
+
+
 def test_what_is_no_side_scan_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="holds no ping with port and starboard"):
         Changed(tmp_path).channels(type=0).open()
