@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 __all__ = ["MosaicRequest", "convert_side_scan", "lay_side_scan", "refuse_options", "show_side_scan", "side_scan_at"]
 
 
+CLOCK_S = 0.02
+"""Pings so far beyond a path belong to it still, since clocks of files tick in steps of 10 ms [s]."""
+
+
 def side_scan_at(file: str) -> SideScan | None:
     """Open a side-scan recording; None if the path is something else."""
     if "://" in file:
@@ -191,7 +195,7 @@ def _with_poses(echogram: Echogram, request: MosaicRequest) -> Echogram:
     """Return the pings along the requested path, with the declination added to their headings."""
     if request.paths:
         path = next(iter(request.paths.values()))
-        inside = (echogram.time_s >= path.time_s[0]) & (echogram.time_s <= path.time_s[-1])
+        inside = (echogram.time_s > path.time_s[0] - CLOCK_S) & (echogram.time_s < path.time_s[-1] + CLOCK_S)
         if not inside.any():
             raise MitsonarError(
                 f"the path covers {path.time_s[0]:.3f}..{path.time_s[-1]:.3f} s, and the pings "
@@ -203,7 +207,7 @@ def _with_poses(echogram: Echogram, request: MosaicRequest) -> Echogram:
         echogram = replace(
             echogram,
             time_s=time_s,
-            poses=path.at(time_s),
+            poses=path.at(np.clip(time_s, path.time_s[0], path.time_s[-1])),
             levels=echogram.levels[inside],
             height_m=echogram.height_m[inside],
         )

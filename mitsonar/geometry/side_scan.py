@@ -71,11 +71,10 @@ def track_bottom(echogram: Echogram, least_m: float | None = None) -> BottomTrac
     """Track the first return through all pings of a side-scan.
 
     Every sample counts for water or for bottom, by its level against a threshold. A ping's evidence for a first return at a
-    bin is the number of dark samples before it, less the bright ones, plus the bright samples just behind it, less the dark
-    ones, over both sides. The track has the most evidence over all pings, less a cost for each bin by which it moves between
-    pings (dynamic programming). Pings without an echo take the track of their neighbours. A first pass takes one threshold
-    for all pings (Otsu); a second one takes thresholds close above the water of each ping, since the bottom straight below
-    is faint.
+    bin is the number of bright samples just behind it, plus the dark ones just before it, less all bright ones before it,
+    over both sides. The track has the most evidence over all pings, less a cost for each bin by which it moves between pings
+    (dynamic programming). Pings without an echo take the track of their neighbours. A first pass takes one threshold for all
+    pings (Otsu); a second one takes thresholds close above the water of each ping, since the bottom straight below is faint.
 
     Args:
         echogram: levels of port and starboard.
@@ -133,14 +132,18 @@ def _track(level: Floats, water_db: Array, bottom_db: Array, share: float, behin
     # 2. evidence of a first return at the lower edge of every bin
     total = np.zeros((len(level), evidence.shape[1] + 1), np.float32)
     np.cumsum(evidence, axis=1, out=total[:, 1:])
-    window = total[:, behind:] - total[:, :-behind]
-    dead = window.max(axis=1) <= 0  # pings without any bottom have no say
-    place = _best_path(np.where(dead[:, None], 0, window - total[:, :-behind]))
+    after = total[:, behind:] - total[:, :-behind]
+    before = total[:, :-behind] - np.pad(total, ((0, 0), (behind, 0)))[:, : after.shape[1]]
+    bright = np.cumsum(np.maximum(evidence, 0), axis=1)[:, : after.shape[1] - 1]
+    score = after - before
+    score[:, 1:] -= bright
+    score[after.max(axis=1) <= 0] = 0  # pings without any bottom have no say
+    place = _best_path(score)
     # 3. contrast of the bins behind the first return and before it
     rows, near = np.arange(len(place)), np.maximum(place - behind, 0)
-    bright = (total[rows, place + behind] - total[rows, place]) / behind
-    dark = (total[rows, place] - total[rows, near]) / np.maximum(place - near, 1)
-    return place, np.maximum(0, (bright - dark) / 2).astype(float)
+    bottom = (total[rows, place + behind] - total[rows, place]) / behind
+    water = (total[rows, place] - total[rows, near]) / np.maximum(place - near, 1)
+    return place, np.maximum(0, (bottom - water) / 2).astype(float)
 
 
 def _classes_about(level: Floats, place: Index, behind: int) -> tuple[Array, Array]:

@@ -141,7 +141,8 @@ def _ping_headers(echogram: Echogram) -> Header:
     header["depth_m"], header["altitude_m"] = np.maximum(0, -poses[:, 2]), np.nan_to_num(echogram.height_m)
     pitch, roll, heading = np.degrees(poses[:, 3:] + np.multiply.outer(convergence, [0, 0, 1])).T
     header["pitch_deg"], header["roll_deg"] = -pitch, roll  # XTF: bow up is positive
-    header["heading_deg"] = header["gyro_deg"] = heading % 360
+    # readers take a heading of 0 for one that was not recorded
+    header["heading_deg"] = header["gyro_deg"] = np.where(heading % 360 == 0, 360.0, heading % 360)
     trajectory = Trajectory(poses, echogram.time_s)
     header["speed_knots"] = np.linalg.norm(velocities(trajectory)[:, :3], axis=1) * KNOTS
     header["time_ms"] = np.rint(1000 * (echogram.time_s - echogram.time_s[0]))

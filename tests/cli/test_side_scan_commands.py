@@ -124,7 +124,7 @@ def test_figures_of_a_map(mitsonar: Command, file: Path, tmp_path: Path) -> None
 @pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
 def test_a_simulated_line_is_shown_and_mapped_as_a_real_one(mitsonar: Command, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    path = ("--trajectory", "shipped", "--frames", 6, "--quality", "draft", "--model", "physical")
+    path = ("--from=-3,-2,3,0,0,90", "--to=1,-2,3,0,0,90", "--frames", 12, "--quality", "draft", "--model", "physical")
     assert mitsonar("sound", "flat_floor", "--instrument", "sidescan", *path, "-o", out).returncode == 0
     info = mitsonar("recording", "info", out)
     assert "echogram of mitsonar" in info.stdout

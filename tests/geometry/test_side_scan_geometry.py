@@ -62,6 +62,14 @@ def test_what_swims_in_the_water_column_does_not_end_it() -> None:
     assert np.abs(error).max() < 4 * BIN_M
 
 
+def test_ground_that_ends_is_no_second_water_column() -> None:
+    """Beyond 12 m there is nothing, for three quarters of the window: the edge of a scene, or the reach of a weak sonar."""
+    echogram = drawn(line(40), bright, sounder=SOUNDER.replace(range_max=50.0, range_bins=1000))
+    levels = echogram.levels.copy()
+    levels[:, :, 240:] = 1e-7
+    assert np.abs(track_bottom(replace(echogram, levels=levels)).range_m - 6).max() <= BIN_M
+
+
 def test_a_surface_echo_is_passed_by_its_range() -> None:
     echogram = drawn(line(40), bright)
     levels = echogram.levels.copy()

@@ -193,6 +193,15 @@ def test_without_a_heading_the_course_is_taken(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.part().poses[:, 5], 2.5, atol=1e-6)
 
 
+def test_a_heading_of_north_is_not_taken_for_none(tmp_path: Path) -> None:
+    """A line that drifts sideways, its bow to the north all along."""
+    written = side_scan_echogram(pings=12, heading=1.2)
+    north = written.poses.copy()
+    north[:, 5] = 0
+    recording = Changed(tmp_path, replace(written, poses=north)).open()
+    assert np.abs(unturned(recording.part().poses[:, 5])).max() < 1e-6
+
+
 def test_headings_across_the_track_are_noted(tmp_path: Path) -> None:
     written = side_scan_echogram(pings=60)
     turned = written.poses.copy()
