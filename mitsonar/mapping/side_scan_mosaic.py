@@ -91,7 +91,7 @@ def build_side_scan_mosaic(
         raise MitsonarError(
             f"cells of {options.cell_m:g} m are too small for a window of {fan.range_max:g} m: take larger ones"
         )
-    across = (np.arange(columns) + 0.5) * step
+    across: Array = (np.arange(columns, dtype=np.float64) + 0.5) * step
     level = _Levels(echogram, lines, across, flatten=flatten)
     # 2. the whole map at once, so that it does not grow ping by ping
     mosaic = Mosaic(options)

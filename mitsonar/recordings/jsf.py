@@ -82,7 +82,7 @@ def is_jsf(path: Path, first: bytes) -> bool:
     """Return whether the first bytes of a file are those of a JSF message."""
     if not first.startswith(MARK) or len(first) < MESSAGE.size:
         return False
-    kind, size = (MESSAGE.unpack_from(first)[field] for field in (3, 9))
+    kind, size = (int(MESSAGE.unpack_from(first)[field]) for field in (3, 9))
     return 0 < kind < MOST_TYPES and size >= 0
 
 

@@ -187,9 +187,7 @@ def _pings(path: Path, channels: tuple[int, ...], size: int) -> _Frames:
 
 def _ping(frame: dict[str, Any], sides: list[dict[str, Any]], size: int) -> _Ping | None:
     """Return the ping of a frame; None if its samples do not lie in the file."""
-    begin, counts = ([one.get(name) for one in sides] for name in ("sampleOffset", "sampleCount"))
-    if not all(type(one) is int for one in (*begin, *counts)):
-        return None
+    begin, counts = ([_whole(one.get(name)) for one in sides] for name in ("sampleOffset", "sampleCount"))
     first, count = counts[0], min(counts)
     if first != counts[1] or count < 1 or min(begin) < 0 or max(begin) + 2 * count > size:
         return None
@@ -198,6 +196,11 @@ def _ping(frame: dict[str, Any], sides: list[dict[str, Any]], size: int) -> _Pin
     near, far = values[5], values[6]
     values[5] = near if 0 < near < far else 0.0  # nan too
     return _Ping((begin[0], begin[1]), count, tuple(values))
+
+
+def _whole(value: object) -> int:
+    """Return a whole number of JSON; -1 for anything else."""
+    return value if isinstance(value, int) and not isinstance(value, bool) else -1
 
 
 def _number(value: object) -> float:

@@ -305,7 +305,7 @@ class _Positions(NamedTuple):
 def _valid_positions(pings: PingHeaders, rows: Index) -> _Positions:
     """Return the valid positions in metres."""
     stated = pings.position[rows]
-    known = np.isfinite(stated).all(axis=1)
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(stated).all(axis=1))
     if pings.in_degrees:
         known &= (stated[:, 0] >= LATITUDES_DEG[0]) & (stated[:, 0] <= LATITUDES_DEG[1]) & (np.abs(stated[:, 1]) <= 180)
     if not known.any():
