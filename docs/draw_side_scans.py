@@ -43,17 +43,17 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="coarse, into a folder that is removed")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", mitsonar.MitsonarWarning)
-    made = simulated(20 if arguments.quick else 1)
+    rendered = simulated(20 if arguments.quick else 1)
     if arguments.quick:
         with tempfile.TemporaryDirectory() as folder:
-            return draw(Path(folder) / "side_scans.png", {"simulated": made, "again": made})
+            return draw(Path(folder) / "side_scans.png", {"simulated": rendered, "again": rendered})
     if arguments.file is None:
         parser.error("name the recording of a side-scan, or use --quick")
     real = mitsonar.open_side_scan(arguments.file).part().read()
     turned = real.poses + np.array([0, 0, 0, 0, 0, math.radians(arguments.declination)])
     named = {
         "real: wreck of the Scotsman, 600 kHz": replace(real, poses=turned),
-        "simulated: sunken_ship, starfish-450f": made,
+        "simulated: sunken_ship, starfish-450f": rendered,
     }
     return draw(Path(__file__).parent / "gallery" / "side_scans.png", named)
 

@@ -63,7 +63,7 @@ def drawn(
             levels[row, column, seen] = pattern(x, y)
     if rng is not None:
         levels = levels * rng.exponential(size=levels.shape)
-    time_s = 1.6e9 + 0.1 * np.arange(len(poses))
+    time_s: Array = 1.6e9 + 0.1 * np.arange(len(poses), dtype=np.float64)
     channels = [("port", "starboard").index(name) for name in sounder.channels]
     return Echogram(time_s, poses, sounder, levels[:, channels].astype(np.float32), poses[:, 2].copy(), origin)
 

@@ -127,7 +127,7 @@ def side_scan_echogram(
 ) -> Echogram:
     """A line at constant speed, with dark water above a bright bottom whose levels differ by side and fall with range."""
     sounder = load_sounder("sidescan").replace(range_min=0.0, range_max=20.0, range_bins=bins, name="towfish")
-    time_s = 1.7e9 + np.arange(pings) * 0.25
+    time_s = np.asarray(1.7e9 + np.arange(pings) * 0.25, dtype=np.float64)
     poses = np.zeros((pings, 6))
     poses[:, :2] = 0.3 + 0.5 * np.arange(pings)[:, None] * [np.sin(heading), np.cos(heading)]
     poses[:, 2:] = [-3.0, 0.02, -0.01, heading]

@@ -34,8 +34,8 @@ def side_scan_at(file: str) -> SideScan | None:
         return None
     from mitsonar.recordings.open import detect_side_scan
 
-    found = detect_side_scan(file)
-    return None if found is None else found.read(Path(file))
+    side_scan_format = detect_side_scan(file)
+    return None if side_scan_format is None else side_scan_format.read(Path(file))
 
 
 def refuse_options(file: str, options: Mapping[str, object]) -> None:

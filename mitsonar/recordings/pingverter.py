@@ -41,7 +41,7 @@ HERTZ_FROM = 10_000.0
 """Frequencies are stated in kHz or Hz: smaller numbers count as kHz."""
 
 PROFILE_PINGS = 200
-"""Number of pings, spread over the log, by which the order of port samples is told."""
+"""Number of pings, spread over the log, by which the order of port samples is recognised."""
 
 
 def is_pingverter(path: Path, first: bytes) -> bool:
@@ -111,14 +111,14 @@ def _side_channels(manifest: Any, path: Path) -> dict[int, dict[str, Any]]:
         raise MitsonarError(f"{path / MANIFEST} describes no samples of {ENCODING}: let PINGVerter 2 export the log again")
     channels: dict[int, dict[str, Any]] = {}
     for side in SIDES:
-        found = [
+        matching = [
             one
             for one in listed
             if isinstance(one, dict) and one.get("orientation") == side and type(one.get("channelId")) is int
         ]
-        if not found or found[0]["channelId"] in channels:
+        if not matching or matching[0]["channelId"] in channels:
             raise MitsonarError(f"{path / MANIFEST} has no side-scan channel {side.lower()}: the log is of another sonar")
-        channels[found[0]["channelId"]] = found[0]
+        channels[matching[0]["channelId"]] = matching[0]
     return channels
 
 

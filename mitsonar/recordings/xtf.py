@@ -248,8 +248,8 @@ class Packets:
 
     def summary(self) -> str:
         """Return in words which packets there are, for an error message."""
-        found = f"{self.damaged:,} damaged, {sum(self.others.values()):,} of other kinds"
-        return f" (packets: {found})" if self.damaged or self.others else ""
+        counts = f"{self.damaged:,} damaged, {sum(self.others.values()):,} of other kinds"
+        return f" (packets: {counts})" if self.damaged or self.others else ""
 
 
 def _find_pings(data: Bytes, start: int, channels: list[Channel]) -> Packets:

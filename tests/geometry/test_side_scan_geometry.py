@@ -14,7 +14,7 @@ import mitsonar
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.side_scan import ground_lines, to_ground_range, track_bottom
 from mitsonar.instruments.sounder import load_sounder
-from mitsonar.motion.pose import Pose
+from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.sounding import SounderSimulator
 
@@ -162,7 +162,7 @@ def test_lines_across_the_track_are_those_of_rays() -> None:
     )
     lines = ground_lines(poses, poses[:, 2])
     for pose, nearest, foot, starboard in zip(poses, lines.nearest_m, lines.foot, lines.starboard, strict=True):
-        axes = mitsonar.motion.pose.vehicle_rotation(pose[None]).as_matrix()[0]
+        axes = vehicle_rotation(pose[None]).as_matrix()[0]
         angle = np.linspace(0, 2 * np.pi, 7201)
         ray = np.cos(angle)[:, None] * axes[:, 0] + np.sin(angle)[:, None] * axes[:, 2]
         ray = ray[ray[:, 2] < -0.05]

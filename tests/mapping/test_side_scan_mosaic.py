@@ -23,7 +23,7 @@ def centres(mosaic: Mosaic) -> tuple[np.ndarray, np.ndarray]:
     """East and north of the centres of cells."""
     west, _, _, north = mosaic.extent
     rows, columns = np.indices(mosaic.mean.shape)
-    return west + (columns + 0.5) * mosaic.cell_m, north - (rows + 0.5) * mosaic.cell_m
+    return np.asarray(west + (columns + 0.5) * mosaic.cell_m), np.asarray(north - (rows + 0.5) * mosaic.cell_m)
 
 
 def error_of(mosaic: Mosaic, echogram: Echogram, shift: tuple[float, float] = (0.0, 0.0)) -> float:
@@ -133,7 +133,7 @@ def test_a_geotiff_lies_in_its_zone(tmp_path: Path) -> None:
     spot = np.array([47.0, -10.0])
 
     def one(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return 0.01 + np.exp(-((x - spot[0]) ** 2 + (y - spot[1]) ** 2) / 0.3**2)
+        return np.asarray(0.01 + np.exp(-((x - spot[0]) ** 2 + (y - spot[1]) ** 2) / 0.3**2))
 
     echogram = drawn(line(80), one, origin=origin)
     mosaic = build_side_scan_mosaic(echogram, 6.0, CELL, flatten=False)
@@ -142,7 +142,7 @@ def test_a_geotiff_lies_in_its_zone(tmp_path: Path) -> None:
         page = file.pages.first
         mean = page.asarray()[0]
         tags = {tag.code: tag.value for tag in page.tags.values()}
-        described = page.geotiff_tags
+        described = page.geotiff_tags or {}
     assert described["GTModelTypeGeoKey"] == 1
     assert int(described["ProjectedCSTypeGeoKey"]) == 32756
     assert "zone 56S" in str(described["GTCitationGeoKey"])
