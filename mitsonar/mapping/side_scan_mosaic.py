@@ -37,6 +37,9 @@ WIDEST_GAP = 5.0
 SHARPEST_TURN = math.radians(5)
 """Strips are left open where the heading turns more between two pings."""
 
+MOST_POINTS = 2**20
+"""Points of a strip that are laid at a time."""
+
 ANGLES = 90
 """Number of angles, from straight down to the side, for which levels are made even."""
 
@@ -206,21 +209,27 @@ def _lay_strip(
         here: levels of the first ping ``(2, columns)``; nan where unknown.
         after: levels of the second ping.
     """
+    known = np.isfinite(here) & np.isfinite(after)
+    if not known.any():
+        return False
     first, second = pings
     foot = lines.foot[first] + share[:, None] * (lines.foot[second] - lines.foot[first])
     starboard = lines.starboard[first] + share[:, None] * (lines.starboard[second] - lines.starboard[first])
-    distance = np.concatenate([-across, across])
-    values = here.ravel() + share[:, None].astype(np.float32) * (after - here).ravel()  # (points, 2 columns)
-    known = np.isfinite(values)
-    if not known.any():
-        return False
-    points = (foot[:, None] + distance[:, None] * starboard[:, None])[known]
-    cells = np.floor(points / mosaic.cell_m).astype(np.int64)
-    box = _box(points, mosaic.cell_m)
+    distance = np.concatenate([-across, across])[known.ravel()]
+    begin, change = here[known], (after - here)[known]
+    ends = distance[[int(np.argmin(distance)), int(np.argmax(distance))]]
+    box = _box((foot[[0, -1], None] + ends[:, None] * starboard[[0, -1], None]).reshape(-1, 2), mosaic.cell_m)
     rows, columns = box.shape
-    place = (cells[:, 1] - box.south) * columns + cells[:, 0] - box.west
-    count = np.bincount(place, minlength=rows * columns)
-    total = np.bincount(place, weights=values[known], minlength=rows * columns)
+    count, total = np.zeros(rows * columns, np.int64), np.zeros(rows * columns)
+    step = max(1, MOST_POINTS // len(distance))
+    for start in range(0, len(share), step):
+        block = slice(start, start + step)
+        values = begin + share[block, None].astype(np.float32) * change  # (points, columns)
+        points = foot[block, None] + distance[:, None] * starboard[block, None]
+        cells = np.floor(points / mosaic.cell_m).astype(np.int64).reshape(-1, 2)
+        place = (cells[:, 1] - box.south) * columns + cells[:, 0] - box.west
+        count += np.bincount(place, minlength=rows * columns)
+        total += np.bincount(place, weights=values.ravel(), minlength=rows * columns)
     mean = (total / np.maximum(count, 1)).astype(np.float32).reshape(box.shape)
     mosaic.add_cells(box, mean, (count > 0).astype(np.float32).reshape(box.shape))
     return True
