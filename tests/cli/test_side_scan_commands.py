@@ -114,6 +114,7 @@ def test_a_map_along_another_path_with_another_heading(mitsonar: Command, echogr
     assert ties[0] - ties[1] == pytest.approx(100, abs=0.2)
 
 
+@pytest.mark.thorough
 def test_figures_of_a_map(mitsonar: Command, file: Path, tmp_path: Path) -> None:
     done = mitsonar("mosaic", file, "true", "-o", tmp_path / "map.png", "--cell-mm", 200)
     assert done.returncode == 0, done.stderr

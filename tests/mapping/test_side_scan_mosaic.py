@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 from drawn_side_scans import amplitude_to_level, blocks, drawn, line
+from helpers import essence
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.mosaic import Mosaic, MosaicOptions, save_geotiff
@@ -38,8 +39,11 @@ def error_of(mosaic: Mosaic, echogram: Echogram, shift: tuple[float, float] = (0
     return float(np.sqrt(np.mean((mosaic.mean - expected)[known] ** 2)))
 
 
+TURNED = (2.5, 0.3, 0.0)
+
+
 @pytest.mark.parametrize(
-    ("heading", "pitch", "roll"), [(0.0, 0.0, 0.0), (0.9, 0.0, 0.1), (2.5, 0.3, 0.0), (-1.2, -0.2, -0.15)]
+    ("heading", "pitch", "roll"), essence([(0.0, 0.0, 0.0), (0.9, 0.0, 0.1), TURNED, (-1.2, -0.2, -0.15)], TURNED)
 )
 def test_cells_show_the_ground_below_them(heading: float, pitch: float, roll: float) -> None:
     """The error is least where the pattern is, and a shift of two cells in any direction doubles it."""
@@ -53,6 +57,7 @@ def test_cells_show_the_ground_below_them(heading: float, pitch: float, roll: fl
         assert error_of(mosaic, echogram, shift) > 2 * right
 
 
+@pytest.mark.thorough
 def test_errors_fall_with_the_size_of_cells() -> None:
     echogram = drawn(line(120, step=0.1))
     errors = [
