@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from mitsonar.motion.sensors import VehicleSensors, load_sensors, save_sensors
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.plotting.figures import mosaic_figure, path_figure
-    from mitsonar.recordings.open import open_recording
+    from mitsonar.recordings.open import open_recording, open_side_scan
     from mitsonar.recordings.write_mcap import write_mcap
     from mitsonar.records.frames import SonarFrames
     from mitsonar.records.responses import ImpulseResponses
@@ -117,6 +117,7 @@ __all__ = [
     "mosaic_figure",
     "odometry",
     "open_recording",
+    "open_side_scan",
     "particle_mesh",
     "path_figure",
     "path_of",
@@ -188,6 +189,7 @@ _MODULES = {
     "mosaic_figure": "plotting.figures",
     "odometry": "mapping.odometry",
     "open_recording": "recordings.open",
+    "open_side_scan": "recordings.open",
     "particle_mesh": "worlds.sea",
     "path_figure": "plotting.figures",
     "path_of": "mapping.series",

@@ -18,6 +18,7 @@ import yaml
 from foreign_scenes import make_sdf, make_urdf
 from helpers import HEARD, TINY, TINY_TRAINING, tiny_network, tiny_recipe, tiny_samples
 from mutations import Rng, changed_arrays, changed_bytes, changed_json, changed_text, changed_value, npz
+from recording_files import side_scan_echogram
 
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
@@ -26,6 +27,7 @@ from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder
 from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
 from mitsonar.motion.sensors import load_sensors, save_sensors
 from mitsonar.motion.trajectory import Trajectory
+from mitsonar.motion.utm import UtmOrigin
 from mitsonar.records.frames import SonarFrames
 from mitsonar.records.responses import ImpulseResponses
 from mitsonar.simulation.runs import RENDERING, progress_of
@@ -459,7 +461,11 @@ def read_foreign(path: Path) -> None:
 def read_recording(path: Path) -> None:
     """Read all frames of a recording, and check that they can be."""
     from mitsonar import open_recording
+    from mitsonar.recordings.open import detect_side_scan
 
+    if detect_side_scan(path) is not None:
+        read_side_scan(path)
+        return
     recording = open_recording(path)
     assert all("\n" not in note for note in recording.notes)
     for part in recording.parts:
@@ -476,6 +482,24 @@ def read_recording(path: Path) -> None:
                 assert frames.image.max() <= 1
             assert np.isfinite(frames.to_linear().image).all()
             assert frames.poses is None or np.isfinite(frames.poses).all()
+
+
+def read_side_scan(path: Path) -> None:
+    """Read all pings of a side-scan, and check that they can be shown."""
+    from mitsonar import open_side_scan
+    from mitsonar.recordings.open import summary_lines, summary_of
+
+    recording = open_side_scan(path)
+    assert all("\n" not in line for line in summary_lines(summary_of(recording)))
+    for part in recording.parts:
+        assert (np.diff(part.time_s) > 0).all()
+        assert np.isfinite(part.poses).all()
+        echogram = part.read()
+        assert np.isfinite(echogram.levels).all()
+        assert echogram.levels.min() >= 0
+        assert not (echogram.height_m <= 0).any()
+        assert (np.diff(echogram.range_m) > 0).all()
+        assert np.isfinite(echogram.decibels()).all()
 
 
 # ---------------------------------------------------------------- trajectories and echoes
@@ -517,6 +541,11 @@ READERS: dict[str, Reader] = {
         lambda folder: responses().save(folder / "responses.npz"),
         spoil_npz("responses.npz"),
         lambda folder: ImpulseResponses.load(folder / "responses.npz"),
+    ),
+    "echogram.npz": Reader(
+        lambda folder: side_scan_echogram(origin=UtmOrigin(19, False, 5e5, 5e6)).save(folder / "echogram.npz"),
+        spoil_npz("echogram.npz"),
+        lambda folder: read_side_scan(folder / "echogram.npz"),
     ),
     "frames.zarr": Reader(make_frames_zarr, spoil_tree, read_frames_zarr),
     "frames.zarr, resumed": Reader(make_frames_zarr, spoil_tree, resume_frames),

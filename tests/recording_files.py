@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mitsonar.instruments.sounder import load_sounder
+from mitsonar.motion.utm import UtmOrigin
+from mitsonar.recordings.jsf import MESSAGE, TRACE
 from mitsonar.recordings.oculus import LATER, OLDER
 from mitsonar.recordings.sound_metrics import FILE, FRAME, FRAME_HEADER
+from mitsonar.records.soundings import Echogram
 
 Values = np.ndarray[Any, Any]
 
@@ -107,3 +113,94 @@ def didson_file(
     size = header or {3: 512, 4: 1024}[version]
     pairs = zip(head, images.astype(np.uint8), strict=True)
     return first.tobytes().ljust(size, b"\0")[:size] + b"".join(one.tobytes() + image.tobytes() for one, image in pairs)
+
+
+# ---------------------------------------------------------------- side-scans
+
+
+def side_scan_echogram(
+    pings: int = 6,
+    bins: int = 40,
+    height: float = 4.0,
+    origin: UtmOrigin | None = None,
+    heading: float = 0.4,
+) -> Echogram:
+    """A line at constant speed, with dark water above a bright bottom whose levels differ by side and fall with range."""
+    sounder = load_sounder("sidescan").replace(range_min=0.0, range_max=20.0, range_bins=bins, name="towfish")
+    time_s = np.asarray(1.7e9 + np.arange(pings) * 0.25, dtype=np.float64)
+    poses = np.zeros((pings, 6))
+    poses[:, :2] = 0.3 + 0.5 * np.arange(pings)[:, None] * [np.sin(heading), np.cos(heading)]
+    poses[:, 2:] = [-3.0, 0.02, -0.01, heading]
+    range_m = sounder.fan.range_m
+    bottom = np.where(range_m >= height, 1 / (1 + range_m), 1e-4)
+    levels = np.stack([bottom, 0.5 * bottom])[None] * np.linspace(0.8, 1, pings)[:, None, None]
+    return Echogram(time_s, poses, sounder, levels.astype(np.float32), np.full(pings, height), origin)
+
+
+def jsf_message(body: bytes, kind: int = 80, subsystem: int = 20, channel: int = 0) -> bytes:
+    """A message of a JSF file."""
+    return MESSAGE.pack(b"\x01\x16", 13, 0, kind, 2, subsystem, channel, 0, 0, len(body)) + body
+
+
+def jsf_trace(counts: Values, *, channel: int, subsystem: int = 20, **fields: Any) -> bytes:
+    """A message with one ping of one side: envelopes, or complex samples if counts are ``(samples, 2)``."""
+    head = np.zeros((), TRACE)
+    given = {
+        "time_s": 1_700_000_000, "ping": 1, "valid": 0x7FFF, "format": counts.ndim - 1, "units": 2, "samples": len(counts),
+        "interval_ns": 40_000, "start_dahz": 11_000, "end_dahz": 13_000, "sound_speed": 1480.0,
+    }  # fmt: skip
+    for name, value in (given | fields).items():
+        head[name] = value
+    return jsf_message(head.tobytes() + counts.astype("<i2").tobytes(), 80, subsystem, channel)
+
+
+def jsf_file(pings: int = 5, samples: int = 30, **fields: Any) -> bytes:
+    """Pings of both sides at 0.25 s, north along a meridian, with another message between them."""
+    counts = 100 + np.arange(samples)
+    parts = [jsf_message(b"serial text", kind=2002)]
+    for ping in range(pings):
+        common = {
+            "ping": ping + 1, "time_s": 1_700_000_000 + ping // 4, "time_ms": 250 * (ping % 4) + 7000,
+            "x": 9_000_000, "y": 25_200_000 + 6 * ping, "heading": 35_900, "pitch": 182, "roll": -364, "depth_mm": 2500,
+            "altitude_mm": 6000, "weighting": 3,
+        }  # fmt: skip
+        parts += [jsf_trace(counts * (1 + side), channel=side, **(common | fields)) for side in (0, 1)]
+    return b"".join(parts)
+
+
+def pingverter_folder(folder: Path, echogram: Echogram, *, reversed_port: bool = False) -> None:
+    """The files that PINGVerter 2.1 writes from a log of 8 bits, by their published code."""
+    folder.mkdir(parents=True)
+    amplitude = np.sqrt(echogram.levels / echogram.levels.max())
+    counts = np.rint(255 * amplitude).astype("<u2") * 257
+    if reversed_port:
+        counts[:, 0] = counts[:, 0, ::-1].copy()
+    origin = echogram.origin or UtmOrigin(16, False, 5e5, 4e6)
+    degrees = origin.to_degrees(echogram.poses[:, :2])
+    heading = np.degrees(echogram.poses[:, 5] + origin.convergence_rad(degrees))
+    fan, size = echogram.sounder.fan, counts[0, 0].nbytes
+    frames = []
+    for ping in range(len(echogram)):
+        sides = [
+            {
+                "channelId": channel, "sampleOffset": (2 * ping + side) * size, "sampleCount": fan.range_bins,
+                "byteLength": size, "minRangeMeters": 0, "maxRangeMeters": fan.range_max,
+                "bottomDepthMeters": float(echogram.height_m[ping]),
+            }
+            for side, channel in enumerate((2, 3))
+        ]  # fmt: skip
+        frames.append(
+            {
+                "frameIndex": ping, "sequenceCount": ping, "timeSeconds": float(echogram.time_s[ping]),
+                "lat": degrees[ping, 0], "lon": degrees[ping, 1], "headingDegrees": heading[ping], "channels": sides,
+            }
+        )  # fmt: skip
+    listed = [
+        {"channelId": channel, "orientation": side, "startFrequencyHz": 455, "endFrequencyHz": 455}
+        for channel, side in ((2, "Port"), (3, "Starboard"))
+    ]
+    samples = {"path": "samples.u16le", "encoding": "uint16-le"}
+    manifest = {"formatVersion": 2, "frames": "frames.jsonl", "samples": samples, "channels": listed}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    (folder / "frames.jsonl").write_text("".join(json.dumps(frame) + "\n" for frame in frames))
+    (folder / "samples.u16le").write_bytes(counts.tobytes())

@@ -132,6 +132,7 @@ OPENERS = {
     "Trajectory.load_tum": Opened(mitsonar.Trajectory.load_tum, ".tum"),
     "DataStore.open": Opened(mitsonar.DataStore.open, ".zarr"),
     "open_recording": Opened(mitsonar.open_recording, ".aris"),
+    "open_side_scan": Opened(mitsonar.open_side_scan, ".xtf"),
     "load_scene": Opened(mitsonar.load_scene, ".xml"),
     "load_sonar": Opened(mitsonar.load_sonar, ".yaml"),
     "load_sounder": Opened(mitsonar.load_sounder, ".yaml"),

@@ -13,6 +13,7 @@ import typer
 
 from mitsonar.cli.console import answered, command_line, numbers, progress_bar, say, say_json, warn
 from mitsonar.cli.options import NOISE, SIX, Frame, Noise, instrument_for, path_for, scene_parameters, sonar_changes
+from mitsonar.cli.side_scan import MosaicRequest, lay_side_scan, refuse_options, side_scan_at
 from mitsonar.errors import MitsonarError, count_noun, did_you_mean
 from mitsonar.io.files import write_atomic
 from mitsonar.io.runs import kind_of_run, refuse_to_replace
@@ -199,7 +200,7 @@ def mosaic(
             "-o", "--out", help="OUT.png for figures of the map and its quality (OUT.quality.png), or OUT.tif for a GeoTIFF."
         ),
     ],
-    cell_mm: Annotated[float, typer.Option(help="Cell size of the map [mm].")] = 10.0,
+    cell_mm: Annotated[float | None, typer.Option(help="Cell size of the map [mm] (default: 10; side-scans: 100).")] = None,
     blend: Annotated[
         str, typer.Option(help="weighted: all beams; centre: the plain mean of the middle beams.")
     ] = "weighted",
@@ -218,9 +219,15 @@ def mosaic(
     geometry: Geometry = None,
     noise: Noise = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
+    stored_height: Annotated[
+        bool, typer.Option("--stored-height", help="Side-scans: heights of the recording (default: by the first return).")
+    ] = False,
+    declination: Annotated[
+        float, typer.Option(help="Side-scans: magnetic declination to add to headings [deg], > 0 is east.")
+    ] = 0.0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
-    """Lay frames on the ground plane along a path: mean level, standard deviation and count of each cell."""
+    """Lay frames, or pings of a side-scan, on the ground plane: mean level, standard deviation and count of each cell."""
     from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, MosaicOptions, build_mosaic, illumination, save_geotiff
     from mitsonar.mapping.odometry_run import ODOMETRY
     from mitsonar.mapping.open_source import Reading, frames_for, with_assumed_plane
@@ -232,6 +239,18 @@ def mosaic(
             f"{command_line('mosaic', trajectory, frames, '-o', out)}"
         )
     quality = _checked_out(out, true, overwrite)
+    scan = side_scan_at(frames)
+    if scan is not None:
+        of_frames = {"--view": view, "--geometry": geometry, "--noise": noise != "none", "--pitch-deg": pitch_deg}
+        refuse_options(frames, {**of_frames, "--blend": blend != "weighted"})
+        paths, _ = _paths(trajectory, true, frame)
+        lay_side_scan(
+            scan, MosaicRequest(out, quality, paths, sequence, cell_mm, height, stored_height, declination, flatten)
+        )
+        return
+    if declination or stored_height:
+        raise MitsonarError(f"--declination and --stored-height apply only to side-scans: got {frames}; leave them out")
+    cell_mm = 10.0 if cell_mm is None else cell_mm
     options = MosaicOptions(cell_mm / 1e3, blend, centre_beams)  # type: ignore[arg-type]  # other words are refused
     paths, path_height = _paths(trajectory, true, frame)
     pitch = None if pitch_deg is None else math.radians(pitch_deg)

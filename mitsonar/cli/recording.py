@@ -13,6 +13,7 @@ import typer
 
 from mitsonar.cli.console import answered, changes_of, command_line, progress_bar, say, say_json, warn
 from mitsonar.cli.estimate import Geometry
+from mitsonar.cli.side_scan import convert_side_scan, refuse_options, show_side_scan, side_scan_at
 from mitsonar.errors import MitsonarError, count_noun, suggest_names
 from mitsonar.io.files import write_atomic
 from mitsonar.io.runs import refuse_to_replace
@@ -63,7 +64,7 @@ def recordings() -> typer.Typer:
     app = typer.Typer(help="Show and convert recordings of real sonars, and runs.", no_args_is_help=True)
     for command in (
         info,
-        show,
+        answered(show, {"height_m": "--height"}),
         video,
         answered(convert, {"beams": "--beams", "crop_bins": "--crop-bins", "crop_beams": "--crop-beams"}),
     ):
@@ -90,6 +91,14 @@ def info(
     from mitsonar.recordings.handedness import check_handedness
     from mitsonar.recordings.open import summary_lines, summary_of
 
+    scan = side_scan_at(file)
+    if scan is not None:
+        refuse_options(file, {"--topic": topic, "--geometry": geometry, "--handedness": handedness, "--turn-deg": turn_deg})
+        if as_json:
+            say_json(summary_of(scan))
+        else:
+            say("\n".join(summary_lines(summary_of(scan))))
+        return
     recording = _opened(file, topic, geometry)
     summary = summary_of(recording)
     verdict = None
@@ -109,7 +118,6 @@ def info(
         )
 
 
-@answered
 def show(
     file: File,
     out: Annotated[Path, typer.Option("-o", "--out", help="PNG to write.")],
@@ -118,11 +126,36 @@ def show(
     topic: TopicName = None,
     geometry: Geometry = None,
     span_db: Span = 60.0,
+    ground_range: Annotated[
+        bool, typer.Option("--ground-range", help="Side-scans: over ground range, without the water column.")
+    ] = False,
+    height: Annotated[
+        float | None, typer.Option(help="Side-scans: height over the ground [m] (default: by the first return).")
+    ] = None,
+    stored_height: Annotated[
+        bool, typer.Option("--stored-height", help="Side-scans: heights of the recording (default: by the first return).")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Draw one frame as a fan with axes in metres and a colour bar in dB."""
+    """Draw one frame as a fan, or all pings of a side-scan as a waterfall, with axes in metres and a colour bar in dB."""
     from mitsonar.plotting.fans import save_fan, to_decibels
 
+    scan = side_scan_at(file)
+    if scan is not None:
+        refuse_options(file, {"--frame": frame, "--topic": topic, "--geometry": geometry})
+        show_side_scan(
+            scan,
+            out,
+            part=part,
+            span_db=span_db,
+            ground_range=ground_range,
+            height=height,
+            stored_height=stored_height,
+            overwrite=overwrite,
+        )
+        return
+    if ground_range or stored_height or height is not None:
+        raise MitsonarError(f"--ground-range and heights apply only to side-scans: got {file}; leave them out")
     refuse_to_replace(out, overwrite=overwrite)
     recording = _opened(file, topic, geometry)
     frames = to_decibels(recording.part(part).read([frame]), span_db)
@@ -159,7 +192,10 @@ def video(
 
 def convert(
     file: File,
-    out: Annotated[Path, typer.Option("-o", "--out", help="FOLDER of a run, FILE.mcap or FILE.aris to make.")],
+    out: Annotated[
+        Path,
+        typer.Option("-o", "--out", help="FOLDER of a run, FILE.mcap or FILE.aris to make; side-scans: .xtf or .npz."),
+    ],
     part: PartNumber = None,
     topic: TopicName = None,
     geometry: Geometry = None,
@@ -180,10 +216,19 @@ def convert(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped conversion to a folder.")] = False,
 ) -> None:
-    """Convert frames to the folder of a run (frames.npz, or frames.zarr above 1,000 frames), to ROS (.mcap) or to .aris."""
+    """Convert frames to the folder of a run (frames.npz, or frames.zarr above 1,000 frames), to ROS (.mcap) or to .aris.
+
+    Side-scans are converted to .xtf, or to the echogram of `mitsonar sound` (.npz).
+    """
     from mitsonar.recordings.pictures import write_frames
     from mitsonar.recordings.write_mcap import write_mcap
 
+    scan = side_scan_at(file)
+    if scan is not None:
+        of_frames = {"--topic": topic, "--geometry": geometry, "--full": full, "--labels": labels, "--beams": beams}
+        refuse_options(file, {**of_frames, "--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume})
+        convert_side_scan(scan, out, part=part, overwrite=overwrite)
+        return
     if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
         raise MitsonarError(f"{out}: unknown ending; {suggest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
     if (full or labels) and out.suffix != ".mcap":

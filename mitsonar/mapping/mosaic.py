@@ -22,6 +22,7 @@ from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.views import directions
 from mitsonar.io.files import write_atomic
 from mitsonar.motion.pose import Pose
+from mitsonar.motion.utm import UtmOrigin
 from mitsonar.records.frames import SonarFrames
 
 __all__ = [
@@ -158,6 +159,28 @@ class Mosaic:
         known = [box for box in boxes if box is not None]
         if known:
             self._make_room(box_around(known), slack=0.0)
+
+    def reserve_box(self, box: Box) -> None:
+        """Allocate the map for a box of cells.
+
+        Raises:
+            MitsonarError: the map would exceed ``most_cells``.
+        """
+        self._make_room(box, slack=0.0)
+
+    def add_cells(self, box: Box, value: Floats, weight: Floats) -> None:
+        """Add values to a box of cells, which counts as one more frame wherever the weight exceeds 0.
+
+        Args:
+            box: cells.
+            value: levels ``(rows, columns)``, finite; row 0 is southernmost.
+            weight: weights ``(rows, columns)``.
+
+        Raises:
+            MitsonarError: the map would exceed ``most_cells``.
+        """
+        self._make_room(box, slack=SLACK)
+        accumulate(self._patch(box), value, weight)
 
     def add(
         self,
@@ -731,11 +754,16 @@ def illumination(frames: SonarFrames, poses: ArrayLike | None = None, height_m: 
 # ---------------- GeoTIFF
 
 
-def save_geotiff(path: str | Path, mosaic: Mosaic) -> None:
-    """Write a mosaic as a GeoTIFF with float32 bands mean, std and count, nan where unknown, in metres of the local world.
+def save_geotiff(path: str | Path, mosaic: Mosaic, origin: UtmOrigin | None = None) -> None:
+    """Write a mosaic as a GeoTIFF with float32 bands mean, std and count, nan where unknown, in metres.
 
-    The reference system is a local engineering system: x east, y north, without a position on Earth (GeoTIFF 1.1:
-    user-defined model, linear unit metre).
+    With an origin, coordinates are those of its UTM grid on WGS 84. Without one, the reference system is a local engineering
+    system: x east, y north, without a position on Earth (GeoTIFF 1.1: user-defined model, linear unit metre).
+
+    Args:
+        path: file to write.
+        mosaic: the map.
+        origin: where on the Earth the origin of the map lies.
     """
     import tifffile
 
@@ -743,8 +771,13 @@ def save_geotiff(path: str | Path, mosaic: Mosaic) -> None:
     west, _, _, north = mosaic.extent
     names = ("mean level, 0..1", "standard deviation of the frames' levels", "frames that saw the cell")
     items = "".join(f'<Item name="DESCRIPTION" sample="{i}" role="description">{n}</Item>' for i, n in enumerate(names))
-    citation = "mitsonar world: x east, y north, metres|"
-    keys = [(1024, 0, 1, 32767), (1025, 0, 1, 1), (1026, 34737, len(citation), 0), (3076, 0, 1, 9001)]
+    if origin is None:
+        model, citation, grid = 32767, "mitsonar world: x east, y north, metres|", []
+    else:
+        west, north = west + origin.east_m, north + origin.north_m
+        hemisphere = "S" if origin.south else "N"
+        model, citation, grid = 1, f"WGS 84 / UTM zone {origin.zone}{hemisphere}|", [(3072, 0, 1, origin.epsg)]
+    keys = [(1024, 0, 1, model), (1025, 0, 1, 1), (1026, 34737, len(citation), 0), *grid, (3076, 0, 1, 9001)]
     directory = [1, 1, 1, len(keys), *(number for key in keys for number in key)]
     tags = [
         (33550, "d", 3, (mosaic.cell_m, mosaic.cell_m, 0.0), True),  # ModelPixelScale

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
-from matplotlib.colors import PowerNorm
+from matplotlib.colors import Normalize, PowerNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, count_noun
+from mitsonar.geometry.side_scan import GroundScan
 from mitsonar.io.files import write_atomic
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import AXES
@@ -29,6 +30,7 @@ __all__ = [
     "crlb_png",
     "dvl_figure",
     "echogram_figure",
+    "ground_range_figure",
     "mosaic_figure",
     "path_figure",
     "quality_figure",
@@ -44,7 +46,11 @@ __all__ = [
 ]
 
 
-ALMANZA_COLOURS = {"estimated": ("red", "darkblue"), "true": ("limegreen", "cyan")}
+ALMANZA_COLOURS = {
+    "estimated": ("red", "darkblue"),
+    "true": ("limegreen", "cyan"),
+    "recorded": ("limegreen", "cyan"),
+}
 """Colours of the line and of the arrows of a path (Almanza-Medina, fig. 2.9 and 3.7)."""
 
 OTHER_COLOURS = (("tab:orange", "tab:brown"), ("tab:purple", "tab:pink"), ("tab:olive", "tab:gray"))
@@ -79,7 +85,9 @@ class LevelMap(Protocol):
         """Return the number of frames that show each cell, shaped as ``mean``."""
 
 
-def mosaic_figure(mosaic: LevelMap, paths: Mapping[str, Trajectory] | None = None, *, title: str = "") -> Figure:
+def mosaic_figure(
+    mosaic: LevelMap, paths: Mapping[str, Trajectory] | None = None, *, title: str = "", stretch: bool = False
+) -> Figure:
     """Draw the mean level of a mosaic with a scale bar, and paths of the sonar with arrows along its heading.
 
     Args:
@@ -87,12 +95,19 @@ def mosaic_figure(mosaic: LevelMap, paths: Mapping[str, Trajectory] | None = Non
         paths: paths to draw, keyed by their names in the legend. ``estimated`` and ``true`` have the colours of
             Almanza-Medina's figures: red line with dark blue arrows, and green line with cyan arrows.
         title: title of the figure.
+        stretch: show levels evenly between their percentiles 0.5 and 99.5, as suits levels in dB.
     """
     figure, (axes,) = _maps(1, mosaic, paths)
     level = mosaic.mean
-    norm = PowerNorm(GAMMA, vmin=0, vmax=float(np.nanpercentile(level, 99.9)) or 1.0)
+    if stretch:
+        norm, shown = Normalize(*np.nanpercentile(level, [0.5, 99.5])), ""
+    else:
+        norm, shown = (
+            PowerNorm(GAMMA, vmin=0, vmax=float(np.nanpercentile(level, 99.9)) or 1.0),
+            f"; shown with gamma {GAMMA:g}",
+        )
     image = axes.imshow(level, extent=mosaic.extent, cmap="copper", norm=norm, interpolation="antialiased")
-    figure.colorbar(image, ax=axes, label=f"mean level (1 = full scale; shown with gamma {GAMMA:g})", fraction=0.04)
+    figure.colorbar(image, ax=axes, label=f"mean level (1 = full scale{shown})", fraction=0.04)
     _draw_paths(axes, paths or {})
     _finish_map(axes, mosaic, paths or {}, title)
     return figure
@@ -429,29 +444,73 @@ def save_sounding_figure(figure: Figure, path: Path) -> None:
     write_atomic(path, _encoded(figure, 110, metadata={"Software": None}))
 
 
-def side_scan_figure(echogram: Echogram) -> Figure:
-    """Draw the waterfall of a side-scan sonar: slant range across with port to the left, the first ping at the bottom."""
+def side_scan_figure(
+    echogram: Echogram,
+    first_return_m: NDArray[np.float64] | None = None,
+    *,
+    span_db: float = SHOWN_SPAN_DB,
+    title: str | None = None,
+) -> Figure:
+    """Draw the waterfall of a side-scan sonar: slant range across with port to the left, the first ping at the bottom.
+
+    Args:
+        echogram: levels of port and starboard.
+        first_return_m: slant range of the first return of each ping ``(pings,)`` [m], to draw as a line on either side.
+        span_db: range of levels to show below full scale [dB].
+        title: title of the figure; default: the instrument, its model and the number of pings.
+    """
     figure, axes = _single_axes(8.4, 5.2)
-    level, channels = echogram.decibels(SHOWN_SPAN_DB), echogram.sounder.channels
+    level, channels = echogram.decibels(span_db), echogram.sounder.channels
     port, starboard = (level[:, channels.index(side)] for side in ("port", "starboard"))
     far, near = echogram.sounder.fan.range_max, echogram.sounder.fan.range_min
     along = _path_extent(echogram)
-    options = {
+    options = _waterfall_options(span_db)
+    image = axes.imshow(port[:, ::-1], extent=(-far, -near, *along), **options)
+    axes.imshow(starboard, extent=(near, far, *along), **options)
+    if first_return_m is not None:
+        place = along[0] + (np.arange(len(echogram)) + 0.5) * (along[1] - along[0]) / len(echogram)
+        axes.plot(-first_return_m, place, color="cyan", lw=0.8, label="first return")
+        axes.plot(first_return_m, place, color="cyan", lw=0.8)
+        axes.legend(loc="lower right", fontsize=8)
+    axes.set(xlim=(-far, far), ylim=along, xlabel="slant range, port - starboard (m)", ylabel=_along_label(echogram))
+    figure.colorbar(image, ax=axes, label="level (dB)")
+    usual = f"{echogram.sounder.name}, {echogram.sounder.fan.model}, {count_noun(len(echogram), 'ping')}"
+    axes.set_title(usual if title is None else title, fontsize=10)
+    return figure
+
+
+def ground_range_figure(scan: GroundScan, *, span_db: float = SHOWN_SPAN_DB, title: str = "") -> Figure:
+    """Draw the waterfall of a side-scan sonar over ground range, port to the left, the first ping at the bottom."""
+    figure, axes = _single_axes(8.4, 5.2)
+    full_scale = float(np.nanpercentile(scan.levels, 99.9)) or 1.0
+    level = 10 * np.log10(np.clip(scan.levels / full_scale, 10 ** (-span_db / 10), 1))
+    along = _path_extent(scan.echogram)
+    half = (scan.across_m[-1] - scan.across_m[0]) / (len(scan.across_m) - 1) / 2
+    extent = (scan.across_m[0] - half, scan.across_m[-1] + half, *along)
+    axes.set_facecolor(UNSEEN_COLOUR)
+    image = axes.imshow(level, extent=extent, **_waterfall_options(span_db))
+    axes.set(ylim=along, xlabel="ground range, port - starboard (m)", ylabel=_along_label(scan.echogram))
+    figure.colorbar(image, ax=axes, label="level (dB)")
+    axes.set_title(title, fontsize=10)
+    return figure
+
+
+def _waterfall_options(span_db: float) -> dict[str, Any]:
+    """Return the options of a picture of levels in dB whose first row is at the bottom."""
+    return {
         "cmap": "copper",
-        "vmin": -SHOWN_SPAN_DB,
+        "vmin": -span_db,
         "vmax": 0,
         "aspect": "auto",
         "origin": "lower",
         "interpolation": "nearest",
     }
-    image = axes.imshow(port[:, ::-1], extent=(-far, -near, *along), **options)
-    axes.imshow(starboard, extent=(near, far, *along), **options)
-    axes.set(xlim=(-far, far), ylim=along, xlabel="slant range, port - starboard (m)", ylabel="along the path (m)")
-    figure.colorbar(image, ax=axes, label="level (dB)")
-    axes.set_title(
-        f"{echogram.sounder.name}, {echogram.sounder.fan.model}, {count_noun(len(echogram), 'ping')}", fontsize=10
-    )
-    return figure
+
+
+def _along_label(echogram: Echogram) -> str:
+    """Return what :func:`_path_extent` counts along."""
+    moved = np.ptp(echogram.poses[:, :3], axis=0).max() > 0
+    return "along the path (m)" if moved else "ping"
 
 
 def echogram_figure(echogram: Echogram, soundings: Soundings | None = None) -> Figure:

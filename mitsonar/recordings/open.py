@@ -1,4 +1,7 @@
-"""How is a recording of unknown format opened? By the first bytes of the file, or the files in the folder."""
+"""How is a recording of unknown format opened? By the first bytes of the file, or the files in the folder.
+
+Recordings of imaging sonars hold frames, those of side-scans echograms.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, count_noun
+from mitsonar.recordings.jsf import is_jsf, read_jsf
 from mitsonar.recordings.oculus import is_oculus, read_oculus
 from mitsonar.recordings.pictures import (
     holds_pictures,
@@ -21,13 +25,30 @@ from mitsonar.recordings.pictures import (
     read_picture_stack,
     read_picture_video,
 )
+from mitsonar.recordings.pingverter import is_pingverter, read_pingverter
 from mitsonar.recordings.public_sets import is_canoe, is_neusis, is_uxo, read_canoe, read_neusis, read_uxo
 from mitsonar.recordings.recording import Part, Recording
 from mitsonar.recordings.ros_messages import is_ros_bag
 from mitsonar.recordings.ros_reader import read_ros_bag
+from mitsonar.recordings.side_scan import SideScan, SideScanPart, holds_echogram, read_echogram
 from mitsonar.recordings.sound_metrics import SIGNATURE, SIGNATURES, read_aris, read_didson
+from mitsonar.recordings.xtf import is_xtf, read_xtf
 
-__all__ = ["FORMATS", "Format", "Summary", "detect_format", "known_formats", "open_recording", "summary_lines", "summary_of"]
+__all__ = [
+    "FORMATS",
+    "SIDE_SCANS",
+    "Format",
+    "SideScanFormat",
+    "Summary",
+    "detect_format",
+    "detect_side_scan",
+    "known_formats",
+    "open_recording",
+    "open_side_scan",
+    "side_scan_words",
+    "summary_lines",
+    "summary_of",
+]
 
 
 FIRST_BYTES = 16
@@ -82,26 +103,57 @@ FORMATS: tuple[Format, ...] = (
     Format("videos (.avi, .mp4)", is_video, _without_topic(read_picture_video)),
     Format("folders of pictures (PNG, JPEG, PGM)", holds_pictures, _without_topic(read_picture_folder)),
 )
-"""All formats, in the order in which they are tried."""
+"""All formats of frames, in the order in which they are tried."""
+
+
+class SideScanFormat(NamedTuple):
+    """A format of side-scan recordings and its reader.
+
+    Attributes:
+        words: readable name.
+        fits: function that returns whether a path with these first bytes (empty for a folder) has the format.
+        read: function that opens a recording.
+    """
+
+    words: str
+    fits: Callable[[Path, bytes], bool]
+    read: Callable[[Path], SideScan]
+
+
+SIDE_SCANS: tuple[SideScanFormat, ...] = (
+    SideScanFormat("XTF (.xtf)", is_xtf, read_xtf),
+    SideScanFormat("JSF (.jsf)", is_jsf, read_jsf),
+    SideScanFormat("folders of PINGVerter", is_pingverter, read_pingverter),
+    SideScanFormat("echograms of mitsonar (.npz, folders of runs)", holds_echogram, read_echogram),
+)
+"""All formats of side-scans, in the order in which they are tried."""
 
 
 def detect_format(path: str | Path) -> Format | None:
-    """Return the format of a file or folder; None if it is not a recording or does not exist."""
-    path = Path(path)
-    first = b""
+    """Return the format of a file or folder; None if it is not a recording with frames or does not exist."""
+    first = _first_bytes(Path(path))
+    return None if first is None else next((one for one in FORMATS if one.fits(Path(path), first)), None)
+
+
+def detect_side_scan(path: str | Path) -> SideScanFormat | None:
+    """Return the format of a file or folder; None if it is not a side-scan or does not exist."""
+    first = _first_bytes(Path(path))
+    return None if first is None else next((one for one in SIDE_SCANS if one.fits(Path(path), first)), None)
+
+
+def _first_bytes(path: Path) -> bytes | None:
+    """Return the first bytes of a file; none of a folder; None if there is neither or it cannot be read."""
     if os.path.isfile(path):
         try:
             with path.open("rb") as file:
-                first = file.read(FIRST_BYTES)
+                return file.read(FIRST_BYTES)
         except OSError:
             return None
-    elif not os.path.isdir(path):
-        return None
-    return next((one for one in FORMATS if one.fits(path, first)), None)
+    return b"" if os.path.isdir(path) else None
 
 
 def known_formats() -> str:
-    """Return the names of all formats as one string, for messages."""
+    """Return the names of all formats of frames as one string, for messages."""
     return ", ".join(one.words for one in FORMATS)
 
 
@@ -121,8 +173,37 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     if recording_format is None:
         if not os.path.exists(path):
             raise MitsonarError(f"no such file: {path}")
+        if detect_side_scan(path) is not None:
+            raise MitsonarError(side_scan_words(path))
         raise MitsonarError(f"{path} is not a recording that mitsonar reads: it reads {known_formats()}")
     return recording_format.read(Path(path), None if geometry is None else Path(geometry), topic)
+
+
+def side_scan_words(path: str | Path) -> str:
+    """Return the message for a side-scan where frames are needed."""
+    return (
+        f"{path} is a side-scan, which has pings in place of frames: `mitsonar recording` and `mitsonar mosaic` take it, "
+        "and mitsonar.open_side_scan in Python"
+    )
+
+
+def open_side_scan(path: str | Path) -> SideScan:
+    """Open a recording of a side-scan sonar, real or simulated; samples are read part by part.
+
+    Args:
+        path: an XTF or JSF file, a folder of PINGVerter, the echogram of a simulated side-scan, or the folder of its run
+            (docs/guides/side-scan.md).
+
+    Raises:
+        MitsonarError: if the path does not exist, has no known format, is damaged, or holds no pings of both sides.
+    """
+    side_scan_format = detect_side_scan(path)
+    if side_scan_format is None:
+        if not os.path.exists(path):
+            raise MitsonarError(f"no such file: {path}")
+        formats = ", ".join(one.words for one in SIDE_SCANS)
+        raise MitsonarError(f"{path} is not a side-scan that mitsonar reads: it reads {formats}")
+    return side_scan_format.read(Path(path))
 
 
 # ---------------- Summary of a recording
@@ -136,21 +217,25 @@ Summary: TypeAlias = dict[str, Any]
 GAP_RATIO = 2.5
 """A time step between frames counts as a gap if it exceeds this multiple of the median step."""
 
-DATES_FROM_S = 946_684_800.0
-"""Times from this one on are shown as dates: 2000-01-01 [s since 1970]."""
+DATES_FROM_S, DATES_TO_S = 946_684_800.0, 32_503_680_000.0
+"""Times from the first to the second are shown as dates: 2000-01-01 to 3000-01-01 [s since 1970]."""
 
 
-def summary_of(recording: Recording) -> Summary:
+def summary_of(recording: Recording | SideScan) -> Summary:
     """Return a summary of a recording; angles are in degrees, all other values in SI units.
 
-    The summary lists frames, format, facts and notes, and of each part its window, beams, rate, times, gaps, attitude and
-    path length.
+    The summary lists frames or pings, format, facts and notes, and of each part its window, beams or sides, rate, times,
+    gaps, attitude and path length.
     """
+    if isinstance(recording, SideScan):
+        unit, parts = "pings", [_side_scan_summary(part) for part in recording.parts]
+    else:
+        unit, parts = "frames", [_part_summary(part) for part in recording.parts]
     return {
         "name": recording.name,
         "format": recording.format,
-        "frames": len(recording),
-        "parts": [_part_summary(part) for part in recording.parts],
+        unit: len(recording),
+        "parts": parts,
         "facts": dict(recording.facts),
         "notes": list(recording.notes),
     }
@@ -189,6 +274,33 @@ def _part_summary(part: Part) -> Summary:
     return summary
 
 
+def _side_scan_summary(part: SideScanPart) -> Summary:
+    """Return the summary of a part of a side-scan."""
+    fan = part.sounder.fan
+    attitude = np.unwrap(part.poses[:, 3:], axis=0)
+    summary: Summary = {
+        "pings": len(part),
+        "sonar": part.sounder.name,
+        "window_m": [fan.range_min, fan.range_max],
+        "bins": fan.range_bins,
+        "bin_m": (fan.range_max - fan.range_min) / fan.range_bins,
+        "sides": list(part.sounder.channels),
+        "frequency_hz": fan.frequency_hz,
+        "sound_speed": fan.sound_speed,
+        **_time_summary(part.time_s),
+        **{
+            name: _limits(np.degrees(values))
+            for name, values in zip(("pitch_deg", "roll_deg", "heading_deg"), attitude.T, strict=True)
+        },
+        "depth_m": _limits(-part.poses[:, 2]) if (part.poses[:, 2] < 0).any() else None,
+        "height_m": _limits(part.height_m),
+        "path_m": float(np.linalg.norm(np.diff(part.poses[:, :3], axis=0), axis=1).sum()),
+    }
+    if part.origin is not None:
+        summary["origin"] = {"epsg": part.origin.epsg, "east_m": part.origin.east_m, "north_m": part.origin.north_m}
+    return summary
+
+
 def _time_summary(time_s: Array) -> Summary:
     """Return first and last time, rate and gaps."""
     time = time_s if time_s.ndim == 1 else time_s.mean(axis=1)
@@ -209,10 +321,11 @@ def _limits(values: Array) -> list[float] | None:
 
 def summary_lines(summary: Summary) -> list[str]:
     """Return the lines of a summary, formatted as a table of two columns."""
-    rows = [("file", summary["name"]), ("format", summary["format"]), ("frames", f"{summary['frames']:,}")]
+    unit = "pings" if "pings" in summary else "frames"
+    rows = [("file", summary["name"]), ("format", summary["format"]), (unit, f"{summary[unit]:,}")]
     for number, part in enumerate(summary["parts"]):
         if len(summary["parts"]) > 1:
-            rows.append((f"part {number}", count_noun(part["frames"], "frame")))
+            rows.append((f"part {number}", count_noun(part[unit], unit[:-1])))
         rows += _part_rows(part)
     rows += [(f"fact {name}", _format_value(value)) for name, value in summary["facts"].items()]
     rows += [("note", note) for note in summary["notes"]]
@@ -224,14 +337,16 @@ def _part_rows(part: Summary) -> list[tuple[str, str]]:
     """Return the table rows of a part: name and value."""
     low, high = part["window_m"]
     step = "" if part["bin_m"] is None else f" of {part['bin_m'] * 1e3:.4g} mm"
-    first, last = part["bearing_deg"]
-    rows = [
-        ("sonar", part["sonar"]),
-        ("window", f"{low:.4g}..{high:.4g} m, {count_noun(part['bins'], 'bin')}{step}"),
-        ("beams", f"{part['beams']:,} from {first:.4g} to {last:.4g} deg, {part['elevation_fov_deg']:.4g} deg high"),
-        ("level", f"{part['level']}, {part['samples']}"),
-        ("sound speed", f"{part['sound_speed']:.6g} m/s"),
-    ]
+    rows = [("sonar", part["sonar"]), ("window", f"{low:.4g}..{high:.4g} m, {count_noun(part['bins'], 'bin')}{step}")]
+    if "sides" in part:
+        rows.append(("sides", ", ".join(part["sides"])))
+    else:
+        first, last = part["bearing_deg"]
+        rows.append(
+            ("beams", f"{part['beams']:,} from {first:.4g} to {last:.4g} deg, {part['elevation_fov_deg']:.4g} deg high")
+        )
+        rows.append(("level", f"{part['level']}, {part['samples']}"))
+    rows.append(("sound speed", f"{part['sound_speed']:.6g} m/s"))
     if part["frequency_hz"]:
         rows.append(("carrier", f"{part['frequency_hz'] / 1e3:,.6g} kHz"))
     if "first_s" in part:
@@ -240,19 +355,22 @@ def _part_rows(part: Summary) -> list[tuple[str, str]]:
     if "rate_hz" in part:
         longest = f"; the longest step takes {part['longest_step_s']:.4g} s" if part["gaps"] else ""
         rows.append(("rate", f"{part['rate_hz']:.4g} Hz, {count_noun(part['gaps'], 'gap')}{longest}"))
-    units = {"pitch_deg": "deg", "roll_deg": "deg", "heading_deg": "deg", "height_m": "m", "gain_db": "dB"}
+    units = {"pitch_deg": "deg", "roll_deg": "deg", "heading_deg": "deg", "depth_m": "m", "height_m": "m", "gain_db": "dB"}
     for name, unit in units.items():
         if part.get(name) is not None:
             least, most = part[name]
             rows.append((name.rpartition("_")[0], f"{least:.4g}..{most:.4g} {unit}"))
     if "path_m" in part:
         rows.append(("poses", f"known; the path is {part['path_m']:.4g} m long"))
+    if "origin" in part:
+        origin = part["origin"]
+        rows.append(("origin", f"{origin['east_m']:.0f} m east, {origin['north_m']:.0f} m north in EPSG:{origin['epsg']}"))
     return rows
 
 
 def _format_time(time_s: float) -> str:
     """Format a time: as a date in UTC if it is one, otherwise in seconds."""
-    if time_s < DATES_FROM_S:
+    if not DATES_FROM_S <= time_s < DATES_TO_S:
         return f"{time_s:.6g} s"
     return datetime.fromtimestamp(time_s, UTC).isoformat(sep=" ", timespec="milliseconds").removesuffix("+00:00")
 

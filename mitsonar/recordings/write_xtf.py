@@ -33,7 +33,8 @@ CHANNEL = layout(
 FILE = layout(
     {
         "format": (0, "u1"), "system": (1, "u1"), "program": (2, "S8"), "version": (10, "S8"), "sonar": (18, "S16"),
-        "note": (36, "S64"), "file": (100, "S64"), "nav_units": (164, "<u2"), "sonar_channels": (166, "<u2"),
+        "sensor": (34, "<u2"), "note": (36, "S64"), "file": (100, "S64"), "nav_units": (164, "<u2"),
+        "sonar_channels": (166, "<u2"), "bathymetry_channels": (168, "<u2"),
     },
     256,
 )  # fmt: skip
@@ -45,8 +46,9 @@ PING = layout(
         "month": (16, "u1"), "day": (17, "u1"), "hour": (18, "u1"), "minute": (19, "u1"), "second": (20, "u1"),
         "hundredths": (21, "u1"), "day_of_year": (22, "<u2"), "event": (24, "<u4"), "ping": (28, "<u4"),
         "half_sound_speed": (32, "<f4"), "sound_speed": (72, "<f4"), "gyro_deg": (124, "<f4"), "ship_y": (128, "<f8"),
-        "ship_x": (136, "<f8"), "speed_knots": (152, "<f4"), "y": (160, "<f8"), "x": (168, "<f8"), "depth_m": (192, "<f4"),
-        "altitude_m": (196, "<f4"), "pitch_deg": (204, "<f4"), "roll_deg": (208, "<f4"), "heading_deg": (212, "<f4"),
+        "ship_x": (136, "<f8"), "speed_knots": (152, "<f4"), "y": (160, "<f8"), "x": (168, "<f8"),
+        "layback_m": (184, "<f4"), "depth_m": (192, "<f4"), "altitude_m": (196, "<f4"), "second_altitude_m": (200, "<f4"),
+        "pitch_deg": (204, "<f4"), "roll_deg": (208, "<f4"), "heading_deg": (212, "<f4"),
         "time_ms": (224, "<u4"),
     },
     256,
@@ -57,6 +59,7 @@ PING_CHANNEL = layout(
     {
         "channel": (0, "<u2"), "slant_range_m": (4, "<f4"), "delay_s": (12, "<f4"), "duration_s": (16, "<f4"),
         "ping_s": (20, "<f4"), "frequency_khz": (26, "<u2"), "samples": (42, "<u4"), "millivolts": (46, "<u2"),
+        "weight": (58, "<i2"),
     },
     64,
 )  # fmt: skip
@@ -66,7 +69,9 @@ FULL_COUNT = 32767
 """Count of the largest amplitude; readers may interpret two bytes as signed or unsigned."""
 
 PORT, STARBOARD = 1, 2
-METRES = 0
+METRES, DEGREES = 0, 3
+"""Units of positions."""
+
 KNOTS = 3600 / 1852
 PAD = 64
 """The size of a record is a multiple of this [bytes]."""
@@ -76,8 +81,8 @@ def write_xtf(path: str | Path, echogram: Echogram) -> None:
     """Write the echogram of a side-scan sonar; the file is complete or absent.
 
     Samples are amplitudes, scaled so that the largest of the file has 32,767 counts. Port samples run from the outermost bin
-    inwards, as XTF requires. Positions are metres, east and north. Heights above the ground are those of the echogram. Times
-    count from 1970.
+    inwards, as XTF requires. Positions are latitudes and longitudes if the echogram has an origin, otherwise metres east and
+    north. Heights above the ground are those of the echogram. Times count from 1970.
 
     Raises:
         MitsonarError: if the echogram is not that of a side-scan sonar.
@@ -107,8 +112,8 @@ def _file_header(echogram: Echogram, name: str) -> bytes:
     header = np.zeros((), FILE)
     header["format"], header["system"], header["program"], header["version"] = 0x7B, 1, b"mitsonar", b"1"
     header["sonar"], header["file"] = sounder.name.encode()[:15], name.encode()[:63]
-    header["note"] = b"simulated by mitsonar; metres, east and north"
-    header["nav_units"], header["sonar_channels"] = METRES, 2
+    header["note"] = b"written by mitsonar; metres, east and north" if echogram.origin is None else b"written by mitsonar"
+    header["nav_units"], header["sonar_channels"] = METRES if echogram.origin is None else DEGREES, 2
     channels = np.zeros(6, CHANNEL)
     for one, kind, side in zip(channels, (PORT, STARBOARD), ("port", "starboard"), strict=False):
         mount = sounder.mounts[side]
@@ -127,12 +132,17 @@ def _ping_headers(echogram: Echogram) -> Header:
     header["magic"], header["channels"] = 0xFACE, 2
     header["event"] = header["ping"] = np.arange(1, len(echogram) + 1)
     header["sound_speed"], header["half_sound_speed"] = sounder.fan.sound_speed, sounder.fan.sound_speed / 2
-    header["x"] = header["ship_x"] = poses[:, 0]
-    header["y"] = header["ship_y"] = poses[:, 1]
+    east, north, convergence = poses[:, 0], poses[:, 1], np.zeros(len(poses))
+    if echogram.origin is not None:
+        degrees = echogram.origin.to_degrees(poses[:, :2])
+        (north, east), convergence = degrees.T, echogram.origin.convergence_rad(degrees)
+    header["x"] = header["ship_x"] = east
+    header["y"] = header["ship_y"] = north
     header["depth_m"], header["altitude_m"] = np.maximum(0, -poses[:, 2]), np.nan_to_num(echogram.height_m)
-    pitch, roll, heading = np.degrees(poses[:, 3:]).T
+    pitch, roll, heading = np.degrees(poses[:, 3:] + np.multiply.outer(convergence, [0, 0, 1])).T
     header["pitch_deg"], header["roll_deg"] = -pitch, roll  # XTF: bow up is positive
-    header["heading_deg"] = header["gyro_deg"] = heading % 360
+    # readers take a heading of 0 for one that was not recorded
+    header["heading_deg"] = header["gyro_deg"] = np.where(heading % 360 == 0, 360.0, heading % 360)
     trajectory = Trajectory(poses, echogram.time_s)
     header["speed_knots"] = np.linalg.norm(velocities(trajectory)[:, :3], axis=1) * KNOTS
     header["time_ms"] = np.rint(1000 * (echogram.time_s - echogram.time_s[0]))

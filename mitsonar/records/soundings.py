@@ -16,6 +16,7 @@ from mitsonar.instruments.sounder import FEWEST_BEAMS, Sounder
 from mitsonar.instruments.views import directions
 from mitsonar.io.files import parse_json, read_npz, write_atomic
 from mitsonar.motion.pose import vehicle_rotation
+from mitsonar.motion.utm import UtmOrigin
 from mitsonar.records.frames import SonarFrames
 
 __all__ = [
@@ -164,6 +165,7 @@ class Echogram:
         sounder: the instrument.
         levels: intensities ``(pings, channels, bins)`` float32, after the range-dependent gain of the instrument.
         height_m: height of the first fan over the surface straight below ``(pings,)`` [m]; nan if there is none.
+        origin: where on the Earth the origin of the poses lies; None if that is unknown, as in a simulated world.
 
     Raises:
         MitsonarError: inconsistent shapes.
@@ -174,6 +176,7 @@ class Echogram:
     sounder: Sounder
     levels: NDArray[np.float32]
     height_m: NDArray[np.float64]
+    origin: UtmOrigin | None = None
 
     def __post_init__(self) -> None:
         expected_shape = (len(self.time_s), len(self.sounder.channels), self.sounder.fan.range_bins)
@@ -215,8 +218,10 @@ class Echogram:
 
     def save(self, path: str | Path) -> None:
         """Write an npz file atomically."""
-        names = ("time_s", "poses", "levels", "height_m")
-        save_pings(path, self.sounder, {name: getattr(self, name) for name in names})
+        arrays = {name: getattr(self, name) for name in ("time_s", "poses", "levels", "height_m")}
+        if self.origin is not None:
+            arrays["origin"] = np.array([self.origin.zone, self.origin.south, self.origin.east_m, self.origin.north_m])
+        save_pings(path, self.sounder, arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -225,8 +230,19 @@ class Echogram:
         Raises:
             MitsonarError: a file that cannot be read or has another format.
         """
-        sounder, arrays = load_pings(path, ("levels", "height_m"))
-        return cls(arrays["time_s"], arrays["poses"], sounder, arrays["levels"], arrays["height_m"])
+        sounder, arrays = load_pings(path, ("levels", "height_m"), constants=("origin",))
+        levels, height_m = arrays["levels"].astype(np.float32, copy=False), arrays["height_m"]
+        if height_m.ndim != 1 or (height_m <= 0).any() or not np.isfinite(levels).all() or (levels < 0).any():
+            raise MitsonarError(
+                f"{path} is damaged: levels must be finite and not negative, with one height above 0 or nan for each ping"
+            )
+        origin = None
+        if "origin" in arrays:
+            if arrays["origin"].shape != (4,):
+                raise MitsonarError(f"{path} is damaged: origin must be 4 numbers, got {arrays['origin'].shape}")
+            zone, south, east_m, north_m = arrays["origin"].tolist()
+            origin = UtmOrigin(int(zone), bool(south), east_m, north_m)
+        return cls(arrays["time_s"], arrays["poses"], sounder, levels, height_m, origin)
 
 
 # ---------------- Range rates of pixels
@@ -400,10 +416,17 @@ def save_pings(path: str | Path, sounder: Sounder, arrays: dict[str, NDArray[Any
     write_atomic(Path(path), buffer.getvalue())
 
 
-def load_pings(path: str | Path, names: tuple[str, ...]) -> tuple[Sounder, dict[str, NDArray[Any]]]:
+def load_pings(
+    path: str | Path, names: tuple[str, ...], constants: tuple[str, ...] = ()
+) -> tuple[Sounder, dict[str, NDArray[Any]]]:
     """Read a file of :func:`save_pings`: the instrument and the named arrays, checked for type and length.
 
     Infinite values are rejected; nan is allowed.
+
+    Args:
+        path: path of the file.
+        names: names of arrays with a row for each ping, which the file must have in addition to times and poses.
+        constants: names of finite arrays without such rows, which the file may have.
 
     Raises:
         MitsonarError: a file that cannot be read or has another format.
@@ -413,7 +436,8 @@ def load_pings(path: str | Path, names: tuple[str, ...]) -> tuple[Sounder, dict[
     except MitsonarError:
         raise
     except Exception as error:  # damaged bytes raise many types of errors
-        raise MitsonarError(f"cannot read {path}: {error}; give a file that `mitsonar sound` wrote") from None
+        reason = " ".join(str(error).split())[:160]
+        raise MitsonarError(f"cannot read {path}: {reason}; give a file that `mitsonar sound` wrote") from None
     missing = [name for name in (*names, "sounder", "time_s", "poses") if name not in table]
     if missing:
         raise MitsonarError(f"{path} lacks {missing[0]}: give a file that `mitsonar sound` wrote")
@@ -428,4 +452,10 @@ def load_pings(path: str | Path, names: tuple[str, ...]) -> tuple[Sounder, dict[
             raise MitsonarError(f"{path} is damaged: {name} must be {pings} rows of numbers")
     if arrays["poses"].shape != (pings, 6) or not pings:
         raise MitsonarError(f"{path} is damaged: poses must be (pings, 6), got {arrays['poses'].shape}")
+    if not (np.isfinite(arrays["poses"]).all() and np.isfinite(arrays["time_s"]).all()):
+        raise MitsonarError(f"{path} is damaged: poses and times must be finite")
+    for name in set(constants) & set(table):
+        if table[name].dtype.kind != "f" or not np.isfinite(table[name]).all():
+            raise MitsonarError(f"{path} is damaged: {name} must be finite numbers")
+        arrays[name] = table[name]
     return sounder, arrays

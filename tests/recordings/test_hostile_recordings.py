@@ -19,11 +19,22 @@ from drawn_frames import over_ground, sway
 from helpers import essence
 from hostile_readers import Reader, attack, read_recording
 from mutations import Rng, changed_bytes, changed_text, outcome
-from recording_files import aris_file, didson_file, oculus_log, oculus_ping, some_pings
+from recording_files import (
+    aris_file,
+    didson_file,
+    jsf_file,
+    oculus_log,
+    oculus_ping,
+    pingverter_folder,
+    side_scan_echogram,
+    some_pings,
+)
 
 from mitsonar import MitsonarError, open_recording
 from mitsonar.instruments.sonar import Sonar
+from mitsonar.motion.utm import UtmOrigin
 from mitsonar.recordings.write_mcap import write_mcap
+from mitsonar.recordings.write_xtf import write_xtf
 
 FIRST, USUAL, FEWER, MANY = 40, 100, 10, 10_000
 """Mutants of each format in the essence, in CI, in the essence of bags, which take 0.1 s each, and in the slow test."""
@@ -64,6 +75,9 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "ros 1 bag": lambda folder: _bag(folder / "a.bag"),
     "ros 2 bag, sqlite": lambda folder: _bag(folder / "a"),
     "ros 2 bag, mcap": lambda folder: _bag(folder / "a_mcap"),
+    "xtf": lambda folder: write_xtf(folder / "a.xtf", side_scan_echogram(origin=UtmOrigin(19, False, 512724.0, 5365826.0))),
+    "jsf": lambda folder: (folder / "a.jsf").write_bytes(jsf_file()),
+    "pingverter": lambda folder: pingverter_folder(folder / "log", side_scan_echogram()),
     "mcap of a run": lambda folder: write_mcap([over_ground(sway(3), SMALL)], folder / "a.mcap"),
 }
 """What writes a small recording of each format into an empty folder: one file, or one folder of files."""
