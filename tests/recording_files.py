@@ -107,3 +107,54 @@ def didson_file(
     size = header or {3: 512, 4: 1024}[version]
     pairs = zip(head, images.astype(np.uint8), strict=True)
     return first.tobytes().ljust(size, b"\0")[:size] + b"".join(one.tobytes() + image.tobytes() for one, image in pairs)
+
+
+def ping360_message(samples: bytes, angle: int, *, automatic: bool = False, **fields: int) -> bytes:
+    """A message of a Ping360 with samples, 2300 or 2301, as ping-protocol defines it."""
+    values = {"gain_setting": 1, "transmit_duration": 30, "sample_period": 200, "transmit_frequency": 750} | fields
+    count = values.pop("number_of_samples", len(samples))
+    head = struct.pack("<BBHHHH", 1, values["gain_setting"], angle, *list(values.values())[1:])
+    if automatic:
+        head += struct.pack("<HHBB", 0, 399, 1, 0)
+    return ping_message(2301 if automatic else 2300, head + struct.pack("<HH", count, len(samples)) + samples)
+
+
+def ping_message(number: int, payload: bytes) -> bytes:
+    """A message of the Ping protocol: header, payload and checksum."""
+    body = b"BR" + struct.pack("<HHBB", len(payload), number, 2, 0) + payload
+    return body + struct.pack("<H", sum(body) % 65536)
+
+
+def ping_viewer_log(messages: list[bytes], times: list[float], *, encoding: str = "utf-16-be") -> bytes:
+    """A log of Ping Viewer: its header, then a time and a message of each record."""
+
+    def text(value: str) -> bytes:
+        content = value.encode(encoding)
+        return struct.pack(">I", len(content)) + content
+
+    head = text("PingViewer sensor log file") + struct.pack(">i", 1)
+    head += b"".join(map(text, ("b0461486", "2020-01-03T14:31:14-03:00", "", "Arch Linux", "unknown")))
+    result = head + struct.pack(">ii", 1, 2)
+    for message, time_s in zip(messages, times, strict=True):
+        milliseconds = round(time_s * 1000)
+        minutes, rest = divmod(milliseconds, 60_000)
+        stamp = f"{minutes // 60 % 24:02}:{minutes % 60:02}:{rest // 1000:02}.{rest % 1000:03}"
+        result += text(stamp) + struct.pack(">I", len(message)) + message
+    return result
+
+
+def ping360_text(samples: bytes, angle: int, **fields: int) -> str:
+    """A message of a Ping360 as ``brping`` prints it."""
+    values = {"mode": 1, "gain_setting": 1, "angle": angle, "transmit_duration": 30, "sample_period": 200}
+    values |= {"transmit_frequency": 750, "number_of_samples": len(samples), "data_length": len(samples)} | fields
+    lines = "".join(f"  - {name}: {value}\n" for name, value in values.items())
+    return (
+        f"\n{'-' * 50}\nID: 2300 - device_data\nHeader: start_1: 66 start_2: 82 payload_length: {14 + len(samples)} "
+        f"message_id: 2300 src_device_id: 2 dst_device_id: 0\nPayload:\n{lines}  - data: {[hex(one) for one in samples]}\n"
+        "Checksum: 1 check: 1 pass: True"
+    )
+
+
+def head_sweeps(angles: list[int], bins: int = 20) -> list[bytes]:
+    """Samples of pings, each sample a function of angle and number of the ping, so that none can be mistaken."""
+    return [bytes((7 * angle + 3 * number + one) % 251 for one in range(bins)) for number, angle in enumerate(angles)]
