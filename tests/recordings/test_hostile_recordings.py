@@ -83,6 +83,8 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "ros 1 bag": lambda folder: _bag(folder / "a.bag"),
     "ros 2 bag, sqlite": lambda folder: _bag(folder / "a"),
     "ros 2 bag, mcap": lambda folder: _bag(folder / "a_mcap"),
+    "ros 2 bag of raw images": lambda folder: _raw_bag(folder / "a"),
+    "ros 2 bag of a ping360": lambda folder: _head_bag(folder / "a"),
     "mcap of a run": lambda folder: write_mcap([over_ground(sway(3), SMALL)], folder / "a.mcap"),
 }
 """What writes a small recording of each format into an empty folder: one file, or one folder of files."""
@@ -107,6 +109,21 @@ def _bag(path: Path) -> None:
         time = 1.0 + 0.1 * number
         sent.append(("/sonar", time, maker.ping(image, time, bearing, distance)))
         sent.append(("/odom", time, maker.odometry(time, [number, 0, 1], level, "base")))
+    write_bag(path, maker, sent)
+
+
+def _raw_bag(path: Path) -> None:
+    maker, bearing = Maker(False), np.radians(np.linspace(-20, 20, 48))
+    sent: list[Sent] = [
+        ("/raw", 1.0 + number, maker.raw(image, 1.0 + number, bearing, beam_major=True))
+        for number, image in enumerate(IMAGES[:3].astype(np.uint8))
+    ]
+    write_bag(path, maker, sent)
+
+
+def _head_bag(path: Path) -> None:
+    maker = Maker(False)
+    sent: list[Sent] = [("/sonar", 1.0 + one, maker.echo(*ping, 1.0 + one)) for one, ping in enumerate(_head())]
     write_bag(path, maker, sent)
 
 
