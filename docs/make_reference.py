@@ -36,7 +36,16 @@ GROUPS = {
         "bridges.gymnasium.SonarTask",
         "bridges.gymnasium.Transition",
     ),
-    "Records": ("SonarFrames", "ImpulseResponses", "Echogram", "Soundings", "load_frames", "open_recording", "write_mcap"),
+    "Records": (
+        "SonarFrames",
+        "ImpulseResponses",
+        "Echogram",
+        "Soundings",
+        "load_frames",
+        "open_recording",
+        "write_mcap",
+        "FirstReturns",
+    ),
     "Estimation and mapping": (
         "create_estimator",
         "Estimate",

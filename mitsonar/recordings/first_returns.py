@@ -85,7 +85,7 @@ class FirstReturns:
 def beam_times(frames: SonarFrames, index: int) -> Array | None:
     """Return the times of the beams of a frame ``(beams,)`` [s]; None if all ping at once, or in unknown order."""
     if frames.time_s.ndim == 2:
-        return frames.time_s[index]
+        return np.asarray(frames.time_s[index], dtype=np.float64)
     if not scans(frames.sonar) or frames.sonar.beams != len(frames.bearing_rad):
         return None
     return np.asarray(frames.time_s[index] + ping_offsets_s(frames.sonar)[group_of_beams(frames.sonar)], dtype=np.float64)

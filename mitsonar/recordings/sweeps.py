@@ -144,7 +144,7 @@ def _is_single(windows: Sequence[Hashable], order: Index) -> NDArray[np.bool_]:
     window = np.array([numbers.setdefault(windows[place], len(numbers)) for place in order])
     single = np.zeros(len(order), bool)
     single[1:-1] = (window[:-2] == window[2:]) & (window[1:-1] != window[:-2])
-    return single & ~np.concatenate([[False], single[:-1]])
+    return np.asarray(single & ~np.concatenate([[False], single[:-1]]), dtype=np.bool_)
 
 
 def _split(angle: NDArray[np.int64], windows: Sequence[Hashable], order: Index) -> list[Index]:
