@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import struct
+import zipfile
 import zlib
 from typing import Any
 
@@ -153,6 +155,46 @@ def ping360_text(samples: bytes, angle: int, **fields: int) -> str:
         f"message_id: 2300 src_device_id: 2 dst_device_id: 0\nPayload:\n{lines}  - data: {[hex(one) for one in samples]}\n"
         "Checksum: 1 check: 1 pass: True"
     )
+
+
+def gemini_file(images: list[Values], **changed: Any) -> bytes:
+    """A GLF file: images ``(ranges, beams)``, and fields of all records, by the layout that ``pytritech`` reads."""
+    beams = images[0].shape[1]
+    fields: dict[str, Any] = {
+        "start": 10, "bearings": np.radians(np.linspace(-60, 60, beams)), "compression": 0, "frequency": 30_000,
+        "speed": 1480.0, "model": 1, "flags": 0, "by_beam": False, "version": 3, "stored": True, "rate_hz": 10.0,
+        "first_s": 1.4e9,  # since 1980
+    } | changed  # fmt: skip
+    content = b""
+    for number, image in enumerate(images):
+        time_s = fields["first_s"] + number / fields["rate_hz"]
+        flat = np.ascontiguousarray(image.T if fields["by_beam"] else image, dtype=np.uint8).tobytes()
+        data = zlib.compress(flat) if fields["compression"] == 0 else flat
+        body = struct.pack("<HH", 1, 0xEFEF)
+        start = fields["start"]
+        body += struct.pack("<HIIHII", fields["version"], start, start + len(image), 0, 0, beams)
+        body += struct.pack("<H", fields["compression"]) if fields["version"] == 3 else b""
+        body += struct.pack("<I", len(data)) + data + np.asarray(fields["bearings"], "<f8").tobytes()
+        body += struct.pack(
+            "<IIfdHfh?BB",
+            0,
+            fields["frequency"],
+            1.0,
+            time_s,
+            fields["flags"],
+            fields["speed"],
+            50,
+            True,
+            2,
+            fields["model"],
+        )
+        body += b"\0" + struct.pack("<H", 0xDEDE)
+        content += struct.pack("<cBIdBHHH", b"*", 1, 21 + len(body), time_s, 0, 1194, 0, 0) + body
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED if fields["stored"] else zipfile.ZIP_DEFLATED) as file:
+        file.writestr("data_1.cfg", "<log><0>a</0></log>")
+        file.writestr("data_1.dat", content + b"\xde\xde")
+    return archive.getvalue()
 
 
 def head_sweeps(angles: list[int], bins: int = 20) -> list[bytes]:

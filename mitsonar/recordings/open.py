@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, count_noun
+from mitsonar.recordings.gemini import is_gemini, read_gemini
 from mitsonar.recordings.oculus import is_oculus, read_oculus
 from mitsonar.recordings.pictures import (
     holds_pictures,
@@ -77,6 +78,7 @@ FORMATS: tuple[Format, ...] = (
     Format("Oculus (.raw, .oculus)", is_oculus, _without_geometry(read_oculus)),
     Format("Ping360 (.bin of Ping Viewer)", is_ping360_log, _without_geometry(read_ping360_log)),
     Format("Ping360 messages as text or CSV", is_ping360_text, _without_geometry(read_ping360_text)),
+    Format("Gemini (.glf)", is_gemini, _without_geometry(read_gemini)),
     Format("ROS bags (.bag, .mcap, .db3, folders)", is_ros_bag, read_ros_bag),
     Format("folders of UXO (DFKI)", is_uxo, _without_geometry(read_uxo)),
     Format("folders of CANOE", is_canoe, _without_geometry(read_canoe)),

@@ -10,6 +10,7 @@ import tracemalloc
 import warnings
 import zlib
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from mutations import Rng, changed_bytes, changed_text, outcome
 from recording_files import (
     aris_file,
     didson_file,
+    gemini_file,
     head_sweeps,
     oculus_log,
     oculus_ping,
@@ -79,6 +81,11 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     ),
     "ping360 cells": lambda folder: (folder / "a.csv").write_text(
         ",".join(f'"<bound method PingMessage.unpack_msg_data of {text}>"' for text in _head_texts())
+    ),
+    **(
+        {"gemini": lambda folder: (folder / "a.glf").write_bytes(gemini_file(list(IMAGES)))}
+        if find_spec("pytritech")
+        else {}
     ),
     "ros 1 bag": lambda folder: _bag(folder / "a.bag"),
     "ros 2 bag, sqlite": lambda folder: _bag(folder / "a"),
