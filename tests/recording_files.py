@@ -111,14 +111,14 @@ def didson_file(
     return first.tobytes().ljust(size, b"\0")[:size] + b"".join(one.tobytes() + image.tobytes() for one, image in pairs)
 
 
-def ping360_message(samples: bytes, angle: int, *, automatic: bool = False, **fields: int) -> bytes:
-    """A message of a Ping360 with samples, 2300 or 2301, as ping-protocol defines it."""
+def ping360_message(samples: bytes, angle: int, number: int = 2300, **fields: int) -> bytes:
+    """A message of a Ping360 with samples, of the number 2300 or 2301, as ping-protocol defines it."""
     values = {"gain_setting": 1, "transmit_duration": 30, "sample_period": 200, "transmit_frequency": 750} | fields
     count = values.pop("number_of_samples", len(samples))
     head = struct.pack("<BBHHHH", 1, values["gain_setting"], angle, *list(values.values())[1:])
-    if automatic:
+    if number == 2301:
         head += struct.pack("<HHBB", 0, 399, 1, 0)
-    return ping_message(2301 if automatic else 2300, head + struct.pack("<HH", count, len(samples)) + samples)
+    return ping_message(number, head + struct.pack("<HH", count, len(samples)) + samples)
 
 
 def ping_message(number: int, payload: bytes) -> bytes:

@@ -39,18 +39,23 @@ class BeamReturns(NamedTuple):
 
 @dataclass(frozen=True)
 class FirstReturns:
-    """Rule that picks the first return of a beam: the strongest bin of the first run of bins at or above a level.
+    """Rule that picks the first return of a beam.
+
+    A return begins at the first bin at or above a level. It ends where a bin falls below the level, at the latest
+    ``length_m`` beyond its begin. Its range is that of its strongest bin.
 
     Attributes:
         level_db: least level of a return, relative to full scale [dB].
         from_m: range at which the search begins [m], beyond the ringing of the transducer.
+        length_m: largest extent of a return in range [m]; behind it may follow the reverberation of what returned it.
 
     Raises:
-        MitsonarError: a level above full scale, or a negative range.
+        MitsonarError: a level above full scale, or a negative range or length.
     """
 
     level_db: float = -20.0
     from_m: float = 0.0
+    length_m: float = 0.2
 
     def __post_init__(self) -> None:
         if not -300 <= self.level_db <= 0:
@@ -59,6 +64,8 @@ class FirstReturns:
             )
         if not 0 <= self.from_m < math.inf:
             raise MitsonarError(f"{argument('from_m')} must be a range of 0 m or more: got {self.from_m:g}")
+        if not 0 <= self.length_m < math.inf:
+            raise MitsonarError(f"{argument('length_m')} must be a length of 0 m or more: got {self.length_m:g}")
 
     def find(self, frames: SonarFrames) -> BeamReturns:
         """Find the first return of each beam of each frame.
@@ -72,11 +79,13 @@ class FirstReturns:
         if not len(range_m) or not len(frames):
             shape = (len(frames), len(frames.bearing_rad))
             return BeamReturns(np.full(shape, np.inf), np.zeros(shape, np.float32))
-        # The first run of bins above the level ends where the count of bins below it, from the first bin above, rises.
+        # 1. A return is the first run of bins above the level, up to its largest extent.
         above = (level_db >= self.level_db) & (image > 0)
         begun = np.logical_or.accumulate(above, axis=1)
-        first_run = above & ~np.logical_or.accumulate(begun & ~above, axis=1)
-        strongest = np.where(first_run, level_db, -np.inf).argmax(axis=1)
+        run = above & ~np.logical_or.accumulate(begun & ~above, axis=1)
+        run &= range_m[:, None] <= range_m[above.argmax(axis=1)][:, None] + self.length_m
+        # 2. Its strongest bin counts, the nearest of equally strong ones.
+        strongest = np.where(run, level_db, -np.inf).argmax(axis=1)
         has_return = above.any(axis=1)
         value = to_float32(np.take_along_axis(image, strongest[:, None], axis=1)[:, 0])
         return BeamReturns(np.where(has_return, range_m[strongest], np.inf), np.where(has_return, value, np.float32(0)))

@@ -285,7 +285,7 @@ def _part(images: _Images, run: Index) -> Part:
     )
     like = SonarFrames(
         image=np.zeros((0, bins, beams), np.uint8),
-        range_m=(line[:-1] + 0.5) * step,
+        range_m=np.asarray((line[:-1] + 0.5) * step, dtype=np.float64),
         bearing_rad=bearing,
         time_s=np.zeros(0),
         sonar=sonar,

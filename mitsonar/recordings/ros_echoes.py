@@ -137,13 +137,14 @@ def _with_motion(part: Part, motion: Motion, first: int) -> Part:
         motion: motion at the times of all pings, followed by those of all frames.
         first: index of the first frame of the part in ``motion``.
     """
-    assert isinstance(part.images, Sweep)
+    sweep = part.images
+    assert isinstance(sweep, Sweep)
     part = with_motion(part, motion, np.arange(first, first + len(part)))
     if motion.poses is None:
         return part
     # A beam that was not scanned takes the pose at the nearest ping of its sweep.
-    nearest = np.empty_like(part.images.ping_of)
-    for row, pings in zip(nearest, part.images.ping_of, strict=True):
+    nearest = np.empty_like(sweep.ping_of)
+    for row, pings in zip(nearest, sweep.ping_of, strict=True):
         scanned = np.flatnonzero(pings >= 0)
         row[:] = pings[scanned[np.rint(np.interp(np.arange(len(pings)), scanned, np.arange(len(scanned)))).astype(np.intp)]]
     return replace(part, beam_poses=motion.poses[nearest])

@@ -37,7 +37,7 @@ def to_wall(place: np.ndarray, heading: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore"):
         along = np.where(east > 0, (east_wall - place[:, 0]) / east, (west_wall - place[:, 0]) / east)
         across = np.where(north > 0, (north_wall - place[:, 1]) / north, (south_wall - place[:, 1]) / north)
-    return np.minimum(along, across)
+    return np.asarray(np.minimum(along, across))
 
 
 def room(velocity: tuple[float, float, float], sweeps: int = 2) -> SonarFrames:
@@ -99,7 +99,7 @@ def in_world(message: Any, points: np.ndarray) -> np.ndarray:
 def from_walls(points: np.ndarray) -> np.ndarray:
     """Distances of points to the nearest wall."""
     gaps = [points[:, 0] - WALLS[0], points[:, 0] - WALLS[1], points[:, 1] - WALLS[2], points[:, 1] - WALLS[3]]
-    return np.abs(np.array(gaps)).min(axis=0)
+    return np.asarray(np.abs(np.array(gaps)).min(axis=0))
 
 
 # ---------------------------------------------------------------- the rule
@@ -118,6 +118,20 @@ def test_the_strongest_bin_of_the_first_run_counts() -> None:
     assert found.value[0] == pytest.approx([0.5, 0, 0.1, 0.3, 0])
     assert FirstReturns(-10.0).find(frames).range_m[0, 3] == pytest.approx(1.05)
     assert np.isinf(FirstReturns(-10.0, from_m=9.0).find(frames).range_m).all()
+
+
+def test_a_return_has_a_largest_extent() -> None:
+    """A lower level does not find a farther return, although the run of bins above it is longer."""
+    sonar = Sonar(beams=2, range_bins=40, range_min=1.0, range_max=5.0)
+    image = np.full((1, 40, 2), 0.02, np.float32)
+    image[0, 5:35], image[0, 8], image[0, 30] = 0.2, 0.3, 0.9
+    frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.zeros(1), sonar)
+    for level_db, expected in ((-3.0, 4.05), (-6.0, 1.85), (-9.0, 1.85), (-20.0, 1.55)):
+        assert FirstReturns(level_db, length_m=0.55).find(frames).range_m[0] == pytest.approx(expected)
+    assert FirstReturns(-9.0, length_m=10.0).find(frames).range_m[0] == pytest.approx(4.05)
+    assert FirstReturns(-9.0, length_m=0.0).find(frames).range_m[0] == pytest.approx(1.55)
+    with pytest.raises(MitsonarError, match="length_m"):
+        FirstReturns(length_m=-1.0)
 
 
 @pytest.mark.parametrize("level", ["dB", "gamma", "linear"])

@@ -49,7 +49,7 @@ def test_pings_of_a_ping360_become_sweeps(tmp_path: Path, name: str) -> None:
     assert np.degrees(frames.bearing_rad) == pytest.approx(0.9 * np.arange(-20, 21))
     # angles are positive to port: the first sweep runs from starboard to port
     assert (frames.image[0].T[::-1] == [list(one) for one in samples[:41]]).all()
-    assert ([list(one) for one in samples[40:81]] == frames.image[1].T).all()
+    assert np.array_equal(frames.image[1].T, [list(one) for one in samples[40:81]])
     assert frames.time_s[1] == pytest.approx(100 + 0.1 * np.arange(40, 81), abs=1e-6)
     assert frames.range_m == pytest.approx((np.arange(20) + 0.5) * 0.2)
     assert (frames.sonar.sound_speed, frames.sonar.frequency_hz) == (1480, 740e3)
