@@ -302,21 +302,21 @@ def _messages(content: bytes) -> list[tuple[int, ...] | None]:
 
     A message is ``BR``, length and number, two device numbers, the payload, and the sum of all bytes modulo 65536.
     """
-    found: list[tuple[int, ...] | None] = []
+    messages: list[tuple[int, ...] | None] = []
     start = content.find(b"BR")
     while 0 <= start <= len(content) - 10:
         length, number = struct.unpack_from("<HH", content, start + 2)
         end = start + 8 + length
         layout = PAYLOADS.get(number)
         if end + 2 > len(content):
-            return [*found, None] if layout else found
+            return [*messages, None] if layout else messages
         intact = sum(content[start:end]) % 2**16 == int.from_bytes(content[end : end + 2], "little")
         if layout is not None:
             *values, count = layout.unpack_from(content, start + 8) if length >= layout.size else (0,) * 7
             fits = intact and layout.size + count <= length and _is_plausible(tuple(values), count)
-            found.append((*values, start + 8 + layout.size, count) if fits else None)
+            messages.append((*values, start + 8 + layout.size, count) if fits else None)
         start = content.find(b"BR", end + 2 if intact else start + 2)
-    return found
+    return messages
 
 
 def _log_facts(data: Bytes) -> Facts:

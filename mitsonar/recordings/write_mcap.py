@@ -466,9 +466,9 @@ class FrameEncoder:
 
     def _return_cloud(self, frames: SonarFrames, index: int, time: int, returns: BeamReturns) -> RosObject:
         """Return the first returns as a point cloud in the plane of the beams, with the value of each."""
-        found = np.isfinite(returns.range_m[index])
-        starboard, forward, up = return_points(frames, index, returns.range_m[index])[found].T
-        value = returns.value[index][found]
+        has_return = np.isfinite(returns.range_m[index])
+        starboard, forward, up = return_points(frames, index, returns.range_m[index])[has_return].T
+        value = returns.value[index][has_return]
         table = {"x": forward, "y": -starboard, "z": up, "intensity": value}
         return self._cloud({name: one.astype(np.float32) for name, one in table.items()}, time)
 
