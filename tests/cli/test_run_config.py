@@ -90,6 +90,18 @@ def test_soundings_repeat_too(mitsonar: Command, tmp_path: Path, scene: Path) ->
     refused(mitsonar("render", "--config", tmp_path / "a/run.yaml"), "of the command 'sound', not of render")
 
 
+def test_all_sensors_of_a_vehicle_repeat(mitsonar: Command, tmp_path: Path, scene: Path) -> None:
+    """The folder of the vehicle holds the options, those of its sensors do not."""
+    sonar = "{beams: 8, range_bins: 32, range_min: 1, range_max: 6, quality: draft}"
+    (tmp_path / "v.yaml").write_text(f"sensors:\n  ahead: {{sonar: {sonar}, mount: [0, 0, 0, 30, 0, 0]}}\n")
+    poses = ("--from", "0,0,2.5,0,0,0", "--to", "0,1,2.5,0,0,0", "--frames", "2", "--speed", "1")
+    mitsonar("render", scene, "--vehicle", tmp_path / "v.yaml", *poses, "-o", tmp_path / "a")
+    mitsonar("render", "--config", tmp_path / "a/run.yaml", "-o", tmp_path / "b")
+    assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
+    assert [str(one.relative_to(tmp_path / "a")) for one in (tmp_path / "a").rglob("run.yaml")] == ["run.yaml"]
+    assert (tmp_path / "a/ahead/frames.npz").exists()
+
+
 @pytest.mark.slow
 def test_impulse_responses_repeat_too(mitsonar: Command, tmp_path: Path, scene: Path) -> None:
     mitsonar("impulse", scene, "--from", "0,0,3,0,0,0", "--velocity", "0.1,0.2", "--frames", "2", "-o", tmp_path / "c")
