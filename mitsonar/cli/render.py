@@ -86,7 +86,7 @@ def render(
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
 ) -> None:
-    """Render sonar frames: frames.npz, images/, poses.tum and run.json in the folder OUT."""
+    """Render sonar frames: frames.npz, images/, poses.tum, run.json and run.yaml in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.acoustics.water import absorption_line
     from mitsonar.instruments.sonar import Sonar
