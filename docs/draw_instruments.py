@@ -1,6 +1,6 @@
 """Draws a picture of each instrument of fans and of a head that turns, and the film of a school, into docs/gallery.
 
-python docs/draw_instruments.py            # sidescan, ping360, altimeter, profiler, dvl .png and school.mp4
+python docs/draw_instruments.py            # sidescan, ping360, returns, altimeter, profiler, dvl .png and school.mp4
 python docs/draw_instruments.py --quick    # coarse, into a folder that is removed: does it still work?
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 
 import mitsonar
 from mitsonar.motion.pose import Pose
-from mitsonar.plotting.fans import save_fan, write_fan_video
+from mitsonar.plotting.fans import fan_figure, save_fan, write_fan_video
 from mitsonar.simulation.instrument_runs import run_sounder
 from mitsonar.simulation.runs import Destination
 
@@ -66,7 +66,18 @@ def draw(folder: Path, coarser: int) -> None:
         head = head.replace(beams=20, ping_groups=20)
     sweep = mitsonar.Simulator(scene, head.replace(quality="draft")).render([Pose(0, -3, 1.2, 0.12)])
     save_fan(folder / "ping360.png", sweep, title="Ping360: a sweep of 13 s over `objects`")
+    first_returns(folder / "returns.png", sweep)
     film(folder / "school.mp4", max(2, FILMED // coarser))
+
+
+def first_returns(path: Path, sweep: mitsonar.SonarFrames) -> None:
+    """Draw a sweep with the first return of each beam."""
+    rule = mitsonar.FirstReturns(level_db=-6.0, from_m=0.75)
+    range_m = rule.find(sweep).range_m[0]
+    figure = fan_figure(sweep, title=f"First returns from {rule.level_db:g} dB on, beyond {rule.from_m:g} m")
+    starboard, forward = range_m * np.sin(sweep.bearing_rad), range_m * np.cos(sweep.bearing_rad)
+    figure.axes[0].plot(starboard, forward, ".", color="cyan", markersize=3)
+    figure.savefig(path, dpi=80)
 
 
 def film(path: Path, frames: int) -> None:

@@ -26,7 +26,14 @@ FOLDER = Path(__file__).parent / "reference"
 GROUPS = {
     "Scenes and sonars": ("load_scene", "load_sonar", "Sonar", "ChannelSonar", "load_sounder", "Sounder"),
     "Poses and paths": ("Pose", "Motion", "Trajectory"),
-    "Simulation": ("Simulator", "ChannelSimulator", "SounderSimulator", "DifferentiableSimulator", "load_noise", "NoiseModel"),
+    "Simulation": (
+        "Simulator",
+        "ChannelSimulator",
+        "SounderSimulator",
+        "DifferentiableSimulator",
+        "load_noise",
+        "NoiseModel",
+    ),
     "Bodies that move": ("Deforming", "load_meshes", "load_motions", "range_rates", "particle_mesh", "fishing_net_mesh"),
     "Sea surface": ("SeaSurface",),
     "Several sensors": ("VehicleSimulator", "Mounted", "load_vehicle"),
@@ -36,7 +43,16 @@ GROUPS = {
         "bridges.gymnasium.SonarTask",
         "bridges.gymnasium.Transition",
     ),
-    "Records": ("SonarFrames", "ImpulseResponses", "Echogram", "Soundings", "load_frames", "open_recording", "write_mcap"),
+    "Records": (
+        "SonarFrames",
+        "ImpulseResponses",
+        "Echogram",
+        "Soundings",
+        "load_frames",
+        "open_recording",
+        "write_mcap",
+        "FirstReturns",
+    ),
     "Estimation and mapping": (
         "create_estimator",
         "Estimate",

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from mitsonar.motion.sensors import VehicleSensors, load_sensors, save_sensors
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.plotting.figures import mosaic_figure, path_figure
+    from mitsonar.recordings.first_returns import FirstReturns
     from mitsonar.recordings.open import open_recording, open_side_scan
     from mitsonar.recordings.write_mcap import write_mcap
     from mitsonar.records.frames import SonarFrames
@@ -71,6 +72,7 @@ __all__ = [
     "Echogram",
     "Effort",
     "Estimate",
+    "FirstReturns",
     "ImpulsePairs",
     "ImpulseResponses",
     "MitsonarError",
@@ -143,6 +145,7 @@ _MODULES = {
     "Echogram": "records.soundings",
     "Effort": "reproduction.tables",
     "Estimate": "estimation.estimator",
+    "FirstReturns": "recordings.first_returns",
     "ImpulsePairs": "datasets.samples",
     "ImpulseResponses": "records.responses",
     "MitsonarError": "errors",

@@ -45,6 +45,7 @@ EXTRAS = {
     "s3fs": ("s3", "object storage"),
     "rosbags": ("ros", "reading ROS bags and writing MCAP"),
     "mcap": ("ros", "writing MCAP"),
+    "pytritech": ("gemini", "reading GLF files of a Gemini"),
     "foxglove": ("live", "a live sonar"),
     "websockets": ("live", "a client of a live sonar"),
     "rerun": ("view", "showing frames in Rerun"),

@@ -108,6 +108,57 @@ class Maker:
             ping=picture,
         )
 
+    def echo(self, samples: bytes, angle: int, time_s: float, **changed: Any) -> RosObject:
+        """A ``SonarEcho`` of a Ping360 at an angle [gradian], positive to port."""
+        fields = {
+            "gain": 1,
+            "number_of_samples": len(samples),
+            "transmit_frequency": 740,
+            "speed_of_sound": 1480,
+            "range": 4,
+        }
+        return self.make(
+            "ping360_sonar/SonarEcho" if self.ros1 else "ping360_sonar_msgs/SonarEcho",
+            header=self.header(time_s, "ping360"),
+            angle=float(np.float32(angle * np.pi / 200)),
+            intensities=np.frombuffer(samples, np.uint8),
+            **fields | changed,
+        )
+
+    def raw(
+        self, image: NDArray[np.uint8], time_s: float, angles: NDArray[np.float64], *, beam_major: bool, **changed: Any
+    ) -> RosObject:
+        """A ``RawSonarImage``; the image ``(bins, beams)``, column 0 the first angle."""
+        flat, width = np.ascontiguousarray(image.T if beam_major else image), np.full(len(angles), 0.02, np.float32)
+        fields = {
+            "ping_info": self.make(
+                "marine_acoustic_msgs/PingInfo",
+                frequency=7.2e5,
+                sound_speed=1480.0,
+                tx_beamwidths=10 * width,
+                rx_beamwidths=width,
+            ),
+            "sample_rate": 37_000.0,
+            "samples_per_beam": len(image),
+            "sample0": 50,
+            "rx_angles": angles.astype(np.float32),
+            "image": self.make(
+                "marine_acoustic_msgs/SonarImageData",
+                is_bigendian=False,
+                dtype=0,
+                beam_count=image.shape[1],
+                data=flat.ravel(),
+            ),
+        }
+        nothing = np.zeros(len(angles), np.float32)
+        return self.make(
+            "marine_acoustic_msgs/RawSonarImage",
+            header=self.header(time_s),
+            tx_delays=nothing,
+            tx_angles=nothing,
+            **fields | changed,
+        )
+
     def pose(self, place: Any, quaternion: Any) -> RosObject:
         return self.make(
             "geometry_msgs/Pose",

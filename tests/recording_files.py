@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import struct
+import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
@@ -204,3 +206,94 @@ def pingverter_folder(folder: Path, echogram: Echogram, *, reversed_port: bool =
     (folder / "manifest.json").write_text(json.dumps(manifest))
     (folder / "frames.jsonl").write_text("".join(json.dumps(frame) + "\n" for frame in frames))
     (folder / "samples.u16le").write_bytes(counts.tobytes())
+
+
+def ping360_message(samples: bytes, angle: int, number: int = 2300, **fields: int) -> bytes:
+    """A message of a Ping360 with samples, of the number 2300 or 2301, as ping-protocol defines it."""
+    values = {"gain_setting": 1, "transmit_duration": 30, "sample_period": 200, "transmit_frequency": 750} | fields
+    count = values.pop("number_of_samples", len(samples))
+    head = struct.pack("<BBHHHH", 1, values["gain_setting"], angle, *list(values.values())[1:])
+    if number == 2301:
+        head += struct.pack("<HHBB", 0, 399, 1, 0)
+    return ping_message(number, head + struct.pack("<HH", count, len(samples)) + samples)
+
+
+def ping_message(number: int, payload: bytes) -> bytes:
+    """A message of the Ping protocol: header, payload and checksum."""
+    body = b"BR" + struct.pack("<HHBB", len(payload), number, 2, 0) + payload
+    return body + struct.pack("<H", sum(body) % 65536)
+
+
+def ping_viewer_log(messages: list[bytes], times: list[float], *, encoding: str = "utf-16-be") -> bytes:
+    """A log of Ping Viewer: its header, then a time and a message of each record."""
+
+    def text(value: str) -> bytes:
+        content = value.encode(encoding)
+        return struct.pack(">I", len(content)) + content
+
+    head = text("PingViewer sensor log file") + struct.pack(">i", 1)
+    head += b"".join(map(text, ("b0461486", "2020-01-03T14:31:14-03:00", "", "Arch Linux", "unknown")))
+    result = head + struct.pack(">ii", 1, 2)
+    for message, time_s in zip(messages, times, strict=True):
+        milliseconds = round(time_s * 1000)
+        minutes, rest = divmod(milliseconds, 60_000)
+        stamp = f"{minutes // 60 % 24:02}:{minutes % 60:02}:{rest // 1000:02}.{rest % 1000:03}"
+        result += text(stamp) + struct.pack(">I", len(message)) + message
+    return result
+
+
+def ping360_text(samples: bytes, angle: int, **fields: int) -> str:
+    """A message of a Ping360 as ``brping`` prints it."""
+    values = {"mode": 1, "gain_setting": 1, "angle": angle, "transmit_duration": 30, "sample_period": 200}
+    values |= {"transmit_frequency": 750, "number_of_samples": len(samples), "data_length": len(samples)} | fields
+    lines = "".join(f"  - {name}: {value}\n" for name, value in values.items())
+    return (
+        f"\n{'-' * 50}\nID: 2300 - device_data\nHeader: start_1: 66 start_2: 82 payload_length: {14 + len(samples)} "
+        f"message_id: 2300 src_device_id: 2 dst_device_id: 0\nPayload:\n{lines}  - data: {[hex(one) for one in samples]}\n"
+        "Checksum: 1 check: 1 pass: True"
+    )
+
+
+def gemini_file(images: list[Values], **changed: Any) -> bytes:
+    """A GLF file: images ``(ranges, beams)``, and fields of all records, by the layout that ``pytritech`` reads."""
+    beams = images[0].shape[1]
+    fields: dict[str, Any] = {
+        "start": 10, "bearings": np.radians(np.linspace(-60, 60, beams)), "compression": 0, "frequency": 30_000,
+        "speed": 1480.0, "model": 1, "flags": 0, "by_beam": False, "version": 3, "stored": True, "rate_hz": 10.0,
+        "first_s": 1.4e9,  # since 1980
+    } | changed  # fmt: skip
+    content = b""
+    for number, image in enumerate(images):
+        time_s = fields["first_s"] + number / fields["rate_hz"]
+        flat = np.ascontiguousarray(image.T if fields["by_beam"] else image, dtype=np.uint8).tobytes()
+        data = zlib.compress(flat) if fields["compression"] == 0 else flat
+        body = struct.pack("<HH", 1, 0xEFEF)
+        start = fields["start"]
+        body += struct.pack("<HIIHII", fields["version"], start, start + len(image), 0, 0, beams)
+        body += struct.pack("<H", fields["compression"]) if fields["version"] == 3 else b""
+        body += struct.pack("<I", len(data)) + data + np.asarray(fields["bearings"], "<f8").tobytes()
+        body += struct.pack(
+            "<IIfdHfh?BB",
+            0,
+            fields["frequency"],
+            1.0,
+            time_s,
+            fields["flags"],
+            fields["speed"],
+            50,
+            True,
+            2,
+            fields["model"],
+        )
+        body += b"\0" + struct.pack("<H", 0xDEDE)
+        content += struct.pack("<cBIdBHHH", b"*", 1, 21 + len(body), time_s, 0, 1194, 0, 0) + body
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED if fields["stored"] else zipfile.ZIP_DEFLATED) as file:
+        file.writestr("data_1.cfg", "<log><0>a</0></log>")
+        file.writestr("data_1.dat", content + b"\xde\xde")
+    return archive.getvalue()
+
+
+def head_sweeps(angles: list[int], bins: int = 20) -> list[bytes]:
+    """Samples of pings, each sample a function of angle and number of the ping, so that none can be mistaken."""
+    return [bytes((7 * angle + 3 * number + one) % 251 for one in range(bins)) for number, angle in enumerate(angles)]

@@ -61,6 +61,7 @@ MADE: dict[str, Callable[[Path], Any]] = {
     "Echogram": lambda _: _sounding().echogram(PATH),
     "Effort": lambda _: mitsonar.Effort(),
     "Estimate": lambda _: mitsonar.Estimate(mitsonar.Motion(0.1, 0.2, 0.03), np.eye(3)),
+    "FirstReturns": lambda _: mitsonar.FirstReturns(),
     "ImpulseResponses": _responses,
     "MosaicOptions": lambda _: mitsonar.MosaicOptions(),
     "Motion": lambda _: mitsonar.Motion(*np.array([0.1, 0.2, 0.3]) / 3),

@@ -14,6 +14,7 @@ import numpy as np
 import typer
 
 from mitsonar.cli.console import numbers, warn
+from mitsonar.cli.run_config import merged_pairs
 from mitsonar.errors import MitsonarError, did_you_mean
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ NOISE = (
 )
 
 SceneName = Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")]
-Parameters = Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")]
+Parameters = Annotated[list[str] | None, typer.Option("-D", callback=merged_pairs, help="NAME=VALUE for the scene's $NAME.")]
 Moving = Annotated[
     list[str] | None,
     typer.Option("--moving", help="ID=FILE.tum: move the shape ID along a path; or FILE.yaml (docs/guides/moving.md)."),
@@ -50,7 +51,10 @@ Frame = Annotated[
     typer.Option(help="Convention of pose files to read and write: mitsonar, ros-enu or ned; --from is always mitsonar."),
 ]
 SonarName = Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")]
-SonarKeys = Annotated[list[str] | None, typer.Option("--set", help="Change a key of the sonar, KEY=VALUE: range_max=8.")]
+SonarKeys = Annotated[
+    list[str] | None,
+    typer.Option("--set", callback=merged_pairs, help="Change a key of the sonar, KEY=VALUE: range_max=8."),
+]
 Noise = Annotated[str, typer.Option(help=f"{NOISE}.")]
 RaysPerLaunch = Annotated[int, typer.Option(help="Rays traced at once, about 30 bytes each: limits memory.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")]

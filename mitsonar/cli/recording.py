@@ -66,7 +66,16 @@ def recordings() -> typer.Typer:
         info,
         answered(show, {"height_m": "--height"}),
         video,
-        answered(convert, {"beams": "--beams", "crop_bins": "--crop-bins", "crop_beams": "--crop-beams"}),
+        answered(
+            convert,
+            {
+                "beams": "--beams",
+                "crop_bins": "--crop-bins",
+                "crop_beams": "--crop-beams",
+                "level_db": "--scan-db",
+                "from_m": "--scan-from",
+            },
+        ),
     ):
         app.command()(command)
     return app
@@ -204,6 +213,15 @@ def convert(
         bool, typer.Option("--full", help="MCAP: write samples bit for bit, uint8 or float32, and labels (default: 8 bit).")
     ] = False,
     labels: Annotated[bool, typer.Option("--labels", help="MCAP: write the points of labels, if any.")] = False,
+    scan_db: Annotated[
+        float | None,
+        typer.Option(
+            "--scan-db",
+            help="MCAP: write the first return of each beam from this level on as LaserScan and PointCloud2 [dB re full "
+            "scale].",
+        ),
+    ] = None,
+    scan_from: Annotated[float, typer.Option("--scan-from", help="Range from which on --scan-db searches [m].")] = 0.0,
     beams: Annotated[
         int | None, typer.Option(help="Beams of an ARIS file: 48, 64, 96 or 128 (default: those of the frames).")
     ] = None,
@@ -220,21 +238,28 @@ def convert(
 
     Side-scans are converted to .xtf, or to the echogram of `mitsonar sound` (.npz).
     """
+    from mitsonar.recordings.first_returns import FirstReturns
     from mitsonar.recordings.pictures import write_frames
     from mitsonar.recordings.write_mcap import write_mcap
 
     scan = side_scan_at(file)
     if scan is not None:
         of_frames = {"--topic": topic, "--geometry": geometry, "--full": full, "--labels": labels, "--beams": beams}
-        refuse_options(file, {**of_frames, "--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume})
+        of_frames |= {"--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume}
+        refuse_options(file, {**of_frames, "--scan-db": scan_db, "--scan-from": scan_from or None})
         convert_side_scan(scan, out, part=part, overwrite=overwrite)
         return
     if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
         raise MitsonarError(f"{out}: unknown ending; {suggest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
     if (full or labels) and out.suffix != ".mcap":
         raise MitsonarError(f"--full and --labels apply only to MCAP files: got {out}; leave them out")
+    if (scan_db is not None or scan_from) and out.suffix != ".mcap":
+        raise MitsonarError(f"--scan-db and --scan-from apply only to MCAP files: got {out}; leave them out")
+    if scan_from and scan_db is None:
+        raise MitsonarError("--scan-from needs --scan-db, the least level of a return, such as --scan-db -20")
     if resume and out.suffix:
         raise MitsonarError("--resume applies only to folders, since a file is written whole: leave it out")
+    returns = None if scan_db is None else FirstReturns(scan_db, scan_from)
     recording = _opened(file, topic, geometry)
     _say_notes(recording)
     chosen = recording.part(part)
@@ -250,7 +275,7 @@ def convert(
     written = out
     with progress_bar("converting", len(chosen), "frames") as progress:
         if out.suffix == ".mcap":
-            words = {"picture": picture, "full": full, "labels": labels, "overwrite": overwrite}
+            words = {"picture": picture, "full": full, "labels": labels, "returns": returns, "overwrite": overwrite}
             write_mcap(chosen.chunks(), out, **words, progress=progress)  # type: ignore[arg-type]
         elif out.suffix == ".aris":
             _to_aris(chosen, out, beams=beams, overwrite=overwrite, progress=progress)

@@ -12,6 +12,7 @@ import typer
 
 from mitsonar.cli import options
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
+from mitsonar.cli.run_config import Config, configuration_of, merged_pairs
 from mitsonar.errors import MitsonarError, count_noun, did_you_mean
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ __all__ = ["image", "impulse", "render", "sound"]
 
 @answered
 def render(
+    ctx: typer.Context,
     scene: options.SceneName,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/SCENE).")] = None,
     frames: Annotated[int | None, typer.Option(help=options.FRAMES)] = None,
@@ -80,10 +82,11 @@ def render(
     ] = None,
     rays_per_launch: options.RaysPerLaunch = 2**22,
     parameter: options.Parameters = None,
+    config: Config = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
 ) -> None:
-    """Render sonar frames: frames.npz, images/, poses.tum and run.json in the folder OUT."""
+    """Render sonar frames: frames.npz, images/, poses.tum, run.json and run.yaml in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.acoustics.water import absorption_line
     from mitsonar.instruments.sonar import Sonar
@@ -100,6 +103,7 @@ def render(
     loaded, origin = _load(scene, parameter)
     changes = options.sonar_changes(set_, quality, model, seed)
     folder = out or Path("out") / find_scene(scene).stem
+    destination = Destination(folder, origin, overwrite, resume, configuration=configuration_of(ctx))
     if all_sensors or vehicle is not None:
         if mirrors:
             raise MitsonarError("--mirrors applies to a single sonar: leave it out, or render the sonars one by one")
@@ -108,7 +112,7 @@ def render(
         path = options.path_for(Sonar(), scene_sonar and scene_sonar[1], scene, frames, start, end, trajectory, frame, speed)
         options.warn_of_speed(path, end, speed)
         motions = _motions(loaded, moving, named, [] if file is None else file.motion_specs)
-        return _render_vehicle(loaded, file, path, changes, motions, outputs, Destination(folder, origin, overwrite, resume))
+        return _render_vehicle(loaded, file, path, changes, motions, outputs, destination)
     instrument, attitude = options.instrument_for(loaded, sonar, changes)
     refuse_noise(outputs.noise, instrument)
     path = options.path_for(instrument, attitude, scene, frames, start, end, trajectory, frame, speed)
@@ -128,7 +132,7 @@ def render(
     origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
     origin["path"] |= {} if speed is None else {"speed": speed}
     with progress_bar("rendering", len(path), "pings") as progress:
-        report = run(simulator, path, outputs, Destination(folder, origin, overwrite, resume, progress))
+        report = run(simulator, path, outputs, replace(destination, origin=origin, progress=progress))
     for sentence in report.warnings:
         warn(sentence)
     say(f"{count_noun(report.frames, 'frame')} ({instrument.model} model, {instrument.title}) in {folder}")
@@ -249,6 +253,7 @@ def _render_vehicle(
 
 @answered
 def impulse(
+    ctx: typer.Context,
     scene: options.SceneName,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/SCENE-impulse).")] = None,
     velocity: Annotated[
@@ -273,7 +278,8 @@ def impulse(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the places and amplitudes of scatterers without cells.")] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a key of the instrument, KEY=VALUE: carrier_hz=160e3.")
+        list[str] | None,
+        typer.Option("--set", callback=merged_pairs, help="Change a key of the instrument, KEY=VALUE: carrier_hz=160e3."),
     ] = None,
     parameter: options.Parameters = None,
     mirrors: Annotated[
@@ -286,6 +292,7 @@ def impulse(
             "--mirror", help="Reflection coefficient of pressure and rms height [m] of a shape, NAME=V,H: surface=-1,0.002."
         ),
     ] = None,
+    config: Config = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
 ) -> None:
@@ -303,7 +310,8 @@ def impulse(
     origin |= {"mirrors": True if parts == "materials" else parts} if parts else {}
     simulator = ChannelSimulator(loaded, sonar, mirrors=parts)
     with progress_bar("measuring", len(flown), "pings") as progress:
-        report = run_impulse(simulator, flown, speeds, Destination(folder, origin, overwrite, resume, progress))
+        destination = Destination(folder, origin, overwrite, resume, progress, configuration_of(ctx))
+        report = run_impulse(simulator, flown, speeds, destination)
     for sentence in report.warnings:
         warn(sentence)
     names = ", ".join(receiver.name for receiver in sonar.receivers)
@@ -429,6 +437,7 @@ def _channel_path(
 
 @answered
 def sound(
+    ctx: typer.Context,
     scene: options.SceneName,
     instrument: Annotated[
         str,
@@ -447,12 +456,14 @@ def sound(
     model: Annotated[str | None, typer.Option(help="coherent (speckle and noise) or physical.")] = None,
     quality: Annotated[str | None, typer.Option(help="draft, standard or fine: number of rays by accuracy.")] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a key of the instrument, KEY=VALUE: range_max=20.")
+        list[str] | None,
+        typer.Option("--set", callback=merged_pairs, help="Change a key of the instrument, KEY=VALUE: range_max=20."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter, speckle and noise.")] = None,
     moving: options.Moving = None,
     rays_per_launch: options.RaysPerLaunch = 2**22,
     parameter: options.Parameters = None,
+    config: Config = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
 ) -> None:
@@ -481,7 +492,7 @@ def sound(
     origin |= {"moving": digests_of(motions)} if motions else {}
     folder = out or Path("out") / sounder.name
     with progress_bar("sounding", len(flown), "pings") as progress:
-        destination = Destination(folder, origin, overwrite, resume, progress)
+        destination = Destination(folder, origin, overwrite, resume, progress, configuration_of(ctx))
         report = run_sounder(simulator, flown, destination, frame=named)
     for sentence in report.warnings:
         warn(sentence)
@@ -495,6 +506,7 @@ def sound(
 
 @answered
 def image(
+    ctx: typer.Context,
     run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run rendered with --exr.")],
     bins: Annotated[int | None, typer.Option(help="Number of range bins (default: as rendered).")] = None,
     window: Annotated[str | None, typer.Option("--range", help="Range window from,to [m] (default: as rendered).")] = None,
@@ -502,6 +514,7 @@ def image(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: OUT/rebinned).")] = None,
     cartesian: Annotated[bool, typer.Option("--cartesian", help="Draw each frame with axes in metres.")] = False,
     frame: options.Frame = "mitsonar",
+    config: Config = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
 ) -> None:
@@ -520,7 +533,8 @@ def image(
         raise MitsonarError(f"-o {folder} would replace the echoes that are read: choose another folder")
     origin = {"echoes_of": str(run_folder), "echoes_recipe": source.settings}
     with progress_bar("binning", len(source.trajectory), "pings") as progress:
-        report = run(source, source.trajectory, outputs, Destination(folder, origin, overwrite, resume, progress))
+        destination = Destination(folder, origin, overwrite, resume, progress, configuration_of(ctx))
+        report = run(source, source.trajectory, outputs, destination)
     for sentence in report.warnings:
         warn(sentence)
     say(f"{count_noun(report.frames, 'frame')} of {count_noun(source.sonar.range_bins, 'bin')} in {folder}")

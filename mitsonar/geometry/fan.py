@@ -117,6 +117,7 @@ def cartesian_map(range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -
     forward = high - (np.arange(rows)[:, None] + 0.5) * pixel
     across = left + (np.arange(columns) + 0.5) * (right - left) / columns
     radius, angle = np.hypot(across, forward), np.arctan2(across, forward)
+    angle = np.where(angle > starboard, angle - 2 * np.pi, angle)  # beams of a full turn may end short of the rear
     inside = (radius >= near) & (radius <= far) & (angle >= port) & (angle <= starboard)
     # Bilinear weights of the four cells around each pixel.
     bin_, over_bin = _cell(_fractional_index(radius, range_m, range_edges), range_m.size)

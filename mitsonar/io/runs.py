@@ -29,6 +29,7 @@ from mitsonar.io.files import (
 )
 
 __all__ = [
+    "CONFIG_FILE",
     "RUN_FILE",
     "RunDirectory",
     "RunKind",
@@ -156,6 +157,9 @@ def changed_versions(stored: Mapping[str, object], packages: Iterable[str]) -> l
 
 RUN_FILE = "run.json"
 
+CONFIG_FILE = "run.yaml"
+"""Name of the file with the options of the command that began the run."""
+
 PARTIAL_SUFFIXES = (".part", "writer.lock")
 """File name suffixes that a killed run may leave behind; a folder with only such files counts as empty."""
 
@@ -271,7 +275,7 @@ class RunDirectory:
             self.path.mkdir(parents=True, exist_ok=True)
             if self._replaces:
                 self._write()
-                _remove(self.path, self.kind.outputs)
+                _remove(self.path, (*self.kind.outputs, CONFIG_FILE))
                 self._replaces = False
             self.note(**notes)
             self._started = True

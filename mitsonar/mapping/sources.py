@@ -663,6 +663,7 @@ def recording_at(
         return open_recording(where, geometry, view)
     source = open_frames(where, sequence=sequence if data_set else None, view=view, geometry=geometry)
     labels = None if data_set else _labels_at(Path(where))
+    times, beam_poses = (None, None) if data_set else _beam_motion_at(Path(where), len(source))
     part = LabelledPart(
         like=source.like,
         time_s=source.time_s,
@@ -670,10 +671,27 @@ def recording_at(
         poses=source.poses,
         attitude_rad=source.attitude_rad,
         height_m=source.height_m,
+        beam_time_s=times,
+        beam_poses=beam_poses,
         labels=(lambda index: {}) if labels is None else labels,
     )
     words = "data set of mitsonar" if data_set else "run of mitsonar"
     return Recording(str(where), words, (part,), {}, (source.note,) if source.note else ())
+
+
+def _beam_motion_at(path: Path, frames: int) -> tuple[Array | None, Array | None]:
+    """Return the times ``(frames, beams)`` and poses ``(frames, beams, 6)`` of the beams of a run, as far as it has them."""
+    if os.path.isdir(path) and path.suffix != ".zarr":
+        path = next(one for one in (path / "frames.npz", path / "frames.zarr") if os.path.exists(one))
+    if os.path.isfile(path):
+        table: dict[str, Any] = SonarFrames.load(path).arrays()
+    else:
+        try:
+            table = open_group(path, COLUMNS, "time_s", "frames_done")[0]
+        except Exception as error:  # a damaged Zarr raises errors of many kinds
+            raise MitsonarError(f"cannot read the times of {path}: {' '.join(str(error).split())[:160]}") from None
+    times, poses = table["time_s"], table.get("beam_poses")
+    return None if times.ndim == 1 else np.asarray(times[:frames]), None if poses is None else np.asarray(poses[:frames])
 
 
 def _labels_at(path: Path) -> Callable[[Index], Labels] | None:

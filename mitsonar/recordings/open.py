@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, count_noun
+from mitsonar.recordings.gemini import is_gemini, read_gemini
 from mitsonar.recordings.jsf import is_jsf, read_jsf
 from mitsonar.recordings.oculus import is_oculus, read_oculus
 from mitsonar.recordings.pictures import (
@@ -25,6 +26,7 @@ from mitsonar.recordings.pictures import (
     read_picture_stack,
     read_picture_video,
 )
+from mitsonar.recordings.ping360 import is_ping360_log, is_ping360_text, read_ping360_log, read_ping360_text
 from mitsonar.recordings.pingverter import is_pingverter, read_pingverter
 from mitsonar.recordings.public_sets import is_canoe, is_neusis, is_uxo, read_canoe, read_neusis, read_uxo
 from mitsonar.recordings.recording import Part, Recording
@@ -95,6 +97,9 @@ FORMATS: tuple[Format, ...] = (
     Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _without_geometry(read_aris)),
     Format("DIDSON (.ddf)", lambda path, first: first[:4] in SIGNATURES, _without_geometry(read_didson)),
     Format("Oculus (.raw, .oculus)", is_oculus, _without_geometry(read_oculus)),
+    Format("Ping360 (.bin of Ping Viewer)", is_ping360_log, _without_geometry(read_ping360_log)),
+    Format("Ping360 messages as text or CSV", is_ping360_text, _without_geometry(read_ping360_text)),
+    Format("Gemini (.glf)", is_gemini, _without_geometry(read_gemini)),
     Format("ROS bags (.bag, .mcap, .db3, folders)", is_ros_bag, read_ros_bag),
     Format("folders of UXO (DFKI)", is_uxo, _without_geometry(read_uxo)),
     Format("folders of CANOE", is_canoe, _without_geometry(read_canoe)),

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, count_noun
+from mitsonar.instruments.sonar import scans
 from mitsonar.records.frames import SonarFrames
 
 __all__ = [
@@ -56,6 +57,8 @@ class Part:
         attitude_rad: pitch, roll, heading [rad] ``(frames, 3)`` measured by the sonar's sensors; nan where unknown.
         height_m: height above the ground ``(frames,)`` [m], if known.
         gain_db: receiver gain of each frame ``(frames,)`` [dB], if known.
+        beam_time_s: time of each beam ``(frames, beams)`` [s], if the beams ping one after another; ``time_s`` is the mean.
+        beam_poses: poses at these times ``(frames, beams, 6)``, if known.
     """
 
     like: SonarFrames
@@ -65,6 +68,8 @@ class Part:
     attitude_rad: Array | None = None
     height_m: Array | None = None
     gain_db: Array | None = None
+    beam_time_s: Array | None = None
+    beam_poses: Array | None = None
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -80,9 +85,10 @@ class Part:
         beyond = chosen[(chosen < 0) | (chosen >= len(self))]
         if beyond.size:
             raise MitsonarError(f"there is no frame {beyond[0]}: the part holds {len(self):,}, numbered from 0")
-        per_frame = ("poses", "attitude_rad", "height_m")
+        per_frame = ("poses", "attitude_rad", "height_m", "beam_poses")
         known = {name: getattr(self, name)[chosen] for name in per_frame if getattr(self, name) is not None}
-        return replace(self.like, image=self.images(chosen), time_s=self.time_s[chosen], **known)
+        time_s = self.time_s if self.beam_time_s is None else self.beam_time_s
+        return replace(self.like, image=self.images(chosen), time_s=time_s[chosen], **known)
 
     def cropped(self, bins: tuple[int, int] | None, beams: tuple[int, int] | None) -> Part:
         """Return the part restricted to half-open intervals of bins and beams.
@@ -100,8 +106,10 @@ class Part:
         )
         range_m, bearing_rad = self.like.range_m[rows], self.like.bearing_rad[columns]
         step_m, step_rad = (float(np.diff(axis).mean()) for axis in (range_m, bearing_rad))
+        scanning = scans(self.like.sonar)
         sonar = self.like.sonar.replace(
             beams=len(bearing_rad),
+            ping_groups=len(bearing_rad) if scanning else min(self.like.sonar.ping_groups, len(bearing_rad)),
             range_bins=len(range_m),
             range_min=max(0.0, float(range_m[0] - step_m / 2)),
             range_max=float(range_m[-1] + step_m / 2),
@@ -109,7 +117,10 @@ class Part:
         )
         image = self.like.image[:, rows, columns]
         like = replace(self.like, image=image, range_m=range_m, bearing_rad=bearing_rad, sonar=sonar)
-        return replace(self, like=like, **self._read_within(rows, columns))
+        per_beam = {
+            name: values[:, columns] for name in ("beam_time_s", "beam_poses") if (values := getattr(self, name)) is not None
+        }
+        return replace(self, like=like, **per_beam, **self._read_within(rows, columns))
 
     def _read_within(self, rows: slice, columns: slice) -> dict[str, Any]:
         """Return replacements for the fields that read pixels, restricted to these bins and beams."""

@@ -21,10 +21,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DTYPES",
+    "ECHOES",
     "FANS",
     "OCULUS",
     "PROJECTED",
+    "RAW",
     "RECORD",
+    "SONARS",
     "WRITTEN",
     "BagFile",
     "Message",
@@ -168,7 +171,8 @@ class BagFile:
 # the public definitions; ``tests/recordings/test_ros_bag.py`` compares their MD5 sums with the published ones. Sources:
 #
 # - ``marine_acoustic_msgs``: apl-ocean-engineering/marine_msgs (BSD-3-Clause), ``ProjectedSonarImage``, ``PingInfo``,
-#   ``SonarImageData``. The older package ``acoustic_msgs`` has the same messages.
+#   ``SonarImageData``, ``RawSonarImage``. The older package ``acoustic_msgs`` has the same messages.
+# - ``ping360_sonar_msgs``: CentraleNantesRobotics/ping360_sonar (MIT), ``SonarEcho``; in ROS 1 part of ``ping360_sonar``.
 # - ``sonar_oculus``: MarineRoboticsGroup/sonar_oculus, ``OculusPing``, ``OculusFire``, in which pings of BlueROVs with an
 #   Oculus are recorded. Older versions hold a ``sensor_msgs/Image``; their bags contain the definition.
 # - ``tf2_msgs``: ros/geometry2 (BSD-3-Clause), ``TFMessage``, which ``rosbags`` lacks for ROS 1.
@@ -177,8 +181,17 @@ class BagFile:
 PROJECTED = ("marine_acoustic_msgs/msg/ProjectedSonarImage", "acoustic_msgs/msg/ProjectedSonarImage")
 """Types of polar images that hold beam directions and bin ranges."""
 
+RAW = ("marine_acoustic_msgs/msg/RawSonarImage", "acoustic_msgs/msg/RawSonarImage")
+"""Types of polar images that hold receive angles and a sample rate."""
+
 OCULUS = ("sonar_oculus/msg/OculusPing",)
 """Types of polar images of an Oculus."""
+
+ECHOES = ("ping360_sonar_msgs/msg/SonarEcho", "ping360_sonar/msg/SonarEcho")
+"""Types of single pings of a Ping360."""
+
+SONARS = (*PROJECTED, *RAW, *OCULUS, *ECHOES)
+"""All types that contain their geometry."""
 
 FANS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 """Types of pictures, which only a geometry given by the user turns into metric fans."""
@@ -218,6 +231,29 @@ float32[] ranges
 SonarImageData image
 """
 
+RAW_SONAR_IMAGE = """
+std_msgs/Header header
+PingInfo ping_info
+float32 sample_rate
+uint32 samples_per_beam
+uint32 sample0
+float32[] tx_delays
+float32[] tx_angles
+float32[] rx_angles
+SonarImageData image
+"""
+
+SONAR_ECHO = """
+std_msgs/Header header
+float32 angle
+uint8 gain
+uint16 number_of_samples
+uint16 transmit_frequency
+uint16 speed_of_sound
+uint8 range
+uint8[] intensities
+"""
+
 OCULUS_FIRE = """
 std_msgs/Header header
 uint8 mode
@@ -254,8 +290,10 @@ DEFINITIONS = {
             ("PingInfo", PING_INFO),
             ("SonarImageData", SONAR_IMAGE_DATA),
             ("ProjectedSonarImage", PROJECTED_SONAR_IMAGE),
+            ("RawSonarImage", RAW_SONAR_IMAGE),
         )
     },
+    **dict.fromkeys(ECHOES, SONAR_ECHO),
     "sonar_oculus/msg/OculusFire": OCULUS_FIRE,
     "sonar_oculus/msg/OculusPing": OCULUS_PING,
     "tf2_msgs/msg/TFMessage": TRANSFORMS,

@@ -1,4 +1,4 @@
-"""How ROS sonar messages become images: geometry, coding and samples of ``ProjectedSonarImage`` and ``OculusPing``."""
+"""How ROS sonar messages become images: geometry, coding and samples of projected and raw images and of ``OculusPing``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.recordings.ros_messages import DTYPES, PROJECTED, Message
+from mitsonar.recordings.ros_messages import DTYPES, PROJECTED, RAW, Message
 
 __all__ = ["SONAR_AXES_IN_FLU", "PingLayout", "decode_image", "is_beam_major", "parse_layout", "samples_of"]
 
@@ -108,11 +108,11 @@ def parse_layout(message: Message, kind: str) -> PingLayout:
     Raises:
         ValueError: the message is damaged: its sizes or numbers are inconsistent.
     """
-    layout = _projected(message) if kind in PROJECTED else _oculus(message)
+    layout = _projected(message) if kind in PROJECTED else _raw(message) if kind in RAW else _oculus(message)
     rising = np.all(np.diff(layout.range_m) > 0) and np.all(np.diff(layout.bearing_rad) > 0)
     if not (layout.cells and rising and np.isfinite(layout.range_m).all() and layout.range_m[0] >= 0):
         raise ValueError("ranges or bearings are empty or not increasing")
-    if kind in PROJECTED and len(message.image.data) != layout.cells * np.dtype(layout.dtype).itemsize:
+    if kind in (*PROJECTED, *RAW) and len(message.image.data) != layout.cells * np.dtype(layout.dtype).itemsize:
         raise ValueError("the number of samples does not match ranges and beams")
     return layout
 
@@ -130,7 +130,7 @@ def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: b
         ValueError: the number of samples does not match the layout, or a picture cannot be decoded.
     """
     shape = (len(layout.range_m), len(layout.bearing_rad))
-    if kind in PROJECTED:
+    if kind in (*PROJECTED, *RAW):
         flat = np.frombuffer(np.asarray(message.image.data, np.uint8).tobytes(), layout.dtype)
         if flat.size != layout.cells:
             raise ValueError("the number of samples does not match ranges and beams")
@@ -175,19 +175,52 @@ def _projected(message: Message) -> PingLayout:
     vectors = np.array([(one.x, one.y, one.z) for one in message.beam_directions], dtype=float).reshape(-1, 3)
     bearing, axes = _bearings(vectors)
     order = np.argsort(bearing, kind="stable")
-    info, image = message.ping_info, message.image
+    info = message.ping_info
     ranges: Array = np.asarray(message.ranges).astype(np.float64)
-    if int(image.dtype) not in DTYPES:
-        raise ValueError(f"unknown sample type {image.dtype}")
     return PingLayout(
         range_m=ranges,
         bearing_rad=bearing[order],
         order=order,
-        dtype=(">" if image.is_bigendian else "<") + DTYPES[int(image.dtype)],
+        dtype=_sample_type(message.image),
         axes=axes,
         frame_id=str(message.header.frame_id),
         frequency_hz=_positive_or_zero(info.frequency),
         sound_speed=_positive_or_zero(info.sound_speed),
+        elevation_rad=_median_angle(info.tx_beamwidths),
+        beam_width_rad=_median_angle(info.rx_beamwidths),
+    )
+
+
+def _sample_type(image: Message) -> str:
+    """Return the NumPy name of the sample type of a ``SonarImageData``."""
+    if int(image.dtype) not in DTYPES:
+        raise ValueError(f"unknown sample type {image.dtype}")
+    return (">" if image.is_bigendian else "<") + DTYPES[int(image.dtype)]
+
+
+def _raw(message: Message) -> PingLayout:
+    """Return the layout of a ``RawSonarImage``.
+
+    Sample i has the two-way travel time (sample0 + i) / sample_rate. Receive angles are positive to starboard, as drivers
+    write them. The message has no beam directions: the axes of its frame are assumed to be forward, left, up (REP 103).
+    """
+    angles: Array = np.asarray(message.rx_angles).astype(np.float64)
+    if not len(angles) or not (np.abs(angles) <= math.pi).all():
+        raise ValueError("receive angles are missing or beyond half a turn")
+    order = np.argsort(angles, kind="stable")
+    info, rate, count = message.ping_info, float(message.sample_rate), int(message.samples_per_beam)
+    speed = _positive_or_zero(info.sound_speed)
+    if not (0 < rate < 1e9 and 0 < count <= len(message.image.data) and speed):
+        raise ValueError("invalid sample rate, number of samples or sound speed")
+    return PingLayout(
+        range_m=np.asarray((int(message.sample0) + np.arange(count)) * (speed / 2 / rate), dtype=np.float64),
+        bearing_rad=angles[order],
+        order=order,
+        dtype=_sample_type(message.image),
+        axes=SONAR_AXES_IN_FLU,
+        frame_id=str(message.header.frame_id),
+        frequency_hz=_positive_or_zero(info.frequency),
+        sound_speed=speed,
         elevation_rad=_median_angle(info.tx_beamwidths),
         beam_width_rad=_median_angle(info.rx_beamwidths),
     )

@@ -14,7 +14,19 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError, count_noun, suggest_names
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order, runs_of
-from mitsonar.recordings.ros_messages import FANS, OCULUS, PROJECTED, WRITTEN, BagFile, Topic, frames_like, short
+from mitsonar.recordings.ros_echoes import read_ros_echoes
+from mitsonar.recordings.ros_messages import (
+    ECHOES,
+    FANS,
+    PROJECTED,
+    RAW,
+    SONARS,
+    WRITTEN,
+    BagFile,
+    Topic,
+    frames_like,
+    short,
+)
 from mitsonar.recordings.ros_pings import PingLayout, is_beam_major, samples_of
 from mitsonar.recordings.ros_topics import TopicScan, motion_in, read_ros_pictures, with_motion
 from mitsonar.records.frames import SonarFrames
@@ -55,11 +67,13 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     """
     # 1. Choose the topic, and scan its messages once.
     bag = BagFile(path)
-    chosen = sonar_topic(bag, topic, FANS if geometry is not None else (*PROJECTED, *OCULUS))
+    chosen = sonar_topic(bag, topic, FANS if geometry is not None else SONARS)
     if chosen.kind in FANS:
         return read_ros_pictures(bag, chosen, None if geometry is None else Path(geometry))
     if geometry is not None:
         raise MitsonarError(f"{path}: {chosen.name} contains its geometry: omit {geometry}")
+    if chosen.kind in ECHOES:
+        return read_ros_echoes(bag, chosen)
     scan = TopicScan(bag, chosen)
     scan.read()
     if not scan.layouts:
@@ -90,7 +104,7 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     return Recording(str(path), format_name, tuple(parts), facts, (*notes, *motion.notes))
 
 
-def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (*PROJECTED, *OCULUS)) -> Topic:
+def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = SONARS) -> Topic:
     """Return the topic of the sonar: the one with the given name, or the only one of the given types.
 
     Args:
@@ -102,7 +116,7 @@ def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (
         MitsonarError: if there is no such topic or there are several, or the type of the named one is not supported.
     """
     topics = bag.topics()
-    readable = [one for one in topics if one.kind in (*PROJECTED, *OCULUS, *FANS) and one.messages]
+    readable = [one for one in topics if one.kind in (*SONARS, *FANS) and one.messages]
     if topic is not None:
         named = next((one for one in topics if one.name == topic), None)
         if named is None:
@@ -128,7 +142,7 @@ def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (
 
 def _type_names(*kinds: str) -> str:
     """Return the names of types as part of a sentence."""
-    return " or ".join(short(one) for one in kinds if not one.startswith("acoustic_msgs"))
+    return " or ".join(short(one) for one in kinds if not one.startswith(("acoustic_msgs", "ping360_sonar/")))
 
 
 class Coding(NamedTuple):
@@ -153,7 +167,7 @@ def _coding(scan: TopicScan, order: Index, notes: list[str]) -> Coding:
     if scale > 1:
         notes.append(f"samples are floats up to {scale:.6g}: they are divided by it")
     layout = scan.layouts[scan.numbers[int(order[0])]]
-    if scan.topic.kind not in PROJECTED:
+    if scan.topic.kind not in (*PROJECTED, *RAW):
         return Coding(False, scale)
     same_layout = order[np.array(scan.numbers)[order] == scan.numbers[int(order[0])]]
     sample = same_layout[np.unique(np.linspace(0, len(same_layout) - 1, ORDER_FRAMES).astype(int))]

@@ -19,7 +19,7 @@ from mitsonar.motion.pose import poses_from
 from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.recordings.pictures import Grey, Pictures, geometry_for, recording_of, refuse_size
 from mitsonar.recordings.recording import Part, Recording
-from mitsonar.recordings.ros_messages import FANS, PROJECTED, BagFile, Message, Topic, short
+from mitsonar.recordings.ros_messages import FANS, PROJECTED, RAW, BagFile, Message, Topic, short
 from mitsonar.recordings.ros_pings import SONAR_AXES_IN_FLU, PingLayout, decode_image, parse_layout
 
 __all__ = ["Motion", "TopicScan", "motion_in", "read_ros_pictures", "with_motion"]
@@ -404,7 +404,7 @@ class TopicScan:
         if number == len(self.layouts):
             self.layouts.append(layout)
         # 3. Remember the bytes ahead of the samples for the messages that follow.
-        if self.topic.kind in PROJECTED:
+        if self.topic.kind in (*PROJECTED, *RAW):
             samples = np.asarray(message.image.data, np.uint8).tobytes()
             self._measure(samples, number)
             head = _offset_of_samples(raw, samples)

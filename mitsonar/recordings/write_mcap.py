@@ -17,10 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, missing_package_error
 from mitsonar.geometry.fan import CartesianMap, cartesian_map
+from mitsonar.instruments.sonar import frame_period_s
 from mitsonar.instruments.views import directions
 from mitsonar.io.runs import refuse_to_replace
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import CONVENTIONS
+from mitsonar.recordings.first_returns import BeamReturns, FirstReturns, beam_times, return_points
 from mitsonar.recordings.ros_messages import PROJECTED, RECORD, WRITTEN, metadata_of, ros2_types
 from mitsonar.records.frames import LABELS, PER_FRAME, SonarFrames, to_float32, to_uint8
 
@@ -44,6 +46,7 @@ def write_mcap(
     picture: str = "jpeg",
     full: bool = False,
     labels: bool = False,
+    returns: FirstReturns | None = None,
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> int:
@@ -66,6 +69,8 @@ def write_mcap(
         full: whether to write samples exactly as they are, float32 or uint8, and labels.
         labels: whether to write ``/sonar/points`` (``sensor_msgs/PointCloud2``) of frames with elevations, which is about as
             large as all other topics together.
+        returns: rule by which the first return of each beam is written as ``/sonar/scan`` (``sensor_msgs/LaserScan``, if
+            the beams are evenly spaced) and ``/sonar/returns`` (``sensor_msgs/PointCloud2``); default: none is written.
         overwrite: whether to replace an existing file.
         progress: function that is called with the number of newly written frames.
 
@@ -85,8 +90,11 @@ def write_mcap(
         with part.open("wb") as file:
             writer = _writer(file)
             span_db: list[float] = []
-            smaller = (_reduced(frames, full, labels, span_db) for frames in chunks)
-            count = _write(writer, smaller, picture, span_db, progress or (lambda done: None))
+            pairs = (
+                (_reduced(frames, full, labels, span_db), None if returns is None else returns.find(frames))
+                for frames in chunks
+            )
+            count = _write(writer, pairs, picture, span_db, progress or (lambda done: None))
             writer.finish()  # type: ignore[no-untyped-call]
         part.replace(path)
     except FileNotFoundError:
@@ -121,20 +129,25 @@ def _reduced(frames: SonarFrames, full: bool, labels: bool, span_db: list[float]
     return replace(frames, image=to_uint8(np.where(frames.image > 0, np.maximum(value, np.float32(1e-6)), np.float32(0))))
 
 
+Chunk: TypeAlias = tuple[SonarFrames, BeamReturns | None]
+"""Frames as they are written, and the first returns of the original frames."""
+
+
 def _write(
-    writer: Writer, chunks: Iterator[SonarFrames], picture: str, span_db: list[float], progress: Callable[[int], None]
+    writer: Writer, chunks: Iterator[Chunk], picture: str, span_db: list[float], progress: Callable[[int], None]
 ) -> int:
     """Write all frames, and return their number."""
-    first = next((one for one in chunks if len(one)), None)
-    if first is None:
+    chunk = next((one for one in chunks if len(one[0])), None)
+    if chunk is None:
         raise MitsonarError("there are no frames to write")
-    encoder = FrameEncoder(first.select(slice(0)), picture)
+    first, returns = chunk
+    encoder = FrameEncoder(first.select(slice(0)), picture, returns=returns is not None)
     writer.start(profile="ros2", library="mitsonar")
     writer.add_metadata(RECORD, metadata_of(first, span_db[0] if span_db else None))
     channels = _channels(writer, encoder)
     count, fixed = 0, False
-    for frames in _all(first, chunks):
-        for message in encoder.messages(frames):
+    for frames, returns in _all(chunk, chunks):
+        for message in encoder.messages(frames, returns):
             if not fixed:
                 _add(writer, channels, encoder.fixed(message.time_ns), 0)
                 fixed = True
@@ -145,7 +158,7 @@ def _write(
     return count
 
 
-def _all(first: SonarFrames, rest: Iterator[SonarFrames]) -> Iterator[SonarFrames]:
+def _all(first: Chunk, rest: Iterator[Chunk]) -> Iterator[Chunk]:
     """Yield the first chunk and all others.
 
     Raises:
@@ -153,7 +166,7 @@ def _all(first: SonarFrames, rest: Iterator[SonarFrames]) -> Iterator[SonarFrame
     """
     yield first
     for one in rest:
-        if one.image.shape[1:] != first.image.shape[1:] or _known(one) != _known(first):
+        if one[0].image.shape[1:] != first[0].image.shape[1:] or _known(one[0]) != _known(first[0]):
             raise MitsonarError("all frames of an MCAP file must have one geometry and the same arrays: write two files")
         yield one
 
@@ -210,6 +223,8 @@ TOPICS = {
     WRITTEN: PROJECTED[0],
     "/sonar/fan/compressed": "sensor_msgs/msg/CompressedImage",
     "/sonar/points": "sensor_msgs/msg/PointCloud2",
+    "/sonar/scan": "sensor_msgs/msg/LaserScan",
+    "/sonar/returns": "sensor_msgs/msg/PointCloud2",
     "/sonar/odometry": "nav_msgs/msg/Odometry",
     "/sonar/imu": "sensor_msgs/msg/Imu",
     "/sonar/altitude": "sensor_msgs/msg/Range",
@@ -226,6 +241,9 @@ PICTURES = {"png": ("PNG", {"compress_level": 3}), "jpeg": ("JPEG", {"quality": 
 
 UINT8, FLOAT32 = 0, 8
 """Codes of sample types in ``SonarImageData``."""
+
+EVEN_RTOL = 1e-3
+"""Relative tolerance for equal steps between beams, which a laser scan requires."""
 
 POINT_TYPES = {np.dtype(np.float32): 7, np.dtype(np.int32): 5}
 """Codes of field types in ``PointField``."""
@@ -245,15 +263,16 @@ class FrameEncoder:
     Args:
         like: frames with the sonar, ranges, bearings, level and arrays of all frames to encode; its images are not read.
         picture: format of the fans, ``png`` or ``jpeg``.
+        returns: whether first returns are encoded, too.
 
     Raises:
         MitsonarError: if the format is unknown.
     """
 
-    def __init__(self, like: SonarFrames, picture: str = "png") -> None:
+    def __init__(self, like: SonarFrames, picture: str = "png", *, returns: bool = False) -> None:
         if picture not in PICTURES:
             raise MitsonarError(f"fans are written as {' or '.join(PICTURES)}: got {picture!r}")
-        self.like, self.picture, self.types = like, picture, ros2_types()
+        self.like, self.picture, self.returns, self.types = like, picture, returns, ros2_types()
 
     @property
     def topics(self) -> list[str]:
@@ -266,20 +285,27 @@ class FrameEncoder:
             "/sonar/altitude": self.like.height_m,
         }
         absent = [name for name, values in needs.items() if values is None]
+        absent += [] if self.returns else ["/sonar/scan", "/sonar/returns"]
+        absent += [] if self._has_even_beams else ["/sonar/scan"]
         return [name for name in TOPICS if name not in absent]
 
     def definition(self, topic: str) -> str:
         """Return the definition of a topic's message type, including those of its nested types."""
         return self.types.generate_msgdef(TOPICS[topic], ros_version=2)[0]
 
-    def messages(self, frames: SonarFrames) -> Iterator[Encoded]:
-        """Encode frames, and yield their messages in order of time."""
+    def messages(self, frames: SonarFrames, returns: BeamReturns | None = None) -> Iterator[Encoded]:
+        """Encode frames and their first returns, and yield the messages in order of time."""
         time_s = frames.time_s if frames.time_s.ndim == 1 else frames.time_s.mean(axis=1)
         for index, time in enumerate(nanoseconds(time_s)):
             yield self._encoded(WRITTEN, time, self._image(frames, index, time))
             yield self._encoded("/sonar/fan/compressed", time, self._fan(frames, index, time))
             if frames.elevation_rad is not None:
                 yield self._encoded("/sonar/points", time, self._points(frames, index, time))
+            if returns is not None:
+                if self._has_even_beams:
+                    yield self._encoded("/sonar/scan", time, self._scan(frames, index, time, returns))
+                cloud = self._return_cloud(frames, index, time, returns)
+                yield self._encoded("/sonar/returns", time, cloud)
             if frames.attitude_rad is not None:
                 yield self._encoded("/sonar/imu", time, self._imu(frames.attitude_rad[index], time))
             if frames.height_m is not None:
@@ -403,6 +429,48 @@ class FrameEncoder:
             data=np.frombuffer(points.tobytes(), np.uint8),
             is_dense=True,
         )
+
+    # ------------------------------------------------------------ first returns
+
+    @cached_property
+    def _has_even_beams(self) -> bool:
+        """Return whether the beams are evenly spaced, as a laser scan requires."""
+        steps = np.diff(self.like.bearing_rad)
+        return len(steps) > 0 and bool(np.allclose(steps, steps.mean(), rtol=EVEN_RTOL, atol=0))
+
+    def _scan(self, frames: SonarFrames, index: int, time: int, returns: BeamReturns) -> RosObject:
+        """Return the first returns as a laser scan: angles are positive to port, and rays follow in order of time.
+
+        The header has the time of the first ray. Rays of beams that ping at once run from starboard to port. The range of a
+        ray without a return is infinite (REP 117).
+        """
+        bearing, ranges, value = frames.bearing_rad, returns.range_m[index], returns.value[index]
+        times, sonar = beam_times(frames, index), frames.sonar
+        from_starboard = times is None or times[0] > times[-1]
+        order = slice(None, None, -1) if from_starboard else slice(None)
+        angle = -bearing[order]
+        first = time if times is None else nanoseconds(times[order][:1])[0]
+        return self._make(
+            "sensor_msgs/LaserScan",
+            header=self._header(first, BODY),
+            angle_min=float(angle[0]),
+            angle_max=float(angle[-1]),
+            angle_increment=float((angle[-1] - angle[0]) / (len(angle) - 1)),
+            time_increment=0.0 if times is None else float(abs(times[-1] - times[0]) / (len(times) - 1)),
+            scan_time=float(frame_period_s(sonar)),
+            range_min=float(sonar.range_min),
+            range_max=float(sonar.range_max),
+            ranges=ranges[order].astype(np.float32),
+            intensities=value[order].astype(np.float32),
+        )
+
+    def _return_cloud(self, frames: SonarFrames, index: int, time: int, returns: BeamReturns) -> RosObject:
+        """Return the first returns as a point cloud in the plane of the beams, with the value of each."""
+        has_return = np.isfinite(returns.range_m[index])
+        starboard, forward, up = return_points(frames, index, returns.range_m[index])[has_return].T
+        value = returns.value[index][has_return]
+        table = {"x": forward, "y": -starboard, "z": up, "intensity": value}
+        return self._cloud({name: one.astype(np.float32) for name, one in table.items()}, time)
 
     # ------------------------------------------------------------ poses
 

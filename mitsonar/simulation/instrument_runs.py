@@ -555,7 +555,7 @@ def run_vehicle(
             if not resumed:
                 begun.append(name)
                 yield 0, {"begun": begun}  # noted first: only a sensor that was begun is resumed in its folder
-            inner = replace(destination, folder=run.path / name, resume=resumed, overwrite=not resumed)
+            inner = replace(destination, folder=run.path / name, resume=resumed, overwrite=not resumed, configuration={})
             sentences = _run_sensor(simulator.scene, one, vehicle, bodies, options, inner)
             warnings += [line for line in (f"{name}: {sentence}" for sentence in sentences) if line not in warnings]
             yield 0, {"warnings": warnings}

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
+import yaml
 from numpy.typing import ArrayLike
 from PIL import Image
 
@@ -21,7 +22,7 @@ from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar, TimedPath, overlap_notes, timed_path
 from mitsonar.io.files import write_atomic
-from mitsonar.io.runs import RunDirectory, RunKind, digest
+from mitsonar.io.runs import CONFIG_FILE, RunDirectory, RunKind, digest
 from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fans import FanPictures, save_fan
@@ -59,6 +60,7 @@ class Destination:
         overwrite: replace an existing run.
         resume: continue an interrupted run.
         progress: called with the number of pings that were added.
+        configuration: options of the command, which are written to ``run.yaml``; empty: no such file.
     """
 
     folder: str | Path
@@ -66,6 +68,7 @@ class Destination:
     overwrite: bool = False
     resume: bool = False
     progress: Callable[[int], None] = lambda pings: None
+    configuration: Mapping[str, Any] = field(default_factory=dict)
 
 
 Steps: TypeAlias = Iterator[tuple[int, dict[str, Any]]]
@@ -97,6 +100,10 @@ def write_run(
         destination.folder, kind, all_settings, resume=destination.resume, overwrite=destination.overwrite
     )
     run.start(**notes)
+    if destination.configuration:
+        words = f"# `mitsonar {destination.configuration['command']} --config {CONFIG_FILE} -o FOLDER` repeats this run\n"
+        text = yaml.safe_dump(dict(destination.configuration), sort_keys=False, allow_unicode=True)
+        write_atomic(run.path / CONFIG_FILE, (words + text).encode())
     for pings, noted in steps(run):
         if noted:
             run.note(**noted)

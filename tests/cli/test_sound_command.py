@@ -29,7 +29,7 @@ def test_each_instrument_writes_what_it_promises(mitsonar: Command, tmp_path: Pa
     out = tmp_path / "out"
     done = mitsonar("sound", "flat_floor", "--instrument", instrument, *PATH, "-o", out)
     assert done.returncode == 0, done.stderr
-    assert {one.name for one in out.iterdir()} == FILES[instrument] | {"run.json"}
+    assert {one.name for one in out.iterdir()} == FILES[instrument] | {"run.json", "run.yaml"}
     result = Soundings.load(out / "soundings.npz")
     assert len(result) == 4
     assert result.found.any()
