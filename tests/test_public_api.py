@@ -58,6 +58,7 @@ MADE: dict[str, Callable[[Path], Any]] = {
     "ComparisonOptions": lambda _: mitsonar.ComparisonOptions(),
     "DataStore": lambda data: mitsonar.DataStore.open(data),
     "Deforming": lambda _: mitsonar.Deforming(PATH, lambda _time: np.zeros((3, 3), np.float32)),
+    "DifferentiableSimulator": lambda _: mitsonar.DifferentiableSimulator(_scene(), SONAR),
     "Echogram": lambda _: _sounding().echogram(PATH),
     "Effort": lambda _: mitsonar.Effort(),
     "Estimate": lambda _: mitsonar.Estimate(mitsonar.Motion(0.1, 0.2, 0.03), np.eye(3)),
