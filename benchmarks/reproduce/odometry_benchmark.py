@@ -336,6 +336,9 @@ DIVE_SONARS: dict[str, tuple[dict[str, Any], float, float]] = {
     "oculus-m750d-750khz": ({"beams": 160, "range_bins": 500, "range_max": 20.0}, 4.0, 20),
     "blueview-p900-45": ({"beams": 128, "range_bins": 500, "range_max": 15.0}, 3.0, 20),
     "gemini-720is": ({"beams": 160, "range_bins": 500, "range_max": 20.0}, 4.0, 20),
+    # as recorded: eight ping groups, looks, tails
+    "didson300-recorded": ({}, 2.5, 35),
+    "aris3000-recorded": ({"range_bins": 600}, 1.6, 30),
 }
 """The presets that dive: changes that save time, height [m], pitch [deg]."""
 
@@ -602,6 +605,14 @@ def _methods(request: Wanted) -> tuple[dict[str, AnyEstimator], list[str]]:
     return estimators, notes
 
 
+def names_of(set_name: str) -> list[str]:
+    """Return the names that pick a set: its own, and those of all dives, of the dives of a sonar, or of its flight."""
+    if not set_name.startswith(f"{DIVE}-"):
+        return [set_name]
+    of_sonar = set_name.rsplit("-", 2)[0]
+    return [set_name, set_name.rsplit("-", 1)[0], of_sonar, DIVE]
+
+
 def _cells(request: Wanted) -> Iterator[Case]:
     """List sets with texture and noise, as cases without a method.
 
@@ -615,7 +626,7 @@ def _cells(request: Wanted) -> Iterator[Case]:
     if request.frames is not None and request.frames < 3:
         raise MitsonarError(f"{argument('frames')} must be at least 3: got {request.frames}")
     for name in dict.fromkeys(request.sets):
-        sets = [set_name for set_name in SETS if f"{set_name}-".startswith(f"{name}-")]
+        sets = [set_name for set_name in SETS if name in names_of(set_name)]
         if sets:
             yield from (
                 Case(set_name, texture, noise, "")

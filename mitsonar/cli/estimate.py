@@ -652,7 +652,7 @@ def odometry_benchmark(
         typer.Option(
             "--set",
             help="dive, rocks, slope, hull, or the path of a recording or a run; several times (default: those four). "
-            "dive means 36 dives of six sonars; dive-aris3000 or dive-aris3000-gentle-3 picks some.",
+            "dive means 48 dives of eight sonars; dive-aris3000 or dive-aris3000-gentle-3 picks some.",
         ),
     ] = None,
     texture: Annotated[
