@@ -684,8 +684,8 @@ def _rays(field: FieldOfView) -> NDArray[np.float64]:
     """Sample the directions of a field of view, edges included, in the body frame ``(n, 3)``."""
     part = np.linspace(-1, 1, RAYS)
     match field.shape:
-        case "rectangular":
-            side = np.sin(math.radians(field.across_deg) / 2 * part)[:, None]
+        case "rectangular" | "line":
+            side = np.sin(field.half_across_rad * part)[:, None]
             up = math.radians(field.along_deg) / 2 * part
             ahead = np.sqrt(1 - side**2)
             local = np.stack(np.broadcast_arrays(ahead * np.cos(up), side, ahead * np.sin(up)), axis=-1)

@@ -38,7 +38,10 @@ from mitsonar.simulation.mirrors import (
 from mitsonar.simulation.points import Patches, SurfacePoints, lattice_points, lattice_size
 from mitsonar.simulation.tracing import height_below, hidden
 
-__all__ = ["DIRECT", "ChannelTracer", "EchoBatch", "EchoValues", "LinkGeometry", "ScattererPath", "Scatterers", "link_table"]
+__all__ = [
+    *("DIRECT", "ChannelTracer", "EchoBatch", "EchoValues", "LinkGeometry", "ScattererPath", "Scatterers"),
+    *("absorption_rate", "link_table"),
+]
 
 
 EchoValues: TypeAlias = dict[str, NDArray[Any]]
@@ -241,7 +244,7 @@ class _WorldScatterers:
         weight = link.sensitivity(u_sent, u_received)
         cosines = dr.dot(normal, u_sent), dr.dot(normal, u_received)
         lambert = cosines[0] * cosines[1]
-        inside = (weight > 0) & (lambert > 0)
+        inside = (weight != 0) & (lambert > 0)  # the lobes of a line change sign
         # 5. shadow rays, only for points that could contribute
         point = ScatteringPoints(position, exact, normal)
         open_, factor = link.reached(scene, point, Leg(u_sent, sent), Leg(u_received, received), inside)
@@ -338,7 +341,7 @@ MARGIN_DEG = 2.0
 LINK = 30
 """Length of :func:`link_table`."""
 
-DRJIT = Maths(dr.asin, dr.atan2, dr.cos, dr.clip, dr.select)
+DRJIT = Maths(dr.asin, dr.atan2, dr.sin, dr.cos, dr.clip, dr.select)
 
 
 class Leg(NamedTuple):
@@ -389,6 +392,11 @@ def link_table(
     axes = [field.axes @ turn.T for field in (one.field, sonar.transmitter)]
     places, velocities = (pose[:3], pose[:3] + turn @ offset), (turn @ velocity[:3], turn @ swing)
     return np.concatenate([*places, *velocities, *(each.ravel() for each in axes)])
+
+
+def absorption_rate(sonar: ChannelSonar) -> float:
+    """Return the rate at which absorption lowers the amplitude of an echo with its delay [1/s]."""
+    return sonar.absorption_db_per_m * sonar.sound_speed * math.log(10) / 20
 
 
 class LinkGeometry:
@@ -468,6 +476,8 @@ class LinkGeometry:
         self, delay: DeviceArray, amplitude: DeviceArray, phase: DeviceArray, doppler: DeviceArray, valid: DeviceArray
     ) -> EchoBatch:
         """Return the echoes, split into those within ``range_max`` and those from beyond."""
+        if self.sonar.absorption_db_per_m > 0:
+            amplitude = amplitude * dr.exp(mi.Float(delay) * -absorption_rate(self.sonar))
         beyond = valid & (delay > 2 * self.sonar.range_max / self.sonar.sound_speed)
         turn = delay * (self.sonar.frequency_step_hz / PADDING)
         turns = delay * self.sonar.carrier_hz
