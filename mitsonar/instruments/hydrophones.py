@@ -15,6 +15,7 @@ from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, short_repr
 from mitsonar.instruments.sonar import FieldValue, Instrument
 from mitsonar.io.checked_model import CheckedModel
+from mitsonar.motion.pose import vehicle_rotation
 
 __all__ = [
     *("HALF_POWER", "LINE_NULLS", "RECEIVER_HEADINGS_DEG", "NUMPY", "PADDING", "ChannelModel", "ChannelSonar"),
@@ -47,8 +48,8 @@ NUMPY = Maths(np.arcsin, np.arctan2, np.sin, np.cos, np.clip, np.where)
 HALF_POWER = 0.44294647
 """x at which sinc(x)^2 is 1/2: the half-power point of a line in one direction."""
 
-LINE_NULLS = 3
-"""Null of the pattern of a line beyond which it counts as deaf; two-way lobes there lie below -41 dB."""
+LINE_NULLS = 2
+"""Null of the pattern of a line beyond which it counts as deaf; two-way lobes there lie below -35 dB."""
 
 
 class FieldOfView(CheckedModel):
@@ -70,7 +71,9 @@ class FieldOfView(CheckedModel):
     shape: Literal["rectangular", "circular", "all", "line"] = Field("rectangular", description="of the field of view")
     heading_deg: float = Field(0.0, ge=-360, le=360, description="where it looks: 0 forward, 90 to starboard [deg]")
     tilt_deg: float = Field(25.0, ge=0, le=180, description="of its middle, from straight down [deg]")
-    across_deg: float = Field(10.0, gt=0, le=180, description="whole width across; of a circle its diameter; half-power width of a line [deg]")
+    across_deg: float = Field(
+        10.0, gt=0, le=180, description="whole width across; of a circle its diameter; half-power width of a line [deg]"
+    )
     along_deg: float = Field(50.0, gt=0, le=180, description="whole width in the vertical plane [deg]")
     taper: float = Field(0.5, ge=0, le=1, description="part of each half width over which sensitivity falls to 0")
 
@@ -141,6 +144,21 @@ class FieldOfView(CheckedModel):
         near = abs(x) < 1e-3  # the series is exact there in single precision
         lobes = maths.where(near, 1 - x * x / 6, maths.sin(x) / maths.where(near, x * 0 + 1, x))
         return maths.where(abs(x) < math.pi * LINE_NULLS, lobes, 0)
+
+    def directions(self, count: int) -> NDArray[np.float64]:
+        """Sample unit directions of the field of view, edges included, in the vehicle's axes ``(count**2, 3)``."""
+        part = np.linspace(-1, 1, count)
+        match self.shape:
+            case "rectangular" | "line":
+                side = np.sin(self.half_across_rad * part)[:, None]
+                up = math.radians(self.along_deg) / 2 * part
+                ahead = np.sqrt(1 - side**2)
+                local = np.stack(np.broadcast_arrays(ahead * np.cos(up), side, ahead * np.sin(up)), axis=-1)
+            case kind:
+                off = math.radians(self.across_deg) / 2 if kind == "circular" else math.pi
+                tilt, turn = np.meshgrid(off * (part + 1) / 2, np.pi * part)
+                local = np.stack([np.cos(tilt), np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn)], axis=-1)
+        return np.asarray(local.reshape(-1, 3) @ self.axes)
 
     def may_see(self, ahead: AnyArray, aside: AnyArray, above: AnyArray, margin: AnyArray) -> NDArray[np.bool_]:
         """Return whether a point within ``margin`` [rad] of a unit direction, in :attr:`axes` components, may be in view."""
@@ -222,11 +240,13 @@ def side_looking_array(
     Args:
         element_m: length of an element along the track [m].
         receivers: number of receivers, centred on the transmitter.
-        carrier_hz, bandwidth_hz: band [Hz], with flat spectrum.
+        carrier_hz: centre of the band [Hz].
+        bandwidth_hz: width of the band, whose spectrum is flat [Hz].
         range_max: largest range [m].
         sound_speed: [m/s].
         side: where the elements look.
-        tilt_deg, along_deg: of the elements in the vertical plane, see :class:`FieldOfView`.
+        tilt_deg: tilt of the elements from straight down [deg].
+        along_deg: whole width of the elements in the vertical plane [deg].
         keys: other keys of :class:`ChannelSonar`; ``frame_rate_hz`` is by default the highest that ``range_max`` allows.
 
     Raises:
@@ -259,6 +279,9 @@ def side_looking_array(
     row = [Hydrophone(name=f"r{k}", position=(0.0, float(y), 0.0), field=field) for k, y in enumerate(places)]
     return ChannelSonar.create(**{**derived, **fixed, **keys, "transmitter": field, "receivers": tuple(row)})
 
+
+DIRECTIONS = 24
+"""Directions over each width of a field of view that bound what it sees."""
 
 SAMPLES_A_BAND = 1.2
 """Sampling rate of a side-looking array over its bandwidth."""
@@ -404,6 +427,22 @@ class ChannelSonar(Instrument):
     def offsets(self) -> NDArray[np.float64]:
         """Return the positions of the receivers in the vehicle's axes ``(receivers, 3)`` [m]."""
         return np.array([receiver.position for receiver in self.receivers], dtype=float)
+
+    def box_seen_from(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return two opposite corners of a box around all that the receivers may see from some poses ``(2, 3)`` [m].
+
+        Args:
+            poses: poses of the transmitter ``(pings, 6)``.
+        """
+        turns = vehicle_rotation(poses).as_matrix()
+        corners = [poses[:, :3].min(axis=0), poses[:, :3].max(axis=0)]
+        for one in self.receivers:
+            rays = np.array(one.position) + self.range_max * one.field.directions(DIRECTIONS)
+            for turn, pose in zip(turns, poses, strict=True):
+                ends = pose[:3] + rays @ turn.T
+                corners += [ends.min(axis=0), ends.max(axis=0)]
+        margin = 0.01 * self.range_max
+        return np.array([np.min(corners, axis=0) - margin, np.max(corners, axis=0) + margin])
 
     def receiver_number(self, receiver: int | str) -> int:
         """Return the index of a receiver that is given by name or by index.

@@ -9,13 +9,11 @@ null at D / 2 along the track, and at c / (2 B) in range.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -25,14 +23,14 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.water import delay_exact
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
-from mitsonar.io.files import read_npz, write_atomic
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.responses import ImpulseResponses
+from mitsonar.records.strips import StripGrid, StripImage
 
 __all__ = [
-    *("ApertureImage", "BackProjector", "PhaseCentres", "PointResponse", "StripGrid", "Weighting"),
-    *("focus", "phase_centres", "point_response", "processed_sine", "refuse_aliased", "strip_grid"),
+    *("BackProjector", "PhaseCentres", "PointResponse", "Weighting", "along_resolution", "focus", "phase_centres"),
+    *("point_response", "processed_sine", "refuse_aliased", "strip_grid"),
 ]
 
 Weighting = Literal["uniform", "hann"]
@@ -47,133 +45,8 @@ The droop of the interpolation is divided out; what remains are images of the sp
 BLOCK_ROWS, BLOCK_COLUMNS = 64, 256
 """Pixels that are computed together: rows bound the memory, columns fit the cache."""
 
-MOST_PIXELS = 2**27
-"""Largest number of pixels of an image: 1 GB."""
-
 TABLE = 4096
 """Entries of the table of weights over the sine within the beam."""
-
-
-# ---------------- Image and grid
-
-
-@dataclass(frozen=True)
-class StripGrid:
-    """Pixels of a stripmap image: a horizontal rectangle along a track.
-
-    Attributes:
-        x, y, z: where both distances are 0 [m].
-        heading_rad: direction of the track, clockwise from +y.
-        along_start_m, along_step_m, rows: distances along the track, one per row.
-        across_start_m, across_step_m, columns: distances to starboard of the track, one per column; negative to port.
-    """
-
-    x: float
-    y: float
-    z: float
-    heading_rad: float
-    along_start_m: float
-    along_step_m: float
-    rows: int
-    across_start_m: float
-    across_step_m: float
-    columns: int
-
-    def __post_init__(self) -> None:
-        steps = (self.along_step_m, self.across_step_m)
-        if not all(math.isfinite(value) for value in asdict(self).values()) or 0 in steps or self.along_step_m < 0:
-            raise MitsonarError(f"a grid has finite numbers and steps that are not 0: got {self}")
-        if min(self.rows, self.columns) < 1 or self.rows * self.columns > MOST_PIXELS:
-            raise MitsonarError(
-                f"an image has 1 to {MOST_PIXELS:,} pixels: got {self.rows:,} x {self.columns:,}; choose larger steps, or a "
-                "smaller area"
-            )
-
-    @property
-    def along_m(self) -> NDArray[np.float64]:
-        """Return the distance of each row along the track ``(rows,)`` [m]."""
-        return self.along_start_m + self.along_step_m * np.arange(self.rows)
-
-    @property
-    def across_m(self) -> NDArray[np.float64]:
-        """Return the distance of each column to starboard ``(columns,)`` [m]."""
-        return self.across_start_m + self.across_step_m * np.arange(self.columns)
-
-    @property
-    def axes(self) -> NDArray[np.float64]:
-        """Return the directions to starboard, along the track and up in the world, as rows ``(3, 3)``."""
-        sin, cos = math.sin(self.heading_rad), math.cos(self.heading_rad)
-        return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-    def local(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions in the world ``(..., 3)`` as distances to starboard, along the track and up [m]."""
-        return np.asarray((places - np.array([self.x, self.y, self.z])) @ self.axes.T)
-
-    def world(self, along_m: float, across_m: float) -> NDArray[np.float64]:
-        """Return the position of a pixel in the world ``(3,)`` [m]."""
-        return np.asarray(np.array([across_m, along_m, 0.0]) @ self.axes + np.array([self.x, self.y, self.z]))
-
-
-@dataclass(frozen=True)
-class ApertureImage:
-    """A complex stripmap image.
-
-    A scatterer of the simulator appears with the square root of its strength and cosines and with its phase: spreading and
-    absorption are undone, and the pattern of the elements across the vertical plane.
-
-    Attributes:
-        value: ``(rows, columns)`` complex64; 0 where no beam looks.
-        grid: the pixels.
-    """
-
-    value: NDArray[np.complex64]
-    grid: StripGrid
-
-    def __post_init__(self) -> None:
-        if self.value.shape != (self.grid.rows, self.grid.columns):
-            raise MitsonarError(f"value must be {(self.grid.rows, self.grid.columns)}: got {self.value.shape}")
-
-    def __repr__(self) -> str:
-        grid = self.grid
-        along, across = grid.along_m[[0, -1]], grid.across_m[[0, -1]]
-        return (
-            f"ApertureImage({grid.rows} x {grid.columns} pixels, {along[0]:g}..{along[1]:g} m along, "
-            f"{across[0]:g}..{across[1]:g} m to starboard)"
-        )
-
-    def decibels(self, span_db: float = 50.0) -> NDArray[np.float32]:
-        """Return the intensity in dB relative to its 99.9th percentile, 0 to ``-span_db`` ``(rows, columns)``."""
-        power = np.square(np.abs(self.value))
-        full_scale = float(np.percentile(power, 99.9)) or float(power.max()) or 1.0
-        return np.asarray(10 * np.log10(np.clip(power / full_scale, 10 ** (-span_db / 10), 1)), dtype=np.float32)
-
-    def save(self, path: str | Path) -> None:
-        """Write an npz file atomically: ``value``, and the fields of the grid as numbers."""
-        buffer = io.BytesIO()
-        np.savez(buffer, value=self.value, **{name: np.asarray(number) for name, number in asdict(self.grid).items()})
-        write_atomic(Path(path), buffer.getvalue())
-
-    @classmethod
-    def load(cls, path: str | Path) -> ApertureImage:
-        """Read a file written by :meth:`save`.
-
-        Raises:
-            MitsonarError: a file that cannot be read or has another format.
-        """
-        advice = "give the image.npz that `mitsonar sas` wrote"
-        try:
-            table = read_npz(path)
-        except Exception as error:  # damaged bytes raise errors of many kinds
-            raise MitsonarError(f"cannot read the image {path}: {' '.join(str(error).split())[:300]}; {advice}") from None
-        fields = StripGrid.__dataclass_fields__
-        if set(table) != {"value", *fields} or any(table[name].ndim or table[name].dtype.kind not in "fi" for name in fields):
-            raise MitsonarError(f"{path} is not an image of `mitsonar sas`: {advice}")
-        whole = ("rows", "columns")
-        grid = StripGrid(**{name: int(table[name]) if name in whole else float(table[name]) for name in fields})
-        value = table["value"]
-        if value.dtype != np.complex64 or not np.isfinite(value).all():
-            raise MitsonarError(f"{path} must hold finite complex64 values: {advice}")
-        return cls(value, grid)
 
 
 # ---------------- Geometry of the aperture
@@ -292,9 +165,10 @@ def strip_grid(
 
     Args:
         responses: responses with poses.
-        near_m, far_m: ground range of the first and last column; default: from 40 deg below the horizon, or where the
-            field of view begins, to ``range_max``.
-        along_step_m, across_step_m: spacing of rows and columns; default: half the resolution.
+        near_m: ground range of the first column; default: where the ground is seen :data:`STEEPEST_DEG` below the horizon.
+        far_m: ground range of the last column; default: that of ``range_max``.
+        along_step_m: spacing of rows; default: half the resolution.
+        across_step_m: spacing of columns; default: half the resolution.
         ground_m: height of the ground (z) that is focused; default: the median of what lies below the pings.
 
     Raises:
@@ -324,30 +198,25 @@ def strip_grid(
             f"range of range_max {sonar.range_max:g} m from {height:.3g} m up: got {near:.4g} and {far:.4g} m"
         )
     # 2. rows that see a whole aperture
-    places = grid_free(centres.middle, centres.sent[0], ahead)
+    places = (centres.middle - centres.sent[0]) @ ahead
     half = math.hypot(far, height) * math.tan(math.asin(min(processed_sine(sonar), 0.999)))
     first, last = float(places.min()) + half, float(places.max()) - half
     if first >= last:
         raise MitsonarError(
-            f"the path of {places.max() - places.min():.3g} m is shorter than the aperture at {far:.4g} m, {2 * half:.3g} m: "
-            "extend it, or focus nearer"
+            f"the path of {places.max() - places.min():.3g} m is shorter than the aperture at {far:.4g} m, which is "
+            f"{2 * half:.3g} m: extend it, or focus nearer"
         )
     # 3. steps
     along = along_step_m or along_resolution(sonar) / 2
     across = across_step_m or sonar.sound_speed / (2 * sonar.bandwidth_hz) / 2
     sign = 1.0 if starboard > 0 else -1.0
     x, y, _ = centres.sent[0]
-    rows, columns = (int(math.floor(reach_m / step)) + 1 for reach_m, step in ((last - first, along), (far - near, across)))
+    rows, columns = (math.floor(reach_m / step) + 1 for reach_m, step in ((last - first, along), (far - near, across)))
     return StripGrid(float(x), float(y), ground, heading, first, along, rows, sign * near, sign * across, columns)
 
 
 STEEPEST_DEG = 60.0
 """Depression angle at which the default image begins [deg]; nearer, ground range is poorly resolved."""
-
-
-def grid_free(places: NDArray[np.float64], start: NDArray[np.float64], ahead: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return distances along the track from its start [m]."""
-    return np.asarray((places - start) @ ahead)
 
 
 def _ground(responses: ImpulseResponses) -> float:
@@ -552,7 +421,7 @@ def focus(
     weighting: Weighting = "uniform",
     path: NDArray[np.float64] | None = None,
     progress: Callable[[int], None] = lambda rows: None,
-) -> ApertureImage:
+) -> StripImage:
     """Focus responses to a stripmap image.
 
     Args:
@@ -570,7 +439,7 @@ def focus(
     for rows, block in BackProjector(responses, grid, weighting, path).blocks():
         value[rows] = block
         progress(len(block))
-    return ApertureImage(value, grid)
+    return StripImage(value, grid)
 
 
 # ---------------- Point response
@@ -606,7 +475,7 @@ def point_response(values: NDArray[np.complexfloating], step_m: float) -> PointR
     spectrum = np.fft.fft(values)
     power = np.abs(spectrum) ** 2
     turn = np.exp(2j * np.pi * np.arange(len(values)) / len(values))
-    centre = int(round(float(np.angle((power * turn).sum())) / (2 * np.pi) * len(values)))
+    centre = round(float(np.angle((power * turn).sum())) / (2 * np.pi) * len(values))
     spectrum = np.fft.fftshift(np.roll(spectrum, -centre))
     pad = (fine - 1) * len(values)
     wide = np.fft.ifft(np.fft.ifftshift(np.pad(spectrum, (pad // 2, pad - pad // 2)))) * fine

@@ -75,6 +75,7 @@ class ChannelTracer:
         sonar: the instrument.
         like: a tracer of the same scene, whose scatterers may be shared.
         mirrors: mirror parts of the scene's shapes.
+        within: box that holds all points that matter, see :meth:`Scatterers.from_scene`.
 
     Attributes:
         notes: notes to the user about the scene's BSDFs.
@@ -87,7 +88,12 @@ class ChannelTracer:
     """
 
     def __init__(
-        self, scene: mi.Scene, sonar: ChannelSonar, like: ChannelTracer | None = None, mirrors: Mirrors | None = None
+        self,
+        scene: mi.Scene,
+        sonar: ChannelSonar,
+        like: ChannelTracer | None = None,
+        mirrors: Mirrors | None = None,
+        within: NDArray[np.float64] | None = None,
     ) -> None:
         self.scene, self.sonar = scene, sonar
         surfaces = Surfaces.from_scene(scene)
@@ -103,7 +109,7 @@ class ChannelTracer:
                 if like is not None and like.scene is scene and isinstance(like.source, _WorldScatterers)
                 else None
             )
-            self.source = _WorldScatterers(scene, sonar, shared, mirrors)
+            self.source = _WorldScatterers(scene, sonar, shared, mirrors, within)
         else:
             self.source = _VehicleRays(sonar, surfaces)
         self.launches: dict[tuple[int, tuple[str, ...], int, int], _Launch] = {}
@@ -185,8 +191,15 @@ def _scatterer_paths(flat: FlatMirrors, bounces: int) -> list[ScattererPath]:
 class _WorldScatterers:
     """Source of echoes from scatterers that are fixed in the world."""
 
-    def __init__(self, scene: mi.Scene, sonar: ChannelSonar, like: _WorldScatterers | None, mirrors: Mirrors | None) -> None:
-        self.sonar = sonar
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sonar: ChannelSonar,
+        like: _WorldScatterers | None,
+        mirrors: Mirrors | None,
+        within: NDArray[np.float64] | None,
+    ) -> None:
+        self.sonar, self.within = sonar, within
         self.scatterers: Scatterers
         self.stored: mi.Float
         self.smooth: frozenset[int] | None = None
@@ -195,10 +208,11 @@ class _WorldScatterers:
                 [] if mirrors is None else np.flatnonzero((mirrors.reflection != 0) & (mirrors.roughness_m == 0)).tolist()
             )
             self.smooth = frozenset(places)
-        if like is not None and _points_of(like.sonar) == _points_of(sonar) and like.smooth == self.smooth:
+        same = like is not None and _points_of(like.sonar) == _points_of(sonar) and like.smooth == self.smooth
+        if like is not None and same and np.array_equal(like.within, within):  # type: ignore[arg-type]
             self.scatterers, self.stored = like.scatterers, like.stored
         else:
-            self.scatterers = Scatterers.from_scene(scene, sonar, self.smooth)
+            self.scatterers = Scatterers.from_scene(scene, sonar, self.smooth, within)
             self.stored = self._rows()
         self.wavenumber = 2 * math.pi / sonar.wavelength_m
         self.roughness: mi.Float | None = None  # rms height of each point's mirror; negative if it is no mirror
@@ -627,13 +641,20 @@ class Scatterers:
     one_sided: NDArray[np.bool_]
 
     @classmethod
-    def from_scene(cls, scene: mi.Scene, sonar: ChannelSonar, smooth: frozenset[int] | None = None) -> Scatterers:
+    def from_scene(
+        cls,
+        scene: mi.Scene,
+        sonar: ChannelSonar,
+        smooth: frozenset[int] | None = None,
+        within: NDArray[np.float64] | None = None,
+    ) -> Scatterers:
         """Place scatterers on a scene's shapes.
 
         Args:
             scene: any Mitsuba scene.
             sonar: instrument that gives number and seed of the points.
             smooth: indices of perfect mirrors in the scene, which scatter nothing; if given, there may be no points at all.
+            within: two opposite corners of a box ``(2, 3)`` [m]; points outside are left out, those inside stay the same.
 
         Raises:
             MitsonarError: no surface can carry scatterers, or there are more than :data:`MOST`.
@@ -642,7 +663,11 @@ class Scatterers:
         for number, shape in enumerate(scene.shapes()):
             if shape.bsdf() is not None and number not in (smooth or ()) and not is_black(shape.bsdf()):
                 grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
-                parts.append(_in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number))
+                some = _in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number, within)
+                if within is not None:
+                    inside = ((some.place >= within[0]) & (some.place <= within[1])).all(axis=1)
+                    some = SurfacePoints(*(values[inside] for values in some))
+                parts.append(some)
                 closed.append(np.full(len(parts[-1].strength), isinstance(shape, mi.Mesh) and _is_closed(shape)))
                 shapes.append(np.full(len(parts[-1].strength), number, np.int32))
         if not sum(map(len, closed)) and smooth is not None:
@@ -781,15 +806,17 @@ def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> SurfacePoints:
     return _scattering_points(shape, si, area, _zeta_of(bits[0], bits[1] ^ _key(*seed, ZETA)), inside & si.is_valid())
 
 
-def _on_lattice(shape: mi.Shape, sonar: ChannelSonar, number: int) -> SurfacePoints:
+def _on_lattice(
+    shape: mi.Shape, sonar: ChannelSonar, number: int, within: NDArray[np.float64] | None = None
+) -> SurfacePoints:
     """Return the points of the world's lattice on a surface, one in each cell of the lattice."""
     pitch = sonar.lattice_pitch_m
-    cells = lattice_size(shape, pitch) / 2
+    cells = lattice_size(shape, pitch, within) / 2
     enough = pitch * math.sqrt(cells / MOST) * 1.1
     advice = "lower points_per_m2" if sonar.scatterer_spacing_m is None else "raise scatterer_spacing_m"
     _check_count(shape, cells, f"{advice}; a spacing of {enough:.2g} m is enough")
     patches = None if sonar.speckle_nu is None else Patches(sonar.speckle_nu, sonar.speckle_patch_m)
-    return lattice_points(shape, grain_key(shape.id(), number), pitch, sonar.seed, patches)
+    return lattice_points(shape, grain_key(shape.id(), number), pitch, sonar.seed, patches, within=within)
 
 
 def _scattering_points(
