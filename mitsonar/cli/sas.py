@@ -15,6 +15,7 @@ from mitsonar.errors import MitsonarError, count_noun
 
 if TYPE_CHECKING:
     from mitsonar.instruments.hydrophones import ChannelSonar
+    from mitsonar.mapping.aperture_run import Correction
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.records.responses import ImpulseResponses
     from mitsonar.simulation.channel import ChannelSimulator
@@ -54,16 +55,26 @@ def sas(
     ground: Annotated[
         float | None, typer.Option(help="Height z of the plane that is focused [m] (default: the ground below the path).")
     ] = None,
+    navigation: Annotated[
+        Path | None,
+        typer.Option(help="Poses that focusing assumes, a TUM or CSV file (default: those that the vehicle has)."),
+    ] = None,
+    correct: Annotated[
+        str | None,
+        typer.Option(help="Corrections of the path: dpc (displaced phase centres), autofocus, or both: dpc,autofocus."),
+    ] = None,
     weighting: Annotated[str, typer.Option(help="uniform (sharpest) or hann (side lobes below -31 dB).")] = "uniform",
     parameter: options.Parameters = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
 ) -> None:
     """Simulate a synthetic aperture, and write image.npz, image.png and the responses into the folder OUT."""
+    import numpy as np
+
     from mitsonar.acoustics.water import Water, absorption_db_per_m
-    from mitsonar.mapping.aperture_run import run_aperture
+    from mitsonar.mapping.aperture_run import ApertureOptions, run_aperture
     from mitsonar.mapping.synthetic_aperture import along_resolution, refuse_aliased, strip_grid
-    from mitsonar.motion.trajectory import velocities
+    from mitsonar.motion.trajectory import Trajectory, velocities
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.instrument_runs import run_impulse
     from mitsonar.simulation.runs import Destination, path_digest
@@ -74,7 +85,10 @@ def sas(
     sonar = _array(element, receivers, side, set_ or [])
     if "absorption_db_per_m" not in [pair.partition("=")[0] for pair in set_ or []]:
         sonar = sonar.replace(absorption_db_per_m=float(absorption_db_per_m(sonar.carrier_hz, Water())))
-    spacing = along_resolution(sonar) * len(sonar.receivers)
+    corrections = _corrections(correct)
+    # displaced phase centres need pings whose receivers overlap
+    shared = len(sonar.receivers) // 2 if "dpc" in corrections else 0
+    spacing = along_resolution(sonar) * (len(sonar.receivers) - shared)
     flown = _path(spacing, trajectory, start, end, speed, frames, frame)
     _refuse_haste(sonar, flown)
     # 2. what is focused is checked before anything is simulated
@@ -94,6 +108,7 @@ def sas(
     )
     if weighting not in ("uniform", "hann"):
         raise MitsonarError(f"--weighting takes uniform or hann: got {weighting}")
+    assumed = None if navigation is None else Trajectory.load(navigation, frame, looks_ahead=False)
     chosen: Literal["uniform", "hann"] = "hann" if weighting == "hann" else "uniform"
     # 3. measure, then focus
     folder = out or Path("out") / f"{find_scene(scene).stem}-sas"
@@ -112,7 +127,8 @@ def sas(
     settings = origin | {"sonar": sonar.model_dump(mode="json"), "poses_sha256": path_digest(flown)}
     with LaterBar("focusing", "rows") as bar:
         report = run_aperture(
-            *(folder, settings, measure, grid, chosen),
+            *(folder, settings, measure),
+            ApertureOptions(grid, chosen, assumed, corrections),
             title=title,
             resume=resume,
             overwrite=overwrite,
@@ -128,7 +144,24 @@ def sas(
         "track, "
         f"{abs(grid.across_m[0]):.3g} to {abs(grid.across_m[-1]):.3g} m to {side}, on the plane z = {grid.z:.3g} m"
     )
+    if micro := report.micronavigation:
+        say(
+            f"displaced phase centres: coherence {np.median(micro.coherence):.2f}, sway between pings "
+            f"{1e3 * np.nanstd(micro.sway_m):.3g} mm, bound {1e3 * np.nanmedian(micro.sway_std_m):.2g} mm"
+        )
     say(f"files: {folder / 'image.png'}, {folder / 'image.npz'}, {folder / 'responses'}")
+
+
+def _corrections(text: str | None) -> tuple[Correction, ...]:
+    """Return the corrections of --correct, in the order in which they are applied."""
+    from mitsonar.errors import suggest_names
+    from mitsonar.mapping.aperture_run import CORRECTIONS
+
+    given = [] if text is None else [one.strip() for one in text.split(",")]
+    for one in given:
+        if one not in CORRECTIONS:
+            raise MitsonarError(f"--correct has no {one!r}: {suggest_names(one, CORRECTIONS)}")
+    return tuple(one for one in CORRECTIONS if one in given)
 
 
 def _array(element: float, receivers: int, side: str, changes: list[str]) -> ChannelSonar:

@@ -72,7 +72,7 @@ class ImpulseResponses:
                 raise MitsonarError(f"{name} must hold {expected_shape[0]} pings: got {len(values)}")
 
     def __len__(self) -> int:
-        return len(self.response)
+        return int(self.response.shape[0])
 
     def __repr__(self) -> str:
         names = ", ".join(receiver.name for receiver in self.sonar.receivers)
