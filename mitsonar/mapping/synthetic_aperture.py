@@ -45,6 +45,9 @@ The droop of the interpolation is divided out; what remains are images of the sp
 BLOCK_ROWS, BLOCK_COLUMNS = 64, 256
 """Pixels that are computed together: rows bound the memory, columns fit the cache."""
 
+FARTHEST_LOBE = 0.75
+"""Length in wavelengths times sine up to which the pattern of one element is undone; the beam of both ends at 0.5."""
+
 TABLE = 4096
 """Entries of the table of weights over the sine within the beam."""
 
@@ -128,6 +131,10 @@ def _direction(places: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([ahead[0], ahead[1], 0.0])
 
 
+LEEWAY = 1.1
+"""Factor by which a spacing may exceed the one that the beam needs: paths are never quite even."""
+
+
 def refuse_aliased(responses: ImpulseResponses) -> None:
     """Refuse phase centres that are too far apart for the beam.
 
@@ -137,7 +144,7 @@ def refuse_aliased(responses: ImpulseResponses) -> None:
     centres, sonar = phase_centres(responses), responses.sonar
     places = np.sort((centres.middle @ _direction(centres.sent)).ravel())
     gap, most = float(np.diff(places).max(initial=0.0)), along_resolution(sonar)
-    if gap <= most * (1 + 1e-6):
+    if gap <= most * LEEWAY:
         return
     count = len(sonar.receivers)
     advance = float(np.median(np.linalg.norm(np.diff(centres.sent, axis=0), axis=1)))
@@ -270,12 +277,16 @@ class BackProjector:
         window = np.ones(TABLE) if weighting == "uniform" else 0.5 + 0.5 * np.cos(np.pi * sine / self.limit)
         window[-1] = 0.0  # beyond the beam
         self.window = window.astype(np.float32)
-        self.weights = [(window / self._pattern(one.field, sine)).astype(np.float32) for one in self.sonar.receivers]
+        self.inverses = [
+            self._inverse(field) for field in (self.sonar.transmitter, *(one.field for one in self.sonar.receivers))
+        ]
 
-    def _pattern(self, receiver: FieldOfView, sine: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pattern of transmitter and receiver over the sine across; fields with tapers stay as they are."""
-        lines = [field for field in (receiver, self.sonar.transmitter) if field.shape == "line"]
-        return np.prod([np.sinc(field.wavelengths * sine) for field in lines], axis=0) * np.ones(len(sine))
+    def _inverse(self, field: FieldOfView) -> NDArray[np.float32] | None:
+        """Return what undoes the pattern of a line, at sines up to twice the limit; None for other fields of view."""
+        if field.shape != "line":
+            return None
+        sine = np.linspace(0, 2 * self.limit, 2 * TABLE)
+        return (1 / np.sinc(np.minimum(field.wavelengths * sine, FARTHEST_LOBE))).astype(np.float32)
 
     def blocks(self, first: int = 0) -> Iterator[tuple[slice, NDArray[np.complex64]]]:
         """Focus the rows in blocks.
@@ -396,9 +407,13 @@ class BackProjector:
         delay = delay_exact(to_point, from_receiver, self.velocity[ping, receiver].tolist(), sonar.sound_speed)
         # 2. weight by the angle off the beam's axis, seen from the phase centre
         line = self.line[ping, receiver]
-        along_line = sum(float(a) * (q + p) for a, q, p in zip(line, to_point, from_receiver, strict=True))
-        index = np.abs(along_line / delay) * ((TABLE - 1) / (self.limit * sonar.sound_speed))
-        number = np.minimum(index, TABLE - 1).astype(np.int32)
+        scale = (TABLE - 1) / (self.limit * sonar.sound_speed / 2) / delay
+        index = [sum(float(a) * p for a, p in zip(line, way, strict=True)) * scale for way in (to_point, from_receiver)]
+        weight = self.window[np.minimum(np.abs(index[0] + index[1]) / 2, TABLE - 1).astype(np.int32)]
+        gain = weight.copy()
+        for place, inverse in zip(index, (self.inverses[0], self.inverses[1 + receiver]), strict=True):
+            if inverse is not None:  # each end sees the pixel at an angle of its own
+                gain *= inverse[np.minimum(np.abs(place), 2 * TABLE - 1).astype(np.int32)]
         # 3. the response at the delay, between two fine taps
         place = delay * (sonar.sampling_hz * OVERSAMPLING)
         place = np.minimum(place, len(taps) - 2)
@@ -411,7 +426,7 @@ class BackProjector:
         angle = ((turns - np.rint(turns)) * (2 * math.pi)).astype(np.float32)
         phasor = np.empty(angle.shape, np.complex64)
         phasor.real, phasor.imag = np.cos(angle), np.sin(angle)
-        return echo * phasor * self.weights[receiver][number], self.window[number]
+        return echo * phasor * gain, weight
 
 
 def focus(
