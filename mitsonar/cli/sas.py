@@ -94,7 +94,6 @@ def sas(
     # 2. what is focused is checked before anything is simulated
     simulator = ChannelSimulator(loaded, sonar, within=sonar.box_seen_from(flown.poses[:: max(1, len(flown) // 1000)]))
     planned = _planned(simulator, flown)
-    refuse_aliased(planned)
     ends, steps = numbers(window, 2, "--range"), numbers(pixel, 2, "--pixel")
     if steps and min(steps) <= 0:
         raise MitsonarError(f"--pixel takes two spacings above 0 m, along,across: got {pixel}")
@@ -106,6 +105,7 @@ def sas(
         across_step_m=steps[1] if steps else None,
         ground_m=ground,
     )
+    refuse_aliased(planned)
     if weighting not in ("uniform", "hann"):
         raise MitsonarError(f"--weighting takes uniform or hann: got {weighting}")
     assumed = None if navigation is None else Trajectory.load(navigation, frame, looks_ahead=False)

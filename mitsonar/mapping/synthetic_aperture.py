@@ -194,14 +194,17 @@ def strip_grid(
     level = vehicle_rotation(np.asarray(responses.poses)[:1]).as_matrix()[0] @ view
     starboard = float(level @ np.array([ahead[1], -ahead[0], 0.0]))
     if abs(starboard) < abs(float(level @ ahead)) or abs(starboard) < 1e-6:
-        raise MitsonarError("the receivers must look to port or starboard of the path: give heading_deg -90 or 90")
+        raise MitsonarError(
+            "the receivers must look to port or starboard of the path: the vehicle must head along it, and their heading_deg "
+            "be -90 or 90"
+        )
     reach = sonar.range_max * 0.999
     farthest = math.sqrt(max(reach**2 - height**2, 0.0))
     far = farthest if far_m is None else far_m
     near = max(height / math.tan(math.radians(STEEPEST_DEG)), 0.0) if near_m is None else near_m
     if not 0 <= near < far <= farthest * (1 + 1e-9):
         raise MitsonarError(
-            f"{argument('near_m')} and {argument('far_m')} must satisfy 0 <= near < far <= {farthest:.4g} m, the ground "
+            f"{argument('near_m, far_m')} must satisfy 0 <= near < far <= {farthest:.4g} m, the ground "
             f"range of range_max {sonar.range_max:g} m from {height:.3g} m up: got {near:.4g} and {far:.4g} m"
         )
     # 2. rows that see a whole aperture
