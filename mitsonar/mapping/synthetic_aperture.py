@@ -195,8 +195,8 @@ def strip_grid(
     starboard = float(level @ np.array([ahead[1], -ahead[0], 0.0]))
     if abs(starboard) < abs(float(level @ ahead)) or abs(starboard) < 1e-6:
         raise MitsonarError(
-            "the receivers must look to port or starboard of the path: the vehicle must head along it, and their heading_deg "
-            "be -90 or 90"
+            "the receivers must look to port or starboard of the path: the vehicle must head along it, and heading_deg of "
+            "receivers be -90 or 90"
         )
     reach = sonar.range_max * 0.999
     farthest = math.sqrt(max(reach**2 - height**2, 0.0))

@@ -674,6 +674,12 @@ class Scatterers:
             none = np.zeros((0, 3), np.float32)
             return cls(none, none, none[:, 0], none[:, 0], np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, bool))
         if not sum(map(len, closed)):
+            if within is not None:
+                low, high = (", ".join(f"{edge:.4g}" for edge in corner) for corner in within)
+                raise MitsonarError(
+                    f"the scene has no surface within reach that can carry scatterers, from ({low}) to ({high}) m: move the "
+                    "path, or raise range_max"
+                )
             raise MitsonarError(
                 "the scene has no surface that can carry scatterers: give it a shape with a diffuse BSDF, cell_noise or a "
                 "bitmap as reflectance, or raise points_per_m2"
