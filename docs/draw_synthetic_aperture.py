@@ -1,4 +1,4 @@
-"""Draws the sunken ship by a synthetic aperture beside a side-scan along the same track: docs/gallery/synthetic_aperture.png.
+"""Draws the sunken ship by a side-scan and by a synthetic aperture along one track: docs/gallery/synthetic_aperture.png.
 
 python docs/draw_synthetic_aperture.py           # about five minutes on two cores
 python docs/draw_synthetic_aperture.py --quick   # a shorter, coarser strip, into a folder that is removed
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image
 
 import mitsonar
 from mitsonar.instruments.hydrophones import side_looking_array
@@ -61,8 +62,9 @@ def draw(path: Path, quick: bool = False) -> None:
         )
         one.set(xlabel="ground range to starboard (m)", title=title)
     axes[0].set_ylabel("along the track (m)")
-    figure.colorbar(drawn, ax=axes, label="level (dB)", fraction=0.03, pad=0.01)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    figure.colorbar(drawn, ax=axes, label="level (dB)", fraction=0.03, pad=0.01, shrink=0.86)
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+    Image.open(path).convert("RGB").quantize(48, dither=Image.Dither.NONE).save(path, optimize=True)
     print(path)
 
 

@@ -63,7 +63,9 @@ def sas(
         str | None,
         typer.Option(help="Corrections of the path: dpc (displaced phase centres), autofocus, or both: dpc,autofocus."),
     ] = None,
-    weighting: Annotated[str, typer.Option(help="uniform (sharpest) or hann (side lobes below -31 dB).")] = "uniform",
+    weighting: Annotated[
+        str, typer.Option(help="uniform (sharpest, side lobes of -13 dB) or hann (-31 dB, 1.6 times as wide).")
+    ] = "uniform",
     parameter: options.Parameters = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,

@@ -47,7 +47,7 @@ class ApertureOptions:
 
     Attributes:
         grid: the pixels.
-        weighting: weights over the processed beam.
+        weighting: weights over beam and band.
         navigation: poses that focusing assumes; default: those at which the responses were measured.
         corrections: corrections of the path.
     """

@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 Weighting = Literal["uniform", "hann"]
-"""Weights over the processed beam: ``uniform`` (side lobes of -13.3 dB) or ``hann`` (-31.5 dB, 1.6 times as wide)."""
+"""Weights over beam and band: ``uniform`` (side lobes of -13.3 dB) or ``hann`` (-31.5 dB, 1.6 times as wide)."""
 
 OVERSAMPLING = 16
 """Values per tap between which responses are interpolated linearly.
@@ -252,7 +252,7 @@ class BackProjector:
     Args:
         responses: responses with poses.
         grid: the pixels.
-        weighting: weights over the processed beam.
+        weighting: weights over beam and band.
         path: corrected positions of the pings ``(pings, 3)`` [m], as of :mod:`mitsonar.mapping.micronavigation`.
 
     Raises:
@@ -270,6 +270,7 @@ class BackProjector:
             raise MitsonarError(f"weighting must be uniform or hann: got {weighting!r}")
         refuse_aliased(responses)
         self.responses, self.grid, self.sonar = responses, grid, responses.sonar
+        self.weighting = weighting
         centres = phase_centres(responses)
         shift = np.zeros_like(centres.sent) if path is None else np.asarray(path, dtype=float) - centres.sent
         self.sent = grid.local(centres.sent + shift)
@@ -375,13 +376,23 @@ class BackProjector:
         count, fine = sonar.taps, sonar.taps * OVERSAMPLING
         spectrum = scipy.fft.fft(response, axis=1)
         number = np.fft.fftfreq(count, 1 / count)
-        spectrum *= (OVERSAMPLING / np.sinc(number / fine) ** 2).astype(np.float32)  # undo the droop of the interpolation
+        droop = np.sinc(number / fine) ** 2  # of the linear interpolation
+        spectrum *= (OVERSAMPLING / droop * self._band(number * sonar.frequency_step_hz)).astype(np.float32)
         wide = np.zeros((len(response), fine), np.complex64)
         half = (count + 1) // 2
         wide[:, :half], wide[:, fine - (count - half) :] = spectrum[:, :half], spectrum[:, half:]
         taps = np.zeros((len(response), fine + 1), np.complex64)
         taps[:, :fine] = scipy.fft.ifft(wide, axis=1, overwrite_x=True)
         return np.asarray(taps * self._gain)
+
+    def _band(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the weights over the band, which leave the peak of the pulse as it is."""
+        if self.weighting == "uniform":
+            return np.ones(len(frequency))
+        share = frequency / ((1 + self.sonar.rolloff) * self.sonar.bandwidth_hz)
+        weight = np.where(np.abs(share) <= 0.5, 0.5 + 0.5 * np.cos(2 * np.pi * share), 0.0)
+        pulse = self.sonar.raised_cosine(frequency)
+        return np.asarray(weight * pulse.sum() / (weight * pulse).sum())
 
     @cached_property
     def _gain(self) -> NDArray[np.float32]:
@@ -445,7 +456,7 @@ def focus(
     Args:
         responses: responses with poses, of one side.
         grid: the pixels; default: :func:`strip_grid`.
-        weighting: weights over the processed beam.
+        weighting: weights over beam and band.
         path: corrected positions of the pings ``(pings, 3)`` [m].
         progress: called with the number of new rows.
 
