@@ -64,7 +64,7 @@ def draw(path: Path, quick: bool = False) -> None:
     axes[0].set_ylabel("along the track (m)")
     figure.colorbar(drawn, ax=axes, label="level (dB)", fraction=0.03, pad=0.01, shrink=0.86)
     figure.savefig(path, dpi=100, metadata={"Software": None})
-    Image.open(path).convert("RGB").quantize(48, dither=Image.Dither.NONE).save(path, optimize=True)
+    Image.open(path).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
     print(path)
 
 

@@ -269,15 +269,15 @@ def _match(
     frequency = scipy.fft.fftfreq(first.shape[1], 1 / sonar.sampling_hz)
     aligned = scipy.fft.ifft(spectra[0] * np.exp(-2j * np.pi * frequency * delay), axis=1)
     product = (aligned * second.conj()).sum(axis=0) * np.exp(4j * np.pi * sway * window.level / sonar.wavelength_m)
-    sums, one, other, level = (
+    sums, one, other, levels = (
         np.array([part.mean() for part in np.array_split(values, SEGMENTS)])
         for values in (product, _power(aligned), _power(second), window.level)
     )
     # the information of each segment, from its coherence and its independent samples
     samples = sonar.bandwidth_hz / sonar.sampling_hz * len(product) / SEGMENTS * len(second)
     coherences = np.minimum(np.abs(sums) / np.sqrt(np.maximum(one * other, 1e-300)), 1 - 1e-9)
-    bounds = np.array([sway_bound(g, samples, sonar.wavelength_m, c) for g, c in zip(coherences, level, strict=True)])
-    each = np.angle(sums) * -sonar.wavelength_m / (4 * math.pi * level)
+    bounds = np.array([sway_bound(g, samples, sonar.wavelength_m, c) for g, c in zip(coherences, levels, strict=True)])
+    each = np.angle(sums) * -sonar.wavelength_m / (4 * math.pi * levels)
     information = bounds**-2.0
     sway += float((information * each).sum() / information.sum())
     return _Match(float(min(coherence, 1.0)), sway, float(information.sum() ** -0.5))
@@ -316,10 +316,10 @@ def _vertex(values: list[tuple[int, float]], best: int) -> float:
 # ---------------- Autofocus
 
 
-SWAY_COST = 0.1
-"""Cost of a mean square sway of one wavelength, in units of the logarithm of the sharpness.
+LARGEST_SWAY = 0.5
+"""Sway in wavelengths beyond which autofocus is held back, by a cost that grows with the fourth power.
 
-A sway that changes slowly over an aperture only shifts the image; the cost holds it small.
+Larger sways let it pile up speckle to points that are sharper than the scene.
 """
 
 MOST_STORED = 2**26
@@ -339,14 +339,14 @@ def autofocus(
     """Return the positions of the pings ``(pings, 3)`` that make an image sharpest.
 
     The sway is a spline along the track, without mean and trend. The sum of the fourth powers of the sharpest patch of the
-    image is maximised, coarse to fine.
+    image is maximised, coarse to fine. A sway beyond half a wavelength costs more than it gains.
 
     Args:
         responses: responses with poses.
         grid: the pixels; default: :func:`~mitsonar.mapping.synthetic_aperture.strip_grid`.
         path: positions at which to begin ``(pings, 3)`` [m]; default: those of the responses.
         columns: number of columns of the patch.
-        detail_m: distance between knots of the sway; default: an eighth of an aperture, and at least four pings.
+        detail_m: distance between knots of the sway; default: a quarter of an aperture, and at least four pings.
         rounds: how often the patch is focused anew along the improved path.
         progress: called with 1 after each round.
 
@@ -358,12 +358,14 @@ def autofocus(
     centres = phase_centres(responses)
     places = centres.sent if path is None else np.asarray(path, dtype=float)
     patch = _sharpest(responses, grid, columns, places)
+    start, height, side = places, float(np.median(places[:, 2])), grid.axes[0] * np.sign(grid.across_step_m)
     for _ in range(max(rounds, 1)):
         contributions = _contributions(BackProjector(responses, patch, path=places), patch)
         along = grid.local(places)[:, 1]
         for basis in _bases(along, detail_m or _detail(patch, along, contributions)):
-            sway, contributions = _sharpen(contributions, basis, patch, float(np.median(places[:, 2])), responses.sonar)
-            places = places + sway[:, None] * grid.axes[0] * np.sign(grid.across_step_m)
+            before = (places - start) @ side
+            sway, contributions = _sharpen(contributions, basis, patch, before, height, responses.sonar)
+            places = places + sway[:, None] * side
         progress(1)
     return places
 
@@ -422,10 +424,10 @@ def _contributions(projector: BackProjector, patch: StripGrid) -> list[_Contribu
 
 
 def _detail(patch: StripGrid, along: NDArray[np.float64], contributions: list[_Contribution]) -> float:
-    """Return the default distance between knots: an eighth of the aperture, and at least four pings [m]."""
+    """Return the default distance between knots: a quarter of the aperture, and at least four pings [m]."""
     seen = [part.rows.stop - part.rows.start for part in contributions]
     aperture = float(np.median(seen)) * patch.along_step_m
-    return max(aperture / 8, 4 * float(np.ptp(along)) / max(len(along) - 1, 1))
+    return max(aperture / 4, 4 * float(np.ptp(along)) / max(len(along) - 1, 1))
 
 
 def _bases(along: NDArray[np.float64], detail_m: float) -> list[NDArray[np.float64]]:
@@ -444,14 +446,19 @@ def _bases(along: NDArray[np.float64], detail_m: float) -> list[NDArray[np.float
 
 
 def _sharpen(
-    contributions: list[_Contribution], basis: NDArray[np.float64], patch: StripGrid, height: float, sonar: ChannelSonar
+    contributions: list[_Contribution],
+    basis: NDArray[np.float64],
+    patch: StripGrid,
+    before: NDArray[np.float64],
+    height: float,
+    sonar: ChannelSonar,
 ) -> tuple[NDArray[np.float64], list[_Contribution]]:
     """Return the sway of each ping towards the scene [m] that makes the patch sharpest, and the turned contributions."""
     across = np.abs(patch.across_m)
     rate = (4 * np.pi / sonar.wavelength_m * across / np.hypot(across, height - patch.z)).astype(np.float32)
 
     def turned(sway: float, part: _Contribution) -> NDArray[np.complex64]:
-        return part.value * np.exp(np.complex64(-1j) * rate * np.float32(sway))
+        return np.asarray(part.value * np.exp(np.complex64(-1j) * rate * np.float32(sway)), dtype=np.complex64)
 
     def loss(coefficients: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         sways = basis @ coefficients * sonar.wavelength_m
@@ -468,11 +475,9 @@ def _sharpen(
                 for sway, part in zip(sways, contributions, strict=True)
             ]
         )
-        cost, slope_of_cost = (
-            SWAY_COST * float(coefficients @ coefficients) / len(basis),
-            2 * SWAY_COST * coefficients / len(basis),
-        )
-        return cost - float(np.log(sharp / energy**2)), slope_of_cost - (slope @ basis) * sonar.wavelength_m
+        share = (before + sways) / (LARGEST_SWAY * sonar.wavelength_m)
+        cost, rise = float(np.mean(share**4)), 4 * share**3 / (len(share) * LARGEST_SWAY * sonar.wavelength_m)
+        return cost - float(np.log(sharp / energy**2)), ((rise - slope) @ basis) * sonar.wavelength_m
 
     start = np.zeros(basis.shape[1])
     fit = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": 40})

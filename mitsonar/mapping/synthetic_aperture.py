@@ -375,7 +375,7 @@ class BackProjector:
         response = np.asarray(self.responses.response[ping], np.complex64)
         count, fine = sonar.taps, sonar.taps * OVERSAMPLING
         spectrum = scipy.fft.fft(response, axis=1)
-        number = np.fft.fftfreq(count, 1 / count)
+        number = np.asarray(np.fft.fftfreq(count, 1 / count), dtype=np.float64)
         droop = np.sinc(number / fine) ** 2  # of the linear interpolation
         spectrum *= (OVERSAMPLING / droop * self._band(number * sonar.frequency_step_hz)).astype(np.float32)
         wide = np.zeros((len(response), fine), np.complex64)

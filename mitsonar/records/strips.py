@@ -6,6 +6,7 @@ import io
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,12 +55,12 @@ class StripGrid:
     @property
     def along_m(self) -> NDArray[np.float64]:
         """Return the distance of each row along the track ``(rows,)`` [m]."""
-        return self.along_start_m + self.along_step_m * np.arange(self.rows)
+        return self.along_start_m + self.along_step_m * np.arange(self.rows, dtype=np.float64)
 
     @property
     def across_m(self) -> NDArray[np.float64]:
         """Return the distance of each column to starboard ``(columns,)`` [m]."""
-        return self.across_start_m + self.across_step_m * np.arange(self.columns)
+        return self.across_start_m + self.across_step_m * np.arange(self.columns, dtype=np.float64)
 
     @property
     def axes(self) -> NDArray[np.float64]:
@@ -112,7 +113,8 @@ class StripImage:
     def save(self, path: str | Path) -> None:
         """Write an npz file atomically: ``value``, and the fields of the grid as numbers."""
         buffer = io.BytesIO()
-        np.savez(buffer, value=self.value, **{name: np.asarray(number) for name, number in asdict(self.grid).items()})
+        numbers = {name: np.asarray(number) for name, number in asdict(self.grid).items()}
+        np.savez(buffer, value=self.value, **numbers)  # type: ignore[arg-type]  # the stubs take allow_pickle for a name
         write_atomic(Path(path), buffer.getvalue())
 
     @classmethod
@@ -133,7 +135,8 @@ class StripImage:
         ):
             raise MitsonarError(f"{path} is not an image of `mitsonar sas`: {advice}")
         whole = ("rows", "columns")
-        grid = StripGrid(**{name: int(table[name]) if name in whole else float(table[name]) for name in fields})
+        numbers: dict[str, Any] = {name: int(table[name]) if name in whole else float(table[name]) for name in fields}
+        grid = StripGrid(**numbers)
         value = table["value"]
         if value.dtype != np.complex64 or not np.isfinite(value).all():
             raise MitsonarError(f"{path} must hold finite complex64 values: {advice}")
