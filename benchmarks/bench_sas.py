@@ -400,9 +400,9 @@ PARTS: dict[str, Part] = {
     ),
     "openstb": (
         "Echoes of points beside openSTB 0.6.1",
-        "Four receivers at 0.01, 3 and 10 m/s, spreading and Ainslie-McColm absorption at the carrier: largest difference of "
-        "a response relative to its peak, and of delay from the phase of the carrier. mitsonar takes the spreading from where "
-        "a receiver is when the sound is sent.",
+        "Four receivers at 0.01, 3 and 10 m/s, spreading and Ainslie-McColm absorption at the carrier: largest difference "
+        "of a response relative to its peak, and of delay from the phase of the carrier. mitsonar takes the spreading from "
+        "where a receiver is when the sound is sent.",
         ["place (m)", "at 0.01 m/s (dB)", "at 3 m/s (dB)", "at 10 m/s (dB)", "delay (ps)"],
         openstb,
     ),
