@@ -47,7 +47,7 @@ def sas(
     ] = None,
     window: Annotated[
         str | None,
-        typer.Option("--range", help="Ground range near,far of the image [m] (default: 60 deg down to range_max)."),
+        typer.Option("--range", help="Ground range near,far of the image [m] (default: edge of the beam to range_max)."),
     ] = None,
     pixel: Annotated[
         str | None, typer.Option(help="Spacing of pixels along,across [m] (default: half the resolution).")

@@ -172,7 +172,8 @@ def strip_grid(
 
     Args:
         responses: responses with poses.
-        near_m: ground range of the first column; default: where the ground is seen :data:`STEEPEST_DEG` below the horizon.
+        near_m: ground range of the first column; default: where the beam has half its sensitivity, and at most
+            :data:`STEEPEST_DEG` below the horizon.
         far_m: ground range of the last column; default: that of ``range_max``.
         along_step_m: spacing of rows; default: half the resolution.
         across_step_m: spacing of columns; default: half the resolution.
@@ -201,7 +202,7 @@ def strip_grid(
     reach = sonar.range_max * 0.999
     farthest = math.sqrt(max(reach**2 - height**2, 0.0))
     far = farthest if far_m is None else far_m
-    near = max(height / math.tan(math.radians(STEEPEST_DEG)), 0.0) if near_m is None else near_m
+    near = height * math.tan(_edge_rad(sonar.receivers[0].field)) if near_m is None else near_m
     if not 0 <= near < far <= farthest * (1 + 1e-9):
         raise MitsonarError(
             f"{argument('near_m, far_m')} must satisfy 0 <= near < far <= {farthest:.4g} m, the ground "
@@ -226,7 +227,13 @@ def strip_grid(
 
 
 STEEPEST_DEG = 60.0
-"""Depression angle at which the default image begins [deg]; nearer, ground range is poorly resolved."""
+"""Largest depression angle at which the default image begins [deg]; nearer, ground range is poorly resolved."""
+
+
+def _edge_rad(field: FieldOfView) -> float:
+    """Return the angle from straight down at which the default image begins [rad]."""
+    edge = field.tilt_deg - (1 - field.taper / 2) * field.along_deg / 2 if field.shape in ("line", "rectangular") else 0.0
+    return math.radians(min(max(edge, 90 - STEEPEST_DEG), 89.0))
 
 
 def _ground(responses: ImpulseResponses) -> float:

@@ -663,7 +663,9 @@ class Scatterers:
         for number, shape in enumerate(scene.shapes()):
             if shape.bsdf() is not None and number not in (smooth or ()) and not is_black(shape.bsdf()):
                 if shape.class_name() == "Instance":
-                    raise MitsonarError(f"scatterers cannot lie on instances: got {shape.id()}; give the scene meshes instead")
+                    raise MitsonarError(
+                        f"scatterers cannot lie on instances: got {shape.id()}; give the scene meshes instead"
+                    )
                 grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
                 some = _in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number, within)
                 if within is not None:
