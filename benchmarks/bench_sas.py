@@ -96,11 +96,11 @@ def one_point(sonar: ChannelSonar, place: tuple[float, float, float]) -> mitsona
     scene = mi.load_dict({"type": "scene", "plate": plate(place)})
     for seed in range(100):
         try:
-            made = mitsonar.ChannelSimulator(scene, sonar.replace(points_per_m2=1e4, seed=seed))
+            simulator = mitsonar.ChannelSimulator(scene, sonar.replace(points_per_m2=1e4, seed=seed))
         except mitsonar.MitsonarError:  # no point on the plate
             continue
-        if len(made.tracer.source.scatterers) == 1:  # type: ignore[union-attr]
-            return made
+        if len(simulator.tracer.source.scatterers) == 1:  # type: ignore[union-attr]
+            return simulator
     raise SystemExit("no seed places a single scatterer on the plate")
 
 
@@ -113,10 +113,10 @@ def point(quick: bool) -> list[Row]:
     ranges = (12.0,) if quick else (12.0, 20.0)
     for far in ranges:
         sonar = side_looking_array(0.1, 4, range_max=25.0)
-        made = one_point(sonar, (far, 6.0, 0.0))
+        simulator = one_point(sonar, (far, 6.0, 0.0))
         flown = track(60, 0.2)
-        responses = made.responses(flown, velocities(flown))
-        scatterers = made.tracer.source.scatterers  # type: ignore[union-attr]
+        responses = simulator.responses(flown, velocities(flown))
+        scatterers = simulator.tracer.source.scatterers  # type: ignore[union-attr]
         x, y, z = (float(value) for value in scatterers.place[0])
         for weighting in ("uniform", "hann"):
             grid = StripGrid(0, 0, z, 0, y - 1, 0.0125, 161, x - 1, 0.0125, 161)
@@ -170,10 +170,11 @@ def speckle(quick: bool) -> list[Row]:
             poses[:, 1] -= poses[:, 1].mean()
             poses[:, 2] = 5.0
             flown = Trajectory(poses, flown.time_s)
-            made = mitsonar.ChannelSimulator(scene, sonar, within=sonar.box_seen_from(poses))
+            simulator = mitsonar.ChannelSimulator(scene, sonar, within=sonar.box_seen_from(poses))
             grid = StripGrid(0, 0, 0, 0, -poses[-1, 1] + 2.0, 0.1, int((2 * poses[-1, 1] - 4.0) / 0.1), 7.0, 0.1, 50)
             power = (
-                np.abs(focus(made.responses(flown, velocities(flown)), grid, weighting=weighting).value.astype(complex)) ** 2
+                np.abs(focus(simulator.responses(flown, velocities(flown)), grid, weighting=weighting).value.astype(complex))
+                ** 2
             )
             sine = 5.0 / np.hypot(grid.across_m, 5.0)
             shares.append(power / (0.3 * sine**2 * wider**2 * 0.1 * C / (2 * 10e3) / np.sqrt(1 - sine**2)))
@@ -208,8 +209,8 @@ def swaying(quick: bool) -> tuple[ImpulseResponses, NDArray[np.float64], Impulse
     scene = mi.load_dict({"type": "scene", "floor": floor, **stones}, optimize=False)
     sonar = side_looking_array(0.1, 8, range_max=22.0, points_per_m2=4000)
     flown, straight = track(pings, 0.2, sway), track(pings, 0.2)
-    made = mitsonar.ChannelSimulator(scene, sonar, within=sonar.box_seen_from(flown.poses))
-    true = made.responses(flown, velocities(flown))
+    simulator = mitsonar.ChannelSimulator(scene, sonar, within=sonar.box_seen_from(flown.poses))
+    true = simulator.responses(flown, velocities(flown))
     return replace(true, poses=straight.poses, velocity=velocities(straight)), sway, true
 
 
@@ -225,19 +226,22 @@ def shared(quick: bool) -> tuple[ImpulseResponses, NDArray[np.float64], ImpulseR
 
 def motion(quick: bool) -> list[Row]:
     """Compare the sway between pings with its bound, at several levels of noise."""
-    found, sway, _ = shared(quick)
+    measured, sway, _ = shared(quick)
     rng = np.random.default_rng(0)
-    near = found.delay_s * C / 2 > 1.5 * HEIGHT
+    near = measured.delay_s * C / 2 > 1.5 * HEIGHT
     rows = []
     for noise_db in (None, -20.0, -10.0, -3.0):
-        noisy = found
+        noisy = measured
         if noise_db is not None:
-            white = rng.normal(size=found.response.shape) + 1j * rng.normal(size=found.response.shape)
-            band = np.abs(np.fft.fftfreq(found.sonar.taps, 1 / found.sonar.sampling_hz)) <= found.sonar.bandwidth_hz / 2
+            white = rng.normal(size=measured.response.shape) + 1j * rng.normal(size=measured.response.shape)
+            band = (
+                np.abs(np.fft.fftfreq(measured.sonar.taps, 1 / measured.sonar.sampling_hz))
+                <= measured.sonar.bandwidth_hz / 2
+            )
             white = np.fft.ifft(np.fft.fft(white, axis=2) * band, axis=2)
-            level = np.mean(np.abs(found.response[:, :, near & (found.delay_s * C / 2 < 22)]) ** 2)
+            level = np.mean(np.abs(measured.response[:, :, near & (measured.delay_s * C / 2 < 22)]) ** 2)
             white *= math.sqrt(level * 10 ** (noise_db / 10) / np.mean(np.abs(white) ** 2))
-            noisy = replace(found, response=(found.response + white).astype(np.complex64))
+            noisy = replace(measured, response=(measured.response + white).astype(np.complex64))
         micro = displaced_phase_centres(noisy)
         error = micro.sway_m - np.diff(sway)
         along = micro.path[:, 0] - sway
@@ -262,19 +266,19 @@ def sharpness(responses: ImpulseResponses, grid: StripGrid, path: NDArray[np.flo
 
 def sharpened(quick: bool) -> list[Row]:
     """Compare the sharpness of an image along several paths."""
-    found, _, true = shared(quick)
+    measured, _, true = shared(quick)
     rows = 60 if quick else 360
     grid = StripGrid(0, 0, 0, 0, 1.2 if quick else 1.5, 0.025, rows, 13.0, 0.02, 200)
-    path = displaced_phase_centres(found).path
+    path = displaced_phase_centres(measured).path
     begun = time.perf_counter()
-    auto = autofocus(found, grid)
+    auto = autofocus(measured, grid)
     seconds = time.perf_counter() - begun
     return [
         ["true path", f"{sharpness(true, grid):.0f}"],
-        ["navigation without the sway", f"{sharpness(found, grid):.0f}"],
-        ["displaced phase centres", f"{sharpness(found, grid, path):.0f}"],
-        [f"autofocus ({seconds:.0f} s)", f"{sharpness(found, grid, auto):.0f}"],
-        ["both", f"{sharpness(found, grid, autofocus(found, grid, path=path)):.0f}"],
+        ["navigation without the sway", f"{sharpness(measured, grid):.0f}"],
+        ["displaced phase centres", f"{sharpness(measured, grid, path):.0f}"],
+        [f"autofocus ({seconds:.0f} s)", f"{sharpness(measured, grid, auto):.0f}"],
+        ["both", f"{sharpness(measured, grid, autofocus(measured, grid, path=path)):.0f}"],
     ]
 
 
@@ -283,13 +287,13 @@ def sharpened(quick: bool) -> list[Row]:
 
 def speed(quick: bool) -> list[Row]:
     """Time the back-projection of one block."""
-    found, _, _ = shared(quick)
+    measured, _, _ = shared(quick)
     grid = StripGrid(0, 0, 0, 0, 1.0, 0.025, 64, 9.0, 0.01875, 512)
-    projector = BackProjector(found, grid)
+    projector = BackProjector(measured, grid)
     every = slice(0, 64)
     pixels = 0
     for ping in projector.pings_of(every):
-        for receiver in range(len(found.sonar.receivers)):
+        for receiver in range(len(measured.sonar.receivers)):
             for rows, columns in projector.tiles(int(ping), receiver, every):
                 pixels += (rows.stop - rows.start) * (columns.stop - columns.start)
     projector.block(every)
@@ -323,13 +327,13 @@ def openstb(quick: bool) -> list[Row]:
     )
     rows = []
     for place in ((12.0, 1.0, 0.0), (20.0, -4.0, 1.0), (5.0, 9.0, 0.5)):
-        made = one_point(sonar, place)
-        scatterers = made.tracer.source.scatterers  # type: ignore[union-attr]
+        simulator = one_point(sonar, place)
+        scatterers = simulator.tracer.source.scatterers  # type: ignore[union-attr]
         spot, normal = scatterers.place[0].astype(float), scatterers.normal[0].astype(float)
         cells, shifted = [], 0.0
         for speed_m_s in (0.01, 3.0, 10.0):
             worst = 0.0
-            (part,) = made.pings(track(1, 0.0).poses, np.array([[0.0, speed_m_s, 0.0, 0.0]]))
+            (part,) = simulator.pings(track(1, 0.0).poses, np.array([[0.0, speed_m_s, 0.0, 0.0]]))
             # openSTB: forward, starboard, down
             frequency = 100e3 + np.fft.fftshift(np.fft.fftfreq(2 * sonar.taps, 1 / sonar.sampling_hz))
             spectrum = sonar.raised_cosine(frequency - 100e3)

@@ -140,8 +140,8 @@ class ImpulseResponses:
             if os.path.isdir(path):
                 table, _ = open_group(path, COLUMNS, "time_s")
                 left = {"response": table["response"]} if stored and "response" in table else {}
-                held = [values for name, values in table.items() if name not in left]
-                refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in held), str(path))
+                loaded = [values for name, values in table.items() if name not in left]
+                refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in loaded), str(path))
                 table |= {name: array[...] for name, array in table.items() if not isinstance(array, np.ndarray)} | left
             else:
                 table = read_npz(path)
