@@ -29,7 +29,7 @@ from mitsonar.acoustics.water import Water, absorption_db_per_m
 from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView, Hydrophone, side_looking_array
 from mitsonar.io.files import write_atomic
 from mitsonar.mapping.micronavigation import autofocus, displaced_phase_centres
-from mitsonar.mapping.synthetic_aperture import BackProjector, focus, point_response
+from mitsonar.mapping.synthetic_aperture import BackProjector, Weighting, focus, point_response
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.responses import ImpulseResponses
 from mitsonar.records.strips import StripGrid
@@ -77,7 +77,7 @@ def track(pings: int, step: float, sway: NDArray[np.float64] | float = 0.0, ever
     """Return pings along +y."""
     poses = np.zeros((pings, 6))
     poses[:, 0], poses[:, 1], poses[:, 2] = sway, np.arange(pings) * step, HEIGHT
-    return Trajectory(poses, np.arange(pings) * every_s)
+    return Trajectory(poses, np.arange(pings, dtype=np.float64) * every_s)
 
 
 def plate(place: tuple[float, float, float]) -> dict[str, Any]:
@@ -118,7 +118,8 @@ def point(quick: bool) -> list[Row]:
         responses = simulator.responses(flown, velocities(flown))
         scatterers = simulator.tracer.source.scatterers  # type: ignore[union-attr]
         x, y, z = (float(value) for value in scatterers.place[0])
-        for weighting in ("uniform", "hann"):
+        weightings: tuple[Weighting, ...] = ("uniform", "hann")
+        for weighting in weightings:
             grid = StripGrid(0, 0, z, 0, y - 1, 0.0125, 161, x - 1, 0.0125, 161)
             image = focus(responses, grid, weighting=weighting)
             row, column = np.unravel_index(np.abs(image.value).argmax(), image.value.shape)
@@ -159,7 +160,8 @@ def speckle(quick: bool) -> list[Row]:
         }
     )
     rows = []
-    for weighting, wider in (("uniform", 1.0), ("hann", 1.5)):
+    weightings: tuple[tuple[Weighting, float], ...] = (("uniform", 1.0), ("hann", 1.5))
+    for weighting, wider in weightings:
         shares = []
         for seed in (0,) if quick else (0, 1, 2):
             sonar = side_looking_array(

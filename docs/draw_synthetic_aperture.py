@@ -11,6 +11,7 @@ import math
 import tempfile
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -23,6 +24,9 @@ from mitsonar.mapping.synthetic_aperture import along_resolution, focus, strip_g
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import velocities
 from mitsonar.records.strips import StripGrid, StripImage
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 NEAR_M, FAR_M = 12.0, 40.0
 """Ground range of both pictures."""
@@ -68,7 +72,7 @@ def draw(path: Path, quick: bool = False) -> None:
     print(path)
 
 
-def aperture(scene: object, start: Pose, end: Pose, quick: bool) -> StripImage:
+def aperture(scene: mi.Scene, start: Pose, end: Pose, quick: bool) -> StripImage:
     """Focus the strip between two poses."""
     sonar = side_looking_array(
         0.2 if quick else 0.1, 8, bandwidth_hz=10e3 if quick else 20e3, range_max=42.0, absorption_db_per_m=0.0336
@@ -81,7 +85,7 @@ def aperture(scene: object, start: Pose, end: Pose, quick: bool) -> StripImage:
     return focus(responses, strip_grid(responses, near_m=NEAR_M, far_m=FAR_M), weighting="hann")
 
 
-def side_scan(scene: object, start: Pose, end: Pose, grid: StripGrid, pings: int) -> NDArray[np.float64]:
+def side_scan(scene: mi.Scene, start: Pose, end: Pose, grid: StripGrid, pings: int) -> NDArray[np.float64]:
     """Return the levels of a side-scan at the pixels of a strip, in ground range [dB]."""
     sounder = mitsonar.load_sounder("sidescan").replace(
         range_min=12.0, range_max=42.0, range_bins=1200, quality="draft", gain_exponent=4

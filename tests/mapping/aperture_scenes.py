@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -16,7 +18,7 @@ ELEMENT = 0.1
 BAND_HZ = 20e3
 
 
-def array(receivers: int = 4, **keys: float) -> ChannelSonar:
+def array(receivers: int = 4, **keys: Any) -> ChannelSonar:
     return side_looking_array(
         ELEMENT, receivers, **{"carrier_hz": 100e3, "bandwidth_hz": BAND_HZ, "range_max": 25.0, **keys}
     )
@@ -26,7 +28,7 @@ def track(pings: int, step: float, every_s: float = 0.1, sway: ArrayLike = 0.0) 
     """Pings along +y at 8 m, with a sway to starboard."""
     poses = np.zeros((pings, 6))
     poses[:, 0], poses[:, 1], poses[:, 2] = sway, np.arange(pings) * step, HEIGHT
-    return Trajectory(poses, np.arange(pings) * every_s)
+    return Trajectory(poses, np.arange(pings, dtype=np.float64) * every_s)
 
 
 def arrival(sent: NDArray[np.float64], back: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:

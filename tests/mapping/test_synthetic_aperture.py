@@ -239,7 +239,7 @@ def test_a_damaged_image_is_one_sentence(tmp_path: Path, changes: dict[str, np.n
     grid = {"x": 1, "y": 2, "z": 0, "heading_rad": 0.3, "along_start_m": 0, "along_step_m": 0.1, "rows": 3}
     grid |= {"across_start_m": 5, "across_step_m": 0.2, "columns": 4}
     table = {"value": np.zeros((3, 4), np.complex64), **{name: np.array(value) for name, value in grid.items()}}
-    np.savez(tmp_path / "image.npz", **(table | changes))
+    np.savez(tmp_path / "image.npz", **(table | changes))  # type: ignore[arg-type]  # the stubs take allow_pickle for a name
     with pytest.raises(MitsonarError):
         StripImage.load(tmp_path / "image.npz")
 
