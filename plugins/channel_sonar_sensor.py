@@ -27,9 +27,9 @@ class ChannelSensor(mi.Sensor):
     Properties: those of :class:`mitsonar.instruments.hydrophones.ChannelSonar` (``carrier_hz`` [Hz, 80000], ``bandwidth_hz``
     [Hz, 4800], ``sampling_hz`` [Hz, 8000], ``frequency_step_hz`` [Hz, 10], ``rolloff`` [0.5], ``range_max`` [m, 25],
     ``sound_speed`` [m/s, 1500], ``frame_rate_hz`` [Hz, 20], ``model`` [scatterers], ``spreading``, ``bounces`` [1],
-    ``direct`` [false], ``points_per_m2`` [1700], ``scatterer_spacing_m`` [m], ``rays`` [50000], ``seed`` [0], ``name``);
-    ``receivers`` [front, left, back, right]: names separated by commas; ``to_world``: of the vehicle, local +z forward, +y
-    up.
+    ``direct`` [false], ``absorption_db_per_m`` [0], ``points_per_m2`` [1700], ``scatterer_spacing_m`` [m], ``rays`` [50000],
+    ``seed`` [0], ``name``); ``receivers`` [front, left, back, right]: names separated by commas; ``to_world``: of the
+    vehicle, local +z forward, +y up.
 
     Fields of view of all receivers: ``shape`` [rectangular], ``tilt_deg`` [deg, 25], ``across_deg`` [deg, 10], ``along_deg``
     [deg, 50], ``taper`` [0.5]. Of one receiver: the same and ``heading_deg``, prefixed with the name of the receiver, as in

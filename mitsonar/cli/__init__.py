@@ -23,7 +23,7 @@ def application() -> typer.Typer:
     """Create the application with all commands."""
     import typer
 
-    from mitsonar.cli import data, doctor, estimate, live, recording, render, train
+    from mitsonar.cli import data, doctor, estimate, live, recording, render, sas, train
 
     app = typer.Typer(
         name="mitsonar",
@@ -37,6 +37,7 @@ def application() -> typer.Typer:
     app.command()(render.impulse)
     app.command()(render.image)
     app.command()(render.sound)
+    app.command()(sas.sas)
     app.command()(doctor.presets)
     app.command()(doctor.scenes)
     app.command()(doctor.doctor)

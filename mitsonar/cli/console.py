@@ -139,6 +139,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "sound": INSTRUMENT,
     "serve": {**INSTRUMENT, "rate_hz": "--rate"},
     "impulse": {**INSTRUMENT, "velocity": "--velocity"},
+    "sas": {"far_m": "--range", "ground_m": "--ground"},
     "image": {"range_bins": "--bins", "range_min": "--range", "range_max": "--range"},
     "odometry": {**GEOMETRY, "every": "--every"},
     "height": {"pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"},

@@ -20,7 +20,7 @@ from mitsonar.acoustics.noise import NoiseModel, load_noise, parse_snr
 from mitsonar.config.data import Flight, Recipe, array_names
 from mitsonar.datasets.modality import Fields, Modality, Read, Scene, StoredArray, StoredAxis, Values, ground_reach
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import directions
 from mitsonar.motion.composition import Motion, compose, motions
@@ -674,23 +674,7 @@ class ResponseModality:
 def _reach(sonar: ChannelSonar, height: float) -> NDArray[np.float64]:
     """Compute the footprint of every receiver and concatenate their corners ``(n, 2)`` [m]."""
     parts = [
-        ground_reach(np.array([*one.position[:2], height + one.position[2]]), _rays(one.field), sonar.range_max)
+        ground_reach(np.array([*one.position[:2], height + one.position[2]]), one.field.directions(RAYS), sonar.range_max)
         for one in sonar.receivers
     ]
     return np.concatenate(parts)
-
-
-def _rays(field: FieldOfView) -> NDArray[np.float64]:
-    """Sample the directions of a field of view, edges included, in the body frame ``(n, 3)``."""
-    part = np.linspace(-1, 1, RAYS)
-    match field.shape:
-        case "rectangular":
-            side = np.sin(math.radians(field.across_deg) / 2 * part)[:, None]
-            up = math.radians(field.along_deg) / 2 * part
-            ahead = np.sqrt(1 - side**2)
-            local = np.stack(np.broadcast_arrays(ahead * np.cos(up), side, ahead * np.sin(up)), axis=-1)
-        case kind:
-            off = math.radians(field.across_deg) / 2 if kind == "circular" else math.pi
-            tilt, turn = np.meshgrid(off * (part + 1) / 2, np.pi * part)
-            local = np.stack([np.cos(tilt), np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn)], axis=-1)
-    return np.asarray(local.reshape(-1, 3) @ field.axes)

@@ -22,6 +22,7 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fans import GAMMA
 from mitsonar.records.responses import ImpulseResponses
 from mitsonar.records.soundings import DvlReadings, Echogram, Soundings
+from mitsonar.records.strips import StripImage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,6 +42,7 @@ __all__ = [
     "save_sounding_figure",
     "side_scan_figure",
     "soundings_figure",
+    "strip_figure",
     "waterfall_figure",
     "waterfall_png",
 ]
@@ -511,6 +513,33 @@ def _along_label(echogram: Echogram) -> str:
     """Return what :func:`_path_extent` counts along."""
     moved = np.ptp(echogram.poses[:, :3], axis=0).max() > 0
     return "along the path (m)" if moved else "ping"
+
+
+def strip_figure(image: StripImage, *, title: str = "", span_db: float = 50.0) -> Figure:
+    """Draw a stripmap image to scale: the track runs upwards, starboard is to the right."""
+    edges = [_outer_edges(values) for values in (image.grid.across_m, image.grid.along_m)]
+    ratio = abs((edges[1][1] - edges[1][0]) / (edges[0][1] - edges[0][0]))
+    figure, axes = _single_axes(8.4, min(max(7.0 * ratio, 2.4), 12.0))
+    drawn = axes.imshow(
+        image.decibels(span_db),
+        extent=(*edges[0], *edges[1]),
+        cmap="copper",
+        vmin=-span_db,
+        vmax=0,
+        aspect="equal",
+        origin="lower",
+        interpolation="antialiased",
+    )
+    axes.set(xlim=sorted(edges[0]), ylim=edges[1], xlabel="ground range to starboard (m)", ylabel="along the track (m)")
+    figure.colorbar(drawn, ax=axes, label="level (dB)", fraction=0.046 * min(ratio, 1.0), pad=0.02)
+    axes.set_title(title, fontsize=10)
+    return figure
+
+
+def _outer_edges(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the outer edges of the first and the last of evenly spaced pixels."""
+    half = 0.5 * float(values[1] - values[0]) if len(values) > 1 else 0.5
+    return float(values[0]) - half, float(values[-1]) + half
 
 
 def echogram_figure(echogram: Echogram, soundings: Soundings | None = None) -> Figure:

@@ -68,11 +68,11 @@ class ImpulseResponses:
             )
         for name in PER_PING:
             values = getattr(self, name)
-            if values is not None and len(values) != expected_shape[0]:
+            if values is not None and values.shape[0] != expected_shape[0]:
                 raise MitsonarError(f"{name} must hold {expected_shape[0]} pings: got {len(values)}")
 
     def __len__(self) -> int:
-        return len(self.response)
+        return int(self.response.shape[0])
 
     def __repr__(self) -> str:
         names = ", ".join(receiver.name for receiver in self.sonar.receivers)
@@ -121,8 +121,12 @@ class ImpulseResponses:
             write_atomic(path, buffer.getvalue())
 
     @classmethod
-    def load(cls, path: str | Path) -> ImpulseResponses:
+    def load(cls, path: str | Path, *, stored: bool = False) -> ImpulseResponses:
         """Read a file written by :meth:`save`, or a folder written by ``mitsonar impulse``.
+
+        Args:
+            path: file or folder.
+            stored: leave the responses of a ``.zarr`` on disk; slices of :attr:`response` read them.
 
         Raises:
             MitsonarError: no such file, or a file that is damaged or does not hold responses.
@@ -135,8 +139,10 @@ class ImpulseResponses:
         try:
             if os.path.isdir(path):
                 table, _ = open_group(path, COLUMNS, "time_s")
-                refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in table.values()), str(path))
-                table |= {name: array[...] for name, array in table.items() if not isinstance(array, np.ndarray)}
+                left = {"response": table["response"]} if stored and "response" in table else {}
+                loaded = [values for name, values in table.items() if name not in left]
+                refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in loaded), str(path))
+                table |= {name: array[...] for name, array in table.items() if not isinstance(array, np.ndarray)} | left
             else:
                 table = read_npz(path)
         except Exception as error:  # a damaged zip or Zarr raises many types of errors

@@ -131,6 +131,8 @@ class ChannelSimulator:
         like: a simulator of the same scene; its scatterers are reused if both instruments have the same ones.
         mirrors: reflection coefficient and rms height [m] keyed by shape id, ``{"surface": (-1.0, 0.0)}``, or
             ``materials`` to use those of the shapes' materials.
+        within: two opposite corners of a box ``(2, 3)`` [m]; scatterers outside are left out, which saves memory in a large
+            scene (:meth:`~mitsonar.instruments.hydrophones.ChannelSonar.box_seen_from`); default: all.
 
     Attributes:
         kinds: kinds of paths, named after what they meet in turn: ``scatterer``, ``surface-scatterer``, ``direct``,
@@ -141,7 +143,13 @@ class ChannelSimulator:
     """
 
     def __init__(
-        self, scene: mi.Scene, sonar: ChannelSonar, *, like: ChannelSimulator | None = None, mirrors: Mirroring = None
+        self,
+        scene: mi.Scene,
+        sonar: ChannelSonar,
+        *,
+        like: ChannelSimulator | None = None,
+        mirrors: Mirroring = None,
+        within: ArrayLike | None = None,
     ) -> None:
         self.sonar = sonar
         from mitsonar.simulation.moving import SceneWatch
@@ -149,6 +157,7 @@ class ChannelSimulator:
 
         refuse_motion(scene, "impulse responses")
         self._given = scene, mirrors
+        self._within = None if within is None else np.asarray(within, dtype=float).reshape(2, 3)
         self._watch = SceneWatch(scene)
         if like is not None:
             like._follow_scene()
@@ -170,7 +179,7 @@ class ChannelSimulator:
         parts = mirror_of(scene, mirrors) if mirrors else None
         check_channel_mirrors(sonar, parts is not None, MIRROR_ADVICE)
         self._without_mirrors = mirrors == "materials" and parts is None
-        self.tracer: ChannelTracer = ChannelTracer(scene, sonar, like, parts)
+        self.tracer: ChannelTracer = ChannelTracer(scene, sonar, like, parts, self._within)
         self.without_scatterer: MirrorPaths = MirrorPaths(self.tracer)
         self.kinds = tuple([path.name for path in self.tracer.paths] + self.without_scatterer.names)
 

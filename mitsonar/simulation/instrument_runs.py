@@ -100,7 +100,12 @@ class ImpulseReport:
 
 
 def run_impulse(
-    simulator: ChannelSimulator, flown: Trajectory, velocity: NDArray[np.float64], destination: Destination
+    simulator: ChannelSimulator,
+    flown: Trajectory,
+    velocity: NDArray[np.float64],
+    destination: Destination,
+    *,
+    pulsed: bool = False,
 ) -> ImpulseReport:
     """Simulate impulse responses into a run folder, or resume an interrupted run.
 
@@ -111,6 +116,8 @@ def run_impulse(
         flown: poses and times of the pings.
         velocity: velocity of the vehicle in each ping, see :class:`~mitsonar.records.responses.ImpulseResponses`.
         destination: folder, origin, and how the run begins.
+        pulsed: a pulse measures each response, not a continuous signal: overspread channels and echoes that come later than
+            the next pulse are no reason to warn.
 
     Raises:
         MitsonarError: no receiver has an echo; or as in :func:`~mitsonar.simulation.runs.write_run`.
@@ -133,7 +140,7 @@ def run_impulse(
         yield run.count("frames_done", len(flown)), {}
         yield from _write_responses(simulator, flown, velocity, run)
         responses = ImpulseResponses.load(run.path / "responses.zarr")
-        yield 0, {"warnings": [*simulator.notes, *_warnings(responses, spread)]}
+        yield 0, {"warnings": [*simulator.notes, *_warnings(responses, None if pulsed else spread)]}
         responses.about |= {"spread_factor": spread.factor}
         write_atomic(run.path / "response.png", figures.response_png(responses))
         write_atomic(run.path / "waterfall.png", figures.waterfall_png(responses))
@@ -238,7 +245,7 @@ def spread_of(paths: list[Paths]) -> Spread:
     return max(spreads, key=lambda spread: spread.factor)
 
 
-def _warnings(responses: ImpulseResponses, spread: Spread) -> list[str]:
+def _warnings(responses: ImpulseResponses, spread: Spread | None) -> list[str]:
     """Return the warnings of a run, one sentence each."""
     arms = {one.name: math.dist(one.position, (0, 0, 0)) for one in responses.sonar.receivers}
     far = [name for name, away in arms.items() if away > FAR_ARM_M]
@@ -258,13 +265,13 @@ def _warnings(responses: ImpulseResponses, spread: Spread) -> list[str]:
                 f"the vehicle's pose{pitch} and range_max"
             )
     dropped = int(responses.dropped.sum())
-    if dropped:
+    if dropped and spread is not None:
         share = dropped / max(1, dropped + int(responses.echoes.sum()))
         sentences.append(
             f"{dropped:,} echoes ({100 * share:.3g} %) came from beyond range_max {responses.sonar.range_max:g} m and were "
             "dropped: raise it, with a frequency_step_hz below sound_speed / (4 range_max)"
         )
-    if spread.factor > OVERSPREAD:
+    if spread is not None and spread.factor > OVERSPREAD:
         sentences.append(
             f"the channel is overspread: delays over {1e3 * spread.delay_s:.3g} ms times Doppler shifts over "
             f"{spread.doppler_hz:.3g} Hz make {spread.factor:.2g}, above {OVERSPREAD:g}; it changes while it is measured, "

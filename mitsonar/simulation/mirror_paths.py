@@ -24,7 +24,7 @@ from mitsonar.simulation.mirrors import (
     mirror_sequences,
     unfolded,
 )
-from mitsonar.simulation.scatterers import ChannelTracer, EchoValues, link_table
+from mitsonar.simulation.scatterers import ChannelTracer, EchoValues, absorption_rate, link_table
 from mitsonar.simulation.tracing import hidden
 
 __all__ = ["APART_M", "FacetEchoes", "MirrorPaths", "facet_echoes", "half_fresnel_m", "phase_mean"]
@@ -223,6 +223,8 @@ def echo_values(
         valid: which echoes exist ``(n,)``; those of amplitude 0 are dropped.
     """
     valid = valid & (np.abs(amplitude) > 0)
+    if sonar.absorption_db_per_m > 0:
+        amplitude = amplitude * np.exp(-absorption_rate(sonar) * delay)
     beyond = valid & (delay > 2 * sonar.range_max / sonar.sound_speed)
     turn, strength = phasors(delay, amplitude, sonar, PADDING)
     return {

@@ -304,13 +304,20 @@ class _Cells(NamedTuple):
     ends: tuple[float, float]
 
 
-def lattice_size(shape: mi.Shape, pitch: float) -> float:
+def lattice_size(shape: mi.Shape, pitch: float, within: NDArray[np.float64] | None = None) -> float:
     """Return the number of lattice cells to search for a shape's points, over both sides of all axes."""
-    return sum(2.0 * cells.wide * cells.tall for cells in _cells_of(shape, pitch))
+    return sum(2.0 * cells.wide * cells.tall for cells in _cells_of(shape, pitch, within))
 
 
 def lattice_points(
-    shape: mi.Shape, grain: int, pitch: float, seed: int, patches: Patches | None = None, *, weighed: bool = True
+    shape: mi.Shape,
+    grain: int,
+    pitch: float,
+    seed: int,
+    patches: Patches | None = None,
+    *,
+    weighed: bool = True,
+    within: NDArray[np.float64] | None = None,
 ) -> SurfacePoints:
     """Find all points that the hashed lattice places on one shape, those that coherent images find with their rays.
 
@@ -324,27 +331,36 @@ def lattice_points(
         seed: seed of the hash.
         patches: patches of unequal strength; default: none.
         weighed: whether strengths contain the reflectivity.
+        within: two opposite corners of a box ``(2, 3)`` [m]; points outside may be left out, and those inside stay the same.
     """
     search = _Search(shape, pitch, patches, weighed)
     parts = []
-    for cells in _cells_of(shape, pitch):
+    for cells in _cells_of(shape, pitch, within):
         for side in (1, 0):
             key = lattice_key(mi.UInt32(grain), mi.UInt32(cells.axis), mi.UInt32(side), seed)
             count = cells.wide * cells.tall
             for begin in range(0, count, AT_A_TIME):
                 parts += search.on_rays(cells, side, key, np.arange(begin, min(begin + AT_A_TIME, count), dtype=np.uint32))
+    if not parts:  # the box holds nothing of the shape
+        none = np.zeros((0, 3), np.float32)
+        return SurfacePoints(none, none, none[:, 0], none[:, 0])
     return SurfacePoints(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-def _cells_of(shape: mi.Shape, pitch: float) -> Iterator[_Cells]:
-    """Yield the lattice cells that cover a shape, along each world axis."""
+def _cells_of(shape: mi.Shape, pitch: float, within: NDArray[np.float64] | None = None) -> Iterator[_Cells]:
+    """Yield the lattice cells that cover a shape, or what lies of it within a box, along each world axis."""
     low, high = _reach(shape)
+    ends = low, high
+    if within is not None:
+        low, high = np.maximum(low, within[0]), np.minimum(high, within[1])
+        if (low > high).any():
+            return
     for axis in range(3):
         p_axis, q_axis = (axis + 1) % 3, (axis + 2) % 3
         first = [math.floor(low[k] / pitch) for k in (p_axis, q_axis)]
         count = [math.floor(high[k] / pitch) - begin + 1 for k, begin in zip((p_axis, q_axis), first, strict=True)]
-        margin = pitch + 1e-4 * (high[axis] - low[axis])
-        yield _Cells(axis, (first[0], first[1]), count[0], count[1], (low[axis] - margin, high[axis] + margin))
+        margin = pitch + 1e-4 * (ends[1][axis] - ends[0][axis])
+        yield _Cells(axis, (first[0], first[1]), count[0], count[1], (ends[0][axis] - margin, ends[1][axis] + margin))
 
 
 def _reach(shape: mi.Shape) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

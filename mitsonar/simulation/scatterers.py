@@ -38,7 +38,10 @@ from mitsonar.simulation.mirrors import (
 from mitsonar.simulation.points import Patches, SurfacePoints, lattice_points, lattice_size
 from mitsonar.simulation.tracing import height_below, hidden
 
-__all__ = ["DIRECT", "ChannelTracer", "EchoBatch", "EchoValues", "LinkGeometry", "ScattererPath", "Scatterers", "link_table"]
+__all__ = [
+    *("DIRECT", "ChannelTracer", "EchoBatch", "EchoValues", "LinkGeometry", "ScattererPath", "Scatterers"),
+    *("absorption_rate", "link_table"),
+]
 
 
 EchoValues: TypeAlias = dict[str, NDArray[Any]]
@@ -72,6 +75,7 @@ class ChannelTracer:
         sonar: the instrument.
         like: a tracer of the same scene, whose scatterers may be shared.
         mirrors: mirror parts of the scene's shapes.
+        within: box that holds all points that matter, see :meth:`Scatterers.from_scene`.
 
     Attributes:
         notes: notes to the user about the scene's BSDFs.
@@ -84,7 +88,12 @@ class ChannelTracer:
     """
 
     def __init__(
-        self, scene: mi.Scene, sonar: ChannelSonar, like: ChannelTracer | None = None, mirrors: Mirrors | None = None
+        self,
+        scene: mi.Scene,
+        sonar: ChannelSonar,
+        like: ChannelTracer | None = None,
+        mirrors: Mirrors | None = None,
+        within: NDArray[np.float64] | None = None,
     ) -> None:
         self.scene, self.sonar = scene, sonar
         surfaces = Surfaces.from_scene(scene)
@@ -100,7 +109,7 @@ class ChannelTracer:
                 if like is not None and like.scene is scene and isinstance(like.source, _WorldScatterers)
                 else None
             )
-            self.source = _WorldScatterers(scene, sonar, shared, mirrors)
+            self.source = _WorldScatterers(scene, sonar, shared, mirrors, within)
         else:
             self.source = _VehicleRays(sonar, surfaces)
         self.launches: dict[tuple[int, tuple[str, ...], int, int], _Launch] = {}
@@ -182,8 +191,15 @@ def _scatterer_paths(flat: FlatMirrors, bounces: int) -> list[ScattererPath]:
 class _WorldScatterers:
     """Source of echoes from scatterers that are fixed in the world."""
 
-    def __init__(self, scene: mi.Scene, sonar: ChannelSonar, like: _WorldScatterers | None, mirrors: Mirrors | None) -> None:
-        self.sonar = sonar
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sonar: ChannelSonar,
+        like: _WorldScatterers | None,
+        mirrors: Mirrors | None,
+        within: NDArray[np.float64] | None,
+    ) -> None:
+        self.sonar, self.within = sonar, within
         self.scatterers: Scatterers
         self.stored: mi.Float
         self.smooth: frozenset[int] | None = None
@@ -192,10 +208,11 @@ class _WorldScatterers:
                 [] if mirrors is None else np.flatnonzero((mirrors.reflection != 0) & (mirrors.roughness_m == 0)).tolist()
             )
             self.smooth = frozenset(places)
-        if like is not None and _points_of(like.sonar) == _points_of(sonar) and like.smooth == self.smooth:
+        same = like is not None and _points_of(like.sonar) == _points_of(sonar) and like.smooth == self.smooth
+        if like is not None and same and np.array_equal(like.within, within):  # type: ignore[arg-type]
             self.scatterers, self.stored = like.scatterers, like.stored
         else:
-            self.scatterers = Scatterers.from_scene(scene, sonar, self.smooth)
+            self.scatterers = Scatterers.from_scene(scene, sonar, self.smooth, within)
             self.stored = self._rows()
         self.wavenumber = 2 * math.pi / sonar.wavelength_m
         self.roughness: mi.Float | None = None  # rms height of each point's mirror; negative if it is no mirror
@@ -241,7 +258,7 @@ class _WorldScatterers:
         weight = link.sensitivity(u_sent, u_received)
         cosines = dr.dot(normal, u_sent), dr.dot(normal, u_received)
         lambert = cosines[0] * cosines[1]
-        inside = (weight > 0) & (lambert > 0)
+        inside = (weight != 0) & (lambert > 0)  # the lobes of a line change sign
         # 5. shadow rays, only for points that could contribute
         point = ScatteringPoints(position, exact, normal)
         open_, factor = link.reached(scene, point, Leg(u_sent, sent), Leg(u_received, received), inside)
@@ -338,7 +355,7 @@ MARGIN_DEG = 2.0
 LINK = 30
 """Length of :func:`link_table`."""
 
-DRJIT = Maths(dr.asin, dr.atan2, dr.cos, dr.clip, dr.select)
+DRJIT = Maths(dr.asin, dr.atan2, dr.sin, dr.cos, dr.clip, dr.select)
 
 
 class Leg(NamedTuple):
@@ -389,6 +406,11 @@ def link_table(
     axes = [field.axes @ turn.T for field in (one.field, sonar.transmitter)]
     places, velocities = (pose[:3], pose[:3] + turn @ offset), (turn @ velocity[:3], turn @ swing)
     return np.concatenate([*places, *velocities, *(each.ravel() for each in axes)])
+
+
+def absorption_rate(sonar: ChannelSonar) -> float:
+    """Return the rate at which absorption lowers the amplitude of an echo with its delay [1/s]."""
+    return sonar.absorption_db_per_m * sonar.sound_speed * math.log(10) / 20
 
 
 class LinkGeometry:
@@ -468,6 +490,8 @@ class LinkGeometry:
         self, delay: DeviceArray, amplitude: DeviceArray, phase: DeviceArray, doppler: DeviceArray, valid: DeviceArray
     ) -> EchoBatch:
         """Return the echoes, split into those within ``range_max`` and those from beyond."""
+        if self.sonar.absorption_db_per_m > 0:
+            amplitude = amplitude * dr.exp(mi.Float(delay) * -absorption_rate(self.sonar))
         beyond = valid & (delay > 2 * self.sonar.range_max / self.sonar.sound_speed)
         turn = delay * (self.sonar.frequency_step_hz / PADDING)
         turns = delay * self.sonar.carrier_hz
@@ -617,13 +641,20 @@ class Scatterers:
     one_sided: NDArray[np.bool_]
 
     @classmethod
-    def from_scene(cls, scene: mi.Scene, sonar: ChannelSonar, smooth: frozenset[int] | None = None) -> Scatterers:
+    def from_scene(
+        cls,
+        scene: mi.Scene,
+        sonar: ChannelSonar,
+        smooth: frozenset[int] | None = None,
+        within: NDArray[np.float64] | None = None,
+    ) -> Scatterers:
         """Place scatterers on a scene's shapes.
 
         Args:
             scene: any Mitsuba scene.
             sonar: instrument that gives number and seed of the points.
             smooth: indices of perfect mirrors in the scene, which scatter nothing; if given, there may be no points at all.
+            within: two opposite corners of a box ``(2, 3)`` [m]; points outside are left out, those inside stay the same.
 
         Raises:
             MitsonarError: no surface can carry scatterers, or there are more than :data:`MOST`.
@@ -631,14 +662,28 @@ class Scatterers:
         parts, closed, shapes = [], [], []
         for number, shape in enumerate(scene.shapes()):
             if shape.bsdf() is not None and number not in (smooth or ()) and not is_black(shape.bsdf()):
+                if shape.class_name() == "Instance":
+                    raise MitsonarError(
+                        f"scatterers cannot lie on instances: got {shape.id()}; give the scene meshes instead"
+                    )
                 grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
-                parts.append(_in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number))
+                some = _in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number, within)
+                if within is not None:
+                    inside = ((some.place >= within[0]) & (some.place <= within[1])).all(axis=1)
+                    some = SurfacePoints(*(values[inside] for values in some))
+                parts.append(some)
                 closed.append(np.full(len(parts[-1].strength), isinstance(shape, mi.Mesh) and _is_closed(shape)))
                 shapes.append(np.full(len(parts[-1].strength), number, np.int32))
         if not sum(map(len, closed)) and smooth is not None:
             none = np.zeros((0, 3), np.float32)
             return cls(none, none, none[:, 0], none[:, 0], np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, bool))
         if not sum(map(len, closed)):
+            if within is not None:
+                low, high = (", ".join(f"{edge:.4g}" for edge in corner) for corner in within)
+                raise MitsonarError(
+                    f"the scene has no surface within reach that can carry scatterers, from ({low}) to ({high}) m: move the "
+                    "path, or raise range_max"
+                )
             raise MitsonarError(
                 "the scene has no surface that can carry scatterers: give it a shape with a diffuse BSDF, cell_noise or a "
                 "bitmap as reflectance, or raise points_per_m2"
@@ -771,15 +816,17 @@ def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> SurfacePoints:
     return _scattering_points(shape, si, area, _zeta_of(bits[0], bits[1] ^ _key(*seed, ZETA)), inside & si.is_valid())
 
 
-def _on_lattice(shape: mi.Shape, sonar: ChannelSonar, number: int) -> SurfacePoints:
+def _on_lattice(
+    shape: mi.Shape, sonar: ChannelSonar, number: int, within: NDArray[np.float64] | None = None
+) -> SurfacePoints:
     """Return the points of the world's lattice on a surface, one in each cell of the lattice."""
     pitch = sonar.lattice_pitch_m
-    cells = lattice_size(shape, pitch) / 2
+    cells = lattice_size(shape, pitch, within) / 2
     enough = pitch * math.sqrt(cells / MOST) * 1.1
     advice = "lower points_per_m2" if sonar.scatterer_spacing_m is None else "raise scatterer_spacing_m"
     _check_count(shape, cells, f"{advice}; a spacing of {enough:.2g} m is enough")
     patches = None if sonar.speckle_nu is None else Patches(sonar.speckle_nu, sonar.speckle_patch_m)
-    return lattice_points(shape, grain_key(shape.id(), number), pitch, sonar.seed, patches)
+    return lattice_points(shape, grain_key(shape.id(), number), pitch, sonar.seed, patches, within=within)
 
 
 def _scattering_points(

@@ -320,3 +320,68 @@ def test_a_trajectory_alone_is_at_rest() -> None:
     result = simulator(ChannelSonar(), floor=cells_floor(cells=64.0))
     flown = Trajectory(np.array([LEVEL]), np.zeros(1))
     assert np.array_equal(result.responses(flown).response, result.responses(flown, np.zeros((1, 4))).response)
+
+
+# ---------------------------------------------------------------- lines, absorption, boxes
+
+
+def test_absorption_lowers_each_echo_by_the_length_of_its_path() -> None:
+    """One plate: amplitude times 10^(-a c tau / 20), delay and phase as without."""
+    clear = ChannelSonar(receivers=(received_from((0.3, 0.1, 0)),), points_per_m2=1e4, seed=1)
+    results = [
+        simulator(one, plate=plate((1, 7, 2), (-1, -7, 8), half=0.005)).paths(LEVEL)
+        for one in (clear, clear.replace(absorption_db_per_m=0.5))
+    ]
+    assert results[0].delay_s == pytest.approx(results[1].delay_s, abs=1e-15)
+    loss = 20 * np.log10(np.abs(results[0].amplitude / results[1].amplitude))
+    assert loss == pytest.approx(0.5 * C * results[0].delay_s, rel=1e-4)
+    with pytest.raises(MitsonarError, match="absorption_db_per_m"):
+        clear.replace(absorption_db_per_m=-1)
+
+
+def test_absorption_also_lowers_the_direct_arrival() -> None:
+    far = ChannelSonar(receivers=(received_from((0, 8, 0)),), direct=True, absorption_db_per_m=0.25)
+    arrivals = simulator(far, floor=cells_floor(half=2.0, cells=64.0)).paths(LEVEL).by("direct")
+    assert abs(arrivals.amplitude[0]) == pytest.approx(10 ** (-0.25 * 8 / 20) / 8, rel=1e-5)
+
+
+def test_a_line_weighs_the_echoes_of_a_plate_by_its_pattern() -> None:
+    """Plates at several angles off the beam, side lobes with their sign included."""
+    wide = ChannelSonar(receivers=(received_from(),), points_per_m2=1e5)
+    line = FieldOfView.of_line(0.1, wide.wavelength_m, heading_deg=90, tilt_deg=60, along_deg=90)
+    narrow = wide.replace(transmitter=FieldOfView(), receivers=(Hydrophone(name="one", field=line),))
+    narrow = narrow.replace(transmitter=FieldOfView(shape="all"))
+    for along in (0.0, 0.8, 1.5, 2.5, 3.3):
+        built = [simulator(sonar, plate=plate((10, along, 3), (-10, -along, 7), half=0.005)) for sonar in (narrow, wide)]
+        away = points(built[0]) - np.array(LEVEL[:3])
+        expected = np.sinc(0.1 / wide.wavelength_m * away[:, 1] / np.linalg.norm(away, axis=1))
+        ratio = built[0].paths(LEVEL).amplitude / built[1].paths(LEVEL).amplitude
+        np.testing.assert_allclose(ratio, expected, atol=1e-4)
+    gone = simulator(narrow, plate=plate((10, 5, 3), (-10, -5, 7), half=0.005)).paths(LEVEL)
+    assert not len(gone.delay_s)  # beyond the second null
+    with pytest.raises(MitsonarError, match="shape line"):
+        narrow.replace(model="rays")
+
+
+def test_a_box_leaves_the_points_inside_as_they_are() -> None:
+    sonar = ChannelSonar(points_per_m2=50.0)
+    every = points(simulator(sonar, ground=floor(diffuse(0.5), 12.0)))
+    box = np.array([[-3.0, 2.0, -1.0], [4.0, 9.0, 1.0]])
+    some = ChannelSimulator(scene(ground=floor(diffuse(0.5), 12.0)), sonar, within=box)
+    inside = every[((every >= box[0]) & (every <= box[1])).all(axis=1)]
+    assert {tuple(row) for row in points(some)} == {tuple(row) for row in inside}
+    cells = ChannelSimulator(scene(ground=cells_floor(half=12.0, cells=64.0)), sonar, within=box)
+    assert 0 < len(points(cells)) < 64**2 / 4
+    with pytest.raises(MitsonarError, match="no surface within"):
+        ChannelSimulator(scene(ground=floor(diffuse(0.5), 12.0)), sonar, within=box + 100)
+
+
+def test_the_box_holds_all_that_is_seen() -> None:
+    sonar = ChannelSonar(range_max=12.0, points_per_m2=30.0)
+    poses = np.array([[0, 0, 8, 0, 0, 0], [1, 3, 8, 0.05, 0, 0.3]])
+    whole = simulator(sonar, ground=floor(diffuse(0.5), 20.0))
+    some = ChannelSimulator(scene(ground=floor(diffuse(0.5), 20.0)), sonar, within=sonar.box_seen_from(poses))
+    assert len(points(some)) < len(points(whole)) / 2
+    for one, other in zip(whole.pings(poses), some.pings(poses), strict=True):
+        np.testing.assert_array_equal(one.echoes, other.echoes)
+        assert np.abs(one.response - other.response).max() < 1e-6 * np.abs(one.response).max()
