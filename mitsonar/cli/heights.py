@@ -100,7 +100,8 @@ def heights(
     chosen = result.regulariser
     say(
         f"regulariser: standard deviation {chosen.std_m:.3g} m, correlation length {chosen.length_m:.3g} m, best of "
-        f"{len(result.trials) - 1} on held-out blocks, whose errors are {math.sqrt(result.dispersion):.1f} times those of speckle"
+        f"{len(result.trials) - 1} on held-out blocks, whose errors are {math.sqrt(result.dispersion):.1f} times those of "
+        "speckle"
     )
     say(f"height map: {', '.join(map(str, out))}")
 

@@ -1,13 +1,14 @@
 """How frames with known poses become a height map of the ground: the fit, its regulariser and its standard deviation.
 
 Heights z are a Gaussian process around level ground, of standard deviation s: Matern's covariance of smoothness 1, whose
-inverse is sparse (Lindgren, Rue and Lindstrom, J. R. Stat. Soc. B 73:423, 2011). The mean level Y of L independent samples of
-speckle has a Gamma distribution around the level m(z) of :mod:`mitsonar.mapping.relief`. Gauss-Newton steps minimise
+inverse is sparse (Lindgren, Rue and Lindstrom, J. R. Stat. Soc. B 73:423, 2011). The mean level Y of L independent samples
+of speckle has a Gamma distribution around the level m(z) of :mod:`mitsonar.mapping.relief`. Gauss-Newton steps minimise
 
     sum L (log m + Y / m) + (z - plane)' Q (z - plane) / (2 s^2).
 
-s is the one that best predicts image blocks which the fit did not use. The residuals of these blocks also give the dispersion
-by which errors exceed those of speckle: texture, and what heights per cell cannot represent. It scales the covariance.
+s is the one that best predicts image blocks which the fit did not use. The residuals of these blocks also give the
+dispersion by which errors exceed those of speckle: texture, and what heights per cell cannot represent. It scales the
+covariance.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ from scipy.sparse.linalg import SuperLU, splu
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.instruments.sonar import Sonar, scans
 from mitsonar.mapping.relief import GroundCells, ReliefView, lit_ground
+from mitsonar.mapping.shadows import shadow_heights
 from mitsonar.records.frames import SonarFrames
 
-__all__ = ["HeightMap", "HeightMapOptions", "Trial", "fit_height_map", "shadow_heights"]
+__all__ = ["HeightMap", "HeightMapOptions", "Trial", "fit_height_map", "most_trials", "views_of"]
 
 Array = NDArray[np.float64]
 Sparse = sparse.csr_array
@@ -36,8 +38,8 @@ FEWEST_BEAMS = 8
 """Smallest number of beams: with fewer, heights across the beams are not resolved."""
 
 LENGTH_CELLS = 4.0
-"""Correlation length of the heights [cells]. Held-out blocks cannot choose it: a long one allows the whole ground to tilt away
-from the sonar and to be brighter, which looks the same in one frame."""
+"""Correlation length of the heights [cells]. Held-out blocks cannot choose it: a long one allows the whole ground to tilt
+away from the sonar and to be brighter, which looks the same in one frame."""
 
 STDS = (0.01, 0.02, 0.04, 0.08)
 """Candidates of the standard deviation of heights, as fractions of the height of the sonar."""
@@ -48,9 +50,6 @@ last. It stands for side lobes and what the map cannot represent, and bounds the
 
 HELD_OUT, PATCH = 0.2, 4
 """Fraction of the blocks that are held out, and the edge of their patches [blocks]."""
-
-DARK = 0.15
-"""Level below which a block is in shadow, relative to level ground."""
 
 STEPS, STEPS_OF_TRIAL = 12, 6
 """Largest numbers of Gauss-Newton steps of the final fit and of a trial."""
@@ -169,7 +168,7 @@ def fit_height_map(
     Raises:
         MitsonarError: too few beams, too many frames, an unknown pose or height, no ground in the window, or no relief.
     """
-    views, levels = _views(frames, np.asarray(poses, dtype=float), np.asarray(height_m, dtype=float), options)
+    views, levels = views_of(frames, np.asarray(poses, dtype=float), np.asarray(height_m, dtype=float), options)
     fit = _Fit(views, levels)
     search = _Search(fit, float(np.median(height_m)), options.seed, progress or (lambda _: None))
     best = search.best()
@@ -202,7 +201,7 @@ def most_trials() -> int:
 # ---------------- Frames become views of a grid
 
 
-def _views(
+def views_of(
     frames: SonarFrames, poses: Array, height_m: Array, options: HeightMapOptions
 ) -> tuple[list[ReliefView], list[Array]]:
     """Return the views of all frames, and their levels in blocks."""
@@ -264,7 +263,7 @@ def _grid(sonar: Sonar, bearing_rad: Array, poses: Array, ground_m: float, cells
 
 @dataclass(frozen=True)
 class _Solution:
-    """Heights ``(cells, cells)`` [m], the reflectivity of the ground, and the levels of echoes in the blocks of each view."""
+    """Heights ``(cells, cells)`` [m], the reflectivity of the ground, and levels of echoes in the blocks of each view."""
 
     height_m: Array
     reflectivity: float
@@ -490,7 +489,7 @@ class _Search:
         self.trials = [Trial(0.0, math.inf, 0.0)]
 
     def _deviance(self, solution: _Solution) -> float:
-        """Return the mean deviance of held-out blocks, in which single bright echoes count no more than :data:`MOST_RATIO`."""
+        """Return the mean deviance of held-out blocks, with ratios of levels up to :data:`MOST_RATIO`."""
         means = self.fit.means(solution)
         parts = [np.log(m) + np.minimum(y / m, MOST_RATIO) for m, y in zip(means, self.fit.measured, strict=True)]
         return sum(float((part * test).sum()) for part, test in zip(parts, self.test, strict=True)) / max(1.0, self.blocks)
@@ -513,8 +512,8 @@ class _Search:
         assert best is not None
         if best.trial.deviance > -LEAST_GAIN:
             raise MitsonarError(
-                "the frames show no relief: level ground explains blocks of the image that the fit did not use as well as any "
-                "height map does; a height map needs shadows or slopes, at grazing angles of about 10 to 40 deg"
+                "the frames show no relief: level ground predicts blocks of the image that the fit did not use as well as any "
+                "height map does; it needs shadows or slopes, at grazing angles of about 10 to 40 deg"
             )
         return best
 
@@ -558,43 +557,3 @@ class _Search:
             ratios.append(np.square(patches[0][whole]) * PATCH**2 * (1.0 if math.isinf(view.looks) else view.looks))
         joined = np.concatenate(ratios)
         return max(1.0, float(joined.mean())) if len(joined) else 1.0
-
-
-# ---------------- Heights from the lengths of shadows
-
-
-def shadow_heights(view: ReliefView, levels: Array, reflectivity: float) -> Array:
-    """Estimate heights from the lengths of shadows: an object whose shadow spans the ranges a to b is H (1 - a / b) high.
-
-    The object is placed before its shadow, as deep as it is high; all other ground is level.
-
-    Args:
-        view: view of the frame.
-        levels: its levels in blocks.
-        reflectivity: reflectivity of the ground.
-
-    Returns:
-        Heights ``(cells, cells)`` [m], with the southernmost row first.
-    """
-    grid = view.grid
-    above = float(view.position[2] - grid.ground_m)
-    # 1. Blocks that are dark in comparison with level ground, without single ones.
-    flat = view.levels(np.full((grid.cells, grid.cells), grid.ground_m)) * reflectivity
-    smooth = ndimage.uniform_filter(levels - view.noise, 3)
-    dark = (smooth < DARK * flat) & view.used
-    dark = ndimage.median_filter(dark.astype(np.uint8), 3) > 0
-    # 2. Column of blocks and horizontal distance of each cell.
-    x, y = grid.centres
-    _, column = view.blocks_of(np.stack([x, y, np.full_like(x, grid.ground_m)], axis=-1))
-    distance = np.hypot(x - view.position[0], y - view.position[1])
-    heights = np.zeros_like(x)
-    # 3. Each run of dark blocks along a beam is the shadow of an object.
-    edges = view.range_m[0] + (np.arange(view.shape[0] + 1) - 0.5) * view.block_m
-    for beam in range(view.shape[1]):
-        change = np.diff(np.r_[0, dark[:, beam].astype(int), 0])
-        for begin, end in zip(np.flatnonzero(change > 0), np.flatnonzero(change < 0), strict=True):
-            height = above * (1 - edges[begin] / edges[end])
-            top = math.sqrt(max(edges[begin] ** 2 - (above - height) ** 2, 0.0))
-            before = (column == beam) & (distance <= top) & (distance > top - max(height, grid.cell_m))
-            heights[before] = np.maximum(heights[before], height)
-    return heights + grid.ground_m

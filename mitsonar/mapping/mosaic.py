@@ -733,7 +733,7 @@ def illumination(frames: SonarFrames, poses: ArrayLike | None = None, height_m: 
 
 
 def save_geotiff(path: str | Path, mosaic: Mosaic) -> None:
-    """Write a mosaic as a GeoTIFF with float32 bands mean, std and count, nan where unknown, in metres of the local world."""
+    """Write a mosaic as a GeoTIFF with float32 bands mean, std and count, nan where unknown."""
     bands = np.stack([mosaic.mean, mosaic.std, mosaic.count.astype(np.float32)])
     west, _, _, north = mosaic.extent
     names = ("mean level, 0..1", "standard deviation of the frames' levels", "frames that saw the cell")

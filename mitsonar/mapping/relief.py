@@ -1,10 +1,10 @@
 """Compute the image that a sonar makes of a height map, with its derivatives by the heights.
 
-The ground is divided into columns of equal azimuth around the sonar. Along a column, the tangent of the elevation at which the
-sonar sees the ground is t = (z - z_sonar) / r. Where t exceeds its maximum over nearer ground, the sonar sees the ground, and
-the increase of this maximum is the elevation that a segment of the column fills. Its level is that of the model ``physical``,
-C cos(theta) dOmega R^(g - 2) (:func:`mitsonar.acoustics.levels.level`), times the pattern over elevation. Shadows and
-silhouettes have derivatives, because a segment that is partly hidden fills less elevation.
+The ground is divided into columns of equal azimuth around the sonar. Along a column, the tangent of the elevation at which
+the sonar sees the ground is t = (z - z_sonar) / r. Where t exceeds its maximum over nearer ground, the sonar sees the
+ground, and the increase of this maximum is the elevation that a segment of the column fills. Its level is that of the model
+``physical``, C cos(theta) dOmega R^(g - 2) (:func:`mitsonar.acoustics.levels.level`), times the pattern over elevation.
+Shadows and silhouettes have derivatives, because a segment that is partly hidden fills less elevation.
 """
 
 from __future__ import annotations
