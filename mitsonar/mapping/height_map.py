@@ -155,8 +155,8 @@ def fit_height_map(
 ) -> HeightMap:
     """Fit one height map to all frames.
 
-    The map covers the ground within the window, the beams and the elevation field of view of the frames. Ground outside it
-    is assumed to be level.
+    The map covers all ground that the frames show, and states heights where it lies within the elevation field of view.
+    Ground outside the map is assumed to be level.
 
     Args:
         frames: one or more frames of one sonar, of the same ground.
@@ -317,13 +317,13 @@ class _Fit:
         self.seen = self._seen()
 
     def _seen(self) -> NDArray[np.bool_]:
-        """Return the cells that lie in the lit ground of some view ``(cells, cells)``."""
+        """Return the cells that lie within the fan and the elevation field of view of some view ``(cells, cells)``."""
         x, y = self.grid.centres
         seen = np.zeros(x.shape, dtype=bool)
         for view in self.views:
             row, column = view.blocks_of(np.stack([x, y, np.full_like(x, self.grid.ground_m)], axis=-1))
             inside = (row >= 0) & (row < view.shape[0]) & (column >= 0) & (column < view.shape[1])
-            seen[inside] |= view.used[row[inside], column[inside]]
+            seen[inside] |= view.in_view[row[inside], column[inside]]
         return seen
 
     def means(self, solution: _Solution) -> list[Array]:
@@ -512,8 +512,8 @@ class _Search:
         assert best is not None
         if best.trial.deviance > -LEAST_GAIN:
             raise MitsonarError(
-                "the frames show no relief: level ground predicts blocks of the image that the fit did not use as well as any "
-                "height map does; it needs shadows or slopes, at grazing angles of about 10 to 40 deg"
+                "the frames show no relief: level ground predicts blocks of the image that the fit did not use as well as "
+                "any height map does; it needs shadows or slopes, at grazing angles of about 10 to 40 deg"
             )
         return best
 

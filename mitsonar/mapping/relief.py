@@ -86,7 +86,9 @@ class GroundCells:
         return sparse.csr_array((weight, (np.tile(inside, 4), index)), shape=(x.size, self.cells**2))
 
 
-def lit_ground(sonar: Sonar, bearing_rad: Array, range_m: Array, pose: Array, ground_m: float) -> Array:
+def lit_ground(
+    sonar: Sonar, bearing_rad: Array, range_m: Array, pose: Array, ground_m: float, *, in_view: bool = False
+) -> Array:
     """Compute the points of level ground that the cells of an image show, in world axes.
 
     Args:
@@ -95,6 +97,7 @@ def lit_ground(sonar: Sonar, bearing_rad: Array, range_m: Array, pose: Array, gr
         range_m: ranges of the cells ``(bins,)`` [m].
         pose: pose of the sonar ``(6,)`` [m, rad].
         ground_m: height of the ground [m].
+        in_view: whether only ground within the elevation field of view counts, not what the pattern lights beyond it.
 
     Returns:
         Points ``(bins, beams, 2)`` [m]; nan where a cell shows no lit ground.
@@ -102,7 +105,8 @@ def lit_ground(sonar: Sonar, bearing_rad: Array, range_m: Array, pose: Array, gr
     geometry = GroundGeometry(range_m, bearing_rad, sonar.bearing, float(pose[2] - ground_m), float(pose[3]), float(pose[4]))
     points = geometry.points
     with np.errstate(invalid="ignore"):
-        lit = np.abs(geometry.elevation(points)) <= _lit_elevation(sonar)
+        most = math.radians(sonar.elevation_fov_deg) / 2 if in_view else _lit_elevation(sonar)
+        lit = np.abs(geometry.elevation(points)) <= most
     world = np.asarray(moved(points, (0.0, 0.0, -float(pose[5]))), dtype=float) + pose[:2]
     return np.where(lit[..., None], world, np.nan)
 
@@ -140,6 +144,7 @@ class ReliefView:
         beams: number of beams in a block.
         shape: number of blocks along range and bearing.
         used: blocks whose ground is lit and lies within the cells, shaped so.
+        in_view: those of them whose ground lies within the elevation field of view, shaped so.
         noise: mean level of the receiver noise, shaped so.
         looks: number of independent samples of speckle in a block; infinite without speckle.
     """
@@ -159,7 +164,9 @@ class ReliefView:
         self.block_m = self.bins * sonar.bin_m
         self.range_m = sonar.range_min + (np.arange(self.shape[0]) + 0.5) * self.block_m
         self.bearing_rad = self._blocks(np.broadcast_to(bearing_rad, (sonar.range_bins, len(bearing_rad))))[0]
-        self.used = grid.contains(lit_ground(sonar, self.bearing_rad, self.range_m, pose, grid.ground_m))
+        blocks = sonar, self.bearing_rad, self.range_m, pose, grid.ground_m
+        self.used = grid.contains(lit_ground(*blocks))
+        self.in_view = grid.contains(lit_ground(*blocks, in_view=True))
         self.noise = self._blocks(np.broadcast_to(noise_of(sonar)[:, None], (sonar.range_bins, len(bearing_rad))))
         # 2. A block collects the echoes of its bins and beams; a beam has the level of a box as wide as itself.
         apart = np.gradient(self.bearing_rad)

@@ -48,8 +48,9 @@ def shadow_heights(view: ReliefView, levels: Array, reflectivity: float) -> Arra
     for beam in range(view.shape[1]):
         change = np.diff(np.r_[0, dark[:, beam].astype(int), 0])
         for begin, end in zip(np.flatnonzero(change > 0), np.flatnonzero(change < 0), strict=True):
-            height = above * (1 - edges[begin] / edges[end])
-            top = math.sqrt(max(edges[begin] ** 2 - (above - height) ** 2, 0.0))
+            first, last = edges[max(begin - 1, 0)], edges[min(end + 1, view.shape[0])]  # smoothing has shortened the run
+            height = above * (1 - first / last)
+            top = math.sqrt(max(first**2 - (above - height) ** 2, 0.0))
             before = (column == beam) & (distance <= top) & (distance > top - max(height, grid.cell_m))
             heights[before] = np.maximum(heights[before], height)
     return heights + grid.ground_m
