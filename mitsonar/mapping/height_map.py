@@ -14,7 +14,9 @@ covariance.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -41,8 +43,8 @@ LENGTH_CELLS = 4.0
 """Correlation length of the heights [cells]. Held-out blocks cannot choose it: a long one allows the whole ground to tilt
 away from the sonar and to be brighter, which looks the same in one frame."""
 
-STDS = (0.01, 0.02, 0.04, 0.08)
-"""Candidates of the standard deviation of heights, as fractions of the height of the sonar."""
+STDS, FIRST = (0.005, 0.01, 0.02, 0.04, 0.08), 1
+"""Candidates of the standard deviation of heights, as fractions of the height of the sonar, and the first that is tried."""
 
 LEAKS = (0.3, 0.1, 0.03)
 """Constant level that is added to the image, as a fraction of that of level ground, from the first steps of the fit to the
@@ -60,8 +62,8 @@ MOST_DAMPED, LEAST_DAMPING = 4, 1e-2
 CONVERGED = 1.0
 """Decrease of the objective at which a fit has converged; 0.5 is one standard deviation of one direction."""
 
-LEAST_GAIN = 0.01
-"""Smallest improvement of the deviance of held-out blocks over level ground, per block, at which there is relief."""
+LEAST_GAIN = 5.0
+"""Smallest gain of the log-likelihood of all held-out blocks over level ground at which there is relief."""
 
 MOST_RATIO = 5.0
 """Largest ratio of the measured to the expected level of a held-out block that counts; some lie in a modelled shadow."""
@@ -299,10 +301,12 @@ class _Fit:
         seen: cells that some frame shows ``(cells, cells)``.
         leak: constant level of the image, see :data:`LEAKS`.
         centre_m: mean of the heights in the regulariser [m].
+        threads: threads that render views; NumPy and SciPy release the interpreter.
     """
 
     def __init__(self, views: Sequence[ReliefView], levels: Sequence[Array]) -> None:
         self.views, self.measured, self.grid = views, levels, views[0].grid
+        self.threads = ThreadPoolExecutor(min(len(views), os.cpu_count() or 1))
         self.weights = [np.where(view.used, 1.0 if math.isinf(view.looks) else view.looks, 0.0) for view in views]
         height = np.full((self.grid.cells, self.grid.cells), self.grid.ground_m)
         ground = [view.levels(height) for view in views]
@@ -356,7 +360,8 @@ class _Fit:
 
     def at(self, height_m: Array, reflectivity: float) -> _Solution:
         """Return the solution of given heights, with the best reflectivity."""
-        return self.with_reflectivity(_Solution(height_m, reflectivity, [view.levels(height_m) for view in self.views]))
+        levels = list(self.threads.map(lambda view: view.levels(height_m), self.views))
+        return self.with_reflectivity(_Solution(height_m, reflectivity, levels))
 
     def minimised(self, trial: Trial, start: _Solution, steps: int) -> _Solution:
         """Minimise the objective by Gauss-Newton steps that are halved until they decrease it."""
@@ -405,16 +410,10 @@ class _Fit:
         """Return Fisher's information about the heights, the gradient, and the information shared with the reflectivity."""
         hessian, gradient = precision, precision @ (solution.height_m.ravel() - self.centre_m)
         shared, alone = np.zeros(len(gradient)), 0.0
-        for view, w, mean, y in zip(self.views, self.weights, self.means(solution), self.measured, strict=True):
-            levels, by_height = view.derivative(solution.height_m)
-            used = np.flatnonzero(w.ravel() > 0)
-            by_height = sparse.csr_array(by_height[used] * solution.reflectivity)
-            m, weight = mean.ravel()[used], w.ravel()[used] / np.square(mean.ravel()[used])
-            by_gain = solution.reflectivity * levels.ravel()[used]
-            hessian = hessian + by_height.T @ sparse.csr_array(by_height.multiply(weight[:, None]))
-            gradient = gradient + by_height.T @ (weight * (m - y.ravel()[used]))
-            shared += by_height.T @ (weight * by_gain)
-            alone += float((weight * by_gain * by_gain).sum())
+        views = zip(self.views, self.weights, self.means(solution), self.measured, strict=True)
+        for parts in self.threads.map(lambda view: _expansion_of(solution, *view), views):  # summed in the order of views
+            hessian, gradient = hessian + parts[0], gradient + parts[1]
+            shared, alone = shared + parts[2], alone + parts[3]
         return sparse.csr_array(hessian), gradient, (shared, alone)
 
     def std(self, trial: Trial, solution: _Solution) -> Array:
@@ -427,6 +426,23 @@ class _Fit:
         inverse, _ = linalg.lapack.dpotri(lower, lower=1, overwrite_c=1)
         variance = inverse.diagonal() + direction**2 / max(alone - float(shared @ direction), 1e-12 * alone)
         return np.asarray(np.sqrt(variance).reshape(solution.height_m.shape))
+
+
+def _expansion_of(
+    solution: _Solution, view: ReliefView, weights: Array, means: Array, measured: Array
+) -> tuple[Sparse, Array, Array, float]:
+    """Return the information and the gradient of one view: of heights, and of the logarithm of the reflectivity."""
+    levels, by_height = view.derivative(solution.height_m)
+    used = np.flatnonzero(weights.ravel() > 0)
+    by_height = sparse.csr_array(by_height[used] * solution.reflectivity)
+    m = means.ravel()[used]
+    weight, by_gain = weights.ravel()[used] / np.square(m), solution.reflectivity * levels.ravel()[used]
+    return (
+        sparse.csr_array(by_height.T @ sparse.csr_array(by_height.multiply(weight[:, None]))),
+        by_height.T @ (weight * (m - measured.ravel()[used])),
+        by_height.T @ (weight * by_gain),
+        float((weight * by_gain * by_gain).sum()),
+    )
 
 
 def _mode(values: Array) -> float:
@@ -495,22 +511,24 @@ class _Search:
         return sum(float((part * test).sum()) for part, test in zip(parts, self.test, strict=True)) / max(1.0, self.blocks)
 
     def best(self) -> _Candidate:
-        """Return the best candidate: larger standard deviations while they help.
+        """Return the best candidate on the way to larger or smaller standard deviations.
 
         Raises:
             MitsonarError: none is better than level ground.
         """
         length = LENGTH_CELLS * self.fit.grid.cell_m
-        start = self._beginning()
-        best: _Candidate | None = None
-        for part in STDS:
-            candidate = self._tried(part * self.height_m, length, start, first=best is None)
-            start = candidate.solution
-            if best is not None and candidate.trial.deviance > best.trial.deviance:
+        first = best = self._tried(STDS[FIRST] * self.height_m, length, self._beginning(), first=True)
+        # Larger ones while they help, or else smaller ones.
+        for parts in (STDS[FIRST + 1 :], STDS[:FIRST][::-1]):
+            if best is not first:
                 break
-            best = candidate
-        assert best is not None
-        if best.trial.deviance > -LEAST_GAIN:
+            for part in parts:
+                candidate = self._tried(part * self.height_m, length, best.solution)
+                if candidate.trial.deviance >= best.trial.deviance:
+                    break
+                best = candidate
+        looks = max(float(weight.max()) for weight in self.all)
+        if best.trial.deviance * self.blocks * looks > -LEAST_GAIN:
             raise MitsonarError(
                 "the frames show no relief: level ground predicts blocks of the image that the fit did not use as well as "
                 "any height map does; it needs shadows or slopes, at grazing angles of about 10 to 40 deg"
