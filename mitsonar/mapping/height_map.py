@@ -223,7 +223,7 @@ def views_of(
     if not (np.isfinite(poses).all() and np.isfinite(height_m).all() and (height_m > 0).all()):
         raise MitsonarError(
             "a height map needs the pose of each frame and a height above 0 m over the ground: some are unknown; give "
-            f"{argument('height')}, or other frames"
+            f"{argument('height_m')}, or other frames"
         )
     images = frames.to_linear().image.astype(float) * frames.level_scale
     if not np.isfinite(images).all():
@@ -250,9 +250,9 @@ def _grid(sonar: Sonar, bearing_rad: Array, poses: Array, ground_m: float, cells
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < cells or any(not np.isfinite(part).any() for part in shown):
         raise MitsonarError(
-            f"a frame shows no ground: at the given height and pitch, level ground lies outside the window of "
-            f"{sonar.range_min:.3g}..{sonar.range_max:.3g} m or the elevation field of view; check {argument('height')} and "
-            f"{argument('pitch_deg')}"
+            "a frame shows no ground: at the given height and pitch, level ground lies outside the window of "
+            f"{sonar.range_min:.3g}..{sonar.range_max:.3g} m or the elevation field of view; check {argument('height_m')} "
+            f"and {argument('pitch_deg')}"
         )
     low, high = points.min(axis=0), points.max(axis=0)
     edge = float((high - low).max())
