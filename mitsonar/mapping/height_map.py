@@ -48,7 +48,7 @@ STDS, FIRST = (0.005, 0.01, 0.02, 0.04, 0.08), 1
 
 LEAKS = (0.3, 0.1, 0.03)
 """Constant level that is added to the image, as a fraction of that of level ground, from the first steps of the fit to the
-last. It stands for side lobes and what the map cannot represent, and bounds the penalty of an echo in a modelled shadow."""
+last. It represents side lobes and what the map cannot represent, and bounds the penalty of an echo in a modelled shadow."""
 
 HELD_OUT, PATCH = 0.2, 4
 """Fraction of the blocks that are held out, and the edge of their patches [blocks]."""
@@ -358,7 +358,7 @@ class _Fit:
                 break
         return solution
 
-    def at(self, height_m: Array, reflectivity: float) -> _Solution:
+    def solution_of(self, height_m: Array, reflectivity: float) -> _Solution:
         """Return the solution of given heights, with the best reflectivity."""
         levels = list(self.threads.map(lambda view: view.levels(height_m), self.views))
         return self.with_reflectivity(_Solution(height_m, reflectivity, levels))
@@ -383,7 +383,7 @@ class _Fit:
                 for fraction in (1.0, 0.5, 0.2):
                     height = solution.height_m + fraction * step
                     if height.max() < ceiling:
-                        moved = self.at(height, solution.reflectivity)
+                        moved = self.solution_of(height, solution.reflectivity)
                         decrease = value - objective(moved)
                     if decrease > 0:
                         break
@@ -404,7 +404,7 @@ class _Fit:
         """
         offset = _mode(solution.height_m[self.seen]) - self.grid.ground_m
         self.centre_m -= offset
-        return self.at(solution.height_m - offset, solution.reflectivity)
+        return self.solution_of(solution.height_m - offset, solution.reflectivity)
 
     def _expansion(self, solution: _Solution, precision: Sparse) -> tuple[Sparse, Array, tuple[Array, float]]:
         """Return Fisher's information about the heights, the gradient, and the information shared with the reflectivity."""
@@ -495,9 +495,9 @@ class _Search:
         self.all, self.train, self.test = fit.weights, [], []
         for weight in fit.weights:
             patches = rng.random([size // PATCH + 1 for size in weight.shape]) < HELD_OUT
-            held = np.kron(patches, np.ones((PATCH, PATCH)))[: weight.shape[0], : weight.shape[1]] > 0
-            self.train.append(np.where(held, 0.0, weight))
-            self.test.append(np.where(held, (weight > 0).astype(float), 0.0))
+            excluded = np.kron(patches, np.ones((PATCH, PATCH)))[: weight.shape[0], : weight.shape[1]] > 0
+            self.train.append(np.where(excluded, 0.0, weight))
+            self.test.append(np.where(excluded, (weight > 0).astype(float), 0.0))
         self.blocks = sum(float(test.sum()) for test in self.test)
         fit.weights = self.train
         self.level = self._deviance(fit.with_reflectivity(fit.flat))
@@ -542,7 +542,7 @@ class _Search:
             shadow_heights(view, y, flat.reflectivity) for view, y in zip(self.fit.views, self.fit.measured, strict=True)
         ]
         smooth = ndimage.gaussian_filter(np.mean(heights, axis=0), 1.0)
-        shadows = self.fit.at(smooth, flat.reflectivity)
+        shadows = self.fit.solution_of(smooth, flat.reflectivity)
         return min(flat, shadows, key=lambda one: self.fit.deviance(one, self.train))
 
     def _tried(self, std_m: float, length_m: float, start: _Solution, *, first: bool = False) -> _Candidate:
