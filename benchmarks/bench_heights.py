@@ -78,7 +78,7 @@ def main() -> None:
     cases = [Case("rocks", seed, frames) for frames in (1, 4) for seed in seeds] + [Case("mesh", 0, 1), Case("mesh", 0, 4)]
     if arguments.quick:
         cases = [Case("rocks", 1, 1)]
-    print(HEAD)
+    print("| " + " | ".join(COLUMNS) + " |\n" + "|---" * len(COLUMNS) + "|")
     rows, shown = [], {}
     for case in cases:
         shown[case.scene, case.frames] = result = measure(case, 24 if arguments.quick else 64)
@@ -92,8 +92,19 @@ def main() -> None:
         draw(arguments.picture.with_stem(arguments.picture.stem + "_mesh"), shown["mesh", 1])
 
 
-HEAD = """| scene | frames | plane, cm | shadows, cm | map, cm | bias, cm | centre: plane | shadows | map | within 2 std, % | cpu, s |
-|---|---|---|---|---|---|---|---|---|---|---|"""
+COLUMNS = (
+    "scene",
+    "frames",
+    "plane, cm",
+    "shadows",
+    "map",
+    "bias",
+    "centre: plane",
+    "shadows",
+    "map",
+    "within 2 std, %",
+    "cpu, s",
+)
 
 
 def measure(case: Case, cells: int) -> Result:
@@ -127,7 +138,6 @@ def rocky_scene(seed: int) -> mi.Scene:
 def mesh_scene() -> mi.Scene:
     """Lay the mesh on an even floor, turned by 30 deg."""
     import mitsuba as mi
-
     import trimesh
 
     bottom = float(trimesh.load_mesh(MESH).bounds[0, 2])

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mitsonar.mapping.sources import FrameSource
+    from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["heights"]
 
@@ -65,11 +66,11 @@ def heights(
 
     # 1. Options that cannot work are refused before anything is read.
     convention_named(frame)
-    for path in out:
-        if path.suffix.lower() not in (*FORMATS, ".png"):
-            raise MitsonarError(f"-o must name a .ply, .tif, .npz or .png file: got {path}")
-        if not path.parent.is_dir():
-            raise MitsonarError(f"there is no folder {path.parent}: make it, or choose another -o")
+    for file in out:
+        if file.suffix.lower() not in (*FORMATS, ".png"):
+            raise MitsonarError(f"-o must name a .ply, .tif, .npz or .png file: got {file}")
+        if not file.parent.is_dir():
+            raise MitsonarError(f"there is no folder {file.parent}: make it, or choose another -o")
     refuse_to_replace(*out, overwrite=overwrite)
     options = HeightMapOptions(cells, seed)
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
@@ -118,13 +119,11 @@ def _chosen(only: str | None, count: int) -> NDArray[np.intp]:
 
 
 def _posed(
-    source: FrameSource, index: NDArray[np.intp], path: object
+    source: FrameSource, index: NDArray[np.intp], path: Trajectory | None
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
     """Return the frames that have a pose, their poses and their heights over the ground."""
-    from mitsonar.motion.trajectory import Trajectory
-
     # 1. Poses: along the given path, of the frames, or for one frame its attitude alone.
-    if isinstance(path, Trajectory):
+    if path is not None:
         along, poses = source.along(path)
         known = np.isin(along, index)
         index, poses = along[known], poses[known]

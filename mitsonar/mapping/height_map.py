@@ -18,6 +18,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ from mitsonar.records.frames import SonarFrames
 __all__ = ["HeightMap", "HeightMapOptions", "Trial", "fit_height_map", "most_trials", "views_of"]
 
 Array = NDArray[np.float64]
-Sparse = sparse.csr_array
+Sparse: TypeAlias = "sparse.csr_array[Any, Any]"
 
 FEWEST_CELLS, MOST_CELLS, MOST_FRAMES = 16, 96, 32
 FEWEST_BEAMS = 8

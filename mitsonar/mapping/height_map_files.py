@@ -54,9 +54,11 @@ def _ply(height_map: HeightMap) -> bytes:
     faces = np.concatenate(
         [np.column_stack([north_west, south_west, south_east]), np.column_stack([north_west, south_east, north_east])]
     )
-    std = {"std_m": height_map.std_m[known].astype(np.float32)}
-    mesh = trimesh.Trimesh(vertices, faces, vertex_attributes=std, process=False)
-    return bytes(mesh.export(file_type="ply", vertex_normal=False))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.vertex_attributes["std_m"] = height_map.std_m[known].astype(np.float32)
+    content = mesh.export(file_type="ply", vertex_normal=False)
+    assert isinstance(content, bytes)
+    return content
 
 
 def _geotiff(height_map: HeightMap) -> bytes:

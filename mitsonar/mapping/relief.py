@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from mitsonar.motion.pose import Pose, vehicle_rotation
 __all__ = ["GroundCells", "ReliefView", "lit_ground"]
 
 Array = NDArray[np.float64]
-Sparse = sparse.csr_array
+Sparse: TypeAlias = "sparse.csr_array[Any, Any]"
 
 POINTS_PER_BLOCK = 2
 """Number of columns per block of beams, and of points of a column per block of bins."""
@@ -164,9 +165,10 @@ class ReliefView:
         self.block_m = self.bins * sonar.bin_m
         self.range_m = sonar.range_min + (np.arange(self.shape[0]) + 0.5) * self.block_m
         self.bearing_rad = self._blocks(np.broadcast_to(bearing_rad, (sonar.range_bins, len(bearing_rad))))[0]
-        blocks = sonar, self.bearing_rad, self.range_m, pose, grid.ground_m
-        self.used = grid.contains(lit_ground(*blocks))
-        self.in_view = grid.contains(lit_ground(*blocks, in_view=True))
+        shown = [
+            lit_ground(sonar, self.bearing_rad, self.range_m, pose, grid.ground_m, in_view=part) for part in (False, True)
+        ]
+        self.used, self.in_view = (grid.contains(ground) for ground in shown)
         self.noise = self._blocks(np.broadcast_to(noise_of(sonar)[:, None], (sonar.range_bins, len(bearing_rad))))
         # 2. A block collects the echoes of its bins and beams; a beam has the level of a box as wide as itself.
         apart = np.gradient(self.bearing_rad)
