@@ -163,7 +163,8 @@ class ReliefView:
         self.beams = int(np.clip(round(width / spacing), 1, max(1, len(bearing_rad) // 4)))
         self.shape = sonar.range_bins // self.bins, len(bearing_rad) // self.beams
         self.block_m = self.bins * sonar.bin_m
-        self.range_m = sonar.range_min + (np.arange(self.shape[0]) + 0.5) * self.block_m
+        middles = (np.arange(self.shape[0]) + 0.5) * self.block_m
+        self.range_m: Array = np.asarray(sonar.range_min + middles, dtype=np.float64)
         self.bearing_rad = self._blocks(np.broadcast_to(bearing_rad, (sonar.range_bins, len(bearing_rad))))[0]
         shown = [
             lit_ground(sonar, self.bearing_rad, self.range_m, pose, grid.ground_m, in_view=part) for part in (False, True)

@@ -192,7 +192,9 @@ def test_a_geotiff_is_north_up_and_in_metres(tmp_path: Path) -> None:
     result, _ = fitted(1)
     save_height_map(tmp_path / "map.tif", result)
     with tifffile.TiffFile(tmp_path / "map.tif") as file:
-        bands, tags = file.asarray(), file.pages[0].tags
+        page = file.pages[0]
+        assert isinstance(page, tifffile.TiffPage)
+        bands, tags = file.asarray(), page.tags
         assert tags["ModelPixelScaleTag"].value[:2] == (result.cell_m, result.cell_m)
         assert tags["ModelTiepointTag"].value[3:5] == (result.west_m, result.north_m)
     np.testing.assert_array_equal(bands, np.stack([result.height_m, result.std_m]).astype(np.float32))
