@@ -38,7 +38,7 @@ Sparse: TypeAlias = "sparse.csr_array[Any, Any]"
 
 FEWEST_CELLS, MOST_CELLS, MOST_FRAMES = 16, 96, 32
 FEWEST_BEAMS = 8
-"""Smallest number of beams: with fewer, heights across the beams are not resolved."""
+"""Smallest number of beams, and of bins: with fewer, heights are not resolved."""
 
 LENGTH_CELLS = 4.0
 """Correlation length of the heights [cells]. Held-out blocks cannot choose it: a long one allows the whole ground to tilt
@@ -209,10 +209,11 @@ def views_of(
 ) -> tuple[list[ReliefView], list[Array]]:
     """Return the views of all frames, and their levels in blocks."""
     count, bearing = len(frames), np.asarray(frames.bearing_rad, dtype=float)
-    if scans(frames.sonar) or len(bearing) < FEWEST_BEAMS:
+    if scans(frames.sonar) or min(len(bearing), len(frames.range_m)) < FEWEST_BEAMS:
+        size = f"{len(bearing)} beams and {len(frames.range_m)} bins"
         raise MitsonarError(
-            f"a height map needs an image of {FEWEST_BEAMS} beams or more from one pose: got "
-            + ("a rotating head, whose beams ping one after another" if scans(frames.sonar) else f"{len(bearing)}")
+            f"a height map needs an image of {FEWEST_BEAMS} beams and bins or more from one pose: got "
+            + ("a rotating head, whose beams ping one after another" if scans(frames.sonar) else size)
             + "; a single bearing shows ranges only, at any height"
         )
     if not 1 <= count <= MOST_FRAMES:

@@ -186,7 +186,7 @@ class ReliefView:
         forward = math.atan2(self.axes[0, 1], self.axes[1, 1])
         turn = (np.arctan2(offset[:, 0], offset[:, 1]) - forward + np.pi) % (2 * np.pi) - np.pi
         apart = float(np.diff(self.bearing_rad).mean())
-        low, high = turn.min() - 2 * apart, turn.max() + 2 * apart
+        low, high = max(turn.min() - 2 * apart, -math.pi), min(turn.max() + 2 * apart, math.pi)
         count = min(MOST_COLUMNS, math.ceil((high - low) / apart * POINTS_PER_BLOCK))
         self._width = (high - low) / count
         self.azimuth = forward + low + (np.arange(count) + 0.5) * self._width

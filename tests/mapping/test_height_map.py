@@ -152,8 +152,11 @@ def test_what_cannot_work_is_refused() -> None:
     frames, poses, _ = drawn(1)
     known = np.array([HEIGHT_M])
     few = replace(frames, image=frames.image[:, :, :4], bearing_rad=frames.bearing_rad[:4])
-    with pytest.raises(MitsonarError, match=r"8 beams or more.*got 4"):
+    with pytest.raises(MitsonarError, match=r"8 beams and bins or more.*got 4 beams"):
         fit_height_map(few, poses, known)
+    short = replace(frames, image=frames.image[:, :3], range_m=frames.range_m[:3])
+    with pytest.raises(MitsonarError, match=r"got 32 beams and 3 bins"):
+        fit_height_map(short, poses, known)
     with pytest.raises(MitsonarError, match="rotating head"):
         fit_height_map(replace(frames, sonar=SONAR.replace(ping_groups=32)), poses, known)
     with pytest.raises(MitsonarError, match="some are unknown"):
