@@ -23,7 +23,7 @@ def application() -> typer.Typer:
     """Create the application with all commands."""
     import typer
 
-    from mitsonar.cli import data, doctor, estimate, live, recording, render, sas, train
+    from mitsonar.cli import data, doctor, estimate, heights, live, recording, render, sas, train
 
     app = typer.Typer(
         name="mitsonar",
@@ -44,6 +44,7 @@ def application() -> typer.Typer:
     app.command()(estimate.compare)
     app.command()(estimate.crlb)
     app.command()(estimate.height)
+    app.command()(heights.heights)
     app.command()(estimate.odometry)
     app.command()(estimate.mosaic)
     app.command()(train.train)

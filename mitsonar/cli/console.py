@@ -143,6 +143,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "image": {"range_bins": "--bins", "range_min": "--range", "range_max": "--range"},
     "odometry": {**GEOMETRY, "every": "--every"},
     "height": {"pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"},
+    "heights": {**GEOMETRY, "cells": "--cells"},
     "mosaic": {**GEOMETRY, "cell_m": "--cell-mm", "centre_beams": "--centre-beams"},
     "compare": {
         "height_m": "NAME:height_m=METRES",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
@@ -44,6 +44,7 @@ __all__ = [
     "fan_of",
     "fractional_index",
     "from_middle",
+    "geotiff_bytes",
     "ground_outline",
     "illumination",
     "levels_of",
@@ -757,19 +758,35 @@ def illumination(frames: SonarFrames, poses: ArrayLike | None = None, height_m: 
 def save_geotiff(path: str | Path, mosaic: Mosaic, origin: UtmOrigin | None = None) -> None:
     """Write a mosaic as a GeoTIFF with float32 bands mean, std and count, nan where unknown, in metres.
 
-    With an origin, coordinates are those of its UTM grid on WGS 84. Without one, the reference system is a local engineering
-    system: x east, y north, without a position on Earth (GeoTIFF 1.1: user-defined model, linear unit metre).
-
     Args:
         path: file to write.
         mosaic: the map.
         origin: where on the Earth the origin of the map lies.
     """
-    import tifffile
-
     bands = np.stack([mosaic.mean, mosaic.std, mosaic.count.astype(np.float32)])
     west, _, _, north = mosaic.extent
     names = ("mean level, 0..1", "standard deviation of the frames' levels", "frames that saw the cell")
+    write_atomic(path, geotiff_bytes(bands, names, (west, north), mosaic.cell_m, origin))
+
+
+def geotiff_bytes(
+    bands: Floats, names: Sequence[str], corner_m: tuple[float, float], cell_m: float, origin: UtmOrigin | None = None
+) -> bytes:
+    """Encode a map as a GeoTIFF in metres.
+
+    With an origin, coordinates are those of its UTM grid on WGS 84. Without one, the reference system is a local engineering
+    system: x east, y north, without a position on Earth (GeoTIFF 1.1: user-defined model, linear unit metre).
+
+    Args:
+        bands: ``(bands, rows, columns)`` float32, with the northernmost row first; nan where unknown.
+        names: description of each band.
+        corner_m: western and northern edge [m].
+        cell_m: edge of a cell [m].
+        origin: where on the Earth the origin of the map lies.
+    """
+    import tifffile
+
+    west, north = corner_m
     items = "".join(f'<Item name="DESCRIPTION" sample="{i}" role="description">{n}</Item>' for i, n in enumerate(names))
     if origin is None:
         model, citation, grid = 32767, "mitsonar world: x east, y north, metres|", []
@@ -780,7 +797,7 @@ def save_geotiff(path: str | Path, mosaic: Mosaic, origin: UtmOrigin | None = No
     keys = [(1024, 0, 1, model), (1025, 0, 1, 1), (1026, 34737, len(citation), 0), *grid, (3076, 0, 1, 9001)]
     directory = [1, 1, 1, len(keys), *(number for key in keys for number in key)]
     tags = [
-        (33550, "d", 3, (mosaic.cell_m, mosaic.cell_m, 0.0), True),  # ModelPixelScale
+        (33550, "d", 3, (cell_m, cell_m, 0.0), True),  # ModelPixelScale
         (33922, "d", 6, (0.0, 0.0, 0.0, west, north, 0.0), True),  # ModelTiepoint: the corner of pixel (0, 0)
         (34735, "H", len(directory), directory, True),  # GeoKeyDirectory
         (34737, "s", 0, citation, True),  # GeoAsciiParams
@@ -798,4 +815,4 @@ def save_geotiff(path: str | Path, mosaic: Mosaic, origin: UtmOrigin | None = No
         metadata=None,
         extratags=tags,
     )
-    write_atomic(path, buffer.getvalue())
+    return buffer.getvalue()

@@ -32,6 +32,7 @@ __all__ = [
     "dvl_figure",
     "echogram_figure",
     "ground_range_figure",
+    "height_map_figure",
     "mosaic_figure",
     "path_figure",
     "quality_figure",
@@ -127,6 +128,37 @@ def quality_figure(mosaic: LevelMap, *, title: str = "") -> Figure:
     figure.colorbar(image, ax=right, label="frames that saw the cell", fraction=0.04)
     for axes in (left, right):
         _finish_map(axes, mosaic, {}, title if axes is left else "")
+    return figure
+
+
+def height_map_figure(
+    extent: tuple[float, float, float, float], maps: Mapping[str, NDArray[np.floating]], *, title: str = ""
+) -> Figure:
+    """Draw maps of heights with one scale of colours, and maps of standard deviations with another.
+
+    Args:
+        extent: west, east, south and north edge of the maps [m].
+        maps: maps ``(rows, columns)`` [m] keyed by name, with the northernmost row first; nan where unknown. Names that
+            begin with ``standard deviation`` have the second scale.
+        title: title of the figure.
+    """
+    figure = Figure(figsize=(4.6 * len(maps), 4.4), layout="constrained")
+    deviations = {name: values for name, values in maps.items() if name.startswith("standard deviation")}
+    heights = [values for name, values in maps.items() if name not in deviations]
+    low, high = (float(np.nanpercentile(np.stack(heights), part)) for part in (0.5, 99.5)) if heights else (0.0, 1.0)
+    for number, (name, values) in enumerate(maps.items()):
+        axes = figure.add_subplot(1, len(maps), number + 1)
+        axes.set_facecolor(UNSEEN_COLOUR)
+        scale: dict[str, Any] = {"cmap": "viridis", "vmin": low, "vmax": high}
+        if name in deviations:
+            scale = {"cmap": "magma", "vmin": 0.0, "vmax": float(np.nanpercentile(values, 99.5)) or 1.0}
+        image = axes.imshow(values, extent=extent, interpolation="nearest", **scale)
+        figure.colorbar(image, ax=axes, label="m", fraction=0.04)
+        axes.set_title(name, fontsize=10)
+        axes.set_xlabel("x, east [m]")
+        axes.set_ylabel("y, north [m]")
+    if title:
+        figure.suptitle(title, fontsize=11)
     return figure
 
 
