@@ -59,7 +59,7 @@ class EdgePieces(NamedTuple):
 
 @dataclass(frozen=True)
 class SonarView:
-    """Where a sonar stands and what it sees.
+    """Place of a sonar and what it sees.
 
     Attributes:
         sonar: the sonar.
