@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,10 +10,38 @@ from array_api_compat import array_namespace
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.arrays import AnyArray
-from mitsonar.motion.pose import Pose, plain_number
+from mitsonar.errors import MitsonarError, suggest_names
+from mitsonar.motion.pose import Pose, mounted, plain_number
 from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["Motion", "MotionPrior", "compose", "inverse", "motions", "steady", "steered"]
+__all__ = [
+    "DEGREES",
+    "PLANAR",
+    "Motion",
+    "MotionPrior",
+    "compose",
+    "compose_six",
+    "degrees_named",
+    "inverse",
+    "motions",
+    "six_of",
+    "steady",
+    "steered",
+]
+
+
+DEGREES = {
+    "sideways": "to starboard [m]",
+    "forward": "ahead [m]",
+    "rise": "up [m]",
+    "pitch": "nose down, about the level axis to starboard [rad]",
+    "roll": "port side up, about the level axis ahead [rad]",
+    "yaw": "to starboard, about the vertical axis [rad]",
+}
+"""The six degrees of freedom of a motion, in level axes of the new heading, in this order; angles turn about the pose."""
+
+PLANAR = ("sideways", "forward", "yaw")
+"""The degrees of freedom of :class:`Motion`."""
 
 
 class Motion(NamedTuple):
@@ -33,6 +62,48 @@ def compose(pose: Pose, motion: Motion) -> Pose:
     x = pose.x + motion.forward * sin + motion.sideways * cos
     y = pose.y + motion.forward * cos - motion.sideways * sin
     return Pose.from_row((float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading)))
+
+
+def compose_six(pose: Pose, motion: ArrayLike) -> Pose:
+    """Compute the pose after a motion with all six degrees of freedom.
+
+    The pose first moves as in :func:`compose`, then rises. It turns about its position with a level vehicle of the new
+    heading, which rolls and then pitches; the attitude that the pose had relative to the level vehicle stays. Without rise,
+    pitch and roll the result is that of :func:`compose`, bit for bit.
+
+    Args:
+        pose: the pose before the motion, at any attitude.
+        motion: the motion in the order of :data:`DEGREES` ``(6,)`` [m, rad].
+    """
+    sideways, forward, rise, pitch, roll, yaw = (float(value) for value in np.asarray(motion, dtype=float))
+    moved = compose(pose, Motion(sideways, forward, yaw))
+    if not (rise or pitch or roll):
+        return moved
+    level = (moved.x, moved.y, moved.z + rise, pitch, roll, moved.heading)
+    tilt = Pose.from_row((0.0, 0.0, 0.0, pose.pitch, pose.roll, 0.0))
+    return Pose.from_row(mounted([level], tilt)[0].tolist())
+
+
+def six_of(motion: ArrayLike, degrees: Sequence[str]) -> NDArray[np.float64]:
+    """Return motions ``(..., 6)`` from some of their degrees of freedom ``(..., k)``; the others are 0."""
+    values = np.asarray(motion, dtype=float)
+    six = np.zeros((*values.shape[:-1], len(DEGREES)))
+    six[..., [list(DEGREES).index(name) for name in degrees]] = values
+    return six
+
+
+def degrees_named(text: str) -> tuple[str, ...]:
+    """Return degrees of freedom from ``3``, ``6`` or their names separated by commas, in the order of :data:`DEGREES`.
+
+    Raises:
+        MitsonarError: an unknown name, or none.
+    """
+    if text.strip() in ("3", "6"):
+        return PLANAR if text.strip() == "3" else tuple(DEGREES)
+    names = {word.strip() for word in text.split(",")}
+    for name in sorted(names - set(DEGREES)):
+        raise MitsonarError(f"unknown degree of freedom {name[:40]!r}: give 3, 6 or names; {suggest_names(name, DEGREES)}")
+    return tuple(name for name in DEGREES if name in names)
 
 
 def inverse(motion: AnyArray) -> AnyArray:
