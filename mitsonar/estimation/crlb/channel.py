@@ -121,7 +121,9 @@ def impulse_information(
     total = np.zeros((len(free), len(free)))
     for band in bands_of(sonar):
         for receiver_band in receiver_bands_of(band.sonar, height_m, span_s / (pings - 1), reach):
-            total += _information(receiver_band.law, _full_turn(receiver_band), full_motion, pings, 10 ** (-snr_db / 10), free)
+            total += _information(
+                receiver_band.law, _full_turn(receiver_band), full_motion, pings, 10 ** (-snr_db / 10), free
+            )
     return total
 
 

@@ -12,6 +12,7 @@ bound is optimistic, since a real estimator has to find the relief and the refle
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -289,9 +290,7 @@ def cramer_rao_bound(
             names = ", ".join(known.name for known in simulator.views)
             raise MitsonarError(f"overlapping portions have no common bound: got view {view!r}; name one of {names}")
         bounds.append(at_pose[portion, kind, law])
-    return np.array([np.zeros(len(degrees)) if one is None else one.std(frames) for one in bounds]).reshape(
-        -1, len(degrees)
-    )
+    return np.array([np.zeros(len(degrees)) if one is None else one.std(frames) for one in bounds]).reshape(-1, len(degrees))
 
 
 # ---------------- Changed sonars and poses
@@ -401,7 +400,8 @@ class Bound:
         # scale F to a unit diagonal; keep the directions that exceed their errors
         diagonal = np.diag(self.information)
         scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
-        size, axes, known = self.directions(scale)
+        size, axes, significant = self.directions(scale)
+        known = size > significant
         inverse = (axes[:, known] / size[known]) @ axes[:, known].T * np.outer(scale, scale)
         # axes with a part in the other directions are unobservable
         unobservable = (axes[:, ~known] ** 2).sum(axis=1) > 1e-3
@@ -409,18 +409,16 @@ class Bound:
         inverse[unobservable, unobservable] = np.inf
         return np.asarray(frames * inverse)
 
-    def directions(
-        self, scale: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the eigenvalues ``(k,)`` and eigenvectors ``(k, k)`` of F for scaled axes, and which are observable.
+    def directions(self, scale: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the eigenvalues ``(k,)`` and eigenvectors ``(k, k)`` of F for scaled axes, and their significance ``(k,)``.
 
-        An eigenvalue counts as observable if it exceeds its error due to the noise of the rays.
+        An eigenvalue is significant if it exceeds this value, a multiple of its error due to the noise of the rays.
 
         Args:
             scale: unit of each axis ``(k,)`` [m, rad].
         """
         size, axes = np.linalg.eigh(self.information * np.outer(scale, scale))
-        return size, axes, size > np.maximum(SIGNIFICANCE * self._error(axes * scale[:, None]), 1e-9)
+        return size, axes, np.maximum(SIGNIFICANCE * self._error(axes * scale[:, None]), 1e-9)
 
     def std(self, frames: int = 1) -> NDArray[np.float64]:
         """Return the least standard deviations ``(k,)`` [m, rad]; inf where an axis cannot be observed."""
@@ -752,6 +750,12 @@ class SpeckleBounds:
         repeated = [(np.repeat(weight, looks, axis=0), correlation) for weight, correlation in parts]
         variance, covariance = ScoreCovariance.of_looks(repeated, looks)
         return CellScores(jacobian, np.divide(1, variance, out=np.zeros_like(variance), where=known), covariance)
+
+    def mounted_at(self, mount: Pose) -> SpeckleBounds:
+        """Return the same bounds for another mount of the sonar."""
+        other = copy(self)
+        other.mount = mount
+        return other
 
     def _places(self, pose: Floats, motions: Floats) -> Floats:
         """Return the poses of the sonar after motions ``(n, k)`` from a pose."""
