@@ -510,7 +510,7 @@ def crlb(
         subject_of_data,
         subject_of_scene,
     )
-    from mitsonar.estimation.crlb.observability import LARGEST, Largest
+    from mitsonar.estimation.crlb.observability import LARGEST, MotionStd
     from mitsonar.instruments.sounder import load_sounder
     from mitsonar.motion.composition import degrees_named
     from mitsonar.motion.trajectory import convention_named
@@ -526,7 +526,7 @@ def crlb(
         gain=gain,
         pings=pings,
         degrees=degrees_named(degrees),
-        largest=LARGEST if limits is None else Largest(limits[0], math.radians(limits[1])),
+        largest=LARGEST if limits is None else MotionStd(limits[0], math.radians(limits[1])),
     )
     convention_named(frame)
     if Path(source).suffix == ".zarr" or "://" in source:

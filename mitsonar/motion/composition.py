@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, suggest_names
-from mitsonar.motion.pose import Pose, mounted, plain_number
+from mitsonar.motion.pose import Pose, mounted, plain_number, poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "degrees_named",
     "inverse",
     "motions",
+    "six_between",
     "six_of",
     "steady",
     "steered",
@@ -82,6 +83,17 @@ def compose_six(pose: Pose, motion: ArrayLike) -> Pose:
     level = (moved.x, moved.y, moved.z + rise, pitch, roll, moved.heading)
     tilt = Pose.from_row((0.0, 0.0, 0.0, pose.pitch, pose.roll, 0.0))
     return Pose.from_row(mounted([level], tilt)[0].tolist())
+
+
+def six_between(before: Pose, after: Pose) -> NDArray[np.float64]:
+    """Return the motion ``(6,)`` that leads from one pose to another by :func:`compose_six`.
+
+    The angles of the level vehicle between are unique while it pitches by less than 90 deg.
+    """
+    tilt = vehicle_rotation(Pose.from_row((0.0, 0.0, 0.0, before.pitch, before.roll, 0.0)))
+    level = poses_from(after[:3], vehicle_rotation(after) * tilt.inv())[0]
+    planar = motions([(*before[:3], 0, 0, before.heading), (*level[:3], 0, 0, level[5])])[0]
+    return np.array([planar[0], planar[1], after.z - before.z, level[3], level[4], planar[2]])
 
 
 def six_of(motion: ArrayLike, degrees: Sequence[str]) -> NDArray[np.float64]:

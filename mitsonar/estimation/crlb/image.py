@@ -1,6 +1,6 @@
 """How well any unbiased estimator can know a motion from images: the Cramer-Rao lower bound for a known scene.
 
-No unbiased estimator of the motion (sideways, forward, yaw; or any of six degrees of freedom) has a covariance below the inverse of the Fisher information
+No unbiased estimator of the motion (sideways, forward, yaw, or more degrees of freedom) has a covariance below the inverse of the Fisher information
 F = J' W J. J is the derivative of the pixels by the motion, W the information of a noisy pixel
 (:mod:`mitsonar.acoustics.noise`). The bound is that of an oracle that has the renderer and knows the scene, its height and
 the frames without noise.
@@ -65,6 +65,7 @@ __all__ = [
     "grain_law",
     "laws_of",
     "overall",
+    "pixel_terms",
     "together",
     "varied",
 ]
@@ -153,11 +154,11 @@ def _check(kind: str, law: str, kinds: Sequence[str] = tuple(KINDS), laws: Seque
 
 
 def _terms(derivative: Derivative, noise: NoiseModel, kind: str, greys: int = 255) -> InformationTerms:
-    return _by_pixels(derivative, noise, greys) if kind == "image" else _by_sums(derivative, noise)
+    return pixel_terms(derivative, noise, greys) if kind == "image" else _by_sums(derivative, noise)
 
 
-def _by_pixels(derivative: Derivative, noise: NoiseModel, greys: int) -> InformationTerms:
-    """Return the information of pixels."""
+def pixel_terms(derivative: Derivative, noise: NoiseModel, greys: int = 255) -> InformationTerms:
+    """Return the information of the pixels that change with the motion, in the order of the image."""
     changing = derivative.jacobian.any(axis=(0, 3, 4))
     level, filled = derivative.level[changing], derivative.filled[changing]
     value_information = information(noise, level, filled, greys=greys)

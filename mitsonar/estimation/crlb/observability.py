@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mitsonar.instruments.sounder import Sounder
     from mitsonar.simulation.simulator import Simulator
 
-__all__ = ["ALL_MOUNTS", "LARGEST", "Largest", "Observability", "bounds_of_fans", "observability"]
+__all__ = ["ALL_MOUNTS", "LARGEST", "MotionStd", "Observability", "bounds_of_fans", "observability"]
 
 ALL_MOUNTS = "all mounts"
 """Name of the sum over all mounts of an instrument."""
@@ -36,8 +36,8 @@ LEAST_SHARE = 0.05
 
 
 @dataclass(frozen=True)
-class Largest:
-    """The largest standard deviation that counts as an observation.
+class MotionStd:
+    """Standard deviations of a motion: of its lengths and of its angles.
 
     Attributes:
         length_m: of sideways, forward and rise [m].
@@ -53,7 +53,7 @@ class Largest:
     def __post_init__(self) -> None:
         if not (0 < self.length_m < np.inf and 0 < self.angle_rad < np.inf):
             raise MitsonarError(
-                "the largest standard deviations must be above 0 and finite: got "
+                "standard deviations of a motion must be above 0 and finite: got "
                 f"{self.length_m:g} m and {np.degrees(self.angle_rad):g} deg"
             )
 
@@ -62,7 +62,8 @@ class Largest:
         return np.array([self.length_m if "[m]" in DEGREES[name] else self.angle_rad for name in degrees])
 
 
-LARGEST = Largest()
+LARGEST = MotionStd()
+"""The largest standard deviations that count as an observation."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ class Observability:
         return tuple(names)
 
 
-def observability(bound: Bound, degrees: Sequence[str], *, largest: Largest = LARGEST, frames: int = 2) -> Observability:
+def observability(bound: Bound, degrees: Sequence[str], *, largest: MotionStd = LARGEST, frames: int = 2) -> Observability:
     """Return the directions of a motion and how well each can be known.
 
     Args:

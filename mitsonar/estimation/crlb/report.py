@@ -15,7 +15,7 @@ from mitsonar.datasets.make import SceneRenderer
 from mitsonar.datasets.store import DataStore, frames_in_part, world_numbers
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.estimation.crlb.image import Bound, bounds_at, laws_of, overall, varied
-from mitsonar.estimation.crlb.observability import LARGEST, Largest, bounds_of_fans, observability
+from mitsonar.estimation.crlb.observability import LARGEST, MotionStd, bounds_of_fans, observability
 from mitsonar.estimation.estimator import PlainTable
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import Sounder
@@ -80,7 +80,7 @@ class BoundOptions:
     gain: float | None = None
     pings: int | None = None
     degrees: tuple[str, ...] = PLANAR
-    largest: Largest = LARGEST
+    largest: MotionStd = LARGEST
 
     def __post_init__(self) -> None:
         load_noise(self.noise or "none")
