@@ -10,7 +10,9 @@ along itself, the three smoothings would differ, and a motion that is almost uno
 appear observable. Each ping is therefore also displaced along the other axes, evenly within their boxes. All derivatives
 are then derivatives of the same function.
 
-The motion has three degrees of freedom by default, or any of the six of :data:`mitsonar.motion.composition.DEGREES`.
+The motion has three degrees of freedom by default, or any of the six of :data:`mitsonar.motion.composition.DEGREES`. Some
+combinations of six hardly change a frame, such as a rise with a pitch and a motion ahead: their derivatives drown in the
+noise of the rays, unless the step along them is longer. Steps may therefore lie along any directions (`basis`).
 """
 
 from __future__ import annotations
@@ -85,6 +87,7 @@ def differentiate(
     first: int = FIRST_PING,
     degrees: Sequence[str] = PLANAR,
     mount: Pose | None = None,
+    basis: NDArray[np.float64] | None = None,
 ) -> Iterator[list[Derivative]]:
     """Estimate the derivatives at each pose, one for each view of the simulator.
 
@@ -101,6 +104,8 @@ def differentiate(
         degrees: names of the k degrees of freedom.
         mount: pose of the sonar in the axes of a vehicle, to which ``poses`` and motions then belong; None: the poses are
             those of the sonar.
+        basis: directions of the steps ``(k, k)``, one a column, in the order of ``degrees`` [m, rad]; ``step`` is then in
+            multiples of each. None: along the degrees of freedom. The derivatives are by these in any case.
 
     Yields:
         The derivatives at each pose, one for each view.
@@ -117,7 +122,15 @@ def differentiate(
     for number, pose in enumerate(table):
         steps = steps_for(source.sonar, degrees) if step is None else np.array(step, dtype=float)
         yield _derivatives_at(
-            source, Pose.from_row(pose), gain, pings, steps, first + 2 * pings * number, degrees=degrees, mount=mount
+            source,
+            Pose.from_row(pose),
+            gain,
+            pings,
+            steps,
+            first + 2 * pings * number,
+            degrees=degrees,
+            mount=mount,
+            basis=basis,
         )
 
 
@@ -158,6 +171,7 @@ def _derivatives_at(
     *,
     degrees: Sequence[str],
     mount: Pose | None,
+    basis: NDArray[np.float64] | None,
 ) -> list[Derivative]:
     """Render both sides of each step, in two halves, and return one derivative for each view."""
     # both sides of a step render the same ping numbers, hence the same jitter, at motions that differ along one axis only
@@ -167,12 +181,12 @@ def _derivatives_at(
         for side in (0, 1):
             motions = within.copy()
             motions[:, axis] = (2 * side - 1) * step[axis]
-            moved = moved_poses(pose, motions, degrees, mount)
+            moved = moved_poses(pose, motions if basis is None else motions @ basis.T, degrees, mount)
             for views in source.render_views(moved, first=first):
                 sums = sums or [_Sums.empty(*batch.levels.shape[1:], len(step)) for batch in views]
                 for total, batch in zip(sums, views, strict=True):
                     total.add(batch.levels, np.arange(len(batch)) + batch.first - first >= pings, gain, axis, side)
-    return [total.derivative(pings, step) for total in sums]
+    return [total.derivative(pings, step, basis) for total in sums]
 
 
 def evenly(count: int, axes: int = 3) -> NDArray[np.float64]:
@@ -210,9 +224,12 @@ class _Sums:
             self.totals[half, axis, side, 1] += (image > 0).sum(axis=0)
             self.squares += np.einsum("pij,pij->ij", image, image, dtype=np.float64)
 
-    def derivative(self, pings: int, step: NDArray[np.float64]) -> Derivative:
+    def derivative(self, pings: int, step: NDArray[np.float64], basis: NDArray[np.float64] | None) -> Derivative:
         """Compute differences over twice the steps, and means over all sides."""
         level, filled = self.totals.mean(axis=(0, 1, 2)) / pings
         jacobian = (self.totals[:, :, 1] - self.totals[:, :, 0]) / pings / (2 * step)[:, None, None, None]
         variance = np.maximum(self.squares / (4 * len(step) * pings) - level**2, 0.0)
-        return Derivative(level, filled, variance, np.moveaxis(jacobian, (1, 2), (4, 3)).astype(np.float32), pings)
+        jacobian = np.moveaxis(jacobian, (1, 2), (4, 3))
+        if basis is not None:
+            jacobian = jacobian @ np.linalg.inv(basis)
+        return Derivative(level, filled, variance, jacobian.astype(np.float32), pings)

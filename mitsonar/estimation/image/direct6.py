@@ -15,17 +15,18 @@ The assumed pose has a Gaussian error of given size. Directions that the frame c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, expected_values
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.crlb.image import Bound, fisher, pixel_terms
+from mitsonar.estimation.crlb.image import Bound, balanced_steps, fisher, pixel_terms
 from mitsonar.estimation.crlb.observability import MotionStd, Observability, observability
 from mitsonar.motion.composition import DEGREES, compose_six, six_between
 from mitsonar.motion.pose import Pose
-from mitsonar.simulation.derivatives import FIRST_PING, STEP, Derivative, differentiate, jittered, steps_for
+from mitsonar.simulation.derivatives import FIRST_PING, Derivative, differentiate, jittered, steps_for
 from mitsonar.simulation.simulator import Simulator
 
 __all__ = ["Direct6", "RegisteredPose", "SixMotion"]
@@ -35,8 +36,8 @@ NAMES = tuple(DEGREES)
 
 GREYS = 255
 
-PARTS = (32 * STEP, 8 * STEP, 2 * STEP, STEP)
-"""Steps of the derivatives, from coarse to fine, as a fraction of a bin and of a beam."""
+COARSE = (1.0, 0.25)
+"""Steps of the coarse derivatives, as a fraction of the standard deviations of the assumed pose."""
 
 COARSE_PINGS = 4
 """Factor of pings by which coarse derivatives have fewer than the finest."""
@@ -203,16 +204,17 @@ class Direct6:
             )
         if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
             raise MitsonarError("values of a frame must be finite and in 0..1: divide grey values by 255")
-        pose, steps = start, 0
-        for part in PARTS:
-            reach = steps_for(sonar, NAMES, max(1.0, LONGEST_STEP * part))
-            derivative = self._derivative(pose, part, steps)
+        pose, steps, bound = start, 0, None
+        for part in (*COARSE, None):
+            derivative = self._derivative(pose, part, steps, bound)
+            reach = steps_for(sonar, NAMES, 1.0) if part is None else LONGEST_STEP * part * self.start_std.of(NAMES)
             level, filled = derivative.level, derivative.filled
             for iteration in range(ITERATIONS):
                 # the derivatives of one pose serve all steps of a size; the expected frame is rendered anew
                 if iteration:
                     level, filled = self._means(pose, steps)
                 linear = self._linearised(values, derivative, level, filled)
+                bound = linear.bound
                 change = linear.step(six_between(pose, start), self.start_std)
                 change /= max(1.0, float((np.abs(change) / reach).max()))
                 pose, steps = compose_six(pose, change), steps + 1
@@ -224,11 +226,22 @@ class Direct6:
             reason = f"the frame differs from the scene by {np.sqrt(linear.misfit):.3g} standard deviations of its pixels"
         return RegisteredPose(pose, linear.covariance(self.start_std), shown, linear.misfit, steps, reason)
 
-    def _derivative(self, pose: Pose, part: float, number: int) -> Derivative:
-        """Differentiate the expected frame at a pose; ``number`` chooses the pings."""
-        pings = self.pings if part == PARTS[-1] else -(-self.pings // COARSE_PINGS)
-        step, first = steps_for(self.simulator.sonar, NAMES, part), self._first(number)
-        return next(differentiate(self.simulator, pose, self.gain, pings=pings, step=step, first=first, degrees=NAMES))[0]
+    def _derivative(self, pose: Pose, part: float | None, number: int, bound: Bound | None) -> Derivative:
+        """Differentiate the expected frame at a pose.
+
+        Args:
+            pose: where.
+            part: one of :data:`COARSE`; None: the finest steps.
+            number: chooses the pings.
+            bound: a first bound, which balances the finest steps.
+        """
+        along: dict[str, Any] = {"degrees": NAMES, "first": self._first(number)}
+        if part is not None:
+            step, pings = part * self.start_std.of(NAMES), -(-self.pings // COARSE_PINGS)
+            return next(differentiate(self.simulator, pose, self.gain, pings=pings, step=step, **along))[0]
+        assert bound is not None
+        basis, step = balanced_steps(bound, self.simulator.sonar, NAMES)
+        return next(differentiate(self.simulator, pose, self.gain, pings=self.pings, step=step, basis=basis, **along))[0]
 
     def _means(self, pose: Pose, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the mean level and the fraction of filled pings of each pixel at a pose ``(bins, beams)``."""
