@@ -503,6 +503,7 @@ def crlb(
     With --degrees 6 the scene is known in all six degrees of freedom, in level axes; directions that two frames cannot show
     are named. With --instrument the information of all fans adds up: fans on several mounts, or the rows of a 3-D sonar.
     """
+    from mitsonar.estimation.crlb.image import LARGEST
     from mitsonar.estimation.crlb.report import (
         BoundOptions,
         bounds_report,
@@ -510,9 +511,8 @@ def crlb(
         subject_of_data,
         subject_of_scene,
     )
-    from mitsonar.estimation.crlb.observability import LARGEST, MotionStd
     from mitsonar.instruments.sounder import load_sounder
-    from mitsonar.motion.composition import degrees_named
+    from mitsonar.motion.composition import MotionStd, degrees_named
     from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.scene import load_scene
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ __all__ = [
     "PLANAR",
     "Motion",
     "MotionPrior",
+    "MotionStd",
     "compose",
     "compose_six",
     "degrees_named",
@@ -199,6 +201,33 @@ def steered(poses: ArrayLike, velocity: ArrayLike, step_s: float) -> NDArray[np.
 
 
 # ---------------- Priors
+
+
+@dataclass(frozen=True)
+class MotionStd:
+    """Standard deviations of a motion: of its lengths and of its angles.
+
+    Attributes:
+        length_m: of sideways, forward and rise [m].
+        angle_rad: of pitch, roll and yaw [rad].
+
+    Raises:
+        MitsonarError: one is not above 0.
+    """
+
+    length_m: float = 0.1
+    angle_rad: float = field(default=float(np.radians(5)))
+
+    def __post_init__(self) -> None:
+        if not (0 < self.length_m < np.inf and 0 < self.angle_rad < np.inf):
+            raise MitsonarError(
+                "standard deviations of a motion must be above 0 and finite: got "
+                f"{self.length_m:g} m and {np.degrees(self.angle_rad):g} deg"
+            )
+
+    def of(self, degrees: Sequence[str]) -> NDArray[np.float64]:
+        """Return them by degree of freedom ``(k,)`` [m, rad]."""
+        return np.array([self.length_m if "[m]" in DEGREES[name] else self.angle_rad for name in degrees])
 
 
 class MotionPrior(NamedTuple):

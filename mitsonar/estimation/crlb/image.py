@@ -1,7 +1,7 @@
 """How well any unbiased estimator can know a motion from images: the Cramer-Rao lower bound for a known scene.
 
-No unbiased estimator of the motion (sideways, forward, yaw, or more degrees of freedom) has a covariance below the inverse of the Fisher information
-F = J' W J. J is the derivative of the pixels by the motion, W the information of a noisy pixel
+No unbiased estimator of the motion (sideways, forward, yaw, or more degrees of freedom) has a covariance below the inverse of
+the Fisher information F = J' W J. J is the derivative of the pixels by the motion, W the information of a noisy pixel
 (:mod:`mitsonar.acoustics.noise`). The bound is that of an oracle that has the renderer and knows the scene, its height and
 the frames without noise.
 
@@ -26,7 +26,7 @@ from mitsonar.acoustics.speckle import rician_information, score_components
 from mitsonar.errors import MitsonarError, suggest_names
 from mitsonar.instruments.sonar import Quality, Sonar
 from mitsonar.instruments.views import Segment, directions
-from mitsonar.motion.composition import PLANAR
+from mitsonar.motion.composition import PLANAR, MotionStd
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.simulation.derivatives import (
     FIRST_PING,
@@ -47,15 +47,16 @@ if TYPE_CHECKING:
 __all__ = [
     "ALL",
     "KINDS",
+    "LARGEST",
     "LAWS",
     "SPECKLE_LAWS",
     "VARIABLES",
     "Bound",
-    "balanced_steps",
     "CellCorrelation",
     "CellScores",
     "ScoreCovariance",
     "SpeckleBounds",
+    "balanced_steps",
     "bound",
     "bounds_at",
     "bounds_of_views",
@@ -65,6 +66,7 @@ __all__ = [
     "fisher_by",
     "floor_ranges",
     "grain_law",
+    "is_decided",
     "laws_of",
     "overall",
     "pixel_terms",
@@ -96,6 +98,9 @@ VARIABLES = {
 FLOOR_MOVING_VARIABLES = ("height_m", "pitch_deg", "azimuth_fov_deg", "elevation_fov_deg")
 """Variables that move the floor out of the window."""
 
+
+LARGEST = MotionStd()
+"""The largest standard deviations that count as an observation."""
 
 LONGEST_STEP = 0.25
 """Longest step of a derivative along directions that hardly change a frame, in bins and beams.
@@ -256,9 +261,15 @@ def bounds_at(
                 first_time, along = not along, {"basis": basis, "step": step}
                 if first_time:
                     continue  # the first bound only balances the steps
-            if all(np.isfinite(one.std()).all() for one in images):
+            if all(is_decided(one, degrees) if six else np.isfinite(one.std()).all() for one in images):
                 break
         yield bounds
+
+
+def is_decided(bound: Bound, degrees: Sequence[str]) -> bool:
+    """Return whether each direction of a motion is observable, or is not by :data:`LARGEST`, despite the rays' noise."""
+    size, _, significant = bound.directions(LARGEST.of(degrees))
+    return bool(((size > significant) | (np.maximum(size, 0.0) + significant < 1)).all())
 
 
 def balanced_steps(
@@ -266,8 +277,8 @@ def balanced_steps(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return directions ``(k, k)`` and steps ``(k,)`` of derivatives that change a frame by about as much each.
 
-    The directions are the eigenvectors of the information, in units of bins and beams. The best known one has the usual step.
-    That of others is longer as their information is smaller, up to :data:`LONGEST_STEP` bins or beams.
+    The directions are the eigenvectors of the information, in units of bins and beams. The best known one has the usual
+    step. That of others is longer as their information is smaller, up to :data:`LONGEST_STEP` bins or beams.
 
     Args:
         bound: a first bound.
@@ -313,8 +324,8 @@ def cramer_rao_bound(
         degrees: names of the k degrees of freedom of the motion, of :data:`mitsonar.motion.composition.DEGREES`.
 
     Returns:
-        Sideways, forward [m] and yaw [rad], or the other ``degrees`` ``(n, k)``; 0 where only rounding separates a pixel from its level, inf where an
-        axis cannot be observed.
+        Sideways, forward [m] and yaw [rad], or the other ``degrees`` ``(n, k)``; 0 where only rounding separates a pixel from
+        its level, inf where an axis cannot be observed.
 
     Raises:
         MitsonarError: unknown names; several portions that overlap, and none named; noise of pixels with speckle.
@@ -766,10 +777,19 @@ class SpeckleBounds:
             pings: see :meth:`at_poses`.
             first: number of the first ping, which determines the rays' jitter.
         """
+        scores = self._ground(pose, pings, first, {})
+        if tuple(self.degrees) != PLANAR:
+            # the first bound only balances the steps
+            basis, step = balanced_steps(scores.bound(), self.sonar, self.degrees)
+            scores = self._ground(pose, pings, first, {"basis": basis, "step": step})
+        return scores
+
+    def _ground(self, pose: Floats, pings: int | None, first: int, along: dict[str, Any]) -> CellScores:
+        """Return :meth:`ground` with steps of the derivatives along given directions."""
         # expected level and derivative, scaled well below clipping
         place = self._places(pose, np.zeros((1, len(self.degrees))))
         gain = 0.01 / float(next(self.expected.pings(place, first=first)).levels.max())
-        motion: dict[str, Any] = {"degrees": self.degrees, "mount": self.mount}
+        motion: dict[str, Any] = {"degrees": self.degrees, "mount": self.mount} | along
         (derivative,) = next(differentiate(self.expected, pose, gain, pings=pings or GROUND_PINGS, first=first, **motion))
         level = derivative.level + self.noise * self.imager.gain[:, None] * gain
         known = (level > 0) & (derivative.variance < (MAX_RELATIVE_DEVIATION * level) ** 2)

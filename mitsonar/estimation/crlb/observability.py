@@ -9,16 +9,15 @@ turn, and then neither is observable, though one combination of them is.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
-from mitsonar.errors import MitsonarError
-from mitsonar.estimation.crlb.image import Bound, SpeckleBounds, bounds_at, together
-from mitsonar.motion.composition import DEGREES
+from mitsonar.estimation.crlb.image import LARGEST, Bound, SpeckleBounds, bounds_at, is_decided, together
+from mitsonar.motion.composition import DEGREES, MotionStd
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.derivatives import PINGS
 
@@ -26,44 +25,13 @@ if TYPE_CHECKING:
     from mitsonar.instruments.sounder import Sounder
     from mitsonar.simulation.simulator import Simulator
 
-__all__ = ["ALL_MOUNTS", "LARGEST", "MotionStd", "Observability", "bounds_of_fans", "observability"]
+__all__ = ["ALL_MOUNTS", "LARGEST", "Observability", "bounds_of_fans", "observability"]
 
 ALL_MOUNTS = "all mounts"
 """Name of the sum over all mounts of an instrument."""
 
 LEAST_SHARE = 0.05
 """Smallest share of a degree of freedom in a direction that is named after it."""
-
-
-@dataclass(frozen=True)
-class MotionStd:
-    """Standard deviations of a motion: of its lengths and of its angles.
-
-    Attributes:
-        length_m: of sideways, forward and rise [m].
-        angle_rad: of pitch, roll and yaw [rad].
-
-    Raises:
-        MitsonarError: one is not above 0.
-    """
-
-    length_m: float = 0.1
-    angle_rad: float = field(default=float(np.radians(5)))
-
-    def __post_init__(self) -> None:
-        if not (0 < self.length_m < np.inf and 0 < self.angle_rad < np.inf):
-            raise MitsonarError(
-                "standard deviations of a motion must be above 0 and finite: got "
-                f"{self.length_m:g} m and {np.degrees(self.angle_rad):g} deg"
-            )
-
-    def of(self, degrees: Sequence[str]) -> NDArray[np.float64]:
-        """Return them by degree of freedom ``(k,)`` [m, rad]."""
-        return np.array([self.length_m if "[m]" in DEGREES[name] else self.angle_rad for name in degrees])
-
-
-LARGEST = MotionStd()
-"""The largest standard deviations that count as an observation."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +82,7 @@ class Observability:
             names += [name for name, within in zip(self.degrees, pure, strict=True) if within]
             mixed = np.flatnonzero((share > LEAST_SHARE) & ~pure)
             if pure.sum() < len(columns) and len(mixed):
-                names.append(" and ".join(self.degrees[k] for k in mixed[np.argsort(-share[mixed], kind="stable")]))
+                names.append(" and ".join(self.degrees[k] for k in mixed[np.argsort(-share[mixed].round(2), kind="stable")]))
         return tuple(names)
 
 
@@ -157,8 +125,8 @@ def bounds_of_fans(
         noise: noise of the pixels.
         gain: gain of the frames.
         degrees: names of the k degrees of freedom of the motion.
-        pings: pings of each half of the derivatives; default: 8, then 32 and 128 while it is undecided whether an axis can be
-            observed by all fans together; for the model ``coherent`` as for one sonar.
+        pings: pings of each half of the derivatives; default: 8, then 32 and 128 while it is undecided what all fans together
+            can observe; for the model ``coherent`` as for one sonar.
     """
     mounts = [Pose.from_row(row) for row in sounder.mount_poses.tolist()]
     names = [mount for mount in sounder.mounts for _ in range(sounder.rows)]
@@ -177,7 +145,7 @@ def bounds_of_fans(
             sums = _sums([{key[1:]: bound for key, bound in fan.items()} for fan in views], names)
             whole = names[0] if len(sounder.mounts) == 1 else ALL_MOUNTS
             images = [one for (mount, kind, _), one in sums.items() if (mount, kind) == (whole, "image")]
-            if all(one is None or np.isfinite(one.std()).all() for one in images):
+            if all(one is None or is_decided(one, degrees) for one in images):
                 break
         yield sums
 

@@ -14,13 +14,13 @@ from mitsonar.config.data import MirrorKeys
 from mitsonar.datasets.make import SceneRenderer
 from mitsonar.datasets.store import DataStore, frames_in_part, world_numbers
 from mitsonar.errors import MitsonarError, argument
-from mitsonar.estimation.crlb.image import Bound, bounds_at, laws_of, overall, varied
-from mitsonar.estimation.crlb.observability import LARGEST, MotionStd, bounds_of_fans, observability
+from mitsonar.estimation.crlb.image import LARGEST, Bound, bounds_at, laws_of, overall, varied
+from mitsonar.estimation.crlb.observability import bounds_of_fans, observability
 from mitsonar.estimation.estimator import PlainTable
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.instruments.views import Segment, View, Whole
-from mitsonar.motion.composition import DEGREES, PLANAR
+from mitsonar.motion.composition import DEGREES, PLANAR, MotionStd
 from mitsonar.simulation.device import release_memory
 from mitsonar.simulation.pings import CALIBRATION_FRAMES, RenderedPings, constant_gain
 from mitsonar.simulation.simulator import Simulator

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, expected_values
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.image import Bound, balanced_steps, fisher, pixel_terms
-from mitsonar.estimation.crlb.observability import MotionStd, Observability, observability
-from mitsonar.motion.composition import DEGREES, compose_six, six_between
+from mitsonar.estimation.crlb.observability import Observability, observability
+from mitsonar.motion.composition import DEGREES, MotionStd, compose_six, six_between
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.derivatives import FIRST_PING, Derivative, differentiate, jittered, steps_for
 from mitsonar.simulation.simulator import Simulator
@@ -136,8 +136,8 @@ class Direct6:
         pings: pings of each half of the finest derivatives.
 
     Raises:
-        MitsonarError: the model ``coherent``, whose speckle a known scene does not predict; several views; a gain that is not
-            above 0, or no pings.
+        MitsonarError: the model ``coherent``, whose speckle a known scene does not predict; several views; a gain that is
+            not above 0, or no pings.
     """
 
     simulator: Simulator
