@@ -51,7 +51,7 @@ SETTLED = 0.2
 LONGEST_STEP = 2.0
 """Longest motion of a step, in steps of coarse derivatives, which hold no farther; of fine ones it is a bin or a beam."""
 
-LARGEST_MISFIT = 2.0
+LARGEST_MISFIT = 1.4
 """Largest mean of the squared whitened differences of a valid pose; 1 is expected."""
 
 START_STD = MotionStd(0.02, float(np.radians(1)))
