@@ -193,7 +193,8 @@ def fan_bound(scene: mi.Scene, sonar: Sonar, pings: int | None) -> Bound | None:
 def sounder_bound(scene: mi.Scene, sounder: Sounder, pings: int | None) -> Bound | None:
     """Return the bound of all fans of an instrument."""
     simulator, pose = Simulator(scene, sounder.fan), np.array([VEHICLE], dtype=float)
-    gain = gain_of(simulator, sounder.fan_poses(pose).reshape(-1, 6))
+    fans = sounder.fan_poses(pose)[0]
+    gain = gain_of(simulator, fans if sounder.rows > 1 else fans[:1])  # bright echoes of a second fan are clipped
     bounds = next(bounds_of_fans(simulator, sounder, pose, LOW, gain, degrees=NAMES, pings=pings))
     return next(one for (_, kind, law), one in bounds.items() if (kind, law) == ("image", "gaussian"))
 

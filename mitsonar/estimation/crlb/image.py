@@ -1,7 +1,7 @@
 """How well any unbiased estimator can know a motion from images: the Cramer-Rao lower bound for a known scene.
 
-No unbiased estimator of the motion (sideways, forward, yaw, or more degrees of freedom) has a covariance below the inverse of
-the Fisher information F = J' W J. J is the derivative of the pixels by the motion, W the information of a noisy pixel
+No unbiased estimator of the motion (sideways, forward, yaw, or more degrees of freedom) has a covariance below the inverse
+of the Fisher information F = J' W J. J is the derivative of the pixels by the motion, W the information of a noisy pixel
 (:mod:`mitsonar.acoustics.noise`). The bound is that of an oracle that has the renderer and knows the scene, its height and
 the frames without noise.
 
@@ -324,8 +324,8 @@ def cramer_rao_bound(
         degrees: names of the k degrees of freedom of the motion, of :data:`mitsonar.motion.composition.DEGREES`.
 
     Returns:
-        Sideways, forward [m] and yaw [rad], or the other ``degrees`` ``(n, k)``; 0 where only rounding separates a pixel from
-        its level, inf where an axis cannot be observed.
+        Sideways, forward [m] and yaw [rad], or the other ``degrees`` ``(n, k)``; 0 where only rounding separates a pixel
+        from its level, inf where an axis cannot be observed.
 
     Raises:
         MitsonarError: unknown names; several portions that overlap, and none named; noise of pixels with speckle.

@@ -125,8 +125,8 @@ def bounds_of_fans(
         noise: noise of the pixels.
         gain: gain of the frames.
         degrees: names of the k degrees of freedom of the motion.
-        pings: pings of each half of the derivatives; default: 8, then 32 and 128 while it is undecided what all fans together
-            can observe; for the model ``coherent`` as for one sonar.
+        pings: pings of each half of the derivatives; default: 8, then 32 and 128 while it is undecided what all fans
+            together can observe; for the model ``coherent`` as for one sonar.
     """
     mounts = [Pose.from_row(row) for row in sounder.mount_poses.tolist()]
     names = [mount for mount in sounder.mounts for _ in range(sounder.rows)]
