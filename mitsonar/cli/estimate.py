@@ -500,8 +500,8 @@ def crlb(
     With --vary the gain is computed for each value. If height, pitch or a field of view varies, both ends of the range
     window follow the nearest and farthest range of the floor. The number of bins stays.
 
-    With --degrees 6 the scene is known in all six degrees of freedom, in level axes; directions that two frames cannot show
-    are named. With --instrument the information of all fans adds up: fans on several mounts, or the rows of a 3-D sonar.
+    With --degrees 6 the motion has all six degrees of freedom, in level axes, and directions that two frames cannot show are
+    named. With --instrument the information of all fans adds up: fans on several mounts, or the rows of a 3-D sonar.
     """
     from mitsonar.estimation.crlb.image import LARGEST
     from mitsonar.estimation.crlb.report import (

@@ -83,7 +83,7 @@ def differentiate(
     gain: float,
     *,
     pings: int = PINGS,
-    step: Sequence[float] | None = None,
+    step: ArrayLike | None = None,
     first: int = FIRST_PING,
     degrees: Sequence[str] = PLANAR,
     mount: Pose | None = None,
