@@ -32,7 +32,17 @@ and their speed drifts: compare times within a table only.
 SECTIONS = (
     *("rendering", "several-reflections", "coherent-ping", "live", "realism", "blind-sorting", "recordings", "data-sets"),
     *("odometry", "hulls", "certainty", "any-start", "loops", "long-run", "odometry-benchmark", "dives", "registration"),
-    *("trajectories", "limit", "six-degrees", "exactness", "speckle", "networks", "unseen-scenes", "table-31", "impulse-responses"),
+    *(
+        "trajectories",
+        "limit",
+        "six-degrees",
+        "exactness",
+        "speckle",
+        "networks",
+        "unseen-scenes",
+        "table-31",
+        "impulse-responses",
+    ),
     *("vectors", "house"),
 )
 """Files of results, in the order of the page."""

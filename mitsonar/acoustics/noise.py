@@ -305,7 +305,7 @@ def expected_values(
     echo = np.divide(level, filled, out=np.zeros_like(level), where=filled > 0)
     if noise.scale == 0:
         empty, _ = _clipped_gaussian(noise.mean, noise.std)
-        return (filled * np.minimum(echo, 1.0) + (1 - filled) * empty).reshape(shape)
+        return np.asarray(filled * np.minimum(echo, 1.0) + (1 - filled) * empty).reshape(shape)
     value, mean = np.arange(greys + 1) / greys, np.zeros(len(level))
     empty = float(noise.grey_of_empty(greys) @ value)
     for k in range(0, len(level), CHUNK):

@@ -183,7 +183,7 @@ def _derivatives_at(
             motions[:, axis] = (2 * side - 1) * step[axis]
             moved = moved_poses(pose, motions if basis is None else motions @ basis.T, degrees, mount)
             for views in source.render_views(moved, first=first):
-                sums = sums or [_Sums.empty(*batch.levels.shape[1:], len(step)) for batch in views]
+                sums = sums or [_Sums.empty(len(step), *batch.levels.shape[1:]) for batch in views]
                 for total, batch in zip(sums, views, strict=True):
                     total.add(batch.levels, np.arange(len(batch)) + batch.first - first >= pings, gain, axis, side)
     return [total.derivative(pings, step, basis) for total in sums]
@@ -213,7 +213,7 @@ class _Sums:
     squares: NDArray[np.float64]
 
     @classmethod
-    def empty(cls, bins: int, beams: int, axes: int) -> _Sums:
+    def empty(cls, axes: int, bins: int, beams: int) -> _Sums:
         return cls(np.zeros((2, axes, 2, 2, bins, beams)), np.zeros((bins, beams)))
 
     def add(self, levels: NDArray[np.float32], second: NDArray[np.bool_], gain: float, axis: int, side: int) -> None:

@@ -2,8 +2,8 @@
 
 The eigenvectors of the Fisher information are directions of motion whose least standard deviations are independent. Metres
 and radians are compared by a largest standard deviation of each: a direction that exceeds it is not observable, as is one
-about which the images hold nothing. Either may mix degrees of freedom: a narrow fan hardly tells a sideways motion from a
-turn, and then neither is observable, though one combination of them is.
+about which the images hold nothing. Either may mix degrees of freedom: a narrow fan hardly separates sideways motion from
+yaw, and then neither is observable, though one combination of them is.
 """
 
 from __future__ import annotations

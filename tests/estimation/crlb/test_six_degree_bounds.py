@@ -203,11 +203,11 @@ def test_information_of_fans_adds_up() -> None:
     rows = Sounder(kind="range-image", fan=fan.replace(elevation_fov_deg=7.0), mounts={"ahead": LEVEL}, rows=2)
     stack = next(bounds_of_fans(source, rows, [VEHICLE], LOW, gain, pings=4))
     assert {key[0] for key in stack} == {"ahead"}
-    each = [
-        next(bounds_at(source, [VEHICLE], LOW, gain, pings=4, degrees=SIX, mount=Pose.from_row(row)))
-        for row in rows.mount_poses.tolist()
-    ]
-    total = sum(one["image", "image", "gaussian"].information for one in each)  # type: ignore[union-attr]
+    each = []
+    for row in rows.mount_poses.tolist():
+        bounds = next(bounds_at(source, [VEHICLE], LOW, gain, pings=4, degrees=SIX, mount=Pose.from_row(row)))
+        each.append(bounds["image", "image", "gaussian"].information)  # type: ignore[union-attr]
+    total = np.sum(each, axis=0)
     np.testing.assert_allclose(stack["ahead", "image", "gaussian"].information, total)  # type: ignore[union-attr]
 
 
