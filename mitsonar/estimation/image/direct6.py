@@ -134,6 +134,8 @@ class Direct6:
         noise: noise of the pixels.
         start_std: standard deviations of the assumed poses.
         pings: pings of each half of the finest derivatives.
+        ray_noise: whether the frames have the noise of the rays of a single ping, as rendered ones; means of many pings and
+            frames of a real sonar do not.
 
     Raises:
         MitsonarError: the model ``coherent``, whose speckle a known scene does not predict; several views; a gain that is
@@ -145,6 +147,7 @@ class Direct6:
     noise: NoiseModel = NOISE_MODELS["none"]
     start_std: MotionStd = START_STD
     pings: int = 32
+    ray_noise: bool = True
 
     def __post_init__(self) -> None:
         if self.simulator.sonar.model == "coherent":
@@ -213,7 +216,8 @@ class Direct6:
                 # the derivatives of one pose serve all steps of a size; the expected frame is rendered anew
                 if iteration:
                     level, filled = self._means(pose, steps)
-                linear = self._linearised(values, derivative, level, filled)
+                # details that coarse steps smooth away count as noise of the rays
+                linear = self._linearised(values, derivative, level, filled, rays=part is not None or self.ray_noise)
                 bound = linear.bound
                 change = linear.step(six_between(pose, start), self.start_std)
                 change /= max(1.0, float((np.abs(change) / reach).max()))
@@ -255,13 +259,19 @@ class Direct6:
         return FIRST_PING + 2 * self.pings * number
 
     def _linearised(
-        self, values: NDArray[np.float64], derivative: Derivative, level: NDArray[np.float64], filled: NDArray[np.float64]
+        self,
+        values: NDArray[np.float64],
+        derivative: Derivative,
+        level: NDArray[np.float64],
+        filled: NDArray[np.float64],
+        *,
+        rays: bool,
     ) -> _Linearised:
         """Compare a frame with the expected one, of given level and filled pixels."""
         terms = pixel_terms(derivative, self.noise)
         changing = derivative.jacobian.any(axis=(0, 3, 4))
         # without noise and rounding a pixel would determine the motion without limit
-        variance = np.maximum(terms.information.variance + terms.rays, 1 / (12 * GREYS**2))
+        variance = np.maximum(terms.information.variance + (terms.rays if rays else 0), 1 / (12 * GREYS**2))
         expected = expected_values(self.noise, level[changing], filled[changing])
         difference = values[changing] - expected
         slope = np.einsum("nj,njk->nk", terms.information.slope, terms.jacobian.mean(axis=0))
