@@ -1,6 +1,6 @@
 """Six degrees of freedom: what instruments can observe over three seabeds, and how near `direct6` comes to the bound.
 
-    python benchmarks/bench_six_degrees.py [--only bounds,direct6] [--frames 20] [--json FILE]
+    python benchmarks/bench_six_degrees.py [--only bounds,direct6] [--frames 10] [--json FILE]
 
 *bounds*: the Cramer-Rao bound of two noisy frames of a known scene, of one fan, two crossed fans, a 3-D sonar, a fan in
 speckle, and of hydrophones over level ground of unknown scatterers. *direct6*: frames with noise, from poses that are off by
@@ -56,7 +56,7 @@ START = MotionStd(0.01, float(np.radians(0.5)))
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="bounds,direct6", help="parts, separated by commas")
-    parser.add_argument("--frames", type=int, default=20, help="frames of direct6 over each seabed")
+    parser.add_argument("--frames", type=int, default=10, help="frames of direct6 over each seabed")
     parser.add_argument("--json", type=Path, help="file to write the rows to")
     parser.add_argument("--quick", action="store_true", help="coarse sonars, and one frame: within a minute")
     arguments = parser.parse_args()

@@ -39,6 +39,9 @@ GREYS = 255
 COARSE = (1.0, 0.25)
 """Steps of the coarse derivatives, as a fraction of the standard deviations of the assumed pose."""
 
+FINE = (None, None)
+"""Rounds of the finest steps: sharp edges need the derivatives of a pose that is nearly the right one."""
+
 COARSE_PINGS = 4
 """Factor of pings by which coarse derivatives have fewer than the finest."""
 
@@ -208,7 +211,7 @@ class Direct6:
         if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
             raise MitsonarError("values of a frame must be finite and in 0..1: divide grey values by 255")
         pose, steps, bound = start, 0, None
-        for part in (*COARSE, None):
+        for part in (*COARSE, *FINE):
             derivative = self._derivative(pose, part, steps, bound)
             reach = steps_for(sonar, NAMES, 1.0) if part is None else LONGEST_STEP * part * self.start_std.of(NAMES)
             level, filled = derivative.level, derivative.filled
