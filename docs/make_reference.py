@@ -69,6 +69,7 @@ GROUPS = {
         "build_mosaic",
         "MosaicOptions",
         "cramer_rao_bound",
+        "estimation.image.direct6.Direct6",
         "load_checkpoint",
     ),
     "Data sets": (

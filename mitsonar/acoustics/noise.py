@@ -27,6 +27,7 @@ __all__ = [
     "NOISE_MODELS",
     "Information",
     "NoiseModel",
+    "expected_values",
     "format_snr",
     "information",
     "information_of_sums",
@@ -293,6 +294,24 @@ def information(noise: NoiseModel, level: ArrayLike, filled: ArrayLike = 1.0, *,
     parts = [_exact(noise, echo[k : k + CHUNK], filled[k : k + CHUNK], greys) for k in range(0, max(len(level), 1), CHUNK)]
     law, slope, variance = (np.concatenate(part) for part in zip(*parts, strict=True))
     return Information(law.reshape(*shape, 2, 2), slope.reshape(*shape, 2), variance.reshape(shape))
+
+
+def expected_values(
+    noise: NoiseModel, level: ArrayLike, filled: ArrayLike = 1.0, *, greys: int = 255
+) -> NDArray[np.float64]:
+    """Compute the mean of noisy, clipped pixels ``(...)``, stored as grey values; the arguments are as for `information`."""
+    level, filled = np.broadcast_arrays(np.asarray(level, dtype=float), np.asarray(filled, dtype=float))
+    shape, level, filled = level.shape, level.ravel(), filled.ravel()
+    echo = np.divide(level, filled, out=np.zeros_like(level), where=filled > 0)
+    if noise.scale == 0:
+        empty, _ = _clipped_gaussian(noise.mean, noise.std)
+        return np.asarray(filled * np.minimum(echo, 1.0) + (1 - filled) * empty).reshape(shape)
+    value, mean = np.arange(greys + 1) / greys, np.zeros(len(level))
+    empty = float(noise.grey_of_empty(greys) @ value)
+    for k in range(0, len(level), CHUNK):
+        part = slice(k, k + CHUNK)
+        mean[part] = filled[part] * (noise.grey_of_echo(echo[part], greys)[0] @ value) + (1 - filled[part]) * empty
+    return mean.reshape(shape)
 
 
 def _exact(

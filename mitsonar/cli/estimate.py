@@ -12,7 +12,17 @@ import numpy as np
 import typer
 
 from mitsonar.cli.console import answered, command_line, numbers, progress_bar, say, say_json, warn
-from mitsonar.cli.options import NOISE, SIX, Frame, Noise, instrument_for, path_for, scene_parameters, sonar_changes
+from mitsonar.cli.options import (
+    NOISE,
+    SIX,
+    Frame,
+    Noise,
+    instrument_for,
+    path_for,
+    scene_parameters,
+    sonar_changes,
+    under_vehicle,
+)
 from mitsonar.cli.side_scan import MosaicRequest, lay_side_scan, refuse_options, side_scan_at
 from mitsonar.errors import MitsonarError, count_noun, did_you_mean
 from mitsonar.io.files import write_atomic
@@ -458,8 +468,25 @@ def crlb(
     frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
     model: Annotated[str | None, typer.Option(help="Model of the echo level: coherent, physical or thesis.")] = None,
+    instrument: Annotated[
+        str | None,
+        typer.Option(
+            help="Instead of a sonar: an instrument of several fans, preset or YAML file, on a vehicle at the poses."
+        ),
+    ] = None,
     segments: Annotated[
         str | None, typer.Option(help="Portions of the view of a sonar that looks down: q1,q2,q3,q4.")
+    ] = None,
+    degrees: Annotated[
+        str,
+        typer.Option(
+            help="Degrees of freedom of the motion: 3 (sideways, forward, yaw), 6, or names of sideways, forward, rise, "
+            "pitch, roll, yaw, separated by commas."
+        ),
+    ] = "3",
+    largest: Annotated[
+        str | None,
+        typer.Option(help="M,DEG: largest standard deviations that count as an observation, with --degrees (0.1,5)."),
     ] = None,
     height: Annotated[
         float | None, typer.Option(help="Height over the ground [m]. The range window follows the floor.")
@@ -491,7 +518,11 @@ def crlb(
 
     With --vary the gain is computed for each value. If height, pitch or a field of view varies, both ends of the range
     window follow the nearest and farthest range of the floor. The number of bins stays.
+
+    With --degrees 6 the motion has all six degrees of freedom, in level axes, and directions that two frames cannot show are
+    named. With --instrument the information of all fans adds up: fans on several mounts, or the rows of a 3-D sonar.
     """
+    from mitsonar.estimation.crlb.image import LARGEST
     from mitsonar.estimation.crlb.report import (
         BoundOptions,
         bounds_report,
@@ -499,23 +530,47 @@ def crlb(
         subject_of_data,
         subject_of_scene,
     )
+    from mitsonar.instruments.sounder import load_sounder
+    from mitsonar.motion.composition import MotionStd, degrees_named
     from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.scene import load_scene
 
     name, values = _variable(vary)
-    options = BoundOptions(noise=noise, height_m=height, vary=name, values=values, gain=gain, pings=pings)
+    limits = numbers(largest, 2, "--largest")
+    options = BoundOptions(
+        noise=noise,
+        height_m=height,
+        vary=name,
+        values=values,
+        gain=gain,
+        pings=pings,
+        degrees=degrees_named(degrees),
+        largest=LARGEST if limits is None else MotionStd(limits[0], math.radians(limits[1])),
+    )
     convention_named(frame)
     if Path(source).suffix == ".zarr" or "://" in source:
-        scene_only = (start, end, poses, trajectory, sonar, model, segments, parameter)
+        scene_only = (start, end, poses, trajectory, sonar, model, instrument, segments, parameter)
         if any(value is not None for value in scene_only):
             raise MitsonarError(f"{source} is a data set, which defines sonar, poses and segments: leave these options out")
         subject = subject_of_data(source, pairs, part=part, seed=seed)
     else:
         loaded = load_scene(source, **scene_parameters(parameter or []))
-        instrument, attitude = instrument_for(loaded, sonar, sonar_changes(None, None, model, seed))
+        changes, attitude = sonar_changes(None, None, model, seed), None
+        if instrument is None:
+            sounder, (fan, attitude) = None, instrument_for(loaded, sonar, changes)
+        else:
+            if any(value is not None for value in (sonar, segments, vary, height)):
+                raise MitsonarError(
+                    "--instrument excludes --sonar, --segments, --vary and --height: leave these options out"
+                )
+            sounder = load_sounder(instrument).replace(**changes)
+            fan = sounder.fan
         count = poses or (20 if trajectory else None)
-        path = path_for(instrument, attitude, source, count, start, end, trajectory, frame)
-        subject = subject_of_scene(loaded, instrument, path.poses, segments=segments.split(",") if segments else [])
+        path = path_for(fan, attitude, source, count, start, end, trajectory, frame)
+        if sounder is not None:
+            path = under_vehicle(path, sounder, trajectory)
+        portions = segments.split(",") if segments else []
+        subject = subject_of_scene(loaded, fan, path.poses, segments=portions, sounder=sounder)
     noiseless = options.noise_for(subject.sonar).scale == 0 and subject.sonar.model != "coherent"
     with progress_bar("differentiating", subject.poses * max(1, len(values)), "poses") as progress:
         report = bounds_report(source, subject, options, progress)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -9,10 +11,40 @@ from array_api_compat import array_namespace
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.arrays import AnyArray
-from mitsonar.motion.pose import Pose, plain_number
+from mitsonar.errors import MitsonarError, suggest_names
+from mitsonar.motion.pose import Pose, mounted, plain_number, poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["Motion", "MotionPrior", "compose", "inverse", "motions", "steady", "steered"]
+__all__ = [
+    "DEGREES",
+    "PLANAR",
+    "Motion",
+    "MotionPrior",
+    "MotionStd",
+    "compose",
+    "compose_six",
+    "degrees_named",
+    "inverse",
+    "motions",
+    "six_between",
+    "six_of",
+    "steady",
+    "steered",
+]
+
+
+DEGREES = {
+    "sideways": "to starboard [m]",
+    "forward": "ahead [m]",
+    "rise": "up [m]",
+    "pitch": "nose down, about the level axis to starboard [rad]",
+    "roll": "port side up, about the level axis ahead [rad]",
+    "yaw": "to starboard, about the vertical axis [rad]",
+}
+"""The six degrees of freedom of a motion, in level axes of the new heading, in this order; angles turn about the pose."""
+
+PLANAR = ("sideways", "forward", "yaw")
+"""The degrees of freedom of :class:`Motion`."""
 
 
 class Motion(NamedTuple):
@@ -33,6 +65,59 @@ def compose(pose: Pose, motion: Motion) -> Pose:
     x = pose.x + motion.forward * sin + motion.sideways * cos
     y = pose.y + motion.forward * cos - motion.sideways * sin
     return Pose.from_row((float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading)))
+
+
+def compose_six(pose: Pose, motion: ArrayLike) -> Pose:
+    """Compute the pose after a motion with all six degrees of freedom.
+
+    The pose first moves as in :func:`compose`, then rises. It turns about its position with a level vehicle of the new
+    heading, which rolls and then pitches; the attitude that the pose had relative to the level vehicle stays. Without rise,
+    pitch and roll the result is that of :func:`compose`, bit for bit.
+
+    Args:
+        pose: the pose before the motion, at any attitude.
+        motion: the motion in the order of :data:`DEGREES` ``(6,)`` [m, rad].
+    """
+    sideways, forward, rise, pitch, roll, yaw = (float(value) for value in np.asarray(motion, dtype=float))
+    moved = compose(pose, Motion(sideways, forward, yaw))
+    if not (rise or pitch or roll):
+        return moved
+    level = (moved.x, moved.y, moved.z + rise, pitch, roll, moved.heading)
+    tilt = Pose.from_row((0.0, 0.0, 0.0, pose.pitch, pose.roll, 0.0))
+    return Pose.from_row(mounted([level], tilt)[0].tolist())
+
+
+def six_between(before: Pose, after: Pose) -> NDArray[np.float64]:
+    """Return the motion ``(6,)`` that leads from one pose to another by :func:`compose_six`.
+
+    The angles of the level vehicle between are unique while it pitches by less than 90 deg.
+    """
+    tilt = vehicle_rotation(Pose.from_row((0.0, 0.0, 0.0, before.pitch, before.roll, 0.0)))
+    level = poses_from(after[:3], vehicle_rotation(after) * tilt.inv())[0]
+    planar = motions([(*before[:3], 0, 0, before.heading), (*level[:3], 0, 0, level[5])])[0]
+    return np.array([planar[0], planar[1], after.z - before.z, level[3], level[4], planar[2]])
+
+
+def six_of(motion: ArrayLike, degrees: Sequence[str]) -> NDArray[np.float64]:
+    """Return motions ``(..., 6)`` from some of their degrees of freedom ``(..., k)``; the others are 0."""
+    values = np.asarray(motion, dtype=float)
+    six = np.zeros((*values.shape[:-1], len(DEGREES)))
+    six[..., [list(DEGREES).index(name) for name in degrees]] = values
+    return six
+
+
+def degrees_named(text: str) -> tuple[str, ...]:
+    """Return degrees of freedom from ``3``, ``6`` or their names separated by commas, in the order of :data:`DEGREES`.
+
+    Raises:
+        MitsonarError: an unknown name, or none.
+    """
+    if text.strip() in ("3", "6"):
+        return PLANAR if text.strip() == "3" else tuple(DEGREES)
+    names = {word.strip() for word in text.split(",")}
+    for name in sorted(names - set(DEGREES)):
+        raise MitsonarError(f"unknown degree of freedom {name[:40]!r}: give 3, 6 or names; {suggest_names(name, DEGREES)}")
+    return tuple(name for name in DEGREES if name in names)
 
 
 def inverse(motion: AnyArray) -> AnyArray:
@@ -116,6 +201,33 @@ def steered(poses: ArrayLike, velocity: ArrayLike, step_s: float) -> NDArray[np.
 
 
 # ---------------- Priors
+
+
+@dataclass(frozen=True)
+class MotionStd:
+    """Standard deviations of a motion: of its lengths and of its angles.
+
+    Attributes:
+        length_m: of sideways, forward and rise [m].
+        angle_rad: of pitch, roll and yaw [rad].
+
+    Raises:
+        MitsonarError: one is not above 0.
+    """
+
+    length_m: float = 0.1
+    angle_rad: float = field(default=float(np.radians(5)))
+
+    def __post_init__(self) -> None:
+        if not (0 < self.length_m < np.inf and 0 < self.angle_rad < np.inf):
+            raise MitsonarError(
+                "standard deviations of a motion must be above 0 and finite: got "
+                f"{self.length_m:g} m and {np.degrees(self.angle_rad):g} deg"
+            )
+
+    def of(self, degrees: Sequence[str]) -> NDArray[np.float64]:
+        """Return them by degree of freedom ``(k,)`` [m, rad]."""
+        return np.array([self.length_m if "[m]" in DEGREES[name] else self.angle_rad for name in degrees])
 
 
 class MotionPrior(NamedTuple):

@@ -678,8 +678,11 @@ Report: TypeAlias = Mapping[str, Any]
 def crlb_png(report: Report) -> bytes:
     """Return a figure of the bounds for two frames, over the varied quantity or over the poses, as a PNG file."""
     name = report["vary"]
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    panels = figure.subplots(1, 3)
+    rows = -(-len(report["units"]) // 3)
+    figure = Figure(figsize=(11, 3.6 * rows), layout="constrained")
+    panels = figure.subplots(rows, min(len(report["units"]), 3), squeeze=False).ravel()
+    for panel in panels[len(report["units"]) :]:
+        panel.set_axis_off()
     series: dict[str, list[tuple[float | str, list[float | None]]]] = {}
     for row in report["rows"]:
         label = " ".join([row["portion"], row["data"], row["law"]])
@@ -688,7 +691,7 @@ def crlb_png(report: Report) -> bytes:
         elif row["two_frames"] is not None:
             x = "..".join(f"{v:g}" for v in row[name]) if name == "window" else row[name]
             series.setdefault(label, []).append((x, row["two_frames"]))
-    for axis, (panel, unit) in enumerate(zip(panels, report["units"], strict=True)):
+    for axis, (panel, unit) in enumerate(zip(panels, report["units"], strict=False)):
         for label, points in series.items():
             known = [(x, std[axis]) for x, std in points if std[axis] is not None]
             panel.plot([x for x, _ in known], [y for _, y in known], "o-" if name else ".", label=label, markersize=4)

@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from mitsonar.acoustics.water import delay_exact
 from mitsonar.errors import MitsonarError
@@ -71,7 +72,13 @@ class LinkResponse(NamedTuple):
 
 
 def link_response(
-    sonar: ChannelSonar, receiver: Hydrophone, height_m: float, points: Array, pose: ArrayLike, velocity: ArrayLike
+    sonar: ChannelSonar,
+    receiver: Hydrophone,
+    height_m: float,
+    points: Array,
+    pose: ArrayLike,
+    velocity: ArrayLike,
+    tilt: ArrayLike = (0.0, 0.0),
 ) -> LinkResponse:
     """Compute delay and amplitude of the echoes of points of level ground.
 
@@ -80,8 +87,9 @@ def link_response(
         receiver: one of its receivers.
         height_m: height of the transmitter over the ground.
         points: x, y ``(n, 2)`` [m].
-        pose: x, y [m] and heading [rad] of the level vehicle when the ping was sent.
+        pose: x, y [m] and heading [rad] of the vehicle when the ping was sent.
         velocity: over ground along x and y [m/s].
+        tilt: pitch (nose down) and roll (starboard side down) of the vehicle [rad], as one small turn about a level axis.
     """
     # points relative to the transmitter and to the receiver, in the vehicle's axes
     x, y, heading = np.asarray(pose, dtype=float)
@@ -90,11 +98,18 @@ def link_response(
     east, north = points[:, 0] - x, points[:, 1] - y
     starboard, ahead = east * cos - north * sin, east * sin + north * cos
     sent = np.stack([starboard, ahead, np.full_like(east, -height_m)])
+    tilted, from_level = any(np.asarray(tilt, dtype=float)), np.eye(3)
+    if tilted:
+        pitch, roll = np.asarray(tilt, dtype=float)
+        from_level = Rotation.from_rotvec([-pitch, roll, 0.0]).inv().as_matrix()
+        sent = from_level @ sent
     received = sent - np.array([[to_starboard], [forward], [up]])
     distance_out, distance_back = np.sqrt((sent**2).sum(axis=0)), np.sqrt((received**2).sum(axis=0))
     # the receiver moves while the sound travels
     speed = np.asarray(velocity, dtype=float)
     velocity_in_axes = np.array([speed[0] * cos - speed[1] * sin, speed[0] * sin + speed[1] * cos, 0.0])
+    if tilted:
+        velocity_in_axes, up = from_level @ velocity_in_axes, float(from_level[:, 2] @ receiver.position)
     delay = np.asarray(delay_exact(list(sent), list(received), list(velocity_in_axes), sonar.sound_speed))
     # amplitude: sensitivities, the cosines of incidence and reflection, and spreading
     amplitude = _sensitivity(sonar, None, sent / distance_out) * _sensitivity(sonar, receiver, received / distance_back)
@@ -194,10 +209,11 @@ class ResponseCovariance:
         """Compute the echoes of the ground in both pings, ``lag`` intervals apart.
 
         Args:
-            motion: sideways, forward [m], yaw [rad] in one interval (eq. 3.4), and the rise of the vehicle [m].
+            motion: sideways, forward [m], yaw [rad] in one interval (eq. 3.4), the rise of the vehicle [m], its pitch and
+                roll [rad]; the last three default to 0. The vehicle is level at the midpoint.
             lag: intervals between the pings.
         """
-        sideways, forward, yaw, heave = _four(motion)
+        sideways, forward, yaw, heave, pitch, roll = _six(motion)
         # eq. 3.4 counts along the new heading, which differs by half the turn from that at the midpoint
         cos, sin = math.cos(yaw / 2), math.sin(yaw / 2)
         displacement = np.array([sideways * cos + forward * sin, forward * cos - sideways * sin])
@@ -207,7 +223,8 @@ class ResponseCovariance:
             velocity = (
                 _clockwise(displacement, half * yaw) / self.interval_s
             )  # along the arc whose chord is the displacement
-            links.append(link_response(self.sonar, self.receiver, height, self.nodes.points, pose, velocity))
+            tilt = (half * pitch, half * roll)
+            links.append(link_response(self.sonar, self.receiver, height, self.nodes.points, pose, velocity, tilt))
         return links[0], links[1]
 
     def covariance(self, motion: ArrayLike, lag: float = 1.0) -> Complex:
@@ -228,9 +245,9 @@ class ResponseCovariance:
         weight = first.amplitude * second.amplitude
         weights = [weight.astype(complex)]
         for number in free:
-            step = np.zeros(4)
+            step = np.zeros(6)
             step[number] = STEP
-            (low_i, low_j), (high_i, high_j) = (self.link_responses(_four(motion) + sign * step, lag) for sign in (-1, 1))
+            (low_i, low_j), (high_i, high_j) = (self.link_responses(_six(motion) + sign * step, lag) for sign in (-1, 1))
             amplitude = high_i.amplitude * high_j.amplitude - low_i.amplitude * low_j.amplitude
             delay_change = (high_i.delay - high_j.delay) - (low_i.delay - low_j.delay)
             weights.append((amplitude - 2j * np.pi * self.sonar.carrier_hz * weight * delay_change) / (2 * STEP))
@@ -260,10 +277,10 @@ def _clockwise(displacement: Array, turn: float) -> Array:
     return np.array([displacement[0] * cos + displacement[1] * sin, displacement[1] * cos - displacement[0] * sin])
 
 
-def _four(motion: ArrayLike) -> Array:
-    """Return sideways, forward, yaw and rise of a motion; a missing rise is 0."""
+def _six(motion: ArrayLike) -> Array:
+    """Return sideways, forward, yaw, rise, pitch and roll of a motion; those that are missing at the end are 0."""
     values = np.asarray(motion, dtype=float)
-    return np.append(values, 0.0) if len(values) == 3 else values
+    return np.append(values, np.zeros(6 - len(values)))
 
 
 def _panels(start: float, end: float, panels: int, nodes: int) -> tuple[Array, Array]:

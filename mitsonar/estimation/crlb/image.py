@@ -1,7 +1,7 @@
 """How well any unbiased estimator can know a motion from images: the Cramer-Rao lower bound for a known scene.
 
-No unbiased estimator of the motion (sideways, forward, yaw) has a covariance below the inverse of the Fisher information
-F = J' W J. J is the derivative of the pixels by the motion, W the information of a noisy pixel
+No unbiased estimator of the motion (sideways, forward, yaw, or more degrees of freedom) has a covariance below the inverse
+of the Fisher information F = J' W J. J is the derivative of the pixels by the motion, W the information of a noisy pixel
 (:mod:`mitsonar.acoustics.noise`). The bound is that of an oracle that has the renderer and knows the scene, its height and
 the frames without noise.
 
@@ -12,6 +12,7 @@ bound is optimistic, since a real estimator has to find the relief and the refle
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,9 +26,19 @@ from mitsonar.acoustics.speckle import rician_information, score_components
 from mitsonar.errors import MitsonarError, suggest_names
 from mitsonar.instruments.sonar import Quality, Sonar
 from mitsonar.instruments.views import Segment, directions
-from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.composition import PLANAR, MotionStd
 from mitsonar.motion.pose import Pose, vehicle_rotation
-from mitsonar.simulation.derivatives import FIRST_PING, PINGS, Derivative, differentiate, evenly, jittered, step_for
+from mitsonar.simulation.derivatives import (
+    FIRST_PING,
+    PINGS,
+    STEP,
+    Derivative,
+    differentiate,
+    evenly,
+    jittered,
+    moved_poses,
+    steps_for,
+)
 from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -36,6 +47,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ALL",
     "KINDS",
+    "LARGEST",
     "LAWS",
     "SPECKLE_LAWS",
     "VARIABLES",
@@ -44,6 +56,7 @@ __all__ = [
     "CellScores",
     "ScoreCovariance",
     "SpeckleBounds",
+    "balanced_steps",
     "bound",
     "bounds_at",
     "bounds_of_views",
@@ -53,8 +66,10 @@ __all__ = [
     "fisher_by",
     "floor_ranges",
     "grain_law",
+    "is_decided",
     "laws_of",
     "overall",
+    "pixel_terms",
     "together",
     "varied",
 ]
@@ -84,12 +99,23 @@ FLOOR_MOVING_VARIABLES = ("height_m", "pitch_deg", "azimuth_fov_deg", "elevation
 """Variables that move the floor out of the window."""
 
 
+LARGEST = MotionStd()
+"""The largest standard deviations that count as an observation."""
+
+LONGEST_STEP = 0.25
+"""Longest step of a derivative along directions that hardly change a frame, in bins and beams.
+
+Derivatives are then known with a tenth of the pings. Bounds of six degrees of freedom are up to 10 % larger than with
+steps of :data:`STEP`, since such steps smooth over a quarter of a bin.
+"""
+
+
 class InformationTerms(NamedTuple):
     """Information about the motion from values that change with it.
 
     Attributes:
         information: of each value ``(n, ...)``.
-        jacobian: two estimates of the derivative of the parameters of the values ``(2, n, 2, 3)``.
+        jacobian: two estimates of the derivative of the parameters of the values ``(2, n, 2, k)``.
         rays: variance of each value by the rays of a ping, beyond what its law includes ``(n,)``.
     """
 
@@ -143,11 +169,11 @@ def _check(kind: str, law: str, kinds: Sequence[str] = tuple(KINDS), laws: Seque
 
 
 def _terms(derivative: Derivative, noise: NoiseModel, kind: str, greys: int = 255) -> InformationTerms:
-    return _by_pixels(derivative, noise, greys) if kind == "image" else _by_sums(derivative, noise)
+    return pixel_terms(derivative, noise, greys) if kind == "image" else _by_sums(derivative, noise)
 
 
-def _by_pixels(derivative: Derivative, noise: NoiseModel, greys: int) -> InformationTerms:
-    """Return the information of pixels."""
+def pixel_terms(derivative: Derivative, noise: NoiseModel, greys: int = 255) -> InformationTerms:
+    """Return the information of the pixels that change with the motion, in the order of the image."""
     changing = derivative.jacobian.any(axis=(0, 3, 4))
     level, filled = derivative.level[changing], derivative.filled[changing]
     value_information = information(noise, level, filled, greys=greys)
@@ -191,7 +217,14 @@ def bounds_of_views(
 
 
 def bounds_at(
-    simulator: Simulator, poses: ArrayLike, noise: NoiseModel, gain: float, *, pings: int | None = None
+    simulator: Simulator,
+    poses: ArrayLike,
+    noise: NoiseModel,
+    gain: float,
+    *,
+    pings: int | None = None,
+    degrees: Sequence[str] = PLANAR,
+    mount: Pose | None = None,
 ) -> Iterator[dict[tuple[str, str, str], Bound | None]]:
     """Compute :func:`bounds_of_views` at each pose.
 
@@ -203,24 +236,60 @@ def bounds_at(
         gain: gain of the frames.
         pings: pings of each half of the derivatives; default: 8, then 32 and 128 while it is undecided whether an
             axis can be observed.
+        degrees: names of the k degrees of freedom of the motion, of :data:`mitsonar.motion.composition.DEGREES`.
+        mount: pose of the sonar in the axes of a vehicle, to which poses and motion then belong.
     """
     if simulator.sonar.model == "coherent":
         refuse_noise(noise, simulator.sonar)
-        for laws in SpeckleBounds(simulator, gain).at_poses(poses, pings=pings):
+        for laws in SpeckleBounds(simulator, gain, degrees, mount).at_poses(poses, pings=pings):
             yield {(simulator.views[0].name, "image", law): one for law, one in laws.items()}
         return
+    six = tuple(degrees) != PLANAR
     source, names = jittered(simulator), [view.name for view in simulator.views]
     portions = [view.member for view in simulator.views if isinstance(view, Segment)]
     apart = not portions or bool(np.sum(portions, axis=0).max() <= 1)
     for number, pose in enumerate(np.atleast_2d(np.asarray(poses, dtype=float))):
-        for count in (PINGS, 4 * PINGS, 16 * PINGS) if pings is None else (pings,):
+        along: dict[str, Any] = {}
+        for count in (PINGS, 4 * PINGS, 16 * PINGS) if pings is None else (pings,) * (2 if six else 1):
             first = FIRST_PING + 32 * PINGS * number
-            views = next(differentiate(source, pose, gain, pings=count, first=first))
+            motion: dict[str, Any] = {"degrees": degrees, "mount": mount} | along
+            views = next(differentiate(source, pose, gain, pings=count, first=first, **motion))
             bounds = bounds_of_views(names, views, noise, apart=apart)
             images = [one for (_, kind, _), one in bounds.items() if kind == "image" and one is not None]
-            if all(np.isfinite(one.std()).all() for one in images):
+            if six and images:
+                basis, step = balanced_steps(sum(images[1:], images[0]), source.sonar, degrees)
+                first_time, along = not along, {"basis": basis, "step": step}
+                if first_time:
+                    continue  # the first bound only balances the steps
+            if all(is_decided(one, degrees) if six else np.isfinite(one.std()).all() for one in images):
                 break
         yield bounds
+
+
+def is_decided(bound: Bound, degrees: Sequence[str]) -> bool:
+    """Return whether each direction of a motion is observable, or is not by :data:`LARGEST`, despite the rays' noise."""
+    size, _, significant = bound.directions(LARGEST.of(degrees))
+    return bool(((size > significant) | (np.maximum(size, 0.0) + significant < 1)).all())
+
+
+def balanced_steps(
+    bound: Bound, sonar: Sonar, degrees: Sequence[str], part: float = STEP
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return directions ``(k, k)`` and steps ``(k,)`` of derivatives that change a frame by about as much each.
+
+    The directions are the eigenvectors of the information, in units of bins and beams. The best known one has the usual
+    step. That of others is longer as their information is smaller, up to :data:`LONGEST_STEP` bins or beams.
+
+    Args:
+        bound: a first bound.
+        sonar: the instrument.
+        degrees: names of the k degrees of freedom.
+        part: the usual step, as a fraction of a bin and of a beam.
+    """
+    unit = steps_for(sonar, degrees, 1.0)
+    size, axes, significant = bound.directions(unit)
+    size = np.maximum(size, significant)
+    return unit[:, None] * axes, np.clip(part * np.sqrt(size.max() / size), part, max(part, LONGEST_STEP))
 
 
 def cramer_rao_bound(
@@ -234,6 +303,7 @@ def cramer_rao_bound(
     law: str | None = None,
     frames: int = 2,
     pings: int | None = None,
+    degrees: Sequence[str] = PLANAR,
 ) -> NDArray[np.float64]:
     """Compute the least standard deviations of a motion at each pose (Cramer and Rao).
 
@@ -251,10 +321,11 @@ def cramer_rao_bound(
         frames: number of noisy frames, 1 or 2.
         pings: pings of each half of the derivatives; default: 8, then 32 and 128 while it is undecided whether an
             axis can be observed.
+        degrees: names of the k degrees of freedom of the motion, of :data:`mitsonar.motion.composition.DEGREES`.
 
     Returns:
-        Sideways, forward [m] and yaw [rad] ``(n, 3)``; 0 where only rounding separates a pixel from its level, inf where an
-        axis cannot be observed.
+        Sideways, forward [m] and yaw [rad], or the other ``degrees`` ``(n, k)``; 0 where only rounding separates a pixel
+        from its level, inf where an axis cannot be observed.
 
     Raises:
         MitsonarError: unknown names; several portions that overlap, and none named; noise of pixels with speckle.
@@ -264,12 +335,12 @@ def cramer_rao_bound(
     _check(kind, law, ["image"] if speckle else list(KINDS), list(laws_of(simulator.sonar)))
     portion = view or (ALL if len(simulator.views) > 1 else simulator.views[0].name)
     bounds = []
-    for at_pose in bounds_at(simulator, poses, noise, gain, pings=pings):
+    for at_pose in bounds_at(simulator, poses, noise, gain, pings=pings, degrees=degrees):
         if (portion, kind, law) not in at_pose:
             names = ", ".join(known.name for known in simulator.views)
             raise MitsonarError(f"overlapping portions have no common bound: got view {view!r}; name one of {names}")
         bounds.append(at_pose[portion, kind, law])
-    return np.array([np.zeros(3) if one is None else one.std(frames) for one in bounds]).reshape(-1, 3)
+    return np.array([np.zeros(len(degrees)) if one is None else one.std(frames) for one in bounds]).reshape(-1, len(degrees))
 
 
 # ---------------- Changed sonars and poses
@@ -357,8 +428,8 @@ class Bound:
     """Fisher information of the motion in one frame.
 
     Attributes:
-        information: F ``(3, 3)`` of sideways, forward [1/m^2] and yaw [1/rad^2].
-        reason: covariance of the elements of F due to the noise of the rays in its computation ``(3, 3, 3, 3)``.
+        information: F ``(k, k)`` of k degrees of freedom, such as sideways, forward [1/m^2] and yaw [1/rad^2].
+        reason: covariance of the elements of F due to the noise of the rays in its computation ``(k, k, k, k)``.
     """
 
     information: NDArray[np.float64]
@@ -369,7 +440,7 @@ class Bound:
         return Bound(self.information + other.information, self.reason + other.reason)
 
     def covariance(self, frames: int = 1) -> NDArray[np.float64]:
-        """Return the least covariance ``(3, 3)`` [m, m, rad]: of one frame relative to an oracle, or of two noisy frames.
+        """Return the least covariance ``(k, k)`` [m, rad]: of one frame relative to an oracle, or of two noisy frames.
 
         It is the pseudo-inverse where not everything can be observed. Axes that contribute to an unobservable direction have
         infinite variance.
@@ -379,8 +450,8 @@ class Bound:
         # scale F to a unit diagonal; keep the directions that exceed their errors
         diagonal = np.diag(self.information)
         scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
-        size, axes = np.linalg.eigh(self.information * np.outer(scale, scale))
-        known = size > np.maximum(SIGNIFICANCE * self._error(axes * scale[:, None]), 1e-9)
+        size, axes, significant = self.directions(scale)
+        known = size > significant
         inverse = (axes[:, known] / size[known]) @ axes[:, known].T * np.outer(scale, scale)
         # axes with a part in the other directions are unobservable
         unobservable = (axes[:, ~known] ** 2).sum(axis=1) > 1e-3
@@ -388,20 +459,31 @@ class Bound:
         inverse[unobservable, unobservable] = np.inf
         return np.asarray(frames * inverse)
 
+    def directions(self, scale: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the eigenvalues ``(k,)`` and eigenvectors ``(k, k)`` of F for scaled axes, and their significance ``(k,)``.
+
+        An eigenvalue is significant if it exceeds this value, a multiple of its error due to the noise of the rays.
+
+        Args:
+            scale: unit of each axis ``(k,)`` [m, rad].
+        """
+        size, axes = np.linalg.eigh(self.information * np.outer(scale, scale))
+        return size, axes, np.maximum(SIGNIFICANCE * self._error(axes * scale[:, None]), 1e-9)
+
     def std(self, frames: int = 1) -> NDArray[np.float64]:
-        """Return the least standard deviations ``(3,)`` [m, m, rad]; inf where an axis cannot be observed."""
+        """Return the least standard deviations ``(k,)`` [m, rad]; inf where an axis cannot be observed."""
         return np.asarray(np.sqrt(np.diag(self.covariance(frames))))
 
     @property
     def relative_error(self) -> NDArray[np.float64]:
-        """Relative standard error of :meth:`std` ``(3,)``; nan where an axis cannot be observed."""
+        """Relative standard error of :meth:`std` ``(k,)``; nan where an axis cannot be observed."""
         covariance = self.covariance()
         variance = np.diag(covariance)
         finite = np.where(np.isfinite(covariance), covariance, 0)
         return np.asarray(np.where(np.isfinite(variance), self._error(finite) / (2 * variance), np.nan))
 
     def _error(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the standard error of v' F v for each column v ``(3, n)``."""
+        """Return the standard error of v' F v for each column v ``(k, n)``."""
         v = directions
         variance: NDArray[np.float64] = np.einsum("ijkl,in,jn,kn,ln->n", self.reason, v, v, v, v)
         return np.sqrt(np.maximum(variance, 0))
@@ -411,9 +493,9 @@ def fisher(jacobian: NDArray[np.float64], weight: NDArray[np.float64]) -> Bound:
     """Compute F = J1' W J2, made symmetric, and the covariance of its elements.
 
     Args:
-        jacobian: two independent estimates of the derivatives of k parameters of n independent values by the motion
-            ``(2, n, k, 3)``.
-        weight: information of each value about its parameters ``(n, k, k)``.
+        jacobian: two independent estimates of the derivatives of p parameters of n independent values by the motion
+            ``(2, n, p, k)``.
+        weight: information of each value about its parameters ``(n, p, p)``.
     """
     return fisher_by(jacobian, lambda values: weight @ values)
 
@@ -424,8 +506,8 @@ def fisher_by(jacobian: NDArray[np.float64], weigh: Callable[[NDArray[np.float64
     With M the mean and D half the difference of both estimates it is M' W M - D' W D, and the noise of M is as large as D.
 
     Args:
-        jacobian: two independent estimates ``(2, n, k, 3)``.
-        weigh: multiplies derivatives ``(n, k, 3)`` by the information of all values, W.
+        jacobian: two independent estimates ``(2, n, p, k)``.
+        weigh: multiplies derivatives ``(n, p, k)`` by the information of all values, W.
     """
     mean, half = jacobian.mean(axis=0), (jacobian[0] - jacobian[1]) / 2
     weighted = weigh(half)
@@ -434,8 +516,9 @@ def fisher_by(jacobian: NDArray[np.float64], weigh: Callable[[NDArray[np.float64
     noise = half.transpose(0, 2, 1) @ weighted
     noise = (noise + noise.transpose(0, 2, 1)) / 2
     mixed = mean.transpose(0, 2, 1) @ weighted
-    parts = np.concatenate([mixed + mixed.transpose(0, 2, 1), np.sqrt(2) * noise]).reshape(-1, 9)
-    return Bound((mean_information - noise).sum(axis=0), (parts.T @ parts).reshape(3, 3, 3, 3))
+    axes = jacobian.shape[-1]
+    parts = np.concatenate([mixed + mixed.transpose(0, 2, 1), np.sqrt(2) * noise]).reshape(-1, axes**2)
+    return Bound((mean_information - noise).sum(axis=0), (parts.T @ parts).reshape((axes,) * 4))
 
 
 def together(parts: Sequence[Bound | None]) -> Bound | None:
@@ -445,7 +528,7 @@ def together(parts: Sequence[Bound | None]) -> Bound | None:
 
 
 def overall(stds: Iterable[ArrayLike]) -> NDArray[np.float64]:
-    """Return one number per axis for many poses ``(3,)``: the root of the mean variance, which is comparable to an RMSE."""
+    """Return one number per axis for many poses ``(k,)``: the root of the mean variance, which is comparable to an RMSE."""
     return np.asarray(np.sqrt(np.mean(np.square(np.array(list(stds), dtype=float)), axis=0)))
 
 
@@ -617,12 +700,16 @@ class SpeckleBounds:
     Args:
         simulator: of the model ``coherent``.
         gain: gain of the frames.
+        degrees: names of the k degrees of freedom of the motion.
+        mount: pose of the sonar in the axes of a vehicle, to which poses and motion then belong.
 
     Raises:
         MitsonarError: another model, or a sonar that saturates.
     """
 
-    def __init__(self, simulator: Simulator, gain: float) -> None:
+    def __init__(
+        self, simulator: Simulator, gain: float, degrees: Sequence[str] = PLANAR, mount: Pose | None = None
+    ) -> None:
         if simulator.model.imager is None:
             raise MitsonarError(f"bounds of speckle are for the model coherent: got {simulator.sonar.model}")
         if simulator.sonar.saturation_db is not None:
@@ -631,6 +718,7 @@ class SpeckleBounds:
                 f" {simulator.sonar.saturation_db:g}; leave it out"
             )
         self.sonar, self.gain = simulator.sonar, gain
+        self.degrees, self.mount = degrees, mount
         self.imager = simulator.model.imager
         self.halves = self.imager, self.imager.of_quality(OTHER_HALF_QUALITY[self.sonar.quality])
         mirrors = simulator.mirrors if self.sonar.bounces > 1 else None  # with one reflection a mirror has no expected level
@@ -665,10 +753,9 @@ class SpeckleBounds:
             pings: see :meth:`at_poses`.
         """
         # two independent estimates of the derivative, by two sets of rays
-        step = np.array(step_for(self.sonar, GRAIN_STEP))
-        jacobian = np.stack([_power_slopes(imager, pose, step, pings or GRAIN_PINGS) for imager in self.halves])
-        looks = self.sonar.looks
-        echo, other_echo = (imager.echoes(pose)[0].astype(np.complex128) for imager in self.halves)
+        jacobian = np.stack([self._power_slopes(imager, pose, pings or GRAIN_PINGS) for imager in self.halves])
+        looks, place = self.sonar.looks, self._places(pose, np.zeros((1, len(self.degrees))))[0]
+        echo, other_echo = (imager.echoes(place)[0].astype(np.complex128) for imager in self.halves)
         power, apart, together = (
             _mean_of_looks(np.abs(field) ** 2, looks) for field in (echo, echo - other_echo, echo + other_echo)
         )
@@ -690,9 +777,20 @@ class SpeckleBounds:
             pings: see :meth:`at_poses`.
             first: number of the first ping, which determines the rays' jitter.
         """
+        scores = self._ground(pose, pings, first, {})
+        if tuple(self.degrees) != PLANAR:
+            # the first bound only balances the steps
+            basis, step = balanced_steps(scores.bound(), self.sonar, self.degrees)
+            scores = self._ground(pose, pings, first, {"basis": basis, "step": step})
+        return scores
+
+    def _ground(self, pose: Floats, pings: int | None, first: int, along: dict[str, Any]) -> CellScores:
+        """Return :meth:`ground` with steps of the derivatives along given directions."""
         # expected level and derivative, scaled well below clipping
-        gain = 0.01 / float(next(self.expected.pings(pose[None], first=first)).levels.max())
-        (derivative,) = next(differentiate(self.expected, pose, gain, pings=pings or GROUND_PINGS, first=first))
+        place = self._places(pose, np.zeros((1, len(self.degrees))))
+        gain = 0.01 / float(next(self.expected.pings(place, first=first)).levels.max())
+        motion: dict[str, Any] = {"degrees": self.degrees, "mount": self.mount} | along
+        (derivative,) = next(differentiate(self.expected, pose, gain, pings=pings or GROUND_PINGS, first=first, **motion))
         level = derivative.level + self.noise * self.imager.gain[:, None] * gain
         known = (level > 0) & (derivative.variance < (MAX_RELATIVE_DEVIATION * level) ** 2)
         safe = np.where(known, level, 1)
@@ -712,12 +810,39 @@ class SpeckleBounds:
         variance, covariance = ScoreCovariance.of_looks(repeated, looks)
         return CellScores(jacobian, np.divide(1, variance, out=np.zeros_like(variance), where=known), covariance)
 
+    def mounted_at(self, mount: Pose) -> SpeckleBounds:
+        """Return the same bounds for another mount of the sonar."""
+        other = copy(self)
+        other.mount = mount
+        return other
+
+    def _places(self, pose: Floats, motions: Floats) -> Floats:
+        """Return the poses of the sonar after motions ``(n, k)`` from a pose."""
+        if self.mount is None and not motions.any():
+            return np.repeat(np.atleast_2d(pose), len(motions), axis=0)
+        return moved_poses(Pose.from_row(pose), motions, self.degrees, self.mount)
+
+    def _power_slopes(self, imager: CoherentImager, pose: Floats, pings: int) -> Floats:
+        """Return the derivative of the power of echoes by the motion ``(bins, beams, k)``: mean over places in the step."""
+        step = steps_for(self.sonar, self.degrees, GRAIN_STEP)
+        offsets = evenly(pings, len(step)) * step
+        slopes = np.zeros((imager.sonar.range_bins, imager.sonar.beams, len(step)))
+        for axis in range(len(step)):
+            for motion in offsets:
+                for side in (1, -1):
+                    moved = motion.copy()
+                    moved[axis] = side * step[axis]
+                    echo = imager.echoes(self._places(pose, moved[None])[0])[0]
+                    power = echo.real.astype(float) ** 2 + echo.imag.astype(float) ** 2
+                    slopes[..., axis] += side * _mean_of_looks(power, imager.sonar.looks)
+        return slopes / (2 * step * pings)
+
 
 class CellScores(NamedTuple):
     """Information of the cells of a frame about the motion.
 
     Attributes:
-        jacobian: two independent estimates of the derivative of the cells' parameters by the motion ``(2, bins, beams, 3)``.
+        jacobian: two independent estimates of the derivative of the cells' parameters by the motion ``(2, bins, beams, k)``.
         weight: Fisher information of each cell about its parameter ``(bins, beams)``.
         covariance: of the standardised scores.
     """
@@ -728,13 +853,14 @@ class CellScores(NamedTuple):
 
     def bound(self) -> Bound:
         """Compute the bound J1' W^1/2 C^-1 W^1/2 J2."""
-        return fisher_by(np.asarray(self.jacobian, dtype=float).reshape(2, -1, 1, 3), self._weigh)
+        axes = self.jacobian.shape[-1]
+        return fisher_by(np.asarray(self.jacobian, dtype=float).reshape(2, -1, 1, axes), self._weigh)
 
     def _weigh(self, values: Floats) -> Floats:
-        """Return W^1/2 C^-1 W^1/2 of values ``(cells, 1, 3)``."""
+        """Return W^1/2 C^-1 W^1/2 of values ``(cells, 1, k)``."""
         root = np.sqrt(self.weight)
-        maps = np.moveaxis(values.reshape(*root.shape, 3), 2, 0)
-        return np.moveaxis(root * self.covariance.solve(root * maps), 0, 2).reshape(-1, 1, 3)
+        maps = np.moveaxis(values.reshape(*root.shape, -1), 2, 0)
+        return np.moveaxis(root * self.covariance.solve(root * maps), 0, 2).reshape(values.shape)
 
 
 def grain_law(
@@ -793,18 +919,3 @@ def expected_sonar(sonar: Sonar) -> Sonar:
 def _mean_of_looks(values: Floats, looks: int) -> Floats:
     """Average values ``(bins * looks, beams)`` over the looks of each bin."""
     return values if looks == 1 else np.asarray(values.reshape(-1, looks, values.shape[1]).mean(axis=1))
-
-
-def _power_slopes(imager: CoherentImager, pose: Floats, step: Floats, pings: int) -> Floats:
-    """Return the derivative of the power of echoes by the motion ``(bins, beams, 3)``: mean over places within the step."""
-    offsets = evenly(pings) * step
-    slopes = np.zeros((imager.sonar.range_bins, imager.sonar.beams, 3))
-    for axis in range(3):
-        for motion in offsets:
-            for side in (1, -1):
-                moved = motion.copy()
-                moved[axis] = side * step[axis]
-                echo = imager.echoes(np.array(compose(Pose.from_row(pose), Motion(*moved))))[0]
-                power = echo.real.astype(float) ** 2 + echo.imag.astype(float) ** 2
-                slopes[..., axis] += side * _mean_of_looks(power, imager.sonar.looks)
-    return slopes / (2 * step * pings)

@@ -14,10 +14,13 @@ from mitsonar.config.data import MirrorKeys
 from mitsonar.datasets.make import SceneRenderer
 from mitsonar.datasets.store import DataStore, frames_in_part, world_numbers
 from mitsonar.errors import MitsonarError, argument
-from mitsonar.estimation.crlb.image import Bound, bounds_at, laws_of, overall, varied
+from mitsonar.estimation.crlb.image import LARGEST, Bound, bounds_at, laws_of, overall, varied
+from mitsonar.estimation.crlb.observability import bounds_of_fans, observability
 from mitsonar.estimation.estimator import PlainTable
 from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import Sounder
 from mitsonar.instruments.views import Segment, View, Whole
+from mitsonar.motion.composition import DEGREES, PLANAR, MotionStd
 from mitsonar.simulation.device import release_memory
 from mitsonar.simulation.pings import CALIBRATION_FRAMES, RenderedPings, constant_gain
 from mitsonar.simulation.simulator import Simulator
@@ -45,7 +48,11 @@ Value = float | tuple[float, float]
 Table = dict[tuple[str, str, str], list[Bound | None]]
 """A bound for each pose, keyed by (portion, kind, law)."""
 
-UNITS = np.array([1e3, 1e3, np.degrees(1)])
+
+def units_of(degrees: Sequence[str]) -> tuple[NDArray[np.float64], list[str]]:
+    """Return the factors from m and rad to the printed units of degrees of freedom ``(k,)``, and the names of the units."""
+    lengths = ["[m]" in DEGREES[name] for name in degrees]
+    return np.where(lengths, 1e3, np.degrees(1)), ["mm" if length else "deg" for length in lengths]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +66,8 @@ class BoundOptions:
         values: values of this variable.
         gain: constant gain; None: that of a data set if nothing varies, else determined from the frames.
         pings: pings of each half of the derivatives; None: as needed.
+        degrees: names of the degrees of freedom of the motion, of :data:`~mitsonar.motion.composition.DEGREES`.
+        largest: largest standard deviations that count as an observation, where ``degrees`` differ from the usual three.
 
     Raises:
         MitsonarError: an unknown noise, or a height that is not above 0.
@@ -70,6 +79,8 @@ class BoundOptions:
     values: Sequence[Value] = ()
     gain: float | None = None
     pings: int | None = None
+    degrees: tuple[str, ...] = PLANAR
+    largest: MotionStd = LARGEST
 
     def __post_init__(self) -> None:
         load_noise(self.noise or "none")
@@ -102,6 +113,7 @@ def bounds_report(source: str, subject: Subject, options: BoundOptions, progress
         MitsonarError: noise or values that do not fit, or no echo at all.
     """
     name, rows = options.vary, []
+    factors, units = units_of(options.degrees)
     values: Sequence[Value | None] = options.values or [None]
     for value in values:
         for (portion, kind, law), bounds in bounds_of_subject(subject, options, value, progress).items():
@@ -109,17 +121,22 @@ def bounds_report(source: str, subject: Subject, options: BoundOptions, progress
             row |= {"portion": portion, "data": kind, "law": law, "poses": len(bounds)}
             known = [one for one in bounds if one is not None]
             for frames, key in ((1, "one_frame"), (2, "two_frames")):
-                each = np.array([one.std(frames) * UNITS for one in known])
+                each = np.array([one.std(frames) * factors for one in known])
                 row[key] = _numbers(overall(each)) if len(known) == len(bounds) else None
                 row[f"{key}_each"] = [_numbers(std) for std in each]
             row["not_observable"] = sum(not np.isfinite(one.std()).all() for one in known)
             row["relative_error"] = _numbers(np.mean([one.relative_error for one in known], axis=0)) if known else None
+            if options.degrees != PLANAR:
+                each_pose = [observability(one, options.degrees, largest=options.largest) for one in known]
+                row["observable_each"] = [one.observable for one in each_pose]
+                row["unobservable_each"] = [list(one.unobservable) for one in each_pose]
+                row["undecided_each"] = [list(one.undecided) for one in each_pose]
             rows.append(row)
     return {
         "source": source,
         "noise": "of the receiver" if subject.sonar.model == "coherent" else options.noise or "high",
         "vary": name,
-        "units": ["sideways mm", "forward mm", "yaw deg"],
+        "units": [f"{degree} {unit}" for degree, unit in zip(options.degrees, units, strict=True)],
         "laws": laws_of(subject.sonar),
         "rows": rows,
     }
@@ -140,12 +157,33 @@ def bounds_of_subject(
         for name, varied_value in changes:
             sonar, poses = varied(sonar, poses, heights, name, varied_value)
             heights = np.full_like(heights, varied_value) if name == "height_m" else heights
+        if subject.sounder is not None:
+            table |= _bounds_of_sounder(subject.sounder, place.scene, poses, options, progress)
+            continue
         simulator = Simulator(place.scene, sonar, views=subject.views(sonar), mirrors=subject.mirrors)
         gain = gain if gain is not None else _gain(simulator, poses)
-        for bounds in bounds_at(simulator, poses, noise, gain, pings=options.pings):
+        for bounds in bounds_at(simulator, poses, noise, gain, pings=options.pings, degrees=options.degrees):
             for key, bound in bounds.items():
                 table.setdefault(key, []).append(bound)
             progress(1)
+    return table
+
+
+def _bounds_of_sounder(
+    sounder: Sounder, scene: mi.Scene, poses: NDArray[np.float64], options: BoundOptions, progress: Callable[[int], None]
+) -> Table:
+    """Compute the bounds of an instrument of several fans at all poses of its vehicle."""
+    simulator = Simulator(scene, sounder.fan)
+    gain = options.gain
+    if gain is None:
+        fans = sounder.fan_poses(poses).reshape(-1, 6)
+        gain = _gain(simulator, fans[np.unique(np.linspace(0, len(fans) - 1, CALIBRATION_FRAMES).round().astype(int))])
+    table: Table = {}
+    noise = options.noise_for(sounder.fan)
+    for bounds in bounds_of_fans(simulator, sounder, poses, noise, gain, degrees=options.degrees, pings=options.pings):
+        for key, bound in bounds.items():
+            table.setdefault(key, []).append(bound)
+        progress(1)
     return table
 
 
@@ -168,12 +206,14 @@ def report_lines(report: PlainTable) -> list[str]:
     """Return the table of least standard deviations as lines of text."""
     name = report["vary"]
     titles = [name] if name else []
-    titles += ["portion", "data", "law", "one frame: mm / mm / deg", "two frames: mm / mm / deg", "poses"]
+    degrees, units = zip(*(unit.split() for unit in report["units"]), strict=True)
+    listed = " / ".join(units)
+    titles += ["portion", "data", "law", f"one frame: {listed}", f"two frames: {listed}", "poses"]
     cells = [titles]
     for row in report["rows"]:
         value = row.get(name)
         value_text = "..".join(f"{v:g}" for v in value) if isinstance(value, tuple) else f"{value:g}" if name else ""
-        texts = [_text(row[words]) for words in ("one_frame", "two_frames")]
+        texts = [_text(row[words], units) for words in ("one_frame", "two_frames")]
         unobservable = f", {row['not_observable']} not observable" if row["not_observable"] else ""
         cells.append(
             [
@@ -187,14 +227,27 @@ def report_lines(report: PlainTable) -> list[str]:
         )
     widths = [max(len(line[k]) for line in cells) for k in range(len(titles))]
     lines = ["  ".join(word.ljust(width) for word, width in zip(line, widths, strict=True)).rstrip() for line in cells]
-    head = f"noise {report['noise']}: least standard deviation, sideways / forward / yaw (root of the mean variance)"
-    return [head, *lines, *(f"{law}: {meaning}" for law, meaning in report["laws"].items())]
+    head = f"noise {report['noise']}: least standard deviation, {' / '.join(degrees)} (root of the mean variance)"
+    meanings = (f"{law}: {meaning}" for law, meaning in report["laws"].items())
+    return [head, *lines, *meanings, *_observability_lines(report["rows"], len(degrees))]
 
 
-def _text(std: list[float | None] | None) -> str:
+def _observability_lines(rows: list[PlainTable], degrees: int) -> list[str]:
+    """Return a line for each set of directions that images cannot show, or about which derivatives are too noisy."""
+    lines: dict[str, None] = {}
+    for row in rows:
+        where = " ".join([row["portion"], row["data"], row["law"]])
+        for key, text in (("unobservable_each", "not"), ("undecided_each", "undecided, for want of pings:")):
+            for observable, names in zip(row.get("observable_each", ()), row.get(key, ()), strict=True):
+                if names:
+                    lines[f"{where}: {observable} of {degrees} directions observable; {text} {', '.join(names)}"] = None
+    return list(lines)
+
+
+def _text(std: list[float | None] | None, units: Sequence[str]) -> str:
     if std is None:
         return "-"
-    return " / ".join(_number(v, d) for v, d in zip(std, (3, 3, 4), strict=True))
+    return " / ".join(_number(v, 3 if unit == "mm" else 4) for v, unit in zip(std, units, strict=True))
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -235,6 +288,7 @@ class Subject:
         poses: number of poses in all places.
         gain: gain of a data set, if it is one.
         mirrors: mirrors of all scenes.
+        sounder: instrument of several fans, whose ``fan`` the sonar is and whose vehicle the poses are of; None: one sonar.
     """
 
     sonar: Sonar
@@ -243,9 +297,17 @@ class Subject:
     poses: int
     gain: float | None = None
     mirrors: MirrorKeys = None
+    sounder: Sounder | None = None
 
 
-def subject_of_scene(scene: mi.Scene, sonar: Sonar, poses: NDArray[np.float64], *, segments: list[str]) -> Subject:
+def subject_of_scene(
+    scene: mi.Scene,
+    sonar: Sonar,
+    poses: NDArray[np.float64],
+    *,
+    segments: list[str],
+    sounder: Sounder | None = None,
+) -> Subject:
     """Return the subject of poses in one scene.
 
     Args:
@@ -253,6 +315,7 @@ def subject_of_scene(scene: mi.Scene, sonar: Sonar, poses: NDArray[np.float64], 
         sonar: the instrument.
         poses: poses of the sonar ``(n, 6)``.
         segments: names of portions of a looking-down sonar's view; none: all of it.
+        sounder: instrument of several fans, whose ``fan`` the sonar is; the poses are then those of its vehicle.
 
     Raises:
         MitsonarError: a pose over nothing.
@@ -261,7 +324,7 @@ def subject_of_scene(scene: mi.Scene, sonar: Sonar, poses: NDArray[np.float64], 
     if not np.isfinite(heights).all():
         raise MitsonarError("nothing is below the sonar at some pose: give a pose over the scene with --from")
     place = Place(scene, poses, heights)
-    return Subject(sonar, lambda other: _views(other, segments), lambda: iter([place]), len(heights))
+    return Subject(sonar, lambda other: _views(other, segments), lambda: iter([place]), len(heights), sounder=sounder)
 
 
 def subject_of_data(source: str, pairs: int, *, part: str | None = None, seed: int | None = None) -> Subject:
