@@ -204,16 +204,22 @@ class ExpectedFormer:
 
     def pattern_over_beams(self, beam_width_deg: float | None = None) -> NDArray[np.float32]:
         """Compute the matrix of :attr:`over_beams`, for beams of another width or for those of the sonar."""
-        # Sample each box evenly in angle, and weight by the derivative of the sine: the integral is over sines.
+        # Sample the cell of each box, which is even in angle or in sine. A box counts for the angle of its whole cell.
         sonar, traced = self.sonar, self.traced
-        aperture, width = sonar.aperture, traced.beam_width_rad
+        aperture = sonar.aperture
         if beam_width_deg is not None:
             aperture = replace(aperture, width=math.radians(beam_width_deg))
         share = (np.arange(PARTS) + 0.5) / PARTS - 0.5
-        line = np.sin(traced.bearing_rad[:, None] + share * width)
-        slope = np.cos(traced.bearing_rad[:, None] + share * width)  # derivative of the sine by the angle
+        angle = np.full(traced.beams, traced.beam_width_rad)
+        if traced.beam_layout == "even":
+            line = np.sin(traced.bearing_rad[:, None] + share * angle[:, None])
+        else:
+            step = 2 * math.sin(math.radians(traced.azimuth_fov_deg) / 2) / traced.beams
+            line = np.sin(traced.bearing_rad)[:, None] + share * step
+            edges = np.sin(traced.bearing_rad)[:, None] + step * np.array([-0.5, 0.5])
+            angle = np.diff(np.arcsin(np.clip(edges, -1, 1)), axis=1)[:, 0]
         away = np.sin(sonar.bearing_rad)[None, :, None] - line[:, None, :]
-        power = (aperture.pattern(away) ** 2 * slope[:, None, :]).mean(axis=2)
+        power = (aperture.pattern(away) ** 2).mean(axis=2) * (angle / traced.beam_width_rad)[:, None]
         return np.asarray(power * aperture.width / aperture.equivalent_width, dtype=np.float32)
 
     @cached_property
