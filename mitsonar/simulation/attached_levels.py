@@ -18,7 +18,7 @@ from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.records.echoes import Echoes
 from mitsonar.simulation.beams import angles_of, beam_at, elevation_gain
 from mitsonar.simulation.device import DeviceArray
-from mitsonar.simulation.edges import EdgePieces, Edges, crossings, edges_of, pieces_of
+from mitsonar.simulation.edges import EdgePieces, Edges, crossings, edges_of, pieces_of, without_derivatives
 from mitsonar.simulation.models.physical import ExpectedFormer
 from mitsonar.simulation.models.thesis import footprint
 from mitsonar.simulation.tracing import Rays, Tracer
@@ -93,13 +93,15 @@ class AttachedLevels:
                 steps += self._swept(part, still, given)
         # 3. Each footprint is a step up at its begin and a step down at its end: their running sum is the share of each bin.
         shape = (self.traced.range_bins + 2, self.traced.beams)
-        sums: DeviceArray = dr.cumsum(dr.tensor_t(mi.Float64)(steps, shape), axis=0)
+        tensor: DeviceArray = dr.tensor_t(mi.Float64)
+        sums: DeviceArray = dr.cumsum(tensor(steps, shape), axis=0)
         boxes = mi.TensorXf(mi.Float(sums.array), shape)[: shape[0] - 2]
         return self._formed(boxes, given)
 
     def _steps(self, echoes: Echoes, elevation: DeviceArray, beam: DeviceArray, given: dict[str, mi.Float]) -> DeviceArray:
         """Return densities of levels as steps ``(bins + 2, beams)``, flat: up where footprints begin, down at the end."""
-        sonar, stretch = self.traced, 1.0
+        sonar = self.traced
+        stretch: DeviceArray = 1.0
         if "sound_speed" in given:
             stretch = sonar.sound_speed / mi.Float64(given["sound_speed"])
         exact = Echoes(**{field.name: mi.Float64(getattr(echoes, field.name)) for field in fields(Echoes)})
@@ -121,14 +123,15 @@ class AttachedLevels:
         sonar, middle = self.traced, pieces.direction
         bearing, elevation = angles_of(sonar, -middle.x, middle.z, middle.y)
         beam, inside = beam_at(sonar, bearing)
-        inside &= dr.abs(elevation) <= math.radians(sonar.elevation_fov_deg) / 2
+        lift: DeviceArray = dr.abs(elevation)
+        inside &= lift <= math.radians(sonar.elevation_fov_deg) / 2
         # 2. Echoes on both sides. What lies at the edge has its range, so that rounding moves nothing to another bin.
         origin, sides = mi.Point3f(*(line.w for line in lines)), []
         for side in (-1, 1):
             direction = dr.normalize(middle + pieces.across * (side * ASIDE_RAD))
             zero, none = mi.Float(0), mi.Vector3f(0)
             fan = Fan(direction, none, none, zero, zero, zero, mi.Float(1), elevation).carried(lines)
-            with dr.suspend_grad():
+            with without_derivatives():
                 echoes = Echo.measure(self.scene, self.tracer.surfaces, mi.Ray3f(origin, fan.d), fan, attached=True)
             behind = echoes.range_m - pieces.distance
             inside &= (echoes.hit == 0) | (behind >= -NEARER * pieces.distance)

@@ -98,11 +98,10 @@ class DifferentiableSimulator:
         import torch
 
         params = mi.traverse(self.scene)
+        known = ["pose", *INSTRUMENT, *(name for name, _ in params)]
         for name in names:
-            if name != "pose" and name not in INSTRUMENT and name not in params:
-                raise MitsonarError(
-                    f"unknown parameter {short_repr(name)}: {suggest_names(name, ['pose', *INSTRUMENT, *params.keys()])}"
-                )
+            if name not in known:
+                raise MitsonarError(f"unknown parameter {short_repr(name)}: {suggest_names(name, known)}")
 
         def rendered(values: Sequence[torch.Tensor], weight: torch.Tensor | None) -> list[NDArray[np.float32]]:
             """Return the levels, or with weights of the levels the derivatives of their sum by the values."""
@@ -142,7 +141,7 @@ class DifferentiableSimulator:
                 pairs = zip(slopes, values, strict=True)
                 return tuple(torch.from_numpy(slope).reshape(value.shape).to(value) for slope, value in pairs)
 
-        return Levels.apply  # type: ignore[no-any-return]  # Torch gives it no types
+        return Levels.apply
 
     # ---------------- Checks
 

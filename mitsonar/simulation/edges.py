@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias, cast
 
@@ -23,7 +24,7 @@ from mitsonar.simulation.beams import angles_of
 from mitsonar.simulation.device import DeviceArray
 from mitsonar.simulation.tracing import Tracer
 
-__all__ = ["EdgePieces", "Edges", "crossings", "edges_of", "pieces_of"]
+__all__ = ["EdgePieces", "Edges", "crossings", "edges_of", "pieces_of", "without_derivatives"]
 
 FLAT = 1e-6
 """Largest difference of the normals of two facets at which their edge is ignored."""
@@ -93,6 +94,12 @@ class SonarView:
         return (inside[0] & inside[1] | (angle > 0.5)) & (distance < self.sonar.range_max)
 
 
+def without_derivatives() -> AbstractContextManager[None]:
+    """Return a context in which nothing carries derivatives."""
+    context: AbstractContextManager[None] = dr.suspend_grad()  # type: ignore[no-untyped-call]  # Dr.Jit gives it no types
+    return context
+
+
 # ---------------- Edges of shapes
 
 
@@ -107,8 +114,8 @@ class MeshEdges:
     """
 
     mesh: mi.Mesh
-    ends: tuple[mi.UInt32, mi.UInt32]
-    facets: tuple[list[mi.UInt32], list[mi.UInt32]]
+    ends: tuple[DeviceArray, DeviceArray]
+    facets: tuple[list[DeviceArray], list[DeviceArray]]
 
     @classmethod
     def of_mesh(cls, mesh: mi.Mesh) -> MeshEdges:
@@ -129,9 +136,9 @@ class MeshEdges:
         columns = [mi.UInt32(np.ascontiguousarray(column)) for column in table.T]
         return cls(mesh, (columns[0], columns[1]), (columns[2:5], columns[5:8]))
 
-    def weights(self, view: SonarView) -> mi.Float:
+    def weights(self, view: SonarView) -> DeviceArray:
         """Return what share of the points each edge takes: by its length in the view, and by how its facets differ."""
-        ends = [view.to_sonar(self.mesh.vertex_position(index) - view.origin) for index in self.ends]
+        ends = [view.to_sonar(self._vertex(index) - view.origin) for index in self.ends]
         one, other = (dr.normalize(end) for end in ends)
         length: DeviceArray = dr.norm(one - other)
         normals = [view.to_sonar(self._normal(corners)) for corners in self.facets]
@@ -141,7 +148,7 @@ class MeshEdges:
         nearer = dr.minimum(dr.norm(ends[0]), dr.norm(ends[1]))
         return dr.select(view.may_see(one + other, length, nearer), length * share, 0)
 
-    def points(self, share: mi.Float, view: SonarView) -> tuple[DeviceArray, DeviceArray]:
+    def points(self, share: DeviceArray, view: SonarView) -> tuple[DeviceArray, DeviceArray]:
         """Return points on the edges, with derivatives, and the piece of the edge that each represents, without [m].
 
         Args:
@@ -153,15 +160,19 @@ class MeshEdges:
         total = dr.cumsum(weight)
         whole = dr.gather(mi.Float64, total, dr.width(total) - 1)
         at = mi.Float64(share) * whole
-        edge = dr.binary_search(0, dr.width(total) - 1, lambda index: dr.gather(mi.Float64, total, index) <= at)
+        search: DeviceArray = dr.binary_search  # Dr.Jit gives it no types
+        edge = search(0, dr.width(total) - 1, lambda index: dr.gather(mi.Float64, total, index) <= at)
         size = dr.gather(mi.Float64, weight, edge)
         part = mi.Float(1 - dr.clip((dr.gather(mi.Float64, total, edge) - at) / size, 0, 1))
         # 2. Its place, and the piece that it represents.
-        one, other = (self.mesh.vertex_position(dr.gather(mi.UInt32, index, edge)) for index in self.ends)
+        one, other = (self._vertex(dr.gather(mi.UInt32, index, edge)) for index in self.ends)
         return one * (1 - part) + other * part, dr.detach(other - one) * mi.Float(whole / size / dr.width(share))
 
-    def _normal(self, corners: Sequence[mi.UInt32]) -> mi.Vector3f:
-        a, b, c = (self.mesh.vertex_position(index, index != NONE) for index in corners)
+    def _vertex(self, index: DeviceArray, active: DeviceArray = True) -> DeviceArray:
+        return self.mesh.vertex_position(index, active)
+
+    def _normal(self, corners: Sequence[DeviceArray]) -> DeviceArray:
+        a, b, c = (self._vertex(index, index != NONE) for index in corners)
         return dr.normalize(dr.cross(b - a, c - a))
 
 
@@ -175,14 +186,15 @@ class Outline:
 
     shape: mi.Shape
 
-    def weights(self, view: SonarView) -> mi.Float:
+    def weights(self, view: SonarView) -> DeviceArray:
         """Return the angle that its box takes in the view."""
         box = self.shape.bbox()
         away = view.to_sonar(mi.Point3f(box.center()) - view.origin)
-        size, distance = dr.norm(mi.Vector3f(box.extents())), dr.norm(away)
+        size: DeviceArray = dr.norm(mi.Vector3f(box.extents()))
+        distance: DeviceArray = dr.norm(away)
         return dr.select(view.may_see(away, size / distance, distance - size), dr.minimum(size / distance, 1), 0)
 
-    def points(self, share: mi.Float, view: SonarView) -> tuple[DeviceArray, DeviceArray]:
+    def points(self, share: DeviceArray, view: SonarView) -> tuple[DeviceArray, DeviceArray]:
         """Return points on the outline, and their pieces; see :meth:`MeshEdges.points`."""
         # 1. Part of the outline of each point, and place on it.
         origin = view.origin
@@ -192,8 +204,9 @@ class Outline:
         part = np.minimum(np.searchsorted(end, at, side="right"), len(end) - 1)
         within = np.clip(1 - (end[part] - at) / share_of_part[part], 0, 1)
         # 2. Its place, which moves with the shape.
-        index = dr.gather(mi.UInt32, parts, mi.UInt32(part.astype(np.uint32)))
-        sample = self.shape.sample_precomputed_silhouette(origin, index, mi.Float(within.astype(np.float32)))
+        index: DeviceArray = dr.gather(mi.UInt32, parts, mi.UInt32(part.astype(np.uint32)))
+        places: DeviceArray = mi.Float(within.astype(np.float32))
+        sample: DeviceArray = self.shape.sample_precomputed_silhouette(origin, index, places)
         si = dr.zeros(mi.SurfaceInteraction3f, len(at))
         si.p, si.uv, si.prim_index, si.shape = sample.p, sample.uv, sample.prim_index, mi.ShapePtr(self.shape)
         density = dr.detach(sample.pdf) * mi.Float(share_of_part[part].astype(np.float32)) * len(at)
@@ -223,7 +236,7 @@ def pieces_of(edges: Sequence[Edges], sonar: Sonar, lines: list[mi.Vector4f], co
     """
     place = mi.Point3f(*(line.w for line in lines))
     view = SonarView(sonar, [dr.detach(line) for line in lines])
-    with dr.suspend_grad():
+    with without_derivatives():
         weights = [float(dr.sum(one.weights(view))[0]) for one in edges]
     pieces = []
     for one, weight in zip(edges, weights, strict=True):
@@ -259,16 +272,16 @@ def crossings(scene: mi.Scene, tracer: Tracer, lines: list[mi.Vector4f], key: mi
     sonar, still = tracer.sonar, [dr.detach(line) for line in lines]
     # 1. Which shape and object does each ray meet?
     ray = dr.arange(mi.UInt32, sonar.rays)
-    with dr.suspend_grad():
+    with without_derivatives():
         hit, _ = _seen(scene, tracer, still, ray, key, attached=False)
     valid, shape, part = hit.valid, mi.Int32(hit.shape_id), mi.Int32(hit.object_id)
     dr.eval(valid, shape, part)
     # 2. Pairs of neighbours that meet different ones, over elevation and across.
     pieces, columns = [], sonar.columns
     for apart, has in ((columns, ray < sonar.rays - columns), (1, ray % columns < columns - 1)):
-        other = dr.select(has, ray + apart, ray)
+        other: DeviceArray = dr.select(has, ray + apart, ray)
         differ = (shape != dr.gather(mi.Int32, shape, other)) | (part != dr.gather(mi.Int32, part, other))
-        one = dr.compress(valid & dr.gather(mi.Bool, valid, other) & differ)
+        one: DeviceArray = dr.compress(valid & dr.gather(mi.Bool, valid, other) & differ)
         if dr.width(one):
             pieces.append(_between(scene, tracer, lines, one, one + apart, key, over_elevation=apart > 1))
     return pieces
@@ -278,8 +291,8 @@ def _between(
     scene: mi.Scene,
     tracer: Tracer,
     lines: list[mi.Vector4f],
-    one: mi.UInt32,
-    other: mi.UInt32,
+    one: DeviceArray,
+    other: DeviceArray,
     key: mi.UInt32,
     *,
     over_elevation: bool,
@@ -307,7 +320,7 @@ def _between(
         d = dr.normalize(direction + across * (side * BEHIND_RAD))
         begin, end = (1 / dr.dot(dr.detach(planes[which]), d) for which in (near, far))
         towards = _to_world(view.lines, d)
-        with dr.suspend_grad():
+        with without_derivatives():
             behind = tracer.surfaces.hit(
                 scene, mi.Ray3f(view.origin + towards * ((begin + end) / 2), towards), attached=True
             )
