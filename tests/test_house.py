@@ -167,6 +167,14 @@ def test_only_plugins_and_the_simulation_speak_mitsuba() -> None:
     }  # worlds and bridges only to check what Mitsuba would read
 
 
+def test_kernels_compile_on_old_versions_of_llvm() -> None:
+    """LLVM 15 and 16 end the process on these; `clipped` and `select` compare."""
+    for path in (path for room in ("mitsonar", "plugins") for path in (ROOT / room).rglob("*.py")):
+        nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        used = {node.attr for node in nodes if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "dr"}
+        assert not used & {"minimum", "maximum", "clip"}, path
+
+
 def test_every_module_says_what_it_is() -> None:
     for name, path in MODULES.items():
         assert ast.get_docstring(parsed(path)), f"{name or 'mitsonar'} has no docstring"

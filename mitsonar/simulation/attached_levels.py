@@ -17,8 +17,8 @@ from mitsonar.plugins.echo_integrator import Echo
 from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.records.echoes import Echoes
 from mitsonar.simulation.beams import angles_of, beam_at, elevation_gain
-from mitsonar.simulation.device import DeviceArray
-from mitsonar.simulation.edges import EdgePieces, Edges, crossings, edges_of, pieces_of, without_derivatives
+from mitsonar.simulation.device import DeviceArray, clipped
+from mitsonar.simulation.edges import EdgePieces, Edges, crossings, pieces_of, without_derivatives
 from mitsonar.simulation.models.physical import ExpectedFormer
 from mitsonar.simulation.models.thesis import footprint
 from mitsonar.simulation.tracing import Rays, Tracer
@@ -42,11 +42,13 @@ class AttachedLevels:
     Attributes:
         scene: the scene.
         sonar: the sonar.
+        edges: edges of the scene.
         edge_points: number of points on edges; 0 leaves edges out.
     """
 
     scene: mi.Scene
     sonar: Sonar
+    edges: list[Edges]
     edge_points: int
 
     @cached_property
@@ -63,11 +65,6 @@ class AttachedLevels:
     def tracer(self) -> Tracer:
         """Return the tracer of its rays."""
         return Tracer(self.scene, self.traced)
-
-    @cached_property
-    def edges(self) -> list[Edges]:
-        """Return the edges of the scene."""
-        return edges_of(self.scene)
 
     def levels(self, pose: list[mi.Float], ping: int, given: dict[str, mi.Float]) -> mi.TensorXf:
         """Compute the levels ``(bins, beams)`` of a ping.
@@ -107,10 +104,12 @@ class AttachedLevels:
         exact = Echoes(**{field.name: mi.Float64(getattr(echoes, field.name)) for field in fields(Echoes)})
         begin, end, length = footprint(replace(exact, near_m=exact.near_m * stretch, far_m=exact.far_m * stretch), sonar)
         gain = elevation_gain(self.sonar, dr.tan(elevation), given.get("elevation_fov_deg"))
-        density = dr.select(exact.hit > 0, level(exact, sonar, dr.select) * mi.Float64(gain * gain) / length, 0)
+        # the gain of the receiver follows the range that it shows
+        density = level(exact, sonar, dr.select) * mi.Float64(gain * gain) * stretch**sonar.gain_exponent / length
+        density = dr.select(exact.hit > 0, density, 0)
         steps = dr.zeros(mi.Float64, (sonar.range_bins + 2) * sonar.beams)
         for place, height in ((begin, density), (end, -density)):
-            inside: DeviceArray = dr.clip(place, 0, sonar.range_bins)
+            inside: DeviceArray = clipped(place, 0, sonar.range_bins)
             first, part = dr.floor(inside), inside - dr.floor(inside)
             for offset, share in ((0, 1 - part), (1, part)):
                 where = (mi.UInt32(first) + offset) * sonar.beams + beam
@@ -156,10 +155,13 @@ class AttachedLevels:
                 slope = mi.TensorXf(np.asarray((high - low) / (2 * STEP * value), dtype=np.float32))
                 pattern = mi.TensorXf(middle) + slope * mi.TensorXf(width - dr.detach(width), shape=(1, 1))
             levels = mi.TensorXf(former.over_bins) @ levels @ pattern
-        # 2. Losses by range, and taper across the fan.
-        if "absorption_db_per_m" in given:
-            more = given["absorption_db_per_m"] - (sonar_absorption(sonar) if former is not None else 0.0)
-            loss_db = mi.TensorXf((-2 * sonar.range_m).astype(np.float32)[:, None]) * mi.TensorXf(more, shape=(1, 1))
+        # 2. Losses over the true range, in place of those of the sonar over the range that it shows; taper across the fan.
+        if "absorption_db_per_m" in given or "sound_speed" in given:
+            known = sonar_absorption(sonar)
+            loss = given.get("absorption_db_per_m", mi.Float(known))
+            slower = given.get("sound_speed", mi.Float(sonar.sound_speed)) / sonar.sound_speed
+            more = mi.TensorXf(loss * slower - known, shape=(1, 1))
+            loss_db = mi.TensorXf((-2 * sonar.range_m).astype(np.float32)[:, None]) * more
             levels = levels * dr.exp(loss_db * (math.log(10) / 10))
         if "taper_db" in given:
             sine = np.square(np.sin(sonar.bearing_rad))

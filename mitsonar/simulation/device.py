@@ -23,6 +23,7 @@ __all__ = [
     "Frozen",
     "LaunchTables",
     "backend",
+    "clipped",
     "current_variant",
     "ensure_variant",
     "padded",
@@ -207,6 +208,13 @@ MOST_LANES = 64
 
 ALIGNED_BYTES = 64
 """Alignment of memory for a launch [bytes]: that of arrays allocated by Dr.Jit, or a multiple of it."""
+
+
+def clipped(value: DeviceArray, low: DeviceArray, high: DeviceArray) -> DeviceArray:
+    """Clip to low..high by comparisons, since LLVM 15 and 16 abort on ``dr.clip`` (see CONTRIBUTING.md)."""
+    import drjit as dr
+
+    return dr.select(value > low, dr.select(value < high, value, high), low)
 
 
 def padded(values: NDArray[Any]) -> NDArray[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +23,16 @@ __all__ = ["DifferentiableSimulator"]
 EDGE_POINTS = 200_000
 """Default number of points on edges."""
 
+SIX = "a pose is six numbers x, y, z [m], pitch, roll, heading [rad]"
+
 INSTRUMENT = ("absorption_db_per_m", "beam_width_deg", "elevation_fov_deg", "sound_speed", "taper_db")
 """Properties of the sonar by which images can be differentiated."""
+
+LEAST = {"absorption_db_per_m": 0, "beam_width_deg": 0.01, "elevation_fov_deg": 0.1, "sound_speed": 1, "taper_db": -60}
+"""Smallest values of these."""
+
+OF_PATTERNS = ("absorption_db_per_m", "beam_width_deg", "elevation_fov_deg")
+"""Those that only sonars with a beam pattern have."""
 
 
 class DifferentiableSimulator:
@@ -43,11 +52,13 @@ class DifferentiableSimulator:
         pose: pose of the sonar in the scene, the default of :meth:`levels`; None if the scene has none.
 
     Raises:
-        MitsonarError: there is no sonar; another model, several reflections or ping groups.
+        MitsonarError: there is no sonar; another model, several reflections or ping groups; absorption without a pattern; a
+            shape without outlines.
     """
 
     def __init__(self, scene: mi.Scene, sonar: Sonar | None = None, *, edge_points: int = EDGE_POINTS) -> None:
         from mitsonar.simulation.attached_levels import AttachedLevels
+        from mitsonar.simulation.edges import edges_of
         from mitsonar.simulation.scene import sonar_in
 
         placed = sonar_in(scene)
@@ -61,8 +72,12 @@ class DifferentiableSimulator:
                 f"{self.sonar.model}, bounces {self.sonar.bounces}, ping_groups {self.sonar.ping_groups}; give "
                 "sonar.replace(model='physical', bounces=1, ping_groups=1)"
             )
+        if self.sonar.beam_pattern == "box" and self.sonar.absorption_db_per_m:
+            raise MitsonarError(
+                "the model physical applies absorption only with a beam pattern: give pattern two_way as well"
+            )
         self.scene, self.edge_points = scene, edge_points
-        self._attached = AttachedLevels(scene, self.sonar, edge_points)
+        self._attached = AttachedLevels(scene, self.sonar, edges_of(scene) if edge_points else [], edge_points)
 
     def __repr__(self) -> str:
         return f"DifferentiableSimulator({self.sonar!r}, {self.edge_points:,} points on edges)"
@@ -73,9 +88,9 @@ class DifferentiableSimulator:
         Args:
             pose: x, y, z [m], pitch, roll, heading [rad], numbers or ``mi.Float``; default: the pose in the scene.
             ping: number of the ping, which draws the places of jittered rays in their cells.
-            instrument: numbers or ``mi.Float`` in place of those of the sonar: ``beam_width_deg`` and
-                ``elevation_fov_deg`` of a sonar with a beam pattern, ``absorption_db_per_m``, ``taper_db``, and the true
-                ``sound_speed`` [m/s], where ranges are those of the sonar's own.
+            instrument: numbers or ``mi.Float``. In place of those of the sonar, if it has a beam pattern:
+                ``beam_width_deg``, ``elevation_fov_deg``, ``absorption_db_per_m``. Besides: ``taper_db``, which the model
+                ``physical`` leaves out, and the true ``sound_speed`` [m/s]; bins and gain are those of the sonar's own.
 
         Returns:
             Levels ``(bins, beams)``.
@@ -107,6 +122,8 @@ class DifferentiableSimulator:
             """Return the levels, or with weights of the levels the derivatives of their sum by the values."""
             inputs: dict[str, DeviceArray] = {}
             for name, value in zip(names, values, strict=True):
+                if name == "pose" and value.numel() != 6:
+                    raise MitsonarError(f"{SIX}: got a tensor of {value.numel()}")
                 array = np.ascontiguousarray(value.detach().cpu().numpy(), dtype=np.float32)
                 kind = type(params[name]) if name in params else mi.Float
                 flat = mi.Float(array.ravel())
@@ -149,17 +166,20 @@ class DifferentiableSimulator:
         pose = self.pose if pose is None else pose
         if pose is None or len(pose) != 6:
             got = "none" if pose is None else str(len(pose))
-            raise MitsonarError(f"a pose is six numbers x, y, z [m], pitch, roll, heading [rad]: got {got}")
+            raise MitsonarError(f"{SIX}: got {got}")
         numbers = [mi.Float(value) for value in pose]
         dr.make_opaque(numbers)  # inputs of the kernels, which another pose then compiles no more
         return numbers
 
     def _checked(self, instrument: dict[str, Any]) -> dict[str, mi.Float]:
-        for name in instrument:
+        given = {name: mi.Float(value) for name, value in instrument.items()}
+        for name, value in given.items():
             if name not in INSTRUMENT:
                 raise MitsonarError(f"unknown property {short_repr(name)}: {suggest_names(name, INSTRUMENT)}")
-            if name in ("beam_width_deg", "elevation_fov_deg") and self.sonar.vertical_pattern == "box":
-                raise MitsonarError(f"{name} has derivatives only with a beam pattern: give the sonar pattern two_way")
-        given = {name: mi.Float(value) for name, value in instrument.items()}
+            if name in OF_PATTERNS and self.sonar.vertical_pattern == "box":
+                raise MitsonarError(f"{name} needs a beam pattern: give the sonar pattern two_way")
+            least = LEAST[name]
+            if dr.width(value) != 1 or not (number := float(dr.detach(value)[0])) >= least or not math.isfinite(number):
+                raise MitsonarError(f"{name} must be one number of at least {least:g}: got {value}")
         dr.make_opaque(given)
         return given

@@ -17,11 +17,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.beams import angles_of
-from mitsonar.simulation.device import DeviceArray
+from mitsonar.simulation.device import DeviceArray, clipped
 from mitsonar.simulation.tracing import Tracer
 
 __all__ = ["EdgePieces", "Edges", "crossings", "edges_of", "pieces_of", "without_derivatives"]
@@ -34,6 +35,9 @@ LEAST = 0.05
 
 BEHIND_RAD = 2e-4
 """Angle from a line where two surfaces cut each other to where the hidden one must go on [rad]."""
+
+INSTANCE = "Instance"
+"""Mitsuba's name of the shape that shows a ``shapegroup``."""
 
 SAME = 0.02
 """Largest difference of the normals there."""
@@ -144,8 +148,9 @@ class MeshEdges:
         normals = [view.to_sonar(self._normal(corners)) for corners in self.facets]
         silhouette = (self.facets[1][0] == NONE) | (dr.dot(normals[0], one) * dr.dot(normals[1], one) < 0)
         differ = dr.norm(normals[0] - normals[1])
-        share = dr.select(silhouette, 1, dr.select(differ > FLAT, dr.clip(differ, LEAST, 1), 0))
-        nearer = dr.minimum(dr.norm(ends[0]), dr.norm(ends[1]))
+        share = dr.select(silhouette, 1, dr.select(differ > FLAT, clipped(differ, LEAST, 1), 0))
+        near, far = (dr.norm(end) for end in ends)
+        nearer = dr.select(near < far, near, far)
         return dr.select(view.may_see(one + other, length, nearer), length * share, 0)
 
     def points(self, share: DeviceArray, view: SonarView) -> tuple[DeviceArray, DeviceArray]:
@@ -163,7 +168,7 @@ class MeshEdges:
         search: DeviceArray = dr.binary_search  # Dr.Jit gives it no types
         edge = search(0, dr.width(total) - 1, lambda index: dr.gather(mi.Float64, total, index) <= at)
         size = dr.gather(mi.Float64, weight, edge)
-        part = mi.Float(1 - dr.clip((dr.gather(mi.Float64, total, edge) - at) / size, 0, 1))
+        part = mi.Float(1 - clipped((dr.gather(mi.Float64, total, edge) - at) / size, 0, 1))
         # 2. Its place, and the piece that it represents.
         one, other = (self._vertex(dr.gather(mi.UInt32, index, edge)) for index in self.ends)
         return one * (1 - part) + other * part, dr.detach(other - one) * mi.Float(whole / size / dr.width(share))
@@ -192,7 +197,7 @@ class Outline:
         away = view.to_sonar(mi.Point3f(box.center()) - view.origin)
         size: DeviceArray = dr.norm(mi.Vector3f(box.extents()))
         distance: DeviceArray = dr.norm(away)
-        return dr.select(view.may_see(away, size / distance, distance - size), dr.minimum(size / distance, 1), 0)
+        return dr.select(view.may_see(away, size / distance, distance - size), clipped(size / distance, 0, 1), 0)
 
     def points(self, share: DeviceArray, view: SonarView) -> tuple[DeviceArray, DeviceArray]:
         """Return points on the outline, and their pieces; see :meth:`MeshEdges.points`."""
@@ -217,12 +222,23 @@ Edges: TypeAlias = MeshEdges | Outline
 
 
 def edges_of(scene: mi.Scene) -> list[Edges]:
-    """Return the edges of all shapes of a scene but instances."""
-    return [
-        MeshEdges.of_mesh(cast(mi.Mesh, shape)) if shape.is_mesh() else Outline(shape)
-        for shape in scene.shapes()
-        if shape.bsdf() is not None
-    ]
+    """Return the edges of all shapes of a scene but instances.
+
+    Raises:
+        MitsonarError: a shape has no outline that Mitsuba knows.
+    """
+    edges: list[Edges] = []
+    for shape in scene.shapes():
+        if shape.is_mesh():
+            edges.append(MeshEdges.of_mesh(cast(mi.Mesh, shape)))
+        elif shape.class_name() != INSTANCE:
+            if int(shape.silhouette_discontinuity_types()) == 0:
+                raise MitsonarError(
+                    f"shape {shape.id()} is of a kind without outlines: got {shape.class_name()}; make it a mesh, or give "
+                    "edge_points=0 for derivatives without edges"
+                )
+            edges.append(Outline(shape))
+    return edges
 
 
 def pieces_of(edges: Sequence[Edges], sonar: Sonar, lines: list[mi.Vector4f], count: int) -> list[EdgePieces]:

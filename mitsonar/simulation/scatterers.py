@@ -23,7 +23,7 @@ from mitsonar.plugins.bsdf_reflectance import is_black, reflectances_of, reflect
 from mitsonar.plugins.cell_noise import CellNoise
 from mitsonar.plugins.hashed_texture import ROUNDS
 from mitsonar.plugins.surfaces import Surfaces, grain_key, registry_index
-from mitsonar.simulation.device import DeviceArray, Frozen, LaunchTables, padded, replayed
+from mitsonar.simulation.device import DeviceArray, Frozen, LaunchTables, clipped, padded, replayed
 from mitsonar.simulation.mirrors import (
     ROW,
     FlatMirrors,
@@ -355,7 +355,7 @@ MARGIN_DEG = 2.0
 LINK = 30
 """Length of :func:`link_table`."""
 
-DRJIT = Maths(dr.asin, dr.atan2, dr.sin, dr.cos, dr.clip, dr.select)
+DRJIT = Maths(dr.asin, dr.atan2, dr.sin, dr.cos, clipped, dr.select)
 
 
 class Leg(NamedTuple):

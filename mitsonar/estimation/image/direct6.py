@@ -307,5 +307,6 @@ class _Linearised:
     def covariance(self, start_std: MotionStd) -> NDArray[np.float64]:
         """Return the covariance of the most probable pose ``(6, 6)``."""
         scale = start_std.of(NAMES)
-        size, axes, _ = self.bound.directions(scale)
-        return np.asarray((axes / (np.maximum(size, 0.0) + 1)) @ axes.T * np.outer(scale, scale))
+        size, axes, significant = self.bound.directions(scale)
+        known = np.where(size > significant, size, 0.0)  # what is no more than its noise counts for nothing
+        return np.asarray((axes / (known + 1)) @ axes.T * np.outer(scale, scale))

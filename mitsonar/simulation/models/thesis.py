@@ -31,7 +31,7 @@ from mitsonar.plugins.echo_integrator import edge_direction, flatter
 from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.records.echoes import Echoes
 from mitsonar.simulation.beams import beam_of
-from mitsonar.simulation.device import DeviceArray, Frozen, LaunchTables, replayed
+from mitsonar.simulation.device import DeviceArray, Frozen, LaunchTables, clipped, replayed
 from mitsonar.simulation.pings import Counts, RenderedPings, labels_of
 from mitsonar.simulation.tracing import Rays, Tracer, half_path_rate, hidden, surfaces_of
 
@@ -263,7 +263,7 @@ def accumulate(
     # 3. Model physical: clip the footprint to the window; its density stays that of the whole footprint.
     a, b, width = footprint(exact, sonar)
     inside = active & hit & (b > 0) & (a < sonar.range_bins)
-    a, b = _clip(a, sonar.range_bins), _clip(b, sonar.range_bins)
+    a, b = clipped(a, 0, sonar.range_bins), clipped(b, 0, sonar.range_bins)
     first, last = _whole(a), _whole(b)
     # 4. Round the density and its fractional parts once, so that the four additions of a box cancel exactly.
     density = value / width
@@ -343,7 +343,7 @@ def strongest(seen: ViewEchoes, ping: mi.UInt32, ray: mi.UInt32, pings: int, vie
         a, b, width = footprint(exact, sonar)
         value = value / width
     inside = seen.active & (exact.hit > 0) & (b > 0) & (a < sonar.range_bins) & (value > 0)
-    a, b = _clip(a, sonar.range_bins), _clip(b, sonar.range_bins)
+    a, b = clipped(a, 0, sonar.range_bins), clipped(b, 0, sonar.range_bins)
     # 2. Pack density and ray into one integer. The bits of positive floats order as the floats do, so a maximum finds both.
     strength: DeviceArray = dr.reinterpret_array(mi.UInt32, mi.Float(value))
     # a level that underflows float32 still beats an empty cell
@@ -368,11 +368,6 @@ def _counter(hit: mi.Bool, near: mi.Bool, sonar: Sonar) -> mi.UInt32:
     """Return the counter cell of a ray outside the window, within its beam."""
     near_cell = mi.UInt32(sonar.range_bins + 1)
     return dr.select(hit, dr.select(near, near_cell, near_cell + 1), near_cell + 2)
-
-
-def _clip(position: DeviceArray, bins: int) -> DeviceArray:
-    """Clip to 0..bins by comparisons, since LLVM 15 and 16 abort on `max` (see CONTRIBUTING.md)."""
-    return dr.select(position > 0, dr.select(position < bins, position, bins), 0)
 
 
 def _whole(position: DeviceArray) -> mi.UInt32:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy import ndimage
 from mitsonar.acoustics.noise import NOISE_MODELS, expected_values
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.image import bounds_at
-from mitsonar.estimation.image.direct6 import Direct6
+from mitsonar.estimation.image.direct6 import Direct6, _Linearised
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import DEGREES, MotionStd, compose_six, six_between
 from mitsonar.motion.pose import Pose
@@ -121,6 +122,13 @@ def test_what_a_frame_does_not_show_stays_as_assumed() -> None:
 
 
 @pytest.mark.usefixtures("variant")
+def test_information_within_its_noise_counts_for_nothing() -> None:
+    bound: Any = SimpleNamespace(directions=lambda _scale: (np.array([100.0] * 5 + [900.0]), np.eye(6), 150.0))
+    covariance = _Linearised(bound, np.zeros(6), 1.0).covariance(START)
+    expected = np.square(START.of(SIX)) * np.array([1.0] * 5 + [1 / 901])
+    np.testing.assert_allclose(covariance, np.diag(expected))
+
+
 def test_frames_of_another_place_and_wrong_arguments_are_refused() -> None:
     simulator, gain = source()
     estimator = Direct6(simulator, gain, LOW, START, pings=4)
