@@ -27,14 +27,16 @@ class BeamReturns(NamedTuple):
     Attributes:
         range_m: ranges ``(frames, beams)`` [m]; inf for a beam without a return.
         value: image values at these ranges ``(frames, beams)`` in 0..1; 0 without a return.
+        from_m: range at which the search began [m].
     """
 
     range_m: Array
     value: NDArray[np.float32]
+    from_m: float = 0.0
 
     def select(self, index: slice) -> BeamReturns:
         """Return those of a subset of the frames."""
-        return BeamReturns(self.range_m[index], self.value[index])
+        return self._replace(range_m=self.range_m[index], value=self.value[index])
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,24 @@ class FirstReturns:
         if not 0 <= self.length_m < math.inf:
             raise MitsonarError(f"{argument('length_m')} must be a length of 0 m or more: got {self.length_m:g}")
 
+    def doubts(self, beams: int, returned: int, nearest: int) -> list[str]:
+        """Return one-sentence notes on a level that finds nothing, or only the ringing of the transducer.
+
+        Args:
+            beams: number of beams that were searched.
+            returned: number of beams with a return.
+            nearest: number of returns in the first bin that is searched.
+        """
+        if beams and not returned:
+            searched = f"{self.level_db:g} dB or more from {self.from_m:g} m on"
+            return [f"no beam has a return of {searched}: give a lower level, but above that of the noise"]
+        if nearest > returned / 2:
+            return [
+                f"{nearest:,} of {returned:,} returns are at {self.from_m:g} m, where the search begins, probably ringing of "
+                "the transducer: begin farther out, or give a higher level"
+            ]
+        return []
+
     def find(self, frames: SonarFrames) -> BeamReturns:
         """Find the first return of each beam of each frame.
 
@@ -78,7 +98,7 @@ class FirstReturns:
         range_m, image = frames.range_m[beyond], frames.image[:, beyond]
         if not len(range_m) or not len(frames):
             shape = (len(frames), len(frames.bearing_rad))
-            return BeamReturns(np.full(shape, np.inf), np.zeros(shape, np.float32))
+            return BeamReturns(np.full(shape, np.inf), np.zeros(shape, np.float32), self.from_m)
         # 1. A return is the first run of bins above the level, up to its largest extent.
         above = (level_db >= self.level_db) & (image > 0)
         begun = np.logical_or.accumulate(above, axis=1)
@@ -88,7 +108,8 @@ class FirstReturns:
         strongest = np.where(run, level_db, -np.inf).argmax(axis=1)
         has_return = above.any(axis=1)
         value = to_float32(np.take_along_axis(image, strongest[:, None], axis=1)[:, 0])
-        return BeamReturns(np.where(has_return, range_m[strongest], np.inf), np.where(has_return, value, np.float32(0)))
+        range_m = np.where(has_return, range_m[strongest], np.inf)
+        return BeamReturns(range_m, np.where(has_return, value, np.float32(0)), self.from_m)
 
 
 def beam_times(frames: SonarFrames, index: int) -> Array | None:

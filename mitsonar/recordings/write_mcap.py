@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mitsonar.errors import MitsonarError, missing_package_error
+from mitsonar.errors import MitsonarError, MitsonarWarning, missing_package_error
 from mitsonar.geometry.fan import CartesianMap, cartesian_map
 from mitsonar.instruments.sonar import frame_period_s
 from mitsonar.instruments.views import directions
@@ -90,10 +91,8 @@ def write_mcap(
         with part.open("wb") as file:
             writer = _writer(file)
             span_db: list[float] = []
-            pairs = (
-                (_reduced(frames, full, labels, span_db), None if returns is None else returns.find(frames))
-                for frames in chunks
-            )
+            tally = _Tally(returns)
+            pairs = ((_reduced(frames, full, labels, span_db), tally.find(frames)) for frames in chunks)
             count = _write(writer, pairs, picture, span_db, progress or (lambda done: None))
             writer.finish()  # type: ignore[no-untyped-call]
         part.replace(path)
@@ -101,7 +100,29 @@ def write_mcap(
         raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first") from None
     finally:
         part.unlink(missing_ok=True)
+    for note in tally.notes():
+        warnings.warn(note, MitsonarWarning, stacklevel=2)
     return count
+
+
+class _Tally:
+    """First returns of all frames, counted for notes on the rule that finds them."""
+
+    def __init__(self, rule: FirstReturns | None) -> None:
+        self.rule, self.beams, self.returned, self.nearest = rule, 0, 0, 0
+
+    def find(self, frames: SonarFrames) -> BeamReturns | None:
+        if self.rule is None:
+            return None
+        returns = self.rule.find(frames)
+        begin = frames.range_m[frames.range_m >= self.rule.from_m][:1]
+        self.beams += returns.range_m.size
+        self.returned += int(np.isfinite(returns.range_m).sum())
+        self.nearest += int((returns.range_m == begin).sum()) if len(begin) else 0
+        return returns
+
+    def notes(self) -> list[str]:
+        return [] if self.rule is None else self.rule.doubts(self.beams, self.returned, self.nearest)
 
 
 def _writer(file: object) -> Writer:
@@ -458,7 +479,7 @@ class FrameEncoder:
             angle_increment=float((angle[-1] - angle[0]) / (len(angle) - 1)),
             time_increment=0.0 if times is None else float(abs(times[-1] - times[0]) / (len(times) - 1)),
             scan_time=float(frame_period_s(sonar)),
-            range_min=float(sonar.range_min),
+            range_min=max(float(sonar.range_min), returns.from_m),
             range_max=float(sonar.range_max),
             ranges=ranges[order].astype(np.float32),
             intensities=value[order].astype(np.float32),

@@ -12,7 +12,7 @@ from bags import decoded
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from mitsonar import MitsonarError, SonarFrames
+from mitsonar import MitsonarError, MitsonarWarning, SonarFrames
 from mitsonar.cli import application
 from mitsonar.instruments.sonar import Sonar, group_of_beams, ping_interval_s, scanned, timed_path
 from mitsonar.motion.trajectory import Trajectory
@@ -223,6 +223,18 @@ def test_beams_of_one_ping_run_from_starboard_and_uneven_ones_are_no_scan(tmp_pa
     assert len(points_of(messages["/sonar/returns"][0])) == 3
     write_mcap([even], tmp_path / "c.mcap")
     assert not {"/sonar/scan", "/sonar/returns"} & set(by_rosbags(tmp_path / "c.mcap"))
+
+
+def test_levels_that_find_nothing_or_ringing_are_noted(tmp_path: Path) -> None:
+    sonar = Sonar(beams=4, range_bins=5, range_min=1.0, range_max=1.5)
+    image = np.zeros((1, 5, 4), np.float32)
+    image[0, 2:, :3] = 0.5
+    frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.array([7.0]), sonar)
+    with pytest.warns(MitsonarWarning, match=r"no beam has a return of -1 dB or more from 0 m on: give a lower level"):
+        write_mcap([frames], tmp_path / "a.mcap", returns=FirstReturns(-1.0))
+    with pytest.warns(MitsonarWarning, match=r"3 of 3 returns are at 1.22 m, where the search begins"):
+        write_mcap([frames], tmp_path / "b.mcap", returns=FirstReturns(-20.0, from_m=1.22))
+    assert by_rosbags(tmp_path / "b.mcap")["/sonar/scan"][0].range_min == pytest.approx(1.22)
 
 
 @pytest.mark.parametrize("packed", [True, False])
