@@ -82,7 +82,7 @@ class FirstReturns:
             return [f"no beam has a return of {searched}: give a lower level, but above that of the noise"]
         if nearest > returned / 2:
             return [
-                f"{nearest:,} of {returned:,} returns are at {self.from_m:g} m, where the search begins, probably ringing of "
+                f"{nearest:,} of {returned:,} returns are at {self.from_m:g} m, where the search begins, perhaps ringing of "
                 "the transducer: begin farther out, or give a higher level"
             ]
         return []
