@@ -149,10 +149,12 @@ def refuse_aliased(responses: ImpulseResponses) -> None:
     count = len(sonar.receivers)
     advance = float(np.median(np.linalg.norm(np.diff(centres.sent, axis=0), axis=1)))
     seconds = float(np.median(np.diff(responses.time_s)))
-    do = [f"pings {most * count:.3g} m apart (they are {advance:.3g} m apart)"]
+    way = float(np.linalg.norm(np.diff(centres.sent, axis=0), axis=1).sum())
+    pings = math.ceil(way / (most * count) - 1e-6) + 1
+    do = [f"pings {most * count:.3g} m apart, {pings:,} on this path ({len(centres.sent):,} are {advance:.3g} m apart)"]
     if seconds > 0:
-        do.append(f"at this rate at most {most * count / seconds:.3g} m/s")
-    do.append(f"at this speed {math.ceil(advance / most - 1e-6):d} receivers spaced by {2 * most:.3g} m")
+        do.append(f"with {1 / seconds:.3g} pings a second at most {most * count / seconds:.3g} m/s")
+    do.append(f"at this spacing {math.ceil(advance / most - 1e-6):d} receivers spaced by {2 * most:.3g} m")
     raise MitsonarError(
         f"the aperture is aliased: phase centres are up to {gap:.3g} m apart along the track, and this beam needs "
         f"{most:.3g} m; give {', or '.join(do)}"

@@ -167,7 +167,8 @@ def test_even_ground_is_speckle_of_contrast_one_at_the_level_of_its_cells() -> N
 def test_an_aliased_aperture_is_refused_with_what_would_do() -> None:
     found = responses_of(array(), track(30, 0.4), PLACE, 1.0)
     with pytest.raises(
-        MitsonarError, match=r"up to 0\.25 m apart.*needs 0\.05 m.*pings 0\.2 m apart.*at most 2 m/s.*8 receiv"
+        MitsonarError,
+        match=r"up to 0\.25 m apart.*needs 0\.05 m.*pings 0\.2 m apart, 59 on this path \(30 are.*at most 2 m/s.*8 receiv",
     ):
         focus(found, AROUND)
     refuse_aliased(responses_of(array(8), track(30, 0.4), PLACE, 1.0))
