@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,7 +46,10 @@ def heights(
         Path | None, typer.Option(help="TUM or CSV file of the path, for frames without poses.", dir_okay=False)
     ] = None,
     frame: Frame = "mitsonar",
-    height: Annotated[float | None, typer.Option(help="Height over level ground [m], for frames that lack it.")] = None,
+    height: Annotated[
+        float | None,
+        typer.Option(help="Height of the first chosen frame over level ground [m] (default: over the lowest ground below)."),
+    ] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for one frame without a pose.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
     view: Annotated[
@@ -75,12 +79,15 @@ def heights(
     options = HeightMapOptions(cells, seed)
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
     # 2. Frames and their poses.
-    source = frames_for(frames, Reading(sequence, view, height_m=height, pitch_rad=pitch, geometry=geometry))
+    reading = Reading(sequence, view, pitch_rad=pitch, geometry=geometry)
+    source = frames_for(frames, reading)
+    if height is not None and source.height_m is None:
+        source = frames_for(frames, replace(reading, height_m=height))
     if source.note:
         say(source.note)
     index = _chosen(only, len(source))
     path = None if trajectory is None else Trajectory.load(trajectory, frame)
-    index, poses, height_m = _posed(source, index, path)
+    index, poses, height_m = _posed(source, index, path, height)
     # 3. The fit, and what it says.
     with progress_bar("fitting", most_trials(), "regularisers") as progress:
         result = fit_height_map(source.read(index), poses, height_m, options, progress)
@@ -119,9 +126,9 @@ def _chosen(only: str | None, count: int) -> NDArray[np.intp]:
 
 
 def _posed(
-    source: FrameSource, index: NDArray[np.intp], path: Trajectory | None
+    source: FrameSource, index: NDArray[np.intp], path: Trajectory | None, height_m: float | None
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the frames that have a pose, their poses and their heights over the ground."""
+    """Return the frames that have a pose, their poses and their heights over level ground."""
     # 1. Poses: along the given path, of the frames, or for one frame its attitude alone.
     if path is not None:
         along, poses = source.along(path)
@@ -139,10 +146,12 @@ def _posed(
                 "--only with one frame and its --height and --pitch-deg"
             )
         poses = np.nan_to_num(attitudes)
-    # 2. Heights over the ground; a frame without a position is above the origin.
+    # 2. Heights over level ground: frames hold those over what lies straight below, which may be a rock.
     if source.height_m is None:
         raise MitsonarError(f"{source.name} holds no height over the ground: give --height")
-    height_m = source.height_m[index]
-    if source.sonar_poses is None and path is None:
-        poses[:, 2] = height_m
-    return index, poses, height_m
+    below = source.height_m[index]
+    if source.sonar_poses is None and path is None:  # one frame, above the origin
+        poses[:, 2] = below if height_m is None else height_m
+        return index, poses, poses[:, 2].copy()
+    ground = (poses[:, 2] - below).min() if height_m is None else poses[0, 2] - height_m
+    return index, poses, np.asarray(poses[:, 2] - ground, dtype=np.float64)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers import Command, diffuse, floor, refused, scene
 
+from mitsonar.cli.heights import _posed
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
@@ -90,5 +93,15 @@ def test_mistakes_are_answered_before_anything_is_read(mitsonar: Command, run: P
     refused(mitsonar("heights", "none.npz", "-o", tmp_path / "a.ply", "--cells", 5), "--cells must lie in 16..96: got 5")
     for only in ("7", "0,0", "0.5"):
         refused(mitsonar("heights", run, "-o", tmp_path / "a.ply", "--only", only), "--only takes different numbers")
-    refused(mitsonar("heights", run, "-o", tmp_path / "a.ply", "--height", 3), "the frames have heights")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, [1.5, 1.5, 1.6]), (1.45, [1.45, 1.45, 1.55])])
+def test_heights_are_those_over_level_ground(given: float | None, expected: list[float]) -> None:
+    """Frames hold the height over what lies straight below: the second is over a rock."""
+    poses = np.array([[0, 0, 1.5, 0.4, 0, 0], [1, 0, 1.5, 0.4, 0, 0], [2, 0, 1.6, 0.4, 0, 0]])
+    source: Any = SimpleNamespace(sonar_poses=poses, height_m=np.array([1.5, 1.3, 1.6]), name="run")
+    index, taken, height_m = _posed(source, np.arange(3), None, given)
+    assert list(index) == [0, 1, 2]
+    np.testing.assert_array_equal(taken, poses)
+    np.testing.assert_allclose(height_m, expected)
