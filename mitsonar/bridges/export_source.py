@@ -231,7 +231,13 @@ def _open_data_set(url: str, view: str | None, split: tuple[float, float, float]
         label_maps: dict[str, Any] = {label: store.read(array, span) for label, array in labels.items()}
         for number in np.unique(scene[span]) if shape_indices else ():
             in_scene = scene[span] == number
-            label_maps["shape_id"][in_scene] = shape_indices[int(number)][label_maps["shape_id"][in_scene]]
+            shapes, known = label_maps["shape_id"][in_scene], len(shape_indices[int(number)]) - 1
+            if shapes.size and not (shapes.min() >= -1 and shapes.max() < known):
+                raise MitsonarError(
+                    f"{url}: shape_id of scene {number} must lie in -1..{known - 1}: got {shapes.min()}..{shapes.max()}; it "
+                    "is damaged"
+                )
+            label_maps["shape_id"][in_scene] = shape_indices[int(number)][shapes]
         return replace(
             stored_view.like,
             image=store.read(stored_view.array, span),
@@ -1123,7 +1129,9 @@ def _check_labels(sources: Sequence[FramesWithPoses]) -> None:
 
     for source in sources[1:]:
         if set(source.labels) != set(first.labels):
-            raise MitsonarError(f"{first.name} has {shown_labels(first)}, {source.name} has {shown_labels(source)}: {remedy}")
+            raise MitsonarError(
+                f"{first.name} has {shown_labels(first)}, {source.name} has {shown_labels(source)}: {remedy}"
+            )
         if not first.labels:
             continue
         if _shows_visible(source) != _shows_visible(first):
@@ -1149,8 +1157,8 @@ def _refuse_common_sequences(sources: Sequence[FramesWithPoses]) -> None:
             name = known.setdefault((source.world, source.raised_db, poses), source.name)
             if name != source.name:
                 raise MitsonarError(
-                    f"{source.name} and {name} have a sequence in common, with the same world and poses: its frames would be "
-                    "in both training and validation; give one of them, or make the other with another --seed"
+                    f"{source.name} and {name} have a sequence in common, with the same world and poses: its frames would "
+                    "be in both training and validation; give one of them, or make the other with another --seed"
                 )
 
 
@@ -1206,7 +1214,7 @@ def _shard_arrays(store: DataStore, sources: Sequence[FramesWithPoses], frame_sl
     """Read the frames of a shard, and return their stored arrays, keyed by name."""
     images, heights, first = [], [], 0
     label_maps: dict[str, list[Values]] = {name: [] for name in store.recipe.labels}
-    for source, stretch in ((source, stretch) for source in sources for stretch in source.stretches):
+    for source, stretch in ((one, stretch) for one in sources for stretch in one.stretches):
         overlap = slice(max(frame_slice.start - first, 0), min(frame_slice.stop - first, len(stretch)))
         if overlap.start < overlap.stop:
             frames = stretch.read(overlap)

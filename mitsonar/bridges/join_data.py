@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,10 @@ from mitsonar.config.data import Recipe
 from mitsonar.datasets.modality import Scene, Values
 from mitsonar.datasets.store import DataStore, shape_names_of
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping.sources import LabelledPart, Labels, is_data_set, recording_at, sequence_in, view_in
-from mitsonar.recordings.recording import Recording
+from mitsonar.mapping.sources import LabelledPart, Labels, is_data_set, is_recording, recording_at, view_in
+from mitsonar.recordings.recording import Part, Pixels
 
-__all__ = ["labelled_recording", "sources_at", "sources_of_data_set"]
+__all__ = ["part_of", "require_single_view", "shape_names_by_scene", "sources_at", "sources_of_data_set"]
 
 
 def sources_at(
@@ -43,11 +44,45 @@ def sources_at(
         MitsonarError: there are no frames or no poses, or an option does not apply to a data set.
     """
     if not is_data_set(where):
-        return [frames_with_poses(where, path=path, frame=frame, height_m=height_m, cut=cut, geometry=geometry)]
+        source = frames_with_poses(where, path=path, frame=frame, height_m=height_m, cut=cut, geometry=geometry)
+        return [source if is_recording(where) else _read_again(source)]
     for option, value in (("--poses", path), ("--geometry", geometry)):
         if value is not None:
             raise MitsonarError(f"{option} does not apply to {where}, a data set with poses of its own: join it without")
     return sources_of_data_set(where, height_m=height_m, cut=cut)
+
+
+def _read_again(source: FramesWithPoses) -> FramesWithPoses:
+    """Return a run whose pixels and labels are not kept in memory: ``frames.npz`` is loaded as a whole when it is read."""
+    part = source.stretches[0].part
+    assert isinstance(part, LabelledPart)
+    # an empty slice would keep the array that it is cut from
+    values = {one.name: getattr(part.like, one.name) for one in fields(part.like)}
+    like = replace(part.like, **{name: one.copy() for name, one in values.items() if isinstance(one, np.ndarray)})
+
+    where, known = source.name, source.labels  # the functions below must not refer to the source, which holds the pixels
+    stamps = tuple(one.stat().st_mtime_ns for one in _files_of(where))
+
+    def labels(index: NDArray[np.intp]) -> Labels:
+        frames = _loaded(where, stamps).read(index)
+        return {name: getattr(frames, name) for name in known}
+
+    def images(index: NDArray[np.intp]) -> Pixels:
+        return _loaded(where, stamps).images(index)
+
+    lazy = replace(part, like=like, images=images, labels=labels)
+    return replace(source, stretches=[replace(stretch, part=lazy) for stretch in source.stretches])
+
+
+def _files_of(where: str) -> list[Path]:
+    """Return the files that may hold the frames of a run, as far as they exist."""
+    return [one for one in (Path(where), Path(where) / "frames.npz", Path(where) / "frames.zarr") if one.exists()]
+
+
+@lru_cache(maxsize=1)
+def _loaded(where: str, stamps: tuple[int, ...]) -> Part:
+    """Open a run, and keep it until another is read or its files have other ``stamps``."""
+    return recording_at(where).part()
 
 
 def sources_of_data_set(
@@ -66,10 +101,10 @@ def sources_of_data_set(
     # 1. Open the images and their labels.
     store = DataStore.open(where)
     recipe = store.recipe
-    _require_single_view(store)
+    require_single_view(store)
     axes = axes_of(view_in(store).like, str(where))
-    part = _part_of(store)
-    names = _shape_names(store)
+    part = part_of(store)
+    names = shape_names_by_scene(store)
     # 2. Divide the frames into sequences, and these by scene.
     sequence, scene = store.read("sequence"), store.read("scene")
     ends = [*(np.flatnonzero(np.diff(sequence) | np.diff(scene)) + 1).tolist(), len(store)]
@@ -110,29 +145,7 @@ def sources_of_data_set(
     return sources
 
 
-def labelled_recording(where: str) -> Recording:
-    """Open frames with their labels as a recording; of a data set, the longest sequence.
-
-    Raises:
-        MitsonarError: there are no frames, or no ``shape_id``.
-    """
-    if is_data_set(where):
-        store = DataStore.open(where)
-        _require_single_view(store)
-        span, number, which = sequence_in(store)
-        scene = int(store.read("scene", span)[0])
-        part = _part_of(store, span, _shape_names(store).get(scene, ()))
-        recording = Recording(str(where), "data set of mitsonar", (part,), {}, (which,))
-    else:
-        recording = recording_at(where)
-    if recording.part().read([0]).shape_id is None:
-        raise MitsonarError(
-            f"{where} has no label shape_id: render with --labels, or give the recipe `labels: [shape_id, object_id]`"
-        )
-    return recording
-
-
-def _require_single_view(store: DataStore) -> None:
+def require_single_view(store: DataStore) -> None:
     """Check that a data set holds images of one sonar.
 
     Raises:
@@ -143,11 +156,13 @@ def _require_single_view(store: DataStore) -> None:
         raise MitsonarError(f"{store.place.url} holds impulse responses: give data sets of images")
     if recipe.receivers or recipe.segments:
         views = ", ".join(view.name for view in recipe.views)
-        raise MitsonarError(f"{store.place.url} has the views {views}: give data sets of one sonar without receivers or segments")
+        raise MitsonarError(
+            f"{store.place.url} has the views {views}: give data sets of one sonar without receivers or segments"
+        )
     view_in(store)  # raises if only vectors are stored
 
 
-def _part_of(store: DataStore, span: slice | None = None, shape_names: tuple[str, ...] = ()) -> LabelledPart:
+def part_of(store: DataStore, span: slice | None = None, shape_names: tuple[str, ...] = ()) -> LabelledPart:
     """Return frames of a data set as a part of a recording, whose pixels and labels are read on demand."""
     view, chosen = view_in(store), span or slice(0, len(store))
     names = [view.array, *store.recipe.labels]
@@ -171,7 +186,7 @@ def _part_of(store: DataStore, span: slice | None = None, shape_names: tuple[str
     )
 
 
-def _shape_names(store: DataStore) -> dict[int, tuple[str, ...]]:
+def shape_names_by_scene(store: DataStore) -> dict[int, tuple[str, ...]]:
     """Return the names of the shapes of each scene, by its number; empty if they are unknown."""
     if "shape_id" not in store.recipe.labels:
         return {}

@@ -719,6 +719,9 @@ def shape_names_of(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArray
         The names, and for each scene number an array ``(shapes + 1,)`` with the index of each ``shape_id`` among the names,
         and -1 for -1. The mapping is empty if ``shape_id`` is the index in every scene. Both are empty if the names
         are unknown: for recorded frames without them, and for scene files in stores of earlier versions.
+
+    Raises:
+        MitsonarError: the stored names are damaged.
     """
     file_names = store.about.get("shape_names")
     scene_names: dict[int, tuple[str, ...]] = {}
@@ -726,9 +729,15 @@ def shape_names_of(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArray
     for number, scene in sorted(store.scenes.items()):
         family = None if store.recipe.recorded is not None else store.recipe.family(scene.group)
         if family is None or family.called == "scene":
-            if not isinstance(file_names, list) or scene.group >= len(file_names):
+            if file_names is None:
                 return (), {}
-            scene_names[number] = tuple(map(str, file_names[scene.group]))
+            names_of_group = file_names[scene.group] if isinstance(file_names, list) and scene.group < len(file_names) else 0
+            if not isinstance(names_of_group, list):
+                raise MitsonarError(
+                    f"{store.place.url}: the attribute shape_names must list the names of {len(store.recipe.scenes):,} "
+                    f"groups of scenes: got {short_repr(file_names)}; it is damaged: make the data set again"
+                )
+            scene_names[number] = tuple(map(str, names_of_group))
         else:
             key = repr(family), scene.seed if family.seeded else 0
             if key not in built_names:
