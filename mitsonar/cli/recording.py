@@ -338,6 +338,8 @@ def _with_outlines(
         if without or classes:
             raise MitsonarError("--without and --classes choose among labels: give --labels too, or leave them out")
         return _opened(file, topic, geometry), None
+    if topic is not None or geometry is not None:
+        raise MitsonarError("--topic and --geometry read recordings, which have no labels: leave --labels out")
     from mitsonar.bridges.label_outlines import labelled_recording, outlines_of
 
     recording = labelled_recording(file)
