@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import fields, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -79,10 +78,16 @@ def _files_of(where: str) -> list[Path]:
     return [one for one in (Path(where), Path(where) / "frames.npz", Path(where) / "frames.zarr") if one.exists()]
 
 
-@lru_cache(maxsize=1)
+_KEPT: dict[tuple[str, tuple[int, ...]], Part] = {}
+"""The run that was read last."""
+
+
 def _loaded(where: str, stamps: tuple[int, ...]) -> Part:
     """Open a run, and keep it until another is read or its files have other ``stamps``."""
-    return recording_at(where).part()
+    if (where, stamps) not in _KEPT:
+        _KEPT.clear()  # before the next one is loaded, so that only one is in memory
+        _KEPT[where, stamps] = recording_at(where).part()
+    return _KEPT[where, stamps]
 
 
 def sources_of_data_set(

@@ -54,10 +54,10 @@ def outlines_of(like: SonarFrames, classes: Sequence[tuple[str, str]] = ()) -> O
     pictures = LabelledPictures(like, "polar", classes, least_snr_db=-np.inf)
 
     def regions(frames: SonarFrames, index: int) -> LabelledRegions:
-        found = pictures.regions(frames, index)
+        visible = pictures.regions(frames, index)
         number = np.zeros(frames.image.shape[1:], dtype=np.int32)
-        for place, region in enumerate(found, start=1):
+        for place, region in enumerate(visible, start=1):
             number[region.mask] = place
-        return LabelledRegions(number, np.array([0, *(region.kind for region in found)], dtype=np.intp))
+        return LabelledRegions(number, np.array([0, *(region.kind for region in visible)], dtype=np.intp))
 
     return Outlines(pictures.classes, regions)

@@ -77,13 +77,13 @@ class Outlines:
         An outline is two pixels wide: the pixels of its region with a neighbour of another region, or of none, and those
         after them.
         """
-        found = self.regions(frames, index)
-        number = np.asarray(nearest_cells(fan, found.number, 0))
+        labelled = self.regions(frames, index)
+        number = np.asarray(nearest_cells(fan, labelled.number, 0))
         padded = np.pad(number, 1)
         edge = np.zeros(number.shape, dtype=bool)
         for rows, columns in ((0, 1), (2, 1), (1, 0), (1, 2)):
             edge |= padded[rows : rows + number.shape[0], columns : columns + number.shape[1]] != number
-        thin = np.where(edge & (number > 0), found.kind[number] + 1, 0).astype(np.int32)
+        thin = np.where(edge & (number > 0), labelled.kind[number] + 1, 0).astype(np.int32)
         return np.asarray(ndimage.maximum_filter(thin, size=2))
 
 

@@ -147,12 +147,12 @@ def test_commands_draw_labels(mitsonar: Command, run: Path, variant: str, tmp_pa
     assert recording.part().read([0, 2]).shape_id is not None
 
 
-def test_labels_that_cannot_be_drawn_are_refused(
-    mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path
-) -> None:
+def test_labels_that_cannot_be_drawn_are_refused(mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path) -> None:
     replace(frames, shape_id=None, shape_names=()).save(tmp_path / "bare.npz")
     out = ("-o", tmp_path / "a.png")
-    refused(mitsonar("recording", "show", tmp_path / "bare.npz", "--labels", *out), "no label shape_id", "render with --labels")
+    refused(
+        mitsonar("recording", "show", tmp_path / "bare.npz", "--labels", *out), "no label shape_id", "render with --labels"
+    )
     refused(mitsonar("recording", "show", run, "--without", "sand", *out), "give --labels too")
     refused(mitsonar("recording", "show", run, "--labels", "--without", "sad", *out), "no shape is named 'sad'", "sand")
     refused(mitsonar("recording", "show", run, "--labels", "--topic", "x", *out), "--topic")
