@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +57,9 @@ def _read_again(source: FramesWithPoses) -> FramesWithPoses:
     part = source.stretches[0].part
     assert isinstance(part, LabelledPart)
     # an empty slice would keep the array that it is cut from
-    values = {one.name: getattr(part.like, one.name) for one in fields(part.like)}
-    like = replace(part.like, **{name: one.copy() for name, one in values.items() if isinstance(one, np.ndarray)})
+    values: dict[str, Any] = {one.name: getattr(part.like, one.name) for one in fields(part.like)}
+    arrays: dict[str, Any] = {name: one.copy() for name, one in values.items() if isinstance(one, np.ndarray)}
+    like = replace(part.like, **arrays)
 
     where, known = source.name, source.labels  # the functions below must not refer to the source, which holds the pixels
     stamps = tuple(one.stat().st_mtime_ns for one in _files_of(where))
@@ -126,7 +128,7 @@ def sources_of_data_set(
     notes = _left_out(store)
     raised = recipe.noise_raised_db(sorted(by_scene))
     counts = np.bincount(scene, minlength=max(by_scene) + 1)
-    sources = []
+    sources: list[FramesWithPoses] = []
     for (number, stretches), raised_db in zip(by_scene.items(), raised, strict=True):
         if stretches:
             source = FramesWithPoses(

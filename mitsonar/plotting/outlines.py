@@ -108,7 +108,7 @@ def add_legend(figure: Figure, names: Sequence[str], kinds: Sequence[int]) -> No
     """Add a legend of the given classes below a figure."""
     from matplotlib.lines import Line2D
 
-    lines = [Line2D([], [], color=np.array(colour_of(kind)) / 255, linewidth=3, label=names[kind]) for kind in kinds]
+    lines = [Line2D([], [], color=f"#{bytes(colour_of(kind)).hex()}", linewidth=3, label=names[kind]) for kind in kinds]
     if lines:
         legend = figure.legend(handles=lines, loc="outside lower center", ncols=min(len(lines), 5), facecolor="0.15")
         for text in legend.get_texts():
