@@ -101,7 +101,7 @@ def test_data_sets_become_one_with_all_scenes(made: list[str], tmp_path: Path) -
     )
     assert store.recipe.split == stores[0].recipe.split
     assert len(set(world_numbers(store.recipe, store.scenes).tolist())) == 4
-    exports = [open_export(url) for url in (tmp_path / "data.zarr", *made)]
+    exports = [open_export(url) for url in (str(tmp_path / "data.zarr"), *made)]
     shapes = [named(one.read(slice(0, one.frames)).shape_id, one.like.shape_names) for one in exports]
     assert np.array_equal(shapes[0], np.concatenate(shapes[1:]))
 
@@ -123,7 +123,7 @@ def test_torch_reads_the_pairs_of_both(made: list[str], tmp_path: Path) -> None:
 
     joined(tmp_path / "data.zarr", *made)
     words: dict[str, Any] = {"part": "all", "noise": "none", "labels": "raw"}
-    one, two, both = (SonarPairs(url, **words) for url in (*made, tmp_path / "data.zarr"))
+    one, two, both = (SonarPairs(url, **words) for url in (*made, str(tmp_path / "data.zarr")))
     assert len(both) == len(one) + len(two)
     for index, (pairs, inner) in {3: (one, 3), len(one) + 5: (two, 5)}.items():
         assert np.array_equal(both[index][0], pairs[inner][0])
@@ -257,7 +257,8 @@ def test_shapes_that_do_not_exist_are_refused(tmp_path: Path, number: int) -> No
 def test_damaged_names_are_no_crash(runs: dict[str, SonarFrames], tmp_path: Path) -> None:
     joined(tmp_path / "data.zarr", *runs)
     attributes = zarr.open_group(tmp_path / "data.zarr", mode="r+").attrs
-    for names in (7, [["sand"]], [["sand"], 3], "sand"):
+    damaged: list[Any] = [7, [["sand"]], [["sand"], 3], "sand"]
+    for names in damaged:
         attributes["shape_names"] = names
         with pytest.raises(MitsonarError, match="attribute shape_names must list the names of 2 groups"):
             open_export(tmp_path / "data.zarr")
