@@ -59,6 +59,7 @@ __all__ = [
     "digest_of",
     "frames_with_poses",
     "json_line",
+    "labels_of",
     "new_folder",
     "open_export",
     "png",
@@ -230,7 +231,13 @@ def _open_data_set(url: str, view: str | None, split: tuple[float, float, float]
         label_maps: dict[str, Any] = {label: store.read(array, span) for label, array in labels.items()}
         for number in np.unique(scene[span]) if shape_indices else ():
             in_scene = scene[span] == number
-            label_maps["shape_id"][in_scene] = shape_indices[int(number)][label_maps["shape_id"][in_scene]]
+            shapes, known = label_maps["shape_id"][in_scene], len(shape_indices[int(number)]) - 1
+            if shapes.size and not (shapes.min() >= -1 and shapes.max() < known):
+                raise MitsonarError(
+                    f"{url}: shape_id of scene {number} must lie in -1..{known - 1}: got {shapes.min()}..{shapes.max()}; it "
+                    "is damaged"
+                )
+            label_maps["shape_id"][in_scene] = shape_indices[int(number)][shapes]
         return replace(
             stored_view.like,
             image=store.read(stored_view.array, span),
@@ -777,6 +784,11 @@ class FramesWithPoses:
         stretches: the frames.
         left_out: number of frames without a pose, of another geometry, or without a neighbour.
         notes: notes on the recording, one sentence each.
+        labels: names of the labels that the frames have.
+        shape_names: name of each shape, by ``shape_id``; empty if unknown.
+        world: digest of the world of a rendered data set; empty if unknown. Sources of one world stay in one part.
+        recipe: recipe of the data set that the frames are taken from; None for runs and recordings.
+        raised_db: level added to the noise of the sonar [dB].
     """
 
     name: str
@@ -787,6 +799,11 @@ class FramesWithPoses:
     stretches: list[Stretch]
     left_out: int
     notes: tuple[str, ...] = ()
+    labels: tuple[str, ...] = ()
+    shape_names: tuple[str, ...] = ()
+    world: str = ""
+    recipe: Recipe | None = None
+    raised_db: float = 0.0
 
     def __len__(self) -> int:
         """Return the number of frames in all stretches."""
@@ -818,7 +835,7 @@ def frames_with_poses(
         MitsonarError: there are no frames or no poses, or a data set cannot represent the sonar.
     """
     if is_data_set(where):
-        raise MitsonarError(f"{where} is a data set already: give runs or recordings")
+        raise MitsonarError(f"{where} is a data set: sources_of_data_set reads it")
     recording = recording_at(where, geometry=geometry)
     longest = recording.part()
     axes = axes_of(longest.like, where)
@@ -834,8 +851,25 @@ def frames_with_poses(
     frame_count = sum(map(len, pieces))
     poses = "its own" if path is None else str(path)
     scale = float(longest.like.level_scale)
-    notes = recording.notes
-    return FramesWithPoses(str(where), recording.format, poses, axes, scale, pieces, len(recording) - frame_count, notes)
+    labels, names = labels_of(longest)
+    return FramesWithPoses(
+        name=str(where),
+        format=recording.format,
+        poses=poses,
+        axes=axes,
+        level_scale=scale,
+        stretches=pieces,
+        left_out=len(recording) - frame_count,
+        notes=recording.notes,
+        labels=labels,
+        shape_names=names,
+    )
+
+
+def labels_of(part: Part) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the labels of a part, and of its shapes by ``shape_id``, without reading pixels."""
+    none = part.read(np.zeros(0, dtype=np.intp))
+    return tuple(name for name in LABELS if getattr(none, name) is not None), none.shape_names
 
 
 def axes_of(like: SonarFrames, name: str) -> Axes:
@@ -960,48 +994,52 @@ def write_recorded(
     sources: Sequence[FramesWithPoses],
     out: str | Path,
     *,
+    labels: bool = True,
     begun: Callable[[int, int], None] = lambda frames, done: None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> RecordedDataSet:
     """Write recorded frames with their poses as a data set.
 
-    Each source becomes a scene, and each of its stretches a sequence. Pixels, levels and bearings are unchanged. The folder
-    is written completely or not at all; one shard at a time is in memory.
+    Each source becomes a scene, and each of its stretches a sequence. Pixels, levels, bearings and labels are unchanged. The
+    folder is written completely or not at all; one shard at a time is in memory.
 
     Args:
-        sources: files and runs of one sonar.
+        sources: files, runs and scenes of data sets, of one sonar.
         out: folder to create.
+        labels: whether to write the labels of pixels, which all sources must have.
         begun: called at the start, with the number of frames of the data set and 0.
         progress: called with the number of frames written since the last call.
 
     Raises:
-        MitsonarError: the folder exists, there are no sources, their sonars differ, heights are unknown, or frames cannot be
-            read.
+        MitsonarError: the folder exists, there are no sources, their sonars or labels differ, heights are unknown, or frames
+            cannot be read.
     """
     if "://" in str(out):
         raise MitsonarError(f"-o must name a folder here: got {out}; copy the finished data set to its storage")
     path = Path(out)
-    recipe = recorded_recipe(sources, path.stem)
+    recipe = recorded_recipe(sources, path.stem, labels=labels)
     plan = _plan(sources)
     stretches = [stretch for source in sources for stretch in source.stretches]
     scale = sources[0].level_scale
     about = {"gain": 1 / scale, "level_scale": scale, "variant": "none", "versions": versions(PACKAGES)}
+    if "shape_id" in recipe.labels and all(source.shape_names for source in sources):
+        about["shape_names"] = [list(source.shape_names) for source in sources]
     begun(len(plan), 0)
     with new_folder(path) as folder:
         store = DataStore.create(Storage(folder), recipe, plan, about)
         for shard in range(store.shards):
             frame_slice = store.frames_of(shard)
-            store.write_shard(shard, _shard_arrays(store, stretches, frame_slice))
+            store.write_shard(shard, _shard_arrays(store, sources, frame_slice))
             progress(frame_slice.stop - frame_slice.start)
         store.finish()
     return RecordedDataSet(path, len(plan), len(stretches), _notes(sources, len(stretches)))
 
 
-def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
+def recorded_recipe(sources: Sequence[FramesWithPoses], name: str, *, labels: bool = True) -> Recipe:
     """Return the recipe of a data set of recorded frames.
 
     Raises:
-        MitsonarError: there are no sources, their sonars differ, a name occurs twice, or heights are unknown.
+        MitsonarError: there are no sources, their sonars or labels differ, frames occur twice, or heights are unknown.
     """
     # 1. Check that the sources fit together.
     if not sources:
@@ -1017,32 +1055,39 @@ def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
     duplicates = [name for name in names if names.count(name) > 1]
     if duplicates:
         raise MitsonarError(f"{duplicates[0]} is given twice: its frames would be in both training and validation")
+    _refuse_common_sequences(sources)
+    if labels:
+        _check_labels(sources)
     # 2. Derive mount and flight from the poses: median attitude, range of heights, largest motion between frames.
     stretches = [stretch for source in sources for stretch in source.stretches]
     poses = np.concatenate([stretch.poses for stretch in stretches])
-    largest_motion = np.abs(np.concatenate([motions(stretch.poses) for stretch in stretches])).max(axis=0)
+    steps = np.abs(np.concatenate([motions(stretch.poses) for stretch in stretches]))
+    sideways, forward, yaw = steps.max(axis=0).tolist() if len(steps) else (0.0, 0.0, 0.0)
     low, high = _heights(stretches)
     pitch, roll = (float(np.round(np.degrees(np.median(poses[:, axis])), 2)) for axis in (3, 4))
     has_floats = any(stretch.part.like.image.dtype != np.uint8 for stretch in stretches)
-    split_by_scene = {"by": "scene", "train": 0.8, "validation": 0.2, "test": 0.0}
+    raised_db = [source.raised_db for source in sources]
     bearings = first.axes.bearing_rad
     return recipe_from(
         {
             "name": name,
-            "about": f"frames of {len(sources)} runs or recordings, with known poses",
+            "about": f"frames of {len(sources)} runs, recordings or scenes of data sets, with known poses",
             "scenes": [{"sequences": len(source.stretches)} for source in sources],
             "sonar": first.axes.sonar.model_dump(mode="json"),
             "mount": {"pitch_deg": pitch, "roll_deg": roll},
             "flight": {
                 "kind": "recorded",
                 "height_m": [low, high],
-                "sideways_mm": 1e3 * float(largest_motion[0]),
-                "forward_mm": 1e3 * float(largest_motion[1]),
-                "yaw_deg": float(np.degrees(largest_motion[2])),
+                "sideways_mm": 1e3 * sideways,
+                "forward_mm": 1e3 * forward,
+                "yaw_deg": math.degrees(yaw),
                 "jump_m": None,
             },
             "pixel": "float32" if has_floats else "uint8",
-            **({"split": split_by_scene} if len(sources) > 1 else {}),
+            **({"labels": list(first.labels)} if labels else {}),
+            **({"visible_labels": True} if labels and _shows_visible(first) else {}),
+            **({"noise_db": raised_db} if any(raised_db) else {}),
+            **_sample_keys(sources),
             "recorded": {
                 "level": first.axes.level,
                 "bearings": None if bearings is None else bearings.tolist(),
@@ -1050,6 +1095,71 @@ def recorded_recipe(sources: Sequence[FramesWithPoses], name: str) -> Recipe:
             },
         }
     )
+
+
+def _sample_keys(sources: Sequence[FramesWithPoses]) -> dict[str, Any]:
+    """Return the keys ``split`` and ``frames``: those of the data sets if all agree, else by scene if there are several."""
+    recipes = [source.recipe for source in sources]
+    agreed = {
+        key: values[0]
+        for key in ("split", "frames")
+        if len(values := [recipe.model_dump(mode="json")[key] for recipe in recipes if recipe is not None]) == len(sources)
+        and all(value == values[0] for value in values)
+    }
+    worlds = {source.world or source.name for source in sources}
+    by_scene = {"split": {"by": "scene", "train": 0.8, "validation": 0.2, "test": 0.0}} if len(worlds) > 1 else {}
+    return by_scene | agreed
+
+
+def _shows_visible(source: FramesWithPoses) -> bool:
+    return source.recipe is not None and source.recipe.visible_labels
+
+
+def _check_labels(sources: Sequence[FramesWithPoses]) -> None:
+    """Check that all sources have the same labels, with the same meaning.
+
+    Raises:
+        MitsonarError: they differ.
+    """
+    first = sources[0]
+    remedy = "give --no-labels to leave labels out, or make a data set for each"
+
+    def shown_labels(source: FramesWithPoses) -> str:
+        return f"the labels {', '.join(source.labels)}" if source.labels else "no labels"
+
+    for source in sources[1:]:
+        if set(source.labels) != set(first.labels):
+            raise MitsonarError(
+                f"{first.name} has {shown_labels(first)}, {source.name} has {shown_labels(source)}: {remedy}"
+            )
+        if not first.labels:
+            continue
+        if _shows_visible(source) != _shows_visible(first):
+            names = (first.name, source.name) if _shows_visible(first) else (source.name, first.name)
+            raise MitsonarError(f"the labels of {names[0]} are visible_labels, those of {names[1]} are not: {remedy}")
+        if "shape_id" in first.labels and bool(source.shape_names) != bool(first.shape_names):
+            names = (first.name, source.name) if first.shape_names else (source.name, first.name)
+            raise MitsonarError(
+                f"{names[0]} names its shapes and {names[1]} does not, so their shape_id cannot be compared: {remedy}"
+            )
+
+
+def _refuse_common_sequences(sources: Sequence[FramesWithPoses]) -> None:
+    """Check that no sequence of a rendered world occurs in two sources, such as a data set and a longer one of its recipe.
+
+    Raises:
+        MitsonarError: one does.
+    """
+    known: dict[tuple[str, float, bytes], str] = {}
+    for source in sources:
+        for stretch in source.stretches if source.world else ():
+            poses = hashlib.sha256(np.ascontiguousarray(stretch.poses).tobytes()).digest()
+            name = known.setdefault((source.world, source.raised_db, poses), source.name)
+            if name != source.name:
+                raise MitsonarError(
+                    f"{source.name} and {name} have a sequence in common, with the same world and poses: its frames would "
+                    "be in both training and validation; give one of them, or make the other with another --seed"
+                )
 
 
 def _source_fields(source: FramesWithPoses) -> dict[str, str | int | float]:
@@ -1062,6 +1172,7 @@ def _source_fields(source: FramesWithPoses) -> dict[str, str | int | float]:
         "left_out": source.left_out,
         "level_scale": source.level_scale,
         "start_s": float(source.stretches[0].time_s[0]),
+        **({"world": source.world} if source.world else {}),
     }
 
 
@@ -1099,15 +1210,18 @@ def _plan(sources: Sequence[FramesWithPoses]) -> Plan:
     )
 
 
-def _shard_arrays(store: DataStore, stretches: Sequence[Stretch], frame_slice: slice) -> dict[str, Values]:
+def _shard_arrays(store: DataStore, sources: Sequence[FramesWithPoses], frame_slice: slice) -> dict[str, Values]:
     """Read the frames of a shard, and return their stored arrays, keyed by name."""
     images, heights, first = [], [], 0
-    for stretch in stretches:
+    label_maps: dict[str, list[Values]] = {name: [] for name in store.recipe.labels}
+    for source, stretch in ((one, stretch) for one in sources for stretch in one.stretches):
         overlap = slice(max(frame_slice.start - first, 0), min(frame_slice.stop - first, len(stretch)))
         if overlap.start < overlap.stop:
             frames = stretch.read(overlap)
             images.append(as_pixels(frames.image, store.recipe.pixel, f"frame {first + overlap.start} and those after it"))
             heights.append(stretch.height_m[overlap])
+            for name, maps in label_maps.items():
+                maps.append(_label_values(frames, name, source))
         first += len(stretch)
     image = np.concatenate(images)
     full_scale = 255 if store.recipe.pixel == "uint8" else 1
@@ -1116,7 +1230,25 @@ def _shard_arrays(store: DataStore, stretches: Sequence[Stretch], frame_slice: s
         "height_m": np.concatenate(heights),
         "dropped": np.zeros(len(image), dtype=np.uint32),
         "saturated": (image == full_scale).sum(axis=(1, 2), dtype=np.uint32),
+        **{name: np.concatenate(maps) for name, maps in label_maps.items()},
     }
+
+
+def _label_values(frames: SonarFrames, name: str, source: FramesWithPoses) -> Values:
+    """Return a label of frames ``(frames, bins, beams)``.
+
+    Raises:
+        MitsonarError: the label is missing, or names a shape that does not exist.
+    """
+    values = getattr(frames, name)
+    if values is None:
+        raise MitsonarError(f"some frames of {source.name} have no {name}: give --no-labels to leave labels out")
+    highest = len(source.shape_names) - 1 if source.shape_names else np.inf
+    if name == "shape_id" and values.size and not (values.min() >= -1 and values.max() <= highest):
+        raise MitsonarError(
+            f"shape_id of {source.name} must lie in -1..{highest}: got {values.min()}..{values.max()}; it is damaged"
+        )
+    return np.asarray(values)
 
 
 def _notes(sources: Sequence[FramesWithPoses], sequences: int) -> list[str]:

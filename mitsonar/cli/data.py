@@ -316,7 +316,8 @@ def from_frames(
     files: Annotated[
         list[str],
         typer.Argument(
-            metavar="RUN|FILE...", help="Folders of runs, frames.npz, frames.zarr or recordings, all of one sonar."
+            metavar="RUN|FILE|DATA...",
+            help="Folders of runs, frames.npz, frames.zarr, recordings or data sets, all of one sonar.",
         ),
     ],
     out: Annotated[str, typer.Option("-o", "--out", help="Folder of the data set; complete or absent.")],
@@ -334,9 +335,13 @@ def from_frames(
         typer.Option(min=2, help="Cut each file into sequences of this many frames, so that a single file can be split."),
     ] = None,
     geometry: Geometry = None,
+    labels: Annotated[
+        bool, typer.Option("--labels/--no-labels", help="Copy the labels of pixels, which all must have.")
+    ] = True,
 ) -> None:
-    """Make a data set from runs and recordings with known poses."""
-    from mitsonar.bridges.export_source import frames_with_poses, write_recorded
+    """Join runs, recordings with known poses, and data sets to one data set."""
+    from mitsonar.bridges.export_source import write_recorded
+    from mitsonar.bridges.join_data import sources_at
 
     paths: list[Path | None] = list(poses) if poses else [None]
     if len(paths) not in (1, len(files)):
@@ -345,10 +350,10 @@ def from_frames(
         raise MitsonarError(f"--height must be above 0 m: got {height:g}")
     words = {"frame": frame, "height_m": height, "cut": cut, "geometry": geometry}
     each = zip(files, paths if len(paths) > 1 else paths * len(files), strict=True)
-    sources = [frames_with_poses(file, path=path, **words) for file, path in each]  # type: ignore[arg-type]
+    sources = [source for file, path in each for source in sources_at(file, path=path, **words)]  # type: ignore[arg-type]
     bar = LaterBar("copying", "frames")
     with bar:
-        report = write_recorded(sources, out, begun=bar.begin, progress=bar.advance)
+        report = write_recorded(sources, out, labels=labels, begun=bar.begin, progress=bar.advance)
     for sentence in report.notes:
         warn(sentence)
     say(f"{count_noun(report.frames, 'frame')} in {count_noun(report.sequences, 'sequence')} in {report.path}")

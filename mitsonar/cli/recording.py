@@ -20,6 +20,7 @@ from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
     from mitsonar.instruments.sonar import Sonar
+    from mitsonar.plotting.outlines import Outlines
     from mitsonar.recordings.recording import Part, Recording
     from mitsonar.records.frames import SonarFrames
 
@@ -57,6 +58,18 @@ PartNumber = Annotated[int | None, typer.Option("--part", help="Part of the reco
 TopicName = Annotated[str | None, typer.Option("--topic", help="Topic of a ROS bag (default: the only sonar's).")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 Span = Annotated[float, typer.Option("--span-db", help="Range of levels to show below full scale [dB].")]
+Without = Annotated[
+    list[str] | None, typer.Option("--without", help="Name of a shape without boxes or outlines, such as the ground.")
+]
+Classes = Annotated[
+    str,
+    typer.Option(
+        "--classes",
+        help="Classes of shapes, GLOB=CLASS,...: pillar*=pillar,seabed*= (empty: left out). Default: their names without "
+        "final numbers.",
+    ),
+]
+Labels = Annotated[bool, typer.Option("--labels", help="Outline labelled objects, with a legend of their classes.")]
 
 
 def recordings() -> typer.Typer:
@@ -144,6 +157,9 @@ def show(
     stored_height: Annotated[
         bool, typer.Option("--stored-height", help="Side-scans: heights of the recording (default: by the first return).")
     ] = False,
+    labels: Labels = False,
+    without: Without = None,
+    classes: Classes = "",
     overwrite: Overwrite = False,
 ) -> None:
     """Draw one frame as a fan, or all pings of a side-scan as a waterfall, with axes in metres and a colour bar in dB."""
@@ -151,7 +167,8 @@ def show(
 
     scan = side_scan_at(file)
     if scan is not None:
-        refuse_options(file, {"--frame": frame, "--topic": topic, "--geometry": geometry})
+        of_frames = {"--labels": labels, "--without": without, "--classes": classes}
+        refuse_options(file, {"--frame": frame, "--topic": topic, "--geometry": geometry, **of_frames})
         show_side_scan(
             scan,
             out,
@@ -166,9 +183,9 @@ def show(
     if ground_range or stored_height or height is not None:
         raise MitsonarError(f"--ground-range and heights apply only to side-scans: got {file}; leave them out")
     refuse_to_replace(out, overwrite=overwrite)
-    recording = _opened(file, topic, geometry)
+    recording, outlines = _with_outlines(file, topic, geometry, part, labels=labels, without=without, classes=classes)
     frames = to_decibels(recording.part(part).read([frame]), span_db)
-    save_fan(out, frames, title=f"{Path(file).name}, frame {frame}")
+    save_fan(out, frames, title=f"{Path(file).name}, frame {frame}", outlines=outlines)
     say(f"picture: {out}")
 
 
@@ -181,12 +198,15 @@ def video(
     geometry: Geometry = None,
     span_db: Span = 60.0,
     rate: Annotated[float | None, typer.Option(help="Frames per second (default: the recording's).")] = None,
+    labels: Labels = False,
+    without: Without = None,
+    classes: Classes = "",
     overwrite: Overwrite = False,
 ) -> None:
     """Write frames as a video of fans."""
     from mitsonar.plotting.fans import write_fan_video
 
-    recording = _opened(file, topic, geometry)
+    recording, outlines = _with_outlines(file, topic, geometry, part, labels=labels, without=without, classes=classes)
     _say_notes(recording)
     chosen = recording.part(part)
     steps = np.diff(chosen.time_s)
@@ -195,7 +215,8 @@ def video(
         raise MitsonarError(f"--rate must lie in 0..1000 a second: got {rate:g}")
     with progress_bar("drawing", len(chosen), "frames") as progress:
         speed = rate or min(1000.0, frame_rate_hz)
-        count = write_fan_video(chosen.chunks(), out, speed, span_db=span_db, overwrite=overwrite, progress=progress)
+        words = {"span_db": span_db, "outlines": outlines, "overwrite": overwrite}
+        count = write_fan_video(chosen.chunks(), out, speed, **words, progress=progress)  # type: ignore[arg-type]
     say(f"{count_noun(count, 'frame')} at {speed:.4g} a second in {out}")
 
 
@@ -300,6 +321,29 @@ def _opened(file: str, topic: str | None, geometry: Path | None) -> Recording:
     from mitsonar.mapping.sources import recording_at
 
     return recording_at(file, view=topic, geometry=geometry)
+
+
+def _with_outlines(
+    file: str,
+    topic: str | None,
+    geometry: Path | None,
+    part: int | None,
+    *,
+    labels: bool,
+    without: list[str] | None,
+    classes: str,
+) -> tuple[Recording, Outlines | None]:
+    """Open frames, with the outlines of their labelled objects if these are shown."""
+    if not labels:
+        if without or classes:
+            raise MitsonarError("--without and --classes choose among labels: give --labels too, or leave them out")
+        return _opened(file, topic, geometry), None
+    if topic is not None or geometry is not None:
+        raise MitsonarError("--topic and --geometry read recordings, which have no labels: leave --labels out")
+    from mitsonar.bridges.label_outlines import labelled_recording, outlines_of
+
+    recording = labelled_recording(file)
+    return recording, outlines_of(recording.part(part).read([]), classes_of(classes, without))
 
 
 def _say_notes(recording: Recording) -> None:
@@ -464,15 +508,6 @@ LEAST_SNR_DB = 3.0
 To = Annotated[str, typer.Option("--to", help="coco, yolo, webdataset, huggingface, kitti or neusis.")]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to make; complete or absent.")]
 Picture = Annotated[str, typer.Option(help="polar, or fan: forward up, starboard to the right.")]
-Without = Annotated[list[str] | None, typer.Option("--without", help="Name of a shape without boxes, such as the ground.")]
-Classes = Annotated[
-    str,
-    typer.Option(
-        "--classes",
-        help="Classes of shapes, GLOB=CLASS,...: pillar*=pillar,seabed*= (empty: left out). Default: their names without "
-        "final numbers.",
-    ),
-]
 Least = Annotated[int, typer.Option(min=1, help="Minimum number of pixels of an object.")]
 LeastSnr = Annotated[
     float,

@@ -297,6 +297,7 @@ class RecordedSource(RecipePart):
     left_out: int = Field(0, ge=0, description="frames without a pose, of another geometry, or with no neighbour")
     level_scale: float = Field(1.0, gt=0, allow_inf_nan=False, description="level of a pixel of 1")
     start_s: float = Field(allow_inf_nan=False, description="time of its first frame [s]; stored times begin at 0")
+    world: str = Field("", max_length=64, description="digest of its rendered world, if known; one world stays in one part")
 
 
 class Recorded(RecipePart):

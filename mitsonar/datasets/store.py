@@ -612,10 +612,14 @@ PARTS = ("train", "validation", "test")
 
 def world_numbers(recipe: Recipe, scenes: dict[int, Scene]) -> NDArray[np.int64]:
     """Return, for each scene number, the first scene with the same world; some worlds do not depend on the seed."""
-    if recipe.recorded is not None:  # it is unknown whether two recordings show the same place
-        return np.arange(max(scenes) + 1)
+    worlds = np.arange(max(scenes) + 1)
+    if recipe.recorded is not None:  # only scenes that were rendered tell whether they show the same place
+        places: dict[str, int] = {}
+        for number, scene in sorted(scenes.items()):
+            place = recipe.recorded.sources[scene.group].world
+            worlds[number] = places.setdefault(place, number) if place else number
+        return worlds
     known: dict[tuple[type[Family], str, int], int] = {}
-    worlds = np.zeros(max(scenes) + 1, dtype=np.int64)
     for number, scene in sorted(scenes.items()):
         family = recipe.family(scene.group)
         world = (type(family), family.model_dump_json(), scene.seed if family.seeded else 0)
@@ -709,24 +713,31 @@ def _format_shares(split: Split) -> str:
 def shape_names_of(store: DataStore) -> tuple[tuple[str, ...], dict[int, NDArray[np.int32]]]:
     """Return the names of all shapes in a data set, and the mapping from each scene's ``shape_id`` to these names.
 
-    The store contains the names of scene files. Other worlds are rebuilt.
+    The store contains the names of scene files and of recorded frames. Other worlds are rebuilt.
 
     Returns:
         The names, and for each scene number an array ``(shapes + 1,)`` with the index of each ``shape_id`` among the names,
         and -1 for -1. The mapping is empty if ``shape_id`` is the index in every scene. Both are empty if the names
-        are unknown: for recorded frames, and for scene files in stores of earlier versions.
+        are unknown: for recorded frames without them, and for scene files in stores of earlier versions.
+
+    Raises:
+        MitsonarError: the stored names are damaged.
     """
-    if store.recipe.recorded is not None:
-        return (), {}
     file_names = store.about.get("shape_names")
     scene_names: dict[int, tuple[str, ...]] = {}
     built_names: dict[tuple[str, int], tuple[str, ...]] = {}
     for number, scene in sorted(store.scenes.items()):
-        family = store.recipe.family(scene.group)
-        if family.called == "scene":
-            if not isinstance(file_names, list) or scene.group >= len(file_names):
+        family = None if store.recipe.recorded is not None else store.recipe.family(scene.group)
+        if family is None or family.called == "scene":
+            if file_names is None:
                 return (), {}
-            scene_names[number] = tuple(map(str, file_names[scene.group]))
+            names_of_group = file_names[scene.group] if isinstance(file_names, list) and scene.group < len(file_names) else 0
+            if not isinstance(names_of_group, list):
+                raise MitsonarError(
+                    f"{store.place.url}: the attribute shape_names must list the names of {len(store.recipe.scenes):,} "
+                    f"groups of scenes: got {short_repr(file_names)}; it is damaged: make the data set again"
+                )
+            scene_names[number] = tuple(map(str, names_of_group))
         else:
             key = repr(family), scene.seed if family.seeded else 0
             if key not in built_names:

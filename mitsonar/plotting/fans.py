@@ -22,25 +22,31 @@ from mitsonar.records.frames import SonarFrames, to_float32, to_uint8
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from mitsonar.plotting.outlines import Outlines
+
 __all__ = ["CODECS", "FanPictures", "fan_figure", "save_fan", "to_decibels", "write_fan_video"]
 
 
 GAMMA = 0.6
 """Exponent applied to levels in figures, so that faint ground is visible next to bright faces; the colour bar states it."""
 
+FIGURE_ROWS = 800
+"""Rows of the fan in a figure [px]."""
 
-def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "") -> Figure:
+
+def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "", outlines: Outlines | None = None) -> Figure:
     """Draw one frame as a fan with axes in metres: forward up, starboard to the right.
 
     Args:
         frames: frames to draw from.
         index: index of the frame.
         title: title of the figure.
+        outlines: labelled regions to outline, with a legend.
     """
     from matplotlib.colors import Normalize, PowerNorm
     from matplotlib.figure import Figure
 
-    fan = to_cartesian(frames.image[index], frames.range_m, frames.bearing_rad)
+    fan = to_cartesian(frames.image[index], frames.range_m, frames.bearing_rad, FIGURE_ROWS)
     left, right, low, high = fan.extent
     height = 6.0
     width = float(np.clip(height * (right - left) / (high - low), 3.0, 14.0))
@@ -58,17 +64,25 @@ def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "") -> Figur
     shown = axes.imshow(values, extent=fan.extent, cmap="copper", norm=norm, interpolation="nearest")
     axes.set(xlabel="starboard (m)", ylabel="forward (m)", title=title)
     figure.colorbar(shown, ax=axes, label=label, fraction=0.04)
+    if outlines is not None:
+        from mitsonar.plotting.outlines import add_legend, colours_of
+
+        drawn = outlines.on(cartesian_map(frames.range_m, frames.bearing_rad, FIGURE_ROWS), frames, index)
+        axes.imshow(colours_of(drawn), extent=fan.extent, interpolation="nearest")
+        add_legend(figure, outlines.names, [int(kind) - 1 for kind in np.unique(drawn) if kind > 0])
     return figure
 
 
-def save_fan(path: str | Path, frames: SonarFrames, index: int = 0, *, title: str = "") -> None:
+def save_fan(
+    path: str | Path, frames: SonarFrames, index: int = 0, *, title: str = "", outlines: Outlines | None = None
+) -> None:
     """Write :func:`fan_figure` as a PNG file, completely or not at all."""
     import io
 
     from mitsonar.io.files import write_atomic
 
     buffer = io.BytesIO()
-    fan_figure(frames, index, title=title).savefig(buffer, format="png", dpi=110)
+    fan_figure(frames, index, title=title, outlines=outlines).savefig(buffer, format="png", dpi=110)
     write_atomic(path, buffer.getvalue())
 
 
@@ -154,6 +168,7 @@ def write_fan_video(
     *,
     span_db: float = 60.0,
     rows: int = 720,
+    outlines: Outlines | None = None,
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> int:
@@ -166,7 +181,8 @@ def write_fan_video(
         path: video file, ``.mp4`` or ``.avi``.
         rate_hz: frames per second of the video [Hz].
         span_db: range of levels shown, downwards from full scale [dB].
-        rows: height of the picture [px].
+        rows: height of the picture [px], without a legend.
+        outlines: labelled regions to outline, with a legend below the picture.
         overwrite: whether to replace an existing file.
         progress: called with the number of frames written since the last call.
 
@@ -184,7 +200,7 @@ def write_fan_video(
         raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first")
     temporary = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
-        count = _write(chunks, temporary, rate_hz, span_db, rows, progress or (lambda done: None))
+        count = _write(chunks, temporary, rate_hz, span_db, rows, outlines, progress or (lambda done: None))
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -192,23 +208,38 @@ def write_fan_video(
 
 
 def _write(
-    chunks: Iterable[SonarFrames], path: Path, rate_hz: float, span_db: float, rows: int, progress: Callable[[int], None]
+    chunks: Iterable[SonarFrames],
+    path: Path,
+    rate_hz: float,
+    span_db: float,
+    rows: int,
+    outlines: Outlines | None,
+    progress: Callable[[int], None],
 ) -> int:
     """Write all frames and return their number."""
     try:
         import cv2
     except ModuleNotFoundError as error:
         raise missing_package_error(error) from None
-    colours = _colours()
+    from mitsonar.plotting.outlines import draw_outlines, legend_rows, legend_strip
+
+    colours, strip_rows = _colours(), 0
     writer, fan, count, first_s = None, None, 0, 0.0
     try:
         for frames in chunks:
             if fan is None:
                 fan = cartesian_map(frames.range_m, frames.bearing_rad, rows=2 * (rows // 2))
             decibel_images = to_decibels(frames, span_db).image
-            for image, time in zip(decibel_images, np.atleast_2d(frames.time_s.T).T.mean(axis=1), strict=True):
+            times = np.atleast_2d(frames.time_s.T).T.mean(axis=1)
+            for index, (image, time) in enumerate(zip(decibel_images, times, strict=True)):
                 values = np.asarray(fan.apply(np.asarray(image, np.float32)))
-                picture = _even(colours[np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)])
+                picture = colours[np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)]
+                if outlines is not None:
+                    draw_outlines(picture, outlines.on(fan, frames, index))
+                    strip_rows = strip_rows or legend_rows(picture.shape[1], outlines.names)
+                    strip = legend_strip(picture.shape[1], outlines.names, strip_rows)
+                    picture = np.concatenate([picture, strip])
+                picture = _even(picture)
                 first_s = first_s if count else float(time)
                 text = f"{count}   {time - first_s:.2f} s"
                 cv2.putText(picture, text, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)

@@ -269,7 +269,8 @@ def test_refusals_say_what_to_give(mitsonar: Command, places: dict[str, Path], f
     assert mitsonar("dataset", "from-frames", tmp_path / "low.npz", "--height", "2.5", "-o", out).returncode == 0
     assert (DataStore.open(out).read("height_m") == 2.5).all()
     refused(mitsonar("dataset", "from-frames", places["npz"], "-o", out), "exists and is kept")
-    refused(mitsonar("dataset", "from-frames", out, "-o", tmp_path / "b.zarr"), "is a data set already")
+    with pytest.raises(MitsonarError, match="is a data set: sources_of_data_set reads it"):
+        frames_with_poses(str(out))
 
 
 def test_pixels_that_cannot_be_leave_nothing_behind(places: dict[str, Path], frames: SonarFrames, tmp_path: Path) -> None:
