@@ -77,8 +77,9 @@ PATTERN_EDGE, NEGLIGIBLE = 0.01, 0.2
 """Power of the pattern over elevation below which its shape is unknown, and the echo, relative to the noise, up to which
 ground out there is noise."""
 
-FEWEST_BLOCKS, LEAST_SIGNAL, LEAST_EXPLAINED = 200, 0.05, 0.3
-"""Fewest blocks, smallest fraction of them above the noise, and of the variance of their levels that ground explains."""
+FEWEST_BLOCKS, LEAST_SIGNAL, LEAST_EXPLAINED, MOST_ERROR_DB = 200, 0.05, 0.5, 4.0
+"""Fewest blocks, smallest fraction of them above the noise, smallest fraction of the variance of their levels that ground
+explains, and their largest robust standard deviation from the model [dB]."""
 
 LAGS, LEAST_CORRELATION = 8, 0.05
 """Largest distance in blocks at which residuals are correlated, and the correlation below which they are independent."""
@@ -292,7 +293,7 @@ class GroundModel:
         undone = np.interp(self.range_m, sonar.range_m, undone_absorption(sonar))
         self._gain = self.range_m ** (sonar.gain_exponent - 3.0) * undone
         self._width = sonar.beam_width_rad / np.cos(bearing_rad) * sonar.bin_m / np.diff(self.edges_m)[:, None]
-        self._aside = np.square(np.sin(bearing_rad) / np.sin(np.abs(sonar.bearing_rad).max()))
+        self.aside = np.square(np.sin(bearing_rad) / np.sin(np.abs(sonar.bearing_rad).max()))
         self._power = 4 if sonar.vertical_pattern == "two_way" else 2
         self._half = half_power((), self._power)
 
@@ -301,7 +302,6 @@ class GroundModel:
         height_m: float,
         pitch_deg: float,
         roll_deg: float,
-        taper_db: float,
         elevation_fov_deg: float,
         absorption_db_per_m: float,
         range_exponent: float,
@@ -312,7 +312,6 @@ class GroundModel:
         Args:
             height_m: height of the sonar over the ground [m].
             pitch_deg, roll_deg: attitude of the sonar [deg].
-            taper_db: gain of the middle beam over the outermost [dB].
             elevation_fov_deg: half-power width over elevation [deg].
             absorption_db_per_m: absorption, one way [dB/m].
             range_exponent: power of the range, relative to the middle of the window, besides that of ``gain_exponent``.
@@ -334,17 +333,20 @@ class GroundModel:
         pattern = np.where(np.abs(x) < 1, np.sinc(x) ** self._power, 0.0)
         level = np.nan_to_num(solid_angle * np.maximum(pattern, least_pattern)) * along[:, None]
         level = level.reshape(-1, SAMPLES, level.shape[1]).mean(axis=1)
-        return np.asarray(level * np.exp(-DB * taper_db * self._aside))
+        return np.asarray(level)
 
 
 # ---------------- Frames as means of blocks
 
 
 def _reference(frames: SonarFrames) -> Array:
-    """Return height [m], pitch and roll [rad] that the parameters refer to: medians over the frames; zeros without poses."""
-    if frames.poses is None or not np.isfinite(frames.poses[:, 2:5]).all():
-        return np.zeros(3)
-    return np.asarray(np.median(frames.poses[:, 2:5], axis=0), dtype=np.float64)
+    """Return height [m], pitch and roll [rad] that the parameters refer to: medians over the frames; nan where unknown."""
+    if frames.poses is None:
+        return np.full(3, np.nan)
+    reference = np.median(frames.poses[:, 2:5], axis=0)
+    if not reference[0] > 0:
+        reference[0] = np.nan
+    return np.asarray(np.where(np.isfinite(reference), reference, np.nan), dtype=np.float64)
 
 
 @dataclass
@@ -358,7 +360,6 @@ class _Solution:
         used: blocks that were used ``(views, rows, columns)``.
         looks: effective looks of a block.
         covariance: of all parameters ``(9, 9)``, in their units.
-        objective: logarithm of the posterior, up to a constant.
     """
 
     values: dict[str, float]
@@ -367,7 +368,6 @@ class _Solution:
     used: NDArray[np.bool_]
     looks: float
     covariance: Array
-    objective: float
 
 
 class _Problem:
@@ -383,11 +383,9 @@ class _Problem:
     def __init__(self, frames: SonarFrames, sonar: Sonar, fit: SonarFit, reference: Array) -> None:
         self.fit = fit
         # 1. Poses that differ, relative to the reference, and the frames of each.
-        has_poses = bool(reference.any())
         away = np.zeros((len(frames), 3))
-        if has_poses:
-            assert frames.poses is not None
-            away = frames.poses[:, 2:5] - reference
+        if frames.poses is not None:
+            away = np.nan_to_num(frames.poses[:, 2:5] - reference)
         step = np.array([SAME_POSE[0], SAME_POSE[1], SAME_POSE[1]])
         _, first, self.view_of = np.unique(np.rint(away / step), axis=0, return_index=True, return_inverse=True)
         self.view_of = self.view_of.ravel()
@@ -439,20 +437,21 @@ class _Problem:
         self.scale_db = fit.full_scale_db - sonar.source_level_db
         absorption = sonar_absorption(sonar)
         self.start = {
-            "level_db": 0.0, "height_m": float(reference[0]), "pitch_deg": math.degrees(reference[1]),
-            "roll_deg": math.degrees(reference[2]), "taper_db": sonar.taper_db,
+            "level_db": 0.0, "height_m": float(np.nan_to_num(reference[0], nan=1.0)),
+            "pitch_deg": math.degrees(np.nan_to_num(reference[1])),
+            "roll_deg": math.degrees(np.nan_to_num(reference[2])), "taper_db": sonar.taper_db,
             "elevation_fov_deg": sonar.elevation_fov_deg, "absorption_db_per_m": absorption, "range_exponent": 0.0,
             "noise_level_db": noise_db,
         }  # fmt: skip
-        self.unknown_place = not reference[0] > 0
-        self.prior_std = PRIOR_STD | (UNKNOWN_POSE_STD if self.unknown_place else {})
+        self.unknown = {n for n, known in zip(UNKNOWN_POSE_STD, reference, strict=False) if not math.isfinite(known)}
+        self.prior_std = PRIOR_STD | {n: UNKNOWN_POSE_STD[n] for n in self.unknown}
         self.prior_std |= {"absorption_db_per_m": max(ABSORPTION_STD[0] * absorption, ABSORPTION_STD[1])}
 
     # ---------------- Model
 
     def signal(self, values: dict[str, float], least_pattern: float = 0.0) -> Array:
         """Return the mean levels of the ground ``(views, rows, columns)``, relative to full scale."""
-        names = [name for name in FIELDS if name not in ("level_db", "noise_level_db")]
+        names = [name for name in FIELDS if name not in ("level_db", "taper_db", "noise_level_db")]
         images = []
         for height, pitch, roll in self.away:
             one = {name: values[name] for name in names}
@@ -462,11 +461,14 @@ class _Problem:
         return np.stack(images) * 10 ** ((values["level_db"] - self.scale_db) / 10)
 
     def means(self, values: dict[str, float], gain_db: Array) -> tuple[Array, Array]:
-        """Return the mean levels ``(views, rows, columns)``, and the fraction of them that is signal."""
-        signal = self.signal(values) * 10 ** (gain_db / 10)
+        """Return the mean levels ``(views, rows, columns)``, and the fraction of them that is signal.
+
+        Taper and gains of the beams act on signal and noise, as in the model coherent.
+        """
+        signal = self.signal(values)
         noise = 10 ** ((values["noise_level_db"] - self.fit.full_scale_db) / 10) * self.noise_gain
         mean = signal + np.maximum(noise, 1e-300)
-        return mean, signal / mean
+        return mean * np.exp(DB * (gain_db - values["taper_db"] * self.model.aside)), signal / mean
 
     def within_pattern(self, values: dict[str, float]) -> NDArray[np.bool_]:
         """Return the blocks ``(views, rows, columns)`` whose ground is in the main lobe, or too faint to matter."""
@@ -487,28 +489,21 @@ class _Problem:
         """Maximise the posterior of the parameters that are not held, from a start or from the priors."""
         free = [name for name in FIELDS if name not in held]
         candidates = [start | held] if start is not None else self._starts(held)
-        best: _Solution | None = None
-        for values in candidates:
-            gain_db = np.zeros(self.mean.shape[2])
-            one = self._climb(_Solution(values, gain_db, False, self.valid, 1.0, np.zeros(0), 0.0), free)
-            if best is None or one.objective > best.objective:
-                best = one
-        assert best is not None
+        solutions = [_Solution(one, np.zeros(self.mean.shape[2]), False, self.valid, 1.0, np.zeros(0)) for one in candidates]
+        if len(solutions) > 1:
+            solutions = [self._climb(self._weighted(one, len(free)), free) for one in solutions]
+        solution = replace(min(solutions, key=lambda one: self._misfit(one.values)), fitted_gains=beam_gains)
         # alternate between the fit, and what is an outlier and how much blocks vary
-        solution = replace(best, fitted_gains=beam_gains)
         for _ in range(ROUNDS):
-            solution = self._weighted(solution, len(free))
-            solution = self._climb(solution, free)
+            solution = self._climb(self._weighted(solution, len(free)), free)
         return solution
 
     def _starts(self, held: dict[str, float]) -> list[dict[str, float]]:
         """Return starts: the priors with a matching level; of unknown places, the best of a grid."""
-        heights, pitches = [self.start["height_m"]], [self.start["pitch_deg"]]
-        if self.unknown_place:
-            heights, pitches = list(STARTS[0] * self.model.edges_m[-1]), list(STARTS[1])
+        grid = {"height_m": STARTS[0] * self.model.edges_m[-1], "pitch_deg": STARTS[1]}
         heights, pitches = (
-            [held[name]] if name in held else places
-            for name, places in (("height_m", heights), ("pitch_deg", pitches))
+            [held.get(name, self.start[name])] if name in held or name not in self.unknown else list(places)
+            for name, places in grid.items()
         )
         scored = []
         for height in heights:
@@ -516,11 +511,14 @@ class _Problem:
                 values = self.start | held | {"height_m": height, "pitch_deg": pitch}
                 if "level_db" not in held:
                     values["level_db"] = self._level(values)
-                mean, _ = self.means(values, np.zeros(self.mean.shape[2]))
-                error = np.log(self.mean / mean)[self.valid]
-                scored.append((float(np.abs(error).mean()), values))
+                scored.append((self._misfit(values), values))
         scored.sort(key=lambda one: one[0])
         return [values for _, values in scored[: 4 if len(scored) > 1 else 1]]
+
+    def _misfit(self, values: dict[str, float]) -> float:
+        """Return the mean absolute difference of the logarithms of blocks and model, without gains of beams."""
+        mean, _ = self.means(values, np.zeros(self.mean.shape[2]))
+        return float(np.abs(np.log(self.mean[self.valid] / mean[self.valid])).mean())
 
     def _level(self, values: dict[str, float]) -> float:
         """Return the level at which the brighter half of the ground has the levels of the frames [dB]."""
@@ -559,7 +557,7 @@ class _Problem:
 
         def deviation(values: dict[str, float]) -> Array:
             away = [
-                0.0 if n == "level_db" or (n == "height_m" and self.unknown_place)
+                0.0 if n == "level_db" or (n == "height_m" and n in self.unknown)
                 else (math.log(values[n] / self.start[n]) if n in POSITIVE else values[n] - self.start[n]) for n in free
             ]  # fmt: skip
             return np.array(away)
@@ -576,7 +574,7 @@ class _Problem:
         best, damping, information = objective(values, gain_db), 1e-3, np.diag(precision)
         for _ in range(ITERATIONS):
             # 1. Derivatives of the logarithm of the means, and the score.
-            mean, part = self.means(values, gain_db)
+            mean, _ = self.means(values, gain_db)
             residual = self.mean / mean - 1
             slopes = []
             for k in range(len(free)):
@@ -589,10 +587,9 @@ class _Problem:
             information = np.einsum("pvrc,qvrc,vrc->pq", slope, slope, weight, optimize=True) + np.diag(precision)
             # 2. Gains of the beams are eliminated: each affects its column alone.
             if solution.fitted_gains:
-                by_gain = DB * part
-                gain_score = (weight * residual * by_gain).sum(axis=(0, 1)) - gain_precision * gain_db
-                gain_information = (weight * by_gain**2).sum(axis=(0, 1)) + gain_precision
-                cross = np.einsum("pvrc,vrc->pc", slope, weight * by_gain)
+                gain_score = DB * (weight * residual).sum(axis=(0, 1)) - gain_precision * gain_db
+                gain_information = DB**2 * weight.sum(axis=(0, 1)) + gain_precision
+                cross = DB * np.einsum("pvrc,vrc->pc", slope, weight)
                 information = information - (cross / gain_information) @ cross.T
                 score = score - (cross / gain_information) @ gain_score
             # 3. A damped step that raises the posterior.
@@ -617,7 +614,7 @@ class _Problem:
         index = [list(FIELDS).index(n) for n in free]
         covariance = np.zeros((len(FIELDS), len(FIELDS)))
         covariance[np.ix_(index, index)] = np.linalg.inv(information) * scale[:, None] * scale
-        return replace(solution, values=values, gain_db=gain_db, covariance=covariance, objective=best)
+        return replace(solution, values=values, gain_db=gain_db, covariance=covariance)
 
     # ---------------- Judgement
 
@@ -630,13 +627,16 @@ class _Problem:
                 f"the frames show no ground above the noise: {lit:.0%} of the blocks, {LEAST_SIGNAL:.0%} are needed; give "
                 "frames of level ground"
             )
-        level = np.log(self.mean[self.valid] / np.broadcast_to(self.noise_gain, self.mean.shape)[self.valid])
-        error = np.log(self.mean[self.valid] / mean[self.valid])
-        explained = 1 - float(error.var() / max(level.var(), 1e-12))
-        if explained < LEAST_EXPLAINED:
+        judged = self.valid & self.within_pattern(solution.values)
+        level = np.log((self.mean / self.noise_gain)[judged])
+        error = np.log(self.mean[judged] / mean[judged])
+        spread_db = 1.4826 * float(np.median(np.abs(error - np.median(error)))) / DB
+        explained = 1 - float(np.square(error).mean() / max(level.var(), 1e-12))
+        if explained < LEAST_EXPLAINED or spread_db > MOST_ERROR_DB:
             raise MitsonarError(
-                f"level ground explains {max(explained, 0.0):.0%} of the variance of the levels, {LEAST_EXPLAINED:.0%} are "
-                "needed: give frames of level ground without large objects, or height and pitch where they are known"
+                f"the frames do not show level ground: it explains {max(explained, 0.0):.0%} of the variance of the levels "
+                f"({LEAST_EXPLAINED:.0%} are needed), and half of the blocks differ by more than {spread_db / 1.4826:.1f} dB; "
+                "give frames of level ground without large objects, or --height and --pitch where they are known"
             )
 
     def looks_of_frame(self, solution: _Solution) -> float:
