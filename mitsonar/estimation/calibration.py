@@ -45,9 +45,12 @@ POSITIVE = ("height_m", "elevation_fov_deg")
 
 PRIOR_STD = {
     "level_db": 1e3, "height_m": 0.2, "pitch_deg": 5.0, "roll_deg": 3.0, "taper_db": 6.0, "elevation_fov_deg": 0.3,
-    "range_exponent": 1.0, "noise_level_db": 10.0,
+    "range_exponent": 1.5, "noise_level_db": 10.0,
 }  # fmt: skip
 """Standard deviations of the priors; of the logarithm where that is fitted."""
+
+UNKNOWN_HEIGHT = 0.2
+"""Height, relative to the end of the window, at which the prior of an unknown one has its middle."""
 
 UNKNOWN_POSE_STD = {"height_m": 1.0, "pitch_deg": 30.0}
 """The same for frames without poses."""
@@ -87,7 +90,7 @@ LAGS, LEAST_CORRELATION = 8, 0.05
 ITERATIONS, ROUNDS, STEPS = 40, 3, 1e-3
 """Iterations of Fisher scoring, rounds of its weights, and the step of differences."""
 
-STARTS = np.geomspace(0.08, 0.9, 12), np.arange(0.0, 75.0, 5.0)
+STARTS = np.geomspace(0.01, 0.9, 20), np.arange(0.0, 75.0, 5.0)
 """Heights, relative to the end of the window, and pitches [deg] of the initial search without poses."""
 
 DB = math.log(10) / 10
@@ -198,13 +201,14 @@ def calibrate_sonar(
         raise MitsonarError(f"the height must be positive: got {height_m:g} m; give the height over the ground")
     # 1. All frames give the result.
     reference = _reference(frames)
-    problem = _Problem(frames, sonar, fit, reference)
+    problem = _Problem(frames, sonar, fit, reference, each_beam=beam_gains)
     solution = problem.solve(held, beam_gains=beam_gains)
     problem.check(solution)
     # 2. Odd frames judge what even frames give, by this model and by the sonar of `sonar fit` at a fitted place.
     held_out = None
     if len(frames) > 1:
-        even, odd = (_Problem(frames.select(np.arange(k, len(frames), 2)), sonar, fit, reference) for k in (0, 1))
+        halves = [frames.select(np.arange(k, len(frames), 2)) for k in (0, 1)]
+        even, odd = (_Problem(half, sonar, fit, reference, each_beam=beam_gains) for half in halves)
         place = {name: value for name, value in held.items() if name not in INSTRUMENT}
         nominal = {name: problem.start[name] for name in INSTRUMENT}
         solutions = [
@@ -378,9 +382,12 @@ class _Problem:
         sonar: the instrument before the calibration.
         fit: what :func:`.fit_sonar` measures.
         reference: result of :func:`_reference`, of all frames.
+        each_beam: whether a block holds one beam rather than several.
     """
 
-    def __init__(self, frames: SonarFrames, sonar: Sonar, fit: SonarFit, reference: Array) -> None:
+    def __init__(
+        self, frames: SonarFrames, sonar: Sonar, fit: SonarFit, reference: Array, *, each_beam: bool = False
+    ) -> None:
         self.fit = fit
         # 1. Poses that differ, relative to the reference, and the frames of each.
         away = np.zeros((len(frames), 3))
@@ -396,10 +403,10 @@ class _Problem:
         # 2. Means of blocks, and the blocks that hold levels.
         bins, beams = frames.image.shape[1:]
         tall = max(1, bins // BLOCKS[0])
-        wide = max(1, math.ceil(beams / BLOCKS[1]))
+        wide = 1 if each_beam else math.ceil(beams / BLOCKS[1])
         rows, columns = bins // tall, beams // wide
         self.mean_of_frame = np.zeros((len(which), rows, columns))
-        valid = np.zeros(self.mean_of_frame.shape, dtype=bool)
+        bad = np.zeros((2, *self.mean_of_frame.shape), dtype=bool)
 
         def averaged(cells: NDArray[Any]) -> Array:
             cut = cells[: rows * tall, : columns * wide].reshape(rows, tall, columns, wide)
@@ -408,22 +415,22 @@ class _Problem:
         for k, number in enumerate(which):
             value = np.asarray(frames.image[number], dtype=float) / (255 if frames.image.dtype.kind == "u" else 1)
             self.mean_of_frame[k] = averaged(decoded(value, sonar))
-            valid[k] = (averaged(value >= FULL_SCALE) <= MOST_CLIPPED) & (averaged(value <= 0) <= MOST_EMPTY)
+            bad[:, k] = averaged(value >= FULL_SCALE) > MOST_CLIPPED, averaged(value <= 0) > MOST_EMPTY
         edges = sonar.range_min + np.arange(rows + 1) * tall * sonar.bin_m
-        if fit.sonar.near_glow_db > 0:
-            valid &= (edges[:-1] > fit.sonar.near_glow_m)[None, :, None]
-        self.valid_of_frame = valid & (self.mean_of_frame > 0)
+        far = edges[:-1] >= (fit.sonar.near_glow_m if fit.sonar.near_glow_db > 0 else 0.0)
+        self.valid_of_frame = ~bad.any(axis=0) & far[:, None] & (self.mean_of_frame > 0)
         count = np.bincount(self.view_of)
         sums = np.zeros((len(count), rows, columns))
         np.add.at(sums, self.view_of, self.mean_of_frame)
         self.mean = sums / count[:, None, None]
-        bad = np.zeros(sums.shape)
-        np.add.at(bad, self.view_of, ~self.valid_of_frame)
-        self.valid: NDArray[np.bool_] = bad == 0
+        missing = np.zeros(sums.shape)
+        np.add.at(missing, self.view_of, ~self.valid_of_frame)
+        self.valid: NDArray[np.bool_] = missing == 0
         if self.valid.sum() < FEWEST_BLOCKS:
             raise MitsonarError(
-                f"a calibration needs at least {FEWEST_BLOCKS} blocks of cells with levels: got {self.valid.sum()}; the "
-                "others are clipped, empty or in the near glow, so record with a lower gain or a larger window"
+                f"a calibration needs at least {FEWEST_BLOCKS} blocks of cells with levels: got {self.valid.sum()} of "
+                f"{self.valid.size:,}; {bad[0].mean():.0%} are clipped, {bad[1].mean():.0%} hold cells without a level, "
+                f"{1 - far.mean():.0%} are in the near glow; give frames whose levels are neither clipped nor cut off below"
             )
         self._weight = (count / count.mean())[:, None, None]
         # 3. Model, priors and start.
@@ -437,7 +444,7 @@ class _Problem:
         self.scale_db = fit.full_scale_db - sonar.source_level_db
         absorption = sonar_absorption(sonar)
         self.start = {
-            "level_db": 0.0, "height_m": float(np.nan_to_num(reference[0], nan=1.0)),
+            "level_db": 0.0, "height_m": float(np.nan_to_num(reference[0], nan=UNKNOWN_HEIGHT * edges[-1])),
             "pitch_deg": math.degrees(np.nan_to_num(reference[1])),
             "roll_deg": math.degrees(np.nan_to_num(reference[2])), "taper_db": sonar.taper_db,
             "elevation_fov_deg": sonar.elevation_fov_deg, "absorption_db_per_m": absorption, "range_exponent": 0.0,
@@ -483,9 +490,7 @@ class _Problem:
 
     # ---------------- Fit
 
-    def solve(
-        self, held: dict[str, float], start: dict[str, float] | None = None, *, beam_gains: bool = False
-    ) -> _Solution:
+    def solve(self, held: dict[str, float], start: dict[str, float] | None = None, *, beam_gains: bool = False) -> _Solution:
         """Maximise the posterior of the parameters that are not held, from a start or from the priors."""
         free = [name for name in FIELDS if name not in held]
         candidates = [start | held] if start is not None else self._starts(held)
@@ -556,11 +561,8 @@ class _Problem:
             return values | {n: math.exp(min(v, 12.0)) if n in POSITIVE else float(v) for n, v in zip(free, x, strict=True)}
 
         def deviation(values: dict[str, float]) -> Array:
-            away = [
-                0.0 if n == "level_db" or (n == "height_m" and n in self.unknown)
-                else (math.log(values[n] / self.start[n]) if n in POSITIVE else values[n] - self.start[n]) for n in free
-            ]  # fmt: skip
-            return np.array(away)
+            away = {n: math.log(values[n] / self.start[n]) if n in POSITIVE else values[n] - self.start[n] for n in free}
+            return np.array([*(away | {"level_db": 0.0} if "level_db" in away else away).values()])
 
         precision = np.array([1 / self.prior_std[n] ** 2 for n in free])
         gain_precision = 1 / BEAM_GAIN_STD_DB**2
