@@ -14,7 +14,8 @@ from helpers import Array, Command, diffuse, floor, floor_levels, refused, scene
 
 from mitsonar.acoustics.water import gain_of
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.estimation.calibration import GroundModel, calibrate_sonar
+from mitsonar.estimation.calibration import calibrate_sonar
+from mitsonar.estimation.ground_levels import GroundModel
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.records.frames import SonarFrames
@@ -44,11 +45,15 @@ def poses_at(places: tuple[tuple[float, float], ...], count: int, seed: int = 1)
     return np.array(rows)
 
 
+def edges_of(sonar: Sonar) -> Array:
+    """Ranges between the bins [m]."""
+    return np.asarray(sonar.range_min + np.arange(sonar.range_bins + 1) * sonar.bin_m, dtype=np.float64)
+
+
 def drawn(places: tuple[tuple[float, float], ...], count: int, seed: int, gain_db: Array | float = 0.0) -> SonarFrames:
     """Frames drawn from the law of the calibration itself: exponential intensities, independent from cell to cell."""
     true = SHEET.replace(**TRUE, coding="linear")
-    edges = true.range_min + np.arange(true.range_bins + 1) * true.bin_m
-    model = GroundModel(true, true.bearing_rad, edges)
+    model = GroundModel(true, true.bearing_rad, edges_of(true))
     noise = 10 ** (TRUE["noise_level_db"] / 10) * gain_of(true)[:, None]
     aside = np.square(np.sin(true.bearing_rad) / np.sin(true.bearing_rad[-1]))
     images, draw = [], np.random.default_rng(seed)
@@ -91,8 +96,9 @@ def test_the_ground_has_the_levels_of_an_integral(bearing: str) -> None:
     pattern = Sonar.create(
         **known, bearing=bearing, model="coherent", frequency_hz=1e6, gain_exponent=3, absorption_db_per_m=0.0
     )
-    edges = box.range_min + np.arange(box.range_bins + 1) * box.bin_m
-    level = GroundModel(pattern, pattern.bearing_rad, edges).levels(2.0, 20.0, 0.0, 14.0, 0.0, 0.0, least_pattern=1.0)
+    level = GroundModel(pattern, pattern.bearing_rad, edges_of(box)).levels(
+        2.0, 20.0, 0.0, 14.0, 0.0, 0.0, least_pattern=1.0
+    )
     np.testing.assert_allclose(level * np.cos(pattern.bearing_rad), floor_levels(box, 2.0, math.radians(20), 1.0), rtol=2e-3)
 
 
@@ -166,7 +172,13 @@ def test_given_values_stay() -> None:
     for name, value in (("taper_db", 3.0), ("range_exponent", 0.0), ("height_m", 1.9)):
         assert (result.parameters[name].value, result.parameters[name].std) == (value, 0.0)
     assert result.fit.sonar.taper_db == 3.0
-    assert not any("gain_exponent" in note for note in result.notes)
+    assert result.notes == []
+
+
+def test_absorption_that_the_gain_undoes_is_not_written() -> None:
+    """The simulator's gain undoes the sonar's absorption, so it cannot hold another."""
+    result = calibrate_sonar(drawn(PLACES, 1, 7), gain_exponent=2, gain_absorption=True)
+    assert result.fit.sonar.absorption_db_per_m == SHEET.absorption_db_per_m
 
 
 def test_one_place_does_not_determine_everything() -> None:
@@ -179,7 +191,7 @@ def test_one_place_does_not_determine_everything() -> None:
     assert "height_m" in note or "pitch_deg" in note
     for name, value in (("height_m", 1.5), ("pitch_deg", 20.0)):
         assert abs(result.parameters[name].value - value) < 4 * result.parameters[name].std
-    assert any("gain and reflectivity" in note for note in result.notes)
+    assert "gain and reflectivity together" in result.lines()[0]
 
 
 def test_a_single_frame_holds_nothing_out() -> None:
