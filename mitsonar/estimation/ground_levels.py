@@ -470,8 +470,8 @@ class GroundProblem:
             raise MitsonarError(
                 f"the frames do not show level ground: it explains {max(explained, 0.0):.0%} of the variance of the levels "
                 f"({LEAST_EXPLAINED:.0%} are needed), and half of the blocks differ by more than "
-                f"{spread_db / 1.4826:.1f} dB ({MOST_ERROR_DB / 1.4826:.1f} are allowed); give frames of level ground without large "
-                "objects, or their height and pitch where these are known"
+                f"{spread_db / 1.4826:.1f} dB ({MOST_ERROR_DB / 1.4826:.1f} are allowed); give frames of level ground "
+                "without large objects, or their height and pitch where these are known"
             )
 
     def looks_of_frame(self, solution: GroundSolution) -> float:
