@@ -35,6 +35,7 @@ __all__ = [
     "Shares",
     "To",
     "Without",
+    "calibrate",
     "classes_of",
     "convert",
     "exported",
@@ -381,6 +382,7 @@ def sonars() -> typer.Typer:
     app = typer.Typer(help="Describe a sonar by its recordings.", no_args_is_help=True)
     app.command()(fit)
     app.command("from-recording")(from_recording)
+    app.command()(calibrate)
     return app
 
 
@@ -455,6 +457,54 @@ def from_recording(
     first = max(0, (len(source) - frames) // 2)
     chosen, notes = as_instrument(source.read(range(first, min(first + frames, len(source)))))
     _fit_and_write(chosen, known, out, noise, notes, measure_coding=measure_coding)
+
+
+@answered
+def calibrate(
+    file: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording of a real sonar, frames or a run.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="YAML file to write, for --sonar.")],
+    sonar: Annotated[
+        str | None,
+        typer.Option(help="Preset or YAML file for what the recording does not contain: beam width, patterns, priors."),
+    ] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Set a known field, which is not fitted: absorption_db_per_m=0.4."),
+    ] = None,
+    height: Annotated[float | None, typer.Option(help="Known height over the ground, the median over frames [m].")] = None,
+    pitch: Annotated[float | None, typer.Option(help="Known pitch, the median over frames, > 0 looks down [deg].")] = None,
+    roll: Annotated[float | None, typer.Option(help="Known roll, the median over frames [deg].")] = None,
+    beam_gains: Annotated[
+        bool, typer.Option("--beam-gains", help="Fit the gain of every beam, which gives stripes_db, besides the taper.")
+    ] = False,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Number of frames to read, spread evenly.")] = 60,
+    part: Annotated[int | None, typer.Option(min=0, help="Part of the recording (default: the longest).")] = None,
+    topic: Annotated[str | None, typer.Option(help="Topic of a ROS bag (default: the only one).")] = None,
+    geometry: Geometry = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+) -> None:
+    """Calibrate taper, elevation pattern, absorption and noise with frames of level ground, and write a sonar.
+
+    Height, pitch and roll are fitted too. Every second frame is held out to compare the likelihood with that of `sonar fit`.
+    """
+    from mitsonar.estimation.calibration import calibrate_sonar
+    from mitsonar.estimation.sonar_fit import as_instrument
+    from mitsonar.mapping.sources import open_frames
+
+    refuse_to_replace(out, overwrite=overwrite)
+    known = _known_fields(sonar, changes)
+    source = open_frames(file, sequence=part, view=topic, geometry=geometry)
+    which = np.unique(np.linspace(0, len(source) - 1, min(frames, len(source))).astype(int))
+    chosen, notes = as_instrument(source.read([int(k) for k in which]))
+    result = calibrate_sonar(
+        chosen, known.sonar, height_m=height, pitch_deg=pitch, roll_deg=roll, beam_gains=beam_gains, **known.fields
+    )
+    write_atomic(out, result.yaml().encode())
+    for line in result.lines():
+        say(line)
+    for note in (*notes, *result.notes):
+        warn(note)
+    say(f"{out}: {command_line('render', 'SCENE', '--sonar', out)}")
 
 
 class _KnownFields(NamedTuple):
