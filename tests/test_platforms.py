@@ -34,29 +34,12 @@ UNIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "te
 """Modules of the standard library that Windows lacks."""
 
 UNIX_NAMES = {
-    *(
-        "os.chown",
-        "os.fchmod",
-        "os.fork",
-        "os.forkpty",
-        "os.geteuid",
-        "os.getloadavg",
-        "os.getpgid",
-        "os.getuid",
-        "os.killpg",
-    ),
-    *("os.mkfifo", "os.nice", "os.O_DIRECTORY", "os.O_NOFOLLOW", "os.posix_fadvise", "os.pread", "os.pwrite"),
+    *("os.chown", "os.fchmod", "os.fork", "os.forkpty", "os.geteuid", "os.getloadavg", "os.getpgid", "os.getuid"),
+    *("os.killpg", "os.mkfifo", "os.nice", "os.O_DIRECTORY", "os.O_NOFOLLOW", "os.posix_fadvise", "os.pread", "os.pwrite"),
     *("os.sched_getaffinity", "os.sched_setaffinity", "os.setpgrp", "os.setsid", "os.statvfs", "os.sync", "os.sysconf"),
     *("os.uname", "signal.alarm", "signal.pause", "signal.pthread_kill", "signal.setitimer", "signal.SIGALRM"),
-    *(
-        "signal.SIGCHLD",
-        "signal.SIGHUP",
-        "signal.SIGKILL",
-        "signal.SIGPIPE",
-        "signal.SIGUSR1",
-        "signal.SIGUSR2",
-        "time.tzset",
-    ),
+    *("signal.SIGCHLD", "signal.SIGHUP", "signal.SIGKILL", "signal.SIGPIPE", "signal.SIGUSR1", "signal.SIGUSR2"),
+    "time.tzset",
 }
 """Names of the standard library that Windows lacks."""
 
@@ -97,14 +80,12 @@ def text_without_encoding(source: str) -> Iterator[str]:
             continue
         name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
         keywords = {word.arg: word.value for word in node.keywords}
-        if name in ("read_text", "write_text", "TextIOWrapper", "NamedTemporaryFile") or name == "open" and opens_text(node):
-            if "encoding" not in keywords:
-                yield ast.unparse(node)
-            elif (name == "write_text" or mode_of(node) in ("w", "a", "x")) and "newline" not in keywords:
-                yield ast.unparse(node)
-        elif name in ("run", "Popen", "check_output") and {"text", "universal_newlines"} & set(keywords):
-            if "encoding" not in keywords:
-                yield ast.unparse(node)
+        piped = name in ("run", "Popen", "check_output") and "text" in keywords
+        opened = name in ("read_text", "write_text", "TextIOWrapper", "NamedTemporaryFile")
+        opened = opened or (name == "open" and opens_text(node))
+        written = opened and (name == "write_text" or mode_of(node) in ("w", "a", "x"))
+        if ((piped or opened) and "encoding" not in keywords) or (written and "newline" not in keywords):
+            yield ast.unparse(node)
 
 
 MODE = re.compile(r"[rwxa][bt+]{0,2}")
@@ -199,7 +180,7 @@ def test_names_of_files_are_valid_on_every_system() -> None:
 
 
 class Handles:
-    """The module ``os`` and the module ``msvcrt`` of Windows: no open file is removed, and one byte is locked by one handle."""
+    """Stand-in for ``os`` and ``msvcrt`` of Windows: no open file is removed, and a byte is locked by one handle."""
 
     LK_NBLCK = 2
 

@@ -38,8 +38,8 @@ VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "cuda_ad_rgb", "llvm_ad_rgb")
 """Variants that mitsonar supports; monochrome ones need less memory."""
 
 INSTALL = {
-    "linux": "on Debian or Ubuntu type `sudo apt-get install libllvm19 libatomic1` (or another libllvm from 17 on), on Fedora "
-    "`sudo dnf install llvm-libs libatomic`, on Arch `sudo pacman -S llvm-libs`",
+    "linux": "on Debian or Ubuntu type `sudo apt-get install libllvm19 libatomic1` (or another libllvm from 17 on), on "
+    "Fedora `sudo dnf install llvm-libs libatomic`, on Arch `sudo pacman -S llvm-libs`",
     "darwin": "type `brew install llvm`",
     "win32": "type `winget install LLVM.LLVM`, and add the folder of LLVM-C.dll to PATH",
 }
