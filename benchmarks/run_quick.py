@@ -21,12 +21,18 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerContext, SpawnContext
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("benchmarks", "docs", "scenes")
 LIBRARIES = ["matplotlib.pyplot", "scipy.ndimage", "scipy.optimize", "torch", "zarr"]
 HAS_FORK = "forkserver" in multiprocessing.get_all_start_methods()
-PROCESSES = multiprocessing.get_context("forkserver" if HAS_FORK else "spawn")
+PROCESSES: ForkServerContext | SpawnContext = (
+    multiprocessing.get_context("forkserver") if HAS_FORK else multiprocessing.get_context("spawn")
+)
 
 
 def main() -> None:

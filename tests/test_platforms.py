@@ -323,7 +323,7 @@ def test_a_missing_library_is_installed_by_the_command_of_the_system(
 
 WITHOUT_UNIX = """
 import os, signal, sys, time
-import asyncio, multiprocessing.connection, psutil, subprocess, tempfile  # they know which system they run on
+import asyncio, multiprocessing.connection, subprocess, tempfile  # they know which system they run on
 import fsspec.implementations.local, matplotlib.pyplot, mitsuba, scipy.optimize, typer, zarr
 import mitsonar.io.system
 os.chdir({folder!r})
@@ -341,7 +341,8 @@ main()
 
 def without_unix(folder: Path, *arguments: str) -> str:
     """What the command line prints in a process without what Windows lacks, in the encoding of a pipe there."""
-    given = {"folder": str(folder), "modules": UNIX_MODULES - {"posix"}, "names": UNIX_NAMES, "arguments": arguments}
+    modules, names = UNIX_MODULES - {"posix"}, UNIX_NAMES - {"os.sysconf"}  # Python and `memory_bytes` call them here
+    given = {"folder": str(folder), "modules": modules, "names": names, "arguments": arguments}
     return run_python(WITHOUT_UNIX.format(**given), PYTHONIOENCODING="cp1252", PYTHONUTF8="0")
 
 

@@ -27,11 +27,11 @@ def usable_cores() -> int:
 
 def memory_bytes() -> int:
     """Return the size of the machine's memory [bytes]."""
-    if hasattr(os, "sysconf"):
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    import psutil  # required on Windows only, which has no sysconf
+    if sys.platform == "win32":
+        import psutil  # required on Windows only
 
-    return int(psutil.virtual_memory().total)
+        return int(psutil.virtual_memory().total)
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def limit_process(memory: int, cpu_s: int) -> None:
@@ -43,10 +43,10 @@ def limit_process(memory: int, cpu_s: int) -> None:
         memory: limit of the address space [bytes].
         cpu_s: limit of the processor time [s].
     """
-    try:
-        import resource
-    except ModuleNotFoundError:  # Windows
+    if sys.platform == "win32":
         return
+    import resource
+
     for kind, maximum in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_CORE, 0)):
         finite_limits = [limit for limit in resource.getrlimit(kind) if limit != resource.RLIM_INFINITY]
         limit = min([maximum, *finite_limits])
