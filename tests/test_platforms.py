@@ -19,6 +19,7 @@ import pytest
 import yaml
 from helpers import Command, run_python
 
+from mitsonar.errors import MitsonarError
 from mitsonar.io import system
 from mitsonar.simulation import device
 
@@ -218,9 +219,9 @@ def on_windows(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
     handles = Handles()
     monkeypatch.setattr(sys, "platform", "win32")
-    monkeypatch.setitem(sys.modules, "msvcrt", handles)  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "msvcrt", handles)
     for name in ("fcntl", "resource"):
-        monkeypatch.setitem(sys.modules, name, None)  # type: ignore[arg-type]
+        monkeypatch.setitem(sys.modules, name, None)
     spec = spec_from_file_location("system_on_windows", system.__file__)
     assert spec is not None
     assert spec.loader is not None
@@ -311,7 +312,7 @@ def test_a_missing_library_is_installed_by_the_command_of_the_system(
 ) -> None:
     monkeypatch.setattr(sys, "platform", name)
     monkeypatch.setattr(device, "_backends", lambda: (False, False))
-    with pytest.raises(device.MitsonarError, match="libLLVM was not found") as refusal:
+    with pytest.raises(MitsonarError, match="libLLVM was not found") as refusal:
         device.ensure_variant("llvm_ad_mono")
     assert words in str(refusal.value)
     assert "DRJIT_LIBLLVM_PATH" in str(refusal.value)
