@@ -4,7 +4,7 @@
 
 It prints the seconds of each script and the last lines of failed ones; the exit status is then 1. Scripts take the cores
 from each other, so their own times are no measurements. Each runs in a process of its own, forked from one that has
-imported the libraries that most of them need.
+imported the libraries that most of them need; on Windows, which has no fork, each imports them again.
 """
 
 from __future__ import annotations
@@ -21,11 +21,18 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerContext, SpawnContext
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("benchmarks", "docs", "scenes")
 LIBRARIES = ["matplotlib.pyplot", "scipy.ndimage", "scipy.optimize", "torch", "zarr"]
-FORKS = multiprocessing.get_context("forkserver")
+HAS_FORK = "forkserver" in multiprocessing.get_all_start_methods()
+PROCESSES: ForkServerContext | SpawnContext = (
+    multiprocessing.get_context("forkserver") if HAS_FORK else multiprocessing.get_context("spawn")
+)
 
 
 def main() -> None:
@@ -40,7 +47,8 @@ def main() -> None:
     if arguments.quick:
         return print("\n".join(str(path.relative_to(ROOT)) for path in expected))
     os.environ |= {"OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
-    FORKS.set_forkserver_preload(LIBRARIES)
+    if HAS_FORK:
+        PROCESSES.set_forkserver_preload(LIBRARIES)
     with ThreadPoolExecutor(max(1, arguments.together)) as pool:
         passed = list(pool.map(partial(passes, limit_s=arguments.limit), expected))
     failed = [path.name for path, well in zip(expected, passed, strict=True) if not well]
@@ -68,15 +76,19 @@ def is_script(path: Path) -> bool:
 def passes(path: Path, limit_s: float) -> bool:
     """Run a script, say how long it took, and whether it ended well."""
     begun = time.perf_counter()
-    with tempfile.NamedTemporaryFile("r", encoding="utf-8", errors="replace") as output:
-        process = FORKS.Process(target=run_script, args=(path, output.name))
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        output = Path(folder, "output.txt")
+        process = PROCESSES.Process(target=run_script, args=(path, output))
         process.start()
         process.join(limit_s)
         late = process.is_alive()
         if late:
-            os.killpg(process.pid or 0, signal.SIGKILL)
+            if sys.platform == "win32":
+                process.kill()
+            else:
+                os.killpg(process.pid or 0, signal.SIGKILL)
             process.join()
-        text = output.read() + (f"\nnot done after {limit_s:g} s" if late else "")
+        text = output.read_text(encoding="utf-8", errors="replace") + (f"\nnot done after {limit_s:g} s" if late else "")
     well = process.exitcode == 0
     lines = [f"{time.perf_counter() - begun:6.1f} s  {'ok    ' if well else 'FAILED'} {path.relative_to(ROOT)}"]
     if not well:
@@ -85,10 +97,11 @@ def passes(path: Path, limit_s: float) -> bool:
     return well
 
 
-def run_script(path: Path, output: str) -> None:
+def run_script(path: Path, output: Path) -> None:
     """Run a script as ``python PATH --quick`` from its folder does, with all that it prints in a file."""
-    os.setpgrp()  # which ends with it if it takes too long
-    file = os.open(output, os.O_WRONLY | os.O_APPEND)
+    if sys.platform != "win32":
+        os.setpgrp()  # which ends with it if it takes too long
+    file = os.open(output, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     for stream in (1, 2):
         os.dup2(file, stream)
     os.chdir(path.parent)

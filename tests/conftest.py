@@ -67,6 +67,10 @@ def _skip_what_is_absent(items: list[pytest.Item]) -> None:
         skips.append(("learn", pytest.mark.skip(reason=reason)))
     if any(item.get_closest_marker("gpu") for item in items) and not _has_cuda():
         skips.append(("gpu", pytest.mark.skip(reason="no CUDA device")))
+    if os.name != "posix":
+        skips.append(("posix", pytest.mark.skip(reason="needs signals, pipes or links as Linux and macOS have them")))
+    if not sys.platform.startswith("linux"):
+        skips.append(("linux", pytest.mark.skip(reason="needs /proc")))
     for item in items:
         for name, skip in skips:
             if item.get_closest_marker(name):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import io
 import json
-import resource
 import signal
+import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -264,7 +264,11 @@ def with_part(content: bytes, name: str, part: bytes) -> bytes:
 
 @contextmanager
 def limits() -> Iterator[None]:
-    """A reader that hangs, or asks for more memory than :data:`MOST_MEMORY`, fails."""
+    """A reader that hangs, or asks for more memory than :data:`MOST_MEMORY`, fails: on Linux, which can limit both."""
+    if sys.platform != "linux":
+        yield
+        return
+    import resource
 
     def hangs(*_: Any) -> None:
         raise AssertionError(f"a reader takes more than {LONGEST_S} s")

@@ -85,7 +85,7 @@ def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) 
         for part in parts:
             (folder / "images" / part).mkdir(parents=True)
             images, annotations = (folder / f"{part}.{name}" for name in ("images", "annotations"))
-            tables[part] = files.enter_context(images.open("w")), files.enter_context(annotations.open("w"))
+            tables[part] = files.enter_context(_text_file(images)), files.enter_context(_text_file(annotations))
         for shot in shots(source):
             name = f"{shot.name}.png"
             write_atomic(folder / "images" / shot.part / name, png(pictures.picture(shot.frames, shot.index)))
@@ -106,7 +106,7 @@ def export_coco(source: ExportSource, pictures: LabelledPictures, folder: Path) 
     table = [{"id": kind + 1, "name": name, "supercategory": "shape"} for kind, name in enumerate(pictures.classes)]
     about = {"description": source.about or source.name, "contributor": "mitsonar", "picture": pictures.picture_kind}
     for part in parts:
-        with (folder / "annotations" / f"{part}.json").open("w") as document:  # streamed, without a copy in memory
+        with _text_file(folder / "annotations" / f"{part}.json") as document:  # streamed, without a copy in memory
             document.write(f'{{"info":{json_line(about)},"licenses":[],"categories":{json_line(table)},"images":[')
             _copy(folder / f"{part}.images", document)
             document.write('],"annotations":[')
@@ -143,9 +143,14 @@ def _annotation(number: int, image: int, region: Region, names: tuple[str, str],
     }
 
 
+def _text_file(path: Path) -> IO[str]:
+    """Open a new text file that has the same bytes on every system."""
+    return path.open("w", encoding="utf-8", newline="\n")
+
+
 def _copy(source: Path, target: IO[str]) -> None:
     """Append the lines of a file to another, separated by commas, and remove the first file."""
-    with source.open() as lines:
+    with source.open(encoding="utf-8") as lines:
         for number, line in enumerate(lines):
             target.write(("," if number else "") + line.rstrip("\n"))
     source.unlink()
@@ -453,7 +458,7 @@ def export_hugging_face(source: ExportSource, pictures: LabelledPictures, folder
             part_folder = folder / "data" / shot.part
             if shot.part not in tables:
                 part_folder.mkdir(parents=True)
-                tables[shot.part] = files.enter_context((part_folder / "metadata.jsonl").open("w"))
+                tables[shot.part] = files.enter_context(_text_file(part_folder / "metadata.jsonl"))
             counts[shot.part] = counts.get(shot.part, 0) + 1
             write_atomic(part_folder / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
             record: dict[str, PlainValue] = {"file_name": f"{shot.name}.png", **pose_fields(shot)}
@@ -579,8 +584,8 @@ def export_kitti(source: ExportSource, pictures: LabelledPictures, folder: Path)
                 for file in (poses, times):
                     if file is not None:
                         file.close()
-                poses = (folder / "poses" / f"{name}.txt").open("w")
-                times = (folder / "sequences" / name / "times.txt").open("w")
+                poses = _text_file(folder / "poses" / f"{name}.txt")
+                times = _text_file(folder / "sequences" / name / "times.txt")
                 start_s = float(np.mean(shot.frames.time_s[shot.index]))
             assert shot.frames.poses is not None
             matrix = np.eye(4)

@@ -10,7 +10,6 @@ output. :mod:`mitsonar.bridges.usd` starts the process and reads both.
 from __future__ import annotations
 
 import json
-import resource
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +18,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+
+from mitsonar.io.system import limit_process
 
 __all__: list[str] = []
 
@@ -54,13 +55,7 @@ class RefusedError(Exception):
 
 def main() -> None:
     """Read the stage that is requested on standard input; print a report, or ``{"error": ...}`` if it cannot be read."""
-    for kind, maximum in (
-        (resource.RLIMIT_AS, MAX_MEMORY_BYTES),
-        (resource.RLIMIT_CPU, MAX_CPU_S),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        finite_limits = [limit for limit in resource.getrlimit(kind) if limit != resource.RLIM_INFINITY]
-        resource.setrlimit(kind, (min([maximum, *finite_limits]), min([maximum, *finite_limits])))
+    limit_process(MAX_MEMORY_BYTES, MAX_CPU_S)
     request = json.loads(sys.stdin.read())
     try:
         check_layers(request["path"], [Path(root) for root in request["roots"]])

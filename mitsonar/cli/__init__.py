@@ -12,10 +12,16 @@ __all__ = ["application", "main"]
 
 def main() -> None:
     """Run the command line, as ``mitsonar`` or ``python -m mitsonar``."""
+    import io
+    import sys
+
     import typer
 
     from mitsonar.cli.console import with_plain_brackets
 
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        # a pipe on Windows takes some 200 characters; file names may hold others
+        sys.stdout.reconfigure(errors="backslashreplace")
     with_plain_brackets(typer.main.get_command(application()))()
 
 

@@ -44,6 +44,7 @@ from mitsonar.cli.recording import (
     shares_of,
 )
 from mitsonar.errors import MitsonarError, count_noun
+from mitsonar.io.system import usable_cores
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -97,7 +98,7 @@ def make(
         raise MitsonarError(f"--workers must be at least 1: got {workers}")
     if workers is not None and scheduler is not None:
         raise MitsonarError("--workers and --scheduler contradict each other: a scheduler has its own workers")
-    processes = len(os.sched_getaffinity(0)) if workers is None else workers
+    processes = usable_cores() if workers is None else workers
     report = _make_with_bar(described, out, sequences=sequences, workers=processes, scheduler=scheduler, verify=verify)
     present = report.shards - report.new_shards
     say(
@@ -171,7 +172,7 @@ def detector(
     for note in notes:
         say(note)
     store = f"{out}.zarr"
-    report = _make_with_bar(recipe, store, workers=workers or len(os.sched_getaffinity(0)))
+    report = _make_with_bar(recipe, store, workers=workers or usable_cores())
     say(f"{report.frames:,} frames in {report.url}: `mitsonar dataset export` writes them again with other classes")
     exported(store, to, out, picture, [*rules, *ground], least, least_snr_db, None, polygons, None, every_class=True)
 

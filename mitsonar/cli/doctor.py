@@ -26,7 +26,7 @@ PACKAGES = ("mitsonar", "mitsuba", "drjit", "numpy", "scipy", "OpenEXR", "trimes
 @answered
 def doctor() -> None:
     """Check variant, libraries and versions, compare small scenes with closed forms, and measure the speed."""
-    from mitsonar.simulation.device import backend
+    from mitsonar.simulation.device import backend, install_hint
 
     say(f"python {platform.python_version()}, {platform.system()} {platform.machine()}")
     for package in PACKAGES:
@@ -37,7 +37,7 @@ def doctor() -> None:
     if device.llvm is not None and device.llvm[0] < 17:
         warn(
             f"LLVM {device.llvm[0]} ends the process on some Mitsuba plugins (it cannot compile `max`); mitsonar's own "
-            "avoid it; better: sudo apt-get install libllvm19"
+            f"avoid it; better: {install_hint()}"
         )
     _check_sphere()
     _check_floor()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,6 +26,7 @@ from mitsonar.cli.side_scan import MosaicRequest, lay_side_scan, refuse_options,
 from mitsonar.errors import MitsonarError, count_noun, did_you_mean
 from mitsonar.io.files import write_atomic
 from mitsonar.io.runs import kind_of_run, refuse_to_replace
+from mitsonar.io.system import usable_cores
 
 if TYPE_CHECKING:
     from mitsonar.estimation.crlb.report import Value
@@ -177,7 +177,7 @@ def odometry(
         sensors=vehicle,
         loops=loops,
         local_map=local_map,
-        workers=workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER)),
+        workers=workers or max(1, min(usable_cores(), pairs // PAIRS_A_WORKER)),
     )
     with progress_bar("estimating", pairs + closing + frames_mapped, "pairs") as progress:
         result = run_odometry(

@@ -16,6 +16,7 @@ import typer
 
 from mitsonar.cli.console import Terminated, answered, changes_of, progress_bar, say, say_json, say_stopped, warn
 from mitsonar.errors import MitsonarError, count_noun, did_you_mean
+from mitsonar.io.system import usable_cores
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -354,7 +355,7 @@ def reproduce(
     from mitsonar.reproduction.tables import reproduce as reproduced
 
     effort = Effort(scale, minutes or None, batch, changes_of(change or [], None), changes_of(data or [], None), quick)
-    processes = len(os.sched_getaffinity(0)) if workers is None else workers
+    processes = usable_cores() if workers is None else workers
     try:
         with ExitStack() as stack:
             watch = stack.enter_context(_Console())

@@ -19,6 +19,7 @@ import yaml
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, short_repr
+from mitsonar.io.system import memory_bytes
 
 __all__ = [
     "FileArray",
@@ -240,7 +241,7 @@ def refuse_beyond_memory(size: int, source: str) -> None:
     Raises:
         MitsonarError: it exceeds half of the machine's memory.
     """
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = memory_bytes()
     if size > memory // 2:
         raise MitsonarError(
             f"{source} would take {size / 2**30:,.4g} GiB of memory, this machine has {memory / 2**30:,.4g}: it is damaged, "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import socket
@@ -21,6 +20,7 @@ from zarr.abc.store import Store
 
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import finite_number, parse_json
+from mitsonar.io.system import exclusive_file
 
 __all__ = ["Storage", "refuse_codecs"]
 
@@ -136,13 +136,9 @@ class Storage:
         """Hold a kernel lock on a file, which is released when the process ends for any reason."""
         new = not os.path.exists(self.root)
         os.makedirs(self.root, exist_ok=True)
-        path = os.path.join(self.root, LOCK_FILE)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
+        with contextlib.ExitStack() as lock:
             try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if not (os.path.exists(path) and os.path.samestat(os.fstat(handle), os.stat(path))):
-                    raise BlockingIOError  # the last owner has just removed it, or another process has created a new one
+                lock.enter_context(exclusive_file(os.path.join(self.root, LOCK_FILE)))
             except BlockingIOError:
                 raise MitsonarError(
                     f"another process is writing {self.url}: wait for it to end, or choose another -o; nothing was changed"
@@ -150,12 +146,10 @@ class Storage:
             try:
                 yield lambda: None
             finally:
-                with contextlib.suppress(OSError):
-                    os.unlink(path)
-                    if new:
+                lock.close()
+                if new:
+                    with contextlib.suppress(OSError):
                         os.rmdir(self.root)  # only if nothing was written
-        finally:
-            os.close(handle)
 
     @contextlib.contextmanager
     def _locked_objects(self) -> Iterator[Callable[[], None]]:

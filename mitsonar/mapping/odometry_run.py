@@ -339,7 +339,7 @@ def add_to_journal(path: Path, key: PlainTable, estimate: Estimate) -> None:
     line = key | {"motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
     about = {name: estimate.about[name] for name in ("modes", "spreads", *HEIGHTS) if name in estimate.about}
     text = json.dumps(line | {"reason": estimate.reason} | ({"about": about} if about else {})) + "\n"
-    with path.open("a", encoding="utf-8") as file:
+    with path.open("a", encoding="utf-8", newline="\n") as file:
         file.write(text)
 
 

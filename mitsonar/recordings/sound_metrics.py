@@ -797,6 +797,11 @@ def aris_bearings(kind: str, beams: int) -> NDArray[np.float64]:
     if (kind, beams) not in TABLES:
         known = ", ".join(f"{one} with {number}" for one, number in TABLES)
         raise MitsonarError(f"no beam angles are known for an ARIS {kind} with {beams} beams: known are {known}")
-    lines = files("mitsonar.recordings").joinpath(f"beam_tables/{TABLES[kind, beams]}.csv").read_text().splitlines()
+    lines = (
+        files("mitsonar.recordings")
+        .joinpath(f"beam_tables/{TABLES[kind, beams]}.csv")
+        .read_text(encoding="utf-8")
+        .splitlines()
+    )
     degrees = np.array([float(line.split(",")[1]) for line in lines[1:]])
     return np.asarray(-np.radians(degrees)[::-1])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 import weakref
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
@@ -37,7 +38,13 @@ __all__ = [
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "cuda_ad_rgb", "llvm_ad_rgb")
 """Variants that mitsonar supports; monochrome ones need less memory."""
 
-INSTALL = "on Debian or Ubuntu type `sudo apt-get install libllvm19 libatomic1` (or another libllvm from 17 on)"
+INSTALL = {
+    "linux": "on Debian or Ubuntu type `sudo apt-get install libllvm19 libatomic1` (or another libllvm from 17 on), on "
+    "Fedora `sudo dnf install llvm-libs libatomic`, on Arch `sudo pacman -S llvm-libs`",
+    "darwin": "type `brew install llvm`",
+    "win32": "type `winget install LLVM.LLVM`, and add the folder of LLVM-C.dll to PATH",
+}
+"""How to install the libraries that Dr.Jit loads, by ``sys.platform``."""
 
 
 class Backend(NamedTuple):
@@ -75,7 +82,7 @@ def ensure_variant(name: str | None = None) -> str:
     if not (cuda if variant.startswith("cuda") else llvm):
         if variant.startswith("cuda"):
             raise MitsonarError(f"{variant} needs an NVIDIA driver, and none was found: use llvm_ad_mono")
-        raise MitsonarError(f"the library libLLVM was not found, which the renderer needs: {INSTALL}")
+        raise MitsonarError(f"the library libLLVM was not found, which the renderer needs: {install_hint()}")
     if mi.variant() != variant:
         mi.set_variant(variant)
     return variant
@@ -89,6 +96,12 @@ def backend() -> Backend:
     return Backend(variant, tuple(dr.detail.llvm_version()) if variant.startswith("llvm") else None)
 
 
+def install_hint() -> str:
+    """Return how to install the libraries that Dr.Jit loads on this system, or where it finds them."""
+    command = INSTALL.get(sys.platform, "install LLVM 17 or later")
+    return f"{command}; or set DRJIT_LIBLLVM_PATH to the file of the library"
+
+
 def use_threads(count: int) -> None:
     """Set the number of threads of the renderer; call this before anything is rendered."""
     import drjit as dr
@@ -99,8 +112,6 @@ def use_threads(count: int) -> None:
 
 def current_variant() -> str:
     """Return the current variant; empty if Mitsuba is not loaded or no variant is set."""
-    import sys
-
     mi = sys.modules.get("mitsuba")
     return str(mi.variant() or "") if mi is not None else ""
 
@@ -184,9 +195,8 @@ def _backends() -> tuple[bool, bool]:
     try:
         import drjit as dr
     except Exception as error:  # without libatomic1 this is a NameError about something else
-        raise MitsonarError(
-            f"Dr.Jit cannot be loaded ({type(error).__name__}: {error}); it needs the library libatomic: {INSTALL}"
-        ) from error
+        remedy = f"it needs the library libatomic: {install_hint()}" if sys.platform == "linux" else "install drjit again"
+        raise MitsonarError(f"Dr.Jit cannot be loaded ({type(error).__name__}: {error}); {remedy}") from error
     return bool(dr.has_backend(dr.JitBackend.CUDA)), bool(dr.has_backend(dr.JitBackend.LLVM))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 import platform
 import signal
 import threading
@@ -27,6 +26,7 @@ from mitsonar.config.training import TrainingRecipe, TrainOptions
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import whole_number, write_atomic
 from mitsonar.io.runs import RUN_FILE, RunDirectory, RunKind
+from mitsonar.io.system import usable_cores
 from mitsonar.motion.errors import Axis
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.data import Array, Batch, JsonObject, Material
@@ -452,7 +452,7 @@ class RunFolder:
 def machine() -> JsonObject:
     """Return a description of this machine."""
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    return {"system": platform.platform(), "cores": len(os.sched_getaffinity(0)), "gpu": device}
+    return {"system": platform.platform(), "cores": usable_cores(), "gpu": device}
 
 
 def column(level: str, axis: Axis) -> str:

@@ -22,6 +22,7 @@ from torch.utils import deterministic
 from mitsonar.config.training import TrainOptions
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.io.runs import RunDirectory, changed_versions
+from mitsonar.io.system import usable_cores
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.data import JsonObject, material_of
 from mitsonar.training.journal import EVENTS, Journal, RunFolder, StateFile, TrainingReport
@@ -172,7 +173,7 @@ def _workers(options: TrainOptions, earlier: RunDirectory | None, trainer: light
     """Return the number of processes that read or render: that of the earlier run, or one that suits the machine."""
     if options.workers is not None:
         return options.workers
-    cores = len(os.sched_getaffinity(0)) // max(1, trainer.world_size)
+    cores = usable_cores() // max(1, trainer.world_size)
     on_cpu = trainer.strategy.root_device.type == "cpu"
     if options.render:
         workers = None if earlier is None else earlier.settings.get("workers")

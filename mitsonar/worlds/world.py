@@ -394,7 +394,7 @@ class World:
             shutil.copyfile(source, temporary / name)
         for name, content in self.content.items():
             (temporary / name).write_bytes(content)
-        (temporary / "scene.xml").write_text(self.xml(), encoding="utf-8")
+        (temporary / "scene.xml").write_bytes(self.xml().encode())
         for subfolder in ("meshes", "textures"):
             if not any((temporary / subfolder).iterdir()):
                 (temporary / subfolder).rmdir()

@@ -224,6 +224,7 @@ def test_a_command_is_stopped_in_time_and_says_why(tmp_path: Path) -> None:
         run.command(asked_of(tmp_path, 2), "late", sleeps)
 
 
+@pytest.mark.posix
 @pytest.mark.thorough
 def test_a_command_that_heeds_no_request_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "GRACE_S", 1.0)

@@ -226,6 +226,7 @@ def started(*words: str) -> tuple[subprocess.Popen[str], int]:
     return process, int(result[1])
 
 
+@pytest.mark.posix
 @pytest.mark.e2e
 @pytest.mark.parametrize("number", essence([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
 def test_a_path_is_played_and_a_signal_ends_the_server_cleanly(number: signal.Signals) -> None:

@@ -61,6 +61,7 @@ def test_it_writes_responses_and_figures(mitsonar: Command, scene: Path, tmp_pat
     refused(mitsonar("impulse", scene, "--frames", 20, "-o", out, "--resume"), "was begun with", "poses_sha256", "velocity")
 
 
+@pytest.mark.posix
 @pytest.mark.thorough
 def test_killed_and_resumed_it_is_the_unbroken_one(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     arguments = ["impulse", scene, "--velocity", "1,-0.5,3", "--frames", 400]

@@ -214,6 +214,7 @@ SAME = (
 )
 
 
+@pytest.mark.posix
 @pytest.mark.thorough
 def test_a_killed_odometry_resumes_to_the_same_files_with_any_workers(mitsonar: Command, tmp_path: Path) -> None:
     over_ground(sway(120)).save(tmp_path / "frames.npz")

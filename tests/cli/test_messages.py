@@ -228,6 +228,7 @@ def interruptible() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.posix
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_ends_a_command_with_a_sentence(
@@ -254,6 +255,7 @@ def test_a_signal_ends_a_command_with_a_sentence(
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
+@pytest.mark.posix
 def test_a_signal_ends_a_child_that_a_command_has_forked() -> None:
     """It inherits the answer to the signal, and is not to go on where its parent was."""
     script = """
@@ -272,6 +274,7 @@ def test_a_signal_ends_a_child_that_a_command_has_forked() -> None:
     assert run_python(script) == f"{int(signal.SIGTERM)}\n"
 
 
+@pytest.mark.posix
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("number", essence([signal.SIGINT, signal.SIGTERM]))
 def test_a_signal_ends_a_rendering_that_goes_on(number: signal.Signals, mitsonar: Command, tmp_path: Path) -> None:

@@ -213,6 +213,7 @@ def test_a_seed_changes_the_jitter_and_a_parameter_the_scene(mitsonar: Command, 
     assert not np.array_equal(images[0], images[2])
 
 
+@pytest.mark.posix
 @pytest.mark.thorough
 def test_a_killed_run_leaves_whole_frames_and_resumes_to_the_same_bits(
     mitsonar: Command, scene: Path, tmp_path: Path

@@ -458,6 +458,7 @@ def test_no_scheduler_there(mitsonar: Command, tmp_path: Path, monkeypatch: pyte
     refused(done, "no dask scheduler", "tcp://127.0.0.1:9")
 
 
+@pytest.mark.posix
 @pytest.mark.thorough
 @pytest.mark.e2e
 def test_killed_at_ten_random_moments_and_finished_it_is_the_unbroken_one(made: Path, tmp_path: Path) -> None:
@@ -644,6 +645,7 @@ def test_a_full_disk_is_said_and_loses_nothing(made: Path, tmp_path: Path) -> No
         subprocess.run(["umount", str(small)], check=True)
 
 
+@pytest.mark.posix
 @pytest.mark.slow
 @pytest.mark.e2e
 def test_a_worker_that_dies_again_and_again_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

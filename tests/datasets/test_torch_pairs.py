@@ -330,7 +330,9 @@ def test_the_order_of_an_epoch_is_a_function_of_seed_and_epoch(made: Path) -> No
     assert sum(len(label) for _, label in pairs.loader(16, drop_last=True)) == 112
 
 
-@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(
+    "start", [pytest.param("fork", marks=pytest.mark.posix), pytest.param("spawn", marks=pytest.mark.thorough)]
+)
 def test_workers_of_a_data_loader_read_the_same(made: Path, start: str) -> None:
     """Forked too, as torch does unasked on Linux, after the store has been read in the parent."""
     pairs = SonarPairs(made, part="all", noise="high")
@@ -412,6 +414,7 @@ def test_workers_render_worlds_of_their_own() -> None:
     assert times.max() <= 4
 
 
+@pytest.mark.posix
 def test_what_cannot_be_rendered_in_training_is_refused() -> None:
     with pytest.raises(MitsonarError, match="random flights only"):
         RenderedPairs(load_recipe("pattern-runs"), seed=0)

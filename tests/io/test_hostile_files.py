@@ -109,6 +109,7 @@ def test_a_path_that_is_too_long_is_refused(path: str, variant: str) -> None:
         assert path[:20] in refusal_without_limit(lambda read=read: read(path)), name  # type: ignore[misc]
 
 
+@pytest.mark.posix
 def test_a_link_to_itself_is_refused(tmp_path: Path, variant: str) -> None:
     for name, read in BY_PATH.items():
         path = tmp_path / name
@@ -854,6 +855,7 @@ def test_json_made_to_harm(text: str, tmp_path: Path) -> None:
     assert "a.json" in refusal(lambda: read_json(tmp_path / "a.json"))
 
 
+@pytest.mark.posix
 def test_a_device_that_never_ends() -> None:
     from mitsonar.io.files import read_yaml
 
@@ -967,6 +969,7 @@ def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:
         assert "line 1 is damaged" in refusal(lambda: read_odometry(tmp_path))
 
 
+@pytest.mark.posix
 def test_a_journal_that_never_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_odometry(tmp_path)
     (tmp_path / "estimates.jsonl").unlink()

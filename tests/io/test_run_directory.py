@@ -103,6 +103,7 @@ def test_a_replaced_run_loses_its_outputs_and_nothing_else(tmp_path: Path) -> No
     assert (again.settings, again.notes, again.finished) == ({"other": 1}, {"done": 0}, False)
 
 
+@pytest.mark.posix
 def test_what_was_killed_while_it_replaced_a_run_begins_anew_when_resumed(tmp_path: Path) -> None:
     """Half of the old outputs are never taken for the new run's."""
     run = begun(tmp_path / "run")

@@ -151,6 +151,7 @@ def test_fans_are_resampled_and_the_told_pitch_and_height_are_kept(tmp_path: Pat
     assert source.height_m == pytest.approx([2.5, 2.5])
 
 
+@pytest.mark.posix
 def test_odd_pictures_are_left_out_and_told(tmp_path: Path) -> None:
     path = folder_of(tmp_path / "p", polar(4), [f"{k}.png" for k in range(4)])
     os.mkfifo(path / "7.png")

@@ -454,6 +454,7 @@ EVERYWHERE = [
 ]
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize(
     "moments",
     [pytest.param([IN_TRAINING], marks=pytest.mark.thorough), pytest.param(EVERYWHERE, marks=pytest.mark.slow)],

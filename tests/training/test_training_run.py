@@ -416,6 +416,7 @@ def killed(told: Path, data: Path | str, out: Path, when: str, *, render: bool =
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
+@pytest.mark.linux
 @pytest.mark.thorough
 @pytest.mark.e2e
 def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: Path) -> None:
@@ -434,6 +435,7 @@ def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: P
     assert best[0].digest == best[1].digest
 
 
+@pytest.mark.linux
 @pytest.mark.slow
 @pytest.mark.e2e
 def test_killed_runs_that_render_end_with_the_same_bits(tmp_path: Path) -> None:
@@ -704,6 +706,7 @@ def test_rows_of_the_log_between_validations_tell_the_errors_in_training(
     )
 
 
+@pytest.mark.posix
 @pytest.mark.thorough
 def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_path: Path) -> None:
     """And the run goes on to the same bits."""
@@ -723,6 +726,7 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
     assert_same(weights(out), weights(whole))
 
 
+@pytest.mark.posix
 @pytest.mark.thorough
 @pytest.mark.e2e
 def test_a_signal_to_all_processes_of_a_training_stops_it_after_its_step(made: Path, tmp_path: Path) -> None:

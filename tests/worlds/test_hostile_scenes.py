@@ -187,6 +187,7 @@ for name in json.loads(sys.argv[1]):
 """
 
 
+@pytest.mark.linux
 def test_scenes_whose_files_are_none_are_refused_at_once(tmp_path: Path) -> None:
     """Each within a second and a GiB."""
     (tmp_path / "secret").write_text("password: 12345\n")

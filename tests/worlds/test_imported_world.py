@@ -188,6 +188,7 @@ def test_damaged_and_harmful_sdf_is_refused_in_one_sentence(change: tuple[str, s
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.posix
 def test_includes_in_a_circle_and_links_out_of_the_folder_are_refused(tmp_path: Path) -> None:
     make_sdf(tmp_path)
     circle = BUOY.replace('<link name="hull">', '<include><uri>model://buoy</uri></include><link name="hull">')
