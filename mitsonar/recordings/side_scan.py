@@ -53,7 +53,7 @@ FARTHEST_M = 1e5
 """The same for positions in metres."""
 
 WINDOW_TOLERANCE = 0.005
-"""Changes of the range below this fraction belong to the sound speed, and do not begin another part."""
+"""Ends of windows that move by less than this fraction of the range follow the sound speed, and begin no other part."""
 
 VELOCITY_S = 5.0
 """Time over which the velocity is taken that extends the track before its first and behind its last fix [s]."""
@@ -415,7 +415,7 @@ class Band:
 
 
 def parts_of(band: Band, placed: Placed) -> list[SideScanPart]:
-    """Return one part for each run of pings with the same number of samples and about the same range.
+    """Return one part for each run of pings with the same number of samples and about the same window.
 
     Raises:
         MitsonarError: a value of the instrument is outside its limits.
@@ -427,7 +427,7 @@ def parts_of(band: Band, placed: Placed) -> list[SideScanPart]:
     pings = np.argsort(here, kind="stable")[int((here < 0).sum()) :]
     # 2. runs of equal windows
     parts = []
-    for run in _windows(band.samples[pings], band.range_max[pings]):
+    for run in _windows(band.samples[pings], band.range_min[pings], band.range_max[pings]):
         members = pings[run]
         where = here[members]
         time_s = placed.time_s[where]
@@ -444,14 +444,14 @@ def parts_of(band: Band, placed: Placed) -> list[SideScanPart]:
     return parts
 
 
-def _windows(samples: NDArray[np.int64], range_m: Array) -> list[Index]:
-    """Return the indices of each run of pings with the same number of samples and about the same range."""
+def _windows(samples: NDArray[np.int64], range_min: Array, range_max: Array) -> list[Index]:
+    """Return the indices of each run of pings with the same number of samples and about the same window."""
     runs: list[list[int]] = []
-    count, reference = -1, 0.0
-    for number, (ping_samples, ping_range) in enumerate(zip(samples.tolist(), range_m.tolist(), strict=True)):
-        if ping_samples != count or not abs(ping_range - reference) <= WINDOW_TOLERANCE * reference:
+    count, begin, end = -1, 0.0, 0.0
+    for number, (size, near, far) in enumerate(zip(samples.tolist(), range_min.tolist(), range_max.tolist(), strict=True)):
+        if size != count or not max(abs(near - begin), abs(far - end)) <= WINDOW_TOLERANCE * end:
             runs.append([])
-            count, reference = ping_samples, ping_range
+            count, begin, end = size, near, far
         runs[-1].append(number)
     return [np.asarray(run, dtype=np.intp) for run in runs]
 

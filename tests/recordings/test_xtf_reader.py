@@ -255,6 +255,18 @@ def test_another_range_begins_another_part(tmp_path: Path) -> None:
     assert recording.part() is recording.parts[0]
 
 
+def test_another_start_of_the_window_begins_another_part(tmp_path: Path) -> None:
+    """The same end and number of samples; a start that moves with the sound speed, by 1 cm, begins none."""
+    delays = [2 * near / 1500 for near in (2.0, 2.01, 6.0)]
+    file = Changed(tmp_path).pings(half_sound_speed=750)
+    for first, delay in zip((0, 2, 4), delays, strict=True):
+        file.headers(range(first, first + 2), delay_s=delay)
+    recording = file.open()
+    assert [len(part) for part in recording.parts] == [4, 2]
+    starts = [part.sounder.fan.range_min for part in recording.parts]
+    assert starts == pytest.approx([2.005, 6])
+
+
 @pytest.mark.parametrize(
     ("kind", "code", "unipolar"), [("u1", 0, 1), ("i1", 8, 0), ("<i2", 3, 0), ("<i4", 2, 0), ("<f4", 5, 0)]
 )
