@@ -399,7 +399,8 @@ def _band(
 ) -> Band:
     """Return the pings of a pair of channels."""
     table, starboard = (_channel_headers(data, [getattr(line, side) for line in lines]) for side in ("port", "starboard"))
-    weight = np.column_stack([table["weight"], starboard["weight"]]) * weighted
+    # int64: the absolute value of -32,768 overflows 16 bits
+    weight = np.column_stack([table["weight"], starboard["weight"]]).astype(np.int64) * weighted
     weight[np.abs(weight) > MOST_WEIGHT] = 0
     slant, delay, duration = (_floats(table, name) for name in ("slant_range_m", "delay_s", "duration_s"))
     duration = np.where((duration > 0) & (duration < 1e3), duration, np.nan)
@@ -447,7 +448,7 @@ class _Samples:
     data: Bytes
     begin: NDArray[np.int64]
     samples: NDArray[np.int64]
-    weight: NDArray[np.int16]
+    weight: NDArray[np.int64]
     sides: tuple[Channel, Channel]
 
     def __call__(self, pings: Index) -> Levels:

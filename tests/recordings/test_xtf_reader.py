@@ -299,6 +299,9 @@ def test_weights_scale_the_samples_of_some_sonars(tmp_path: Path) -> None:
     scaled = file.file(sensor=38).open().part().read().levels
     np.testing.assert_allclose(scaled[:3], plain[:3] / 16, rtol=1e-6)
     np.testing.assert_allclose(scaled[3:], plain[3:] * 4, rtol=1e-6)
+    for damaged in (-32768, -31, 31, 32767):
+        file.headers(weight=damaged)
+        np.testing.assert_array_equal(file.open().part().read().levels, plain)
 
 
 def test_more_than_six_channels_enlarge_the_header(tmp_path: Path) -> None:
