@@ -61,6 +61,9 @@ VELOCITY_S = 5.0
 SHORTEST_TRACK_M = 1.0
 """A track must be longer than this to give a course."""
 
+LEAST_STEP_M = 0.1
+"""Over :data:`VELOCITY_S` a vehicle must move this far to have a course: at rest it keeps its last one."""
+
 LEAST_COURSE_M = 20.0
 """A track must be longer than this for its course to be compared with headings."""
 
@@ -347,13 +350,20 @@ def _track(time_s: Array, fix_s: Array, fixes: Array) -> Array:
 
 
 def _course(time_s: Array, xy: Array) -> Array:
-    """Return the direction of the track at each ping ``(n,)`` [rad]; 0 for a vehicle at rest."""
+    """Return the direction of the track at each ping ``(n,)`` [rad].
+
+    A vehicle that stops keeps its last course, before it sets off it has its first one, and one that never moves has 0.
+    """
     if len(xy) < 2 or np.linalg.norm(np.ptp(xy, axis=0)) < SHORTEST_TRACK_M:
         return np.zeros(len(xy))
     half = VELOCITY_S / 2
     ahead, behind = (np.column_stack([np.interp(time_s + dt, time_s, one) for one in xy.T]) for dt in (half, -half))
     east, north = (ahead - behind).T
-    return np.unwrap(np.arctan2(east, north))
+    moving = np.flatnonzero(np.hypot(east, north) >= LEAST_STEP_M)
+    if not len(moving):
+        return np.zeros(len(xy))
+    last = moving[np.maximum(np.searchsorted(moving, np.arange(len(xy)), side="right") - 1, 0)]
+    return np.unwrap(np.arctan2(east[last], north[last]))
 
 
 def _heading_note(time_s: Array, xy: Array, heading: Array) -> list[str]:

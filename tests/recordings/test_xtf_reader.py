@@ -193,6 +193,16 @@ def test_without_a_heading_the_course_is_taken(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.part().poses[:, 5], 2.5, atol=1e-6)
 
 
+def test_a_vehicle_that_stops_keeps_its_course(tmp_path: Path) -> None:
+    """At rest for 20 s before it sets off, between two legs, and behind the second."""
+    written = side_scan_echogram(pings=400, heading=2.5)
+    moved = np.clip(np.arange(400.0) - 80, 0, 80) + np.clip(np.arange(400.0) - 240, 0, 80)
+    poses = written.poses.copy()
+    poses[:, :2] = 0.3 + 0.5 * moved[:, None] * [np.sin(2.5), np.cos(2.5)]
+    recording = Changed(tmp_path, replace(written, poses=poses)).pings(heading_deg=0, gyro_deg=0).open()
+    np.testing.assert_allclose(recording.part().poses[:, 5], 2.5, atol=1e-6)
+
+
 def test_a_heading_of_north_is_not_taken_for_none(tmp_path: Path) -> None:
     """A line that drifts sideways, its bow to the north all along."""
     written = side_scan_echogram(pings=12, heading=1.2)
