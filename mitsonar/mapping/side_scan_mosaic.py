@@ -219,20 +219,30 @@ def _lay_strip(
     begin, change = here[known], (after - here)[known]
     ends = distance[[int(np.argmin(distance)), int(np.argmax(distance))]]
     box = _box((foot[[0, -1], None] + ends[:, None] * starboard[[0, -1], None]).reshape(-1, 2), mosaic.cell_m)
-    rows, columns = box.shape
-    count, total = np.zeros(rows * columns, np.int64), np.zeros(rows * columns)
+    place, total, count = np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     step = max(1, MOST_POINTS // len(distance))
     for start in range(0, len(share), step):
         block = slice(start, start + step)
         values = begin + share[block, None].astype(np.float32) * change  # (points, columns)
         points = foot[block, None] + distance[:, None] * starboard[block, None]
         cells = np.floor(points / mosaic.cell_m).astype(np.int64).reshape(-1, 2)
-        place = (cells[:, 1] - box.south) * columns + cells[:, 0] - box.west
-        count += np.bincount(place, minlength=rows * columns)
-        total += np.bincount(place, weights=values.ravel(), minlength=rows * columns)
-    mean = (total / np.maximum(count, 1)).astype(np.float32).reshape(box.shape)
-    mosaic.add_cells(box, mean, (count > 0).astype(np.float32).reshape(box.shape))
+        hit = (cells[:, 1] - box.south) * box.shape[1] + cells[:, 0] - box.west
+        place, total, count = _sums_of_cells(
+            np.append(place, hit), np.append(total, values.ravel()), np.append(count, np.ones(len(hit)))
+        )
+    mosaic.add_cells(box, place, (total / count).astype(np.float32))
     return True
+
+
+def _sums_of_cells(place: NDArray[np.int64], total: Array, count: Array) -> tuple[NDArray[np.int64], Array, Array]:
+    """Add up totals and counts ``(n,)`` of equal places; return each place once.
+
+    Only cells that are hit take memory and time: the box around a strip at 45 deg may have hundreds of times as many.
+    """
+    order = np.argsort(place, kind="stable")  # fast, since places along each line are nearly sorted
+    place = place[order]
+    first = np.flatnonzero(np.append(True, np.diff(place) != 0))
+    return place[first], np.add.reduceat(total[order], first), np.add.reduceat(count[order], first)
 
 
 def _box(points: Array, cell_m: float) -> Box:
