@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.geometry.side_scan import GroundLines, ground_lines
+from mitsonar.geometry.side_scan import GroundLines, at_ground_range, ground_lines
 from mitsonar.mapping.mosaic import Box, Mosaic, MosaicOptions
 from mitsonar.records.soundings import Echogram
 
@@ -41,7 +41,7 @@ MOST_POINTS = 2**20
 """Points of a strip that are laid at a time."""
 
 ANGLES = 90
-"""Number of angles, from straight down to the side, for which levels are made even."""
+"""Number of angles, from straight down to the horizon, for which levels are made even."""
 
 FLATTENING_PINGS = 2000
 """Number of pings, spread over the recording, that determine the level at each angle."""
@@ -70,7 +70,7 @@ def build_side_scan_mosaic(
         height_m: height of the sonar over the ground ``(pings,)``, or one for all [m], such as that of
             :func:`mitsonar.geometry.side_scan.track_bottom`.
         options: size of cells, and largest number of cells. The blend is always that of all echoes.
-        flatten: subtract the median level at each angle below the horizon and add the median of all, so that neither the
+        flatten: subtract the median level at each angle from straight down and add the median of all, so that neither the
             beam pattern nor spreading shades the map. Levels may then lie outside 0..1.
         progress: function that is called with the number of pings done since its last call.
 
@@ -127,28 +127,25 @@ class _Levels:
     """
 
     def __init__(self, echogram: Echogram, lines: GroundLines, across: Array, *, flatten: bool) -> None:
-        fan = echogram.sounder.fan
+        self.fan = echogram.sounder.fan
         sides = [echogram.sounder.channels.index(side) for side in ("port", "starboard")]
         self.level = 1 + echogram.decibels(SPAN_DB)[:, sides] / np.float32(SPAN_DB)
         self.nearest_m, self.across = lines.nearest_m, across
-        self.near, self.step, self.bins = fan.range_min, (fan.range_max - fan.range_min) / fan.range_bins, fan.range_bins
         self.profile: Array | None = None
         if flatten:
             self.profile = self._median_over_angles()
 
     def __call__(self, ping: int) -> Floats:
-        slant = np.hypot(self.across, self.nearest_m[ping])
-        index = (slant - self.near) / self.step - 0.5
-        values = np.stack([np.interp(index, np.arange(self.bins), side) for side in self.level[ping]])
+        nearest = float(self.nearest_m[ping])
+        values = at_ground_range(self.level[ping], self.fan, self.across, nearest)
         if self.profile is not None:
-            place = self._angle_index(self.nearest_m[ping] / slant)
+            place = self._angle_index(nearest / np.hypot(self.across, nearest))
             values -= np.stack([np.interp(place, np.arange(ANGLES), side) for side in self.profile])
-        values[:, (index < -0.5) | (index > self.bins - 0.5)] = np.nan
         return values.astype(np.float32)
 
-    def _angle_index(self, sine: Array) -> Array:
-        """Return the fractional index among :data:`ANGLES` of angles below the horizon, given their sines."""
-        return np.arccos(np.clip(sine, 0, 1)) * (2 / np.pi * ANGLES) - 0.5
+    def _angle_index(self, cosine: Array) -> Array:
+        """Return the fractional index among :data:`ANGLES` of angles from straight down, given their cosines."""
+        return np.arccos(np.clip(cosine, 0, 1)) * (2 / np.pi * ANGLES) - 0.5
 
     def _median_over_angles(self) -> Array:
         """Return the median level at each angle ``(2, ANGLES)``, less the median of all.
@@ -157,7 +154,7 @@ class _Levels:
         constant. Levels of 0 are no echoes, and do not count. An angle with few echoes takes the level of its neighbours.
         """
         some = range(0, len(self.level), max(1, len(self.level) // FLATTENING_PINGS))
-        slant = self.near + (np.arange(self.bins) + 0.5) * self.step
+        slant = self.fan.range_m
         values = np.full((len(some), 2, ANGLES), np.nan)
         for row, ping in enumerate(some):
             first = int(np.searchsorted(slant, self.nearest_m[ping]))
