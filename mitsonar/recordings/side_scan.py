@@ -9,20 +9,21 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.motion.utm import LATITUDES_DEG, UtmOrigin
-from mitsonar.recordings.recording import Facts
+from mitsonar.recordings.recording import Bytes, Facts
 from mitsonar.records.soundings import Echogram
 
 __all__ = [
@@ -33,15 +34,34 @@ __all__ = [
     "Placed",
     "SideScan",
     "SideScanPart",
+    "amplitudes_of",
     "holds_echogram",
+    "in_hertz",
+    "marked_packets",
     "parts_of",
     "place_pings",
     "read_echogram",
+    "sound_speed_of",
 ]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Levels = NDArray[np.float32]
+
+SOUND_SPEEDS = (1300.0, 1800.0)
+"""Plausible sound speeds [m/s]."""
+
+ASSUMED_SOUND_SPEED = 1500.0
+"""Sound speed for files that state none [m/s]."""
+
+HERTZ_FROM = 10_000.0
+"""Formats leave the unit of frequencies open: smaller numbers count as kHz, others as Hz."""
+
+LARGEST_SAMPLE = 1e8
+"""Amplitudes of floats must stay below this."""
+
+MOST_WEIGHT = 30
+"""Samples are scaled by 2^-N with a weight N of the file; larger weights are damage."""
 
 TYPICAL = {"azimuth_fov_deg": 1.0, "elevation_fov_deg": 50.0, "tilt_deg": 30.0}
 """Beam width, vertical beam width and tilt for files that state none: the typical values that the XTF format names."""
@@ -182,6 +202,62 @@ def read_echogram(path: Path) -> SideScan:
         echogram.origin,
     )
     return SideScan(path.name, "echogram of mitsonar (.npz)", (part,))
+
+
+# ---------------- Packets, and the numbers in them
+
+
+def marked_packets(
+    data: Bytes, mark: bytes, start: int, head: int, size_at: Callable[[memoryview, int], int]
+) -> Iterator[tuple[int, int]]:
+    """Yield the begin and end of each packet of a file [bytes], in order.
+
+    A mark that occurs by chance, or whose packet does not fit into the file, is passed over: the search goes on behind its
+    first byte.
+
+    Args:
+        data: the whole file.
+        mark: first bytes of a packet.
+        start: where the search begins [bytes].
+        head: size of the header of a packet [bytes].
+        size_at: function that returns the size of the packet whose header begins at an offset [bytes]; 0 for no packet.
+    """
+    view, pattern, offset = data.data, re.compile(re.escape(mark)), start
+    while (hit := pattern.search(view, offset)) and hit.start() + head <= len(view):
+        at = hit.start()
+        size = size_at(view, at)
+        if head <= size <= len(view) - at:
+            yield at, at + size
+            offset = at + size
+        else:
+            offset = at + 1
+
+
+def sound_speed_of(*stated: Array) -> tuple[float, list[str]]:
+    """Return the median of the plausible sound speeds in the first field that has some [m/s], and a sentence if none has."""
+    low, high = SOUND_SPEEDS
+    for values in stated:
+        plausible = values[(values >= low) & (values <= high)]
+        if len(plausible):
+            return float(np.median(plausible)), []
+    return ASSUMED_SOUND_SPEED, [f"the file states no sound speed: {ASSUMED_SOUND_SPEED:g} m/s is assumed"]
+
+
+def in_hertz(frequency: ArrayLike) -> Array:
+    """Return frequencies of a file, which are in kHz below :data:`HERTZ_FROM`, in Hz."""
+    stated = np.asarray(frequency, dtype=np.float64)
+    return np.where(stated < HERTZ_FROM, 1e3 * stated, stated)
+
+
+def amplitudes_of(raw: NDArray[Any], ping: int) -> Array:
+    """Return the samples of a ping as doubles.
+
+    Raises:
+        MitsonarError: if a float is not a number, or too large for one.
+    """
+    if raw.dtype.kind == "f" and not (np.abs(raw) < LARGEST_SAMPLE).all():
+        raise MitsonarError(f"ping {ping} has samples that are no finite amplitudes: the file is damaged")
+    return raw.astype(np.float64)
 
 
 # ---------------- Positions and attitudes
