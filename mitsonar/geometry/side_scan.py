@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from mitsonar.errors import MitsonarError, argument
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.records.soundings import Echogram
 
-__all__ = ["BottomTrack", "GroundLines", "GroundScan", "ground_lines", "to_ground_range", "track_bottom"]
+__all__ = ["BottomTrack", "GroundLines", "GroundScan", "at_ground_range", "ground_lines", "to_ground_range", "track_bottom"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -230,17 +231,30 @@ def to_ground_range(echogram: Echogram, height_m: ArrayLike, columns: int | None
     count = 2 * fan.range_bins if columns is None else columns
     edges = np.linspace(-far, far, count + 1)
     across = (edges[:-1] + edges[1:]) / 2
-    step = (fan.range_max - fan.range_min) / fan.range_bins
     levels = np.empty((len(echogram), count), np.float32)
     sides = [(echogram.channel("port"), across < 0), (echogram.channel("starboard"), across >= 0)]
     for row, nearest in enumerate(first_return):
-        place = (np.hypot(across, nearest) - fan.range_min) / step - 0.5
         for side, columns_of_side in sides:
-            index = place[columns_of_side]
-            values = np.interp(index, np.arange(fan.range_bins), side[row])
-            inside = (index >= -0.5) & (index <= fan.range_bins - 0.5)
-            levels[row, columns_of_side] = np.where(inside, values, np.nan)
+            levels[row, columns_of_side] = at_ground_range(side[row, None], fan, across[columns_of_side], nearest)[0]
     return GroundScan(across, levels, echogram)
+
+
+def at_ground_range(levels: Floats, fan: Sonar, across_m: Array, nearest_m: float) -> Array:
+    """Interpolate one ping at ground ranges over level ground.
+
+    Args:
+        levels: values over slant range ``(sides, bins)``.
+        fan: the window.
+        across_m: distances from the track ``(columns,)`` [m], of either sign.
+        nearest_m: range of the first return [m].
+
+    Returns:
+        Values ``(sides, columns)``; nan outside the window.
+    """
+    index = (np.hypot(across_m, nearest_m) - fan.range_min) / fan.bin_m - 0.5
+    values = np.stack([np.interp(index, np.arange(fan.range_bins), side) for side in levels])
+    values[:, (index < -0.5) | (index > fan.range_bins - 0.5)] = np.nan
+    return values
 
 
 @dataclass(frozen=True)

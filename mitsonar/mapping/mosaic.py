@@ -169,19 +169,23 @@ class Mosaic:
         """
         self._make_room(box, slack=0.0)
 
-    def add_cells(self, box: Box, value: Floats, weight: Floats) -> None:
-        """Add values to a box of cells, which counts as one more frame wherever the weight exceeds 0.
+    def add_cells(self, box: Box, place: NDArray[np.int64], value: Floats) -> None:
+        """Add values to some cells of a box, which count as one more frame with a weight of 1.
 
         Args:
             box: cells.
-            value: levels ``(rows, columns)``, finite; row 0 is southernmost.
-            weight: weights ``(rows, columns)``.
+            place: indices of cells ``(n,)`` in the box, row by row from its southernmost; each occurs once.
+            value: levels ``(n,)``, finite.
 
         Raises:
             MitsonarError: the map would exceed ``most_cells``.
         """
         self._make_room(box, slack=SLACK)
-        accumulate(self._patch(box), value, weight)
+        rows, columns = np.divmod(place, box.shape[1])
+        some = (slice(None), rows + (box.south - self._box.south), columns + (box.west - self._box.west))
+        sums = self._sums[some]
+        accumulate(CellSums(*sums), value, np.ones_like(value))
+        self._sums[some] = sums
 
     def add(
         self,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.geometry.side_scan import GroundLines, ground_lines
+from mitsonar.geometry.side_scan import GroundLines, at_ground_range, ground_lines
 from mitsonar.mapping.mosaic import Box, Mosaic, MosaicOptions
 from mitsonar.records.soundings import Echogram
 
@@ -41,7 +41,7 @@ MOST_POINTS = 2**20
 """Points of a strip that are laid at a time."""
 
 ANGLES = 90
-"""Number of angles, from straight down to the side, for which levels are made even."""
+"""Number of angles, from straight down to the horizon, for which levels are made even."""
 
 FLATTENING_PINGS = 2000
 """Number of pings, spread over the recording, that determine the level at each angle."""
@@ -70,7 +70,7 @@ def build_side_scan_mosaic(
         height_m: height of the sonar over the ground ``(pings,)``, or one for all [m], such as that of
             :func:`mitsonar.geometry.side_scan.track_bottom`.
         options: size of cells, and largest number of cells. The blend is always that of all echoes.
-        flatten: subtract the median level at each angle below the horizon and add the median of all, so that neither the
+        flatten: subtract the median level at each angle from straight down and add the median of all, so that neither the
             beam pattern nor spreading shades the map. Levels may then lie outside 0..1.
         progress: function that is called with the number of pings done since its last call.
 
@@ -127,28 +127,25 @@ class _Levels:
     """
 
     def __init__(self, echogram: Echogram, lines: GroundLines, across: Array, *, flatten: bool) -> None:
-        fan = echogram.sounder.fan
+        self.fan = echogram.sounder.fan
         sides = [echogram.sounder.channels.index(side) for side in ("port", "starboard")]
         self.level = 1 + echogram.decibels(SPAN_DB)[:, sides] / np.float32(SPAN_DB)
         self.nearest_m, self.across = lines.nearest_m, across
-        self.near, self.step, self.bins = fan.range_min, (fan.range_max - fan.range_min) / fan.range_bins, fan.range_bins
         self.profile: Array | None = None
         if flatten:
             self.profile = self._median_over_angles()
 
     def __call__(self, ping: int) -> Floats:
-        slant = np.hypot(self.across, self.nearest_m[ping])
-        index = (slant - self.near) / self.step - 0.5
-        values = np.stack([np.interp(index, np.arange(self.bins), side) for side in self.level[ping]])
+        nearest = float(self.nearest_m[ping])
+        values = at_ground_range(self.level[ping], self.fan, self.across, nearest)
         if self.profile is not None:
-            place = self._angle_index(self.nearest_m[ping] / slant)
+            place = self._angle_index(nearest / np.hypot(self.across, nearest))
             values -= np.stack([np.interp(place, np.arange(ANGLES), side) for side in self.profile])
-        values[:, (index < -0.5) | (index > self.bins - 0.5)] = np.nan
         return values.astype(np.float32)
 
-    def _angle_index(self, sine: Array) -> Array:
-        """Return the fractional index among :data:`ANGLES` of angles below the horizon, given their sines."""
-        return np.arccos(np.clip(sine, 0, 1)) * (2 / np.pi * ANGLES) - 0.5
+    def _angle_index(self, cosine: Array) -> Array:
+        """Return the fractional index among :data:`ANGLES` of angles from straight down, given their cosines."""
+        return np.arccos(np.clip(cosine, 0, 1)) * (2 / np.pi * ANGLES) - 0.5
 
     def _median_over_angles(self) -> Array:
         """Return the median level at each angle ``(2, ANGLES)``, less the median of all.
@@ -157,7 +154,7 @@ class _Levels:
         constant. Levels of 0 are no echoes, and do not count. An angle with few echoes takes the level of its neighbours.
         """
         some = range(0, len(self.level), max(1, len(self.level) // FLATTENING_PINGS))
-        slant = self.near + (np.arange(self.bins) + 0.5) * self.step
+        slant = self.fan.range_m
         values = np.full((len(some), 2, ANGLES), np.nan)
         for row, ping in enumerate(some):
             first = int(np.searchsorted(slant, self.nearest_m[ping]))
@@ -219,20 +216,30 @@ def _lay_strip(
     begin, change = here[known], (after - here)[known]
     ends = distance[[int(np.argmin(distance)), int(np.argmax(distance))]]
     box = _box((foot[[0, -1], None] + ends[:, None] * starboard[[0, -1], None]).reshape(-1, 2), mosaic.cell_m)
-    rows, columns = box.shape
-    count, total = np.zeros(rows * columns, np.int64), np.zeros(rows * columns)
+    place, total, count = np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     step = max(1, MOST_POINTS // len(distance))
     for start in range(0, len(share), step):
         block = slice(start, start + step)
         values = begin + share[block, None].astype(np.float32) * change  # (points, columns)
         points = foot[block, None] + distance[:, None] * starboard[block, None]
         cells = np.floor(points / mosaic.cell_m).astype(np.int64).reshape(-1, 2)
-        place = (cells[:, 1] - box.south) * columns + cells[:, 0] - box.west
-        count += np.bincount(place, minlength=rows * columns)
-        total += np.bincount(place, weights=values.ravel(), minlength=rows * columns)
-    mean = (total / np.maximum(count, 1)).astype(np.float32).reshape(box.shape)
-    mosaic.add_cells(box, mean, (count > 0).astype(np.float32).reshape(box.shape))
+        hit = (cells[:, 1] - box.south) * box.shape[1] + cells[:, 0] - box.west
+        place, total, count = _sums_of_cells(
+            np.append(place, hit), np.append(total, values.ravel()), np.append(count, np.ones(len(hit)))
+        )
+    mosaic.add_cells(box, place, (total / count).astype(np.float32))
     return True
+
+
+def _sums_of_cells(place: NDArray[np.int64], total: Array, count: Array) -> tuple[NDArray[np.int64], Array, Array]:
+    """Add up totals and counts ``(n,)`` of equal places; return each place once.
+
+    Only cells that are hit take memory and time: the box around a strip at 45 deg may have hundreds of times as many.
+    """
+    order = np.argsort(place, kind="stable")  # fast, since places along each line are nearly sorted
+    place = place[order]
+    first = np.flatnonzero(np.append(True, np.diff(place) != 0))
+    return place[first], np.add.reduceat(total[order], first), np.add.reduceat(count[order], first)
 
 
 def _box(points: Array, cell_m: float) -> Box:

@@ -7,7 +7,6 @@ write.
 
 from __future__ import annotations
 
-import re
 import struct
 from collections import Counter
 from dataclasses import dataclass, field
@@ -19,7 +18,20 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.recordings.recording import Bytes, Facts, Header, layout, mapped
-from mitsonar.recordings.side_scan import Band, Index, Levels, PingHeaders, SideScan, SideScanPart, parts_of, place_pings
+from mitsonar.recordings.side_scan import (
+    MOST_WEIGHT,
+    Band,
+    Index,
+    Levels,
+    PingHeaders,
+    SideScan,
+    SideScanPart,
+    amplitudes_of,
+    marked_packets,
+    parts_of,
+    place_pings,
+    sound_speed_of,
+)
 
 __all__ = ["MESSAGE", "TRACE", "is_jsf", "read_jsf"]
 
@@ -68,15 +80,6 @@ ANGLE_DEG = 180 / 32768
 FORMATS = {0: ("<i2", 1), 1: ("<i2", 2), 8: ("<f4", 1)}
 """Type of samples and numbers a sample: envelopes, complex samples behind the matched filter, envelopes as floats."""
 
-MOST_WEIGHTING = 30
-"""Samples are scaled by 2^-N; larger exponents are damage."""
-
-LARGEST_SAMPLE = 1e8
-"""Amplitudes of floats must stay below this."""
-
-SOUND_SPEEDS = (1300.0, 1800.0)
-ASSUMED_SOUND_SPEED = 1500.0
-
 
 def is_jsf(path: Path, first: bytes) -> bool:
     """Return whether the first bytes of a file are those of a JSF message."""
@@ -106,13 +109,10 @@ def read_jsf(path: Path) -> SideScan:
         table = _table(data, [port for port, _ in pairs])
         headers, assumed = _ping_headers(table)
         placed = place_pings(headers)
-        speeds = table["sound_speed"][(table["sound_speed"] >= SOUND_SPEEDS[0]) & (table["sound_speed"] <= SOUND_SPEEDS[1])]
-        sound_speed = float(np.median(speeds)) if len(speeds) else ASSUMED_SOUND_SPEED
-        if not len(speeds):
-            assumed.append(f"the file states no sound speed: {ASSUMED_SOUND_SPEED:g} m/s is assumed")
+        sound_speed, speed_note = sound_speed_of(table["sound_speed"])
         parts += parts_of(_band(data, table, pairs, subsystem, sound_speed), placed)
         facts = placed.facts | facts
-        notes += [*placed.notes, *assumed]
+        notes += [*placed.notes, *assumed, *speed_note]
     return SideScan(path.name, "JSF (.jsf)", tuple(parts), facts, tuple(dict.fromkeys(notes)))
 
 
@@ -168,19 +168,11 @@ class Messages:
 
 def _find_traces(data: Bytes) -> Messages:
     """Find all pings of side-scans, and pair port and starboard; only headers are read."""
-    messages, view, mark, offset = Messages(), data.data, re.compile(re.escape(MARK)), 0
+    messages, view = Messages(), data.data
     waiting: dict[tuple[int, int], dict[int, Trace]] = {}
-    while hit := mark.search(view, offset):
-        at = hit.start()
-        if at + MESSAGE.size > len(view):
-            break
-        _, _, _, kind, _, subsystem, channel, _, _, size = MESSAGE.unpack_from(view, at)
-        end = at + MESSAGE.size + size
-        if not (0 < kind < MOST_TYPES and size >= 0 and end <= len(view)):
-            offset = at + 1  # the mark occurred by chance, or the size is damaged: search behind its first byte
-            continue
-        offset = end
-        messages.bytes += MESSAGE.size + size
+    for at, end in marked_packets(data, MARK, 0, MESSAGE.size, _size_at):
+        _, _, _, kind, _, subsystem, channel, _, _, _ = MESSAGE.unpack_from(view, at)
+        messages.bytes += end - at
         if kind != SONAR_DATA or subsystem not in SIDE_SCANS or channel not in (PORT, STARBOARD):
             messages.others[kind] += 1
             continue
@@ -201,6 +193,12 @@ def _find_traces(data: Bytes) -> Messages:
     return messages
 
 
+def _size_at(view: memoryview, at: int) -> int:
+    """Return the size of a message with its header [bytes]; 0 if there is none."""
+    _, _, _, kind, _, _, _, _, _, size = MESSAGE.unpack_from(view, at)
+    return MESSAGE.size + int(size) if 0 < kind < MOST_TYPES and size >= 0 else 0
+
+
 def _trace(view: memoryview, at: int, end: int) -> tuple[Trace | None, int]:
     """Return the trace in a message and its ping number; no trace if it does not fit or cannot be decoded."""
     if at + TRACE.itemsize > end:
@@ -208,7 +206,7 @@ def _trace(view: memoryview, at: int, end: int) -> tuple[Trace | None, int]:
     header = np.frombuffer(view[at : at + TRACE.itemsize], TRACE)[0]
     ping, code = int(header["ping"]), int(header["format"])
     samples = int(_samples(header))
-    if code not in FORMATS or samples < 1 or header["packet"] > 1 or abs(int(header["weighting"])) > MOST_WEIGHTING:
+    if code not in FORMATS or samples < 1 or header["packet"] > 1 or abs(int(header["weighting"])) > MOST_WEIGHT:
         return None, ping
     kind, numbers = FORMATS[code]
     fits = at + TRACE.itemsize + samples * numbers * np.dtype(kind).itemsize <= end
@@ -316,8 +314,6 @@ class _Traces:
                 begin = trace.header + TRACE.itemsize
                 count = trace.samples * numbers * np.dtype(kind).itemsize
                 raw = np.frombuffer(self.data[begin : begin + count].tobytes(), kind)
-                if not (np.abs(raw) < LARGEST_SAMPLE).all():
-                    raise MitsonarError(f"ping {ping} has samples that are no finite amplitudes: the file is damaged")
-                power = np.square(raw.astype(np.float64).reshape(-1, numbers)).sum(axis=1)
+                power = np.square(amplitudes_of(raw, int(ping)).reshape(-1, numbers)).sum(axis=1)
                 levels[row, side] = power * 4.0 ** -int(header["weighting"])
         return levels

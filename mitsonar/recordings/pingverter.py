@@ -18,7 +18,17 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.io.files import parse_json, read_bytes
 from mitsonar.recordings.recording import Bytes, mapped
-from mitsonar.recordings.side_scan import Band, Index, Levels, PingHeaders, SideScan, parts_of, place_pings
+from mitsonar.recordings.side_scan import (
+    ASSUMED_SOUND_SPEED,
+    Band,
+    Index,
+    Levels,
+    PingHeaders,
+    SideScan,
+    in_hertz,
+    parts_of,
+    place_pings,
+)
 
 __all__ = ["is_pingverter", "read_pingverter"]
 
@@ -34,11 +44,6 @@ SIDES = ("Port", "Starboard")
 ENCODING = "uint16-le"
 
 FULL_SCALE = 65535.0
-
-ASSUMED_SOUND_SPEED = 1500.0
-
-HERTZ_FROM = 10_000.0
-"""Frequencies are stated in kHz or Hz: smaller numbers count as kHz."""
 
 PROFILE_PINGS = 200
 """Number of pings, spread over the log, by which the order of port samples is recognised."""
@@ -230,7 +235,7 @@ def _frequency_hz(channels: dict[int, dict[str, Any]]) -> float:
     port = next(iter(channels.values()))
     ends = [_number(port.get(name)) for name in ("startFrequencyHz", "endFrequencyHz")]
     middle = float(np.nan if np.isnan(ends).all() else np.nanmean(ends))
-    return 1e3 * middle if middle < HERTZ_FROM else middle
+    return float(in_hertz(middle))
 
 
 # ---------------- Samples

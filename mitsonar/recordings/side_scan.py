@@ -9,20 +9,21 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.motion.utm import LATITUDES_DEG, UtmOrigin
-from mitsonar.recordings.recording import Facts
+from mitsonar.recordings.recording import Bytes, Facts
 from mitsonar.records.soundings import Echogram
 
 __all__ = [
@@ -33,15 +34,34 @@ __all__ = [
     "Placed",
     "SideScan",
     "SideScanPart",
+    "amplitudes_of",
     "holds_echogram",
+    "in_hertz",
+    "marked_packets",
     "parts_of",
     "place_pings",
     "read_echogram",
+    "sound_speed_of",
 ]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Levels = NDArray[np.float32]
+
+SOUND_SPEEDS = (1300.0, 1800.0)
+"""Plausible sound speeds [m/s]."""
+
+ASSUMED_SOUND_SPEED = 1500.0
+"""Sound speed for files that state none [m/s]."""
+
+HERTZ_FROM = 10_000.0
+"""Formats leave the unit of frequencies open: smaller numbers count as kHz, others as Hz."""
+
+LARGEST_SAMPLE = 1e8
+"""Amplitudes of floats must stay below this."""
+
+MOST_WEIGHT = 30
+"""Samples are scaled by 2^-N with a weight N of the file; larger weights are damage."""
 
 TYPICAL = {"azimuth_fov_deg": 1.0, "elevation_fov_deg": 50.0, "tilt_deg": 30.0}
 """Beam width, vertical beam width and tilt for files that state none: the typical values that the XTF format names."""
@@ -53,13 +73,16 @@ FARTHEST_M = 1e5
 """The same for positions in metres."""
 
 WINDOW_TOLERANCE = 0.005
-"""Changes of the range below this fraction belong to the sound speed, and do not begin another part."""
+"""Ends of windows that move by less than this fraction of the range follow the sound speed, and begin no other part."""
 
 VELOCITY_S = 5.0
 """Time over which the velocity is taken that extends the track before its first and behind its last fix [s]."""
 
 SHORTEST_TRACK_M = 1.0
 """A track must be longer than this to give a course."""
+
+LEAST_STEP_M = 0.1
+"""Over :data:`VELOCITY_S` a vehicle must move this far to have a course: at rest it keeps its last one."""
 
 LEAST_COURSE_M = 20.0
 """A track must be longer than this for its course to be compared with headings."""
@@ -179,6 +202,62 @@ def read_echogram(path: Path) -> SideScan:
         echogram.origin,
     )
     return SideScan(path.name, "echogram of mitsonar (.npz)", (part,))
+
+
+# ---------------- Packets, and the numbers in them
+
+
+def marked_packets(
+    data: Bytes, mark: bytes, start: int, head: int, size_at: Callable[[memoryview, int], int]
+) -> Iterator[tuple[int, int]]:
+    """Yield the begin and end of each packet of a file [bytes], in order.
+
+    A mark that occurs by chance, or whose packet does not fit into the file, is passed over: the search goes on behind its
+    first byte.
+
+    Args:
+        data: the whole file.
+        mark: first bytes of a packet.
+        start: where the search begins [bytes].
+        head: size of the header of a packet [bytes].
+        size_at: function that returns the size of the packet whose header begins at an offset [bytes]; 0 for no packet.
+    """
+    view, pattern, offset = data.data, re.compile(re.escape(mark)), start
+    while (hit := pattern.search(view, offset)) and hit.start() + head <= len(view):
+        at = hit.start()
+        size = size_at(view, at)
+        if head <= size <= len(view) - at:
+            yield at, at + size
+            offset = at + size
+        else:
+            offset = at + 1
+
+
+def sound_speed_of(*stated: Array) -> tuple[float, list[str]]:
+    """Return the median of the plausible sound speeds in the first field that has some [m/s], and a sentence if none has."""
+    low, high = SOUND_SPEEDS
+    for values in stated:
+        plausible = values[(values >= low) & (values <= high)]
+        if len(plausible):
+            return float(np.median(plausible)), []
+    return ASSUMED_SOUND_SPEED, [f"the file states no sound speed: {ASSUMED_SOUND_SPEED:g} m/s is assumed"]
+
+
+def in_hertz(frequency: ArrayLike) -> Array:
+    """Return frequencies of a file, which are in kHz below :data:`HERTZ_FROM`, in Hz."""
+    stated = np.asarray(frequency, dtype=np.float64)
+    return np.where(stated < HERTZ_FROM, 1e3 * stated, stated)
+
+
+def amplitudes_of(raw: NDArray[Any], ping: int) -> Array:
+    """Return the samples of a ping as doubles.
+
+    Raises:
+        MitsonarError: if a float is not a number, or too large for one.
+    """
+    if raw.dtype.kind == "f" and not (np.abs(raw) < LARGEST_SAMPLE).all():
+        raise MitsonarError(f"ping {ping} has samples that are no finite amplitudes: the file is damaged")
+    return raw.astype(np.float64)
 
 
 # ---------------- Positions and attitudes
@@ -347,13 +426,20 @@ def _track(time_s: Array, fix_s: Array, fixes: Array) -> Array:
 
 
 def _course(time_s: Array, xy: Array) -> Array:
-    """Return the direction of the track at each ping ``(n,)`` [rad]; 0 for a vehicle at rest."""
+    """Return the direction of the track at each ping ``(n,)`` [rad].
+
+    A vehicle that stops keeps its last course, before it sets off it has its first one, and one that never moves has 0.
+    """
     if len(xy) < 2 or np.linalg.norm(np.ptp(xy, axis=0)) < SHORTEST_TRACK_M:
         return np.zeros(len(xy))
     half = VELOCITY_S / 2
     ahead, behind = (np.column_stack([np.interp(time_s + dt, time_s, one) for one in xy.T]) for dt in (half, -half))
     east, north = (ahead - behind).T
-    return np.unwrap(np.arctan2(east, north))
+    moving = np.flatnonzero(np.hypot(east, north) >= LEAST_STEP_M)
+    if not len(moving):
+        return np.zeros(len(xy))
+    last = moving[np.maximum(np.searchsorted(moving, np.arange(len(xy)), side="right") - 1, 0)]
+    return np.unwrap(np.arctan2(east[last], north[last]))
 
 
 def _heading_note(time_s: Array, xy: Array, heading: Array) -> list[str]:
@@ -415,7 +501,7 @@ class Band:
 
 
 def parts_of(band: Band, placed: Placed) -> list[SideScanPart]:
-    """Return one part for each run of pings with the same number of samples and about the same range.
+    """Return one part for each run of pings with the same number of samples and about the same window.
 
     Raises:
         MitsonarError: a value of the instrument is outside its limits.
@@ -427,7 +513,7 @@ def parts_of(band: Band, placed: Placed) -> list[SideScanPart]:
     pings = np.argsort(here, kind="stable")[int((here < 0).sum()) :]
     # 2. runs of equal windows
     parts = []
-    for run in _windows(band.samples[pings], band.range_max[pings]):
+    for run in _windows(band.samples[pings], band.range_min[pings], band.range_max[pings]):
         members = pings[run]
         where = here[members]
         time_s = placed.time_s[where]
@@ -444,14 +530,14 @@ def parts_of(band: Band, placed: Placed) -> list[SideScanPart]:
     return parts
 
 
-def _windows(samples: NDArray[np.int64], range_m: Array) -> list[Index]:
-    """Return the indices of each run of pings with the same number of samples and about the same range."""
+def _windows(samples: NDArray[np.int64], range_min: Array, range_max: Array) -> list[Index]:
+    """Return the indices of each run of pings with the same number of samples and about the same window."""
     runs: list[list[int]] = []
-    count, reference = -1, 0.0
-    for number, (ping_samples, ping_range) in enumerate(zip(samples.tolist(), range_m.tolist(), strict=True)):
-        if ping_samples != count or not abs(ping_range - reference) <= WINDOW_TOLERANCE * reference:
+    count, begin, end = -1, 0.0, 0.0
+    for number, (size, near, far) in enumerate(zip(samples.tolist(), range_min.tolist(), range_max.tolist(), strict=True)):
+        if size != count or not max(abs(near - begin), abs(far - end)) <= WINDOW_TOLERANCE * end:
             runs.append([])
-            count, reference = ping_samples, ping_range
+            count, begin, end = size, near, far
         runs[-1].append(number)
     return [np.asarray(run, dtype=np.intp) for run in runs]
 

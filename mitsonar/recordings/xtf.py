@@ -8,7 +8,6 @@ this reader with, gives up such a file, and reads no file of more than six chann
 
 from __future__ import annotations
 
-import re
 import struct
 from collections import Counter
 from dataclasses import dataclass, field
@@ -20,7 +19,22 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.recordings.recording import Bytes, Facts, Header, mapped
-from mitsonar.recordings.side_scan import Band, Index, Levels, PingHeaders, SideScan, SideScanPart, parts_of, place_pings
+from mitsonar.recordings.side_scan import (
+    MOST_WEIGHT,
+    SOUND_SPEEDS,
+    Band,
+    Index,
+    Levels,
+    PingHeaders,
+    SideScan,
+    SideScanPart,
+    amplitudes_of,
+    in_hertz,
+    marked_packets,
+    parts_of,
+    place_pings,
+    sound_speed_of,
+)
 from mitsonar.recordings.write_xtf import CHANNEL, DEGREES, FILE, FULL_COUNT, PING, PING_CHANNEL, PORT, STARBOARD
 
 __all__ = ["is_xtf", "read_xtf"]
@@ -52,14 +66,6 @@ SIDE_SCAN_PACKET = 0
 GROUND_RANGE = 2
 """Mark of a channel whose samples were resampled to ground range."""
 
-SOUND_SPEEDS = (1300.0, 1800.0)
-"""Plausible sound speeds [m/s]."""
-
-ASSUMED_SOUND_SPEED = 1500.0
-
-HERTZ_FROM = 10_000.0
-"""The format leaves the unit of frequencies open: smaller numbers count as kHz, others as Hz."""
-
 IBM_FLOAT = 1
 FORMATS = {2: "<i4", 3: "<i2", 5: "<f4", 8: "i1"}
 """NumPy types of samples by the code in a channel's description; 0 leaves it to the number of bytes."""
@@ -69,12 +75,6 @@ FULL_SCALES = {1: 255.0, 2: float(FULL_COUNT), 4: float(2**31 - 1)}
 
 WEIGHTED = (24, 35, 38, 48)
 """Sonars, by their code in the file header, whose samples are scaled by 2^-N with a weight N in each channel's header."""
-
-MOST_WEIGHT = 30
-"""Larger weights are damage, and are ignored."""
-
-LARGEST_SAMPLE = 1e8
-"""Amplitudes of floats must stay below this."""
 
 
 def is_xtf(path: Path, first: bytes) -> bool:
@@ -256,16 +256,9 @@ def _find_pings(data: Bytes, start: int, channels: list[Channel]) -> Packets:
     """Find all pings of side-scans; only headers are read."""
     ports, starboards = ([number for number, one in enumerate(channels) if one.kind == side] for side in (PORT, STARBOARD))
     pairs = list(zip(ports, starboards, strict=False))
-    packets, view, mark, offset = Packets(start), data.data, re.compile(re.escape(MAGIC)), start
-    while hit := mark.search(view, offset):
-        at = hit.start()
-        if at + PACKET.size > len(view):
-            break
+    packets, view = Packets(start), data.data
+    for at, _ in marked_packets(data, MAGIC, start, PACKET.size, lambda view, at: int(PACKET.unpack_from(view, at)[2])):
         kind, count, size = PACKET.unpack_from(view, at)
-        if not PACKET.size <= size <= len(view) - at:
-            offset = at + 1  # the mark occurred by chance, or the size is damaged: search behind its first byte
-            continue
-        offset = at + size
         packets.bytes += size
         if kind != SIDE_SCAN_PACKET:
             packets.others[kind] += 1
@@ -376,12 +369,7 @@ def _sound_speed(table: Header) -> tuple[float, list[str]]:
     The field holds half of the sound speed by the format, since echoes go there and back; some programs store all of it.
     """
     stated, computed = _floats(table, "half_sound_speed"), _floats(table, "sound_speed")
-    low, high = SOUND_SPEEDS
-    for candidates in (np.where(stated < high / 2, 2 * stated, stated), computed):
-        plausible = candidates[(candidates >= low) & (candidates <= high)]
-        if len(plausible):
-            return float(np.median(plausible)), []
-    return ASSUMED_SOUND_SPEED, [f"the file states no sound speed: {ASSUMED_SOUND_SPEED:g} m/s is assumed"]
+    return sound_speed_of(np.where(stated < SOUND_SPEEDS[1] / 2, 2 * stated, stated), computed)
 
 
 # ---------------- Samples
@@ -399,7 +387,8 @@ def _band(
 ) -> Band:
     """Return the pings of a pair of channels."""
     table, starboard = (_channel_headers(data, [getattr(line, side) for line in lines]) for side in ("port", "starboard"))
-    weight = np.column_stack([table["weight"], starboard["weight"]]) * weighted
+    # int64: the absolute value of -32,768 overflows 16 bits
+    weight = np.column_stack([table["weight"], starboard["weight"]]).astype(np.int64) * weighted
     weight[np.abs(weight) > MOST_WEIGHT] = 0
     slant, delay, duration = (_floats(table, name) for name in ("slant_range_m", "delay_s", "duration_s"))
     duration = np.where((duration > 0) & (duration < 1e3), duration, np.nan)
@@ -416,7 +405,7 @@ def _band(
         samples=samples[usable],
         range_min=near[usable],
         range_max=far[usable],
-        frequency_hz=np.where(stated < HERTZ_FROM, 1e3 * stated, stated)[usable],
+        frequency_hz=in_hertz(stated)[usable],
         levels=_Samples(data, begin[usable], samples[usable], weight[usable], (channels[pair[0]], channels[pair[1]])),
         name=name,
         sound_speed=sound_speed,
@@ -447,7 +436,7 @@ class _Samples:
     data: Bytes
     begin: NDArray[np.int64]
     samples: NDArray[np.int64]
-    weight: NDArray[np.int16]
+    weight: NDArray[np.int64]
     sides: tuple[Channel, Channel]
 
     def __call__(self, pings: Index) -> Levels:
@@ -464,9 +453,7 @@ class _Samples:
             for row, ping in enumerate(pings):
                 at = int(self.begin[ping, side])
                 raw = np.frombuffer(self.data[at : at + bins * kind.itemsize].tobytes(), kind)
-                if kind.kind == "f" and not (np.abs(raw) < LARGEST_SAMPLE).all():
-                    raise MitsonarError(f"ping {ping} has samples that are no finite amplitudes: the file is damaged")
                 scale = 2.0 ** -float(self.weight[ping, side]) / channel.full_scale
-                levels[row, side] = np.square(raw.astype(np.float64) * scale)
+                levels[row, side] = np.square(amplitudes_of(raw, int(ping)) * scale)
         levels[:, 0] = levels[:, 0, ::-1].copy()  # port is stored from its outermost sample inwards
         return levels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -107,6 +108,19 @@ def test_counts_and_spread_are_those_of_pings() -> None:
     count = two.count[middle]
     np.testing.assert_allclose(two.std[middle], step / 2 * np.sqrt(count / (count - 1)), rtol=0.02)
     assert two.frames == 80
+
+
+def test_a_diagonal_strip_takes_the_memory_of_its_cells() -> None:
+    """At 45 deg the box around a strip is nearly the whole map, of which it fills about 1 %."""
+    echogram = drawn(line(3, heading=np.pi / 4))
+    tracemalloc.start()
+    try:
+        mosaic = build_side_scan_mosaic(echogram, 6.0, MosaicOptions(cell_m=0.02), flatten=False)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert (mosaic.count > 0).mean() < 0.03
+    assert peak < 1.5 * mosaic.state_bytes
 
 
 def test_flattening_removes_the_beam_pattern_and_keeps_the_ground() -> None:

@@ -277,3 +277,11 @@ def test_many_marks_of_messages_do_not_take_long(tmp_path: Path) -> None:
     """Two million marks, none of which begins a message, behind a good ping."""
     (tmp_path / "a.raw").write_bytes(some_pings(1)[0] + b"SO" * 2_000_000)
     assert outcome(lambda: len(open_recording(tmp_path / "a.raw"))) == "read"
+
+
+def test_many_marks_in_a_log_of_a_ping360_do_not_take_long(tmp_path: Path) -> None:
+    """200,000 marks, each of a message of 65,535 bytes whose sum is wrong, behind good pings."""
+    pings = [ping360_message(samples, angle) for samples, angle in zip(head_sweeps([190, 191]), (190, 191), strict=True)]
+    content = ping_viewer_log([*pings, b"BR\xff\xff" * 200_000], [0.0, 0.1, 0.2])
+    (tmp_path / "a.bin").write_bytes(content)
+    assert outcome(lambda: open_recording(tmp_path / "a.bin")) == "read"

@@ -193,6 +193,16 @@ def test_without_a_heading_the_course_is_taken(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.part().poses[:, 5], 2.5, atol=1e-6)
 
 
+def test_a_vehicle_that_stops_keeps_its_course(tmp_path: Path) -> None:
+    """At rest for 20 s before it sets off, between two legs, and behind the second."""
+    written = side_scan_echogram(pings=400, heading=2.5)
+    moved = np.clip(np.arange(400.0) - 80, 0, 80) + np.clip(np.arange(400.0) - 240, 0, 80)
+    poses = written.poses.copy()
+    poses[:, :2] = 0.3 + 0.5 * moved[:, None] * [np.sin(2.5), np.cos(2.5)]
+    recording = Changed(tmp_path, replace(written, poses=poses)).pings(heading_deg=0, gyro_deg=0).open()
+    np.testing.assert_allclose(recording.part().poses[:, 5], 2.5, atol=1e-6)
+
+
 def test_a_heading_of_north_is_not_taken_for_none(tmp_path: Path) -> None:
     """A line that drifts sideways, its bow to the north all along."""
     written = side_scan_echogram(pings=12, heading=1.2)
@@ -255,6 +265,18 @@ def test_another_range_begins_another_part(tmp_path: Path) -> None:
     assert recording.part() is recording.parts[0]
 
 
+def test_another_start_of_the_window_begins_another_part(tmp_path: Path) -> None:
+    """The same end and number of samples; a start that moves with the sound speed, by 1 cm, begins none."""
+    delays = [2 * near / 1500 for near in (2.0, 2.01, 6.0)]
+    file = Changed(tmp_path).pings(half_sound_speed=750)
+    for first, delay in zip((0, 2, 4), delays, strict=True):
+        file.headers(range(first, first + 2), delay_s=delay)
+    recording = file.open()
+    assert [len(part) for part in recording.parts] == [4, 2]
+    starts = [part.sounder.fan.range_min for part in recording.parts]
+    assert starts == pytest.approx([2.005, 6])
+
+
 @pytest.mark.parametrize(
     ("kind", "code", "unipolar"), [("u1", 0, 1), ("i1", 8, 0), ("<i2", 3, 0), ("<i4", 2, 0), ("<f4", 5, 0)]
 )
@@ -287,6 +309,9 @@ def test_weights_scale_the_samples_of_some_sonars(tmp_path: Path) -> None:
     scaled = file.file(sensor=38).open().part().read().levels
     np.testing.assert_allclose(scaled[:3], plain[:3] / 16, rtol=1e-6)
     np.testing.assert_allclose(scaled[3:], plain[3:] * 4, rtol=1e-6)
+    for damaged in (-32768, -31, 31, 32767):
+        file.headers(weight=damaged)
+        np.testing.assert_array_equal(file.open().part().read().levels, plain)
 
 
 def test_more_than_six_channels_enlarge_the_header(tmp_path: Path) -> None:
