@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
+from mitsonar.mapping import height_map
 from mitsonar.mapping.height_map import HeightMap, HeightMapOptions, fit_height_map, most_trials, views_of
 from mitsonar.mapping.height_map_files import save_height_map
 from mitsonar.mapping.relief import ReliefView
@@ -140,6 +141,21 @@ def test_the_same_frames_give_the_same_map() -> None:
     frames, poses, _ = drawn(1)
     again = fit_height_map(frames, poses, np.array([HEIGHT_M]), SMALL)
     np.testing.assert_array_equal(again.height_m, fitted(1)[0].height_m)
+
+
+def test_a_rejected_regulariser_leaves_the_map_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same map comes out when only the regularisers are tried that the search has taken."""
+    result, _ = fitted(1)
+    tried = result.trials[1:]
+    taken = [trial for k, trial in enumerate(tried) if all(trial.deviance < one.deviance for one in tried[:k])]
+    assert len(taken) < len(tried), "some are rejected"
+    parts = sorted(trial.std_m / HEIGHT_M for trial in taken)
+    monkeypatch.setattr(height_map, "STDS", tuple(parts))
+    monkeypatch.setattr(height_map, "FIRST", parts.index(tried[0].std_m / HEIGHT_M))
+    frames, poses, _ = drawn(1)
+    alone = fit_height_map(frames, poses, np.array([HEIGHT_M]), SMALL)
+    assert alone.regulariser.std_m == pytest.approx(result.regulariser.std_m)
+    np.testing.assert_allclose(alone.height_m, result.height_m, atol=1e-6)
 
 
 def test_level_ground_is_refused() -> None:
