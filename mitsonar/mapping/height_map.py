@@ -28,7 +28,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.instruments.sonar import Sonar, scans
 from mitsonar.mapping.relief import GroundCells, ReliefView, lit_ground
-from mitsonar.mapping.shadows import shadow_heights
+from mitsonar.mapping.shadows import joined_shadow_heights
 from mitsonar.records.frames import SonarFrames
 
 __all__ = ["HeightMap", "HeightMapOptions", "Trial", "fit_height_map", "most_trials", "views_of"]
@@ -546,10 +546,8 @@ class _Search:
     def _beginning(self) -> _Solution:
         """Return level ground, or the heights from shadows where they explain the image better."""
         flat = self.fit.with_reflectivity(self.fit.flat)
-        heights = [
-            shadow_heights(view, y, flat.reflectivity) for view, y in zip(self.fit.views, self.fit.measured, strict=True)
-        ]
-        smooth = ndimage.gaussian_filter(np.mean(heights, axis=0), 1.0)
+        heights = joined_shadow_heights(self.fit.views, self.fit.measured, flat.reflectivity)
+        smooth = ndimage.gaussian_filter(heights, 1.0)
         shadows = self.fit.solution_of(smooth, flat.reflectivity, flat.centre_m)
         return min(flat, shadows, key=lambda one: self.fit.deviance(one, self.train))
 

@@ -20,7 +20,7 @@ from mitsonar.mapping import height_map
 from mitsonar.mapping.height_map import HeightMap, HeightMapOptions, fit_height_map, most_trials, views_of
 from mitsonar.mapping.height_map_files import save_height_map
 from mitsonar.mapping.relief import ReliefView
-from mitsonar.mapping.shadows import shadow_heights
+from mitsonar.mapping.shadows import joined_shadow_heights, shadow_heights
 from mitsonar.records.frames import SonarFrames
 
 pytestmark = pytest.mark.filterwarnings("ignore:.* lie outside the window")
@@ -135,6 +135,21 @@ def test_a_shadow_gives_the_height_of_a_wall() -> None:
     middle = heights[:, 28:36].max(axis=0)
     np.testing.assert_allclose(middle, 0.2, atol=0.03)
     assert not shadow_heights(view, view.levels(0 * wall), 1.0).any()
+
+
+def test_frames_without_a_shadow_do_not_lower_a_wall() -> None:
+    """A wall that only one of two frames shows has the height that this frame gives."""
+    frames, poses, _ = drawn(2)
+    views, _ = views_of(frames, poses, np.full(2, HEIGHT_M), HeightMapOptions(cells=64))
+    wall = np.zeros((64, 64))
+    wall[30:32] = 0.2
+    levels = [views[0].levels(wall), views[1].levels(0 * wall)]
+    np.testing.assert_allclose(joined_shadow_heights(views, levels, 1.0), shadow_heights(views[0], levels[0], 1.0))
+    both = [view.levels(wall) for view in views]
+    each = [shadow_heights(view, y, 1.0) for view, y in zip(views, both, strict=True)]
+    shared = (each[0] > 0) & (each[1] > 0)
+    assert shared.any()
+    np.testing.assert_allclose(joined_shadow_heights(views, both, 1.0)[shared], np.mean(each, axis=0)[shared])
 
 
 def test_the_same_frames_give_the_same_map() -> None:
