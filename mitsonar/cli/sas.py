@@ -75,6 +75,7 @@ def sas(
 
     from mitsonar.acoustics.water import Water, absorption_db_per_m
     from mitsonar.mapping.aperture_run import ApertureOptions, run_aperture
+    from mitsonar.mapping.micronavigation import LEAST_COHERENCE
     from mitsonar.mapping.synthetic_aperture import along_resolution, refuse_aliased, strip_grid
     from mitsonar.motion.trajectory import Trajectory, velocities
     from mitsonar.simulation.channel import ChannelSimulator
@@ -147,6 +148,11 @@ def sas(
         f"{abs(grid.across_m[0]):.3g} to {abs(grid.across_m[-1]):.3g} m to {side}, on the plane z = {grid.z:.3g} m"
     )
     if micro := report.micronavigation:
+        if micro.unused:
+            warn(
+                f"{micro.unused} of {count_noun(len(micro.sway_m), 'pair')} of pings not used: their coherence is below "
+                f"{LEAST_COHERENCE:g}, and their sway counts as 0; see {folder / 'micronavigation.csv'}"
+            )
         say(
             f"displaced phase centres: coherence {np.median(micro.coherence):.2f}, sway between pings "
             f"{1e3 * np.nanstd(micro.sway_m):.3g} mm, bound {1e3 * np.nanmedian(micro.sway_std_m):.2g} mm"

@@ -109,6 +109,24 @@ def test_what_has_no_overlap_is_refused() -> None:
         displaced_phase_centres(quiet, near_m=24.4)
 
 
+def with_noise_alone(quiet: ImpulseResponses, pings: list[int]) -> ImpulseResponses:
+    """The same, but some pings hold noise alone."""
+    rng = np.random.default_rng(2)
+    response = quiet.response.copy()
+    shape = (len(pings), *response.shape[1:])
+    response[pings] = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+    return replace(quiet, response=response)
+
+
+def test_pairs_that_are_not_coherent_are_counted_and_refused_if_there_are_no_others() -> None:
+    found = displaced_phase_centres(with_noise_alone(quiet_field(), [10]))
+    assert np.flatnonzero(np.isnan(found.sway_m)).tolist() == [9, 10]
+    assert found.unused == 2
+    assert displaced_phase_centres(quiet_field()).unused == 0
+    with pytest.raises(MitsonarError, match=r"no pair of pings is as coherent .* 0\.3: the best of 31 has 0\.0.*autofocus"):
+        displaced_phase_centres(with_noise_alone(quiet_field(), list(range(PINGS))))
+
+
 def sharpness(found: ImpulseResponses, grid: StripGrid, path: NDArray[np.float64] | None = None) -> float:
     power = np.abs(focus(found, grid, path=path).value.astype(complex)) ** 2
     return float((power**2).mean() / power.mean() ** 2)
