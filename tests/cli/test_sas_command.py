@@ -98,6 +98,7 @@ def test_pairs_of_pings_without_coherence_are_named(mitsonar: Command, tmp_path:
     [
         ((*ENDS, "--frames", 9), "the aperture is aliased"),
         (("--from", "0,0,2.5,0,0,0"), "give a path"),
+        (("--trajectory", "path.tum", "--speed", 1.5), "path.tum has times of its own: leave --speed out"),
         (("--from", "0,0,2.5,0,0,0", "--to", "0,0,2.5,0,0,0"), "path that moves"),
         ((*ENDS[:4], "--speed", 60), "before the echo from 6 m is back"),
         ((*ENDS, "--side", "up"), "port or starboard"),
