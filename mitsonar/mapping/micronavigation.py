@@ -178,10 +178,11 @@ def _height_m(responses: ImpulseResponses) -> float:
     Raises:
         MitsonarError: it is not known.
     """
-    heights = None if responses.height_m is None else np.asarray(responses.height_m, dtype=float)
-    if heights is None or not np.isfinite(heights).any() or not np.nanmedian(heights) > 0:
+    ground = responses.ground_m
+    height = math.nan if ground is None else float(np.median(np.asarray(responses.poses)[:, 2])) - ground
+    if not height > 0:
         raise MitsonarError("micronavigation needs the height over the ground: give responses with height_m above 0")
-    return float(np.nanmedian(heights))
+    return height
 
 
 def _looking_side(responses: ImpulseResponses, line: NDArray[np.float64]) -> NDArray[np.float64]:

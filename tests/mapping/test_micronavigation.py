@@ -109,6 +109,19 @@ def test_what_has_no_overlap_is_refused() -> None:
         displaced_phase_centres(quiet, near_m=24.4)
 
 
+def test_the_ground_is_the_median_below_the_pings_that_know_it() -> None:
+    quiet = quiet_field()
+    poses = np.array(quiet.poses)
+    poses[:, 2] += np.linspace(0, 1, PINGS)
+    heights = poses[:, 2] + 2.0  # ground at z = -2
+    heights[:20] = np.nan
+    assert replace(quiet, poses=poses, height_m=heights).ground_m == pytest.approx(-2.0)
+    for unknown in ({"poses": None}, {"height_m": None}, {"height_m": np.full(PINGS, np.nan)}):
+        assert replace(quiet, **unknown).ground_m is None  # type: ignore[arg-type]
+    with pytest.raises(MitsonarError, match="height_m above 0"):
+        displaced_phase_centres(replace(quiet, height_m=np.zeros(PINGS)))
+
+
 def with_noise_alone(quiet: ImpulseResponses, pings: list[int]) -> ImpulseResponses:
     """The same, but some pings hold noise alone."""
     rng = np.random.default_rng(2)
