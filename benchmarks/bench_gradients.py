@@ -21,6 +21,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
 import mitsonar
 from mitsonar.motion.pose import Pose
@@ -54,7 +55,9 @@ def ground(relief_m: float, rough_m: float = 0.15) -> trimesh.Trimesh:
 
 def moved(mesh: trimesh.Trimesh, place: tuple[float, ...], turn: float = 0.0) -> trimesh.Trimesh:
     """Return a mesh at a place, turned about an oblique axis [rad]."""
-    mesh.apply_transform(trimesh.transformations.rotation_matrix(turn, [1, 2, 3]))
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_rotvec(turn * np.array([1, 2, 3]) / np.sqrt(14)).as_matrix()
+    mesh.apply_transform(turned)
     mesh.apply_translation(place)
     return mesh
 

@@ -5,8 +5,8 @@
 A DIDSON 300, model `coherent`, looks from 1.5 m above the ground at a pitch of 20 deg: at rocks of 0.1 to 0.6 m that rest
 in the seabed, whose reflectivity is random (one value per 20 mm cell and per face of a rock), and at a piece of unexploded
 ordnance (`scenes/meshes/uxo.ply`, not made here) on an even floor. *plane*: level ground at the known height. *shadows*:
-heights from the lengths of shadows. *centre*: cells within 1.3 m of the middle, which all frames see. Processor seconds are
-of the fit alone. `--quick` fits one small map.
+heights from the lengths of shadows, in each cell the mean of the frames that have one there. *centre*: cells within 1.3 m
+of the middle, which all frames see. Processor seconds are of the fit alone. `--quick` fits one small map.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 import mitsonar
 from mitsonar.mapping.height_map import HeightMap, HeightMapOptions, fit_height_map, views_of
-from mitsonar.mapping.shadows import shadow_heights
+from mitsonar.mapping.shadows import joined_shadow_heights
 from mitsonar.plotting.figures import height_map_figure, save_figure
 from mitsonar.simulation.device import ensure_variant
 from mitsonar.worlds.families import create_family
@@ -121,8 +121,8 @@ def measure(case: Case, cells: int) -> Result:
     estimate = fit_height_map(frames, poses, height_m, options)
     seconds = time.process_time() - begun
     views, levels = views_of(frames, poses, height_m, options)
-    heights = [shadow_heights(view, y, estimate.reflectivity) for view, y in zip(views, levels, strict=True)]
-    return Result(estimate, true_heights(scene, estimate), np.mean(heights, axis=0)[::-1], seconds)
+    shadows = joined_shadow_heights(views, levels, estimate.reflectivity)
+    return Result(estimate, true_heights(scene, estimate), shadows[::-1], seconds)
 
 
 def rocky_scene(seed: int) -> mi.Scene:

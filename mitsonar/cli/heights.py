@@ -145,7 +145,13 @@ def _posed(
                 f"{source.name} does not state the poses of its frames, and heights depend on them: give --trajectory, or "
                 "--only with one frame and its --height and --pitch-deg"
             )
-        poses = np.nan_to_num(attitudes)
+        unknown = [name for name, value in zip(("pitch", "roll"), attitudes[0, 3:5], strict=True) if not np.isfinite(value)]
+        if unknown:
+            raise MitsonarError(
+                f"frame {index[0]} of {source.name} has no known {' and '.join(unknown)}, and heights depend on it: choose "
+                "another one with --only, give --pitch-deg, which takes the roll as 0, or --trajectory"
+            )
+        poses = np.nan_to_num(attitudes)  # position and heading: anything does
     # 2. Heights over level ground: frames hold those over what lies straight below, which may be a rock.
     if source.height_m is None:
         raise MitsonarError(f"{source.name} holds no height over the ground: give --height")

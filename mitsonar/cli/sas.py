@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["sas"]
 
+SPEED = 1.5
+"""Speed of the vehicle between two poses, unless another is given [m/s]."""
+
 
 @answered
 def sas(
@@ -32,7 +35,7 @@ def sas(
     ] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose of the vehicle: {options.SIX}.")] = None,
     end: options.End = None,
-    speed: Annotated[float, typer.Option(help="Speed from --from to --to [m/s].")] = 1.5,
+    speed: Annotated[float | None, typer.Option(help=f"Speed from --from to --to [m/s] (default: {SPEED}).")] = None,
     frames: Annotated[
         int | None,
         typer.Option(help="Number of pings (default: as far apart as the phase centres of the array allow)."),
@@ -75,6 +78,7 @@ def sas(
 
     from mitsonar.acoustics.water import Water, absorption_db_per_m
     from mitsonar.mapping.aperture_run import ApertureOptions, run_aperture
+    from mitsonar.mapping.micronavigation import LEAST_COHERENCE
     from mitsonar.mapping.synthetic_aperture import along_resolution, refuse_aliased, strip_grid
     from mitsonar.motion.trajectory import Trajectory, velocities
     from mitsonar.simulation.channel import ChannelSimulator
@@ -147,6 +151,11 @@ def sas(
         f"{abs(grid.across_m[0]):.3g} to {abs(grid.across_m[-1]):.3g} m to {side}, on the plane z = {grid.z:.3g} m"
     )
     if micro := report.micronavigation:
+        if micro.unused:
+            warn(
+                f"{micro.unused} of {count_noun(len(micro.sway_m), 'pair')} of pings not used: their coherence is below "
+                f"{LEAST_COHERENCE:g}, and their sway counts as 0; see {folder / 'micronavigation.csv'}"
+            )
         say(
             f"displaced phase centres: coherence {np.median(micro.coherence):.2f}, sway between pings "
             f"{1e3 * np.nanstd(micro.sway_m):.3g} mm, bound {1e3 * np.nanmedian(micro.sway_std_m):.2g} mm"
@@ -199,7 +208,7 @@ def _path(
     file: Path | None,
     start: str | None,
     end: str | None,
-    speed: float,
+    speed: float | None,
     frames: int | None,
     frame: str,
 ) -> Trajectory:
@@ -215,11 +224,14 @@ def _path(
     if file is not None:
         if start or end:
             raise MitsonarError("--trajectory and --from/--to contradict each other: give one")
+        if speed is not None:
+            raise MitsonarError(f"--speed belongs to --from and --to, and {file} has times of its own: leave --speed out")
         flown = Trajectory.load(file, frame, looks_ahead=False)
     else:
         first, last = numbers(start, 6, "--from"), numbers(end, 6, "--to")
         if first is None or last is None:
             raise MitsonarError(f"give a path: --trajectory FILE.tum, or --from and --to ({options.SIX})")
+        speed = SPEED if speed is None else speed
         if not 0 < speed < 1e4:
             raise MitsonarError(f"--speed must be above 0 m/s: got {speed:g}")
         length = math.dist(first[:3], last[:3])

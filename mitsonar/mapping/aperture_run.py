@@ -221,8 +221,8 @@ def _joined(run: RunDirectory, grid: StripGrid) -> StripImage:
         path, rows = run.path / "parts" / f"{start:09d}.npz", slice(start, min(start + BLOCK_ROWS, grid.rows))
         try:
             block = read_npz(path)["value"]
-            if block.dtype != np.complex64:
-                raise ValueError(f"values of type {block.dtype}")
+            if block.dtype != np.complex64 or block.shape != value[rows].shape:
+                raise ValueError(f"values of type {block.dtype} and shape {block.shape}")
             value[rows] = block
         except Exception as error:  # damaged bytes raise errors of many kinds
             reason = " ".join(str(error).split())[:200]

@@ -28,7 +28,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.instruments.sonar import Sonar, scans
 from mitsonar.mapping.relief import GroundCells, ReliefView, lit_ground
-from mitsonar.mapping.shadows import shadow_heights
+from mitsonar.mapping.shadows import joined_shadow_heights
 from mitsonar.records.frames import SonarFrames
 
 __all__ = ["HeightMap", "HeightMapOptions", "Trial", "fit_height_map", "most_trials", "views_of"]
@@ -267,10 +267,18 @@ def _grid(sonar: Sonar, bearing_rad: Array, poses: Array, ground_m: float, cells
 
 @dataclass(frozen=True)
 class _Solution:
-    """Heights ``(cells, cells)`` [m], the reflectivity of the ground, and levels of echoes in the blocks of each view."""
+    """Heights, the reflectivity of the ground, and what follows from them.
+
+    Attributes:
+        height_m: heights ``(cells, cells)`` [m].
+        reflectivity: reflectivity of the ground.
+        centre_m: mean of the heights in the regulariser [m].
+        levels: levels of echoes in the blocks of each view, for a reflectivity of 1.
+    """
 
     height_m: Array
     reflectivity: float
+    centre_m: float
     levels: list[Array]
 
 
@@ -302,7 +310,6 @@ class _Fit:
         weights: number of independent samples of each block of each view; 0 where it is not used.
         seen: cells that some frame shows ``(cells, cells)``.
         leak: constant level of the image, see :data:`LEAKS`.
-        centre_m: mean of the heights in the regulariser [m].
         threads: threads that render views; NumPy and SciPy release the interpreter.
     """
 
@@ -317,9 +324,9 @@ class _Fit:
         if not len(ratio) or not np.median(ratio) > 0:
             raise MitsonarError("the frames hold no echo of the ground: check the height, the pitch and the window")
         reflectivity = float(np.median(ratio))
-        self.flat = _Solution(height, reflectivity, ground)
+        self.flat = _Solution(height, reflectivity, self.grid.ground_m, ground)
         self._ground = [reflectivity * m for m in ground]
-        self.leak, self.centre_m = LEAKS[-1], self.grid.ground_m
+        self.leak = LEAKS[-1]
         self.seen = self._seen()
 
     def _seen(self) -> NDArray[np.bool_]:
@@ -360,17 +367,17 @@ class _Fit:
                 break
         return solution
 
-    def solution_of(self, height_m: Array, reflectivity: float) -> _Solution:
-        """Return the solution of given heights, with the best reflectivity."""
+    def solution_of(self, height_m: Array, reflectivity: float, centre_m: float) -> _Solution:
+        """Return the solution of given heights around a centre, with the best reflectivity."""
         levels = list(self.threads.map(lambda view: view.levels(height_m), self.views))
-        return self.with_reflectivity(_Solution(height_m, reflectivity, levels))
+        return self.with_reflectivity(_Solution(height_m, reflectivity, centre_m, levels))
 
     def minimised(self, trial: Trial, start: _Solution, steps: int) -> _Solution:
         """Minimise the objective by Gauss-Newton steps that are halved until they decrease it."""
         precision = _Regulariser(self.grid, trial.std_m, trial.length_m).precision()
 
         def objective(solution: _Solution) -> float:
-            offset = solution.height_m.ravel() - self.centre_m
+            offset = solution.height_m.ravel() - solution.centre_m
             return self.deviance(solution, self.weights) + float(offset @ (precision @ offset)) / 2
 
         solution = self.with_reflectivity(start)
@@ -385,7 +392,7 @@ class _Fit:
                 for fraction in (1.0, 0.5, 0.2):
                     height = solution.height_m + fraction * step
                     if height.max() < ceiling:
-                        moved = self.solution_of(height, solution.reflectivity)
+                        moved = self.solution_of(height, solution.reflectivity, solution.centre_m)
                         decrease = value - objective(moved)
                     if decrease > 0:
                         break
@@ -405,12 +412,11 @@ class _Fit:
         Rocks raise the mean of the heights above the ground. A common offset of all heights hardly changes an image.
         """
         offset = _mode(solution.height_m[self.seen]) - self.grid.ground_m
-        self.centre_m -= offset
-        return self.solution_of(solution.height_m - offset, solution.reflectivity)
+        return self.solution_of(solution.height_m - offset, solution.reflectivity, solution.centre_m - offset)
 
     def _expansion(self, solution: _Solution, precision: Sparse) -> tuple[Sparse, Array, tuple[Array, float]]:
         """Return Fisher's information about the heights, the gradient, and the information shared with the reflectivity."""
-        hessian, gradient = precision, precision @ (solution.height_m.ravel() - self.centre_m)
+        hessian, gradient = precision, precision @ (solution.height_m.ravel() - solution.centre_m)
         shared, alone = np.zeros(len(gradient)), 0.0
         views = zip(self.views, self.weights, self.means(solution), self.measured, strict=True)
         for parts in self.threads.map(lambda view: _expansion_of(solution, *view), views):  # summed in the order of views
@@ -540,11 +546,9 @@ class _Search:
     def _beginning(self) -> _Solution:
         """Return level ground, or the heights from shadows where they explain the image better."""
         flat = self.fit.with_reflectivity(self.fit.flat)
-        heights = [
-            shadow_heights(view, y, flat.reflectivity) for view, y in zip(self.fit.views, self.fit.measured, strict=True)
-        ]
-        smooth = ndimage.gaussian_filter(np.mean(heights, axis=0), 1.0)
-        shadows = self.fit.solution_of(smooth, flat.reflectivity)
+        heights = joined_shadow_heights(self.fit.views, self.fit.measured, flat.reflectivity)
+        smooth = ndimage.gaussian_filter(heights, 1.0)
+        shadows = self.fit.solution_of(smooth, flat.reflectivity, flat.centre_m)
         return min(flat, shadows, key=lambda one: self.fit.deviance(one, self.train))
 
     def _tried(self, std_m: float, length_m: float, start: _Solution, *, first: bool = False) -> _Candidate:

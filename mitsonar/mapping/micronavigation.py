@@ -49,7 +49,7 @@ class MicroNavigation:
         advance_m: displacement along the track, from the coherence of neighbouring pairs ``(pings - 1,)`` [m].
         coherence: of the overlapping phase centres ``(pings - 1,)``, 0..1.
         path: corrected positions of the pings ``(pings, 3)`` [m]: those of the navigation, and the sum of the sways without
-            its mean and trend, which a synthetic aperture does not sense.
+            its mean and trend, which a synthetic aperture does not sense. A sway that is not valid counts as 0.
     """
 
     sway_m: NDArray[np.float64]
@@ -57,6 +57,11 @@ class MicroNavigation:
     advance_m: NDArray[np.float64]
     coherence: NDArray[np.float64]
     path: NDArray[np.float64]
+
+    @property
+    def unused(self) -> int:
+        """Return the number of pairs whose sway is not valid."""
+        return int(np.isnan(self.sway_m).sum())
 
 
 def sway_bound(coherence: float, samples: float, wavelength_m: float, cosine: float = 1.0) -> float:
@@ -93,7 +98,8 @@ def displaced_phase_centres(responses: ImpulseResponses, *, near_m: float | None
         near_m: slant range at which the compared window begins; default: 1.5 times the height.
 
     Raises:
-        MitsonarError: no poses or heights; fewer than three receivers, or uneven ones; no overlap between pings.
+        MitsonarError: no poses or heights; fewer than three receivers, or uneven ones; no overlap between pings; no pair of
+            pings that is coherent enough.
     """
     sonar, centres = responses.sonar, phase_centres(responses)
     spacing = _spacing(sonar)
@@ -103,6 +109,12 @@ def displaced_phase_centres(responses: ImpulseResponses, *, near_m: float | None
     side = _looking_side(responses, line)
     results = [_between(responses, centres, pair, window, spacing, side) for pair in range(len(responses) - 1)]
     phase, std, advance, coherence = (np.array(column) for column in zip(*results, strict=True))
+    if not np.isfinite(phase).any():
+        raise MitsonarError(
+            f"no pair of pings is as coherent as displaced phase centres need, {LEAST_COHERENCE:g}: the best of "
+            f"{len(phase)} has {coherence.max():.2g}; correct the path with autofocus alone, raise the level of the echoes "
+            "over the noise, or give a navigation that is closer to the path"
+        )
     sway = _without_drift(phase, responses.time_s, float(sonar.delay_s[window.taps].mean()))
     total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(sway))])
     number = np.arange(len(total))
@@ -166,10 +178,11 @@ def _height_m(responses: ImpulseResponses) -> float:
     Raises:
         MitsonarError: it is not known.
     """
-    heights = None if responses.height_m is None else np.asarray(responses.height_m, dtype=float)
-    if heights is None or not np.isfinite(heights).any() or not np.nanmedian(heights) > 0:
+    ground = responses.ground_m
+    height = math.nan if ground is None else float(np.median(np.asarray(responses.poses)[:, 2])) - ground
+    if not height > 0:
         raise MitsonarError("micronavigation needs the height over the ground: give responses with height_m above 0")
-    return float(np.nanmedian(heights))
+    return height
 
 
 def _looking_side(responses: ImpulseResponses, line: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +11,28 @@ from scipy import ndimage
 
 from mitsonar.mapping.relief import ReliefView
 
-__all__ = ["shadow_heights"]
+__all__ = ["joined_shadow_heights", "shadow_heights"]
 
 Array = NDArray[np.float64]
 
 DARK = 0.15
 """Level below which a block is in shadow, relative to level ground."""
+
+
+def joined_shadow_heights(views: Sequence[ReliefView], levels: Sequence[Array], reflectivity: float) -> Array:
+    """Estimate heights from the shadows of several frames: the mean of those that place an object in a cell.
+
+    Args:
+        views: views of the frames, on one grid.
+        levels: their levels in blocks.
+        reflectivity: reflectivity of the ground.
+
+    Returns:
+        Heights ``(cells, cells)`` [m], with the southernmost row first; level ground where no frame places an object.
+    """
+    ground = views[0].grid.ground_m
+    above = np.array([shadow_heights(view, y, reflectivity) - ground for view, y in zip(views, levels, strict=True)])
+    return np.asarray(ground + above.sum(axis=0) / np.maximum((above > 0).sum(axis=0), 1))
 
 
 def shadow_heights(view: ReliefView, levels: Array, reflectivity: float) -> Array:

@@ -188,7 +188,9 @@ def strip_grid(
     centres, sonar = phase_centres(responses), responses.sonar
     ahead = _direction(centres.sent)
     heading = math.atan2(ahead[0], ahead[1])
-    ground = ground_m if ground_m is not None else _ground(responses)
+    ground = responses.ground_m if ground_m is None else ground_m
+    if ground is None:
+        raise MitsonarError(f"the height of the ground is not known: give {argument('ground_m')}, its z [m]")
     height = float(np.median(centres.sent[:, 2])) - ground
     if height <= 0:
         raise MitsonarError(f"the ground must lie below the path: got z = {ground:g} m, {-height:g} m above it")
@@ -236,18 +238,6 @@ def _edge_rad(field: FieldOfView) -> float:
     """Return the angle from straight down at which the default image begins [rad]."""
     edge = field.tilt_deg - (1 - field.taper / 2) * field.along_deg / 2 if field.shape in ("line", "rectangular") else 0.0
     return math.radians(min(max(edge, 90 - STEEPEST_DEG), 89.0))
-
-
-def _ground(responses: ImpulseResponses) -> float:
-    """Return the median height of the ground below the pings.
-
-    Raises:
-        MitsonarError: the heights are not known.
-    """
-    heights = None if responses.height_m is None else np.asarray(responses.height_m, dtype=float)
-    if heights is None or not np.isfinite(heights).any():
-        raise MitsonarError(f"the height of the ground is not known: give {argument('ground_m')}, its z [m]")
-    return float(np.nanmedian(np.asarray(responses.poses)[:, 2] - heights))
 
 
 # ---------------- Back-projection

@@ -87,6 +87,14 @@ class ImpulseResponses:
         """Return the delay of each tap ``(taps,)`` [s]."""
         return self.sonar.delay_s
 
+    @property
+    def ground_m(self) -> float | None:
+        """Return the median height (z) of the ground below the pings [m]; None if no ping knows its pose and height."""
+        if self.poses is None or self.height_m is None:
+            return None
+        below = np.asarray(self.poses, dtype=float)[:, 2] - np.asarray(self.height_m, dtype=float)
+        return float(np.median(below[np.isfinite(below)])) if np.isfinite(below).any() else None
+
     def select(self, index: slice | NDArray[np.integer] | NDArray[np.bool_]) -> ImpulseResponses:
         """Return a subset of the pings."""
         selected = {name: getattr(self, name)[index] for name in PER_PING if getattr(self, name) is not None}

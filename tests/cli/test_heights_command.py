@@ -78,6 +78,20 @@ def test_one_frame_without_a_pose_takes_height_and_pitch(mitsonar: Command, bare
         assert table["ground_m"] == 0
 
 
+def test_a_pitch_or_roll_that_the_frame_lacks_is_not_taken_as_level(mitsonar: Command, bare: Path, tmp_path: Path) -> None:
+    known = np.array([[np.radians(20), 0.0, 0.0], [np.nan, np.nan, np.nan]])
+    replace(SonarFrames.load(bare), attitude_rad=known).save(tmp_path / "tilted.npz")
+    words = ["heights", tmp_path / "tilted.npz", "-o", tmp_path / "map.npz", "--cells", 20, "--height", 1.5]
+    done = mitsonar(*words, "--only", 0)
+    assert done.returncode == 0, done
+    refused(mitsonar(*words, "--overwrite", "--only", 1), "frame 1 of", "no known pitch and roll", "give --pitch-deg")
+    done = mitsonar(*words, "--overwrite", "--only", 1, "--pitch-deg", 20)
+    assert done.returncode == 0, done
+    known[1, 0] = np.radians(20)
+    replace(SonarFrames.load(bare), attitude_rad=known).save(tmp_path / "tilted.npz")
+    refused(mitsonar(*words, "--overwrite", "--only", 1), "frame 1 of", "no known roll, and")
+
+
 def test_a_path_gives_the_poses(mitsonar: Command, run: Path, bare: Path, tmp_path: Path) -> None:
     Trajectory(POSES, SonarFrames.load(run).time_s).save(tmp_path / "path.tum")
     words = ["heights", bare, "-o", tmp_path / "map.npz", "--cells", 20, "--trajectory", tmp_path / "path.tum"]

@@ -76,11 +76,29 @@ def test_another_navigation_is_corrected(mitsonar: Command, tmp_path: Path) -> N
     assert again.returncode == 0, again.stderr
 
 
+def test_pairs_of_pings_without_coherence_are_named(mitsonar: Command, tmp_path: Path) -> None:
+    """One fix of the navigation is 0.5 m off to the side, beyond the delays that are compared."""
+    straight = Trajectory.between(Pose(0, -1.2, 2.5), Pose(0, 1.2, 2.5), 49, 10.0)
+    wrong = straight.poses.copy()
+    wrong[24, 0] += 0.5
+    straight.save(tmp_path / "straight.tum")
+    Trajectory(wrong, straight.time_s).save(tmp_path / "wrong.tum")
+    out = tmp_path / "out"
+    paths = ("--trajectory", tmp_path / "straight.tum", "--navigation", tmp_path / "wrong.tum")
+    done = mitsonar("sas", "flat_floor", *paths, *SMALL, "--correct", "dpc", "-o", out)
+    assert done.returncode == 0, done.stderr
+    with (out / "micronavigation.csv").open() as file:
+        unused = sum(row["sway_m"] == "nan" for row in csv.DictReader(file))
+    assert 1 <= unused < 10
+    assert f"{unused} of 48 pairs of pings not used" in " ".join(done.stderr.split())
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
         ((*ENDS, "--frames", 9), "the aperture is aliased"),
         (("--from", "0,0,2.5,0,0,0"), "give a path"),
+        (("--trajectory", "path.tum", "--speed", 1.5), "path.tum has times of its own: leave --speed out"),
         (("--from", "0,0,2.5,0,0,0", "--to", "0,0,2.5,0,0,0"), "path that moves"),
         ((*ENDS[:4], "--speed", 60), "before the echo from 6 m is back"),
         ((*ENDS, "--side", "up"), "port or starboard"),

@@ -65,9 +65,14 @@ def test_a_run_that_was_stopped_continues_to_the_same_bits(measured: ImpulseResp
 def test_a_damaged_part_is_one_sentence(measured: ImpulseResponses, tmp_path: Path) -> None:
     with pytest.raises(Stopped):
         run(tmp_path / "run", measured, 64)
-    (tmp_path / "run" / "parts" / "000000000.npz").write_bytes(b"PK broken")
+    part = tmp_path / "run" / "parts" / "000000000.npz"
+    part.write_bytes(b"PK broken")
     with pytest.raises(MitsonarError, match="start again with --overwrite"):
         run(tmp_path / "run", measured)
+    for shape in ((1, 1), (64, 1), (1, 40)):  # NumPy would repeat them over the block
+        np.savez(part, value=np.zeros(shape, np.complex64))
+        with pytest.raises(MitsonarError, match=r"shape \(\d+, \d+\)\): start again with --overwrite"):
+            run(tmp_path / "run", measured)
 
 
 def test_a_navigation_replaces_the_poses_and_must_cover_the_pings(measured: ImpulseResponses, tmp_path: Path) -> None:

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
+from mitsonar.mapping import height_map
 from mitsonar.mapping.height_map import HeightMap, HeightMapOptions, fit_height_map, most_trials, views_of
 from mitsonar.mapping.height_map_files import save_height_map
 from mitsonar.mapping.relief import ReliefView
-from mitsonar.mapping.shadows import shadow_heights
+from mitsonar.mapping.shadows import joined_shadow_heights, shadow_heights
 from mitsonar.records.frames import SonarFrames
 
 pytestmark = pytest.mark.filterwarnings("ignore:.* lie outside the window")
@@ -136,10 +137,40 @@ def test_a_shadow_gives_the_height_of_a_wall() -> None:
     assert not shadow_heights(view, view.levels(0 * wall), 1.0).any()
 
 
+def test_frames_without_a_shadow_do_not_lower_a_wall() -> None:
+    """A wall that only one of two frames shows has the height that this frame gives."""
+    frames, poses, _ = drawn(2)
+    views, _ = views_of(frames, poses, np.full(2, HEIGHT_M), HeightMapOptions(cells=64))
+    wall = np.zeros((64, 64))
+    wall[30:32] = 0.2
+    levels = [views[0].levels(wall), views[1].levels(0 * wall)]
+    np.testing.assert_allclose(joined_shadow_heights(views, levels, 1.0), shadow_heights(views[0], levels[0], 1.0))
+    both = [view.levels(wall) for view in views]
+    each = [shadow_heights(view, y, 1.0) for view, y in zip(views, both, strict=True)]
+    shared = (each[0] > 0) & (each[1] > 0)
+    assert shared.any()
+    np.testing.assert_allclose(joined_shadow_heights(views, both, 1.0)[shared], np.mean(each, axis=0)[shared])
+
+
 def test_the_same_frames_give_the_same_map() -> None:
     frames, poses, _ = drawn(1)
     again = fit_height_map(frames, poses, np.array([HEIGHT_M]), SMALL)
     np.testing.assert_array_equal(again.height_m, fitted(1)[0].height_m)
+
+
+def test_a_rejected_regulariser_leaves_the_map_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same map comes out when only the regularisers are tried that the search has taken."""
+    result, _ = fitted(1)
+    tried = result.trials[1:]
+    taken = [trial for k, trial in enumerate(tried) if all(trial.deviance < one.deviance for one in tried[:k])]
+    assert len(taken) < len(tried), "some are rejected"
+    parts = sorted(trial.std_m / HEIGHT_M for trial in taken)
+    monkeypatch.setattr(height_map, "STDS", tuple(parts))
+    monkeypatch.setattr(height_map, "FIRST", parts.index(tried[0].std_m / HEIGHT_M))
+    frames, poses, _ = drawn(1)
+    alone = fit_height_map(frames, poses, np.array([HEIGHT_M]), SMALL)
+    assert alone.regulariser.std_m == pytest.approx(result.regulariser.std_m)
+    np.testing.assert_allclose(alone.height_m, result.height_m, atol=1e-6)
 
 
 def test_level_ground_is_refused() -> None:

@@ -109,6 +109,37 @@ def test_what_has_no_overlap_is_refused() -> None:
         displaced_phase_centres(quiet, near_m=24.4)
 
 
+def test_the_ground_is_the_median_below_the_pings_that_know_it() -> None:
+    quiet = quiet_field()
+    poses = np.array(quiet.poses)
+    poses[:, 2] += np.linspace(0, 1, PINGS)
+    heights = poses[:, 2] + 2.0  # ground at z = -2
+    heights[:20] = np.nan
+    assert replace(quiet, poses=poses, height_m=heights).ground_m == pytest.approx(-2.0)
+    for unknown in ({"poses": None}, {"height_m": None}, {"height_m": np.full(PINGS, np.nan)}):
+        assert replace(quiet, **unknown).ground_m is None  # type: ignore[arg-type]
+    with pytest.raises(MitsonarError, match="height_m above 0"):
+        displaced_phase_centres(replace(quiet, height_m=np.zeros(PINGS)))
+
+
+def with_noise_alone(quiet: ImpulseResponses, pings: list[int]) -> ImpulseResponses:
+    """The same, but some pings hold noise alone."""
+    rng = np.random.default_rng(2)
+    response = quiet.response.copy()
+    shape = (len(pings), *response.shape[1:])
+    response[pings] = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+    return replace(quiet, response=response)
+
+
+def test_pairs_that_are_not_coherent_are_counted_and_refused_if_there_are_no_others() -> None:
+    found = displaced_phase_centres(with_noise_alone(quiet_field(), [10]))
+    assert np.flatnonzero(np.isnan(found.sway_m)).tolist() == [9, 10]
+    assert found.unused == 2
+    assert displaced_phase_centres(quiet_field()).unused == 0
+    with pytest.raises(MitsonarError, match=r"no pair of pings is as coherent .* 0\.3: the best of 31 has 0\.0.*autofocus"):
+        displaced_phase_centres(with_noise_alone(quiet_field(), list(range(PINGS))))
+
+
 def sharpness(found: ImpulseResponses, grid: StripGrid, path: NDArray[np.float64] | None = None) -> float:
     power = np.abs(focus(found, grid, path=path).value.astype(complex)) ** 2
     return float((power**2).mean() / power.mean() ** 2)

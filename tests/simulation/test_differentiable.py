@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import Array, MitsubaDict, diffuse, essence, sphere
+from scipy.spatial.transform import Rotation
 
 import mitsonar
 from mitsonar.errors import MitsonarError
@@ -47,8 +48,10 @@ def solid(folder: Path, name: str, mesh: trimesh.Trimesh) -> MitsubaDict:
 
 def cube(folder: Path, place: tuple[float, ...]) -> MitsubaDict:
     """A cube of 0.24 m, turned."""
-    mesh = trimesh.creation.box((0.24,) * 3, trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
-    mesh.apply_translation(place)
+    placed = np.eye(4)
+    placed[:3, :3] = Rotation.from_rotvec(0.7 * np.array([1, 2, 3]) / np.sqrt(14)).as_matrix()
+    placed[:3, 3] = place
+    mesh = trimesh.creation.box((0.24,) * 3, placed)
     return solid(folder, "cube", mesh)
 
 
@@ -173,7 +176,7 @@ def test_properties_of_the_sonar_itself_change_nothing() -> None:
     plain = np.array(simulator.levels(POSE))
     same = simulator.levels(POSE, beam_width_deg=np.degrees(sonar.beam_width_rad), absorption_db_per_m=0.5, taper_db=0,
                             elevation_fov_deg=sonar.elevation_fov_deg, sound_speed=sonar.sound_speed)  # fmt: skip
-    np.testing.assert_allclose(same, plain, rtol=1e-5, atol=1e-6 * plain.max())
+    np.testing.assert_allclose(np.array(same), plain, rtol=1e-5, atol=1e-6 * plain.max())
     other = mitsonar.DifferentiableSimulator(loaded, sonar.replace(absorption_db_per_m=0.8))
     changed = np.array(simulator.levels(POSE, absorption_db_per_m=0.8))
     np.testing.assert_allclose(changed, np.array(other.levels(POSE)), rtol=1e-4, atol=1e-6 * plain.max())
