@@ -117,7 +117,7 @@ def test_the_ground_is_the_median_below_the_pings_that_know_it() -> None:
     heights[:20] = np.nan
     assert replace(quiet, poses=poses, height_m=heights).ground_m == pytest.approx(-2.0)
     for unknown in ({"poses": None}, {"height_m": None}, {"height_m": np.full(PINGS, np.nan)}):
-        assert replace(quiet, **unknown).ground_m is None  # type: ignore[arg-type]
+        assert replace(quiet, **unknown).ground_m is None
     with pytest.raises(MitsonarError, match="height_m above 0"):
         displaced_phase_centres(replace(quiet, height_m=np.zeros(PINGS)))
 
