@@ -123,7 +123,7 @@ def test_speckle_of_the_simulator_leaves_a_box_in_place(variant: str) -> None:
     true = np.where((np.abs(x) < 0.4) & (np.abs(y) < 0.25), 0.2, 0.0)
     seen = np.isfinite(result.height_m)
     assert rmse(result.height_m, true) < 0.7 * rmse(np.zeros_like(true), np.where(seen, true, np.nan))
-    assert abs(np.nanmedian(result.height_m[(np.abs(x) < 0.25) & (np.abs(y) < 0.1)]) - 0.2) < 0.06
+    assert abs(np.nanmedian(result.height_m[(np.abs(x) < 0.25) & (np.abs(y) < 0.1)]) - 0.2) < 0.08  # speckle of two frames
 
 
 def test_a_shadow_gives_the_height_of_a_wall() -> None:

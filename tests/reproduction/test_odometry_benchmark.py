@@ -361,7 +361,7 @@ def test_a_word_before_a_hyphen_means_all_such_sets(tmp_path: Path, monkeypatch:
     assert arguments == flown
     arguments.clear()
     benchmark_odometry(Wanted(methods=("zero",)), tmp_path / "all")
-    assert len(arguments) == 2 * (36 + 3)
+    assert len(arguments) == 2 * (48 + 3)
     assert {"rocks", *flown} < set(arguments)
 
 
