@@ -22,7 +22,7 @@ CellOutput = dict[str, Any]
 
 ROOT = Path(__file__).parent.parent
 
-NOTEBOOKS = ("01_render", "02_dataset", "03_odometry", "04_networks", "06_bluerov")
+NOTEBOOKS = ("01_render", "02_dataset", "03_odometry", "04_networks", "05_gradients", "06_bluerov")
 
 PAGES = {
     "benchmarks/README.md": "benchmarks.md",
