@@ -200,16 +200,19 @@ def odometry(
 @answered
 def mosaic(
     frames: Frames,
-    trajectory: Annotated[
-        str,
-        typer.Argument(help="Path: a TUM or CSV file, the folder of an odometry, or `true` for the poses in the frames."),
-    ],
     out: Annotated[
         Path,
         typer.Option(
             "-o", "--out", help="OUT.png for figures of the map and its quality (OUT.quality.png), or OUT.tif for a GeoTIFF."
         ),
     ],
+    trajectory: Annotated[
+        str,
+        typer.Argument(
+            help="Path: a TUM or CSV file, the folder of an odometry, or `true` for the poses in the frames.",
+            show_default=False,
+        ),
+    ] = "",
     cell_mm: Annotated[float | None, typer.Option(help="Cell size of the map [mm] (default: 10; side-scans: 100).")] = None,
     blend: Annotated[
         str, typer.Option(help="weighted: all beams; centre: the plain mean of the middle beams.")
@@ -246,7 +249,11 @@ def mosaic(
     if kind_of_run(frames) == ODOMETRY.name:
         raise MitsonarError(
             f"{frames} is the folder of an odometry, and mosaic takes the frames first, the odometry second: "
-            f"{command_line('mosaic', trajectory, frames, '-o', out)}"
+            f"{command_line('mosaic', trajectory or 'FRAMES', frames, '-o', out)}"
+        )
+    if not trajectory:
+        raise MitsonarError(
+            "mosaic needs a path after the frames: give `true` for their poses, a TUM or CSV file, or the folder of an odometry"
         )
     quality = _checked_out(out, true, overwrite)
     scan = side_scan_at(frames)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeAlias
 import typer
 
 from mitsonar.errors import MitsonarError, short_repr, suggest_names
+from mitsonar.instruments.sonar import Sonar
 
 __all__ = ["Config", "configuration_of", "merged_pairs"]
 
@@ -121,6 +122,10 @@ def _options_in(path: Path, ctx: typer.Context) -> dict[str, Any]:
             if value != ctx.info_name:
                 raise MitsonarError(f"{path} is a configuration of the command {short_repr(value)}, not of {ctx.info_name}")
         elif key not in known:
+            if "set" in known and key in Sonar.model_fields:
+                raise MitsonarError(
+                    f"{path}: {name} is a key of the sonar: give it below `set`, as {name}: {short_repr(value)}"
+                )
             raise MitsonarError(f"{path}: unknown key {short_repr(name)}: {suggest_names(key, known)}")
         elif value is not None:
             result[str(known[key].name)] = _value(value, known[key], f"{path}: {key}")

@@ -467,11 +467,16 @@ class GroundProblem:
         spread_db = 1.4826 * float(np.median(np.abs(error - np.median(error)))) / DB
         explained = 1 - float(np.square(error).mean() / max(level.var(), 1e-12))
         if explained < LEAST_EXPLAINED or spread_db > MOST_ERROR_DB:
+            misfits = []
+            if explained < LEAST_EXPLAINED:
+                share = max(explained, 0.0)
+                misfits.append(f"it explains {share:.0%} of the variance of the levels ({LEAST_EXPLAINED:.0%} are needed)")
+            if spread_db > MOST_ERROR_DB:
+                differ, most = spread_db / 1.4826, MOST_ERROR_DB / 1.4826
+                misfits.append(f"half of the blocks differ by more than {differ:.1f} dB ({most:.1f} are allowed)")
             raise MitsonarError(
-                f"the frames do not show level ground: it explains {max(explained, 0.0):.0%} of the variance of the levels "
-                f"({LEAST_EXPLAINED:.0%} are needed), and half of the blocks differ by more than "
-                f"{spread_db / 1.4826:.1f} dB ({MOST_ERROR_DB / 1.4826:.1f} are allowed); give frames of level ground "
-                "without large objects, or their height and pitch where these are known"
+                f"the frames do not show level ground: {', and '.join(misfits)}; give frames of level ground without large "
+                "objects, or their height and pitch where these are known"
             )
 
     def looks_of_frame(self, solution: GroundSolution) -> float:

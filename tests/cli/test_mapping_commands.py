@@ -262,6 +262,7 @@ def test_bad_frames_are_answered_by_one_sentence(mitsonar: Command, tmp_path: Pa
     refused(mitsonar("odometry", tmp_path / "still.npz", "-o", out), "times", "increase")
     refused(mitsonar("odometry", tmp_path / "nothing.npz", "-o", out), "no frames")
     refused(mitsonar("mosaic", tmp_path / "nothing.npz", "true", "-o", tmp_path / "m.png"), "no frames")
+    refused(mitsonar("mosaic", tmp_path / "text.npz", "-o", tmp_path / "m.png"), "needs a path after the frames", "`true`")
     refused(mitsonar("mosaic", tmp_path / "text.npz", "true", "-o", tmp_path / "m.png"), "cannot read")
     assert not out.exists()
 

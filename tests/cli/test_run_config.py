@@ -115,6 +115,7 @@ def test_impulse_responses_repeat_too(mitsonar: Command, tmp_path: Path, scene: 
     [
         ("framess: 3", "unknown key 'framess': did you mean frames"),
         ("resume: true", "unknown key 'resume'"),
+        ("range_max: 6", "range_max is a key of the sonar: give it below `set`, as range_max: 6"),
         ("- a\n- b", "must hold options of `mitsonar render`"),
         ("labels: 3", "labels must be true or false: got 3"),
         ("set: beams=8", "set must hold KEY: VALUE pairs"),

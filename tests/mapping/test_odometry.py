@@ -16,6 +16,7 @@ from drawn_frames import SONAR, START, as_zarr, over_ground, sway
 from helpers import files_of, lit_plane, tiny_recipe
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from recording_files import aris_file
 
 from mitsonar.acoustics.levels import LocalContrast
 from mitsonar.acoustics.noise import NOISE_MODELS
@@ -524,6 +525,8 @@ def test_a_data_set_s_sequences_are_runs(tmp_path: Path) -> None:
 
 def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
+    (tmp_path / "with one").mkdir()
+    (tmp_path / "with one" / "a.aris").write_bytes(aris_file())
     (tmp_path / "wrong.npz").write_bytes(b"no zip")
     (tmp_path / "empty.aris").touch()
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
@@ -531,7 +534,8 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
     (tmp_path / "damaged.zarr" / "zarr.json").write_text("{")
     numbered(sway(4)).save(tmp_path / "frames.npz")
     for name, message in (
-        ("empty", "holds no frames.npz"),
+        ("empty", r"holds no frames\.npz or frames\.zarr: give frames\.npz"),
+        ("with one", r"holds no frames\.npz or frames\.zarr: give the recording in it, such as .*a\.aris"),
         ("none.aris", r"there are no frames at .*none\.aris: give frames\.npz, .* or a recording"),
         ("wrong.npz", r"cannot read frames .*: it is neither a whole frames\.npz nor a recording .*: ARIS \(\.aris\), "),
         ("empty.aris", r"cannot read frames .*empty\.aris: it is empty; give .* a recording: ARIS \(\.aris\), "),
