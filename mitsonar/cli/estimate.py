@@ -253,7 +253,8 @@ def mosaic(
         )
     if not trajectory:
         raise MitsonarError(
-            "mosaic needs a path after the frames: give `true` for their poses, a TUM or CSV file, or the folder of an odometry"
+            "mosaic needs a path after the frames: give `true` for their poses, a TUM or CSV file, or the folder of an "
+            "odometry"
         )
     quality = _checked_out(out, true, overwrite)
     scan = side_scan_at(frames)
