@@ -53,11 +53,14 @@ Config = Annotated[
 ]
 
 
-def merged_pairs(ctx: typer.Context, param: typer.CallbackParam, value: list[str] | None) -> list[str] | None:
-    """Return the pairs of the file followed by those of the command line, which override them; a callback of Typer."""
+def merged_pairs(ctx: typer.Context, param: typer.CallbackParam, value: list[str] | None) -> list[str]:
+    """Return the pairs of the file followed by those of the command line, which override them; a callback of Typer.
+
+    Without any pair the list is empty, never None: Typer 0.15 takes the length of what a callback returns.
+    """
     of_file = (ctx.default_map or {}).get(str(param.name))
     if not of_file or value is None or list(value) == list(of_file):
-        return value
+        return list(value or ())
     return [*of_file, *value]
 
 
