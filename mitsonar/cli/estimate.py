@@ -200,19 +200,20 @@ def odometry(
 @answered
 def mosaic(
     frames: Frames,
+    trajectory: Annotated[
+        str | None,
+        typer.Argument(
+            help="Path: a TUM or CSV file, the folder of an odometry, or `true` for the poses in the frames.",
+            show_default=False,
+        ),
+    ] = None,
+    *,
     out: Annotated[
         Path,
         typer.Option(
             "-o", "--out", help="OUT.png for figures of the map and its quality (OUT.quality.png), or OUT.tif for a GeoTIFF."
         ),
     ],
-    trajectory: Annotated[
-        str,
-        typer.Argument(
-            help="Path: a TUM or CSV file, the folder of an odometry, or `true` for the poses in the frames.",
-            show_default=False,
-        ),
-    ] = "",
     cell_mm: Annotated[float | None, typer.Option(help="Cell size of the map [mm] (default: 10; side-scans: 100).")] = None,
     blend: Annotated[
         str, typer.Option(help="weighted: all beams; centre: the plain mean of the middle beams.")

@@ -9,7 +9,6 @@ from typing import Annotated, Any, TypeAlias
 import typer
 
 from mitsonar.errors import MitsonarError, short_repr, suggest_names
-from mitsonar.instruments.sonar import Sonar
 
 __all__ = ["Config", "configuration_of", "merged_pairs"]
 
@@ -112,6 +111,7 @@ def _options_in(path: Path, ctx: typer.Context) -> dict[str, Any]:
     Raises:
         MitsonarError: the file cannot be read, belongs to another command, or has an unknown key or an unfit value.
     """
+    from mitsonar.instruments.sonar import Sonar
     from mitsonar.io.files import read_yaml
 
     table = read_yaml(path, "configuration")

@@ -339,7 +339,7 @@ class Mosaic:
 
     def _empty(self) -> str:
         added = f"{count_noun(self.frames, 'frame')} added, without ground in {self.frames_without_ground:,}"
-        return f"the mosaic is empty: {added}; check height, pitch and window"
+        return f"the mosaic is empty: {added}; check height, pitch, window and the cell size of {self.cell_m:g} m"
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
