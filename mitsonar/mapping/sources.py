@@ -359,9 +359,6 @@ StoredArray = Any
 RUN_FRAMES = ("frames.npz", "frames.zarr")
 """Files that hold the frames of a run."""
 
-MOST_LISTED = 100
-"""Files of a folder that are tried as recordings."""
-
 FINDING = "give frames.npz, frames.zarr, the folder of a run, a data set or a recording"
 
 
@@ -393,10 +390,9 @@ def open_frames(
     if os.path.isdir(path) and not os.path.isfile(path / "zarr.json"):
         candidates = [path / name for name in RUN_FRAMES if os.path.exists(path / name)]
         if not candidates:
-            inside = (str(one) for one in sorted(path.iterdir())[:MOST_LISTED] if one.is_file() and is_recording(one))
-            recording = next(inside, None)
-            advice = FINDING if recording is None else f"give the recording in it, such as {recording}"
-            raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {advice}")
+            from mitsonar.recordings.open import recordings_in
+
+            raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {recordings_in(path) or FINDING}")
         path = candidates[0]
     return _open_zarr(path, str(where)) if os.path.isdir(path) else _open_npz(path, str(where))
 

@@ -47,6 +47,7 @@ __all__ = [
     "known_formats",
     "open_recording",
     "open_side_scan",
+    "recordings_in",
     "side_scan_words",
     "summary_lines",
     "summary_of",
@@ -157,6 +158,23 @@ def _first_bytes(path: Path) -> bytes | None:
     return b"" if os.path.isdir(path) else None
 
 
+MOST_TRIED, MOST_NAMED = 100, 5
+"""Entries of a folder that are tried as recordings, and recordings that a message names."""
+
+
+def recordings_in(folder: Path) -> str:
+    """Return advice that names the recordings in a folder that is none itself, for messages; empty if it holds none."""
+    try:
+        entries = sorted(folder.iterdir())[:MOST_TRIED] if os.path.isdir(folder) else []
+    except OSError:
+        return ""
+    inside = [one for one in entries if detect_format(one) is not None or detect_side_scan(one) is not None]
+    if len(inside) < 2:
+        return f"give the recording in it, {inside[0]}" if inside else ""
+    more = f" and {len(inside) - MOST_NAMED:,} more" if len(inside) > MOST_NAMED else ""
+    return f"give one of the recordings in it: {', '.join(one.name for one in inside[:MOST_NAMED])}{more}"
+
+
 def known_formats() -> str:
     """Return the names of all formats of frames as one string, for messages."""
     return ", ".join(one.words for one in FORMATS)
@@ -180,7 +198,8 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
             raise MitsonarError(f"no such file: {path}")
         if detect_side_scan(path) is not None:
             raise MitsonarError(side_scan_words(path))
-        raise MitsonarError(f"{path} is not a recording that mitsonar reads: it reads {known_formats()}")
+        advice = recordings_in(Path(path)) or f"it reads {known_formats()}"
+        raise MitsonarError(f"{path} is not a recording that mitsonar reads: {advice}")
     return recording_format.read(Path(path), None if geometry is None else Path(geometry), topic)
 
 
@@ -206,8 +225,8 @@ def open_side_scan(path: str | Path) -> SideScan:
     if side_scan_format is None:
         if not os.path.exists(path):
             raise MitsonarError(f"no such file: {path}")
-        formats = ", ".join(one.words for one in SIDE_SCANS)
-        raise MitsonarError(f"{path} is not a side-scan that mitsonar reads: it reads {formats}")
+        advice = recordings_in(Path(path)) or f"it reads {', '.join(one.words for one in SIDE_SCANS)}"
+        raise MitsonarError(f"{path} is not a side-scan that mitsonar reads: {advice}")
     return side_scan_format.read(Path(path))
 
 
