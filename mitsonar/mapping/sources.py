@@ -470,11 +470,10 @@ def _open_npz(path: Path, name: str) -> FrameSource:
     if not os.path.exists(path):
         raise MitsonarError(f"there are no frames at {path}: {FINDING}")
     if os.path.isfile(path) and os.access(path, os.R_OK) and not is_zipfile(path):
-        from mitsonar.recordings.open import detect_side_scan, known_formats, side_scan_words
+        from mitsonar.recordings.open import frameless_words, known_formats
 
-        if detect_side_scan(path) is not None:
-            raise MitsonarError(side_scan_words(path))
-
+        if words := frameless_words(path):
+            raise MitsonarError(words)
         empty = path.stat().st_size == 0
         reason = "it is empty" if empty else "it is neither a whole frames.npz nor a recording that mitsonar reads"
         raise MitsonarError(f"cannot read frames {path}: {reason}; {FINDING}: {known_formats()}")

@@ -46,12 +46,12 @@ __all__ = [
     "Summary",
     "detect_format",
     "detect_side_scan",
+    "frameless_words",
     "known_formats",
     "open_ranges",
     "open_recording",
     "open_side_scan",
     "recordings_in",
-    "side_scan_words",
     "summary_lines",
     "summary_of",
 ]
@@ -171,11 +171,7 @@ def recordings_in(folder: Path) -> str:
         entries = sorted(folder.iterdir())[:MOST_TRIED] if os.path.isdir(folder) else []
     except OSError:
         return ""
-    inside = [
-        one
-        for one in entries
-        if detect_format(one) or detect_side_scan(one) or is_range_images(one, _first_bytes(one) or b"")
-    ]
+    inside = [one for one in entries if detect_format(one) is not None or frameless_words(one)]
     if len(inside) < 2:
         return f"give the recording in it, {inside[0]}" if inside else ""
     more = f" and {len(inside) - MOST_NAMED:,} more" if len(inside) > MOST_NAMED else ""
@@ -203,29 +199,26 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     if recording_format is None:
         if not os.path.exists(path):
             raise MitsonarError(f"no such file: {path}")
-        if detect_side_scan(path) is not None:
-            raise MitsonarError(side_scan_words(path))
-        if is_range_images(Path(path), _first_bytes(Path(path)) or b""):
-            raise MitsonarError(points_words(path))
+        if words := frameless_words(path):
+            raise MitsonarError(words)
         advice = recordings_in(Path(path)) or f"it reads {known_formats()}"
         raise MitsonarError(f"{path} is not a recording that mitsonar reads: {advice}")
     return recording_format.read(Path(path), None if geometry is None else Path(geometry), topic)
 
 
-def side_scan_words(path: str | Path) -> str:
-    """Return the message for a side-scan where frames are needed."""
-    return (
-        f"{path} is a side-scan, which has pings in place of frames: `mitsonar recording` and `mitsonar mosaic` take it, "
-        "and mitsonar.open_side_scan in Python"
-    )
-
-
-def points_words(path: str | Path) -> str:
-    """Return the message for a recording of ranges where frames are needed."""
-    return (
-        f"{path} holds points of each ping in place of frames: `mitsonar recording info` and `convert` take it, and "
-        "mitsonar.recordings.open.open_ranges in Python"
-    )
+def frameless_words(path: str | Path) -> str:
+    """Return the message for a side-scan, or a recording of ranges, where frames are needed; empty for anything else."""
+    if detect_side_scan(path) is not None:
+        return (
+            f"{path} is a side-scan, which has pings in place of frames: `mitsonar recording` and `mitsonar mosaic` take it,"
+            " and mitsonar.open_side_scan in Python"
+        )
+    if is_range_images(Path(path), _first_bytes(Path(path)) or b""):
+        return (
+            f"{path} holds points of each ping in place of frames: `mitsonar recording info` and `convert` take it, and "
+            "mitsonar.recordings.open.open_ranges in Python"
+        )
+    return ""
 
 
 def open_ranges(path: str | Path, topic: str | None = None) -> RangeRecording | None:

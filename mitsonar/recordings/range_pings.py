@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, suggest_names
+from mitsonar.errors import MitsonarError
 from mitsonar.io.files import whole_file
 from mitsonar.io.runs import refuse_to_replace
 from mitsonar.motion.pose import vehicle_rotation
@@ -110,7 +110,7 @@ def write_points(
     """
     path = Path(path)
     if path.suffix not in FORMATS:
-        raise MitsonarError(f"{path}: points are written as {', '.join(FORMATS)}; {suggest_names(path.suffix, FORMATS)}")
+        raise MitsonarError(f"{path}: points are written as {', '.join(FORMATS)}: give one of these endings")
     refuse_to_replace(path, overwrite=overwrite)
     total, count = int(recording.points.sum()), 0
     if not total:

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 import trimesh
 from bags import KINDS, Maker, Sent, decoded, pings, smooth, write_bag
+from helpers import Command
 from recording_files import message, range_image, rip_packet, rip_payload
 from scipy.spatial.transform import Rotation
 
-import mitsonar
+from mitsonar import open_recording
 from mitsonar.errors import MitsonarError
+from mitsonar.mapping.sources import open_frames
 from mitsonar.recordings.open import open_ranges, summary_lines, summary_of
 from mitsonar.recordings.range_pings import RangeRecording, write_points
 from mitsonar.recordings.ros_messages import ros1_types
@@ -101,13 +103,13 @@ def test_a_bag_with_images_has_frames_unless_the_topic_is_named(tmp_path: Path) 
     path = write_bag(tmp_path / "a", maker, [*pings(maker, smooth()), *sent])
     assert open_ranges(path) is None
     assert open_ranges(path, "/sonar") is None
-    assert len(mitsonar.open_recording(path)) == 6
+    assert len(open_recording(path)) == 6
     assert len(opened(path, "/mb")) == 1
     two = write_bag(tmp_path / "two", maker, [*sent, ("/mc", 1.0, sent[0][2])])
     with pytest.raises(MitsonarError, match="several sonars: choose one by --topic /mb, /mc"):
         open_ranges(two)
     with pytest.raises(MitsonarError, match="SonarRanges hold no image: `mitsonar recording convert` writes their points"):
-        mitsonar.open_recording(write_bag(tmp_path / "one", maker, sent))
+        open_recording(write_bag(tmp_path / "one", maker, sent))
 
 
 def test_the_definition_of_ros_1_is_the_published_one() -> None:
@@ -163,7 +165,9 @@ def test_damage_costs_only_its_packet(tmp_path: Path) -> None:
     assert "left out: 1 packet that cannot be decoded" in notes
     assert f"skipped: {len(packets[1]) + 30} bytes" in notes
     with pytest.raises(MitsonarError, match="holds points of each ping in place of frames"):
-        mitsonar.open_recording(path)
+        open_recording(path)
+    with pytest.raises(MitsonarError, match="holds points of each ping in place of frames"):
+        open_frames(path)
     with pytest.raises(MitsonarError, match="without topics"):
         open_ranges(path, "/sonar")
     path.write_bytes(packets[1])
@@ -221,3 +225,16 @@ def test_points_are_written_in_the_world(tmp_path: Path) -> None:
         write_points(recording, tmp_path / "a.las")
     with pytest.raises(MitsonarError, match="there is no folder"):
         write_points(recording, tmp_path / "none" / "a.ply")
+
+
+def test_the_commands_take_points(mitsonar: Command, tmp_path: Path) -> None:
+    path = tmp_path / "a.sonar"
+    path.write_bytes(base64.b64decode(WLSONAR["packets"]))
+    info = mitsonar("recording", "info", path, "--json")
+    assert json.loads(info.stdout)["parts"][0]["points"] == 34
+    done = mitsonar("recording", "convert", path, "-o", tmp_path / "a.ply")
+    assert "34 points of 3 pings in" in done.stdout
+    assert "the sonar states no motion" in done.stderr
+    refused = mitsonar("recording", "convert", path, "-o", tmp_path / "b.ply", "--part", 1)
+    assert refused.returncode == 2
+    assert "holds points, and --part applies only to frames" in refused.stderr
