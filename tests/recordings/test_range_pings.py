@@ -112,7 +112,7 @@ def test_a_bag_with_images_has_frames_unless_the_topic_is_named(tmp_path: Path) 
         open_recording(write_bag(tmp_path / "one", maker, sent))
 
 
-def test_the_definition_of_ros_1_is_the_published_one() -> None:
+def test_fields_have_the_published_names_and_order() -> None:
     text = ros1_types().generate_msgdef("marine_acoustic_msgs/msg/SonarRanges")[0]
     assert [line.split()[1] for line in text.split("=" * 80)[0].strip().splitlines() if line.strip()] == [
         *("header", "ping_info", "flags", "transmit_delays", "intensities", "beam_unit_vec", "ranges")
