@@ -21,6 +21,7 @@ from mitsonar.io.runs import refuse_to_replace
 if TYPE_CHECKING:
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.plotting.outlines import Outlines
+    from mitsonar.recordings.range_pings import RangeRecording
     from mitsonar.recordings.recording import Part, Recording
     from mitsonar.records.frames import SonarFrames
 
@@ -121,6 +122,15 @@ def info(
             say_json(summary_of(scan))
         else:
             say("\n".join(summary_lines(summary_of(scan))))
+        return
+    ranges = ranges_at(file, topic)
+    if ranges is not None:
+        of_frames = {"--geometry": geometry, "--handedness": handedness, "--turn-deg": turn_deg}
+        refuse_options(file, of_frames, "holds points")
+        if as_json:
+            say_json(summary_of(ranges))
+        else:
+            say("\n".join(summary_lines(summary_of(ranges))))
         return
     recording = _opened(file, topic, geometry)
     summary = summary_of(recording)
@@ -225,7 +235,11 @@ def convert(
     file: File,
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", help="FOLDER of a run, FILE.mcap or FILE.aris to make; side-scans: .xtf or .npz."),
+        typer.Option(
+            "-o",
+            "--out",
+            help="FOLDER of a run, FILE.mcap or FILE.aris; side-scans: .xtf or .npz; points: .ply, .csv or .mcap.",
+        ),
     ],
     part: PartNumber = None,
     topic: TopicName = None,
@@ -258,7 +272,8 @@ def convert(
 ) -> None:
     """Convert frames to the folder of a run (frames.npz, or frames.zarr above 1,000 frames), to ROS (.mcap) or to .aris.
 
-    Side-scans are converted to .xtf, or to the echogram of `mitsonar sound` (.npz).
+    Side-scans are converted to .xtf, or to the echogram of `mitsonar sound` (.npz); points of SonarRanges and of a Sonar
+    3D-15 to .ply, .csv or .mcap.
     """
     from mitsonar.recordings.first_returns import FirstReturns
     from mitsonar.recordings.pictures import write_frames
@@ -270,6 +285,13 @@ def convert(
         of_frames |= {"--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume}
         refuse_options(file, {**of_frames, "--scan-db": scan_db, "--scan-from": scan_from or None})
         convert_side_scan(scan, out, part=part, overwrite=overwrite)
+        return
+    ranges = ranges_at(file, topic)
+    if ranges is not None:
+        of_frames = {"--geometry": geometry, "--full": full, "--labels": labels, "--beams": beams, "--part": part}
+        of_frames |= {"--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume}
+        refuse_options(file, {**of_frames, "--scan-db": scan_db, "--scan-from": scan_from or None}, "holds points")
+        _convert_ranges(ranges, out, overwrite=overwrite)
         return
     if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
         raise MitsonarError(f"{out}: unknown ending; {suggest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
@@ -304,6 +326,25 @@ def convert(
         else:
             written = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
     say(f"{count_noun(len(chosen), 'frame')} in {written}")
+
+
+def ranges_at(file: str, topic: str | None) -> RangeRecording | None:
+    """Open a recording of a sonar that measures ranges; None if the path is something else."""
+    if "://" in file:
+        return None
+    from mitsonar.recordings.open import open_ranges
+
+    return open_ranges(file, topic)
+
+
+def _convert_ranges(recording: RangeRecording, out: Path, *, overwrite: bool) -> None:
+    """Write the points of all pings."""
+    from mitsonar.recordings.range_pings import write_points
+
+    _say_notes(recording)
+    with progress_bar("converting", len(recording), "pings") as progress:
+        count = write_points(recording, out, overwrite=overwrite, progress=progress)
+    say(f"{count_noun(count, 'point')} of {count_noun(len(recording), 'ping')} in {out}")
 
 
 def _span(text: str, what: str) -> tuple[int, int]:
@@ -347,7 +388,7 @@ def _with_outlines(
     return recording, outlines_of(recording.part(part).read([]), classes_of(classes, without))
 
 
-def _say_notes(recording: Recording) -> None:
+def _say_notes(recording: Recording | RangeRecording) -> None:
     for note in recording.notes:
         warn(note)
 
