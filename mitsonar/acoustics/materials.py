@@ -455,9 +455,9 @@ Law = Literal["lambert", "lommel-seeliger", "rough-fluid", "table"]
 Basis = Literal["measured", "computed", "fitted", "extrapolated", "assumed"]
 """What the level of a material is based on, within its band.
 
-``measured`` there; ``computed`` from density and speed of sound measured there; ``fitted`` to a recording; ``extrapolated``
-from measurements at other frequencies; ``assumed`` by this project. The weakest number counts, but not
-roughness.
+``measured``: its scattering was measured there; ``computed`` by a model from properties that were measured there, such as
+density and speed of sound; ``fitted`` to a recording; ``extrapolated`` from measurements at other frequencies; ``assumed``
+by this project. The weakest number counts, except roughness and law, which most materials assume.
 """
 
 GRAZING_DEG = np.arange(91.0)
@@ -556,8 +556,8 @@ MEGAHERTZ = "-mhz"
 def band_warning(one: Material, frequency_hz: float) -> str | None:
     """Return a one-sentence warning if a frequency lies outside the band of a material, else None.
 
-    It gives the band and what its numbers are based on, and names the material for the frequency where there is one:
-    ``sand-mhz`` for ``sand``.
+    The sentence names the band, what the level is based on, and the material for the frequency if there is one: ``sand-mhz``
+    for ``sand``.
     """
     if _holds(one.band_hz, frequency_hz):
         return None
@@ -568,7 +568,7 @@ def band_warning(one: Material, frequency_hz: float) -> str | None:
     better = next((other for other in others if _holds(material(other).band_hz, frequency_hz)), None)
     basis = f" ({one.basis})" if one.basis else ""
     return f"the numbers of material {one.name}{basis} hold {band}: {frequency_hz / 1000:,.4g} kHz is extrapolated" + (
-        f"; {better} holds there" if better else ""
+        f"; give {better}, which is meant for it" if better else ""
     )
 
 

@@ -226,7 +226,7 @@ def materials(
             say(f"  source: {one.source or 'not stated'}")
         return
     say(f"{'material':10} {'basis':12} {'band (kHz)':12} {'law':12} {'dB at 30 deg':>12}  description")
-    for key, (about, *_) in known.items():
+    for key, (about, *_) in sorted(known.items()):
         one = material(key)
         band = "..".join(f"{end / 1000:g}" for end in one.band_hz)
         strength = 10 * np.log10(sigma_table(one, reference_hz(one))[30])

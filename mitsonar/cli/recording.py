@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mitsonar.plotting.outlines import Outlines
     from mitsonar.recordings.range_pings import RangeRecording
     from mitsonar.recordings.recording import Part, Recording
+    from mitsonar.recordings.side_scan import SideScan
     from mitsonar.records.frames import SonarFrames
 
 __all__ = [
@@ -115,22 +116,17 @@ def info(
     from mitsonar.recordings.handedness import check_handedness
     from mitsonar.recordings.open import summary_lines, summary_of
 
-    scan = side_scan_at(file)
-    if scan is not None:
-        refuse_options(file, {"--topic": topic, "--geometry": geometry, "--handedness": handedness, "--turn-deg": turn_deg})
-        if as_json:
-            say_json(summary_of(scan))
-        else:
-            say("\n".join(summary_lines(summary_of(scan))))
-        return
-    ranges = ranges_at(file, topic)
-    if ranges is not None:
-        of_frames = {"--geometry": geometry, "--handedness": handedness, "--turn-deg": turn_deg}
+    of_frames = {"--geometry": geometry, "--handedness": handedness, "--turn-deg": turn_deg}
+    frameless: SideScan | RangeRecording | None = side_scan_at(file)
+    if frameless is not None:
+        refuse_options(file, {"--topic": topic, **of_frames})
+    elif (frameless := ranges_at(file, topic, geometry)) is not None:
         refuse_options(file, of_frames, "holds points")
+    if frameless is not None:
         if as_json:
-            say_json(summary_of(ranges))
+            say_json(summary_of(frameless))
         else:
-            say("\n".join(summary_lines(summary_of(ranges))))
+            say("\n".join(summary_lines(summary_of(frameless))))
         return
     recording = _opened(file, topic, geometry)
     summary = summary_of(recording)
@@ -279,18 +275,17 @@ def convert(
     from mitsonar.recordings.pictures import write_frames
     from mitsonar.recordings.write_mcap import write_mcap
 
+    of_frames: dict[str, object] = {"--geometry": geometry, "--full": full, "--labels": labels, "--beams": beams}
+    of_frames |= {"--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume}
+    of_frames |= {"--scan-db": scan_db, "--scan-from": scan_from or None}
     scan = side_scan_at(file)
     if scan is not None:
-        of_frames = {"--topic": topic, "--geometry": geometry, "--full": full, "--labels": labels, "--beams": beams}
-        of_frames |= {"--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume}
-        refuse_options(file, {**of_frames, "--scan-db": scan_db, "--scan-from": scan_from or None})
+        refuse_options(file, {"--topic": topic, **of_frames})
         convert_side_scan(scan, out, part=part, overwrite=overwrite)
         return
-    ranges = ranges_at(file, topic)
+    ranges = ranges_at(file, topic, geometry)
     if ranges is not None:
-        of_frames = {"--geometry": geometry, "--full": full, "--labels": labels, "--beams": beams, "--part": part}
-        of_frames |= {"--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume}
-        refuse_options(file, {**of_frames, "--scan-db": scan_db, "--scan-from": scan_from or None}, "holds points")
+        refuse_options(file, {"--part": part, **of_frames}, "holds points")
         _convert_ranges(ranges, out, overwrite=overwrite)
         return
     if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
@@ -328,12 +323,14 @@ def convert(
     say(f"{count_noun(len(chosen), 'frame')} in {written}")
 
 
-def ranges_at(file: str, topic: str | None) -> RangeRecording | None:
-    """Open a recording of a sonar that measures ranges; None if the path is something else."""
+def ranges_at(file: str, topic: str | None, geometry: Path | None) -> RangeRecording | None:
+    """Open a recording of a sonar that measures ranges; None if the path, or with a geometry the bag, is something else."""
     if "://" in file:
         return None
-    from mitsonar.recordings.open import open_ranges
+    from mitsonar.recordings.open import detect_format, open_ranges
 
+    if geometry is not None and detect_format(file) is not None:  # pictures in a bag, which may hold ranges, too
+        return None
     return open_ranges(file, topic)
 
 

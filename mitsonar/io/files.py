@@ -82,13 +82,13 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     Raises:
         MitsonarError: if the folder does not exist.
     """
+    if not path.parent.is_dir():
+        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first")
     part = path.with_name(f".{path.name}.part")
     try:
         with part.open("wb") as file:
             yield file
         part.replace(path)
-    except FileNotFoundError:
-        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first") from None
     finally:
         part.unlink(missing_ok=True)
 

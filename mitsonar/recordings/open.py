@@ -166,7 +166,7 @@ MOST_TRIED, MOST_NAMED = 100, 5
 
 
 def recordings_in(folder: Path) -> str:
-    """Return advice that names the recordings in a folder that is none itself, for messages; empty if it holds none."""
+    """Return advice that names the recordings in a folder, which is none itself; empty if it holds none."""
     try:
         entries = sorted(folder.iterdir())[:MOST_TRIED] if os.path.isdir(folder) else []
     except OSError:

@@ -103,7 +103,7 @@ def write_points(
     """Write all points as PLY, CSV or MCAP, and return their number; the file is complete or absent.
 
     PLY and CSV hold world coordinates if poses are known, else starboard, forward and up of the sonar. MCAP holds a
-    ``PointCloud2`` a ping on ``/sonar/returns``, and the poses on ``/tf``.
+    ``PointCloud2`` a ping on ``/sonar/returns``, and the poses on ``/tf``. Unknown intensities are nan in CSV, else 0.
 
     Raises:
         MitsonarError: another suffix, no points, or a file that exists or cannot be written.
@@ -184,7 +184,7 @@ class _RangeScan(TopicScan):
 
     Attributes:
         points: number of valid ranges of each ping.
-        beams: largest number of beams of a ping.
+        beams: number of beams of each ping.
         delay_s: largest transmit delay of a beam [s].
         nearest: least range [m].
         farthest: largest range [m].
@@ -192,7 +192,7 @@ class _RangeScan(TopicScan):
     """
 
     points: list[int] = field(default_factory=list)
-    beams: int = 0
+    beams: list[int] = field(default_factory=list)
     delay_s: float = 0.0
     nearest: float = np.inf
     farthest: float = 0.0
@@ -212,13 +212,14 @@ class _RangeScan(TopicScan):
         if len(ping.points):
             range_m = np.linalg.norm(ping.points, axis=1)
             self.nearest, self.farthest = min(self.nearest, range_m.min()), max(self.farthest, range_m.max())
-        self.beams = max(self.beams, len(message.ranges))
         delays = np.asarray(message.transmit_delays, dtype=float)
         self.delay_s = max(self.delay_s, float(np.max(delays[np.isfinite(delays)], initial=0.0)))
         self.points.append(len(ping.points))
+        self.beams.append(len(message.ranges))
         return 0
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _ping(message: Message) -> RangePing:
     """Return the valid ranges of a ``SonarRanges`` as points, in the axes forward, left, up of its frame.
 
@@ -244,7 +245,6 @@ def _ping(message: Message) -> RangePing:
     return RangePing(points @ SONAR_AXES_IN_FLU, strength)
 
 
-@np.errstate(over="ignore", invalid="ignore")
 def read_ros_ranges(bag: BagFile, topic: Topic) -> RangeRecording:
     """Open a topic of ``SonarRanges``; points are read on demand.
 
@@ -256,7 +256,7 @@ def read_ros_ranges(bag: BagFile, topic: Topic) -> RangeRecording:
     """
     scan = _RangeScan(bag, topic)
     scan.read()
-    order, notes = in_time_order(scan.frame_times()) if scan.received else (np.zeros(0, np.intp), [])
+    order, notes = in_time_order(scan.frame_times(), what="ping") if scan.received else (np.zeros(0, np.intp), [])
     if not len(order):
         raise MitsonarError(f"{bag.path}: no message of {topic.name} can be read: {scan.reason or 'there is none'}")
     time_s = scan.frame_times()[order]
@@ -271,12 +271,12 @@ def read_ros_ranges(bag: BagFile, topic: Topic) -> RangeRecording:
         for place in places:
             yield pings[int(place)]
 
-    facts: Facts = {"topic": topic.name, "type": short(topic.kind), "frame_id": frame, "beams": scan.beams}
+    facts: Facts = {"topic": topic.name, "type": short(topic.kind), "frame_id": frame, "beams": max(scan.beams)}
     facts |= {"range_m": [float(scan.nearest), float(scan.farthest)]} if scan.farthest else {}
     known = {"frequency_hz": frequency_hz, "sound_speed": sound_speed}
     facts |= {name: value for name, value in known.items() if np.isfinite(value) and value > 0}
     facts |= {"poses": motion.origin} if motion.origin else {}
-    bad = 1 - sum(scan.points) / max(1, len(scan.points) * scan.beams)
+    bad = 1 - sum(scan.points) / max(1, sum(scan.beams))
     if bad > 0:
         notes.append(f"left out: {bad:.1%} of the beams, which are flagged or have no range")
     return RangeRecording(
@@ -284,7 +284,7 @@ def read_ros_ranges(bag: BagFile, topic: Topic) -> RangeRecording:
         f"ROS {1 if bag.is_ros1 else 2} bag, {short(topic.kind)}",
         time_s,
         np.array(scan.points, dtype=np.intp)[order],
-        np.errstate(over="ignore", invalid="ignore")(read),
+        read,
         motion.poses,
         facts,
         (*scan.notes(), *notes, *motion.notes),

@@ -560,7 +560,7 @@ def _first_bins(band: Band, pings: Index, bins: int) -> Levels:
 
 
 def _empty_bins(band: Band, pings: Index) -> int:
-    """Return how many last samples of both sides no ping fills; 0 if there are too few pings to decide."""
+    """Return how many last samples of both sides none of :data:`PROBED_PINGS` pings fills; 0 if too few pings decide."""
     if len(pings) < LEAST_PROBED:
         return 0
     probed = pings[np.unique(np.linspace(0, len(pings) - 1, PROBED_PINGS).astype(int))]

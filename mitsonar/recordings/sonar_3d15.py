@@ -36,15 +36,15 @@ PROTOCOLS = (b"RIP1", b"RIP2")
 LEAST_BYTES, MOST_BYTES = 12, 65_507
 """Size of a packet, which fits into one UDP packet [bytes]."""
 
-MOST_UNPACKED = 2**20
-"""Largest size of a message [bytes]; an image of 256 x 64 takes 49 kB."""
+MOST_UNPACKED, MOST_FIELDS = 2**18, 100
+"""Largest size of a message [bytes], and number of its fields; an image of 256 x 64 pixels takes 49 kB and 10 fields."""
 
 CHECK_FACTOR = 16
 """Bytes whose checksum is wrong may be so many times those of the file, before the search for packets ends."""
 
 RANGE_IMAGE, STRENGTH_IMAGE = "RangeImage", "BitmapImageGreyscale8"
 
-MOST_PIXELS = 2**18
+MOST_PIXELS = 2**16
 
 Fields: TypeAlias = dict[int, list["int | bytes"]]
 """Values of the fields of a message by number: whole numbers, or bytes."""
@@ -72,14 +72,15 @@ def read_range_images(path: Path) -> RangeRecording:
     """Open a ``.sonar`` file; points are read on demand.
 
     Points are those of the pixels with a range. Their intensity is the logarithmic strength 0..1 of the strength image with
-    the same number, if the file has one that fits.
+    the same number, if the file has one that fits. Numbers may begin anew: the nearest image before or behind counts.
 
     Raises:
         MitsonarError: if the file holds no range image that can be read.
     """
     data = mapped(path, "a recording of a Sonar 3D-15", LEAST_BYTES)
-    images: list[tuple[float, int, int, int]] = []  # time, number, points, place
-    strengths: dict[int, int] = {}
+    images: list[list[float]] = []  # time, number, points, place, place of its strengths (-1: none)
+    alone: dict[int, int] = {}  # images without strengths, by number
+    strengths: dict[int, int] = {}  # places of strengths without image, by number
     first: _Image | None = None
     others = damaged = used = 0
     for begin, size in _packets(data):
@@ -88,27 +89,34 @@ def read_range_images(path: Path) -> RangeRecording:
             kind, fields = _message(data, begin)
             if kind == RANGE_IMAGE:
                 image = _range_image(fields)
-                images.append((image.time_s, image.sequence, int((image.pixels > 0).sum()), begin))
+                partner = strengths.pop(image.sequence, -1)
+                if partner < 0:
+                    alone[image.sequence] = len(images)
+                images.append([image.time_s, image.sequence, int((image.pixels > 0).sum()), begin, partner])
                 first = first or image
             elif kind == STRENGTH_IMAGE and not _number(fields, 5):
                 _strengths(fields)
-                strengths[_sequence(fields)] = begin
+                number = _sequence(fields)
+                if number in alone:
+                    images[alone.pop(number)][4] = begin
+                else:
+                    strengths[number] = begin
             else:
                 others += 1
         except ValueError:
             damaged += 1
-    table = np.array(images, dtype=np.float64).reshape(-1, 4)
-    order, notes = in_time_order(table[:, 0], table[:, 1])
+    table = np.array(images, dtype=np.float64).reshape(-1, 5)
+    order, notes = in_time_order(table[:, 0], table[:, 1], "image")
     if first is None or not len(order):
         raise MitsonarError(f"{path} holds no range image that can be read ({damaged:,} damaged packets, {others:,} others)")
-    counts, places = table[order, 2].astype(np.intp), table[order, 3].astype(np.int64)
+    counts, places = table[order, 2].astype(np.intp), table[order, 3:].astype(np.int64)
 
     def read(index: Index) -> Iterator[RangePing]:
-        for place in places[index]:
-            image = _range_image(_message(data, int(place))[1])
+        for place, partner in places[index].tolist():
+            image = _range_image(_message(data, place)[1])
             strength = np.full(image.pixels.shape, np.nan, np.float32)
-            if image.sequence in strengths:
-                stated = _strengths(_message(data, strengths[image.sequence])[1])
+            if partner >= 0:
+                stated = _strengths(_message(data, partner)[1])
                 strength = stated if stated.shape == strength.shape else strength
             yield _points(image, strength)
 
@@ -122,7 +130,7 @@ def read_range_images(path: Path) -> RangeRecording:
     rows, columns = first.pixels.shape
     facts: Facts = {
         "image": f"{columns} x {rows}",
-        "fov_deg": [math.degrees(one) for one in first.fov_rad],
+        "fov_deg": " x ".join(f"{math.degrees(one):.4g}" for one in first.fov_rad),
         "range_max": first.range_max,
         "frequency_hz": first.frequency_hz,
         "sound_speed": first.sound_speed,
@@ -242,11 +250,14 @@ def _fields(content: bytes) -> Fields:
     """Return the fields of a message.
 
     Raises:
-        ValueError: the message is cut off, or has fields of an unknown type.
+        ValueError: the message is cut off, or has fields of an unknown type or too many.
     """
     fields: Fields = {}
-    at = 0
+    at = count = 0
     while at < len(content):
+        count += 1
+        if count > MOST_FIELDS:
+            raise ValueError("too many fields")
         key, at = _varint(content, at)
         number, kind = key >> 3, key & 7
         value: int | bytes

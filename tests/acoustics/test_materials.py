@@ -230,10 +230,10 @@ def test_all_that_the_house_needs_is_there() -> None:
 def test_a_warning_gives_the_band_and_the_material_that_holds(name: str) -> None:
     low, high = material(name), material(f"{name}-mhz")
     assert band_warning(low, 2.1e6) == (
-        f"the numbers of material {name} (measured) hold from 10 kHz to 100 kHz: 2,100 kHz is extrapolated; {name}-mhz "
-        "holds there"
+        f"the numbers of material {name} (computed) hold from 10 kHz to 100 kHz: 2,100 kHz is extrapolated; "
+        f"give {name}-mhz, which is meant for it"
     )
-    assert str(band_warning(high, 50e3)).endswith(f"50 kHz is extrapolated; {name} holds there")
+    assert str(band_warning(high, 50e3)).endswith(f"50 kHz is extrapolated; give {name}, which is meant for it")
     assert [band_warning(high, hz) for hz in (0.1e6, 0.4e6, 1.2e6, 3e6)] == [None] * 4
     assert str(band_warning(high, 4e6)).endswith("4,000 kHz is extrapolated")
     assert str(band_warning(Material(mu=0.1, frequency_max_hz=5e4), 1e5)) == (

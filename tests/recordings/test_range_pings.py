@@ -112,6 +112,26 @@ def test_a_bag_with_images_has_frames_unless_the_topic_is_named(tmp_path: Path) 
         open_recording(write_bag(tmp_path / "one", maker, sent))
 
 
+def test_a_geometry_chooses_the_pictures_of_a_bag(mitsonar: Command, tmp_path: Path) -> None:
+    maker = Maker(False)
+    image = {
+        "height": 20,
+        "width": 16,
+        "encoding": "mono8",
+        "is_bigendian": 0,
+        "step": 16,
+        "data": np.full(320, 9, np.uint8),
+    }
+    picture = maker.make("sensor_msgs/Image", header=maker.header(1.0, "fan"), **image)
+    ranges = maker.ranges(np.ones(31), DIRECTIONS, 1.0)
+    path = write_bag(tmp_path / "a", maker, [("/mb", 1.0, ranges), ("/fan", 1.0, picture)])
+    (tmp_path / "g.yaml").write_text("layout: polar\nazimuth_fov_deg: 60\nrange_min: 1\nrange_max: 5\n")
+    points = mitsonar("recording", "info", path, "--json")
+    assert json.loads(points.stdout)["parts"][0]["points"] == 31
+    frames = mitsonar("recording", "info", path, "--geometry", tmp_path / "g.yaml", "--json")
+    assert json.loads(frames.stdout)["parts"][0]["beams"] == 16
+
+
 def test_fields_have_the_published_names_and_order() -> None:
     text = ros1_types().generate_msgdef("marine_acoustic_msgs/msg/SonarRanges")[0]
     assert [line.split()[1] for line in text.split("=" * 80)[0].strip().splitlines() if line.strip()] == [
@@ -161,7 +181,7 @@ def test_damage_costs_only_its_packet(tmp_path: Path) -> None:
     recording = opened(path)
     assert recording.time_s == pytest.approx(1.7e9 + 0.2 * np.array([0, 2, 4]))
     notes = " ".join(recording.notes)
-    assert "frames are not in order of time" in notes
+    assert "images are not in order of time" in notes
     assert "left out: 1 packet that cannot be decoded" in notes
     assert f"skipped: {len(packets[1]) + 30} bytes" in notes
     with pytest.raises(MitsonarError, match="holds points of each ping in place of frames"):
@@ -173,6 +193,24 @@ def test_damage_costs_only_its_packet(tmp_path: Path) -> None:
     path.write_bytes(packets[1])
     with pytest.raises(MitsonarError, match="holds no range image that can be read"):
         open_ranges(path)
+
+
+def test_strengths_belong_to_the_image_of_their_number_nearby(tmp_path: Path) -> None:
+    """Numbers begin anew after a restart; strengths come before or behind their image."""
+
+    def shaded(number: int, level: int) -> bytes:
+        return rip_packet(rip_payload("BitmapImageGreyscale8", f1=message(f2=number), f6=4, f7=3, f10=bytes([level] * 12)))
+
+    pixels = np.full((3, 4), 1000)
+    later = message(f1=message(f1=1_700_000_009), f2=1)
+    images = [
+        rip_packet(range_image(pixels, 1)),
+        rip_packet(range_image(pixels, 2)),
+        rip_packet(range_image(pixels, 1, f1=later)),
+    ]
+    path = tmp_path / "a.sonar"
+    path.write_bytes(b"".join([images[0], shaded(1, 51), shaded(2, 102), images[1], images[2], shaded(1, 204)]))
+    assert [float(ping.intensity.max()) for ping in opened(path).pings()] == pytest.approx([0.2, 0.4, 0.8])
 
 
 @pytest.mark.parametrize(
