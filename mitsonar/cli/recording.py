@@ -60,7 +60,13 @@ File = Annotated[
 PartNumber = Annotated[int | None, typer.Option("--part", help="Part of the recording (default: the longest).")]
 TopicName = Annotated[str | None, typer.Option("--topic", help="Topic of a ROS bag (default: the only sonar's).")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
-Span = Annotated[float, typer.Option("--span-db", help="Range of levels to show below full scale [dB].")]
+Span = Annotated[float, typer.Option("--span-db", help="Range of levels to show below the top [dB].")]
+WIDEST_DB, DARK_DB = 300.0, 20.0
+"""Largest span of a picture, and distance of the brightest thousandth of a dark frame from the top [dB]."""
+
+Top = Annotated[
+    float, typer.Option("--top-db", max=0, help="Level of the brightest colour [dB re full scale]; of dark frames -30, say.")
+]
 Without = Annotated[
     list[str] | None, typer.Option("--without", help="Name of a shape without boxes or outlines, such as the ground.")
 ]
@@ -155,6 +161,7 @@ def show(
     topic: TopicName = None,
     geometry: Geometry = None,
     span_db: Span = 60.0,
+    top_db: Top = 0.0,
     ground_range: Annotated[
         bool, typer.Option("--ground-range", help="Side-scans: over ground range, without the water column.")
     ] = False,
@@ -172,9 +179,11 @@ def show(
     """Draw one frame as a fan, or all pings of a side-scan as a waterfall, with axes in metres and a colour bar in dB."""
     from mitsonar.plotting.fans import save_fan, to_decibels
 
+    if out.suffix.lower() != ".png":
+        raise MitsonarError(f"{out}: pictures are written as .png: give this ending")
     scan = side_scan_at(file)
     if scan is not None:
-        of_frames = {"--labels": labels, "--without": without, "--classes": classes}
+        of_frames = {"--labels": labels, "--without": without, "--classes": classes, "--top-db": top_db}
         refuse_options(file, {"--frame": frame, "--topic": topic, "--geometry": geometry, **of_frames})
         show_side_scan(
             scan,
@@ -191,8 +200,16 @@ def show(
         raise MitsonarError(f"--ground-range and heights apply only to side-scans: got {file}; leave them out")
     refuse_to_replace(out, overwrite=overwrite)
     recording, outlines = _with_outlines(file, topic, geometry, part, labels=labels, without=without, classes=classes)
-    frames = to_decibels(recording.part(part).read([frame]), span_db)
-    save_fan(out, frames, title=f"{Path(file).name}, frame {frame}", outlines=outlines)
+    read = recording.part(part).read([frame])
+    frames = to_decibels(read, span_db, top_db)
+    save_fan(out, frames, title=f"{Path(file).name}, frame {frame}", outlines=outlines, top_db=top_db)
+    brightest_db = WIDEST_DB * (float(np.percentile(to_decibels(read, WIDEST_DB).image, 99.9)) - 1)
+    if -WIDEST_DB < brightest_db < top_db - DARK_DB:
+        suggested = 10 * math.ceil(brightest_db / 10)
+        warn(
+            f"the picture is dark: the brightest thousandth lies at {brightest_db:.0f} dB re full scale; "
+            f"give --top-db {suggested}"
+        )
     say(f"picture: {out}")
 
 
@@ -204,6 +221,7 @@ def video(
     topic: TopicName = None,
     geometry: Geometry = None,
     span_db: Span = 60.0,
+    top_db: Top = 0.0,
     rate: Annotated[float | None, typer.Option(help="Frames per second (default: the recording's).")] = None,
     labels: Labels = False,
     without: Without = None,
@@ -222,7 +240,7 @@ def video(
         raise MitsonarError(f"--rate must lie in 0..1000 a second: got {rate:g}")
     with progress_bar("drawing", len(chosen), "frames") as progress:
         speed = rate or min(1000.0, frame_rate_hz)
-        words = {"span_db": span_db, "outlines": outlines, "overwrite": overwrite}
+        words = {"span_db": span_db, "top_db": top_db, "outlines": outlines, "overwrite": overwrite}
         count = write_fan_video(chosen.chunks(), out, speed, **words, progress=progress)  # type: ignore[arg-type]
     say(f"{count_noun(count, 'frame')} at {speed:.4g} a second in {out}")
 
@@ -449,10 +467,16 @@ def fit(
     Give frames of a resting or slow sonar whose darkest parts, shadows or black water, are noise. For a resting sonar,
     speckle that differs in every frame counts as volume scattering.
     """
+    from mitsonar.mapping.sources import is_recording
+    from mitsonar.recordings.open import frameless_words
     from mitsonar.records.frames import SonarFrames
 
     refuse_to_replace(out, overwrite=overwrite)
     known = _known_fields(sonar, changes)
+    if is_recording(frames):
+        raise MitsonarError(f"{frames} is a recording: give `{command_line('sonar', 'from-recording', frames, '-o', out)}`")
+    if words := frameless_words(frames):
+        raise MitsonarError(words)
     _fit_and_write(SonarFrames.load(frames), known, out, measure_coding=measure_coding)
 
 
@@ -534,6 +558,7 @@ def calibrate(
     source = open_frames(file, sequence=part, view=topic, geometry=geometry)
     which = np.unique(np.linspace(0, len(source) - 1, min(frames, len(source))).astype(int))
     chosen, notes = as_instrument(source.read([int(k) for k in which]))
+    _check_carrier(chosen, known)
     result = calibrate_sonar(
         chosen, known.sonar, height_m=height, pitch_deg=pitch, roll_deg=roll, beam_gains=beam_gains, **known.fields
     )
@@ -559,6 +584,20 @@ def _known_fields(sonar: str | None, changes: list[str] | None) -> _KnownFields:
     return _KnownFields(None if sonar is None else load_sonar(sonar), dict(changes_of(changes or [], None)))
 
 
+def _check_carrier(frames: SonarFrames, known: _KnownFields) -> None:
+    """Reject frames without a carrier, which the model coherent needs, if the user gives none.
+
+    Raises:
+        MitsonarError: no carrier in the frames, the sonar or the fields.
+    """
+    stated = (frames.sonar if known.sonar is None else known.sonar).frequency_hz
+    if stated is None and "frequency_hz" not in known.fields:
+        raise MitsonarError(
+            "neither the frames nor a preset state the carrier: give --set frequency_hz=1.8e6, for example, or "
+            "--sonar PRESET"
+        )
+
+
 def _fit_and_write(
     frames: SonarFrames,
     known: _KnownFields,
@@ -571,6 +610,7 @@ def _fit_and_write(
     """Fit a sonar to frames, write it to OUT, or its noise to another file, and print the result."""
     from mitsonar.estimation.sonar_fit import NOISE_FIELDS, fit_sonar
 
+    _check_carrier(frames, known)
     fitted = fit_sonar(frames, known.sonar, measure_coding=measure_coding, **known.fields)
     if noise is None:
         write_atomic(out, fitted.yaml().encode())

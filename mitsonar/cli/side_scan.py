@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from mitsonar.cli.console import progress_bar, say, warn
-from mitsonar.errors import MitsonarError, count_noun, suggest_names
+from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
@@ -116,9 +116,7 @@ def convert_side_scan(recording: SideScan, out: Path, *, part: int | None, overw
     from mitsonar.recordings.write_xtf import write_xtf
 
     if out.suffix not in (".xtf", ".npz"):
-        raise MitsonarError(
-            f"{out}: a side-scan is converted to .xtf or .npz; {suggest_names(out.suffix or out.name, ['.xtf', '.npz'])}"
-        )
+        raise MitsonarError(f"{out}: a side-scan is converted to .xtf or .npz: give one of these endings")
     refuse_to_replace(out, overwrite=overwrite)
     _say_notes(recording)
     if len(recording.parts) > 1:
@@ -164,9 +162,13 @@ def lay_side_scan(recording: SideScan, request: MosaicRequest) -> None:
     from mitsonar.mapping.mosaic import MosaicOptions, save_geotiff
     from mitsonar.mapping.side_scan_mosaic import CELL_M, build_side_scan_mosaic
     from mitsonar.motion.trajectory import Trajectory
+    from mitsonar.recordings.side_scan import OF_COURSE, heading_note
 
-    _say_notes(recording)
     echogram = _with_poses(recording.part(request.part).read(), request)
+    if request.declination:  # the course is compared with the headings that are used
+        others = [note for note in recording.notes if not note.startswith(OF_COURSE)]
+        recording = replace(recording, notes=(*others, *heading_note(echogram.time_s, echogram.poses)))
+    _say_notes(recording)
     height_m = _heights(echogram, request.height, stored=request.stored_height)
     if request.height is None and not request.stored_height:
         _say_height(echogram, height_m)

@@ -65,14 +65,15 @@ FileArray: TypeAlias = NDArray[Any]
 
 
 def write_atomic(path: str | Path, content: bytes) -> None:
-    """Write a file atomically, by renaming a temporary file: a reader finds either the old or the complete new file."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.part")
-    with temporary.open("wb") as file:
+    """Write a file atomically, by renaming a temporary file: a reader finds either the old or the complete new file.
+
+    Raises:
+        MitsonarError: if the folder does not exist.
+    """
+    with whole_file(Path(path)) as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 @contextmanager

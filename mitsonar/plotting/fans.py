@@ -34,7 +34,9 @@ FIGURE_ROWS = 800
 """Rows of the fan in a figure [px]."""
 
 
-def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "", outlines: Outlines | None = None) -> Figure:
+def fan_figure(
+    frames: SonarFrames, index: int = 0, *, title: str = "", outlines: Outlines | None = None, top_db: float = 0.0
+) -> Figure:
     """Draw one frame as a fan with axes in metres: forward up, starboard to the right.
 
     Args:
@@ -42,6 +44,7 @@ def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "", outlines
         index: index of the frame.
         title: title of the figure.
         outlines: labelled regions to outline, with a legend.
+        top_db: level of the brightest colour [dB re full scale], as given to :func:`to_decibels`.
     """
     from matplotlib.colors import Normalize, PowerNorm
     from matplotlib.figure import Figure
@@ -55,10 +58,10 @@ def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "", outlines
     values = fan.image / (255 if frames.image.dtype == np.uint8 else 1)
     if frames.level == "dB":
         low, high = frames.decibels_of(0.0), frames.decibels_of(1.0)
-        values, norm = low + values * (high - low), Normalize(low, high)
         label = "level (dB re 1 uPa)" if frames.sonar.source_level_db else "level (dB re the source at 1 m)"
         label = "level (dB re full scale)" if (low, high) == (-frames.sonar.coding_db, 0.0) else label
         label += " with gain" if frames.sonar.gain_exponent or frames.sonar.gain_absorption else ""
+        values, norm = low + top_db + values * (high - low), Normalize(low + top_db, high + top_db)
     else:
         norm, label = PowerNorm(GAMMA, vmin=0, vmax=1), f"level (1 = full scale; shown with gamma {GAMMA:g})"
     shown = axes.imshow(values, extent=fan.extent, cmap="copper", norm=norm, interpolation="nearest")
@@ -74,15 +77,17 @@ def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "", outlines
 
 
 def save_fan(
-    path: str | Path, frames: SonarFrames, index: int = 0, *, title: str = "", outlines: Outlines | None = None
+    path: str | Path,
+    frames: SonarFrames,
+    index: int = 0,
+    *,
+    title: str = "",
+    outlines: Outlines | None = None,
+    top_db: float = 0.0,
 ) -> None:
     """Write :func:`fan_figure` as a PNG file, completely or not at all."""
-    import io
-
-    from mitsonar.io.files import write_atomic
-
     buffer = io.BytesIO()
-    fan_figure(frames, index, title=title, outlines=outlines).savefig(buffer, format="png", dpi=110)
+    fan_figure(frames, index, title=title, outlines=outlines, top_db=top_db).savefig(buffer, format="png", dpi=110)
     write_atomic(path, buffer.getvalue())
 
 
@@ -167,6 +172,7 @@ def write_fan_video(
     rate_hz: float,
     *,
     span_db: float = 60.0,
+    top_db: float = 0.0,
     rows: int = 720,
     outlines: Outlines | None = None,
     overwrite: bool = False,
@@ -180,7 +186,8 @@ def write_fan_video(
         chunks: frames, in chunks of any size.
         path: video file, ``.mp4`` or ``.avi``.
         rate_hz: frames per second of the video [Hz].
-        span_db: range of levels shown, downwards from full scale [dB].
+        span_db: range of levels shown, downwards from the top [dB].
+        top_db: level of the brightest colour [dB re full scale].
         rows: height of the picture [px], without a legend.
         outlines: labelled regions to outline, with a legend below the picture.
         overwrite: whether to replace an existing file.
@@ -200,7 +207,7 @@ def write_fan_video(
         raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first")
     temporary = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
-        count = _write(chunks, temporary, rate_hz, span_db, rows, outlines, progress or (lambda done: None))
+        count = _write(chunks, temporary, rate_hz, (span_db, top_db), rows, outlines, progress or (lambda done: None))
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -211,7 +218,7 @@ def _write(
     chunks: Iterable[SonarFrames],
     path: Path,
     rate_hz: float,
-    span_db: float,
+    levels_db: tuple[float, float],
     rows: int,
     outlines: Outlines | None,
     progress: Callable[[int], None],
@@ -229,7 +236,7 @@ def _write(
         for frames in chunks:
             if fan is None:
                 fan = cartesian_map(frames.range_m, frames.bearing_rad, rows=2 * (rows // 2))
-            decibel_images = to_decibels(frames, span_db).image
+            decibel_images = to_decibels(frames, *levels_db).image
             times = np.atleast_2d(frames.time_s.T).T.mean(axis=1)
             for index, (image, time) in enumerate(zip(decibel_images, times, strict=True)):
                 values = np.asarray(fan.apply(np.asarray(image, np.float32)))
@@ -275,10 +282,10 @@ def _even(picture: Picture) -> Picture:
 # ---------------- Decibel coding
 
 
-def to_decibels(frames: SonarFrames, span_db: float) -> SonarFrames:
-    """Convert frames of any coding to decibels: values 0..1, float32, span the ``span_db`` decibels below full scale.
+def to_decibels(frames: SonarFrames, span_db: float, top_db: float = 0.0) -> SonarFrames:
+    """Convert frames of any coding to decibels: values 0..1, float32, span the ``span_db`` decibels below the top.
 
-    Lower levels become 0.
+    Lower levels become 0, higher ones 1. The top is ``top_db`` re full scale.
 
     Raises:
         MitsonarError: the span is not in 0..300 dB.
@@ -287,10 +294,10 @@ def to_decibels(frames: SonarFrames, span_db: float) -> SonarFrames:
         raise MitsonarError(f"the span must lie in 0..300 dB: got {span_db:g}")
     values = to_float32(frames.image)
     if frames.level == "dB":
-        coded = 1 + (values - 1) * np.float32(frames.sonar.coding_db / span_db)
+        coded = 1 + (values - 1) * np.float32(frames.sonar.coding_db / span_db) - np.float32(top_db / span_db)
         coded[values <= 0] = 0
     else:
         with np.errstate(divide="ignore"):
-            coded = 1 + 10 * np.log10(decoded(np.clip(values, 0, 1), frames.sonar, frames.level)) / span_db
+            coded = 1 + (10 * np.log10(decoded(np.clip(values, 0, 1), frames.sonar, frames.level)) - top_db) / span_db
     sonar = frames.sonar.replace(coding="dB", coding_db=span_db)
     return replace(frames, image=np.clip(coded, 0, 1).astype(np.float32), level="dB", sonar=sonar)

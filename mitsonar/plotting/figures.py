@@ -192,17 +192,21 @@ def path_figure(
     over_time = [figure.add_subplot(grid[0, 1])]
     over_time += [figure.add_subplot(grid[row, 1], sharex=over_time[0]) for row in range(1, len(AXES) + 1)]
     _draw_paths(above, paths)
+    start_s = min(float(path.time_s[0]) for path in paths.values())
+    start_s = start_s if start_s > CLOCK_FROM_S else 0.0
     for name, line, _ in _path_colours(paths):
         path = paths[name]
+        time_s = path.time_s - start_s
         if name in pose_bands:
             _draw_ellipses(above, path.poses[:, :2], pose_bands[name][:, :2, :2], line)
         heading = np.degrees(np.unwrap(path.poses[:, 5]))
-        _plot_with_band(over_time[0], path.time_s, heading, _std(pose_bands.get(name), 2, math.degrees(1)), line)
+        _plot_with_band(over_time[0], time_s, heading, _std(pose_bands.get(name), 2, math.degrees(1)), line)
         path_motions = motions(path.poses)
         for axis, (_, _, scale) in enumerate(AXES):
             band = _std(motion_bands.get(name), axis, scale)
-            _plot_with_band(over_time[1 + axis], path.time_s[1:], path_motions[:, axis] * scale, band, line)
+            _plot_with_band(over_time[1 + axis], time_s[1:], path_motions[:, axis] * scale, band, line)
     _label_path(above, over_time, title)
+    over_time[-1].set_xlabel("time since the first frame (s)" if start_s else "time (s)")
     return figure
 
 
@@ -297,6 +301,10 @@ def _path_colours(paths: Mapping[str, Trajectory]) -> Iterator[tuple[str, str, s
             others += 1
 
 
+CLOCK_FROM_S = 1e6
+"""Paths that begin later have times of a clock, such as seconds since 1970, and are drawn from their first frame [s]."""
+
+
 def _label_path(above: Axes, over_time: list[Axes], title: str) -> None:
     """Set labels, legend and grids of :func:`path_figure`."""
     above.set(xlabel="x, east (m)", ylabel="y, north (m)", title=title, aspect="equal")
@@ -305,7 +313,6 @@ def _label_path(above: Axes, over_time: list[Axes], title: str) -> None:
     over_time[0].set_ylabel("heading (deg)")
     for axes, (name, unit, _) in zip(over_time[1:], AXES, strict=True):
         axes.set_ylabel(f"{name} ({unit})")
-    over_time[-1].set_xlabel("time (s)")
     for axes in (above, *over_time):
         axes.grid(alpha=0.3)
 
@@ -371,7 +378,7 @@ def _plot_with_band(
     axes: Axes, time: NDArray[np.float64], value: NDArray[np.float64], std: NDArray[np.float64] | None, colour: str
 ) -> None:
     """Draw a line with a band of two standard deviations."""
-    axes.plot(time, value, color=colour, linewidth=1.0)
+    axes.plot(time, value, color=colour, linewidth=1.0, marker="o" if len(time) == 1 else "", markersize=3)
     if std is not None:
         axes.fill_between(time, value - BAND_STD * std, value + BAND_STD * std, color=colour, alpha=0.2, linewidth=0)
 

@@ -210,8 +210,8 @@ def frameless_words(path: str | Path) -> str:
     """Return the message for a side-scan, or a recording of ranges, where frames are needed; empty for anything else."""
     if detect_side_scan(path) is not None:
         return (
-            f"{path} is a side-scan, which has pings in place of frames: `mitsonar recording` and `mitsonar mosaic` take it,"
-            " and mitsonar.open_side_scan in Python"
+            f"{path} is a side-scan, which has pings in place of frames: `mitsonar recording info`, `show` and `convert` "
+            "and `mitsonar mosaic` take it, and mitsonar.open_side_scan in Python"
         )
     if is_range_images(Path(path), _first_bytes(Path(path)) or b""):
         return (

@@ -293,7 +293,7 @@ def _pings_of_log(data: Bytes) -> tuple[Header, list[str]]:
             else:
                 *values, place, count = ping
                 pings.append((*values, start + place, count, _seconds(match.group().replace(b"\0", b""))))
-    notes = [f"left out: {count_noun(lost, 'message')} that are cut off or damaged"] if lost else []
+    notes = [f"left out: {count_noun(lost, 'cut off or damaged message')}"] if lost else []
     return np.array(pings, PING) if records else np.zeros(0, PING), notes
 
 
@@ -368,7 +368,7 @@ def _pings_of_text(data: Bytes) -> tuple[Header, list[str]]:
         else:
             pings.append((*ping, time_s))
         time_s = math.nan  # a time belongs to one message
-    notes = [f"left out: {count_noun(lost, 'message')} that are cut off or damaged"] if lost else []
+    notes = [f"left out: {count_noun(lost, 'cut off or damaged message')}"] if lost else []
     return np.array(pings, PING), notes
 
 

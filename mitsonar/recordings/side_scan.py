@@ -27,6 +27,7 @@ from mitsonar.recordings.recording import Bytes, Facts
 from mitsonar.records.soundings import Echogram
 
 __all__ = [
+    "OF_COURSE",
     "Band",
     "Index",
     "Levels",
@@ -35,6 +36,7 @@ __all__ = [
     "SideScan",
     "SideScanPart",
     "amplitudes_of",
+    "heading_note",
     "holds_echogram",
     "in_hertz",
     "marked_packets",
@@ -358,7 +360,7 @@ def place_pings(pings: PingHeaders) -> Placed:
     else:
         if origin is not None and len(rows):
             heading = heading - origin.convergence_rad(origin.to_degrees(xy[:1]))[0]
-        notes += _heading_note(time_s, xy, heading)
+        notes += heading_note(time_s, np.column_stack([xy, np.zeros((len(xy), 3)), heading]))
     pitch, roll, depth = (
         np.zeros(len(rows)) if (values := _filled(stated[rows])) is None else values
         for stated in (-np.radians(pings.pitch_deg), np.radians(pings.roll_deg), pings.depth_m)
@@ -460,8 +462,13 @@ def _course(time_s: Array, xy: Array) -> Array:
     return np.unwrap(np.arctan2(east[last], north[last]))
 
 
-def _heading_note(time_s: Array, xy: Array, heading: Array) -> list[str]:
-    """Return a sentence if headings differ much from the course of the track."""
+OF_COURSE = "the track lies "
+"""Begin of the sentence of :func:`heading_note`."""
+
+
+def heading_note(time_s: Array, poses: Array) -> list[str]:
+    """Return a sentence if the headings of poses ``(pings, 6)`` differ much from the course of the track."""
+    xy, heading = poses[:, :2], poses[:, 5]
     if len(xy) < 2 or np.linalg.norm(np.ptp(xy, axis=0)) < LEAST_COURSE_M:
         return []
     difference = np.angle(np.exp(1j * (_course(time_s, xy) - heading)))
@@ -469,7 +476,7 @@ def _heading_note(time_s: Array, xy: Array, heading: Array) -> list[str]:
     if abs(middle) < UNUSUAL_DRIFT_DEG:
         return []
     return [
-        f"the track lies {middle:+.0f} deg from the headings in the mean: they may be magnetic (mosaic --declination), or a "
+        f"{OF_COURSE}{middle:+.0f} deg from the headings in the mean: they may be magnetic (mosaic --declination), or a "
         "current sets the vehicle"
     ]
 

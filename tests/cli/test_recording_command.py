@@ -150,6 +150,27 @@ def test_odometry_reads_what_was_converted(mitsonar: Command, places: dict[str, 
     assert (tmp_path / "out/true.tum").exists()
 
 
+def test_a_dark_frame_is_noted_and_drawn_below_another_top(mitsonar: Command, frames: SonarFrames, tmp_path: Path) -> None:
+    replace(frames, image=(frames.image * 1e-5).astype(np.float32)).save(tmp_path / "dark.npz")
+    done = mitsonar("recording", "show", tmp_path / "dark.npz", "-o", tmp_path / "a.png")
+    assert "the picture is dark: the brightest thousandth lies at -5" in done.stderr
+    assert "give --top-db -50" in done.stderr
+    done = mitsonar("recording", "show", tmp_path / "dark.npz", "-o", tmp_path / "b.png", "--top-db", -50)
+    assert not done.stderr
+    dark, light = (np.asarray(Image.open(tmp_path / name).convert("L"))[100:500, 100:400] for name in ("a.png", "b.png"))
+    assert light.mean() > dark.mean() + 20
+
+
+def test_fits_name_the_command_for_recordings_and_the_missing_carrier(
+    mitsonar: Command, places: dict[str, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "sonar.yaml"
+    refused(mitsonar("sonar", "fit", places["mcap"], "-o", out), "is a recording: give `mitsonar sonar from-recording")
+    for words in (("from-recording",), ("calibrate",)):
+        refused(mitsonar("sonar", *words, places["mcap"], "-o", out), "state the carrier: give --set frequency_hz=1.8e6")
+    assert not out.exists()
+
+
 def test_a_topic_is_chosen(mitsonar: Command, tmp_path: Path) -> None:
     maker, sent = Maker(True), []
     bearing, distance = np.radians(np.linspace(-20, 20, 8)), np.arange(1, 13, dtype=np.float64)
@@ -175,6 +196,8 @@ def test_a_topic_is_chosen(mitsonar: Command, tmp_path: Path) -> None:
         (["convert", "FRAMES", "-o", "a", "--full"], "--full and --labels apply only to MCAP files"),
         (["video", "FRAMES", "-o", "a.mp4", "--rate", "0"], "--rate must lie"),
         (["show", "FRAMES", "-o", "a.png", "--span-db", "-1"], "the span must lie"),
+        (["show", "FRAMES", "-o", "a.jpg"], "a.jpg: pictures are written as .png"),
+        (["show", "FRAMES", "-o", "none/a.png"], "there is no folder none; create it first"),
     ],
 )
 def test_mistakes_are_one_sentence(

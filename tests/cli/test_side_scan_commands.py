@@ -114,6 +114,16 @@ def test_a_map_along_another_path_with_another_heading(mitsonar: Command, echogr
     assert ties[0] - ties[1] == pytest.approx(100, abs=0.2)
 
 
+def test_a_declination_is_taken_into_account_by_the_note_on_headings(mitsonar: Command, tmp_path: Path) -> None:
+    written = drawn(line(100, heading=0.3), rng=np.random.default_rng(0), origin=ORIGIN)
+    written.poses[:, 5] += 0.3  # headings of a compass
+    write_xtf(tmp_path / "line.xtf", written)
+    words = ("mosaic", tmp_path / "line.xtf", "true", "--height", 6, "-o")
+    assert "the track lies -17 deg from the headings" in mitsonar(*words, tmp_path / "a.tif").stderr
+    assert "the track lies" not in mitsonar(*words, tmp_path / "b.tif", "--declination", -np.degrees(0.3)).stderr
+    assert "the track lies -34 deg" in mitsonar(*words, tmp_path / "c.tif", "--declination", np.degrees(0.3)).stderr
+
+
 @pytest.mark.thorough
 def test_figures_of_a_map(mitsonar: Command, file: Path, tmp_path: Path) -> None:
     done = mitsonar("mosaic", file, "true", "-o", tmp_path / "map.png", "--cell-mm", 200)

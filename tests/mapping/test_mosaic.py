@@ -562,6 +562,16 @@ def test_path_figures_show_motions_along_the_new_heading() -> None:
         np.testing.assert_allclose(values, expected, atol=1e-9)
 
 
+def test_times_of_a_clock_are_drawn_from_the_first_frame() -> None:
+    """Two frames make one motion, which is drawn as a point."""
+    path = Trajectory(np.array([looking(0), looking(0, y=1.0)]), 1_371_198_079.25 + np.array([0.0, 0.5]))
+    figure = path_figure({"true": path})
+    assert figure.axes[-1].get_xlabel() == "time since the first frame (s)"
+    heading, *motions = (axes.lines[0] for axes in figure.axes[1:])
+    assert np.asarray(heading.get_xdata()).tolist() == [0, 0.5]
+    assert [(np.asarray(one.get_xdata()).tolist(), one.get_marker()) for one in motions] == [([0.5], "o")] * 3
+
+
 def test_bands_are_two_standard_deviations() -> None:
     path = Trajectory.between(looking(0), looking(0, y=1.0), 11, 10)
     covariance = np.tile(np.diag([1e-6, 4e-6, 9e-6]), (10, 1, 1))

@@ -67,6 +67,8 @@ def test_values_of_each_coding_become_decibels(level: str, value: float, decibel
     assert (shown.level, shown.sonar.coding_db) == ("dB", 60)
     assert shown.image == pytest.approx(0 if decibels is None else 1 + decibels / 60, abs=1e-6)
     assert to_decibels(replace(frames, image=np.zeros_like(frames.image)), 60).image.max() == 0
+    below_top = to_decibels(frames, 60, -30).image
+    assert below_top == pytest.approx(0 if decibels is None else min(1, 1 + (decibels + 30) / 60), abs=1e-6)
 
 
 def test_a_span_that_cannot_be_is_refused() -> None:
