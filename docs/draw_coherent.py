@@ -39,7 +39,7 @@ class Shown:
 
 SHOWN = (
     Shown("sunken_ship", {}, {"source_level_db": 210.0, "noise_level_db": 66.0, "gain_exponent": 3}),
-    Shown("objects", {"x": "0", "floor_material": "materials/sand_bed.yaml"}, {}),
+    Shown("objects", {"x": "0", "floor_material": "sand-mhz"}, {}),
 )
 
 

@@ -34,7 +34,7 @@ class Shown:
     pose: Pose | None = None
 
 
-SAND = {"floor_material": "materials/sand_bed.yaml"}
+SAND = {"floor_material": "sand-mhz"}
 
 SHOWN = {
     "objects": Shown(SAND),

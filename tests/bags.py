@@ -159,6 +159,23 @@ class Maker:
             **fields | changed,
         )
 
+    def ranges(
+        self, range_m: Any, directions: Any, time_s: float, *, package: str = "marine_acoustic_msgs", **changed: Any
+    ) -> RosObject:
+        """A ``SonarRanges``, with directions ``(beams, 3)`` in the axes of its frame."""
+        beams = len(range_m)
+        flags = changed.pop("flags", np.zeros(beams, int))
+        floats = {"ranges": range_m, "intensities": np.arange(beams), "transmit_delays": np.zeros(beams)} | changed
+        info = {"frequency": 4e5, "sound_speed": 1490.0, "tx_beamwidths": np.zeros(0, np.float32)}
+        return self.make(
+            f"{package}/SonarRanges",
+            header=self.header(time_s, "multibeam"),
+            ping_info=self.make(f"{package}/PingInfo", rx_beamwidths=np.zeros(0, np.float32), **info),
+            flags=[self.make(f"{package}/DetectionFlag", flag=int(one)) for one in flags],
+            beam_unit_vec=[self.vector(one) for one in directions],
+            **{name: np.asarray(one, np.float32) for name, one in floats.items()},
+        )
+
     def pose(self, place: Any, quaternion: Any) -> RosObject:
         return self.make(
             "geometry_msgs/Pose",

@@ -461,10 +461,18 @@ def read_foreign(path: Path) -> None:
 def read_recording(path: Path) -> None:
     """Read all frames of a recording, and check that they can be."""
     from mitsonar import open_recording
-    from mitsonar.recordings.open import detect_side_scan
+    from mitsonar.recordings.open import detect_side_scan, open_ranges
 
     if detect_side_scan(path) is not None:
         read_side_scan(path)
+        return
+    ranges = open_ranges(path)
+    if ranges is not None:
+        assert (np.diff(ranges.time_s) > 0).all()
+        for count, ping in zip(ranges.points, ranges.pings(), strict=True):
+            assert ping.points.shape == (count, 3)
+            assert np.isfinite(ping.points).all()
+            assert not np.isinf(ping.intensity).any()
         return
     recording = open_recording(path)
     assert all("\n" not in note for note in recording.notes)

@@ -8,6 +8,8 @@ The simulator's reflectivity C is Lambert's mu itself, not pi mu. A surface with
 5 dB more than is physically possible. The mu of a material is physical: ``pi mu`` is at most 1. To use C as the share of the
 power that is scattered, set mu to C / pi.
 
+Its ``basis`` states whether its level was measured in its band, computed, fitted, extrapolated or assumed (:data:`Basis`).
+
 Each named material is a YAML file in ``materials/`` that cites a source for every number. In a source, ``(not seen)`` marks
 a number that is widely quoted from a document that could not be consulted, ``second hand`` a number that a third party
 quotes from the named document, and ``ours`` a choice or calculation of this project.
@@ -43,6 +45,7 @@ __all__ = [
     "GRAZING_DEG",
     "LAWS",
     "SEDIMENTS",
+    "Basis",
     "Law",
     "Material",
     "MuTable",
@@ -449,6 +452,14 @@ def _sine_below(sediment: Sediment, cosine: Angles) -> NDArray[np.complex128]:
 
 Law = Literal["lambert", "lommel-seeliger", "rough-fluid", "table"]
 
+Basis = Literal["measured", "computed", "fitted", "extrapolated", "assumed"]
+"""What the level of a material is based on, within its band.
+
+``measured``: its scattering was measured there; ``computed`` by a model from properties that were measured there, such as
+density and speed of sound; ``fitted`` to a recording; ``extrapolated`` from measurements at other frequencies; ``assumed``
+by this project. The weakest number counts, except roughness and law, which most materials assume.
+"""
+
 GRAZING_DEG = np.arange(91.0)
 """Grazing angles of every table [deg]."""
 
@@ -477,6 +488,7 @@ class Material(CheckedModel):
     name: str = Field("custom", max_length=200, description="name of the material")
     about: str = Field("", max_length=2000, description="description of the material")
     source: str = Field("", max_length=20_000, description="where its numbers come from")
+    basis: Basis | None = Field(None, description="measured, computed, fitted, extrapolated or assumed within its band")
     law: Law = Field("lambert", description="lambert, lommel-seeliger, rough-fluid or table")
     mu: float | None = Field(None, gt=0, le=1 / math.pi, description="cross-section at normal incidence [1/sr]")
     reflection: float | None = Field(
@@ -537,13 +549,31 @@ class Material(CheckedModel):
         return self.reflection is not None
 
 
-def band_warning(material: Material, frequency_hz: float) -> str | None:
-    """Return a one-sentence warning if a frequency lies outside the band of a material, else None."""
-    low, high = material.band_hz
-    if low <= frequency_hz <= high:
+MEGAHERTZ = "-mhz"
+"""End of the names of materials for sonars that make images, where those for lower frequencies do not hold."""
+
+
+def band_warning(one: Material, frequency_hz: float) -> str | None:
+    """Return a one-sentence warning if a frequency lies outside the band of a material, else None.
+
+    The sentence names the band, what the level is based on, and the material for the frequency if there is one: ``sand-mhz``
+    for ``sand``.
+    """
+    if _holds(one.band_hz, frequency_hz):
         return None
-    end = f"from {low / 1000:,.4g} kHz" if frequency_hz < low else f"to {high / 1000:,.4g} kHz"
-    return f"the numbers of material {material.name} hold {end}: {frequency_hz / 1000:,.4g} kHz is extrapolated"
+    low, high = one.band_hz
+    band = " ".join(f"{word} {end / 1000:,.4g} kHz" for word, end in (("from", low), ("to", high)) if 0 < end < math.inf)
+    family = one.name.removesuffix(MEGAHERTZ)
+    others = [other for other in (family, family + MEGAHERTZ) if other != one.name and other in named_materials()]
+    better = next((other for other in others if _holds(material(other).band_hz, frequency_hz)), None)
+    basis = f" ({one.basis})" if one.basis else ""
+    return f"the numbers of material {one.name}{basis} hold {band}: {frequency_hz / 1000:,.4g} kHz is extrapolated" + (
+        f"; give {better}, which is meant for it" if better else ""
+    )
+
+
+def _holds(band_hz: tuple[float, float], frequency_hz: float) -> bool:
+    return band_hz[0] <= frequency_hz <= band_hz[1]
 
 
 @lru_cache(maxsize=256)

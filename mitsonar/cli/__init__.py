@@ -45,6 +45,7 @@ def application() -> typer.Typer:
     app.command()(render.sound)
     app.command()(sas.sas)
     app.command()(doctor.presets)
+    app.command()(doctor.materials)
     app.command()(doctor.scenes)
     app.command()(doctor.doctor)
     app.command()(estimate.compare)

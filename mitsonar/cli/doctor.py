@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.io.checked_model import Preset
 
-__all__ = ["doctor", "presets", "scenes"]
+__all__ = ["doctor", "materials", "presets", "scenes"]
 
 
 PACKAGES = ("mitsonar", "mitsuba", "drjit", "numpy", "scipy", "OpenEXR", "trimesh", "zarr", "torch")
@@ -104,7 +104,7 @@ def _version(package: str) -> str:
         return "not installed" + (" (only needed for learning)" if package == "torch" else "")
 
 
-# ---------------- ``mitsonar presets`` and ``mitsonar scenes``: what can be named
+# ---------------- ``mitsonar presets``, ``mitsonar materials`` and ``mitsonar scenes``: what can be named
 
 
 @answered
@@ -199,6 +199,39 @@ def _accuracy(names: list[str]) -> list[str]:
         *lines,
         f"Physical model; the thesis model keeps its own rays. Ground a fifth of the far range below the sonar. {about}.",
     ]
+
+
+@answered
+def materials(
+    name: Annotated[
+        str | None, typer.Argument(help="Print every number of this material (or YAML file) with its source.")
+    ] = None,
+) -> None:
+    """List the materials of surfaces, or print one: what its level is based on, its band, and the source of each number."""
+    import numpy as np
+
+    from mitsonar.acoustics.materials import material, named_materials, reference_hz, sigma_table
+
+    known = named_materials()
+    if name is not None:
+        one = material(name)
+        sources = known[name].sources if name in known else {}
+        say(f"{one.name}: {one.about or 'no description'}")
+        for key, value in one.model_dump(exclude={"name", "about", "source"}, exclude_none=True).items():
+            shown = (
+                f"{value:g}" if isinstance(value, float) else f"{len(value)} values" if isinstance(value, tuple) else value
+            )
+            say(f"  {key:18} {shown:12} {sources.get(key, '')}".rstrip())
+        if not sources:
+            say(f"  source: {one.source or 'not stated'}")
+        return
+    say(f"{'material':10} {'basis':12} {'band (kHz)':12} {'law':12} {'dB at 30 deg':>12}  description")
+    for key, (about, *_) in sorted(known.items()):
+        one = material(key)
+        band = "..".join(f"{end / 1000:g}" for end in one.band_hz)
+        strength = 10 * np.log10(sigma_table(one, reference_hz(one))[30])
+        say(f"{key:10} {one.basis or '-':12} {band:12} {one.law:12} {strength:12.1f}  {about}")
+    say("dB: backscattering strength at 30 deg of grazing, mid-band. `mitsonar materials NAME` prints the sources.")
 
 
 @answered

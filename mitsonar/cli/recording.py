@@ -21,7 +21,9 @@ from mitsonar.io.runs import refuse_to_replace
 if TYPE_CHECKING:
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.plotting.outlines import Outlines
+    from mitsonar.recordings.range_pings import RangeRecording
     from mitsonar.recordings.recording import Part, Recording
+    from mitsonar.recordings.side_scan import SideScan
     from mitsonar.records.frames import SonarFrames
 
 __all__ = [
@@ -114,13 +116,17 @@ def info(
     from mitsonar.recordings.handedness import check_handedness
     from mitsonar.recordings.open import summary_lines, summary_of
 
-    scan = side_scan_at(file)
-    if scan is not None:
-        refuse_options(file, {"--topic": topic, "--geometry": geometry, "--handedness": handedness, "--turn-deg": turn_deg})
+    of_frames = {"--geometry": geometry, "--handedness": handedness, "--turn-deg": turn_deg}
+    frameless: SideScan | RangeRecording | None = side_scan_at(file)
+    if frameless is not None:
+        refuse_options(file, {"--topic": topic, **of_frames})
+    elif (frameless := ranges_at(file, topic, geometry)) is not None:
+        refuse_options(file, of_frames, "holds points")
+    if frameless is not None:
         if as_json:
-            say_json(summary_of(scan))
+            say_json(summary_of(frameless))
         else:
-            say("\n".join(summary_lines(summary_of(scan))))
+            say("\n".join(summary_lines(summary_of(frameless))))
         return
     recording = _opened(file, topic, geometry)
     summary = summary_of(recording)
@@ -225,7 +231,11 @@ def convert(
     file: File,
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", help="FOLDER of a run, FILE.mcap or FILE.aris to make; side-scans: .xtf or .npz."),
+        typer.Option(
+            "-o",
+            "--out",
+            help="FOLDER of a run, FILE.mcap or FILE.aris; side-scans: .xtf or .npz; points: .ply, .csv or .mcap.",
+        ),
     ],
     part: PartNumber = None,
     topic: TopicName = None,
@@ -258,18 +268,25 @@ def convert(
 ) -> None:
     """Convert frames to the folder of a run (frames.npz, or frames.zarr above 1,000 frames), to ROS (.mcap) or to .aris.
 
-    Side-scans are converted to .xtf, or to the echogram of `mitsonar sound` (.npz).
+    Side-scans are converted to .xtf, or to the echogram of `mitsonar sound` (.npz); points of SonarRanges and of a Sonar
+    3D-15 to .ply, .csv or .mcap.
     """
     from mitsonar.recordings.first_returns import FirstReturns
     from mitsonar.recordings.pictures import write_frames
     from mitsonar.recordings.write_mcap import write_mcap
 
+    of_frames: dict[str, object] = {"--geometry": geometry, "--full": full, "--labels": labels, "--beams": beams}
+    of_frames |= {"--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume}
+    of_frames |= {"--scan-db": scan_db, "--scan-from": scan_from or None}
     scan = side_scan_at(file)
     if scan is not None:
-        of_frames = {"--topic": topic, "--geometry": geometry, "--full": full, "--labels": labels, "--beams": beams}
-        of_frames |= {"--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume}
-        refuse_options(file, {**of_frames, "--scan-db": scan_db, "--scan-from": scan_from or None})
+        refuse_options(file, {"--topic": topic, **of_frames})
         convert_side_scan(scan, out, part=part, overwrite=overwrite)
+        return
+    ranges = ranges_at(file, topic, geometry)
+    if ranges is not None:
+        refuse_options(file, {"--part": part, **of_frames}, "holds points")
+        _convert_ranges(ranges, out, overwrite=overwrite)
         return
     if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
         raise MitsonarError(f"{out}: unknown ending; {suggest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
@@ -304,6 +321,27 @@ def convert(
         else:
             written = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
     say(f"{count_noun(len(chosen), 'frame')} in {written}")
+
+
+def ranges_at(file: str, topic: str | None, geometry: Path | None) -> RangeRecording | None:
+    """Open a recording of a sonar that measures ranges; None if the path, or with a geometry the bag, is something else."""
+    if "://" in file:
+        return None
+    from mitsonar.recordings.open import detect_format, open_ranges
+
+    if geometry is not None and detect_format(file) is not None:  # pictures in a bag, which may hold ranges, too
+        return None
+    return open_ranges(file, topic)
+
+
+def _convert_ranges(recording: RangeRecording, out: Path, *, overwrite: bool) -> None:
+    """Write the points of all pings."""
+    from mitsonar.recordings.range_pings import write_points
+
+    _say_notes(recording)
+    with progress_bar("converting", len(recording), "pings") as progress:
+        count = write_points(recording, out, overwrite=overwrite, progress=progress)
+    say(f"{count_noun(count, 'point')} of {count_noun(len(recording), 'ping')} in {out}")
 
 
 def _span(text: str, what: str) -> tuple[int, int]:
@@ -347,7 +385,7 @@ def _with_outlines(
     return recording, outlines_of(recording.part(part).read([]), classes_of(classes, without))
 
 
-def _say_notes(recording: Recording) -> None:
+def _say_notes(recording: Recording | RangeRecording) -> None:
     for note in recording.notes:
         warn(note)
 

@@ -38,19 +38,20 @@ def side_scan_at(file: str) -> SideScan | None:
     return None if side_scan_format is None else side_scan_format.read(Path(file))
 
 
-def refuse_options(file: str, options: Mapping[str, object]) -> None:
-    """Reject options of frames that were given for a side-scan.
+def refuse_options(file: str, options: Mapping[str, object], what: str = "is a side-scan") -> None:
+    """Reject options of frames that were given for a side-scan or another recording without frames.
 
     Args:
         file: the recording, for the message.
         options: values of options, keyed by name; false values, None and 0 count as not given.
+        what: what the recording is, as part of a sentence.
 
     Raises:
         MitsonarError: an option was given.
     """
     for name, value in options.items():
         if value:
-            raise MitsonarError(f"{file} is a side-scan, and {name} applies only to frames: leave it out")
+            raise MitsonarError(f"{file} {what}, and {name} applies only to frames: leave it out")
 
 
 def show_side_scan(

@@ -11,8 +11,10 @@ import os
 import stat
 import sys
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 import yaml
@@ -35,6 +37,7 @@ __all__ = [
     "read_yaml",
     "refuse_beyond_memory",
     "refuse_irregular",
+    "whole_file",
     "whole_number",
     "write_atomic",
     "write_json",
@@ -70,6 +73,24 @@ def write_atomic(path: str | Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a temporary file to write in parts; it takes the name of the path at the end, and vanishes on an error.
+
+    Raises:
+        MitsonarError: if the folder does not exist.
+    """
+    if not path.parent.is_dir():
+        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first")
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            yield file
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def write_json(path: str | Path, value: dict[str, PlainValue]) -> None:

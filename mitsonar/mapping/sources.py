@@ -359,9 +359,6 @@ StoredArray = Any
 RUN_FRAMES = ("frames.npz", "frames.zarr")
 """Files that hold the frames of a run."""
 
-MOST_LISTED = 100
-"""Files of a folder that are tried as recordings."""
-
 FINDING = "give frames.npz, frames.zarr, the folder of a run, a data set or a recording"
 
 
@@ -393,10 +390,9 @@ def open_frames(
     if os.path.isdir(path) and not os.path.isfile(path / "zarr.json"):
         candidates = [path / name for name in RUN_FRAMES if os.path.exists(path / name)]
         if not candidates:
-            inside = (str(one) for one in sorted(path.iterdir())[:MOST_LISTED] if one.is_file() and is_recording(one))
-            recording = next(inside, None)
-            advice = FINDING if recording is None else f"give the recording in it, such as {recording}"
-            raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {advice}")
+            from mitsonar.recordings.open import recordings_in
+
+            raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {recordings_in(path) or FINDING}")
         path = candidates[0]
     return _open_zarr(path, str(where)) if os.path.isdir(path) else _open_npz(path, str(where))
 
@@ -474,11 +470,10 @@ def _open_npz(path: Path, name: str) -> FrameSource:
     if not os.path.exists(path):
         raise MitsonarError(f"there are no frames at {path}: {FINDING}")
     if os.path.isfile(path) and os.access(path, os.R_OK) and not is_zipfile(path):
-        from mitsonar.recordings.open import detect_side_scan, known_formats, side_scan_words
+        from mitsonar.recordings.open import frameless_words, known_formats
 
-        if detect_side_scan(path) is not None:
-            raise MitsonarError(side_scan_words(path))
-
+        if words := frameless_words(path):
+            raise MitsonarError(words)
         empty = path.stat().st_size == 0
         reason = "it is empty" if empty else "it is neither a whole frames.npz nor a recording that mitsonar reads"
         raise MitsonarError(f"cannot read frames {path}: {reason}; {FINDING}: {known_formats()}")

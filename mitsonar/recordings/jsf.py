@@ -110,9 +110,10 @@ def read_jsf(path: Path) -> SideScan:
         headers, assumed = _ping_headers(table)
         placed = place_pings(headers)
         sound_speed, speed_note = sound_speed_of(table["sound_speed"])
-        parts += parts_of(_band(data, table, pairs, subsystem, sound_speed), placed)
+        of_subsystem, left_out = parts_of(_band(data, table, pairs, subsystem, sound_speed), placed)
+        parts += of_subsystem
         facts = placed.facts | facts
-        notes += [*placed.notes, *assumed, *speed_note]
+        notes += [*placed.notes, *assumed, *speed_note, *left_out]
     return SideScan(path.name, "JSF (.jsf)", tuple(parts), facts, tuple(dict.fromkeys(notes)))
 
 

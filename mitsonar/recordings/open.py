@@ -1,6 +1,6 @@
 """How is a recording of unknown format opened? By the first bytes of the file, or the files in the folder.
 
-Recordings of imaging sonars hold frames, those of side-scans echograms.
+Recordings of imaging sonars hold frames, those of side-scans echograms, and those of other multibeams points.
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ from mitsonar.recordings.pictures import (
 from mitsonar.recordings.ping360 import is_ping360_log, is_ping360_text, read_ping360_log, read_ping360_text
 from mitsonar.recordings.pingverter import is_pingverter, read_pingverter
 from mitsonar.recordings.public_sets import is_canoe, is_neusis, is_uxo, read_canoe, read_neusis, read_uxo
+from mitsonar.recordings.range_pings import RangeRecording, ranges_topic, read_ros_ranges
 from mitsonar.recordings.recording import Part, Recording
-from mitsonar.recordings.ros_messages import is_ros_bag
+from mitsonar.recordings.ros_messages import SONARS, BagFile, is_ros_bag
 from mitsonar.recordings.ros_reader import read_ros_bag
 from mitsonar.recordings.side_scan import SideScan, SideScanPart, holds_echogram, read_echogram
+from mitsonar.recordings.sonar_3d15 import is_range_images, read_range_images
 from mitsonar.recordings.sound_metrics import SIGNATURE, SIGNATURES, read_aris, read_didson
 from mitsonar.recordings.xtf import is_xtf, read_xtf
 
@@ -44,10 +46,12 @@ __all__ = [
     "Summary",
     "detect_format",
     "detect_side_scan",
+    "frameless_words",
     "known_formats",
+    "open_ranges",
     "open_recording",
     "open_side_scan",
-    "side_scan_words",
+    "recordings_in",
     "summary_lines",
     "summary_of",
 ]
@@ -157,6 +161,23 @@ def _first_bytes(path: Path) -> bytes | None:
     return b"" if os.path.isdir(path) else None
 
 
+MOST_TRIED, MOST_NAMED = 100, 5
+"""Entries of a folder that are tried as recordings, and recordings that a message names."""
+
+
+def recordings_in(folder: Path) -> str:
+    """Return advice that names the recordings in a folder, which is none itself; empty if it holds none."""
+    try:
+        entries = sorted(folder.iterdir())[:MOST_TRIED] if os.path.isdir(folder) else []
+    except OSError:
+        return ""
+    inside = [one for one in entries if detect_format(one) is not None or frameless_words(one)]
+    if len(inside) < 2:
+        return f"give the recording in it, {inside[0]}" if inside else ""
+    more = f" and {len(inside) - MOST_NAMED:,} more" if len(inside) > MOST_NAMED else ""
+    return f"give one of the recordings in it: {', '.join(one.name for one in inside[:MOST_NAMED])}{more}"
+
+
 def known_formats() -> str:
     """Return the names of all formats of frames as one string, for messages."""
     return ", ".join(one.words for one in FORMATS)
@@ -178,18 +199,53 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     if recording_format is None:
         if not os.path.exists(path):
             raise MitsonarError(f"no such file: {path}")
-        if detect_side_scan(path) is not None:
-            raise MitsonarError(side_scan_words(path))
-        raise MitsonarError(f"{path} is not a recording that mitsonar reads: it reads {known_formats()}")
+        if words := frameless_words(path):
+            raise MitsonarError(words)
+        advice = recordings_in(Path(path)) or f"it reads {known_formats()}"
+        raise MitsonarError(f"{path} is not a recording that mitsonar reads: {advice}")
     return recording_format.read(Path(path), None if geometry is None else Path(geometry), topic)
 
 
-def side_scan_words(path: str | Path) -> str:
-    """Return the message for a side-scan where frames are needed."""
-    return (
-        f"{path} is a side-scan, which has pings in place of frames: `mitsonar recording` and `mitsonar mosaic` take it, "
-        "and mitsonar.open_side_scan in Python"
-    )
+def frameless_words(path: str | Path) -> str:
+    """Return the message for a side-scan, or a recording of ranges, where frames are needed; empty for anything else."""
+    if detect_side_scan(path) is not None:
+        return (
+            f"{path} is a side-scan, which has pings in place of frames: `mitsonar recording` and `mitsonar mosaic` take it,"
+            " and mitsonar.open_side_scan in Python"
+        )
+    if is_range_images(Path(path), _first_bytes(Path(path)) or b""):
+        return (
+            f"{path} holds points of each ping in place of frames: `mitsonar recording info` and `convert` take it, and "
+            "mitsonar.recordings.open.open_ranges in Python"
+        )
+    return ""
+
+
+def open_ranges(path: str | Path, topic: str | None = None) -> RangeRecording | None:
+    """Open a recording of a sonar that measures ranges: a ``.sonar`` file, or a ROS bag with ``SonarRanges``.
+
+    Args:
+        path: path of a file or folder; its content determines the format (docs/guides/recordings.md).
+        topic: topic of the sonar in a ROS bag; default: the only one, if the bag has no images of a sonar.
+
+    Returns:
+        The recording; None if the path is something else.
+
+    Raises:
+        MitsonarError: if the file is damaged, or has several such topics of which none is chosen.
+    """
+    path, first = Path(path), _first_bytes(Path(path))
+    if first is not None and is_range_images(path, first):
+        if topic is not None:
+            raise MitsonarError(f"{path} is a recording of one sonar without topics: omit {topic!r}")
+        return read_range_images(path)
+    if first is None or not is_ros_bag(path, first):
+        return None
+    bag = BagFile(path)
+    if topic is None and any(one.kind in SONARS and one.messages for one in bag.topics()):
+        return None
+    chosen = ranges_topic(bag, topic)
+    return None if chosen is None else read_ros_ranges(bag, chosen)
 
 
 def open_side_scan(path: str | Path) -> SideScan:
@@ -206,8 +262,8 @@ def open_side_scan(path: str | Path) -> SideScan:
     if side_scan_format is None:
         if not os.path.exists(path):
             raise MitsonarError(f"no such file: {path}")
-        formats = ", ".join(one.words for one in SIDE_SCANS)
-        raise MitsonarError(f"{path} is not a side-scan that mitsonar reads: it reads {formats}")
+        advice = recordings_in(Path(path)) or f"it reads {', '.join(one.words for one in SIDE_SCANS)}"
+        raise MitsonarError(f"{path} is not a side-scan that mitsonar reads: {advice}")
     return side_scan_format.read(Path(path))
 
 
@@ -226,7 +282,7 @@ DATES_FROM_S, DATES_TO_S = 946_684_800.0, 32_503_680_000.0
 """Times from the first to the second are shown as dates: 2000-01-01 to 3000-01-01 [s since 1970]."""
 
 
-def summary_of(recording: Recording | SideScan) -> Summary:
+def summary_of(recording: Recording | SideScan | RangeRecording) -> Summary:
     """Return a summary of a recording; angles are in degrees, all other values in SI units.
 
     The summary lists frames or pings, format, facts and notes, and of each part its window, beams or sides, rate, times,
@@ -234,6 +290,8 @@ def summary_of(recording: Recording | SideScan) -> Summary:
     """
     if isinstance(recording, SideScan):
         unit, parts = "pings", [_side_scan_summary(part) for part in recording.parts]
+    elif isinstance(recording, RangeRecording):
+        unit, parts = "pings", [_range_summary(recording)]
     else:
         unit, parts = "frames", [_part_summary(part) for part in recording.parts]
     return {
@@ -306,6 +364,18 @@ def _side_scan_summary(part: SideScanPart) -> Summary:
     return summary
 
 
+def _range_summary(recording: RangeRecording) -> Summary:
+    """Return the summary of a recording of ranges."""
+    summary: Summary = {
+        "points": int(recording.points.sum()),
+        "points_of_ping": [int(recording.points.min()), int(recording.points.max())],
+        **_time_summary(recording.time_s),
+    }
+    if recording.poses is not None:
+        summary["path_m"] = float(np.linalg.norm(np.diff(recording.poses[:, :3], axis=0), axis=1).sum())
+    return summary
+
+
 def _time_summary(time_s: Array) -> Summary:
     """Return first and last time, rate and gaps."""
     time = time_s if time_s.ndim == 1 else time_s.mean(axis=1)
@@ -340,20 +410,11 @@ def summary_lines(summary: Summary) -> list[str]:
 
 def _part_rows(part: Summary) -> list[tuple[str, str]]:
     """Return the table rows of a part: name and value."""
-    low, high = part["window_m"]
-    step = "" if part["bin_m"] is None else f" of {part['bin_m'] * 1e3:.4g} mm"
-    rows = [("sonar", part["sonar"]), ("window", f"{low:.4g}..{high:.4g} m, {count_noun(part['bins'], 'bin')}{step}")]
-    if "sides" in part:
-        rows.append(("sides", ", ".join(part["sides"])))
+    if "points" in part:
+        fewest, most = part["points_of_ping"]
+        rows = [("points", f"{part['points']:,}, {fewest:,}..{most:,} a ping")]
     else:
-        first, last = part["bearing_deg"]
-        rows.append(
-            ("beams", f"{part['beams']:,} from {first:.4g} to {last:.4g} deg, {part['elevation_fov_deg']:.4g} deg high")
-        )
-        rows.append(("level", f"{part['level']}, {part['samples']}"))
-    rows.append(("sound speed", f"{part['sound_speed']:.6g} m/s"))
-    if part["frequency_hz"]:
-        rows.append(("carrier", f"{part['frequency_hz'] / 1e3:,.6g} kHz"))
+        rows = _window_rows(part)
     if "first_s" in part:
         duration_s = part["last_s"] - part["first_s"]
         rows.append(("times", f"{_format_time(part['first_s'])} to {_format_time(part['last_s'])}, {duration_s:.6g} s"))
@@ -370,6 +431,25 @@ def _part_rows(part: Summary) -> list[tuple[str, str]]:
     if "origin" in part:
         origin = part["origin"]
         rows.append(("origin", f"{origin['east_m']:.0f} m east, {origin['north_m']:.0f} m north in EPSG:{origin['epsg']}"))
+    return rows
+
+
+def _window_rows(part: Summary) -> list[tuple[str, str]]:
+    """Return the table rows of the sonar of a part: window, beams or sides, coding, sound speed and carrier."""
+    low, high = part["window_m"]
+    step = "" if part["bin_m"] is None else f" of {part['bin_m'] * 1e3:.4g} mm"
+    rows = [("sonar", part["sonar"]), ("window", f"{low:.4g}..{high:.4g} m, {count_noun(part['bins'], 'bin')}{step}")]
+    if "sides" in part:
+        rows.append(("sides", ", ".join(part["sides"])))
+    else:
+        first, last = part["bearing_deg"]
+        rows.append(
+            ("beams", f"{part['beams']:,} from {first:.4g} to {last:.4g} deg, {part['elevation_fov_deg']:.4g} deg high")
+        )
+        rows.append(("level", f"{part['level']}, {part['samples']}"))
+    rows.append(("sound speed", f"{part['sound_speed']:.6g} m/s"))
+    if part["frequency_hz"]:
+        rows.append(("carrier", f"{part['frequency_hz'] / 1e3:,.6g} kHz"))
     return rows
 
 

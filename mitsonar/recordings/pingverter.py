@@ -85,10 +85,16 @@ def read_pingverter(path: Path) -> SideScan:
         name="PINGVerter",
         sound_speed=ASSUMED_SOUND_SPEED,
     )
-    notes = [*index.notes(), *placed.notes, f"the log states no sound speed: {ASSUMED_SOUND_SPEED:g} m/s is assumed"]
+    parts, left_out = parts_of(band, placed)
+    notes = [
+        *index.notes(),
+        *placed.notes,
+        *left_out,
+        f"the log states no sound speed: {ASSUMED_SOUND_SPEED:g} m/s is assumed",
+    ]
     if reverse:
         notes.append("port samples are stored from the outermost inwards, as their likeness to starboard shows: turned")
-    return SideScan(path.name, "log by PINGVerter (folder)", tuple(parts_of(band, placed)), placed.facts, tuple(notes))
+    return SideScan(path.name, "log by PINGVerter (folder)", tuple(parts), placed.facts, tuple(notes))
 
 
 # ---------------- Index

@@ -191,12 +191,13 @@ class Recording:
         return self.parts[self.longest if number is None else number]
 
 
-def in_time_order(time_s: ArrayLike, number: ArrayLike | None = None) -> tuple[Index, list[str]]:
+def in_time_order(time_s: ArrayLike, number: ArrayLike | None = None, what: str = "frame") -> tuple[Index, list[str]]:
     """Sort frames by time, and drop those without a valid time or with the time of the frame before.
 
     Args:
         time_s: frame times ``(frames,)`` [s].
         number: number that the sonar gave each frame ``(frames,)``, if known. Gaps in it are reported as missing frames.
+        what: noun for a frame in the sentences.
 
     Returns:
         The indices of the remaining frames in order of time, and sentences on what was sorted, dropped or is missing.
@@ -204,17 +205,17 @@ def in_time_order(time_s: ArrayLike, number: ArrayLike | None = None) -> tuple[I
     time = np.asarray(time_s, dtype=float)
     known = np.isfinite(time)
     order = np.flatnonzero(known)[np.argsort(time[known], kind="stable")]
-    notes = [] if known.all() else [f"left out: {count_noun(int((~known).sum()), 'frame')} without a valid time"]
+    notes = [] if known.all() else [f"left out: {count_noun(int((~known).sum()), what)} without a valid time"]
     if (np.diff(order) < 0).any():
-        notes.append("frames are not in order of time: they were sorted")
+        notes.append(f"{what}s are not in order of time: they were sorted")
     increasing = order[np.diff(time[order], prepend=-np.inf) > 0]
     if len(increasing) < len(order):
-        notes.append(f"left out: {count_noun(len(order) - len(increasing), 'frame')} at the time of the one before")
+        notes.append(f"left out: {count_noun(len(order) - len(increasing), what)} at the time of the one before")
     if number is not None and len(increasing) > 1:
         steps = np.diff(np.asarray(number, dtype=float)[increasing])
         missing = float((steps[steps > 1] - 1).sum())
         if missing:
-            notes.append(f"missing: {count_noun(round(missing), 'frame')}, by the numbers that the sonar gave them")
+            notes.append(f"missing: {count_noun(round(missing), what)}, by the numbers that the sonar gave them")
     return increasing, notes
 
 

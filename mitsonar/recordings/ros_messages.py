@@ -25,6 +25,7 @@ __all__ = [
     "FANS",
     "OCULUS",
     "PROJECTED",
+    "RANGES",
     "RAW",
     "RECORD",
     "SONARS",
@@ -171,7 +172,8 @@ class BagFile:
 # the public definitions; ``tests/recordings/test_ros_bag.py`` compares their MD5 sums with the published ones. Sources:
 #
 # - ``marine_acoustic_msgs``: apl-ocean-engineering/marine_msgs (BSD-3-Clause), ``ProjectedSonarImage``, ``PingInfo``,
-#   ``SonarImageData``, ``RawSonarImage``. The older package ``acoustic_msgs`` has the same messages.
+#   ``SonarImageData``, ``RawSonarImage``, ``SonarRanges``, ``DetectionFlag``. The older package ``acoustic_msgs`` has the
+#   same messages.
 # - ``ping360_sonar_msgs``: CentraleNantesRobotics/ping360_sonar (MIT), ``SonarEcho``; in ROS 1 part of ``ping360_sonar``.
 # - ``sonar_oculus``: MarineRoboticsGroup/sonar_oculus, ``OculusPing``, ``OculusFire``, in which pings of BlueROVs with an
 #   Oculus are recorded. Older versions hold a ``sensor_msgs/Image``; their bags contain the definition.
@@ -189,6 +191,9 @@ OCULUS = ("sonar_oculus/msg/OculusPing",)
 
 ECHOES = ("ping360_sonar_msgs/msg/SonarEcho", "ping360_sonar/msg/SonarEcho")
 """Types of single pings of a Ping360."""
+
+RANGES = ("marine_acoustic_msgs/msg/SonarRanges", "acoustic_msgs/msg/SonarRanges")
+"""Types of the ranges of a multibeam, one a beam, whose directions are free; they hold no image."""
 
 SONARS = (*PROJECTED, *RAW, *OCULUS, *ECHOES)
 """All types that contain their geometry."""
@@ -243,6 +248,24 @@ float32[] rx_angles
 SonarImageData image
 """
 
+DETECTION_FLAG = """
+uint8 DETECT_OK=0
+uint8 DETECT_BAD_SONAR=1
+uint8 DETECT_BAD_FILTER=2
+uint8 DETECT_BAD_USER=4
+uint8 flag
+"""
+
+SONAR_RANGES = """
+std_msgs/Header header
+PingInfo ping_info
+DetectionFlag[] flags
+float32[] transmit_delays
+float32[] intensities
+geometry_msgs/Vector3[] beam_unit_vec
+float32[] ranges
+"""
+
 SONAR_ECHO = """
 std_msgs/Header header
 float32 angle
@@ -291,6 +314,8 @@ DEFINITIONS = {
             ("SonarImageData", SONAR_IMAGE_DATA),
             ("ProjectedSonarImage", PROJECTED_SONAR_IMAGE),
             ("RawSonarImage", RAW_SONAR_IMAGE),
+            ("DetectionFlag", DETECTION_FLAG),
+            ("SonarRanges", SONAR_RANGES),
         )
     },
     **dict.fromkeys(ECHOES, SONAR_ECHO),

@@ -19,6 +19,7 @@ from mitsonar.recordings.ros_messages import (
     ECHOES,
     FANS,
     PROJECTED,
+    RANGES,
     RAW,
     SONARS,
     WRITTEN,
@@ -135,6 +136,8 @@ def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = S
         )
     if not candidates:
         others = ", ".join(f"{one.name} ({short(one.kind)})" for one in topics[:8]) or "none"
+        if any(one.kind in RANGES for one in topics):
+            others += "; SonarRanges hold no image: `mitsonar recording convert` writes their points"
         more = "; pictures need a geometry file (--geometry)" if readable and not set(FANS) & set(kinds) else ""
         raise MitsonarError(f"{bag.path} holds no messages {_type_names(*kinds)}: its topics are {others}{more}")
     return candidates[0]

@@ -90,6 +90,24 @@ LEAST_COURSE_M = 20.0
 UNUSUAL_DRIFT_DEG = 10.0
 """Mean difference of course and heading from which a note mentions it."""
 
+PROBED_PINGS = 200
+"""Pings, spread over a part, in which its last samples are looked at."""
+
+LEAST_PROBED = 10
+"""Fewer pings than these do not show that a sample is never filled."""
+
+NEIGHBOURS = 16
+"""Samples before the last ones with which these are compared."""
+
+MOST_EQUAL = 0.1
+"""Fraction of the neighbours up to which they may have the value of the fill."""
+
+MOST_WEAK, WEAK = 8, 0.05
+"""At most so many last samples are left out that stay below this fraction of the median of their neighbours.
+
+Speckle brings a sample below a twentieth of the median in 3.4 % of all pings, and in all of ten pings never.
+"""
+
 
 @dataclass(frozen=True)
 class SideScanPart:
@@ -500,8 +518,10 @@ class Band:
     tilt_deg: float = 0.0
 
 
-def parts_of(band: Band, placed: Placed) -> list[SideScanPart]:
-    """Return one part for each run of pings with the same number of samples and about the same window.
+def parts_of(band: Band, placed: Placed) -> tuple[list[SideScanPart], list[str]]:
+    """Return one part for each run of pings with the same number of samples and about the same window, and notes.
+
+    The last samples of a side are left out where no ping of the run fills them.
 
     Raises:
         MitsonarError: a value of the instrument is outside its limits.
@@ -512,22 +532,63 @@ def parts_of(band: Band, placed: Placed) -> list[SideScanPart]:
     here = order[band.rows]
     pings = np.argsort(here, kind="stable")[int((here < 0).sum()) :]
     # 2. runs of equal windows
-    parts = []
+    parts, notes = [], []
     for run in _windows(band.samples[pings], band.range_min[pings], band.range_max[pings]):
         members = pings[run]
         where = here[members]
         time_s = placed.time_s[where]
+        empty = _empty_bins(band, members)
+        bins = int(band.samples[members[0]]) - empty
+        if empty:
+            notes.append(f"left out: {count_noun(empty, 'sample')} at the end of each side, never filled")
         parts.append(
             SideScanPart(
                 time_s=time_s,
                 poses=placed.poses[where],
                 height_m=placed.height_m[where],
-                sounder=_sounder(band, members, time_s),
-                levels=partial(band.levels, members),
+                sounder=_sounder(band, members, time_s, bins),
+                levels=partial(_first_bins, band, members, bins),
                 origin=placed.origin,
             )
         )
-    return parts
+    return parts, list(dict.fromkeys(notes))
+
+
+def _first_bins(band: Band, pings: Index, bins: int) -> Levels:
+    """Read the intensities of the first bins ``(n, 2, bins)``."""
+    return band.levels(pings)[..., :bins]
+
+
+def _empty_bins(band: Band, pings: Index) -> int:
+    """Return how many last samples of both sides none of :data:`PROBED_PINGS` pings fills; 0 if too few pings decide."""
+    if len(pings) < LEAST_PROBED:
+        return 0
+    probed = pings[np.unique(np.linspace(0, len(pings) - 1, PROBED_PINGS).astype(int))]
+    try:
+        levels = band.levels(probed)
+    except MitsonarError:  # of a damaged ping, which reading the part reports
+        return 0
+    return min(_empty_end(levels[:, side]) for side in range(levels.shape[1]))
+
+
+def _empty_end(levels: Levels) -> int:
+    """Return how many last samples of a side ``(pings, bins)`` no ping fills.
+
+    Such samples have one value in all pings, and those before them another, as behind the fill of a recorder; echoes that
+    fade below the least count do not end so. Or they are a few samples that are much weaker in every ping than those before
+    them, such as amplitudes of which one byte was written.
+    """
+    bins = int(levels.shape[1])
+    varies = np.flatnonzero((levels != levels[:1]).any(axis=0))
+    if not len(varies):
+        return 0
+    end = int(varies[-1]) + 1
+    if end < bins and (levels[:, max(0, end - NEIGHBOURS) : end] == levels[0, end]).mean() > MOST_EQUAL:
+        end = bins
+    for begin in range(max(1, end - MOST_WEAK), end):
+        if levels[:, begin:end].max() < WEAK * np.median(levels[:, max(0, begin - NEIGHBOURS) : begin]):
+            return bins - begin
+    return bins - end
 
 
 def _windows(samples: NDArray[np.int64], range_min: Array, range_max: Array) -> list[Index]:
@@ -542,8 +603,8 @@ def _windows(samples: NDArray[np.int64], range_min: Array, range_max: Array) -> 
     return [np.asarray(run, dtype=np.intp) for run in runs]
 
 
-def _sounder(band: Band, pings: Index, time_s: Array) -> Sounder:
-    """Return the instrument of some pings of a band, with :data:`TYPICAL` angles where the file states none."""
+def _sounder(band: Band, pings: Index, time_s: Array, bins: int) -> Sounder:
+    """Return the instrument of the first bins of some pings, with :data:`TYPICAL` angles where the file states none."""
     angles = {}
     for name, typical in TYPICAL.items():
         angle = float(getattr(band, name))
@@ -555,15 +616,16 @@ def _sounder(band: Band, pings: Index, time_s: Array) -> Sounder:
         known["frequency_hz"] = frequency_hz
     if len(time_s) > 1:
         known["frame_rate_hz"] = min(1e6, 1 / max(1e-6, float(np.median(np.diff(time_s)))))
+    near, far = (float(np.median(ends[pings])) for ends in (band.range_min, band.range_max))
     return Sounder.create(
         name=band.name or "side-scan",
         kind="sidescan",
         mounts={"port": (0, 0, 0, tilt, 0, -90), "starboard": (0, 0, 0, tilt, 0, 90)},
         beams=1,
         bearing="cone",
-        range_min=float(np.median(band.range_min[pings])),
-        range_max=float(np.median(band.range_max[pings])),
-        range_bins=int(band.samples[pings[0]]),
+        range_min=near,
+        range_max=near + (far - near) * (bins / int(band.samples[pings[0]])),
+        range_bins=bins,
         sound_speed=band.sound_speed,
         **angles,
         **known,

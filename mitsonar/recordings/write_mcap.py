@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ from mitsonar.errors import MitsonarError, MitsonarWarning, missing_package_erro
 from mitsonar.geometry.fan import CartesianMap, cartesian_map
 from mitsonar.instruments.sonar import frame_period_s
 from mitsonar.instruments.views import directions
+from mitsonar.io.files import whole_file
 from mitsonar.io.runs import refuse_to_replace
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import CONVENTIONS
@@ -30,7 +31,19 @@ from mitsonar.records.frames import LABELS, PER_FRAME, SonarFrames, to_float32, 
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
-__all__ = ["BODY", "SENSOR", "SPAN_DB", "TOPICS", "WORLD", "Encoded", "FrameEncoder", "nanoseconds", "write_mcap"]
+__all__ = [
+    "BODY",
+    "SENSOR",
+    "SPAN_DB",
+    "TOPICS",
+    "WORLD",
+    "CloudEncoder",
+    "Encoded",
+    "FrameEncoder",
+    "nanoseconds",
+    "write_clouds",
+    "write_mcap",
+]
 
 
 SPAN_DB = 80.0
@@ -86,23 +99,31 @@ def write_mcap(
     if path.suffix != ".mcap":
         raise MitsonarError(f"{path} must end with .mcap: ROS recognises bags by their suffix")
     refuse_to_replace(path, overwrite=overwrite)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as file:
-            writer = _writer(file)
-            span_db: list[float] = []
-            tally = _Tally(returns)
-            pairs = ((_reduced(frames, full, labels, span_db), tally.find(frames)) for frames in chunks)
-            count = _write(writer, pairs, picture, span_db, progress or (lambda done: None))
-            writer.finish()  # type: ignore[no-untyped-call]
-        part.replace(path)
-    except FileNotFoundError:
-        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first") from None
-    finally:
-        part.unlink(missing_ok=True)
+    span_db: list[float] = []
+    tally = _Tally(returns)
+    pairs = ((_reduced(frames, full, labels, span_db), tally.find(frames)) for frames in chunks)
+    with whole_file(path) as file:
+        writer = _writer(file)
+        count = _write(writer, pairs, picture, span_db, progress or (lambda done: None))
+        writer.finish()  # type: ignore[no-untyped-call]
     for note in tally.notes():
         warnings.warn(note, MitsonarWarning, stacklevel=2)
     return count
+
+
+def write_clouds(path: Path, encoder: CloudEncoder, messages: Iterable[Encoded]) -> None:
+    """Write encoded messages as MCAP (profile ``ros2``); the file is complete or absent.
+
+    Raises:
+        MitsonarError: if the file cannot be written.
+    """
+    with whole_file(path) as file:
+        writer = _writer(file)
+        writer.start(profile="ros2", library="mitsonar")
+        channels = _channels(writer, encoder)
+        for number, message in enumerate(messages):
+            _add(writer, channels, message, number)
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 class _Tally:
@@ -197,7 +218,7 @@ def _known(frames: SonarFrames) -> list[bool]:
     return [getattr(frames, name) is not None for name in PER_FRAME]
 
 
-def _channels(writer: Writer, encoder: FrameEncoder) -> dict[str, int]:
+def _channels(writer: Writer, encoder: _RosEncoder) -> dict[str, int]:
     """Register types and topics, and return the channel number of each topic."""
     schemas: dict[str, int] = {}
     channels = {}
@@ -278,7 +299,97 @@ class Encoded(NamedTuple):
     data: bytes
 
 
-class FrameEncoder:
+class _RosEncoder:
+    """Encoder of ROS 2 messages (CDR)."""
+
+    topics: Sequence[str] = ()
+    """Topics of the messages."""
+
+    def __init__(self) -> None:
+        self.types = ros2_types()
+
+    def definition(self, topic: str) -> str:
+        """Return the definition of a topic's message type, including those of its nested types."""
+        return self.types.generate_msgdef(TOPICS[topic], ros_version=2)[0]
+
+    def _encoded(self, topic: str, time: int, message: RosObject) -> Encoded:
+        return Encoded(topic, time, bytes(self.types.serialize_cdr(message, TOPICS[topic], little_endian=True)))
+
+    def _make(self, kind: str, **fields: RosObject) -> RosObject:
+        """Create a message of the given type."""
+        package, _, name = kind.partition("/")
+        return self.types.types[f"{package}/msg/{name}"](**fields)
+
+    def _header(self, time: int, frame: str) -> RosObject:
+        stamp = self._make("builtin_interfaces/Time", sec=time // 10**9, nanosec=time % 10**9)
+        return self._make("std_msgs/Header", stamp=stamp, frame_id=frame)
+
+    def _vector(self, values: Array, kind: str = "geometry_msgs/Vector3") -> RosObject:
+        return self._make(kind, **dict(zip("xyzw", (float(one) for one in values), strict=False)))
+
+    def _cloud(self, table: dict[str, NDArray[Any]], time: int) -> RosObject:
+        """Return a point cloud with the given fields, each ``(points,)``."""
+        kind = np.dtype([(name, one.dtype.newbyteorder("<")) for name, one in table.items()])
+        points = np.zeros(len(table["x"]), kind)
+        for name, one in table.items():
+            points[name] = one
+        fields = [
+            self._make("sensor_msgs/PointField", name=name, offset=4 * index, datatype=POINT_TYPES[one.dtype], count=1)
+            for index, (name, one) in enumerate(table.items())
+        ]
+        return self._make(
+            "sensor_msgs/PointCloud2",
+            header=self._header(time, BODY),
+            height=1,
+            width=len(points),
+            fields=fields,
+            is_bigendian=False,
+            point_step=kind.itemsize,
+            row_step=kind.itemsize * len(points),
+            data=np.frombuffer(points.tobytes(), np.uint8),
+            is_dense=True,
+        )
+
+    def _transform(self, parent: str, child: str, time: int, place: Array, turn: Rotation) -> RosObject:
+        transform = self._make(
+            "geometry_msgs/Transform",
+            translation=self._vector(place),
+            rotation=self._vector(turn.as_quat(canonical=True), "geometry_msgs/Quaternion"),
+        )
+        header = self._header(time, parent)
+        one = self._make("geometry_msgs/TransformStamped", header=header, child_frame_id=child, transform=transform)
+        return self._make("tf2_msgs/TFMessage", transforms=[one])
+
+
+class CloudEncoder(_RosEncoder):
+    """Encoder of the points of pings: ``/sonar/returns`` (``sensor_msgs/PointCloud2``), and ``/tf`` of a moving sonar.
+
+    Args:
+        moving: whether poses are encoded.
+    """
+
+    def __init__(self, *, moving: bool) -> None:
+        super().__init__()
+        self.topics = ["/sonar/returns", *(["/tf"] if moving else [])]
+
+    def messages(
+        self, time_s: float, points: Array, intensity: NDArray[np.float32], pose: Array | None
+    ) -> Iterator[Encoded]:
+        """Encode the points of a ping, as starboard, forward, up ``(n, 3)`` [m], and the pose of the sonar ``(6,)``.
+
+        Raises:
+            MitsonarError: if ROS cannot represent the time.
+        """
+        (time,) = nanoseconds(np.array([time_s]))
+        starboard, forward, up = points.T
+        table = {"x": forward, "y": -starboard, "z": up, "intensity": intensity}
+        cloud = self._cloud({name: one.astype(np.float32) for name, one in table.items()}, time)
+        yield self._encoded("/sonar/returns", time, cloud)
+        if pose is not None:
+            yield self._encoded("/tf", time, self._transform(WORLD, BODY, time, *_ros_pose(pose)))
+
+
+class FrameEncoder(_RosEncoder):
     """Encoder of frames of one sonar as ROS 2 messages (CDR).
 
     Args:
@@ -293,10 +404,11 @@ class FrameEncoder:
     def __init__(self, like: SonarFrames, picture: str = "png", *, returns: bool = False) -> None:
         if picture not in PICTURES:
             raise MitsonarError(f"fans are written as {' or '.join(PICTURES)}: got {picture!r}")
-        self.like, self.picture, self.returns, self.types = like, picture, returns, ros2_types()
+        super().__init__()
+        self.like, self.picture, self.returns = like, picture, returns
+        self.topics = self._topics()
 
-    @property
-    def topics(self) -> list[str]:
+    def _topics(self) -> list[str]:
         """Return the topics to which frames are encoded."""
         needs = {
             "/sonar/points": self.like.elevation_rad,
@@ -309,10 +421,6 @@ class FrameEncoder:
         absent += [] if self.returns else ["/sonar/scan", "/sonar/returns"]
         absent += [] if self._has_even_beams else ["/sonar/scan"]
         return [name for name in TOPICS if name not in absent]
-
-    def definition(self, topic: str) -> str:
-        """Return the definition of a topic's message type, including those of its nested types."""
-        return self.types.generate_msgdef(TOPICS[topic], ros_version=2)[0]
 
     def messages(self, frames: SonarFrames, returns: BeamReturns | None = None) -> Iterator[Encoded]:
         """Encode frames and their first returns, and yield the messages in order of time."""
@@ -340,21 +448,6 @@ class FrameEncoder:
         """Encode the fixed transform from the frame ``sonar`` to the frame ``sonar_link``."""
         turn = Rotation.from_matrix([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
         return self._encoded("/tf_static", time, self._transform(BODY, SENSOR, time, np.zeros(3), turn))
-
-    def _encoded(self, topic: str, time: int, message: RosObject) -> Encoded:
-        return Encoded(topic, time, bytes(self.types.serialize_cdr(message, TOPICS[topic], little_endian=True)))
-
-    def _make(self, kind: str, **fields: RosObject) -> RosObject:
-        """Create a message of the given type."""
-        package, _, name = kind.partition("/")
-        return self.types.types[f"{package}/msg/{name}"](**fields)
-
-    def _header(self, time: int, frame: str) -> RosObject:
-        stamp = self._make("builtin_interfaces/Time", sec=time // 10**9, nanosec=time % 10**9)
-        return self._make("std_msgs/Header", stamp=stamp, frame_id=frame)
-
-    def _vector(self, values: Array, kind: str = "geometry_msgs/Vector3") -> RosObject:
-        return self._make(kind, **dict(zip("xyzw", (float(one) for one in values), strict=False)))
 
     # ------------------------------------------------------------ images
 
@@ -428,29 +521,6 @@ class FrameEncoder:
         table |= {name: one[index][rows, columns].astype(np.int32) for name, one in labels.items() if one is not None}
         return self._cloud(table, time)
 
-    def _cloud(self, table: dict[str, NDArray[Any]], time: int) -> RosObject:
-        """Return a point cloud with the given fields, each ``(points,)``."""
-        kind = np.dtype([(name, one.dtype.newbyteorder("<")) for name, one in table.items()])
-        points = np.zeros(len(table["x"]), kind)
-        for name, one in table.items():
-            points[name] = one
-        fields = [
-            self._make("sensor_msgs/PointField", name=name, offset=4 * index, datatype=POINT_TYPES[one.dtype], count=1)
-            for index, (name, one) in enumerate(table.items())
-        ]
-        return self._make(
-            "sensor_msgs/PointCloud2",
-            header=self._header(time, BODY),
-            height=1,
-            width=len(points),
-            fields=fields,
-            is_bigendian=False,
-            point_step=kind.itemsize,
-            row_step=kind.itemsize * len(points),
-            data=np.frombuffer(points.tobytes(), np.uint8),
-            is_dense=True,
-        )
-
     # ------------------------------------------------------------ first returns
 
     @cached_property
@@ -494,16 +564,6 @@ class FrameEncoder:
         return self._cloud({name: one.astype(np.float32) for name, one in table.items()}, time)
 
     # ------------------------------------------------------------ poses
-
-    def _transform(self, parent: str, child: str, time: int, place: Array, turn: Rotation) -> RosObject:
-        transform = self._make(
-            "geometry_msgs/Transform",
-            translation=self._vector(place),
-            rotation=self._vector(turn.as_quat(canonical=True), "geometry_msgs/Quaternion"),
-        )
-        header = self._header(time, parent)
-        one = self._make("geometry_msgs/TransformStamped", header=header, child_frame_id=child, transform=transform)
-        return self._make("tf2_msgs/TFMessage", transforms=[one])
 
     def _odometry(self, time: int, place: Array, turn: Rotation) -> RosObject:
         """Return the pose of the sonar as odometry; a covariance of -1 marks the twist as unknown."""

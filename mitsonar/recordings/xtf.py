@@ -118,14 +118,16 @@ def read_xtf(path: Path) -> SideScan:
     parts: list[SideScanPart] = []
     for pair, lines in packets.pairs.items():
         band = _band(data, channels, pair, lines, name, sound_speed, weighted=int(head["sensor"]) in WEIGHTED)
-        parts += parts_of(band, placed)
+        of_pair, left_out = parts_of(band, placed)
+        parts += of_pair
+        notes += left_out
     facts: Facts = {"recorded by": " ".join(_text(head[key]) for key in ("program", "version")), **placed.facts}
     if note := _text(head["note"]):
         facts["text"] = note
     ground_range = any(channels[side].correction == GROUND_RANGE for pair in packets.pairs for side in pair)
     if ground_range:
         notes.append("the file marks its samples as corrected to ground range: ranges are wrong by this correction")
-    all_notes = (*packets.notes(len(data)), *placed.notes, *notes, *speed_note)
+    all_notes = (*packets.notes(len(data)), *placed.notes, *dict.fromkeys(notes), *speed_note)
     return SideScan(path.name, "XTF (.xtf)", tuple(parts), facts, all_notes)
 
 

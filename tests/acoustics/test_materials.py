@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from mitsonar.acoustics.materials import (
     LARGEST_MU,
     LAWS,
     SEDIMENTS,
+    Basis,
     Material,
     Sediment,
     band_warning,
@@ -206,6 +207,7 @@ def test_material_is_valid_and_every_number_has_a_source(name: str) -> None:
     one, known = material(name), named_materials()[name]
     assert one.name == name
     assert known.about.strip()
+    assert one.basis in get_args(Basis)
     assert all(isinstance(source, str) and len(source.strip()) >= 4 for source in known.sources.values())
     given = {key for key, value in one.model_dump().items() if value != Material.model_fields[key].default}
     assert given - {"name", "about", "source", "law"} <= set(known.sources)
@@ -220,7 +222,61 @@ def test_material_is_valid_and_every_number_has_a_source(name: str) -> None:
 
 
 def test_all_that_the_house_needs_is_there() -> None:
-    assert set(named_materials()) >= {"mud", "sand", "gravel", "rock", "steel", "concrete", "wood", "rubber"}
+    natural = {"mud", "sand", "gravel", "rock", "sand-mhz", "rock-mhz"}
+    assert set(named_materials()) >= {*natural, "steel", "concrete", "wood", "rubber"}
+
+
+@pytest.mark.parametrize("name", ["sand", "rock"])
+def test_a_warning_gives_the_band_and_the_material_that_holds(name: str) -> None:
+    low, high = material(name), material(f"{name}-mhz")
+    assert band_warning(low, 2.1e6) == (
+        f"the numbers of material {name} (computed) hold from 10 kHz to 100 kHz: 2,100 kHz is extrapolated; "
+        f"give {name}-mhz, which is meant for it"
+    )
+    assert str(band_warning(high, 50e3)).endswith(f"50 kHz is extrapolated; give {name}, which is meant for it")
+    assert [band_warning(high, hz) for hz in (0.1e6, 0.4e6, 1.2e6, 3e6)] == [None] * 4
+    assert str(band_warning(high, 4e6)).endswith("4,000 kHz is extrapolated")
+    assert str(band_warning(Material(mu=0.1, frequency_max_hz=5e4), 1e5)) == (
+        "the numbers of material custom hold to 50 kHz: 100 kHz is extrapolated"
+    )
+
+
+def test_levels_above_100_khz_are_those_of_their_sources() -> None:
+    """Sand through its model where that ends, at 30 deg; rock through the middle of what was measured at 20 deg."""
+    for frequency in (4e5, 3e6):
+        sand, rock = (sigma_table(material(name), frequency) for name in ("sand-mhz", "rock-mhz"))
+        assert 10 * math.log10(sand[30] / sigma_table(material("sand"), 100e3)[30]) == pytest.approx(0, abs=0.1)
+        assert 10 * math.log10(rock[20]) == pytest.approx(-25, abs=0.1)
+
+
+def test_grains_that_scatter_alone_are_louder_than_sand() -> None:
+    """A bed of independent grains, f^2 / (16 pi chi) sin g, with the functions of Thorne and Meral 2008: by 4 to 7 dB."""
+    radius = 0.5e-3 * 2**-1.5
+    for frequency in (1.35e6, 1.8e6, 2.1e6, 3e6):
+        x = 2 * math.pi * frequency / 1500 * radius
+        peaks = (1 - 0.35 * math.exp(-(((x - 1.5) / 0.7) ** 2))) * (1 + 0.5 * math.exp(-(((x - 1.8) / 2.2) ** 2)))
+        form = x**2 * peaks / (1 + 0.9 * x**2)
+        extinction = 0.29 * x**4 / (0.95 + 1.28 * x**2 + 0.25 * x**4)
+        grains = form**2 / (16 * math.pi * extinction) * math.sin(math.radians(30))
+        assert 4.0 <= 10 * math.log10(grains / sigma_table(material("sand-mhz"), frequency)[30]) <= 7.0
+
+
+def test_harder_things_reflect_more_at_every_frequency() -> None:
+    """Of what faces the sonar: mirror and rest together are V^2, whatever the roughness."""
+    for frequency in (4e5, 1.2e6, 3e6):
+        powers = []
+        for name in ("rubber", "wood", "concrete", "steel"):
+            one = material(name)
+            rest = math.pi * sigma_table(one, frequency)[90]
+            powers.append(rest + float(mirror_amplitude(one, 1.0, frequency)) ** 2)
+            assert powers[-1] == pytest.approx(float(one.reflection or 0) ** 2, rel=0.01)
+        assert powers == sorted(powers)
+
+
+@pytest.mark.parametrize(("name", "density", "speed"), [("steel", 7850.0, 5890.0), ("concrete", 2400.0, 3500.0)])
+def test_reflections_are_those_of_impedances(name: str, density: float, speed: float) -> None:
+    ratio = density * speed / 1.5e6
+    assert (ratio - 1) / (ratio + 1) == pytest.approx(float(material(name).reflection or 0), abs=0.005)
 
 
 def test_the_materials_are_packaged() -> None:
@@ -315,6 +371,10 @@ def test_unknown_material_names_the_nearest(wrong: str, near: str) -> None:
         ("material: sand\nspectral_exponent: 4\n", "spectral_exponent: input should be less than or equal to 3.9"),
         ("law: table\nstrength_db: [1, 2]\n", "strength_db: .*91 items"),
         ("law: table\nstrength_db: -20\n", "strength_db: input should be a valid tuple, got -20"),
+        (
+            "mu: 0.1\nbasis: guessed\n",
+            "basis: .*'measured', 'computed', 'fitted', 'extrapolated' or 'assumed'.*got 'guessed'",
+        ),
         ("mu: 0.1\nfrequency_min_hz: 2.0e+5\nfrequency_max_hz: 1.0e+5\n", "frequency_max_hz must exceed frequency_min_hz"),
     ],
 )

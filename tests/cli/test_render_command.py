@@ -289,6 +289,11 @@ def test_presets_scenes_and_doctor_print(mitsonar: Command) -> None:
     refused(mitsonar("presets", "gemini"), "gemini-720is")
     instruments = ("ping2", "a50", "deltat-837", "sonar-3d-15", "starfish-450f")
     assert all(re.search(rf"^{name} +\w", listed.stdout, re.MULTILINE) for name in instruments)
+    surfaces = mitsonar("materials").stdout
+    assert re.search(r"sand-mhz +extrapolated +100\.\.3000 +lambert +-21\.5 ", surfaces)
+    assert re.search(r"steel +computed +100\.\.3000 ", surfaces)
+    assert "Olson, Lyons and Saebo" in mitsonar("materials", "rock-mhz").stdout
+    refused(mitsonar("materials", "snd"), "did you mean sand")
     ping = mitsonar("presets", "ping2")
     assert re.search(r"mounts +\{'down'.* ours: straight down", ping.stdout)
     assert re.search(r"range_max +30 +ours, inside the instrument's 100 m", ping.stdout)

@@ -16,7 +16,7 @@ from drawn_frames import SONAR, START, as_zarr, over_ground, sway
 from helpers import files_of, lit_plane, tiny_recipe
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from recording_files import aris_file
+from recording_files import aris_file, side_scan_echogram
 
 from mitsonar.acoustics.levels import LocalContrast
 from mitsonar.acoustics.noise import NOISE_MODELS
@@ -36,6 +36,7 @@ from mitsonar.mapping.sources import FrameSource, load_frames, open_frames
 from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
+from mitsonar.recordings.write_xtf import write_xtf
 from mitsonar.records.frames import SonarFrames
 
 Array = NDArray[np.float64]
@@ -527,6 +528,10 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "with one").mkdir()
     (tmp_path / "with one" / "a.aris").write_bytes(aris_file())
+    (tmp_path / "with two").mkdir()
+    (tmp_path / "with two" / "b.aris").write_bytes(aris_file())
+    write_xtf(tmp_path / "with two" / "c.xtf", side_scan_echogram())
+    (tmp_path / "with two" / "notes.txt").write_text("none")
     (tmp_path / "wrong.npz").write_bytes(b"no zip")
     (tmp_path / "empty.aris").touch()
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
@@ -535,7 +540,8 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
     numbered(sway(4)).save(tmp_path / "frames.npz")
     for name, message in (
         ("empty", r"holds no frames\.npz or frames\.zarr: give frames\.npz"),
-        ("with one", r"holds no frames\.npz or frames\.zarr: give the recording in it, such as .*a\.aris"),
+        ("with one", r"holds no frames\.npz or frames\.zarr: give the recording in it, .*with one.a\.aris"),
+        ("with two", r"holds no frames\.npz or frames\.zarr: give one of the recordings in it: b\.aris, c\.xtf$"),
         ("none.aris", r"there are no frames at .*none\.aris: give frames\.npz, .* or a recording"),
         ("wrong.npz", r"cannot read frames .*: it is neither a whole frames\.npz nor a recording .*: ARIS \(\.aris\), "),
         ("empty.aris", r"cannot read frames .*empty\.aris: it is empty; give .* a recording: ARIS \(\.aris\), "),

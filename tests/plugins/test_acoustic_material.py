@@ -287,8 +287,8 @@ def test_a_hostile_file_is_refused(xml: Path, content: str) -> None:
 @pytest.mark.parametrize(
     ("name", "shapes"),
     [
-        ("sunken_ship", {"seabed": "sand_bed", "rocks": "stone", "ship": "steel"}),
-        ("observatory", {"seabed": "sand_bed", "torpedo": "steel", "cable": "rubber", "amphora": "fired_clay"}),
+        ("sunken_ship", {"seabed": "sand-mhz", "rocks": "stone", "ship": "steel"}),
+        ("observatory", {"seabed": "sand-mhz", "torpedo": "steel", "cable": "rubber", "amphora": "fired_clay"}),
     ],
 )
 def test_shipped_scenes_have_materials_that_hold_at_their_carrier(name: str, shapes: dict[str, str]) -> None:

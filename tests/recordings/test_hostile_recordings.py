@@ -32,6 +32,8 @@ from recording_files import (
     ping360_text,
     ping_viewer_log,
     pingverter_folder,
+    range_image,
+    rip_packet,
     side_scan_echogram,
     some_pings,
 )
@@ -39,14 +41,18 @@ from recording_files import (
 from mitsonar import MitsonarError, open_recording
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.utm import UtmOrigin
+from mitsonar.recordings.open import open_ranges
 from mitsonar.recordings.write_mcap import write_mcap
 from mitsonar.recordings.write_xtf import write_xtf
 
 FIRST, USUAL, FEWER, MANY = 40, 100, 10, 10_000
 """Mutants of each format in the essence, in CI, in the essence of bags, which take 0.1 s each, and in the slow test."""
 
-MEMORY_FLOOR, MEMORY_FACTOR = 4 * 2**20, 40
-"""What a reader may hold at a time: so many bytes, and so many times the size of the recording."""
+MEMORY_FLOOR, MEMORY_FACTOR = 10 * 2**20, 40
+"""What a reader may hold at a time: so many bytes, and so many times the size of the recording.
+
+Of a bag that lost its definitions of messages, ``rosbags`` holds 8 MB of its own.
+"""
 
 TEXT = (".csv", ".txt", ".yaml", ".yml", ".json", ".tum")
 """Files that are spoilt by their words."""
@@ -100,6 +106,10 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "pingverter": lambda folder: pingverter_folder(folder / "log", side_scan_echogram()),
     "ros 2 bag of raw images": lambda folder: _raw_bag(folder / "a"),
     "ros 2 bag of a ping360": lambda folder: _head_bag(folder / "a"),
+    "ros 2 bag of ranges": lambda folder: _ranges_bag(folder / "a"),
+    "sonar 3d-15": lambda folder: (folder / "a.sonar").write_bytes(
+        b"".join(rip_packet(one, packed) for one, packed in zip(_range_images(), (True, False, True), strict=True))
+    ),
     "mcap of a run": lambda folder: write_mcap([over_ground(sway(3), SMALL)], folder / "a.mcap"),
 }
 """What writes a small recording of each format into an empty folder: one file, or one folder of files."""
@@ -140,6 +150,18 @@ def _head_bag(path: Path) -> None:
     maker = Maker(False)
     sent: list[Sent] = [("/sonar", 1.0 + one, maker.echo(*ping, 1.0 + one)) for one, ping in enumerate(_head())]
     write_bag(path, maker, sent)
+
+
+def _ranges_bag(path: Path) -> None:
+    maker, angle = Maker(False), np.linspace(-1, 1, 9)
+    directions = np.stack([0 * angle, np.sin(angle), np.cos(angle)], axis=-1)
+    sent: list[Sent] = [("/mb", 1.0 + one, maker.ranges(3 + angle, directions, 1.0 + one)) for one in range(3)]
+    write_bag(path, maker, sent)
+
+
+def _range_images() -> list[bytes]:
+    pixels = np.random.default_rng(4).integers(0, 20_000, (3, 4, 6))
+    return [range_image(image, number) for number, image in enumerate(pixels)]
 
 
 def _gained() -> bytes:
@@ -285,3 +307,51 @@ def test_many_marks_in_a_log_of_a_ping360_do_not_take_long(tmp_path: Path) -> No
     content = ping_viewer_log([*pings, b"BR\xff\xff" * 200_000], [0.0, 0.1, 0.2])
     (tmp_path / "a.bin").write_bytes(content)
     assert outcome(lambda: open_recording(tmp_path / "a.bin")) == "read"
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_damaged_range_images_with_a_right_checksum(tmp_path: Path, packed: bool) -> None:
+    """Of packed messages those bytes are changed, too, that Snappy reads."""
+    rng, path = np.random.default_rng(8), tmp_path / "a.sonar"
+    whole = [rip_packet(one, packed) for one in _range_images()]
+    outcomes = []
+    for _ in range(USUAL * 10):
+        content = b"".join(_with_sum(changed_numbers(rng, one[8:-4]), one[:4]) for one in whole)
+        path.write_bytes(content)
+        outcomes.append(outcome(lambda: read_recording(path)))
+    assert {"read", "refused"} <= set(outcomes)
+
+
+def _with_sum(payload: bytes, identifier: bytes) -> bytes:
+    head = identifier + struct.pack("<I", len(payload) + 12) + payload
+    return head + struct.pack("<I", zlib.crc32(head))
+
+
+def test_packets_that_unpack_to_more_than_they_say_are_left_out(tmp_path: Path) -> None:
+    """Copies of one byte that make 64 MB, behind a small and behind a large stated size."""
+    for stated in (b"\x10", b"\xff\xff\xff\x7f"):
+        packed = stated + b"\x00a" + b"\xfe\x01\x00" * 20_000
+        (tmp_path / "a.sonar").write_bytes(_with_sum(packed, b"RIP2"))
+        tracemalloc.start()
+        with pytest.raises(MitsonarError, match="holds no range image"):
+            open_ranges(tmp_path / "a.sonar")
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert most < MEMORY_FLOOR
+
+
+def test_packets_of_many_fields_are_left_out(tmp_path: Path) -> None:
+    """Packets of 13 kB that unpack to 130,000 fields each, with a right checksum: parsing them all would take minutes."""
+    packed = b"\x80\x80\x10" + b"\x04\x58\x00" + b"\xfe\x02\x00" * 4095 + b"\xf6\x02\x00"
+    good = rip_packet(_range_images()[0])
+    (tmp_path / "a.sonar").write_bytes(good + _with_sum(packed, b"RIP2") * 300)
+    recording = open_ranges(tmp_path / "a.sonar")
+    assert recording is not None
+    assert "left out: 300 packets that cannot be decoded" in recording.notes
+
+
+def test_many_marks_of_packets_do_not_take_long(tmp_path: Path) -> None:
+    """200,000 marks, each of a packet of 65,507 bytes whose sum is wrong, behind a good packet."""
+    good = rip_packet(_range_images()[0])
+    (tmp_path / "a.sonar").write_bytes(good + (b"RIP2" + struct.pack("<I", 65_507)) * 200_000)
+    assert outcome(lambda: open_ranges(tmp_path / "a.sonar")) == "read"

@@ -12,7 +12,7 @@ import pytest
 from recording_files import side_scan_echogram
 
 import mitsonar
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.motion.utm import UtmOrigin
 from mitsonar.recordings.side_scan import SideScan
 from mitsonar.recordings.write_xtf import CHANNEL, FILE, PING, PING_CHANNEL, write_xtf
@@ -346,12 +346,75 @@ def test_what_is_no_side_scan_is_refused(tmp_path: Path) -> None:
         mitsonar.open_side_scan(tmp_path / "text.txt")
 
 
+def test_a_folder_names_the_recording_in_it(tmp_path: Path) -> None:
+    Changed(tmp_path)
+    for opened in (mitsonar.open_side_scan, mitsonar.open_recording):
+        with pytest.raises(MitsonarError, match=r"mitsonar reads: give the recording in it, .*line\.xtf"):
+            opened(tmp_path)
+
+
 def test_side_scans_have_no_frames(tmp_path: Path) -> None:
     file = Changed(tmp_path)
     with pytest.raises(MitsonarError, match="a side-scan, which has pings in place of frames"):
         mitsonar.open_recording(file.path)
     with pytest.raises(MitsonarError, match="a side-scan, which has pings in place of frames"):
         mitsonar.load_frames(file.path)
+
+
+def speckled(pings: int, fill: float | None, samples: int, *, side: int | None = None) -> Echogram:
+    """Exponential speckle around 0.1, with the last samples of both sides, or of one, set to a value."""
+    echogram = side_scan_echogram(pings=pings)
+    levels = np.random.default_rng(3).exponential(0.1, echogram.levels.shape).clip(max=0.9).astype(np.float32)
+    if fill is not None:
+        levels[:, slice(None) if side is None else side, -samples:] = fill
+    levels[0, 0, 0] = 1.0  # full scale of the writer
+    return replace(echogram, levels=levels)
+
+
+@pytest.mark.parametrize("fill", [0.0, 1.0])
+@pytest.mark.parametrize("samples", [1, 9, 30])
+def test_samples_that_no_ping_fills_are_left_out(tmp_path: Path, fill: float, samples: int) -> None:
+    written = speckled(40, fill, samples)
+    recording = Changed(tmp_path, written).open()
+    read, bins = recording.part().read(), written.sounder.fan.range_bins
+    assert read.levels.shape[2] == bins - samples
+    np.testing.assert_allclose(read.range_m, written.range_m[:-samples], rtol=1e-6)
+    np.testing.assert_allclose(np.sqrt(read.levels), np.sqrt(written.levels[..., :-samples]), atol=1e-4)
+    assert recording.notes == (f"left out: {count_noun(samples, 'sample')} at the end of each side, never filled",)
+
+
+def test_a_few_last_samples_of_one_byte_are_left_out(tmp_path: Path) -> None:
+    """As in the real file: the last amplitudes vary, below 128 of 32,767 counts."""
+    written = speckled(40, None, 0)
+    written.levels[..., -2:] *= 1e-5
+    assert Changed(tmp_path, written).open().part().sounder.fan.range_bins == written.sounder.fan.range_bins - 2
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        speckled(40, None, 0),
+        speckled(9, 0.0, 4),  # too few pings to decide
+        speckled(40, 0.0, 4, side=1),  # one side is filled
+        replace(speckled(40, None, 0), levels=np.full_like(speckled(40, None, 0).levels, 0.5)),
+    ],
+    ids=["speckle", "few pings", "one side", "constant"],
+)
+def test_samples_that_may_be_echoes_stay(tmp_path: Path, written: Echogram) -> None:
+    recording = Changed(tmp_path, written).open()
+    assert recording.part().sounder.fan.range_bins == written.sounder.fan.range_bins
+    assert not recording.notes
+
+
+def test_echoes_that_fade_below_a_count_stay(tmp_path: Path) -> None:
+    """Absorption takes them to 0, within a few tens of samples, without a step."""
+    written = speckled(40, None, 0)
+    bins = written.levels.shape[2]
+    written.levels[...] *= np.exp(-40 * np.arange(bins) / bins).astype(np.float32)
+    written.levels[0, 0, 0] = 1.0
+    part = Changed(tmp_path, written).open().part()
+    assert (part.read().levels[..., -1] == 0).all()
+    assert part.sounder.fan.range_bins == bins
 
 
 # ---------------------------------------------------------------- a real file
@@ -366,7 +429,9 @@ def test_a_real_file_is_read_as_pyxtf_reads_it() -> None:
     assert len(part) == 461
     assert part.sounder.fan.frequency_hz == 600e3
     assert part.sounder.fan.sound_speed == 1500
-    assert part.sounder.fan.range_max == pytest.approx(29.98, abs=0.01)
+    # the recorder wrote one byte of the last sample of each side
+    assert "left out: 1 sample at the end of each side, never filled" in recording.notes
+    assert part.sounder.fan.range_max == pytest.approx(29.98 * 1023 / 1024, abs=0.01)
     assert part.origin is not None
     assert part.origin.epsg == 32619
     assert recording.facts["fixes"] == "219 in 461 pings"
@@ -376,7 +441,8 @@ def test_a_real_file_is_read_as_pyxtf_reads_it() -> None:
     _, packets = pyxtf.xtf_read(str(REAL))
     pings = packets[pyxtf.XTFHeaderType.sonar]
     amplitude = np.array([[ping.data[0][::-1], ping.data[1]] for ping in pings], dtype=float)
-    np.testing.assert_allclose(levels, np.square(amplitude / 32767), rtol=1e-5)
+    np.testing.assert_allclose(levels, np.square(amplitude[..., :-1] / 32767), rtol=1e-5)
+    assert (amplitude[..., -1] < 128).all()
     for name, column, sign in (("SensorPitch", 3, -1), ("SensorRoll", 4, 1)):
         stated = np.array([getattr(ping, name) for ping in pings[1:]])
         np.testing.assert_allclose(np.degrees(part.poses[1:, column]), sign * stated, atol=1e-5)

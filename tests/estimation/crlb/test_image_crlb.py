@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-import typer
+from crlb_command import command, floor_scene
 from helpers import box, diffuse, floor, scene, sphere
 from scipy import ndimage, optimize, special, stats
-from typer.testing import CliRunner
 
 from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, information, information_of_sums
 from mitsonar.errors import MitsonarError
@@ -502,22 +501,7 @@ def test_segments_and_their_sums() -> None:
     assert (cramer_rao_bound(source, pose, LOW, gain, kind="vector", pings=24)[0] == whole.std(2)).all()
 
 
-def command(*arguments: object) -> tuple[int, str]:
-    from mitsonar.cli.estimate import crlb
-
-    app = typer.Typer()
-    app.command()(crlb)
-    done = CliRunner().invoke(app, [str(word) for word in arguments])
-    return done.exit_code, done.output
-
-
-SCENE = """<scene version="3.0.0"><sensor type="imaging_sonar">
-  <integer name="beams" value="16"/><integer name="rays_per_beam" value="100"/><integer name="rays_across" value="2"/>
-  <integer name="range_bins" value="64"/>
-  <transform name="to_world"><lookat origin="0,0,2.5" target="0,3.57,0" up="0,0,1"/></transform></sensor>
-<shape type="rectangle" id="floor"><transform name="to_world"><scale value="100"/></transform>
-  <bsdf type="diffuse"><texture type="cell_noise" name="reflectance"><integer name="cells" value="2000"/></texture></bsdf>
-</shape></scene>"""
+SCENE = floor_scene('<texture type="cell_noise" name="reflectance"><integer name="cells" value="2000"/></texture>')
 
 
 @pytest.mark.usefixtures("variant")

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-import typer
+from crlb_command import command, floor_scene
 from helpers import box, diffuse, floor, scene
 from scipy import ndimage
-from typer.testing import CliRunner
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError
@@ -309,22 +308,6 @@ def test_scores_of_drawn_responses_have_the_information_of_pitch_and_roll() -> N
 # ---------------------------------------------------------------- the command
 
 
-def command(*arguments: object) -> tuple[int, str]:
-    from mitsonar.cli.estimate import crlb
-
-    app = typer.Typer()
-    app.command()(crlb)
-    done = CliRunner().invoke(app, [str(word) for word in arguments])
-    return done.exit_code, done.output
-
-
-SCENE = """<scene version="3.0.0"><sensor type="imaging_sonar">
-  <integer name="beams" value="16"/><integer name="rays_per_beam" value="100"/><integer name="rays_across" value="2"/>
-  <integer name="range_bins" value="64"/>
-  <transform name="to_world"><lookat origin="0,0,2.5" target="0,3.57,0" up="0,0,1"/></transform></sensor>
-<shape type="rectangle" id="floor"><transform name="to_world"><scale value="100"/></transform>
-  <bsdf type="diffuse"/></shape></scene>"""
-
 FANS = """kind: range-image
 mounts: {level: [0, 0, 0, 35, 0, 0], upright: [0, 0, 0, 35, 90, 0]}
 model: physical
@@ -339,7 +322,7 @@ range_bins: 32
 @pytest.mark.usefixtures("variant")
 def test_the_command_names_what_cannot_be_observed(tmp_path: Path) -> None:
     path, fans, picture = tmp_path / "floor.xml", tmp_path / "fans.yaml", tmp_path / "six.png"
-    path.write_text(SCENE)
+    path.write_text(floor_scene())
     fans.write_text(FANS)
     code, text = command(path, "--degrees", 6, "--noise", "low", "--model", "physical", "--pings", 4, "--plot", picture)
     assert code == 0, text
