@@ -33,7 +33,8 @@ SECTIONS = (
     *("rendering", "several-reflections", "coherent-ping", "live", "realism", "blind-sorting", "recordings", "data-sets"),
     *("odometry", "hulls", "certainty", "any-start", "loops", "long-run", "odometry-benchmark", "dives", "registration"),
     *("gradients", "height-maps", "trajectories", "limit", "six-degrees", "exactness", "speckle", "networks"),
-    *("unseen-scenes", "table-31", "impulse-responses", "synthetic-aperture", "vectors", "house"),
+    *("unseen-scenes", "table-31", "impulse-responses", "synthetic-aperture", "vectors", "gpu"),
+    "house",
 )
 """Files of results, in the order of the page."""
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, cast
 
+import drjit as dr
 import mitsuba as mi
 
 from mitsonar.acoustics.materials import Material, material, named_materials, single_mu
@@ -30,7 +32,8 @@ class AcousticMaterial(mi.BSDF):
 
     Properties: ``material``: a name, or a YAML file (relative to the scene's folder), or ``none``, which gives a plain
     ``diffuse`` whose reflectance is the reflectivity; ``reflectance`` [0.5]: a texture or number. ``reflectance_mean`` [the
-    mean of the texture]: what the reflectance is divided by for sonars; required for ``mesh_attribute``.
+    mean of the texture]: what the reflectance is divided by for sonars; required for ``mesh_attribute``. ``level_db`` [0]:
+    added to the scattering strength of the material; ``mi.traverse`` shows it, with derivatives.
 
     Cameras see a diffuse surface of that reflectance, from both sides. For sonars only its relative variation matters: it is
     divided by its mean, and multiplies the cross-section. A plain number therefore affects only camera images.
@@ -55,6 +58,7 @@ class AcousticMaterial(mi.BSDF):
         self.reflectance = cast(mi.Texture, props.get_texture("reflectance", SHADE))
         self.given_mean = number_of_property(props, "reflectance_mean", 0.0)
         self.mean = _mean(self.reflectance, self.given_mean)
+        self.level_db = mi.Float(number_of_property(props, "level_db", 0.0))
         self.mu = min(max(single_mu(self.material), FAINTEST), LOUDEST)
         shown = {"type": "twosided", "below": {"type": "diffuse", "reflectance": self.reflectance}}
         self.shown = cast(mi.BSDF, load_dict(shown))
@@ -62,8 +66,9 @@ class AcousticMaterial(mi.BSDF):
         self.m_flags = self.shown.flags()
 
     def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: DeviceArray = True) -> mi.Spectrum:
-        """Return the reflectivity for sonars that do not evaluate the law: mu times the relative variation."""
-        value: Any = self.reflectance.eval(si, active) * (self.mu / self.mean)
+        """Return the reflectivity for sonars that do not evaluate the law: mu times the relative variation and the level."""
+        factor: DeviceArray = dr.exp2(self.level_db * (math.log2(10) / 10))
+        value: Any = self.reflectance.eval(si, active) * (self.mu / self.mean) * factor
         return mi.Spectrum(value)
 
     def sample(
@@ -96,8 +101,9 @@ class AcousticMaterial(mi.BSDF):
         return self.shown.eval_pdf(ctx, si, wo, active)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose the reflectance to ``mi.traverse``."""
+        """Expose the reflectance and the level to ``mi.traverse``."""
         callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
+        callback.put("level_db", self.level_db, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Update the mean of the reflectance after a change."""

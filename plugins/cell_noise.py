@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import drjit as dr
 import mitsuba as mi
 
@@ -20,7 +22,8 @@ class CellNoise(HashedTexture):
     [0.5] and ``std`` [0.2], clipped to 0..1; ``octaves`` [1]: number of grids, each with half the cell size and half the
     weight of the previous one; ``seed`` [0]; ``to_uv``: transform of uv.
 
-    It is not filtered: a ray reads the single cell that it hits.
+    It is not filtered: a ray reads the single cell that it hits. ``mi.traverse`` shows ``low``, ``high``, ``mean`` and
+    ``std``, with derivatives.
 
     .. code-block:: xml
 
@@ -30,17 +33,29 @@ class CellNoise(HashedTexture):
         </texture>
     """
 
+    LEVELS = MappingProxyType({"low": "low", "high": "high", "mean": "middle", "std": "std"})
+
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props, cells=2048.0, cell_size=0.015)
         self.distribution = str(props.get("distribution", "uniform"))
-        self.low, self.high = number_of_property(props, "low", 0.0), number_of_property(props, "high", 1.0)
-        self.middle, self.std = number_of_property(props, "mean", 0.5), number_of_property(props, "std", 0.2)
         if self.distribution not in ("uniform", "gaussian"):
             raise MitsonarError(f"cell_noise distribution must be uniform or gaussian: got {self.distribution!r}")
-        if not 0 <= self.low <= self.high <= 1 or not 0 <= self.middle <= 1 or not self.std >= 0:
+        defaults = {"low": 0.0, "high": 1.0, "mean": 0.5, "std": 0.2}
+        levels = [number_of_property(props, name, default) for name, default in defaults.items()]
+        self.check(*levels)
+        self.low, self.high, self.middle, self.std = map(mi.Float, levels)
+
+    def check(self, *levels: float) -> None:
+        """Check low, high, mean and standard deviation.
+
+        Raises:
+            MitsonarError: a level is outside its limits.
+        """
+        low, high, mean, std = levels
+        if not 0 <= low <= high <= 1 or not 0 <= mean <= 1 or not std >= 0:
             raise MitsonarError(
-                f"cell_noise needs 0 <= low <= high <= 1, 0 <= mean <= 1, std >= 0: got low {self.low:g}, "
-                f"high {self.high:g}, mean {self.middle:g}, std {self.std:g}"
+                f"cell_noise needs 0 <= low <= high <= 1, 0 <= mean <= 1, std >= 0: got low {low:g}, high {high:g}, "
+                f"mean {mean:g}, std {std:g}"
             )
 
     def octave(self, point: DeviceArray, seed: int) -> DeviceArray:
@@ -55,7 +70,8 @@ class CellNoise(HashedTexture):
 
     def mean(self) -> DeviceArray:
         """Return the mean of the distribution, which Mitsuba uses for importance sampling."""
-        return mi.Float((self.low + self.high) / 2 if self.distribution == "uniform" else self.middle)
+        mean: DeviceArray = (self.low + self.high) / 2 if self.distribution == "uniform" else self.middle
+        return mi.Float(mean)
 
 
 mi.register_texture("cell_noise", CellNoise)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import cast
 
 import drjit as dr
@@ -38,6 +40,29 @@ class HashedTexture(mi.Texture):
                 f"{self.name} needs cells > 0, cell_size > 0 and octaves 1..24: got cells {self.cells:g}, cell_size "
                 f"{self.cell_size:g} m, octaves {self.octaves}"
             )
+
+    LEVELS: Mapping[str, str] = MappingProxyType({})
+    """Attributes by their name in ``mi.traverse``: Dr.Jit numbers that scale the values, with derivatives if any."""
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose the levels to ``mi.traverse``."""
+        for name, attribute in self.LEVELS.items():
+            callback.put(name, getattr(self, attribute), mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        """Check the levels after a change.
+
+        Raises:
+            MitsonarError: a level is outside its limits.
+        """
+        self.check(*(float(dr.detach(getattr(self, name))[0]) for name in self.LEVELS.values()))
+
+    def check(self, *levels: float) -> None:
+        """Check the values of :attr:`LEVELS`; subclasses override this.
+
+        Raises:
+            MitsonarError: a level is outside its limits.
+        """
 
     @property
     def name(self) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import drjit as dr
 import mitsuba as mi
 
@@ -20,7 +22,8 @@ class Perlin(HashedTexture):
     of the previous one; ``low`` [0], ``high`` [1]: reflectivity at noise -1 and 1, clipped; ``contrast`` [1.5]: factor
     applied to the noise before that; ``seed`` [0]; ``to_uv``: transform of uv.
 
-    It repeats only after the 2^32 lattice points of its hash.
+    It repeats only after the 2^32 lattice points of its hash. ``mi.traverse`` shows ``low``, ``high`` and ``contrast``, with
+    derivatives.
 
     .. code-block:: xml
 
@@ -30,14 +33,25 @@ class Perlin(HashedTexture):
         </texture>
     """
 
+    LEVELS = MappingProxyType({name: name for name in ("low", "high", "contrast")})
+
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props, cells=64.0, cell_size=0.5, octaves=4)
-        self.low, self.high = number_of_property(props, "low", 0.0), number_of_property(props, "high", 1.0)
-        self.contrast = number_of_property(props, "contrast", 1.5)
-        if not 0 <= self.low <= self.high <= 1 or not self.contrast > 0:
+        defaults = {"low": 0.0, "high": 1.0, "contrast": 1.5}
+        levels = [number_of_property(props, name, default) for name, default in defaults.items()]
+        self.check(*levels)
+        self.low, self.high, self.contrast = map(mi.Float, levels)
+
+    def check(self, *levels: float) -> None:
+        """Check low, high and contrast.
+
+        Raises:
+            MitsonarError: a level is outside its limits.
+        """
+        low, high, contrast = levels
+        if not 0 <= low <= high <= 1 or not contrast > 0:
             raise MitsonarError(
-                f"perlin needs 0 <= low <= high <= 1 and contrast > 0: got low {self.low:g}, high {self.high:g}, "
-                f"contrast {self.contrast:g}"
+                f"perlin needs 0 <= low <= high <= 1 and contrast > 0: got low {low:g}, high {high:g}, contrast {contrast:g}"
             )
 
     def octave(self, point: DeviceArray, seed: int) -> DeviceArray:

@@ -543,6 +543,17 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
             return np.asarray(motions(self.pose[here]).mean(axis=0))
         return np.asarray(self.motion[here.start : here.stop - 1].mean(axis=0))
 
+    @property
+    def arrays(self) -> dict[str, tuple[str, np.dtype[Any]]]:
+        """Return the arrays of the store of which samples consist, keyed by their name in a sample: name and type there."""
+        result = {}
+        for name, (kind, view) in array_names(self.recipe).items():
+            if view in self.arrange.views and kind == self.stored_kind:
+                result[view] = name, self.store.array(name).dtype
+            elif view in self.arrange.views and kind == "nonzero" and self.stored_kind == "vector":
+                result[f"nonzero_{view}"] = name, np.dtype(np.int32)
+        return result
+
     def raw(self, index: int) -> RawSample:
         """Read a sample as stored: the frames keyed by view, their numbers, and the label; see :meth:`finished`."""
         here = self.frame_slice(index)
@@ -550,11 +561,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
             "frames": np.arange(here.start, here.stop),
             "label": self.labels.encode(self.target(index)),
         }
-        for name, (kind, view) in array_names(self.recipe).items():
-            if view in self.arrange.views and kind == self.stored_kind:
-                sample[view] = self._read(name, here)
-            elif view in self.arrange.views and kind == "nonzero" and self.stored_kind == "vector":
-                sample[f"nonzero_{view}"] = self._read(name, here).astype(np.int32)
+        sample |= {key: self._read(name, here).astype(kind, copy=False) for key, (name, kind) in self.arrays.items()}
         if self.ground:
             if index not in self._grounds:  # cached: it is the same in every epoch
                 image = sample[self.arrange.views[0]]

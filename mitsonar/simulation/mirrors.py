@@ -23,6 +23,7 @@ from mitsonar.errors import MitsonarError, short_repr, suggest_names
 from mitsonar.plugins.material_laws import material_of
 from mitsonar.plugins.surfaces import Hit, Surfaces, registry_index
 from mitsonar.simulation.device import DeviceArray
+from mitsonar.simulation.shape_pieces import FLAT, triangles_of
 from mitsonar.simulation.tracing import OFF_SURFACE, hidden
 
 __all__ = [
@@ -193,9 +194,6 @@ MOST_FACETS = 2_000_000
 STEEPEST, HIGHEST = 0.5, 0.1
 """Limits of a plane with waves: cosine of the steepest facet (60 deg), and rms height as a fraction of the mesh's size."""
 
-FLAT = ("Rectangle", "Disk")
-"""Flat shapes of Mitsuba."""
-
 SAME_PLANE = 2e-6
 """Largest distance of a facet from a plane that it lies on, as a fraction of the mesh's size."""
 
@@ -300,7 +298,7 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
                 f"shape {name} ({kind.lower()}) is curved and does not mirror in impulse responses: give it as a mesh"
             )
             continue
-        corners = _triangles(shape)
+        corners = triangles_of(shape)
         planes = _planes(corners)
         if planes is not None:
             flat.planes.extend(MirrorPlane(name, index, normal, offset, *part) for normal, offset in planes)
@@ -323,19 +321,9 @@ def mirror_planes(scene: mi.Scene, mirrors: Mirrors | None) -> list[MirrorPlane]
         assert mirrors is not None
         part = float(mirrors.reflection[index]), float(mirrors.roughness_m[index])
         if part[0] != 0 and (isinstance(shape, mi.Mesh) or shape.class_name() in FLAT):
-            planes = _planes(_triangles(shape)) or []
+            planes = _planes(triangles_of(shape)) or []
             flat_planes += [MirrorPlane(shape.id(), index, normal, offset, *part) for normal, offset in planes]
     return flat_planes
-
-
-def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
-    """Return the triangles of a mesh ``(n, 3, 3)`` [m]; one triangle in the plane of a rectangle or disk."""
-    if isinstance(shape, mi.Mesh):
-        vertices = np.array(shape.vertex_positions_buffer(), dtype=float).reshape(-1, 3)
-        return np.asarray(vertices[np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)])
-    matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=float).reshape(4, 4, -1)[..., 0]
-    middle, across, along = matrix[:3, 3], matrix[:3, 0], matrix[:3, 1]
-    return np.stack([middle, middle + across, middle + along])[None]
 
 
 def _mean_plane(

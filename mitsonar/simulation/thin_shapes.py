@@ -16,8 +16,6 @@ from mitsonar.acoustics.speckle import BLENDED_VARIANCE, patch_amplitudes
 from mitsonar.plugins.surfaces import grain_key
 from mitsonar.simulation.beams import CommonFan
 from mitsonar.simulation.device import DeviceArray, padded
-from mitsonar.simulation.mirrors import FLAT
-from mitsonar.simulation.narrow_mirrors import COLUMNS, MOST_FACETS, pieces_of, sphere_and_width, triangles_of
 from mitsonar.simulation.points import (
     Patches,
     lattice_key,
@@ -27,6 +25,7 @@ from mitsonar.simulation.points import (
     place_in_cell,
     weight_of,
 )
+from mitsonar.simulation.shape_pieces import COLUMNS, FLAT, MOST_FACETS, pieces_of, sphere_and_width, triangles_of
 
 __all__ = ["ThinShapes"]
 

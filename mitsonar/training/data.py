@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -266,11 +267,12 @@ def batches(
     device: torch.device,
     workers: int = 0,
     share: tuple[int, int] = (0, 1),
-) -> DataLoader[Batch]:
-    """Return a loader of the batches for steps ``start`` to ``stop`` of a training.
+) -> DataLoader[Batch] | BatchesInMemory:
+    """Return the batches for steps ``start`` to ``stop`` of a training.
 
     The batch of a step does not depend on ``start``, and skipped batches are not read. On a CPU, the processes that read
-    also finish the samples. Otherwise :func:`finished` does this on the device.
+    also finish the samples. Otherwise :func:`finished` does this on the device. A data set that fits into the memory of a
+    GPU is copied there once.
 
     Args:
         material: data of the training.
@@ -294,6 +296,8 @@ def batches(
         return DataLoader(RawStream(material.samples, size, start, share), batch_size=size, **options)
     assert material.numbers is not None
     order = Order(material.numbers, recipe.batch, recipe.seed, start, stop, share)
+    if isinstance(material.samples, SonarPairs) and fits_on(device, material.samples):
+        return BatchesInMemory(material.samples, order, device)
     return DataLoader(_Stored(material.samples), batch_sampler=order, **options)
 
 
@@ -323,6 +327,46 @@ class Order(Sampler[list[tuple[int, int]]]):
             if epoch != current_epoch:
                 current_epoch, order = epoch, np.random.default_rng([self.seed, ORDER, epoch]).permutation(self.numbers)
             yield [(epoch, int(number)) for number in order[position * self.batch : (position + 1) * self.batch][rank::size]]
+
+
+MEMORY_SHARE = 0.5
+"""A data set is copied to a GPU if it fills at most this fraction of the memory that is free."""
+
+
+def fits_on(device: torch.device, pairs: SonarPairs) -> bool:
+    """Return whether the frames of a data set can be kept in the memory of a GPU; frames with ground geometry cannot."""
+    if device.type != "cuda" or pairs.ground:
+        return False
+    shapes = [(pairs.store.array(name).shape, kind.itemsize) for name, kind in pairs.arrays.values()]
+    return sum(math.prod(shape) * size for shape, size in shapes) <= MEMORY_SHARE * torch.cuda.mem_get_info(device)[0]
+
+
+class BatchesInMemory:
+    """Batches of raw samples from frames in the memory of a device: the same samples that a loader reads from disk.
+
+    Args:
+        pairs: samples without ground geometry.
+        order: yields the (epoch, sample) pairs of each batch.
+        device: holds the frames.
+    """
+
+    def __init__(self, pairs: SonarPairs, order: Order, device: torch.device) -> None:
+        self.pairs, self.order, self.device = pairs, order, device
+
+    def __iter__(self) -> Iterator[Batch]:
+        pairs, device = self.pairs, self.device
+        tables = {
+            key: torch.from_numpy(pairs.store.read(name).astype(kind, copy=False)).to(device)
+            for key, (name, kind) in pairs.arrays.items()
+        }
+        labels = torch.from_numpy(np.stack([pairs.labels.encode(pairs.target(index)) for index in range(len(pairs))]))
+        first, offsets = torch.from_numpy(pairs.first), torch.arange(pairs.frames)
+        for keys in self.order:
+            numbers = torch.tensor([number for _, number in keys])
+            frames = first[numbers, None] + offsets
+            here = frames.to(device)
+            raw = {"frames": frames, "label": labels[numbers], **{key: table[here] for key, table in tables.items()}}
+            yield {"epoch": keys[0][0], "frames": frames[:, 0].clone(), "raw": raw}
 
 
 @dataclass(frozen=True)

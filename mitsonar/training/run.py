@@ -140,6 +140,7 @@ def _trainer(journal: Journal, options: TrainOptions) -> lightning.Trainer:
             callbacks=[journal],
             plugins=[StateFile()],
             logger=_tensorboard(folder),
+            benchmark=options.accelerator != "cpu",  # of convolutions: their sizes never change
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,

@@ -25,7 +25,7 @@ from mitsonar.training.data import STEP, Array, Batch, Material, Validation, bat
 if TYPE_CHECKING:
     from torch.utils.data import DataLoader
 
-    from mitsonar.training.data import NetworkInput, NetworkOutput
+    from mitsonar.training.data import BatchesInMemory, NetworkInput, NetworkOutput
 
 __all__ = [
     "AUGMENTATIONS",
@@ -160,8 +160,8 @@ class NetworkTraining(lightning.LightningModule):
         self.workers = 0
         self.squares: Array = np.zeros(len(material.samples.labels.names))
 
-    def train_dataloader(self) -> DataLoader[Batch]:
-        """Return a loader for all batches from the next step to the end of training."""
+    def train_dataloader(self) -> DataLoader[Batch] | BatchesInMemory:
+        """Return all batches from the next step to the end of training."""
         share = (self.trainer.global_rank, self.trainer.world_size)
         return batches(
             self.material, self.recipe, self.global_step, self.steps, device=self.device, workers=self.workers, share=share

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from helpers import MitsubaDict, diffuse, essence, floor, scene
 
+import mitsonar
 from mitsonar.acoustics.materials import GRAZING_DEG, material, mu_at, mu_table, sigma_at, sigma_table, single_mu
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar
@@ -170,6 +171,26 @@ def test_only_the_relative_variation_counts() -> None:
     np.testing.assert_allclose(varied / plain, local / 0.5, rtol=1e-4)
     dark = reflectivity(scene(f=floor(made_of("sand", reflectance=0.05), 3)), down(4000, 0.9))
     np.testing.assert_allclose(dark, plain, rtol=1e-6)
+
+
+def test_a_level_shifts_the_law_at_every_angle() -> None:
+    ray = down(300, 0.9)
+    plain, louder = (reflectivity(scene(f=floor(made_of("mud", **level), 3)), ray) for level in ({}, {"level_db": 6.0}))
+    np.testing.assert_allclose(louder, plain * 10**0.6, rtol=1e-5)
+
+
+def test_levels_of_images_follow_the_level_of_a_material() -> None:
+    """Images are proportional to 10^(level_db / 10), so that d image / d level_db is ln(10) / 10 times the image."""
+    loaded = scene(f=floor(made_of("sand")))
+    sonar = SONAR.replace(model="physical", jitter=False)
+    simulator, params = mitsonar.DifferentiableSimulator(loaded, sonar, edge_points=0), mi.traverse(loaded)
+    key = next(key for key, _ in params if key.endswith("level_db"))
+    dr.enable_grad(params[key])
+    params.update()
+    levels = simulator.levels([0, 0, 3.0, math.radians(40), 0, 0])
+    dr.forward(params[key])
+    image = np.array(levels)
+    np.testing.assert_allclose(np.array(dr.grad(levels)), image * math.log(10) / 10, rtol=1e-4, atol=1e-9 * image.max())
 
 
 def test_materials_and_other_surfaces_side_by_side() -> None:

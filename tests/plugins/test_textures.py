@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from mitsonar.arrays import DeviceArray
+from mitsonar.errors import MitsonarError
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -265,6 +266,51 @@ def test_all_ways_to_ask_agree(kind: str) -> None:
 def test_bad_properties(kind: str, properties: MitsubaDict, message: str) -> None:
     with pytest.raises(RuntimeError, match=message):
         texture(kind, **properties)
+
+
+@pytest.mark.parametrize(
+    ("kind", "properties", "scales"),
+    [
+        ("cell_noise", {"low": 0.2, "high": 0.7}, ("low", "high")),
+        ("cell_noise", {"distribution": "gaussian", "mean": 0.5, "std": 0.05}, ("mean", "std")),
+        ("perlin", {"low": 0.3, "high": 0.6, "contrast": 1.0}, ("low", "high")),
+    ],
+)
+def test_levels_have_derivatives_and_scale_the_values(kind: str, properties: MitsubaDict, scales: tuple[str, ...]) -> None:
+    """A value is proportional to its levels taken together (Euler): its derivatives by them, times them, add up to it."""
+    loaded = cast(
+        mi.Scene,
+        mi.load_dict({"type": "scene", "plate": {"type": "rectangle", "bsdf": diffuse({"type": kind, **properties})}}),
+    )
+    params = mi.traverse(loaded)
+    keys = [next(key for key, _ in params if key.endswith(f"reflectance.{name}")) for name in scales]
+    for key in keys:
+        dr.enable_grad(params[key])
+    params.update()
+    si = dr.zeros(mi.SurfaceInteraction3f, 200)
+    si.uv = mi.Point2f(*np.random.default_rng(3).random((2, 200), dtype=np.float32))
+    value = loaded.shapes()[0].bsdf().eval_diffuse_reflectance(si)
+    total = dr.sum(value[0])
+    dr.backward(total)
+    whole = sum(float(dr.grad(params[key])[0]) * float(dr.detach(params[key])[0]) for key in keys)
+    assert whole == pytest.approx(float(total[0]), rel=1e-5)
+
+
+def test_a_level_is_changed_by_traverse_and_checked() -> None:
+    loaded = cast(
+        mi.Scene, mi.load_dict({"type": "scene", "plate": {"type": "rectangle", "bsdf": diffuse({"type": "cell_noise"})}})
+    )
+    params = mi.traverse(loaded)
+    key = next(key for key, _ in params if key.endswith("reflectance.high"))
+    si = dr.zeros(mi.SurfaceInteraction3f, 4)
+    si.uv = mi.Point2f([0.1, 0.3, 0.5, 0.7], 0.2)
+    before = np.array(loaded.shapes()[0].bsdf().eval_diffuse_reflectance(si)[0])
+    params[key] = mi.Float(0.5)
+    params.update()
+    np.testing.assert_allclose(np.array(loaded.shapes()[0].bsdf().eval_diffuse_reflectance(si)[0]), before / 2, rtol=1e-6)
+    params[key] = mi.Float(1.5)
+    with pytest.raises(MitsonarError, match=r"high 1\.5"):
+        params.update()
 
 
 def test_a_bitmap_is_read_where_it_lies() -> None:

@@ -50,7 +50,15 @@ from mitsonar.datasets.samples import (  # noqa: E402
 )
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.corrnet import GaussianHead  # noqa: E402
-from mitsonar.training.data import Order, Validation, _Collation, finished, material_of  # noqa: E402
+from mitsonar.training.data import (  # noqa: E402
+    BatchesInMemory,
+    Order,
+    Validation,
+    _Collation,
+    finished,
+    fits_on,
+    material_of,
+)
 from mitsonar.training.evaluate import evaluate  # noqa: E402
 from mitsonar.training.journal import TrainingReport, _score  # noqa: E402
 from mitsonar.training.run import train  # noqa: E402
@@ -353,6 +361,26 @@ def numbers_of(validation: Validation) -> list[int]:
     numbers = [row for row in validation.rows if isinstance(row, int)]
     assert len(numbers) == len(validation)
     return numbers
+
+
+@pytest.mark.parametrize("kind", ["image", "vector"])
+def test_batches_in_the_memory_of_a_device_are_those_of_the_loader(kind: str, tmp_path: Path) -> None:
+    """Bit for bit, in raw samples and in finished ones with noise; CPUs read, and so do frames with ground geometry."""
+    url = tmp_path / "both.zarr"
+    make_dataset(tiny_recipe(scenes=[{"count": 1, "sequences": 10}], store="both"), str(url))
+    pairs, cpu = SonarPairs(url, kind=kind, noise="high", split="sample"), torch.device("cpu")
+    order = Order(np.arange(len(pairs)), 8, 0, 1, 6, (0, 1))
+    assert not fits_on(cpu, pairs)
+    for keys, batch in zip(order, BatchesInMemory(pairs, order, cpu), strict=True):
+        read = _Collation(pairs, finish=False)([{"epoch": epoch, **pairs.raw(number)} for epoch, number in keys])
+        assert batch["epoch"] == read["epoch"]
+        assert torch.equal(batch["frames"], read["frames"])
+        assert batch["raw"].keys() == read["raw"].keys()
+        for name, values in read["raw"].items():
+            assert values.dtype == batch["raw"][name].dtype
+            assert torch.equal(values, batch["raw"][name]), name
+        for one, other in zip(finished(batch, pairs, cpu), finished(read, pairs, cpu), strict=True):
+            assert torch.equal(one, other)
 
 
 def test_a_part_of_the_data_is_its_first_frames(made: Path) -> None:
