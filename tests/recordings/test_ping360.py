@@ -267,7 +267,7 @@ def test_damaged_and_cut_messages_are_left_out_and_counted(tmp_path: Path) -> No
     (tmp_path / "a.bin").write_bytes(content[:-7])
     recording = open_recording(tmp_path / "a.bin")
     assert recording.facts["pings"] == len(SECTOR) - 3
-    assert "3 messages" in note_of(recording, "damaged")
+    assert "3 cut off or damaged messages" in note_of(recording, "damaged")
 
 
 def test_samples_that_look_like_a_record_are_samples(tmp_path: Path) -> None:
