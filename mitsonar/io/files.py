@@ -70,10 +70,12 @@ def write_atomic(path: str | Path, content: bytes) -> None:
     Raises:
         MitsonarError: if the folder does not exist.
     """
-    with whole_file(Path(path)) as file:
+    temporary = _part_of(Path(path))
+    with temporary.open("wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
+    temporary.replace(path)
 
 
 @contextmanager
@@ -83,15 +85,20 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     Raises:
         MitsonarError: if the folder does not exist.
     """
-    if not path.parent.is_dir():
-        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first")
-    part = path.with_name(f".{path.name}.part")
+    part = _part_of(path)
     try:
         with part.open("wb") as file:
             yield file
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _part_of(path: Path) -> Path:
+    """Return the temporary file that becomes a path when it is complete; a missing folder is an error."""
+    if not path.parent.is_dir():
+        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; create it first")
+    return path.with_name(f".{path.name}.part")
 
 
 def write_json(path: str | Path, value: dict[str, PlainValue]) -> None:
