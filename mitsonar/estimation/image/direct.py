@@ -4,7 +4,8 @@ It is photometric Gauss-Newton in native polar coordinates. The exact geometry o
 frame, where the other frame shows the same ground. Each frame is resampled at the cells of the other, and both differences
 are used: if both frames are interpolated at once, a texture finer than a beam biases the estimate towards whole and half
 beams. The slopes of the denoised mean of both frames turn differences into motion. Single differences, and whole blocks
-that move independently, have Cauchy weights: shadow edges and relief are outliers.
+that move independently, have Cauchy weights: relief and the ends of shadows are outliers. The sides of shadows move with the
+bodies that cast them.
 
 The iteration starts from zero motion, or from a prior. Where that fails or the match is hardly distinct, ``phase`` finds a
 start. Over far motions relief dominates the error, so the heights of blocks are estimated as well
@@ -14,6 +15,7 @@ start. Over far motions relief dominates the error, so the heights of blocks are
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple, overload
 
 import cv2
@@ -53,6 +55,7 @@ from mitsonar.estimation.image.registration import (
     products_by_block,
     register,
     sampled,
+    shadow_lengths,
     slopes_of,
     smoothed,
 )
@@ -139,6 +142,15 @@ class _Task:
         """Height [m] from which relief would move as it does here if seen as steeply as on rocky fields."""
         middle_m = float(self.frames.range_m[[0, -1]].mean())
         return max(self.attitude.height_m, ROCKY_FIELD_STEEPNESS * middle_m**2 / self.attitude.height_m)
+
+    @cached_property
+    def shadows(self) -> tuple[Floats, Floats] | None:
+        """Lengths of the shadows of both frames; None where the frames hold no levels."""
+        if self.frames.level == "contrast":
+            return None
+        linear = self.frames.level == "linear"  # other codings are matched by their fourth roots
+        roots = [np.maximum(image, 0) ** np.float32(0.25) if linear else image for image in self.images]
+        return shadow_lengths(roots[0]), shadow_lengths(roots[1])
 
 
 @dataclass(frozen=True)
@@ -247,7 +259,7 @@ class Direct:
             if last and until_far and is_far(Motion(*v[:3].tolist()), CLEARLY_FAR * task.relief_m):
                 return Motion(*v[:3].tolist())
             pair = smoothed(task.images[0], level), smoothed(task.images[1], level)
-            cells = Cells(nodes, level)
+            cells = Cells(nodes, level, task.shadows)
             registration = register(pair, cells, v, level, last=last, prior=start_prior)
             if registration is None:
                 return replace(rejected("nothing in the frames to match"), about={"start": start_name})
@@ -274,7 +286,7 @@ class Direct:
 
     def _over_relief(self, task: _Task, start: Motion, near: Motion, start_name: str) -> Estimate:
         """Register over relief from a nearby motion; the distance of the result is measured from ``start``."""
-        registration = registered_over_relief(task.images, task.frames, task.attitude, np.array(near))
+        registration = registered_over_relief(task.images, task.frames, task.attitude, np.array(near), task.shadows)
         if registration is None:
             return replace(rejected("nothing in the frames to match"), about={"start": start_name})
         # far motions also match the ground between rocks, since rocks look different from elsewhere
@@ -449,9 +461,11 @@ class _ResampledFrame(NamedTuple):
 class _ReliefLevel:
     """One pyramid level: its frames, its cells, and the derivatives at the motion with which it begins."""
 
-    def __init__(self, images: Pair, nodes: GroundNodes, v: NDArray[np.float64], level: DirectLevel) -> None:
+    def __init__(
+        self, images: Pair, nodes: GroundNodes, v: NDArray[np.float64], level: DirectLevel, shadows: Pair | None
+    ) -> None:
         self.level = level
-        self.nodes, self.cells = nodes, Cells(nodes, level)
+        self.nodes, self.cells = nodes, Cells(nodes, level, shadows)
         slow = ILLUMINATION[0] / level.step, ILLUMINATION[1]
         self.images = tuple(one - blurred(one, *slow) for one in (smoothed(image, level) for image in images))
         self.shape = self.images[0].shape
@@ -576,7 +590,11 @@ class _ReliefLevel:
 
 
 def registered_over_relief(
-    images: Pair, frames: SonarFrames, attitude: Attitude, start: NDArray[np.float64]
+    images: Pair,
+    frames: SonarFrames,
+    attitude: Attitude,
+    start: NDArray[np.float64],
+    shadows: Pair | None = None,
 ) -> tuple[NDArray[np.float64], Fit] | None:
     """Register two frames over relief from a start near the motion; return None if there is nothing to match.
 
@@ -591,6 +609,7 @@ def registered_over_relief(
         frames: the same frames, with their axes.
         attitude: of the sonar; its height is that over the mean of the visible ground.
         start: sideways, forward [m], yaw [rad] ``(3,)``.
+        shadows: lengths of the shadows of both frames, see :func:`~mitsonar.estimation.image.registration.shadow_lengths`.
 
     Returns:
         The motion ``(3,)`` and its fit, whose derivative by height is that by the mean of the heights.
@@ -602,7 +621,7 @@ def registered_over_relief(
     for number, level in enumerate(RELIEF_LEVELS):
         if number + 1 < len(RELIEF_LEVELS) and not is_resolved(len(images[0]), level):
             continue
-        relief_level = _ReliefLevel(images, nodes, v, level)
+        relief_level = _ReliefLevel(images, nodes, v, level, shadows)
         # heights of the coarser level, resampled to the blocks of this one
         if heights is not None:
             table = heights.reshape(shape).astype(np.float32)

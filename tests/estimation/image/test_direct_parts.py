@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from mitsonar.estimation.estimator import two_frames
-from mitsonar.estimation.image.direct import LEVELS, _resolved, registered_over_relief
+from mitsonar.estimation.image import direct
+from mitsonar.estimation.image.direct import LEVELS, Direct, _resolved, registered_over_relief
 from mitsonar.estimation.image.registration import (
     Cells,
     DirectLevel,
@@ -19,10 +21,11 @@ from mitsonar.estimation.image.registration import (
     cell_blocks,
     is_resolved,
     products_by_block,
+    shadow_lengths,
     smoothed,
 )
 from mitsonar.estimation.named import create_estimator
-from mitsonar.geometry.ground import Attitude, GroundView
+from mitsonar.geometry.ground import Attitude, GroundGeometry, GroundView
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.records.frames import SonarFrames
@@ -82,6 +85,79 @@ def test_margins_do_not_shrink() -> None:
         inner = _inner(np.full((2, 64, 32), rows, dtype=np.float32), slice(0, None), margins)
         assert inner is not None
         assert inner[0] == slice(expected, 64 - expected)
+
+
+# ---------------- Shadows
+
+
+def posts(poses: np.ndarray, place: np.ndarray, height_m: float = 0.4, half_m: float = 0.06) -> SonarFrames:
+    """Frames of a textured floor with posts ``(n, 2)``, which face the sonar and cast shadows, by plane geometry."""
+    sonar = Sonar(range_bins=512, beams=96)
+    ground = GroundGeometry(sonar.range_m, sonar.bearing_rad, sonar.bearing, poses[0, 2], poses[0, 3])
+    rng = np.random.default_rng(7)
+    wave, phase = rng.normal(0, 50, (60, 2)), rng.uniform(0, 2 * np.pi, 60)
+    images = []
+    for x, y, z, *_ in poses:
+        on_floor = np.nan_to_num(ground.points) + np.array([x, y])
+        albedo = 0.5 + 0.4 * np.tanh(np.cos(on_floor @ wave.T + phase).sum(axis=-1) / 6)
+        across, ahead = np.nan_to_num(ground.points)[..., 0], np.nan_to_num(ground.points)[..., 1]
+        for east, north in place - [x, y]:
+            if north > 0.5:
+                # the ray to a cell passes the post where it is as far ahead; the shadow ends where the ray over its top does
+                hidden = np.abs(across * north / np.maximum(ahead, 0.1) - east) < half_m
+                albedo[hidden & (ahead > north) & (ahead < north * z / (z - height_m))] = 0
+        images.append(cv2.GaussianBlur(albedo.astype(np.float32), (0, 0), 0.6))
+    return SonarFrames(np.stack(images), sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar, poses=poses)
+
+
+def test_a_shadow_moves_across_the_beams_as_what_casts_it() -> None:
+    """A step aside and a turn before a post: its shadow moves across as its foot does, and turns as the floor does."""
+    step_m, turn_rad, ahead_m, pitch = 0.02, 0.01, 2.9, float(np.radians(35))
+    frames = posts(np.tile([0.0, 0.0, 2.5, pitch, 0.0, 0.0], (2, 1)), np.array([[0.0, ahead_m]]))
+    lengths = shadow_lengths(frames.image[0] ** np.float32(0.25))
+    cells = Cells(GroundNodes(frames, ATTITUDE, heave=False), LEVELS[-1], (lengths, lengths))
+    beam_rad = float(np.diff(frames.bearing_rad).mean())
+    x_m = ahead_m * np.array([1.03, 1.08, 1.15])
+    rows = np.rint(np.interp(np.hypot(2.5, x_m), frames.range_m, np.arange(512))).astype(int)
+    x_m = np.sqrt(frames.range_m[rows] ** 2 - 2.5**2)
+    # angles in the axes of a sonar that looks down by its pitch
+    foot, floor = (x * np.cos(pitch) + 2.5 * np.sin(pitch) for x in (ahead_m, x_m))
+    aside, turned = (cells.shift(np.array(v))[1] * beam_rad for v in ([step_m, 0.0, 0.0], [0.0, 0.0, turn_rad]))
+    np.testing.assert_allclose(aside[rows, 47:49].mean(axis=1), -step_m / foot, rtol=0.01)
+    np.testing.assert_allclose(aside[rows, 30], aside[rows, 65], rtol=0.01)
+    np.testing.assert_allclose(aside[rows, 30:66:35].mean(axis=1), -step_m / floor, rtol=0.02)
+    np.testing.assert_allclose(turned[rows, 47:49].mean(axis=1), -turn_rad * x_m / floor, rtol=0.01)
+
+
+@pytest.mark.parametrize(("step_m", "remains"), [(0.04, 0.7), (0.1, 0.2)])
+def test_shadows_do_not_turn_a_sideways_motion(step_m: float, remains: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Posts all over three floors: displaced as the floor, their shadows turn the motion by 0.3 deg a metre or more."""
+    start = [0.0, 0.0, 2.5, np.radians(35), 0.0, 0.0]
+    steps = np.array([start, [step_m, *start[1:]]])
+    floors = [posts(steps, np.random.default_rng(seed).uniform([-2, 2], [2, 5], (70, 2))) for seed in range(3)]
+
+    def turn() -> float:
+        return float(np.mean([Direct(2.5, relief_m=0.0).estimate(one).motion.yaw for one in floors]))
+
+    with_shadows = turn()
+    monkeypatch.setattr(direct, "shadow_lengths", np.zeros_like)
+    without = turn()
+    assert without > np.radians(0.3) * step_m
+    assert abs(with_shadows) < remains * without
+
+
+@pytest.mark.parametrize("coded", [True, False])
+def test_shadows_are_the_same_in_all_codings(coded: bool) -> None:
+    """Levels and their fourth roots; dark sand at a third of the level casts nothing and is no shadow."""
+    level = np.full((200, 40), 0.5, dtype=np.float32)
+    level[80:120, 10:20], level[80:120, 25:35] = 0.002, 0.17
+    sonar = Sonar(range_bins=200, beams=40, coding="gamma" if coded else "linear", coding_gamma=0.25)
+    image = np.stack([level ** np.float32(0.25) if coded else level] * 2)
+    frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar, level=sonar.coding)
+    shadows = direct._Task(frames, two_frames(frames), ATTITUDE, None).shadows
+    assert shadows is not None
+    assert shadows[0][100, 15] == pytest.approx(100 - 79, abs=2)
+    assert shadows[0][:, 28:32].max() == 0
 
 
 def test_small_frames_leave_out_coarse_levels_over_relief() -> None:
