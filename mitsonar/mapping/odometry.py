@@ -257,6 +257,9 @@ Row = tuple[str, float, str]
 MANY = 0.1
 """Fraction of invalid motions above which the user is warned that much of the path is interpolated."""
 
+LONG_S = 5.0
+"""Duration of a bridged motion above which the user is warned that it is a guess [s]."""
+
 
 @dataclass(frozen=True)
 class Odometry:
@@ -356,6 +359,13 @@ class Odometry:
                     f"{len(reasons)} of {count_noun(len(self.estimates), 'motion')} ({part:.0f} %) {what}: "
                     f"{_frequent(reasons)}"
                 )
+        pauses_s = self.series.step_s[~self.valid]
+        pauses_s = pauses_s[pauses_s > LONG_S]
+        if len(pauses_s):
+            warnings.append(
+                f"{count_noun(len(pauses_s), 'bridged motion')} took up to {pauses_s.max():,.4g} s, over which the vehicle "
+                "may have moved anywhere: rely on the path between such pauses only"
+            )
         doubts = [str(one.about["doubt"]) for one in self.estimates if "doubt" in one.about]
         if doubts:
             warnings.append(

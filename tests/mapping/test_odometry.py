@@ -267,6 +267,15 @@ def test_many_that_are_not_believed_are_warned_of_and_all_is_an_error() -> None:
         odometry(*told(path, lost=tuple(range(30))))
 
 
+def test_a_pause_that_is_bridged_is_warned_of() -> None:
+    """Frame 5 comes 50 minutes after frame 4; measured across the pause, nothing is a guess."""
+    path = sway(41)
+    paused = Trajectory(path.poses, path.time_s + 3000.0 * (np.arange(41) >= 5))
+    (warning,) = odometry(*told(paused, lost=(4, 9))).warnings()
+    assert warning.startswith("1 bridged motion took up to 3,000 s, over which the vehicle may have moved anywhere")
+    assert odometry(*told(paused, lost=(9,))).warnings() == []
+
+
 # ---------------------------------------------------------------- scale and smoothing
 
 
