@@ -514,13 +514,13 @@ class Cells:
         derivative: of the displacement of the patches' centres by motion (and heave) ``(3 or 4, 2, patches)``.
         usable: rows that meet the ground.
         seen: 1 where a cell shows ground to match, else 0 ``(bins, beams)``; None if all cells do.
-        casters: in each frame, the row at which the shadow over a cell begins, else its own row ``(bins, beams)``; None if
-            shadows are not known.
+        casters: in each frame, the number of the cell at which the shadow over a cell begins, else its own number
+            ``(bins, beams)``; None if shadows are not known.
     """
 
     def __init__(self, nodes: GroundNodes, level: DirectLevel, shadows: tuple[Floats, Floats] | None = None) -> None:
         self.nodes, self.grid = nodes, cell_grid(*nodes.key, level.step)
-        self.casters = None if shadows is None else tuple(_casting_rows(lengths, level.step) for lengths in shadows)
+        self.casters = None if shadows is None else tuple(_casting_cells(lengths, level.step) for lengths in shadows)
         self.row, self.column, self.patch, self.patches = self.grid.row, self.grid.column, self.grid.patch, self.grid.patches
         self.derivative = self._on_patches(nodes.derivative)
         known = nodes.known
@@ -556,11 +556,13 @@ class Cells:
         It is in bins and beams. ``back``: from the second frame to the first. ``lift_m``: for ground higher by this.
         A translation moves shadows across the beams as far as the places where they begin.
         """
-        shift = self._on_all(self.nodes.shift(v, back=back, lift_m=lift_m))
+        nodes = self.nodes.shift(v, back=back, lift_m=lift_m)
+        shift = self._on_all(nodes)
         if self.casters is not None:
             # what casts a shadow turns with it, so that only the translation counts
-            turn = self._on_all(self.nodes.shift(np.array([0, 0, *v[2:]]), back=back, lift_m=lift_m))[1]
-            shift[1] = turn + np.take_along_axis(shift[1] - turn, self.casters[int(back)], axis=0)
+            across = (nodes - self.nodes.shift(np.array([0, 0, *v[2:]]), back=back, lift_m=lift_m))[1].astype(np.float32)
+            translation = self.grid.over_bins[1] @ across @ self.grid.over_beams[1]
+            shift[1] += translation.ravel()[self.casters[int(back)]] - translation
         return shift
 
     def lifted_shift(self, v: Doubles) -> Doubles:
@@ -659,10 +661,12 @@ def shadow_lengths(root: Floats) -> Floats:
     return np.asarray(cv2.dilate(lengths, np.ones((1, SHADOW_SIDES), np.uint8)), dtype=np.float32)
 
 
-def _casting_rows(lengths: Floats, step: int) -> NDArray[np.intp]:
-    """Return the row of each cell of a level whose translation across the beams it shares ``(bins, beams)``."""
+def _casting_cells(lengths: Floats, step: int) -> NDArray[np.intp]:
+    """Return the number of the cell of a level whose translation across the beams each cell shares ``(bins, beams)``."""
     of_level = lengths[step // 2 :: step] / np.float32(step)
-    return np.maximum(np.rint(np.arange(len(of_level))[:, None] - of_level), 0).astype(np.intp)
+    bins, beams = of_level.shape
+    row = np.maximum(np.rint(np.arange(bins)[:, None] - of_level), 0).astype(np.intp)
+    return np.asarray(row * beams + np.arange(beams), dtype=np.intp)
 
 
 # ---------------- Nodes on level ground
