@@ -153,7 +153,9 @@ def test_shadows_are_the_same_in_all_codings(coded: bool) -> None:
     level[80:120, 10:20], level[80:120, 25:35] = 0.002, 0.17
     sonar = Sonar(range_bins=200, beams=40, coding="gamma" if coded else "linear", coding_gamma=0.25)
     image = np.stack([level ** np.float32(0.25) if coded else level] * 2)
-    frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar, level=sonar.coding)
+    frames = SonarFrames(
+        image, sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar, level="gamma" if coded else "linear"
+    )
     shadows = direct._Task(frames, two_frames(frames), ATTITUDE, None).shadows
     assert shadows is not None
     assert shadows[0][100, 15] == pytest.approx(100 - 79, abs=2)
