@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias, TypedDict, Unpack
 
@@ -543,7 +544,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
             return np.asarray(motions(self.pose[here]).mean(axis=0))
         return np.asarray(self.motion[here.start : here.stop - 1].mean(axis=0))
 
-    @property
+    @cached_property
     def arrays(self) -> dict[str, tuple[str, np.dtype[Any]]]:
         """Return the arrays of the store of which samples consist, keyed by their name in a sample: name and type there."""
         result = {}

@@ -359,7 +359,7 @@ class BatchesInMemory:
             key: torch.from_numpy(pairs.store.read(name).astype(kind, copy=False)).to(device)
             for key, (name, kind) in pairs.arrays.items()
         }
-        labels = torch.from_numpy(np.stack([pairs.labels.encode(pairs.target(index)) for index in range(len(pairs))]))
+        labels = torch.from_numpy(pairs.labels.encode(np.stack([pairs.target(index) for index in range(len(pairs))])))
         first, offsets = torch.from_numpy(pairs.first), torch.arange(pairs.frames)
         for keys in self.order:
             numbers = torch.tensor([number for _, number in keys])
