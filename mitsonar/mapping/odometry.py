@@ -88,8 +88,9 @@ class OdometryOptions:
         start: first pose; by default the true one, or the origin at the height of the first frame. Height, pitch and roll
             follow those of the frames along the path, where known.
         every: use only every ``every``-th frame.
-        closure: number of motions over which loops are closed; covariances are inflated to explain the loop residuals. 0
-            closes none.
+        closure: number of motions over which loops are closed; covariances are inflated to explain the loop residuals.
+            Where fewer than two such loops close, since the frames lie too far apart to be matched, it is halved. 0 closes
+            none.
         sensors: sensors of the vehicle; they give the estimators a prior and enter the pose graph.
         loops: search for places seen again, and close the path there in a pose graph.
         local_map: also register frames to a map of the last metres; see :mod:`mitsonar.mapping.local_map`.
@@ -160,6 +161,8 @@ def odometry(
     # 3. inflate covariances to explain the loop residuals, and refine the motions by the local map
     steps = options.closure
     closing = closure_of(source, estimator, numbers, estimates, steps, progress) if steps else None
+    while closing is None and (steps := steps // 2) > 1:
+        closing = closure_of(source, estimator, numbers, estimates, steps)
     estimates = estimates if closing is None else closing.inflate_covariances(estimates)
     pairs = estimates  # the height profile needs their first echoes
     estimates = mapped(shown, numbers, estimates, progress) if options.local_map and shown is not None else estimates
@@ -333,8 +336,10 @@ class Odometry:
             std = np.sqrt(np.diagonal(self.series.covariances, axis1=1, axis2=2).mean(axis=0))
             rows += _by_axis("estimated standard deviation of a motion", in_units(std))
         if self.closure is not None:
-            rows += _by_axis(f"closure over {self.closure.steps} motions, rms", in_units(self.closure.rms))
-            rows += _by_axis(f"closure over {self.closure.steps} motions, mean", in_units(self.closure.mean))
+            over = f"closure over {self.closure.steps} motions"
+            rows.append((f"{over}, loops", len(self.closure.residuals), ""))
+            rows += _by_axis(f"{over}, rms", in_units(self.closure.rms))
+            rows += _by_axis(f"{over}, mean", in_units(self.closure.mean))
         true = self.true_at_frames
         rows += [] if self.graph is None else self.graph.rows(true)
         if self.true is None or true is None:
@@ -365,6 +370,11 @@ class Odometry:
             warnings.append(
                 f"{count_noun(len(pauses_s), 'bridged motion')} took up to {pauses_s.max():,.4g} s, over which the vehicle "
                 "may have moved anywhere: rely on the path between such pauses only"
+            )
+        if self.options.closure and self.closure is None:
+            warnings.append(
+                f"no closure is given, since fewer than two loops of 2 to {self.options.closure} motions were matched: the "
+                "frames may be too few, or too far apart for a match over several motions; record faster or swim slowly"
             )
         doubts = [str(one.about["doubt"]) for one in self.estimates if "doubt" in one.about]
         if doubts:
