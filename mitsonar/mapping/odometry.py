@@ -258,7 +258,7 @@ Row = tuple[str, float, str]
 """Name, value and unit of a result."""
 
 MANY = 0.1
-"""Fraction of invalid motions above which the user is warned that much of the path is interpolated."""
+"""Fraction of motions above which the user is warned that they are interpolated, or that their height is doubtful."""
 
 LONG_S = 5.0
 """Duration of a bridged motion above which the user is warned that it is a guess [s]."""
@@ -377,11 +377,11 @@ class Odometry:
                 "frames may be too few, or too far apart for a match over several motions; record faster or swim slowly"
             )
         doubts = [str(one.about["doubt"]) for one in self.estimates if "doubt" in one.about]
-        if doubts:
+        if len(doubts) > MANY * len(self.estimates):
             warnings.append(
                 f"{len(doubts)} of {len(self.estimates)} pairs of frames contradict the height given, which "
-                f"counts unless the ground rises: {_frequent(doubts)}; check height and pitch (faint ground near the sonar "
-                "looks so, too)"
+                f"counts unless the ground rises: {_frequent(doubts)}; check height, pitch and elevation aperture (faint "
+                "ground near the sonar looks so, too)"
             )
         untrained = dict.fromkeys(str(one.about["untrained"]) for one in self.estimates if "untrained" in one.about)
         warnings.extend(f"{one}: its covariances have not been learnt there" for one in untrained)

@@ -203,6 +203,13 @@ class FrameSource:
                 f"{self.name}: the frames have a pitch, so that {np.degrees(pitch_rad):g} deg would not be used: leave "
                 "it out, or give it to the estimator, as NAME:pitch_deg=35"
             )
+        if pitch_rad is not None and self.attitude_rad is not None and np.isfinite(self.attitude_rad[:, :2]).all():
+            warnings.warn(
+                f"{self.name}: a pitch of {np.degrees(pitch_rad):g} deg replaces the pitch and roll of each frame, which the "
+                "sensors of the sonar measured: leave it out to use them",
+                MitsonarWarning,
+                stacklevel=3,
+            )
         if height_m is not None and not 0 < height_m < np.inf:
             raise MitsonarError(f"the height must be above 0: got {height_m:g} m")
         if height_m is not None and height_m > self.like.range_m[-1]:

@@ -487,6 +487,9 @@ def test_geometry_is_given_where_it_lacks_and_only_there() -> None:
         FrameSource.of(frames).with_geometry(3500.0)
     with pytest.raises(MitsonarError, match=r"-90..90"):
         FrameSource.of(frames).with_geometry(pitch_rad=2.0)
+    leaning = FrameSource.of(replace(frames, attitude_rad=np.zeros((4, 3))))
+    with pytest.warns(MitsonarWarning, match="replaces the pitch and roll of each frame"):
+        leaning.with_geometry(pitch_rad=0.5)
 
 
 def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> None:
