@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, count_noun, suggest_names
-from mitsonar.estimation.estimator import AnyEstimator, Estimate
+from mitsonar.estimation.estimator import FROM_PRIOR, AnyEstimator, Estimate
 from mitsonar.estimation.named import EstimatorLike, create_estimator
 from mitsonar.mapping.local_map import USED, map_attitudes, mapped
 from mitsonar.mapping.loops import Canvas, LoopSearch, canvas_of, search_loops
@@ -60,6 +60,7 @@ __all__ = [
     "Row",
     "Smoothing",
     "closure_of",
+    "contradiction",
     "errors_along",
     "graph_path",
     "height_profile",
@@ -158,6 +159,9 @@ def odometry(
         source, estimator, numbers, workers=options.workers, priors=priors, store=store, progress=progress
     )
     estimates = continued(estimates)
+    doubt = "" if sensors is None else contradiction(sensors, estimates, time_s)
+    if doubt and not any(one.valid for one in estimates):
+        raise MitsonarError(doubt)
     # 3. inflate covariances to explain the loop residuals, and refine the motions by the local map
     steps = options.closure
     closing = closure_of(source, estimator, numbers, estimates, steps, progress) if steps else None
@@ -191,7 +195,9 @@ def odometry(
     correlated = None
     if shown is not None and options.smooth == "none" and graph is None:
         correlated = errors_along(series.motions, canvas_of(shown))
-    return Odometry(numbers, estimates, series, path, source.true, options, factors, heights, closing, graph, correlated)
+    return Odometry(
+        numbers, estimates, series, path, source.true, options, factors, heights, closing, graph, correlated, doubt
+    )
 
 
 def _frames_used(source: Source, options: OdometryOptions) -> tuple[Index, FrameSource | None]:
@@ -281,6 +287,7 @@ class Odometry:
         graph: solution of the pose graph, if sensors or loops were requested.
         correlated: how errors of motions over the same ground are correlated; None to use the correlation stored in
             ``series``, if any.
+        doubt: how the frames contradict the sensors; empty if they agree.
     """
 
     frames: Index
@@ -294,6 +301,7 @@ class Odometry:
     closure: Closure | None = None
     graph: GraphPath | None = None
     correlated: CorrelatedErrors | None = None
+    doubt: str = ""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -356,7 +364,7 @@ class Odometry:
         """Return warnings for the user: many motions invalid or not from the map, doubtful heights, untrained regimes."""
         lost = [estimate.reason for estimate in self.estimates if not estimate.valid]
         without = [one.about["map"] for one in self.estimates if one.about.get("map", USED) != USED]
-        warnings = []
+        warnings = [self.doubt] if self.doubt else []
         for reasons, what in ((lost, "were rejected and bridged"), (without, "are those of pairs of frames")):
             if len(reasons) > MANY * len(self.estimates):
                 part = 100 * len(reasons) / len(self.estimates)
@@ -532,6 +540,12 @@ DEFAULT_REACH_M = 3.0
 NOTHING = 1e-9
 """Correlation of errors that are independent of each other."""
 
+CLEARLY_RELATED = 0.7
+"""Correlation of the turns of frames and gyroscope above which their ratio shows the unit and the sign."""
+
+NEARLY_RADIANS = 0.6
+"""Smallest ratio of turns, in units of 57.3, that shows rad/s in place of deg/s."""
+
 MEASURED = 0.5
 """Fraction of the standard deviation of an unknown component below which a sensor counts as measuring the component."""
 
@@ -599,6 +613,40 @@ def normalised_errors(path: Trajectory, covariances: Array, true: Trajectory) ->
     off[:, 2] = wrapped(off[:, 2])
     solution = np.linalg.solve(covariances[1:], off[..., None])[..., 0]
     return np.asarray((off * solution).sum(axis=1) / 3)
+
+
+def contradiction(sensors: VehicleSensors, estimates: Sequence[Estimate], time_s: Array) -> str:
+    """Return a sentence where the frames contradict the sensors in many motions, with the likely cause; else nothing.
+
+    The slope of the turns of the frames over those of the gyroscope shows its unit and sign.
+
+    Args:
+        sensors: sensors of the vehicle.
+        estimates: estimate of each pair of frames, with the sensors as a prior.
+        time_s: times of the frames ``(frames,)`` [s].
+    """
+    count, against = len(estimates), sum(FROM_PRIOR in one.reason for one in estimates)
+    if against <= MANY * count:
+        return ""
+    cause = "check time_s, in seconds and in the clock of the recording, and the units and signs of its columns"
+    gyro = sensors.yaw_rate
+    if gyro is not None:
+        compared = gyro.covers(time_s) & np.array([one.valid or FROM_PRIOR in one.reason for one in estimates])
+        seen = np.array([one.motion.yaw for one in estimates])[compared]
+        turned = (gyro.means(time_s) * np.diff(time_s))[compared]
+        slope = float(seen @ turned / max(float(turned @ turned), np.finfo(float).tiny))
+        if len(seen) > 2 and abs(np.corrcoef(seen, turned)[0, 1]) > CLEARLY_RELATED:
+            faults = []
+            if NEARLY_RADIANS < np.radians(abs(slope)) < 1 / NEARLY_RADIANS:
+                faults.append("to hold rad/s, so that it must be multiplied by 57.3")
+            if slope < 0:
+                faults.append("to have the wrong sign, since it is positive clockwise seen from above")
+            cause = (
+                f"yaw_rate_deg_s seems {' and '.join(faults)}"
+                if faults
+                else f"the frames turn {slope:.2g} times as far; {cause}"
+            )
+    return f"{against} of {count_noun(count, 'motion')} contradict {sensors.name}: {cause}"
 
 
 def errors_along(motions: Array, canvas: Canvas | None) -> CorrelatedErrors:

@@ -205,8 +205,8 @@ class FrameSource:
             )
         if pitch_rad is not None and self.attitude_rad is not None and np.isfinite(self.attitude_rad[:, :2]).all():
             warnings.warn(
-                f"{self.name}: a pitch of {np.degrees(pitch_rad):g} deg replaces the pitch and roll of each frame, which the "
-                "sensors of the sonar measured: leave it out to use them",
+                f"{self.name}: a pitch of {np.degrees(pitch_rad):g} deg replaces the pitch and roll of each frame, which "
+                "sensors measured: leave it out to use them",
                 MitsonarWarning,
                 stacklevel=3,
             )
