@@ -23,6 +23,7 @@ from scipy.spatial.transform import Slerp
 from mitsonar.acoustics.levels import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, MitsonarWarning, count_noun, suggest_names
+from mitsonar.io.files import missing_file
 from mitsonar.motion.errors import associated
 from mitsonar.motion.pose import poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
@@ -475,7 +476,7 @@ def _open_npz(path: Path, name: str) -> FrameSource:
         MitsonarError: the file is missing, of another kind, or damaged.
     """
     if not os.path.exists(path):
-        raise MitsonarError(f"there are no frames at {path}: {FINDING}")
+        raise missing_file(path, FINDING)
     if os.path.isfile(path) and os.access(path, os.R_OK) and not is_zipfile(path):
         from mitsonar.recordings.open import frameless_words, known_formats
 

@@ -184,10 +184,18 @@ def test_a_topic_is_chosen(mitsonar: Command, tmp_path: Path) -> None:
     assert result["facts"]["topic"] == "/starboard"
 
 
+def test_a_missing_file_is_named_with_its_neighbour(mitsonar: Command, tmp_path: Path) -> None:
+    (tmp_path / "dive.mcap").touch()
+    for typed in (["recording", "info", "dvie.mcap"], ["odometry", "DIVE.MCAP", "-o", "out"]):
+        refused(mitsonar(*typed, cwd=tmp_path), "no such file: ", "; did you mean dive.mcap?")
+    (tmp_path / "notes.mcap").write_text("text")
+    refused(mitsonar("recording", "info", tmp_path / "notes.mcap"), "XTF (.xtf)", "Sonar 3D-15 (.sonar)")
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["info", "no.aris"], "there are no frames at no.aris"),
+        (["info", "no.aris"], "no such file: no.aris; give frames.npz"),
         (["convert", "FRAMES", "-o", "a.bag"], "unknown ending"),
         (["convert", "FRAMES", "-o", "a.mcap", "--resume"], "--resume applies only to folders"),
         (["convert", "FRAMES", "-o", "a.mcap", "--part", "3"], "has no part 3"),

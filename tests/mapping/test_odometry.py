@@ -554,7 +554,7 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
         ("empty", r"holds no frames\.npz or frames\.zarr: give frames\.npz"),
         ("with one", r"holds no frames\.npz or frames\.zarr: give the recording in it, .*with one.a\.aris"),
         ("with two", r"holds no frames\.npz or frames\.zarr: give one of the recordings in it: b\.aris, c\.xtf$"),
-        ("none.aris", r"there are no frames at .*none\.aris: give frames\.npz, .* or a recording"),
+        ("none.aris", r"no such file: .*none\.aris; give frames\.npz, .* or a recording"),
         ("wrong.npz", r"cannot read frames .*: it is neither a whole frames\.npz nor a recording .*: ARIS \(\.aris\), "),
         ("empty.aris", r"cannot read frames .*empty\.aris: it is empty; give .* a recording: ARIS \(\.aris\), "),
         ("other.npz", "lacks image"),
