@@ -16,6 +16,7 @@ from PIL import Image
 from mitsonar import SonarFrames
 from mitsonar.mapping.series import path_of
 from mitsonar.mapping.sources import recording_at
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.write_mcap import write_mcap
 
 
@@ -148,6 +149,24 @@ def test_odometry_reads_what_was_converted(mitsonar: Command, places: dict[str, 
     done = mitsonar("odometry", places["mcap"], "--estimator", "zero", "-o", tmp_path / "out")
     assert done.returncode == 0, done
     assert (tmp_path / "out/true.tum").exists()
+
+
+def test_an_estimated_path_is_written_with_a_recording_that_has_none(
+    mitsonar: Command, frames: SonarFrames, tmp_path: Path
+) -> None:
+    write_mcap([replace(frames, poses=None, height_m=None)], tmp_path / "dive.mcap")
+    path = sway(6)
+    path.save(tmp_path / "path.tum")
+    done = mitsonar("recording", "convert", "dive.mcap", "--poses", "path.tum", "-o", "both.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done
+    poses = recording_at(tmp_path / "both.mcap").part().poses
+    assert poses is not None
+    np.testing.assert_allclose(poses, path.poses, atol=1e-6)
+    Trajectory(path.poses[:3], path.time_s[:3]).save(tmp_path / "short.tum")
+    refused(
+        mitsonar("recording", "convert", "dive.mcap", "--poses", "short.tum", "-o", "a.mcap", cwd=tmp_path),
+        "short.tum has no pose for 3 of 6 frames",
+    )
 
 
 def test_a_dark_frame_is_noted_and_drawn_below_another_top(mitsonar: Command, frames: SonarFrames, tmp_path: Path) -> None:
