@@ -17,6 +17,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import pytest
@@ -152,6 +153,28 @@ def test_page_runs(page: str, tmp_path: Path, mitsonar: Command, shared: Callabl
             run_python(block.text, page, tmp_path)
         else:
             run_xml(block.text)
+
+
+def test_the_recipe_for_a_mavlink_log_makes_sensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The block runs with a stand-in for pymavlink, whose messages have the fields and units of MAVLink."""
+    from mitsonar.motion.sensors import load_sensors
+
+    sent = [
+        SimpleNamespace(get_type=lambda: "ATTITUDE", _timestamp=1.7e9, yawspeed=0.1),
+        SimpleNamespace(get_type=lambda: "VFR_HUD", _timestamp=1.7e9, alt=-2.5),
+        SimpleNamespace(get_type=lambda: "ATTITUDE", _timestamp=1.7e9 + 0.05, yawspeed=-0.2),
+        None,
+    ]
+    log = SimpleNamespace(recv_match=lambda type: sent.pop(0))
+    stand_in = SimpleNamespace(mavutil=SimpleNamespace(mavlink_connection=lambda name: log))
+    monkeypatch.setitem(sys.modules, "pymavlink", stand_in)
+    (block,) = (one for one in blocks_of(DOCS / "tutorials/bluerov.md") if "pymavlink" in one.text)
+    run_python(block.text, "bluerov.md", tmp_path)
+    sensors = load_sensors(tmp_path / "sensors.csv")
+    assert sensors.yaw_rate is not None
+    assert sensors.depth is not None
+    assert sensors.yaw_rate.values == pytest.approx([0.1, -0.2])
+    assert sensors.depth.values.tolist() == [2.5]
 
 
 def test_what_is_not_run_says_why() -> None:

@@ -91,8 +91,8 @@ def odometry(
     closure: Annotated[
         int | None,
         typer.Option(
-            help="Number of motions per closed loop; covariances grow to explain its residual. 0: none. Default: 8 with "
-            "contrast (half the motions if fewer than 16), else 0."
+            help="Number of motions per closed loop, halved where loops do not close; covariances grow to explain the "
+            "residuals. 0: none. Default: 8 with contrast (half the motions if fewer than 16), else 0."
         ),
     ] = None,
     sensors: Annotated[

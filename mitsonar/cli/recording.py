@@ -275,6 +275,10 @@ def convert(
     beams: Annotated[
         int | None, typer.Option(help="Beams of an ARIS file: 48, 64, 96 or 128 (default: those of the frames).")
     ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(help="Path of the sonar to write with the frames: folder of an odometry, TUM or CSV file."),
+    ] = None,
     crop_bins: Annotated[
         str | None, typer.Option("--crop-bins", help="Bins to keep, first,end: numbered from 0, end excluded.")
     ] = None,
@@ -295,7 +299,7 @@ def convert(
 
     of_frames: dict[str, object] = {"--geometry": geometry, "--full": full, "--labels": labels, "--beams": beams}
     of_frames |= {"--crop-bins": crop_bins, "--crop-beams": crop_beams, "--resume": resume}
-    of_frames |= {"--scan-db": scan_db, "--scan-from": scan_from or None}
+    of_frames |= {"--scan-db": scan_db, "--scan-from": scan_from or None, "--poses": poses}
     scan = side_scan_at(file)
     if scan is not None:
         refuse_options(file, {"--topic": topic, **of_frames})
@@ -324,6 +328,9 @@ def convert(
     if len(recording.parts) > 1:
         number = recording.longest if part is None else part
         say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {count_noun(len(recording), 'frame')}")
+    if poses is not None:
+        chosen = _along(chosen, poses, file)
+        recording, part = replace(recording, format=f"{recording.format}, poses of {poses}", parts=(chosen,)), None
     if any(spans):
         chosen = chosen.cropped(*spans)
         # a resumed conversion compares formats, so that it does not go on with another crop
@@ -339,6 +346,26 @@ def convert(
         else:
             written = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
     say(f"{count_noun(len(chosen), 'frame')} in {written}")
+
+
+def _along(part: Part, path: Path, name: str) -> Part:
+    """Return a part with the poses of a path.
+
+    Raises:
+        MitsonarError: no such path, or a frame has no pose in it.
+    """
+    from mitsonar.mapping.odometry_run import OdometryFolder
+    from mitsonar.mapping.sources import poses_at
+    from mitsonar.motion.trajectory import Trajectory
+
+    trajectory = OdometryFolder.open(path).estimated if path.is_dir() else Trajectory.load(path)
+    poses, known = poses_at(trajectory, part.time_s, name, part.attitude_rad)
+    if not known.all():
+        raise MitsonarError(
+            f"{path} has no pose for {int((~known).sum()):,} of {count_noun(len(part), 'frame')} of {name}: give a path of "
+            "the whole recording"
+        )
+    return replace(part, poses=poses, beam_poses=None)
 
 
 def ranges_at(file: str, topic: str | None, geometry: Path | None) -> RangeRecording | None:

@@ -346,6 +346,10 @@ LARGEST_SQUARE = 21.1
 """Quantile 0.9999 of chi-square with three degrees of freedom: one correct estimate in ten thousand exceeds it."""
 
 
+FROM_PRIOR = "from the prior"
+"""Words by which the reason of a motion that contradicts its prior is recognised."""
+
+
 def prior_rejection(motion: Motion, covariance: NDArray[np.float64] | None, prior: MotionPrior | None) -> str:
     """Return why a motion contradicts its prior; empty if it does not, or if there is no prior.
 
@@ -370,7 +374,7 @@ def prior_rejection(motion: Motion, covariance: NDArray[np.float64] | None, prio
     sideways, forward, yaw = in_units(difference)
     deviations = np.sqrt(square)
     return (
-        f"the motion is {sideways:.0f}, {forward:.0f} mm, {yaw:.2f} deg from the prior: {deviations:.1f} standard deviations"
+        f"the motion is {sideways:.0f}, {forward:.0f} mm, {yaw:.2f} deg {FROM_PRIOR}: {deviations:.1f} standard deviations"
     )
 
 

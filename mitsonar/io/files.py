@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import difflib
 import io
 import itertools
 import json
@@ -28,6 +29,7 @@ __all__ = [
     "PlainValue",
     "check_plain_value",
     "finite_number",
+    "missing_file",
     "parse_json",
     "parse_yaml",
     "read_at_most",
@@ -141,6 +143,21 @@ def refuse_irregular(path: str | Path, what: str, limit: int | None = None) -> N
         raise MitsonarError(f"{what} {path} is larger than {limit:,} bytes: it is damaged, or something else")
 
 
+SIMILAR = 0.7
+"""Smallest similarity of a file's name at which a message suggests it."""
+
+
+def missing_file(path: str | Path, otherwise: str = "") -> MitsonarError:
+    """Return an error that suggests the file with the most similar name in the folder; ``otherwise`` if there is none."""
+    try:
+        names = {name.lower(): name for name in sorted(os.listdir(Path(path).parent))}
+    except OSError:
+        names = {}
+    similar = difflib.get_close_matches(Path(path).name.lower(), names, n=1, cutoff=SIMILAR)
+    suggestion = f"did you mean {Path(path).parent / names[similar[0]]}?" if similar else otherwise
+    return MitsonarError(f"no such file: {path}{'; ' if suggestion else ''}{suggestion}")
+
+
 def read_bytes(path: str | Path, what: str, limit: int) -> bytes:
     """Read the bytes of a file up to a limit.
 
@@ -155,7 +172,7 @@ def read_bytes(path: str | Path, what: str, limit: int) -> bytes:
     try:
         content = read_at_most(path, limit)
     except FileNotFoundError:
-        raise MitsonarError(f"no such file: {path}") from None
+        raise missing_file(path) from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise MitsonarError(f"cannot read {what} {path}: {reason}; give an existing file") from None

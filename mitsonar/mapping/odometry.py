@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, count_noun, suggest_names
-from mitsonar.estimation.estimator import AnyEstimator, Estimate
+from mitsonar.estimation.estimator import FROM_PRIOR, AnyEstimator, Estimate
 from mitsonar.estimation.named import EstimatorLike, create_estimator
 from mitsonar.mapping.local_map import USED, map_attitudes, mapped
 from mitsonar.mapping.loops import Canvas, LoopSearch, canvas_of, search_loops
@@ -60,6 +60,7 @@ __all__ = [
     "Row",
     "Smoothing",
     "closure_of",
+    "contradiction",
     "errors_along",
     "graph_path",
     "height_profile",
@@ -88,8 +89,9 @@ class OdometryOptions:
         start: first pose; by default the true one, or the origin at the height of the first frame. Height, pitch and roll
             follow those of the frames along the path, where known.
         every: use only every ``every``-th frame.
-        closure: number of motions over which loops are closed; covariances are inflated to explain the loop residuals. 0
-            closes none.
+        closure: number of motions over which loops are closed; covariances are inflated to explain the loop residuals.
+            Where fewer than two such loops close, since the frames lie too far apart to be matched, it is halved. 0 closes
+            none.
         sensors: sensors of the vehicle; they give the estimators a prior and enter the pose graph.
         loops: search for places seen again, and close the path there in a pose graph.
         local_map: also register frames to a map of the last metres; see :mod:`mitsonar.mapping.local_map`.
@@ -157,9 +159,14 @@ def odometry(
         source, estimator, numbers, workers=options.workers, priors=priors, store=store, progress=progress
     )
     estimates = continued(estimates)
+    doubt = "" if sensors is None else contradiction(sensors, estimates, time_s)
+    if doubt and not any(one.valid for one in estimates):
+        raise MitsonarError(doubt)
     # 3. inflate covariances to explain the loop residuals, and refine the motions by the local map
     steps = options.closure
     closing = closure_of(source, estimator, numbers, estimates, steps, progress) if steps else None
+    while closing is None and (steps := steps // 2) > 1:
+        closing = closure_of(source, estimator, numbers, estimates, steps)
     estimates = estimates if closing is None else closing.inflate_covariances(estimates)
     pairs = estimates  # the height profile needs their first echoes
     estimates = mapped(shown, numbers, estimates, progress) if options.local_map and shown is not None else estimates
@@ -188,7 +195,9 @@ def odometry(
     correlated = None
     if shown is not None and options.smooth == "none" and graph is None:
         correlated = errors_along(series.motions, canvas_of(shown))
-    return Odometry(numbers, estimates, series, path, source.true, options, factors, heights, closing, graph, correlated)
+    return Odometry(
+        numbers, estimates, series, path, source.true, options, factors, heights, closing, graph, correlated, doubt
+    )
 
 
 def _frames_used(source: Source, options: OdometryOptions) -> tuple[Index, FrameSource | None]:
@@ -255,7 +264,7 @@ Row = tuple[str, float, str]
 """Name, value and unit of a result."""
 
 MANY = 0.1
-"""Fraction of invalid motions above which the user is warned that much of the path is interpolated."""
+"""Fraction of motions above which the user is warned that they are interpolated, or that their height is doubtful."""
 
 LONG_S = 5.0
 """Duration of a bridged motion above which the user is warned that it is a guess [s]."""
@@ -278,6 +287,7 @@ class Odometry:
         graph: solution of the pose graph, if sensors or loops were requested.
         correlated: how errors of motions over the same ground are correlated; None to use the correlation stored in
             ``series``, if any.
+        doubt: how the frames contradict the sensors; empty if they agree.
     """
 
     frames: Index
@@ -291,6 +301,7 @@ class Odometry:
     closure: Closure | None = None
     graph: GraphPath | None = None
     correlated: CorrelatedErrors | None = None
+    doubt: str = ""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -333,8 +344,10 @@ class Odometry:
             std = np.sqrt(np.diagonal(self.series.covariances, axis1=1, axis2=2).mean(axis=0))
             rows += _by_axis("estimated standard deviation of a motion", in_units(std))
         if self.closure is not None:
-            rows += _by_axis(f"closure over {self.closure.steps} motions, rms", in_units(self.closure.rms))
-            rows += _by_axis(f"closure over {self.closure.steps} motions, mean", in_units(self.closure.mean))
+            over = f"closure over {self.closure.steps} motions"
+            rows.append((f"{over}, loops", len(self.closure.residuals), ""))
+            rows += _by_axis(f"{over}, rms", in_units(self.closure.rms))
+            rows += _by_axis(f"{over}, mean", in_units(self.closure.mean))
         true = self.true_at_frames
         rows += [] if self.graph is None else self.graph.rows(true)
         if self.true is None or true is None:
@@ -351,7 +364,7 @@ class Odometry:
         """Return warnings for the user: many motions invalid or not from the map, doubtful heights, untrained regimes."""
         lost = [estimate.reason for estimate in self.estimates if not estimate.valid]
         without = [one.about["map"] for one in self.estimates if one.about.get("map", USED) != USED]
-        warnings = []
+        warnings = [self.doubt] if self.doubt else []
         for reasons, what in ((lost, "were rejected and bridged"), (without, "are those of pairs of frames")):
             if len(reasons) > MANY * len(self.estimates):
                 part = 100 * len(reasons) / len(self.estimates)
@@ -366,12 +379,17 @@ class Odometry:
                 f"{count_noun(len(pauses_s), 'bridged motion')} took up to {pauses_s.max():,.4g} s, over which the vehicle "
                 "may have moved anywhere: rely on the path between such pauses only"
             )
+        if self.options.closure and self.closure is None:
+            warnings.append(
+                f"no closure is given, since fewer than two loops of 2 to {self.options.closure} motions were matched: the "
+                "frames may be too few, or too far apart for a match over several motions; record faster or swim slowly"
+            )
         doubts = [str(one.about["doubt"]) for one in self.estimates if "doubt" in one.about]
-        if doubts:
+        if len(doubts) > MANY * len(self.estimates):
             warnings.append(
                 f"{len(doubts)} of {len(self.estimates)} pairs of frames contradict the height given, which "
-                f"counts unless the ground rises: {_frequent(doubts)}; check height and pitch (faint ground near the sonar "
-                "looks so, too)"
+                f"counts unless the ground rises: {_frequent(doubts)}; check height, pitch and elevation aperture (faint "
+                "ground near the sonar looks so, too)"
             )
         untrained = dict.fromkeys(str(one.about["untrained"]) for one in self.estimates if "untrained" in one.about)
         warnings.extend(f"{one}: its covariances have not been learnt there" for one in untrained)
@@ -522,6 +540,12 @@ DEFAULT_REACH_M = 3.0
 NOTHING = 1e-9
 """Correlation of errors that are independent of each other."""
 
+CLEARLY_RELATED = 0.7
+"""Correlation of the turns of frames and gyroscope above which their ratio shows the unit and the sign."""
+
+NEARLY_RADIANS = 0.6
+"""Smallest ratio of turns, in units of 57.3, that shows rad/s in place of deg/s."""
+
 MEASURED = 0.5
 """Fraction of the standard deviation of an unknown component below which a sensor counts as measuring the component."""
 
@@ -589,6 +613,40 @@ def normalised_errors(path: Trajectory, covariances: Array, true: Trajectory) ->
     off[:, 2] = wrapped(off[:, 2])
     solution = np.linalg.solve(covariances[1:], off[..., None])[..., 0]
     return np.asarray((off * solution).sum(axis=1) / 3)
+
+
+def contradiction(sensors: VehicleSensors, estimates: Sequence[Estimate], time_s: Array) -> str:
+    """Return a sentence where the frames contradict the sensors in many motions, with the likely cause; else nothing.
+
+    The slope of the turns of the frames over those of the gyroscope shows its unit and sign.
+
+    Args:
+        sensors: sensors of the vehicle.
+        estimates: estimate of each pair of frames, with the sensors as a prior.
+        time_s: times of the frames ``(frames,)`` [s].
+    """
+    count, against = len(estimates), sum(FROM_PRIOR in one.reason for one in estimates)
+    if against <= MANY * count:
+        return ""
+    cause = "check time_s, in seconds and in the clock of the recording, and the units and signs of its columns"
+    gyro = sensors.yaw_rate
+    if gyro is not None:
+        compared = gyro.covers(time_s) & np.array([one.valid or FROM_PRIOR in one.reason for one in estimates])
+        seen = np.array([one.motion.yaw for one in estimates])[compared]
+        turned = (gyro.means(time_s) * np.diff(time_s))[compared]
+        slope = float(seen @ turned / max(float(turned @ turned), np.finfo(float).tiny))
+        if len(seen) > 2 and abs(np.corrcoef(seen, turned)[0, 1]) > CLEARLY_RELATED:
+            faults = []
+            if NEARLY_RADIANS < np.radians(abs(slope)) < 1 / NEARLY_RADIANS:
+                faults.append("to hold rad/s, so that it must be multiplied by 57.3")
+            if slope < 0:
+                faults.append("to have the wrong sign, since it is positive clockwise seen from above")
+            cause = (
+                f"yaw_rate_deg_s seems {' and '.join(faults)}"
+                if faults
+                else f"the frames turn {slope:.2g} times as far; {cause}"
+            )
+    return f"{against} of {count_noun(count, 'motion')} contradict {sensors.name}: {cause}"
 
 
 def errors_along(motions: Array, canvas: Canvas | None) -> CorrelatedErrors:

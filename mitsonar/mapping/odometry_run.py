@@ -322,8 +322,8 @@ def _figure(result: Odometry, title: str) -> Figure:
 LARGEST_JOURNAL = 2**30
 """Largest size of a journal [bytes]: some three million pairs."""
 
-HEIGHTS = ("height_m", "height_std_m")
-"""Height over the ground and its standard deviation [m], which an estimator may report."""
+HEIGHTS, SENTENCES = ("height_m", "height_std_m"), ("doubt", "untrained")
+"""What an estimator may report: height over the ground with its standard deviation [m], and sentences for the user."""
 
 
 def add_to_journal(path: Path, key: PlainTable, estimate: Estimate) -> None:
@@ -337,7 +337,7 @@ def add_to_journal(path: Path, key: PlainTable, estimate: Estimate) -> None:
     covariance = None if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float).tolist()
     motion = [float(value) for value in estimate.motion]
     line = key | {"motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
-    about = {name: estimate.about[name] for name in ("modes", "spreads", *HEIGHTS) if name in estimate.about}
+    about = {name: estimate.about[name] for name in ("modes", "spreads", *HEIGHTS, *SENTENCES) if name in estimate.about}
     text = json.dumps(line | {"reason": estimate.reason} | ({"about": about} if about else {})) + "\n"
     with path.open("a", encoding="utf-8", newline="\n") as file:
         file.write(text)

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Slerp
 from mitsonar.acoustics.levels import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, MitsonarWarning, count_noun, suggest_names
+from mitsonar.io.files import missing_file
 from mitsonar.motion.errors import associated
 from mitsonar.motion.pose import poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
@@ -202,6 +203,13 @@ class FrameSource:
             raise MitsonarError(
                 f"{self.name}: the frames have a pitch, so that {np.degrees(pitch_rad):g} deg would not be used: leave "
                 "it out, or give it to the estimator, as NAME:pitch_deg=35"
+            )
+        if pitch_rad is not None and self.attitude_rad is not None and np.isfinite(self.attitude_rad[:, :2]).all():
+            warnings.warn(
+                f"{self.name}: a pitch of {np.degrees(pitch_rad):g} deg replaces the pitch and roll of each frame, which "
+                "sensors measured: leave it out to use them",
+                MitsonarWarning,
+                stacklevel=3,
             )
         if height_m is not None and not 0 < height_m < np.inf:
             raise MitsonarError(f"the height must be above 0: got {height_m:g} m")
@@ -468,7 +476,7 @@ def _open_npz(path: Path, name: str) -> FrameSource:
         MitsonarError: the file is missing, of another kind, or damaged.
     """
     if not os.path.exists(path):
-        raise MitsonarError(f"there are no frames at {path}: {FINDING}")
+        raise missing_file(path, FINDING)
     if os.path.isfile(path) and os.access(path, os.R_OK) and not is_zipfile(path):
         from mitsonar.recordings.open import frameless_words, known_formats
 

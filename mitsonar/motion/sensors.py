@@ -247,12 +247,20 @@ class VehicleSensors:
             )
 
     def __repr__(self) -> str:
-        readings = [
-            item for item in (self.yaw_rate, self.sideways, self.forward, self.depth, self.heading) if item is not None
-        ]
-        times = [item.time_s for item in readings] + ([self.dead_reckoning.path.time_s] if self.dead_reckoning else [])
-        span = max(float(time[-1]) for time in times) - min(float(time[0]) for time in times)
-        return f"VehicleSensors({', '.join(self.names)}; {sum(map(len, times)):,} readings over {span:.4g} s)"
+        count, (first, last) = sum(map(len, self._times)), self.span_s
+        return f"VehicleSensors({', '.join(self.names)}; {count:,} readings over {last - first:.4g} s)"
+
+    @property
+    def _times(self) -> list[Array]:
+        """Return the times of the readings of each sensor [s]."""
+        readings = self.yaw_rate, self.sideways, self.forward, self.depth, self.heading
+        times = [item.time_s for item in readings if item is not None]
+        return times + ([self.dead_reckoning.path.time_s] if self.dead_reckoning else [])
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Return the times of the first and the last reading of any sensor [s]."""
+        return min(float(time[0]) for time in self._times), max(float(time[-1]) for time in self._times)
 
     @property
     def names(self) -> list[str]:
@@ -290,8 +298,11 @@ class VehicleSensors:
         """
         measured = [sensor_motions for sensor_motions in self._motions_by_sensor(time_s) if sensor_motions.pair.size]
         if not measured and self.headings(time_s).pose.size == 0 and self.rises(time_s) is None:
-            first, last = time_s[0], time_s[-1]
-            raise MitsonarError(f"{self.name} hold no reading between {first:g} and {last:g} s, the times of the frames")
+            frames, readings = (f"{first:.10g}..{last:.10g} s" for first, last in ((time_s[0], time_s[-1]), self.span_s))
+            raise MitsonarError(
+                f"{self.name} hold no reading at the times of the frames, {frames}, but at {readings}: give time_s in "
+                "seconds, in the clock of the recording, which `mitsonar recording info` prints"
+            )
         return measured
 
     def _motions_by_sensor(self, time_s: Array) -> Iterator[SensorMotions]:

@@ -318,7 +318,7 @@ def _label_path(above: Axes, over_time: list[Axes], title: str) -> None:
 
 
 def _draw_paths(axes: Axes, paths: Mapping[str, Trajectory]) -> None:
-    """Draw lines with arrows along the heading, and mark the start."""
+    """Draw lines with arrows along the heading and a mark at the start, which the legend explains."""
     for name, line, arrow in _path_colours(paths):
         poses = paths[name].poses
         axes.plot(poses[:, 0], poses[:, 1], color=line, label=name, linewidth=1.5, zorder=3)
@@ -326,6 +326,9 @@ def _draw_paths(axes: Axes, paths: Mapping[str, Trajectory]) -> None:
         arrow_poses = poses[_sample_indices(len(poses))]
         direction = np.sin(arrow_poses[:, 5]), np.cos(arrow_poses[:, 5])
         axes.quiver(*arrow_poses[:, :2].T, *direction, color=arrow, scale=25, width=0.003, zorder=4)
+    if paths:
+        axes.plot([], [], linestyle="none", marker="o", color="grey", markersize=4, label="start")
+        axes.plot([], [], linestyle="none", marker=r"$\rightarrow$", color="grey", markersize=10, label="heading")
 
 
 def _sample_indices(frames: int) -> NDArray[np.intp]:

@@ -23,7 +23,17 @@ from mitsonar.errors import MitsonarError, count_noun, missing_package_error
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import preset
 from mitsonar.io.files import INFLATION, refuse_beyond_memory, refuse_irregular
-from mitsonar.recordings.recording import Bytes, Facts, Part, Pixels, Recording, in_time_order, mapped, runs_of
+from mitsonar.recordings.recording import (
+    ELEVATION_PATTERN,
+    Bytes,
+    Facts,
+    Part,
+    Pixels,
+    Recording,
+    in_time_order,
+    mapped,
+    runs_of,
+)
 from mitsonar.recordings.ros_pings import is_beam_major
 from mitsonar.records.frames import SonarFrames
 
@@ -271,6 +281,7 @@ def _part(images: _Images, run: Index) -> Part:
         name=name or "gemini",
         azimuth_fov_deg=min(180.0, math.degrees(span) * beams / (beams - 1)),
         elevation_fov_deg=known.elevation_fov_deg if isinstance(known, Sonar) else ELEVATION_DEG,
+        elevation_pattern=ELEVATION_PATTERN,
         beam_width_deg=known.beam_width_deg if isinstance(known, Sonar) else None,
         beams=beams,
         range_min=float(line[0]) * step,

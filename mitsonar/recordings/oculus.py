@@ -25,6 +25,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import preset
 from mitsonar.io.files import INFLATION
 from mitsonar.recordings.recording import (
+    ELEVATION_PATTERN,
     Bytes,
     Facts,
     Header,
@@ -322,6 +323,7 @@ def _empty_frames(head: Header, bearings: Array, time_s: Array, images: OculusIm
         name=known or "oculus",
         azimuth_fov_deg=fan_deg,
         elevation_fov_deg=named.elevation_fov_deg if named else ELEVATION_DEG,
+        elevation_pattern=ELEVATION_PATTERN,
         beam_width_deg=named.beam_width_deg if named else None,
         beams=beams,
         range_min=0.0,

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, count_noun
+from mitsonar.io.files import missing_file
 from mitsonar.recordings.gemini import is_gemini, read_gemini
 from mitsonar.recordings.jsf import is_jsf, read_jsf
 from mitsonar.recordings.oculus import is_oculus, read_oculus
@@ -179,8 +180,9 @@ def recordings_in(folder: Path) -> str:
 
 
 def known_formats() -> str:
-    """Return the names of all formats of frames as one string, for messages."""
-    return ", ".join(one.words for one in FORMATS)
+    """Return the names of all formats as one string, for messages."""
+    frameless = ", ".join((*(one.words for one in SIDE_SCANS), "Sonar 3D-15 (.sonar)"))
+    return f"{', '.join(one.words for one in FORMATS)}; without frames: {frameless}"
 
 
 def open_recording(path: str | Path, geometry: str | Path | None = None, topic: str | None = None) -> Recording:
@@ -198,7 +200,7 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     recording_format = detect_format(path)
     if recording_format is None:
         if not os.path.exists(path):
-            raise MitsonarError(f"no such file: {path}")
+            raise missing_file(path)
         if words := frameless_words(path):
             raise MitsonarError(words)
         advice = recordings_in(Path(path)) or f"it reads {known_formats()}"
@@ -261,7 +263,7 @@ def open_side_scan(path: str | Path) -> SideScan:
     side_scan_format = detect_side_scan(path)
     if side_scan_format is None:
         if not os.path.exists(path):
-            raise MitsonarError(f"no such file: {path}")
+            raise missing_file(path)
         advice = recordings_in(Path(path)) or f"it reads {', '.join(one.words for one in SIDE_SCANS)}"
         raise MitsonarError(f"{path} is not a side-scan that mitsonar reads: {advice}")
     return side_scan_format.read(Path(path))

@@ -31,7 +31,7 @@ from mitsonar.recordings.picture_geometry import (
     find_geometry_file,
     load_geometry,
 )
-from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order
+from mitsonar.recordings.recording import ELEVATION_PATTERN, Facts, Part, Pixels, Recording, in_time_order
 from mitsonar.records.frames import MAX_NPZ_FRAMES, FrameStore, SonarFrames
 
 __all__ = [
@@ -773,6 +773,7 @@ def _sonar(geometry: PictureGeometry, bins: int, beams: int, fov_deg: float, rat
         name=geometry.name,
         azimuth_fov_deg=fov_deg,
         elevation_fov_deg=geometry.elevation_fov_deg or ANY_ELEVATION_DEG,
+        elevation_pattern=ELEVATION_PATTERN,
         beams=beams,
         range_min=near,
         range_max=far,

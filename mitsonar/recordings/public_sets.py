@@ -23,7 +23,7 @@ from mitsonar.io.csv_table import CsvTable
 from mitsonar.io.files import FileArray, PlainValue, finite_number, read_bytes, read_json
 from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.pictures import Grey, is_complete, natural_key, picture_size, read_picture
-from mitsonar.recordings.recording import Facts, Header, Part, Pixels, Recording, in_time_order, runs_of
+from mitsonar.recordings.recording import ELEVATION_PATTERN, Facts, Header, Part, Pixels, Recording, in_time_order, runs_of
 from mitsonar.recordings.sound_metrics import (
     BEAMS,
     FRAME,
@@ -150,6 +150,7 @@ def _canoe_part(files: list[Path], size: tuple[int, int], times: Array, poses: A
         name="oculus-m3000d",
         azimuth_fov_deg=min(180.0, float(np.degrees(bearings[-1] - bearings[0])) * beams / (beams - 1)),
         elevation_fov_deg=ELEVATION_DEG,
+        elevation_pattern=ELEVATION_PATTERN,
         beams=beams,
         range_min=0.0,
         range_max=RANGE_MAX,

@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, count_noun
+from mitsonar.instruments.beams import Pattern
 from mitsonar.instruments.sonar import scans
 from mitsonar.records.frames import SonarFrames
 
 __all__ = [
     "CHUNK_BYTES",
+    "ELEVATION_PATTERN",
     "Bytes",
     "EqualFrames",
     "Facts",
@@ -42,6 +44,12 @@ Facts: TypeAlias = dict[str, Any]
 
 CHUNK_BYTES = 8 * 2**20
 """Approximate amount of pixel data that is read at a time [bytes]."""
+
+ELEVATION_PATTERN: Pattern = "two_way"
+"""Pattern over elevation of a real sonar, whose files do not state it.
+
+An elevation aperture is a half-power width: ground beyond it echoes, and the first echoes of level ground come from there.
+"""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, count_noun, suggest_names
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order, runs_of
+from mitsonar.recordings.recording import ELEVATION_PATTERN, Facts, Part, Pixels, Recording, in_time_order, runs_of
 from mitsonar.recordings.ros_echoes import read_ros_echoes
 from mitsonar.recordings.ros_messages import (
     ECHOES,
@@ -263,6 +263,7 @@ def _empty_frames(layout: PingLayout, time_s: Array, name: str) -> SonarFrames:
         name=name.strip("/").replace("/", "_") or "ros",
         azimuth_fov_deg=min(360.0, math.degrees(float(layout.bearing_rad[-1] - layout.bearing_rad[0] + across))),
         elevation_fov_deg=min(180.0, math.degrees(layout.elevation_rad) or ELEVATION_DEG),
+        elevation_pattern=ELEVATION_PATTERN,
         beams=beams,
         range_min=max(0.0, float(layout.range_m[0] - steps[0] / 2)),
         range_max=float(layout.range_m[-1] + steps[-1] / 2),

@@ -24,6 +24,7 @@ from mitsonar.errors import MitsonarError, count_noun
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import preset
 from mitsonar.recordings.recording import (
+    ELEVATION_PATTERN,
     Bytes,
     EqualFrames,
     Facts,
@@ -339,6 +340,7 @@ def empty_aris_frames(headers: Header, samples: int, beams: int) -> SonarFrames:
         name=f"aris{kind.name}",
         azimuth_fov_deg=float(np.degrees(bearings[-1] - bearings[0]) * beams / (beams - 1)),
         elevation_fov_deg=TELEPHOTO_ELEVATION_DEG if lens else kind.elevation_deg,
+        elevation_pattern=ELEVATION_PATTERN,
         beams=beams,
         range_min=near,
         range_max=near + samples * step,
@@ -730,6 +732,7 @@ def _didson_sonar(header: np.void, windows: _Windows, time_s: Array) -> SonarFra
         name="didson-lr" if far else "didson",
         azimuth_fov_deg=float(np.degrees(bearings[-1] - bearings[0])) * beams / (beams - 1),
         elevation_fov_deg=preset("didson300").elevation_fov_deg,
+        elevation_pattern=ELEVATION_PATTERN,
         beams=beams,
         range_min=start,
         range_max=start + length,

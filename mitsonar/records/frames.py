@@ -24,6 +24,7 @@ from mitsonar.io.files import (
     FileArray,
     PlainValue,
     finite_number,
+    missing_file,
     parse_json,
     read_json,
     read_npz,
@@ -568,7 +569,7 @@ class SonarFrames:
                 raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: give the folder of a finished run")
             path = existing[0]
         if not os.path.exists(path):
-            raise MitsonarError(f"there are no frames at {path}: give frames.npz or a run's folder")
+            raise missing_file(path, "give frames.npz or a run's folder")
         try:
             if os.path.isdir(path):
                 table, done = open_group(path, COLUMNS, "time_s", "frames_done")

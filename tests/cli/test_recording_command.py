@@ -16,6 +16,7 @@ from PIL import Image
 from mitsonar import SonarFrames
 from mitsonar.mapping.series import path_of
 from mitsonar.mapping.sources import recording_at
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.write_mcap import write_mcap
 
 
@@ -150,6 +151,24 @@ def test_odometry_reads_what_was_converted(mitsonar: Command, places: dict[str, 
     assert (tmp_path / "out/true.tum").exists()
 
 
+def test_an_estimated_path_is_written_with_a_recording_that_has_none(
+    mitsonar: Command, frames: SonarFrames, tmp_path: Path
+) -> None:
+    write_mcap([replace(frames, poses=None, height_m=None)], tmp_path / "dive.mcap")
+    path = sway(6)
+    path.save(tmp_path / "path.tum")
+    done = mitsonar("recording", "convert", "dive.mcap", "--poses", "path.tum", "-o", "both.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done
+    poses = recording_at(tmp_path / "both.mcap").part().poses
+    assert poses is not None
+    np.testing.assert_allclose(poses, path.poses, atol=1e-6)
+    Trajectory(path.poses[:3], path.time_s[:3]).save(tmp_path / "short.tum")
+    refused(
+        mitsonar("recording", "convert", "dive.mcap", "--poses", "short.tum", "-o", "a.mcap", cwd=tmp_path),
+        "short.tum has no pose for 3 of 6 frames",
+    )
+
+
 def test_a_dark_frame_is_noted_and_drawn_below_another_top(mitsonar: Command, frames: SonarFrames, tmp_path: Path) -> None:
     replace(frames, image=(frames.image * 1e-5).astype(np.float32)).save(tmp_path / "dark.npz")
     done = mitsonar("recording", "show", tmp_path / "dark.npz", "-o", tmp_path / "a.png")
@@ -184,10 +203,18 @@ def test_a_topic_is_chosen(mitsonar: Command, tmp_path: Path) -> None:
     assert result["facts"]["topic"] == "/starboard"
 
 
+def test_a_missing_file_is_named_with_its_neighbour(mitsonar: Command, tmp_path: Path) -> None:
+    (tmp_path / "dive.mcap").touch()
+    for typed in (["recording", "info", "dvie.mcap"], ["odometry", "DIVE.MCAP", "-o", "out"]):
+        refused(mitsonar(*typed, cwd=tmp_path), "no such file: ", "; did you mean dive.mcap?")
+    (tmp_path / "notes.mcap").write_text("text")
+    refused(mitsonar("recording", "info", tmp_path / "notes.mcap"), "XTF (.xtf)", "Sonar 3D-15 (.sonar)")
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["info", "no.aris"], "there are no frames at no.aris"),
+        (["info", "no.aris"], "no such file: no.aris; give frames.npz"),
         (["convert", "FRAMES", "-o", "a.bag"], "unknown ending"),
         (["convert", "FRAMES", "-o", "a.mcap", "--resume"], "--resume applies only to folders"),
         (["convert", "FRAMES", "-o", "a.mcap", "--part", "3"], "has no part 3"),

@@ -220,7 +220,7 @@ def test_the_command_writes_what_the_simulator_reads(
     read = load_sonar(tmp_path / "mine.yaml")
     assert read == fit_sonar(recordings["dB"], focus_m=4).sonar.replace(name=read.name)
     refused(mitsonar("sonar", "fit", tmp_path / "frames.npz", "-o", tmp_path / "mine.yaml"), "exists", "--overwrite")
-    refused(mitsonar("sonar", "fit", tmp_path / "none.npz", "-o", tmp_path / "x.yaml"), "there are no frames at")
+    refused(mitsonar("sonar", "fit", tmp_path / "none.npz", "-o", tmp_path / "x.yaml"), "no such file: ")
     blank().save(tmp_path / "flat.npz")
     carrier = ("--set", "frequency_hz=1.8e6")
     refused(mitsonar("sonar", "fit", tmp_path / "flat.npz", "-o", tmp_path / "x.yaml", *carrier), "all cells have the same")

@@ -463,6 +463,11 @@ def test_a_skirt_of_the_light_does_not_lower_the_height(
     assert result.first is not None
     at_the_middle = result.first.height_m / np.cos(sonar.bearing_rad).mean()  # the cone's beams aside go down less
     assert at_the_middle == pytest.approx(height_m, rel=0.01)
+    # of a recorded sonar only the pattern over elevation is known; wrong heights are doubted, true ones are not
+    recorded = replace(frames, sonar=sonar.replace(pattern="box", elevation_pattern=pattern))
+    for factor in (0.5, 0.75, 1, 1.3, 2):
+        attitude = attitude_of(recorded, "a test", factor * height_m, np.radians(pitch_deg))
+        assert bool(attitude.doubt) == (factor != 1)
 
 
 def test_shallow_rays_and_local_contrast_show_no_end() -> None:

@@ -34,6 +34,7 @@ class Known:
     """Tells the true motion with errors: Gaussian ones of ``std``, independent of the length, and a ``pull`` towards rest.
 
     The pull is a part of motions of one step; over several steps there is none, as with light that moves with a sonar.
+    Motions over more than ``farthest`` steps are rejected.
     """
 
     poses: NDArray[np.float64]
@@ -41,6 +42,7 @@ class Known:
     told: NDArray[np.float64] | None
     pull: float = 0.0
     lost: tuple[int, ...] = ()
+    farthest: int = FRAMES
 
     consumes = SonarFrames
     inputs = "nothing"
@@ -50,7 +52,10 @@ class Known:
         first, second = (int(number) for number in frames.image[:, 0, 0])
         answer = motions(self.poses[[first, second]])[0] * (1 - self.pull * (second - first == 1))
         answer = answer + np.random.default_rng([first, second]).normal(0, self.std)
-        return Estimate(Motion(*answer), None if self.told is None else np.diag(self.told**2), first not in self.lost)
+        return Estimate(Motion(*answer), None if self.told is None else np.diag(self.told**2), self._valid(first, second))
+
+    def _valid(self, first: int, second: int) -> bool:
+        return first not in self.lost and second - first <= self.farthest
 
 
 def closed(estimator: Known, frames: SonarFrames) -> tuple[Closure, list[Estimate]]:
@@ -126,3 +131,15 @@ def test_odometry_tells_the_closure_and_raises_its_covariances() -> None:
     assert "closure over 8 motions, rms, forward" in names
     with pytest.raises(MitsonarError, match="must be 0, or 2 motions or more: got 1"):
         OdometryOptions(closure=1)
+
+
+@pytest.mark.parametrize(("farthest", "steps"), [(8, 8), (5, 4), (2, 2), (1, None)])
+def test_loops_are_halved_until_they_close_or_a_sentence_says_that_none_does(farthest: int, steps: int | None) -> None:
+    frames = numbered(41)
+    assert frames.poses is not None
+    result = odometry(frames, Known(frames.poses, STD, STD, farthest=farthest), OdometryOptions(closure=8))
+    names = [name for name, _, _ in result.rows()]
+    assert (f"closure over {steps} motions, loops" in names) == (steps is not None)
+    assert [sentence for sentence in result.warnings() if "no closure is given" in sentence] == (
+        [] if steps else [result.warnings()[0]]
+    )

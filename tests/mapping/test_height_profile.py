@@ -83,19 +83,22 @@ class Echoing:
     def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
         assert frames.poses is not None
         time = float(frames.time_s[0])
-        return Estimate(Motion(0.0, 0.02, 0.0), about={"height_m": 2 + time / 10, "height_std_m": 0.04, "correlation": 1.0})
+        heights = {"height_m": 2 + time / 10, "height_std_m": 0.04, "doubt": "first echoes give 2.0 m, not 9.0 m"}
+        return Estimate(Motion(0.0, 0.02, 0.0), about={**heights, "correlation": 1.0})
 
 
 @pytest.mark.thorough
-def test_a_resumed_run_has_the_same_profile(source: FrameSource, tmp_path: Path) -> None:
-    run_odometry(source, "echoing", Echoing(), tmp_path / "run")
+def test_a_resumed_run_has_the_same_profile_and_warnings(source: FrameSource, tmp_path: Path) -> None:
+    whole = run_odometry(source, "echoing", Echoing(), tmp_path / "run")
     table = (tmp_path / "run/height_profile.csv").read_bytes()
     rows = list(csv.DictReader(table.decode().splitlines()))
     assert [row["measured_by"] for row in rows] == [FIRST_ECHOES] * COUNT
     assert float(rows[-1]["distance_m"]) == pytest.approx(0.02 * (COUNT - 1))
     assert rows[0]["ground_depth_m"] == ""
     (tmp_path / "run/height_profile.csv").unlink()
-    run_odometry(source, "echoing", Echoing(), tmp_path / "run", resume=True)
+    again = run_odometry(source, "echoing", Echoing(), tmp_path / "run", resume=True)
+    assert "contradict the height given" in whole.warnings()[0]
+    assert again.warnings() == whole.warnings()
     assert (tmp_path / "run/height_profile.csv").read_bytes() == table
     run_odometry(source, "zero", create_estimator("zero"), tmp_path / "run", overwrite=True)
     assert ALTIMETER in (tmp_path / "run/height_profile.csv").read_text()

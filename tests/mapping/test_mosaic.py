@@ -541,6 +541,9 @@ def test_a_map_is_drawn_where_it_lies_with_a_true_scale_bar() -> None:
     lines = {line.get_label(): line for line in axes.lines}
     np.testing.assert_array_equal(lines["estimated"].get_xydata(), path.poses[:, :2])
     assert (lines["estimated"].get_color(), lines["true"].get_color()) == ("red", "limegreen")
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["estimated", "true", "start", "heading"]
     arrows = next(one for one in axes.collections if isinstance(one, Quiver))
     np.testing.assert_allclose([np.asarray(arrows.U)[0], np.asarray(arrows.V)[0]], [0, 1], atol=1e-12)
     np.testing.assert_allclose([np.asarray(arrows.U)[-1], np.asarray(arrows.V)[-1]], [1, 0], atol=1e-12)

@@ -487,6 +487,9 @@ def test_geometry_is_given_where_it_lacks_and_only_there() -> None:
         FrameSource.of(frames).with_geometry(3500.0)
     with pytest.raises(MitsonarError, match=r"-90..90"):
         FrameSource.of(frames).with_geometry(pitch_rad=2.0)
+    leaning = FrameSource.of(replace(frames, attitude_rad=np.zeros((4, 3))))
+    with pytest.warns(MitsonarWarning, match="replaces the pitch and roll of each frame"):
+        leaning.with_geometry(pitch_rad=0.5)
 
 
 def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> None:
@@ -551,7 +554,7 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
         ("empty", r"holds no frames\.npz or frames\.zarr: give frames\.npz"),
         ("with one", r"holds no frames\.npz or frames\.zarr: give the recording in it, .*with one.a\.aris"),
         ("with two", r"holds no frames\.npz or frames\.zarr: give one of the recordings in it: b\.aris, c\.xtf$"),
-        ("none.aris", r"there are no frames at .*none\.aris: give frames\.npz, .* or a recording"),
+        ("none.aris", r"no such file: .*none\.aris; give frames\.npz, .* or a recording"),
         ("wrong.npz", r"cannot read frames .*: it is neither a whole frames\.npz nor a recording .*: ARIS \(\.aris\), "),
         ("empty.aris", r"cannot read frames .*empty\.aris: it is empty; give .* a recording: ARIS \(\.aris\), "),
         ("other.npz", "lacks image"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,10 @@ from drawn_frames import sway
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.estimation.estimator import Estimate, prior_rejection
+from mitsonar.mapping.odometry import contradiction
 from mitsonar.mapping.sensors import SensorNoise, open_sensors, simulated_sensors
-from mitsonar.motion.composition import motions
+from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.sensors import ROOT_HOUR, Readings, VehicleSensors, load_sensors, save_sensors
 from mitsonar.motion.trajectory import Trajectory
 
@@ -97,7 +100,7 @@ def test_gaps_and_ends_are_not_bridged() -> None:
     covered = [(frames[k], frames[k + 1]) for k in message.pair]
     assert covered == [(float(t), float(t + 1)) for t in (0, 1, 2, 3, 10, 11, 12, 13)]
     np.testing.assert_allclose(message.motions[:, 2], 1, rtol=1e-6)
-    with pytest.raises(MitsonarError, match="no reading between 50 and 52 s"):
+    with pytest.raises(MitsonarError, match=r"no reading at the times of the frames, 50\.\.52 s"):
         gyro.motions(np.array([50.0, 51, 52]))
 
 
@@ -264,3 +267,47 @@ def test_the_folder_of_a_trajectory_may_be_given(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(MitsonarError, match=r"no trajectory\.csv"):
         open_sensors(tmp_path / "empty")
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (
+            lambda time, rate: (time, np.radians(rate)),
+            "yaw_rate_deg_s seems to hold rad/s, so that it must be multiplied by",
+        ),
+        (lambda time, rate: (time, -rate), "yaw_rate_deg_s seems to have the wrong sign, since it is positive clockwise"),
+        (lambda time, rate: (time, -np.radians(rate)), "by 57.3 and to have the wrong sign"),
+        (
+            lambda time, rate: (time[0] + 1e3 * (time - time[0]), rate),
+            "check time_s, in seconds and in the clock of the recording",
+        ),
+        (lambda time, rate: (time, rate), ""),
+    ],
+)
+def test_a_gyroscope_that_the_frames_contradict_is_named_with_the_likely_cause(
+    change: Callable[[Array, Array], tuple[Array, Array]], cause: str
+) -> None:
+    """The frames give the true motions; those that differ from the gyroscope's are rejected, as estimators do."""
+    path = sway(60)
+    gyro = simulated_sensors(path, SensorNoise(gyro_deg_rth=0.3)).yaw_rate
+    assert gyro is not None
+    time, rate = change(gyro.time_s, gyro.values)
+    sensors = VehicleSensors(readings(time, rate, gyro.std[0]), name="the sensors of s.csv")
+    estimates, covariance = [], np.diag([1e-3, 1e-3, np.radians(0.02)]) ** 2
+    for moved, prior in zip(motions(path.poses), sensors.priors(path.time_s) or [], strict=True):
+        motion = Motion(*(float(value) for value in moved))
+        reason = prior_rejection(motion, covariance, prior)
+        estimates.append(Estimate(motion, covariance, not reason, reason))
+    sentence = contradiction(sensors, estimates, path.time_s)
+    assert sentence.startswith(
+        f"{sum(not one.valid for one in estimates)} of 59 motions contradict the sensors of s.csv"
+    ) == (cause != "")
+    assert cause in sentence
+
+
+def test_sensors_of_another_clock_are_refused_with_both_clocks() -> None:
+    time = 1.7e9 + np.arange(20.0)
+    sensors = VehicleSensors(depth=readings(time, time, 0.1), name="the sensors of s.csv")
+    with pytest.raises(MitsonarError, match=r"the sensors of s\.csv hold no reading .* 0\.\.5 s, but at 1700000000\.\."):
+        sensors.priors(np.arange(6.0))

@@ -167,6 +167,7 @@ def test_the_carrier_names_the_preset(tmp_path: Path, frequency: float, name: st
     (tmp_path / "a.raw").write_bytes(oculus_ping(np.ones((4, 3)), frequency=frequency))
     sonar = open_recording(tmp_path / "a.raw").part().like.sonar
     assert (sonar.name, sonar.elevation_fov_deg, sonar.frequency_hz) == (name, elevation, frequency)
+    assert sonar.vertical_pattern == "two_way"
 
 
 def test_a_carrier_of_no_preset_is_said(tmp_path: Path) -> None:

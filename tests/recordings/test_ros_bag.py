@@ -51,6 +51,7 @@ def test_pings_are_read_as_they_were_sent(tmp_path: Path, name: str, beam_major:
     assert frames.range_m == pytest.approx(RANGE, rel=1e-6)
     assert frames.sonar.sound_speed == 1480
     assert frames.sonar.elevation_fov_deg == pytest.approx(np.degrees(0.35), rel=1e-6)
+    assert frames.sonar.vertical_pattern == "two_way", "first echoes come from beyond the aperture"
     assert frames.sonar.range_min == pytest.approx(0.975, abs=1e-6)
     assert recording.facts["received_after_s"] == pytest.approx([0.02, 0.02], abs=1e-5)
 
