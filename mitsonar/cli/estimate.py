@@ -98,8 +98,8 @@ def odometry(
     sensors: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file of gyroscope, DVL, depth, compass or dead reckoning, with named columns of values and noise, "
-            "also beside the poses of a trajectory; or a ROS bag. A pose graph adds them to the frames.",
+            help="CSV file of gyroscope, DVL, depth, attitude, compass or dead reckoning, with named columns of values and "
+            "noise, also beside the poses of a trajectory; or a ROS bag. A pose graph adds them to the frames.",
         ),
     ] = None,
     local_map: Annotated[

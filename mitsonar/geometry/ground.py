@@ -743,13 +743,17 @@ def _deviations(frames: SonarFrames) -> tuple[Apart, ...]:
 def _change_std(frames: SonarFrames) -> Apart:
     """Return the standard deviation of the unmeasured changes of height, pitch and roll between the frames.
 
-    A pitch and roll that are the same in all frames do not count as a measurement of their change, unless heights are known.
+    A pitch and roll that are the same in all frames do not count as a measurement of their change, unless heights are known
+    and no attitude is marked as unknown.
     """
     time_s = frames.time_s if frames.time_s.ndim == 1 else frames.time_s.mean(axis=1)
     step_s = abs(float(time_s[-1] - time_s[0]))
     pitch_roll = _pitch_roll(frames)
     heave_known = frames.poses is not None and bool(np.isfinite(frames.poses[:, 2]).all())
-    lean_known = pitch_roll is not None and (heave_known or bool((np.abs(pitch_roll - pitch_roll[0]) > MIN_CHANGE).any()))
+    marked = frames.poses is not None and frames.attitude_rad is not None and bool(np.isnan(frames.attitude_rad).any())
+    lean_known = pitch_roll is not None and (
+        (heave_known and not marked) or bool((np.abs(pitch_roll - pitch_roll[0]) > MIN_CHANGE).any())
+    )
     rates = zip(UNKNOWN_PER_S, UNKNOWN_MOST, (heave_known, lean_known, lean_known), strict=True)
     return Apart(*(0.0 if known else min(rate * step_s, most) for rate, most, known in rates))
 

@@ -151,6 +151,8 @@ def odometry(
     # 1. select the frames, and reject impossible options before hours of estimating
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
     estimator, sensors = create_estimator(estimator), options.sensors
+    if sensors is not None and isinstance(source, FrameSource):
+        source, sensors = source.with_sensors(sensors)
     numbers, shown = _frames_used(source, options)
     time_s, store = source.time_s[numbers], store or EstimateStore()
     # 2. estimate the motion of each pair, and resolve ambiguous motions by their neighbours
@@ -231,11 +233,13 @@ def _scale_factors(
 
 
 def _start(source: Source, first: int) -> Pose:
-    """Return the true first pose; without truth, the origin with the known height and pitch."""
+    """Return the true first pose; without truth, the origin with the known height, pitch and roll."""
     if source.poses is not None:
         return Pose.from_row(float(value) for value in source.poses[first])
     height = 0.0 if source.height_m is None else float(np.nan_to_num(source.height_m[first]))
-    return Pose(0.0, 0.0, height, source.pitch_rad or 0.0)
+    lean = source.attitudes(np.array([first])) if isinstance(source, FrameSource) else None
+    pitch, roll = (0.0, 0.0) if lean is None else np.nan_to_num(lean[0, 3:5]).tolist()
+    return Pose(0.0, 0.0, height, pitch, roll)
 
 
 def _with_known(path: Trajectory, source: Source, numbers: Index, *, by_sensors: bool) -> Trajectory:
@@ -629,6 +633,8 @@ def contradiction(sensors: VehicleSensors, estimates: Sequence[Estimate], time_s
     if against <= MANY * count:
         return ""
     cause = "check time_s, in seconds and in the clock of the recording, and the units and signs of its columns"
+    if sensors.pitch is None:
+        cause += "; a sonar that looks down turns as the vehicle rolls, which vehicle_pitch_deg and vehicle_roll_deg correct"
     gyro = sensors.yaw_rate
     if gyro is not None:
         compared = gyro.covers(time_s) & np.array([one.valid or FROM_PRIOR in one.reason for one in estimates])

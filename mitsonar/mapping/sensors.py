@@ -173,6 +173,7 @@ class SensorNoise:
         compass_deg: standard deviation of each heading [deg].
         walk: random walk of dead reckoning after one second [m, deg].
         rate_hz: readings per second of each sensor [Hz].
+        attitude_deg: standard deviation of each pitch and roll [deg].
     """
 
     gyro_deg_rth: float | None = None
@@ -182,6 +183,7 @@ class SensorNoise:
     compass_deg: float | None = None
     walk: tuple[float, float] | None = None
     rate_hz: float = 20.0
+    attitude_deg: float | None = None
 
 
 def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> VehicleSensors:
@@ -211,8 +213,9 @@ def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> Ve
     # 2. draw the noise of all sensors, so that the errors of one do not depend on which others there are
     draws = rng.normal(size=(7, count))
     bias = rng.normal()
+    leaning = rng.normal(size=(2, count))
     # 3. rates and velocities: mean over the interval, with motions turned into the axes half-way through it
-    yaw_rate = sideways = forward = depth = heading = dead = None
+    yaw_rate = sideways = forward = depth = pitch = roll = heading = dead = None
     bias_std = noise.gyro_bias_deg_h * np.radians(1) / 3600
     if noise.gyro_deg_rth is not None:
         density = noise.gyro_deg_rth * ROOT_HOUR
@@ -223,16 +226,19 @@ def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> Ve
         sin, cos = np.sin(moved[:, 2] / 2), np.cos(moved[:, 2] / 2)
         sideways = Readings(time, (moved[:, 0] * cos + moved[:, 1] * sin) / step + std * draws[1], std)
         forward = Readings(time, (moved[:, 1] * cos - moved[:, 0] * sin) / step + std * draws[2], std)
-    # 4. depth, compass and dead reckoning at the times themselves
+    # 4. depth, attitude, compass and dead reckoning at the times themselves
     poses = straight_poses(true, time)
     if noise.depth_m is not None:
         depth = Readings(time, -poses[:, 2] + noise.depth_m * draws[3], np.full(count, noise.depth_m))
+    if noise.attitude_deg is not None:
+        std = np.full(count, np.radians(noise.attitude_deg))
+        pitch, roll = (Readings(time, poses[:, 3 + k] + std * leaning[k], std) for k in (0, 1))
     if noise.compass_deg is not None:
         std = np.full(count, np.radians(noise.compass_deg))
         heading = Readings(time, poses[:, 5] + std * draws[4], std)
     if noise.walk is not None:
         dead = _simulated_reckoning(on_edges, edges, noise.walk, draws[[5, 6, 4]].T)
-    return VehicleSensors(yaw_rate, sideways, forward, depth, heading, dead, bias_std, "simulated sensors")
+    return VehicleSensors(yaw_rate, sideways, forward, depth, heading, dead, bias_std, "simulated sensors", pitch, roll)
 
 
 def _simulated_reckoning(poses: Array, time_s: Array, walk: tuple[float, float], draws: Array) -> DeadReckoning:

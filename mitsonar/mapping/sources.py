@@ -22,10 +22,11 @@ from scipy.spatial.transform import Slerp
 
 from mitsonar.acoustics.levels import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
-from mitsonar.errors import MitsonarError, MitsonarWarning, count_noun, suggest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, argument, count_noun, suggest_names
 from mitsonar.io.files import missing_file
 from mitsonar.motion.errors import associated
 from mitsonar.motion.pose import poses_from, vehicle_rotation
+from mitsonar.motion.sensors import VehicleSensors, leaning_mount
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels, Recording
 from mitsonar.records.frames import COLUMNS, LABELS, PER_FRAME, SonarFrames, check_column, open_group, to_float32
@@ -82,6 +83,7 @@ class FrameSource:
         height_m: height over the ground ``(frames,)`` [m], if known; nan where nothing is below.
         pitch_rad: pitch of the sonar [rad], if its poses are not known.
         given_height_m: height that the user gave for frames without one [m].
+        rise_m: rise of each frame above the first, from a depth sensor ``(frames,)`` [m], if known and poses are not.
         assumed_height: whether ``height_m`` is an assumption, because neither the frames nor the user give a height.
         noise: noise added to the frames when they are read.
         seed: seed of the noise.
@@ -101,6 +103,7 @@ class FrameSource:
     height_m: Array | None = None
     pitch_rad: float | None = None
     given_height_m: float | None = None
+    rise_m: Array | None = None
     assumed_height: bool = False
     noise: NoiseModel | None = None
     seed: int = 0
@@ -231,6 +234,36 @@ class FrameSource:
             pitch_rad=pitch_rad if self.pitch_rad is None else self.pitch_rad,
         )
 
+    def with_sensors(self, sensors: VehicleSensors) -> tuple[Self, VehicleSensors]:
+        """Return the same frames with the rise and the attitude that a vehicle's sensors measured, if they lack them.
+
+        A given height is then the mean over the run, and a given pitch that of the mount.
+
+        Returns:
+            The frames, and the sensors in the axes of the sonar.
+
+        Raises:
+            MitsonarError: the sensors measure the attitude of the vehicle, and neither frames nor user give a pitch.
+        """
+        lean, aided = sensors.attitudes(self.time_s), self
+        if self.poses is None and (rise := sensors.rises(self.time_s)) is not None:
+            heights = self.height_m
+            if heights is not None and np.ptp(heights) == 0:
+                heights = heights + rise - rise.mean()
+            aided = replace(self, rise_m=rise, height_m=heights)
+        if lean is None:
+            return aided, sensors
+        known = self.attitudes(np.arange(len(self)))
+        if known is None:
+            raise MitsonarError(
+                f"{self.name}: {sensors.name} hold the attitude of the vehicle, but the pitch of the sonar on it is not "
+                f"known: give {argument('pitch_rad')}, 0 for a sonar that looks straight ahead"
+            )
+        if self.poses is None and self.pitch_rad is not None:
+            aided = replace(aided, attitude_rad=leaning_mount(lean, self.pitch_rad), pitch_rad=None)
+            return aided, sensors.on_mount(self.pitch_rad)
+        return aided, sensors.on_mount(float(np.nanmean(known[:, 3] - lean[:, 0])))
+
     @property
     def sonar_poses(self) -> Array | None:
         """Return the poses of the sonar ``(frames, 6)`` [m, rad]; None if they are not known."""
@@ -260,7 +293,7 @@ class FrameSource:
         """Read the frames with these numbers ``(n,)`` as an estimator may see them.
 
         Their poses have height, pitch and roll, but zero position and heading, so that no ground truth can leak. If only
-        pitch and roll are known, the height is nan.
+        pitch and roll are known, the height is nan. A pitch that is only that of the mount comes with attitudes of nan.
 
         Raises:
             MitsonarError: a frame does not exist, or its pixels cannot be read.
@@ -278,14 +311,15 @@ class FrameSource:
             numbers = chosen.astype(np.int64) + self.first_number
             image = self.noise.apply(to_float32(image), seed=self.seed, frames=numbers)
         poses = self.attitudes(chosen)
-        if poses is not None and self.poses is None:
+        if poses is not None and self.poses is None and self.rise_m is None:
             poses[:, 2] = np.nan
+        unmeasured = self.rise_m is not None and self.pitch_rad is not None
         frames = replace(
             self.like,
             image=image,
             time_s=self.time_s[chosen],
             poses=poses,
-            attitude_rad=None,
+            attitude_rad=np.full((len(chosen), 3), np.nan) if unmeasured else None,
             height_m=None if self.height_m is None else self.height_m[chosen],
         )
         if self.altimeter is not None:
@@ -301,12 +335,15 @@ class FrameSource:
         """Return poses without position and heading ``(n, 6)``; None if neither poses, pitch nor attitudes are known."""
         if self.poses is not None:
             return self.poses[chosen] * [0, 0, 1, 1, 1, 0]
-        if self.pitch_rad is not None:
-            return np.tile([0.0, 0, 0, self.pitch_rad, 0, 0], (len(chosen), 1))
-        if self.attitude_rad is None:
+        if self.pitch_rad is None and self.attitude_rad is None:
             return None
-        pitch_roll = self.attitude_rad[chosen, :2]
-        return np.column_stack([np.zeros((len(chosen), 3)), pitch_roll, np.zeros(len(chosen))])
+        poses = np.zeros((len(chosen), 6))
+        poses[:, 2] = 0.0 if self.rise_m is None else self.rise_m[chosen]
+        if self.pitch_rad is not None:
+            poses[:, 3] = self.pitch_rad
+        elif self.attitude_rad is not None:
+            poses[:, 3:5] = self.attitude_rad[chosen, :2]
+        return poses
 
     def chunks(self, index: ArrayLike) -> Iterator[SonarFrames]:
         """Read the frames with these numbers ``(n,)``, a few at a time."""

@@ -1,6 +1,6 @@
-"""Combine the readings of a vehicle's other sensors: gyroscope, DVL, depth, compass and dead reckoning, all optional.
+"""Combine the readings of a vehicle's other sensors, all optional: gyroscope, DVL, depth, attitude, compass, dead reckoning.
 
-Readings are integrated over the time between frames. They yield motions with covariances, and headings and depths.
+Readings are integrated over the time between frames. They yield motions with covariances, headings, depths and attitudes.
 """
 
 from __future__ import annotations
@@ -8,17 +8,19 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import make_smoothing_spline
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, suggest_names
 from mitsonar.io.csv_table import CsvTable
 from mitsonar.io.files import write_atomic
 from mitsonar.motion.composition import Motion, MotionPrior, motions
+from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import ALIASES, Trajectory
 
 __all__ = [
@@ -47,6 +49,12 @@ MIN_STD = 1e-12
 
 LONGEST_GAP_S = 1.0
 """Longest time between two readings that still cover the time in between, unless readings are slower throughout [s]."""
+
+SMOOTHED_MARGIN_S = 10.0
+"""Time before the first and after the last frame whose readings enter the smoothing [s]."""
+
+FEWEST_SMOOTHED = 5
+"""Fewest readings that are smoothed; fewer are interpolated."""
 
 SLOWER = 3.0
 """Number of median steps beyond which a step counts as a gap."""
@@ -151,6 +159,21 @@ class Readings:
         value = np.interp(time_s, self.time_s, self.values)
         return np.where(near, value, np.nan), np.where(near, self.std[nearest], np.nan)
 
+    def smoothed(self, time_s: Array) -> Array | None:
+        """Return values at times ``(times,)`` from a smoothing spline; None if the readings do not reach all times.
+
+        Noise is smoothed as generalised cross-validation suggests, since height and attitude of a frame must not jump by it.
+        """
+        if time_s[0] < self.edges_s[0] - 1e-6 or time_s[-1] > self.edges_s[-1] + 1e-6:
+            return None
+        chosen = slice(*np.searchsorted(self.time_s, time_s[[0, -1]] + [-SMOOTHED_MARGIN_S, SMOOTHED_MARGIN_S]))
+        seconds, values = self.time_s[chosen] - time_s[0], self.values[chosen]
+        if len(values) < FEWEST_SMOOTHED or np.ptp(values) == 0:
+            return np.asarray(np.interp(time_s, self.time_s, self.values))
+        with np.errstate(divide="ignore", invalid="ignore"):  # readings without noise leave nothing to validate by
+            spline = make_smoothing_spline(seconds, values, 1 / self.std[chosen] ** 2)
+        return np.asarray(spline(np.clip(time_s - time_s[0], seconds[0], seconds[-1])))
+
 
 def _integrate_between(edges: Array, rate: Array, time_s: Array) -> Array:
     """Integrate a step function with values ``rate`` (n,) and limits ``edges`` (n + 1,) between consecutive times."""
@@ -195,6 +218,18 @@ def straight_poses(path: Trajectory, time_s: Array) -> Array:
     return np.column_stack([np.interp(time_s, path.time_s, column) for column in table.T])
 
 
+def leaning_mount(lean: Array, pitch_rad: float) -> Array:
+    """Compute pitch, roll and heading ``(n, 3)`` [rad] of a sonar on a vehicle that leans and heads north.
+
+    Args:
+        lean: pitch and roll of the vehicle ``(n, 2)`` [rad].
+        pitch_rad: pitch of the sonar in the axes of the vehicle [rad].
+    """
+    poses = np.zeros((len(lean), 6))
+    poses[:, 3:5] = lean
+    return mounted(poses, Pose(0.0, 0.0, 0.0, pitch_rad))[:, 3:]
+
+
 class SensorMotions(NamedTuple):
     """Motions between frames measured by one sensor.
 
@@ -220,13 +255,15 @@ class VehicleSensors:
         sideways: velocity to starboard from a DVL [m/s].
         forward: forward velocity from a DVL [m/s].
         depth: depth below the surface [m].
+        pitch: pitch of the vehicle [rad], > 0: bow down.
+        roll: roll of the vehicle [rad], > 0: starboard down.
         heading: heading of a compass [rad], clockwise from north.
         dead_reckoning: poses from other navigation.
         bias_std: standard deviation of the constant gyroscope bias [rad/s]; 0 for none.
         name: name of the source in messages.
 
     Raises:
-        MitsonarError: no sensor at all, or a negative bias.
+        MitsonarError: no sensor at all, a pitch without roll or the reverse, or a negative bias.
     """
 
     yaw_rate: Readings | None = None
@@ -237,10 +274,16 @@ class VehicleSensors:
     dead_reckoning: DeadReckoning | None = None
     bias_std: float = 0.0
     name: str = "the sensors"
+    pitch: Readings | None = None
+    roll: Readings | None = None
 
     def __post_init__(self) -> None:
+        if (self.pitch is None) != (self.roll is None):
+            raise MitsonarError(f"{self.name}: pitch and roll of the vehicle need each other: give both, or leave both out")
         if not self.names:
-            raise MitsonarError(f"{self.name} hold no reading: give a gyroscope, velocities, depths, headings or poses")
+            raise MitsonarError(
+                f"{self.name} hold no reading: give a gyroscope, velocities, depths, attitudes, headings or poses"
+            )
         if not 0 <= self.bias_std < np.inf:
             raise MitsonarError(
                 f"the bias of a gyroscope needs a standard deviation of 0 or more: got {self.bias_std:g} rad/s"
@@ -253,8 +296,7 @@ class VehicleSensors:
     @property
     def _times(self) -> list[Array]:
         """Return the times of the readings of each sensor [s]."""
-        readings = self.yaw_rate, self.sideways, self.forward, self.depth, self.heading
-        times = [item.time_s for item in readings if item is not None]
+        times = [readings.time_s for readings in _readings_by_column(self).values()]
         return times + ([self.dead_reckoning.path.time_s] if self.dead_reckoning else [])
 
     @property
@@ -269,6 +311,7 @@ class VehicleSensors:
             "gyroscope": self.yaw_rate,
             "DVL": self.sideways or self.forward,
             "depth": self.depth,
+            "attitude": self.pitch,
             "compass": self.heading,
             "dead reckoning": self.dead_reckoning,
         }
@@ -277,7 +320,7 @@ class VehicleSensors:
     def digest(self) -> str:
         """Return the SHA-256 of all readings."""
         digest = hashlib.sha256(repr(self.bias_std).encode())
-        for readings in (self.yaw_rate, self.sideways, self.forward, self.depth, self.heading):
+        for readings in (self.yaw_rate, self.sideways, self.forward, self.depth, self.heading, self.pitch, self.roll):
             for values in () if readings is None else (readings.time_s, readings.values, readings.std):
                 digest.update(values.astype(float).tobytes())
             digest.update(b";")
@@ -290,6 +333,39 @@ class VehicleSensors:
             )
         return digest.hexdigest()
 
+    def on_mount(self, pitch_rad: float) -> Self:
+        """Return the sensors in the axes of a sonar on a pitched mount, whose heading changes as the vehicle rolls.
+
+        A vehicle that rolls by 4 deg turns a sonar that looks 25 deg down by 1.7 deg.
+
+        Args:
+            pitch_rad: pitch of the sonar in the axes of the vehicle [rad].
+        """
+        pitch = self.pitch
+        if pitch is None:
+            return self
+
+        def turn(time_s: Array) -> Array:
+            lean = self.attitudes(np.clip(time_s, pitch.time_s[0], pitch.time_s[-1]))
+            assert lean is not None
+            return leaning_mount(lean, pitch_rad)[:, 2]
+
+        changes: dict[str, Readings | DeadReckoning] = {}
+        if (gyro := self.yaw_rate) is not None:
+            rate = np.diff(turn(gyro.edges_s)) / np.diff(gyro.edges_s)
+            changes["yaw_rate"] = replace(gyro, values=gyro.values + rate)
+        if (compass := self.heading) is not None:
+            changes["heading"] = replace(compass, values=compass.values + turn(compass.time_s))
+        if (side := self.sideways) is not None and (ahead := self.forward) is not None:
+            for name, one, other, sign in (("sideways", side, ahead, -1), ("forward", ahead, side, 1)):
+                angle, beside = turn(one.time_s), np.interp(one.time_s, other.time_s, other.values)
+                changes[name] = replace(one, values=one.values * np.cos(angle) + sign * beside * np.sin(angle))
+        if (reckoning := self.dead_reckoning) is not None:
+            poses = reckoning.path.poses.copy()
+            poses[:, 5] += turn(reckoning.path.time_s)
+            changes["dead_reckoning"] = replace(reckoning, path=Trajectory(poses, reckoning.path.time_s))
+        return replace(self, **changes)  # type: ignore[arg-type]  # each name with its type
+
     def motions(self, time_s: Array) -> list[SensorMotions]:
         """Return the motions between frames at ``time_s`` ``(frames,)`` [s], one item per sensor, with independent errors.
 
@@ -297,7 +373,8 @@ class VehicleSensors:
             MitsonarError: no sensor covers the time of any frame.
         """
         measured = [sensor_motions for sensor_motions in self._motions_by_sensor(time_s) if sensor_motions.pair.size]
-        if not measured and self.headings(time_s).pose.size == 0 and self.rises(time_s) is None:
+        others = self.rises(time_s), self.attitudes(time_s)
+        if not measured and self.headings(time_s).pose.size == 0 and all(one is None for one in others):
             frames, readings = (f"{first:.10g}..{last:.10g} s" for first, last in ((time_s[0], time_s[-1]), self.span_s))
             raise MitsonarError(
                 f"{self.name} hold no reading at the times of the frames, {frames}, but at {readings}: give time_s in "
@@ -402,10 +479,14 @@ class VehicleSensors:
 
     def depths(self, time_s: Array) -> Array | None:
         """Return the depth of each frame below the surface ``(frames,)`` [m]; None if not known."""
-        if self.depth is None:
+        return None if self.depth is None else self.depth.smoothed(time_s)
+
+    def attitudes(self, time_s: Array) -> Array | None:
+        """Return pitch and roll of the vehicle at each frame ``(frames, 2)`` [rad]; None if not known."""
+        if self.pitch is None or self.roll is None:
             return None
-        covered = time_s[0] >= self.depth.edges_s[0] - 1e-6 and time_s[-1] <= self.depth.edges_s[-1] + 1e-6
-        return np.interp(time_s, self.depth.time_s, self.depth.values) if covered else None
+        pitch, roll = self.pitch.smoothed(time_s), self.roll.smoothed(time_s)
+        return None if pitch is None or roll is None else np.column_stack([pitch, roll])
 
 
 def _inverse(matrices: Array) -> Array:
@@ -443,6 +524,8 @@ COLUMNS = {
     "sideways_m_s": ("sideways_std_m_s", 1.0, 1.0),
     "forward_m_s": ("forward_std_m_s", 1.0, 1.0),
     "depth_m": ("depth_std_m", 1.0, 1.0),
+    "vehicle_pitch_deg": ("vehicle_pitch_std_deg", DEG, DEG),
+    "vehicle_roll_deg": ("vehicle_roll_std_deg", DEG, DEG),
     "heading_deg": ("heading_std_deg", DEG, DEG),
     "compass_deg": ("compass_std_deg", DEG, DEG),
 }
@@ -475,6 +558,8 @@ def load_sensors(path: str | Path) -> VehicleSensors:
     | | | ``yaw_rate_bias_deg_h``; default: 0 |
     | DVL | ``sideways_m_s`` to starboard, ``forward_m_s`` | ``sideways_std_m_s``, ``forward_std_m_s``, per reading |
     | depth | ``depth_m`` | ``depth_std_m`` |
+    | attitude | ``vehicle_pitch_deg``, > 0: bow down | ``vehicle_pitch_std_deg`` |
+    | | ``vehicle_roll_deg``, > 0: starboard down | ``vehicle_roll_std_deg`` |
     | compass | ``heading_deg``, clockwise from north | ``heading_std_deg`` |
     | | or ``compass_deg``; the only choice in a file with poses | ``compass_std_deg`` |
     | dead reckoning | ``reckoned_x_m``, ``reckoned_y_m`` | ``reckoned_walk_m_rts``, after one second |
@@ -506,6 +591,8 @@ def load_sensors(path: str | Path) -> VehicleSensors:
         _parse_dead_reckoning(table, time) if set(sensor_columns) & set(RECKONED) else None,
         bias,
         f"the sensors of {Path(path).name}",
+        readings.get("vehicle_pitch_deg"),
+        readings.get("vehicle_roll_deg"),
     )
 
 
@@ -540,6 +627,8 @@ def _readings_by_column(sensors: VehicleSensors) -> Mapping[str, Readings]:
         "sideways_m_s": sensors.sideways,
         "forward_m_s": sensors.forward,
         "depth_m": sensors.depth,
+        "vehicle_pitch_deg": sensors.pitch,
+        "vehicle_roll_deg": sensors.roll,
         "heading_deg": sensors.heading,
     }
     return {name: readings for name, readings in by_column.items() if readings is not None}

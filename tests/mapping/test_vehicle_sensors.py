@@ -8,20 +8,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_frames import sway
+from drawn_frames import over_ground, sway
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import Estimate, prior_rejection
+from mitsonar.geometry.ground import attitude_of
 from mitsonar.mapping.odometry import contradiction
 from mitsonar.mapping.sensors import SensorNoise, open_sensors, simulated_sensors
+from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, motions
+from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.sensors import ROOT_HOUR, Readings, VehicleSensors, load_sensors, save_sensors
 from mitsonar.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-EXACT = SensorNoise(0.01, 0.0, 1e-3, 1e-6, 1e-6, (1e-4, 1e-2), rate_hz=200.0)
+EXACT = SensorNoise(0.01, 0.0, 1e-3, 1e-6, 1e-6, (1e-4, 1e-2), 200.0, 1e-6)
 
 
 def readings(time: Array, values: Array, std: float) -> Readings:
@@ -34,7 +37,7 @@ def readings(time: Array, values: Array, std: float) -> Readings:
 def test_exact_readings_give_the_true_motions() -> None:
     path = sway(60)
     sensors = simulated_sensors(path, EXACT)
-    assert sensors.names == ["gyroscope", "DVL", "depth", "compass", "dead reckoning"]
+    assert sensors.names == ["gyroscope", "DVL", "depth", "attitude", "compass", "dead reckoning"]
     true = motions(path.poses)
     gyro, dvl, dead = sensors.motions(path.time_s)
     assert gyro.pair.tolist() == dvl.pair.tolist() == dead.pair.tolist() == list(range(59))
@@ -51,6 +54,61 @@ def test_exact_readings_give_the_true_motions() -> None:
     message = sensors.headings(path.time_s)
     off = message.heading - path.poses[message.pose, 5]
     np.testing.assert_allclose(off - 2 * np.pi * np.rint(off / (2 * np.pi)), 0, atol=1e-3)
+
+
+def rolling() -> tuple[Trajectory, Trajectory]:
+    """Return the paths of a vehicle that rolls, pitches and heaves, and of a sonar on it that looks 25 deg down."""
+    time = np.arange(41) / 5
+    swell = 2 * np.pi * time / 4
+    poses = np.zeros((len(time), 6))
+    poses[:, 1], poses[:, 2] = 0.06 * np.arange(len(time)), 2.2 + 0.1 * np.sin(swell)
+    poses[:, 3:] = np.radians([2, 4, 10]) * np.sin(np.outer(swell, [1, 0.8, 0.5]) + np.array([1, 0, 0]))
+    return Trajectory(poses, time), Trajectory(mounted(poses, Pose(0, 0, 0, np.radians(25))), time)
+
+
+def test_a_sonar_that_looks_down_turns_as_the_vehicle_rolls() -> None:
+    vehicle, sonar = rolling()
+    # readings as fast as the poses: between them, headings of the two paths are interpolated differently
+    noise = SensorNoise(1e-4, 0.0, 1e-9, 1e-9, 1e-9, (1e-9, 1e-9), 5.0, 1e-9)
+    seen, expected = (simulated_sensors(path, noise) for path in (vehicle, sonar))
+    on_sonar = seen.on_mount(np.radians(25))
+    assert np.abs(np.diff(sonar.poses[:, 5] - vehicle.poses[:, 5])).max() > np.radians(0.3)
+    for one, true in zip(on_sonar.motions(vehicle.time_s), expected.motions(vehicle.time_s), strict=True):
+        np.testing.assert_allclose(one.motions[1:-1], true.motions[1:-1], atol=4e-4)
+    np.testing.assert_allclose(on_sonar.heading.values[1:-1], expected.heading.values[1:-1], atol=4e-4)  # type: ignore[union-attr]
+
+
+def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None:
+    vehicle, sonar = rolling()
+    frames = replace(over_ground(sway(len(vehicle))), time_s=vehicle.time_s)
+    source = FrameSource.of(replace(frames, poses=None, height_m=None, attitude_rad=None))
+    sensors = simulated_sensors(vehicle, SensorNoise(depth_m=1e-9, attitude_deg=1e-9, rate_hz=50.0))
+    with pytest.raises(MitsonarError, match="the pitch of the sonar on it is not known"):
+        source.with_sensors(sensors)
+    aided, _ = source.with_geometry(float(sonar.poses[:, 2].mean()), np.radians(25)).with_sensors(sensors)
+    some = np.arange(len(vehicle))
+    np.testing.assert_allclose(aided.height_m, sonar.poses[:, 2], atol=2e-3)
+    np.testing.assert_allclose(aided.attitudes(some)[:, 3:5], sonar.poses[:, 3:5], atol=1e-3)  # type: ignore[index]
+    # a depth sensor alone measures the heave, and leaves pitch and roll unknown
+    deep = simulated_sensors(vehicle, SensorNoise(depth_m=1e-9, rate_hz=50.0))
+    heaving, _ = source.with_geometry(2.2, np.radians(25)).with_sensors(deep)
+    unsure = attitude_of(heaving.read([3, 4]), "direct", None, None).unsure
+    assert unsure.height_m == 0
+    assert min(unsure.pitch_rad, unsure.roll_rad) > 0
+    assert not any(attitude_of(aided.read([3, 4]), "direct", None, None).unsure)
+
+
+def test_smoothing_takes_noise_out_and_leaves_what_is_exact() -> None:
+    time, frames = np.arange(0, 20, 0.05), np.arange(5, 15, 0.2)
+    swell = 0.1 * np.sin(2 * np.pi * time / 4)
+    true = 0.1 * np.sin(2 * np.pi * frames / 4)
+    noise = np.random.default_rng(3).normal(size=len(time)) * 0.01
+    np.testing.assert_allclose(readings(time, swell, 0.01).smoothed(frames), true, atol=1e-4)
+    smoothed = readings(time, swell + noise, 0.01).smoothed(frames)
+    assert smoothed is not None
+    assert np.std(smoothed - true) < 0.005
+    assert readings(time, swell, 0.01).smoothed(frames + 10) is None
+    np.testing.assert_array_equal(readings(time, np.full(len(time), 3.0), 0.01).smoothed(frames), 3)
 
 
 def test_a_gyroscope_s_noise_grows_with_the_root_of_time() -> None:
@@ -134,7 +192,7 @@ def test_priors_join_sensors_by_their_information() -> None:
 
 def test_a_file_holds_all_readings(tmp_path: Path) -> None:
     path = sway(20)
-    for noise in (SensorNoise(1.0, 5.0, 0.02, 0.1, 2.0, (0.01, 0.1)), SensorNoise(gyro_deg_rth=1.0)):
+    for noise in (SensorNoise(1.0, 5.0, 0.02, 0.1, 2.0, (0.01, 0.1), attitude_deg=0.5), SensorNoise(gyro_deg_rth=1.0)):
         sensors = simulated_sensors(path, noise, 3)
         save_sensors(tmp_path / "s.csv", sensors)
         read = load_sensors(tmp_path / "s.csv")
@@ -144,6 +202,8 @@ def test_a_file_holds_all_readings(tmp_path: Path) -> None:
             np.testing.assert_allclose(one.motions, two.motions, atol=1e-9)
             np.testing.assert_allclose(one.covariances, two.covariances, rtol=1e-6)
         np.testing.assert_array_equal(read.headings(path.time_s).pose, sensors.headings(path.time_s).pose)
+        if noise.attitude_deg is not None:
+            np.testing.assert_allclose(read.attitudes(path.time_s[1:-1]), sensors.attitudes(path.time_s[1:-1]), atol=1e-9)  # type: ignore[arg-type]
 
 
 def test_sensors_of_other_times_share_a_file(tmp_path: Path) -> None:
