@@ -195,14 +195,16 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     if clipped:
         share = 100 * float(((value <= 0) | (value >= FULL_SCALE)).mean())
         notes.append(
-            f"{share:.0f} % of the cells have the smallest or the largest value: grain of clipped frames has no coding"
+            f"{share:.0f} % of the cells have the smallest or the largest value: the grain of clipped frames has no coding "
+            "and no pulse"
         )
     elif frames.level == "dB":
         span = _span(value)
     else:
         gamma = _gamma(value)
     sonar = _with_coding(sonar, span, gamma, measure_coding, notes)
-    sonar = _with_resolution(sonar, value, frames.level == "dB" and not measure_coding, given, notes)
+    if not clipped:
+        sonar = _with_resolution(sonar, value, frames.level == "dB" and not measure_coding, given, notes)
     intensity = decoded(value, sonar)
     level = statistics.decibels(intensity, float(statistics.decibels(intensity[intensity > 0].min())) - 3)
     # 3. intensities before the gain give the noise, and the contrast of bright windows the speckle
@@ -231,7 +233,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         fitted |= _water(flat, level, noise, sonar, full_scale_db, notes)
         # 6. dark bins contain noise and the detector's offset
         dark_db = _grain_windows(value)[1] * sonar.coding_db
-        ratio = _offset_of(dark_db, sonar.looks) if frames.level == "dB" else 0.0
+        ratio = _offset_of(dark_db, sonar.looks) if frames.level == "dB" and not clipped else 0.0
         least_db = _grain(sonar.looks, OFFSETS[1])[0]
         if frames.level == "dB" and len(dark_db) and (spread_db := float(np.median(dark_db.std(axis=1)))) < least_db:
             notes.append(
