@@ -39,6 +39,8 @@ from mitsonar.estimation.estimator import (
 from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.image.registration import (
     FEWEST_CELLS,
+    SHADOW_SIDES,
+    SHADOW_SIDES_CODED,
     Cells,
     DirectLevel,
     Fit,
@@ -149,8 +151,9 @@ class _Task:
         if self.frames.level == "contrast":
             return None
         linear = self.frames.level == "linear"  # other codings are matched by their fourth roots
+        sides = SHADOW_SIDES if linear else SHADOW_SIDES_CODED
         roots = [np.maximum(image, 0) ** np.float32(0.25) if linear else image for image in self.images]
-        return shadow_lengths(roots[0]), shadow_lengths(roots[1])
+        return shadow_lengths(roots[0], sides), shadow_lengths(roots[1], sides)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,8 @@ __all__ = [
     "FAINTEST",
     "FEWEST_CELLS",
     "NODES",
+    "SHADOW_SIDES",
+    "SHADOW_SIDES_CODED",
     "Cells",
     "DirectLevel",
     "Fit",
@@ -643,22 +645,23 @@ SHADOW_SMOOTHING = (1.0, 0.6)
 SHADOW_SURROUNDINGS = (61, 25)
 """Bins and beams by which frames are smoothed, and over which the level of the surroundings is taken."""
 
-SHADOW_SIDES = 5
-"""Beams across which the side of a shadow is smoothed, and moves with it."""
+SHADOW_SIDES, SHADOW_SIDES_CODED = 5, 9
+"""Beams across which the side of a shadow is smoothed, and moves with it: hard-edged beams, and overlapping ones."""
 
 
-def shadow_lengths(root: Floats) -> Floats:
+def shadow_lengths(root: Floats, sides: int) -> Floats:
     """Measure how many bins before each cell the shadow over it begins ``(bins, beams)``; 0 outside shadows.
 
     Args:
         root: fourth roots of the levels of a frame ``(bins, beams)``.
+        sides: :data:`SHADOW_SIDES`, or :data:`SHADOW_SIDES_CODED` for coded levels.
     """
     smooth = blurred(root, *SHADOW_SMOOTHING)
     dark = smooth < np.float32(SHADOW_LEVEL**0.25) * cv2.blur(smooth, SHADOW_SURROUNDINGS[::-1])
     rows = np.arange(len(root))[:, None]
     last_lit = np.maximum.accumulate(np.where(dark, -1, rows), axis=0)
     lengths = np.where(last_lit < 0, 0, rows - last_lit).astype(np.float32)  # nothing casts the dark before the first echo
-    return np.asarray(cv2.dilate(lengths, np.ones((1, SHADOW_SIDES), np.uint8)), dtype=np.float32)
+    return np.asarray(cv2.dilate(lengths, np.ones((1, sides), np.uint8)), dtype=np.float32)
 
 
 def _casting_cells(lengths: Floats, step: int) -> NDArray[np.intp]:

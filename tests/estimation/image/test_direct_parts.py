@@ -12,6 +12,7 @@ from mitsonar.estimation.estimator import two_frames
 from mitsonar.estimation.image import direct
 from mitsonar.estimation.image.direct import LEVELS, Direct, _resolved, registered_over_relief
 from mitsonar.estimation.image.registration import (
+    SHADOW_SIDES,
     Cells,
     DirectLevel,
     GroundNodes,
@@ -114,7 +115,7 @@ def test_a_shadow_moves_across_the_beams_as_what_casts_it() -> None:
     """A step aside and a turn before a post: its shadow moves across as its foot does, and turns as the floor does."""
     step_m, turn_rad, ahead_m, pitch = 0.02, 0.01, 2.9, float(np.radians(35))
     frames = posts(np.tile([0.0, 0.0, 2.5, pitch, 0.0, 0.0], (2, 1)), np.array([[0.0, ahead_m]]))
-    lengths = shadow_lengths(frames.image[0] ** np.float32(0.25))
+    lengths = shadow_lengths(frames.image[0] ** np.float32(0.25), SHADOW_SIDES)
     cells = Cells(GroundNodes(frames, ATTITUDE, heave=False), LEVELS[-1], (lengths, lengths))
     beam_rad = float(np.diff(frames.bearing_rad).mean())
     x_m = ahead_m * np.array([1.03, 1.08, 1.15])
@@ -140,7 +141,7 @@ def test_shadows_do_not_turn_a_sideways_motion(step_m: float, remains: float, mo
         return float(np.mean([Direct(2.5, relief_m=0.0).estimate(one).motion.yaw for one in floors]))
 
     with_shadows = turn()
-    monkeypatch.setattr(direct, "shadow_lengths", np.zeros_like)
+    monkeypatch.setattr(direct, "shadow_lengths", lambda root, sides: np.zeros_like(root))
     without = turn()
     assert without > np.radians(0.3) * step_m
     assert abs(with_shadows) < remains * without
