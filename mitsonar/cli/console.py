@@ -271,6 +271,10 @@ def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], N
         yield lambda done: bar.advance(task, done)
 
 
+FEWEST_TIMED = 3
+"""Number of finished items from which the time left is estimated."""
+
+
 class _Log:
     """Progress without a terminal: a line every ten seconds."""
 
@@ -286,8 +290,9 @@ class _Log:
         self.done += done
         if time_s - self.reported_s >= self.every_s and self.done > self.resumed:
             rate = (self.done - self.resumed) / (time_s - self.begun)
-            left = (self.total - self.done) / rate
-            line = f"{self.what} {self.done}/{self.total}, {rate:.1f} {self.unit}/s, {left:.0f} s left"
+            line = f"{self.what} {self.done}/{self.total}, {rate:.1f} {self.unit}/s"
+            if self.done - self.resumed >= FEWEST_TIMED:  # the first items load and compile
+                line += f", {max(0, self.total - self.done) / rate:.0f} s left"
             typer.echo(line, err=True)
             self.reported_s = time_s
 

@@ -24,7 +24,7 @@ from mitsonar.cli.options import (
 )
 from mitsonar.cli.side_scan import MosaicRequest, lay_side_scan, refuse_options, side_scan_at
 from mitsonar.errors import MitsonarError, count_noun, did_you_mean
-from mitsonar.io.files import write_atomic
+from mitsonar.io.files import missing_file, write_atomic
 from mitsonar.io.runs import kind_of_run, refuse_to_replace
 from mitsonar.io.system import usable_cores
 
@@ -350,10 +350,8 @@ def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Tr
             paths["true"] = folder.true
     elif trajectory != "true":
         if not Path(trajectory).exists():
-            raise MitsonarError(
-                f"there is no trajectory {trajectory}: give a TUM or CSV file, the folder of an odometry, or "
-                f"`true`{did_you_mean(trajectory, ['true'])}"
-            )
+            otherwise = f"give a TUM or CSV file, the folder of an odometry, or `true`{did_you_mean(trajectory, ['true'])}"
+            raise missing_file(trajectory, otherwise)
         paths["estimated"] = Trajectory.load(trajectory, frame)
     if true is not None:
         if trajectory == "true":

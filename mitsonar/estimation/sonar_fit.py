@@ -94,8 +94,9 @@ class SonarFit:
         full_scale_db: level of full scale, before the gain, in the units of ``noise_level_db``.
         bright_db: 99.9th percentile of the levels beyond the near glow, relative to full scale [dB].
         speckle_span_db: span of the coding dB at which grain of 5.57 dB has the spread of these values [dB]; None for other
-            codings.
-        speckle_gamma: exponent of value = amplitude^gamma, from the coefficient of variation of the values; None in dB.
+            codings, and where most windows are clipped.
+        speckle_gamma: exponent of value = amplitude^gamma, from the coefficient of variation of the values; None in dB, and
+            where most windows are clipped.
         glow_db: level of the first bins over the trend beyond them [dB].
         notes: sentences on assumptions and on quantities that could not be fitted.
     """
@@ -113,11 +114,11 @@ class SonarFit:
         """Return the results as lines of text, one per quantity, with units."""
         sonar = self.sonar
         noise_text = "not seen" if self.noise_db is None else f"{self.noise_db:.1f} dB at mid range"
-        grain = (
-            f"a span of {self.speckle_span_db:.1f} dB"
-            if self.speckle_span_db is not None
-            else f"gamma {self.speckle_gamma:.2f} (linear is 2)"
-        )
+        grain = "none, since the frames are clipped"
+        if self.speckle_span_db is not None:
+            grain = f"a span of {self.speckle_span_db:.1f} dB"
+        elif self.speckle_gamma is not None:
+            grain = f"gamma {self.speckle_gamma:.2f} (linear is 2)"
         coding = {"dB": f"dB, span {sonar.coding_db:g} dB", "gamma": f"gamma {sonar.coding_gamma:g}"}
         level = "not fitted" if sonar.noise_level_db is None else f"{sonar.noise_level_db:.1f} dB"
         crosstalk_text = "none seen" if sonar.crosstalk_db is None else f"{sonar.crosstalk_db:.1f} dB"
@@ -189,9 +190,21 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     value = np.asarray(frames.image, dtype=float) / (255 if frames.image.dtype.kind == "u" else 1)
     notes: list[str] = []
     # 2. the grain of dark windows gives a coding; with it, values become intensities
-    span, gamma = (_span(value), None) if frames.level == "dB" else (None, _gamma(value))
+    clipped = _inside(statistics.window_values(value)).sum() < LEAST_WINDOWS
+    span = gamma = None
+    if clipped:
+        share = 100 * float(((value <= 0) | (value >= FULL_SCALE)).mean())
+        notes.append(
+            f"{share:.0f} % of the cells have the smallest or the largest value: the grain of clipped frames has no coding "
+            "and no pulse"
+        )
+    elif frames.level == "dB":
+        span = _span(value)
+    else:
+        gamma = _gamma(value)
     sonar = _with_coding(sonar, span, gamma, measure_coding, notes)
-    sonar = _with_resolution(sonar, value, frames.level == "dB" and not measure_coding, given, notes)
+    if not clipped:
+        sonar = _with_resolution(sonar, value, frames.level == "dB" and not measure_coding, given, notes)
     intensity = decoded(value, sonar)
     level = statistics.decibels(intensity, float(statistics.decibels(intensity[intensity > 0].min())) - 3)
     # 3. intensities before the gain give the noise, and the contrast of bright windows the speckle
@@ -220,7 +233,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         fitted |= _water(flat, level, noise, sonar, full_scale_db, notes)
         # 6. dark bins contain noise and the detector's offset
         dark_db = _grain_windows(value)[1] * sonar.coding_db
-        ratio = _offset_of(dark_db, sonar.looks) if frames.level == "dB" else 0.0
+        ratio = _offset_of(dark_db, sonar.looks) if frames.level == "dB" and not clipped else 0.0
         least_db = _grain(sonar.looks, OFFSETS[1])[0]
         if frames.level == "dB" and len(dark_db) and (spread_db := float(np.median(dark_db.std(axis=1)))) < least_db:
             notes.append(
@@ -286,6 +299,11 @@ def _mode(values: Array) -> float:
     return float(values.mean()) if len(values) else math.nan
 
 
+def _inside(parts: Array) -> NDArray[np.bool_]:
+    """Return the windows ``(windows,)`` in which hardly any cell has the smallest or the largest value."""
+    return np.asarray(((parts > 0) & (parts < FULL_SCALE)).mean(axis=1) > 1 - MOST_CLIPPED)
+
+
 def _grain_windows(value: Array) -> tuple[Array, Array]:
     """Return windows and their detrended values ``(windows, cells)`` from which a coding is measured.
 
@@ -293,7 +311,7 @@ def _grain_windows(value: Array) -> tuple[Array, Array]:
     which the texture of the bottom does not change.
     """
     parts, rest = (statistics.window_values(one) for one in (value, statistics.detrended(value)))
-    inside = ((parts > 0) & (parts < FULL_SCALE)).mean(axis=1) > 1 - MOST_CLIPPED
+    inside = _inside(parts)
     if inside.sum() >= LEAST_WINDOWS:
         parts, rest = parts[inside], rest[inside]
     mean = parts.mean(axis=1)
@@ -304,7 +322,7 @@ def _grain_windows(value: Array) -> tuple[Array, Array]:
 def _bright_windows(value: Array, sonar: Sonar) -> Array:
     """Return detrended values ``(windows, cells)`` of windows far above the darkest, hardly clipped, in dB."""
     parts, rest = (statistics.window_values(one) for one in (value, statistics.detrended(value)))
-    inside = ((parts > 0) & (parts < FULL_SCALE)).mean(axis=1) > 1 - MOST_CLIPPED
+    inside = _inside(parts)
     mean = parts.mean(axis=1)
     above = np.percentile(mean, NOISE_PERCENTILE) + 10 * math.log10(FLAT_NOISE_RATIO) / sonar.coding_db
     return np.asarray(rest[inside & (mean > above)])
@@ -336,8 +354,9 @@ def _with_coding(sonar: Sonar, span: float | None, gamma: float | None, measure:
     """Return the sonar with the measured coding if requested; else add a note if it differs from the stated one."""
     if span is not None:
         stated, measured, coding = sonar.coding_db, span, {"coding": "dB", "coding_db": round(span, 1)}
+    elif gamma is None:
+        return sonar
     else:
-        assert gamma is not None
         stated = sonar.coding_gamma if sonar.value_coding == "gamma" else 2.0
         measured, coding = gamma, {"coding": "gamma", "coding_gamma": round(gamma, 2)}
     if measure:

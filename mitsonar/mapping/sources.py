@@ -24,6 +24,7 @@ from mitsonar.acoustics.levels import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, count_noun, suggest_names
 from mitsonar.io.files import missing_file
+from mitsonar.io.runs import kind_of_run
 from mitsonar.motion.errors import associated
 from mitsonar.motion.pose import poses_from, vehicle_rotation
 from mitsonar.motion.sensors import VehicleSensors, leaning_mount
@@ -437,6 +438,10 @@ def open_frames(
         if not candidates:
             from mitsonar.recordings.open import recordings_in
 
+            if kind_of_run(path) == "odometry":
+                raise MitsonarError(
+                    f"{path} is the folder of an odometry, which holds no frames: give the run or recording of the frames"
+                )
             raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {recordings_in(path) or FINDING}")
         path = candidates[0]
     return _open_zarr(path, str(where)) if os.path.isdir(path) else _open_npz(path, str(where))

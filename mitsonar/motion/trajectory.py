@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, count_noun, suggest_names
-from mitsonar.io.files import read_at_most, write_atomic
+from mitsonar.io.files import missing_file, read_at_most, write_atomic
 from mitsonar.motion.pose import Pose, poses_from, refuse_beyond_reach, vehicle_rotation
 
 __all__ = [
@@ -367,6 +367,8 @@ def _read_text(path: str | Path) -> str:
     try:
         content = read_at_most(path, LARGEST)
         text = content.decode("utf-8-sig")
+    except FileNotFoundError:
+        raise missing_file(path, "give a TUM or CSV file") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
         raise MitsonarError(f"cannot read trajectory {path}: {reason}; give a TUM or CSV file") from None

@@ -158,7 +158,7 @@ def test_mistakes_are_answered(mitsonar: Command, scene: Path, tmp_path: Path, m
     refused(mitsonar("impulse", scene, "--set", "transmitter=all"), "in the scene or in Python")
     refused(mitsonar("impulse", scene, "--from", "0,0,-10,0,0,0"), "no receiver has an echo", "(0, 0, -10) m")
     refused(mitsonar("impulse", scene, "--trajectory", "sqare"), "unknown course 'sqare'", "square")
-    refused(mitsonar("impulse", scene, "--trajectory", tmp_path / "no.tum"), "cannot read trajectory")
+    refused(mitsonar("impulse", scene, "--trajectory", tmp_path / "no.tum"), "no such file: ")
     refused(mitsonar("impulse", scene, "--trajectory", "square", "--velocity", "1,1"), "contradict")
     refused(mitsonar("impulse", "flat_floor"), "no channel_sonar", "--from")
     bare = tmp_path / "bare.xml"

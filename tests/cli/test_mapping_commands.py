@@ -303,6 +303,7 @@ def test_a_bad_mosaic_is_answered_by_one_sentence(mitsonar: Command, drawn: Path
     (tmp_path / "estimated").mkdir()
     (tmp_path / "estimated" / "run.json").write_text('{"kind": "odometry"}')
     refused(mitsonar("mosaic", tmp_path / "estimated", drawn, "-o", out), "frames first, the odometry second")
+    refused(mitsonar("odometry", tmp_path / "estimated", "-o", out), "the folder of an odometry, which holds no frames")
     refused(mitsonar("mosaic", drawn, "true", "-o", tmp_path / "map.jpg"), ".png, .tif")
     refused(mitsonar("mosaic", drawn, "true", "-o", tmp_path / "no" / "map.png"), "no folder")
     refused(mitsonar("mosaic", drawn, "true", "-o", out, "--cell-mm", 0), "above 0")

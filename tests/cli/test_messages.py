@@ -19,7 +19,7 @@ import typer
 from drawn_frames import over_ground, sway
 from helpers import Command, essence, refused, run_python
 
-from mitsonar.cli.console import OPTIONS, answered, command_line, say_json
+from mitsonar.cli.console import OPTIONS, _Log, answered, command_line, say_json
 from mitsonar.errors import MitsonarError, argument, did_you_mean
 from mitsonar.geometry.ground import attitude_of
 
@@ -295,3 +295,14 @@ def test_a_signal_ends_a_rendering_that_goes_on(number: signal.Signals, mitsonar
 def test_printed_json_has_no_words_of_python(capfd: pytest.CaptureFixture[str]) -> None:
     say_json({"a": [1.5, float("nan")], "b": {"c": (float("inf"), "NaN")}}, indent=0)
     assert json.loads(capfd.readouterr().out, parse_constant=pytest.fail) == {"a": [1.5, None], "b": {"c": [None, "NaN"]}}
+
+
+def test_the_time_left_is_estimated_from_the_third_item(capsys: pytest.CaptureFixture[str]) -> None:
+    """The first items load and compile; more items than announced leave no time below 0."""
+    log = _Log("rendering", 3, "pings", every_s=0.0)
+    log.begun -= 10
+    for _ in range(4):
+        log(1)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.rpartition(", ")[2].endswith("s left") for line in lines] == [False, False, True, True]
+    assert lines[-1].endswith(" 0 s left")

@@ -169,7 +169,7 @@ def test_a_simulated_line_is_shown_and_mapped_as_a_real_one(mitsonar: Command, t
         (("odometry", "FILE", "-o", "x"), "pings in place of frames"),
         (("mosaic", "FILE", "true", "-o", "x.tif", "--blend", "centre"), "--blend applies only to frames"),
         (("mosaic", "FILE", "true", "-o", "x.tif", "--cell-mm", 1), "the map would have"),
-        (("mosaic", "FILE", "absent.tum", "-o", "x.tif"), "there is no trajectory"),
+        (("mosaic", "FILE", "absent.tum", "-o", "x.tif"), "no such file: absent.tum"),
     ],
 )
 def test_wrong_options_are_named(mitsonar: Command, file: Path, words: tuple[object, ...], says: str) -> None:

@@ -109,6 +109,17 @@ def test_the_grain_tells_the_coding(recordings: dict[str, SonarFrames]) -> None:
     assert fit_sonar(recordings["linear"]).speckle_gamma == pytest.approx(2, abs=0.15)
 
 
+def test_clipped_frames_have_no_coding(recordings: dict[str, SonarFrames]) -> None:
+    """The darkest two thirds of the cells become 0."""
+    frames = recordings["70 dB"].select(slice(None))
+    frames.image = np.where(frames.image > np.percentile(frames.image, 66), frames.image, 0)
+    result = fit_sonar(frames)
+    assert result.speckle_span_db is None
+    assert "66 % of the cells have the smallest or the largest value" in result.notes[0]
+    assert any("none, since the frames are clipped" in line for line in result.lines())
+    assert not any("the grain suggests" in note for note in result.notes)
+
+
 def test_eight_bit_and_a_named_sonar_do(recordings: dict[str, SonarFrames]) -> None:
     """Counts of uint8; what the frames do not tell comes from the preset, the window from the frames."""
     frames = recordings["dB"].select(slice(None))
