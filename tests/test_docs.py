@@ -160,9 +160,9 @@ def test_the_recipe_for_a_mavlink_log_makes_sensors(tmp_path: Path, monkeypatch:
     from mitsonar.motion.sensors import load_sensors
 
     sent = [
-        SimpleNamespace(get_type=lambda: "ATTITUDE", _timestamp=1.7e9, yawspeed=0.1),
+        SimpleNamespace(get_type=lambda: "ATTITUDE", _timestamp=1.7e9, yawspeed=0.1, pitch=-0.03, roll=0.02),
         SimpleNamespace(get_type=lambda: "VFR_HUD", _timestamp=1.7e9, alt=-2.5),
-        SimpleNamespace(get_type=lambda: "ATTITUDE", _timestamp=1.7e9 + 0.05, yawspeed=-0.2),
+        SimpleNamespace(get_type=lambda: "ATTITUDE", _timestamp=1.7e9 + 0.05, yawspeed=-0.2, pitch=0.01, roll=0.0),
         None,
     ]
     log = SimpleNamespace(recv_match=lambda type: sent.pop(0))
@@ -175,6 +175,10 @@ def test_the_recipe_for_a_mavlink_log_makes_sensors(tmp_path: Path, monkeypatch:
     assert sensors.depth is not None
     assert sensors.yaw_rate.values == pytest.approx([0.1, -0.2])
     assert sensors.depth.values.tolist() == [2.5]
+    assert sensors.pitch is not None
+    assert sensors.roll is not None
+    assert sensors.pitch.values == pytest.approx([0.03, -0.01])  # MAVLink: > 0 is bow up
+    assert sensors.roll.values == pytest.approx([0.02, 0.0])
 
 
 def test_what_is_not_run_says_why() -> None:

@@ -87,8 +87,11 @@ def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None
         source.with_sensors(sensors)
     aided, _ = source.with_geometry(float(sonar.poses[:, 2].mean()), np.radians(25)).with_sensors(sensors)
     some = np.arange(len(vehicle))
+    poses = aided.attitudes(some)
+    assert poses is not None
+    assert aided.height_m is not None
     np.testing.assert_allclose(aided.height_m, sonar.poses[:, 2], atol=2e-3)
-    np.testing.assert_allclose(aided.attitudes(some)[:, 3:5], sonar.poses[:, 3:5], atol=1e-3)  # type: ignore[index]
+    np.testing.assert_allclose(poses[:, 3:5], sonar.poses[:, 3:5], atol=1e-3)
     # a depth sensor alone measures the heave, and leaves pitch and roll unknown
     deep = simulated_sensors(vehicle, SensorNoise(depth_m=1e-9, rate_hz=50.0))
     heaving, _ = source.with_geometry(2.2, np.radians(25)).with_sensors(deep)
@@ -103,12 +106,15 @@ def test_smoothing_takes_noise_out_and_leaves_what_is_exact() -> None:
     swell = 0.1 * np.sin(2 * np.pi * time / 4)
     true = 0.1 * np.sin(2 * np.pi * frames / 4)
     noise = np.random.default_rng(3).normal(size=len(time)) * 0.01
-    np.testing.assert_allclose(readings(time, swell, 0.01).smoothed(frames), true, atol=1e-4)
-    smoothed = readings(time, swell + noise, 0.01).smoothed(frames)
+    exact, smoothed = (readings(time, values, 0.01).smoothed(frames) for values in (swell, swell + noise))
+    assert exact is not None
     assert smoothed is not None
+    np.testing.assert_allclose(exact, true, atol=1e-4)
     assert np.std(smoothed - true) < 0.005
     assert readings(time, swell, 0.01).smoothed(frames + 10) is None
-    np.testing.assert_array_equal(readings(time, np.full(len(time), 3.0), 0.01).smoothed(frames), 3)
+    constant = readings(time, np.full(len(time), 3.0), 0.01).smoothed(frames)
+    assert constant is not None
+    np.testing.assert_array_equal(constant, 3)
 
 
 def test_a_gyroscope_s_noise_grows_with_the_root_of_time() -> None:
