@@ -185,7 +185,7 @@ class AttachedLevels:
         # 1. Points on the surfaces, and the solid angle that each represents.
         view = SonarView(self.traced, [dr.detach(line) for line in lines])
         with without_derivatives():
-            shapes = self.scene.shapes()
+            shapes: DeviceArray = self.scene.shapes()
             weights = [float(Outline(shapes[number]).weights(view)[0]) ** 2 for number in self.curved]
             parts = []
             for number, weight in zip(self.curved, weights, strict=True):
@@ -194,7 +194,7 @@ class AttachedLevels:
                     sample = np.stack([count * GOLDEN % 1, count / size]).astype(np.float32)  # a Fibonacci lattice
                     place = shapes[number].sample_position(0.0, mi.Point2f(sample))
                     away = place.p - view.origin
-                    met = dr.zeros(mi.PreliminaryIntersection3f, size)
+                    met: DeviceArray = dr.zeros(mi.PreliminaryIntersection3f, size)
                     met.t, met.shape, met.valid = dr.norm(away), mi.ShapePtr(shapes[number]), mi.Bool(True)
                     ray = mi.Ray3f(view.origin, away / met.t)
                     facing = dr.dot(met.compute_surface_interaction(ray, mi.RayFlags.Minimal).n, ray.d)
