@@ -1,10 +1,12 @@
 """Derivatives of expected images by the pose of the sonar, against central differences, in ten scenes with occlusion.
 
-The derivatives are those of a sum of all levels with weights that vary over range and beams. Errors are in % of the
-gradient, for places and angles together (an angle counts as a place at the range of the scene). Differences are means over
-draws of the jitter, whose spread gives their standard error.
+The derivatives are those of a sum of all levels with weights that vary over range and beams. A difference between two poses
+is the mean of the derivative along the way from one to the other. Both are compared over a step that is long against the
+cells of the rays, whose noise falls with its length, and without an error of truncation: the derivative is averaged over
+places that divide the step evenly. Errors are in % of the gradient, for places and angles together (an angle counts as a
+place at the range of the scene). Differences are means over draws of the jitter, whose spread gives their standard error.
 
-    python benchmarks/bench_gradients.py [--draws 24] [--edge-points 200000]
+    python benchmarks/bench_gradients.py [--draws 24] [--places 6] [--edge-points 200000] [--scene "hills and a ball"]
     python benchmarks/bench_gradients.py --quick    # one scene, two draws
 """
 
@@ -13,7 +15,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +36,9 @@ POSE = Pose(0, -3, 2.0, 0.6)
 RANGE_M = 3.5
 """Range at which an angle counts as much as a place [m]."""
 
-STEP_M = 5e-3
+STEP_M = 0.03
+"""Half the step of the differences [m], or at that range."""
+
 CENTRE = (0.2, -0.3, 0.35)
 
 Array = NDArray[np.float64]
@@ -95,22 +99,23 @@ def main() -> None:
     """Print a row for each scene."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=24, help="draws of the jitter")
+    parser.add_argument("--places", type=int, default=6, help="places on each step where the derivative is computed")
     parser.add_argument("--edge-points", type=int, default=200_000)
+    parser.add_argument("--scene", choices=SOLIDS, help="one scene instead of all")
     parser.add_argument("--quick", action="store_true", help="one scene, two draws")
     arguments = parser.parse_args()
+    names = [arguments.scene] if arguments.scene else list(SOLIDS)
     if arguments.quick:
-        arguments.draws, arguments.edge_points = 2, 20_000
+        arguments.draws, arguments.places, arguments.edge_points, names = 2, 1, 20_000, names[:1]
     ensure_variant()
     print("scene: error of rays alone, with edges; standard error of the differences [% of the gradient]; s a gradient")
     worst = []
-    for name, solid in list(SOLIDS.items())[: 1 if arguments.quick else None]:
-        scene = built(solid())
+    for name in names:
+        scene = built(SOLIDS[name]())
         truth, spread = differences(scene, arguments.draws)
         size = np.linalg.norm(truth)
-        alone = gradient(scene, 0, 1)
-        begin = time.perf_counter()
-        whole = gradient(scene, arguments.edge_points, 4)
-        seconds = (time.perf_counter() - begin) / 4
+        alone, _ = gradient(scene, 0, 1)
+        whole, seconds = gradient(scene, arguments.edge_points, arguments.places)
         errors = [100 * np.linalg.norm(one - truth) / size for one in (alone, whole)]
         worst.append(errors[1])
         print(
@@ -148,40 +153,41 @@ def scales() -> Array:
     return np.array([1.0] * 3 + [RANGE_M] * 3)
 
 
-def gradient(scene: mi.Scene, edge_points: int, draws: int) -> Array:
-    """Return the gradient by x, y, z, pitch, roll, heading, per metre: the mean over draws."""
+def moved_pose(number: int, step: float) -> list[float]:
+    """Return the pose with one of its numbers changed by a step [m], or at the range of the scene."""
+    pose = np.array(POSE, dtype=float)
+    pose[number] += step / scales()[number]
+    return [float(value) for value in pose]
+
+
+def gradient(scene: mi.Scene, edge_points: int, places: int) -> tuple[Array, float]:
+    """Return the gradient by x, y, z, pitch, roll, heading, per metre: its mean along the step of each; and seconds each."""
     import drjit as dr
     import mitsuba as mi
 
     simulator = mitsonar.DifferentiableSimulator(scene, edge_points=edge_points)
     weight = mi.TensorXf(weights().astype(np.float32))
-    total = np.zeros(6)
-    for draw in range(draws):
-        pose = [mi.Float(value) for value in POSE]
-        dr.enable_grad(pose)
-        dr.backward(dr.sum(simulator.levels(pose, ping=draw) * weight))
-        total += [float(dr.grad(value)[0]) for value in pose]
-    return np.asarray(total / draws / scales(), dtype=np.float64)
+    total, begin = np.zeros(6), time.perf_counter()
+    for number in range(6):
+        for place in range(places):
+            pose = [mi.Float(value) for value in moved_pose(number, STEP_M * ((2 * place + 1) / places - 1))]
+            dr.enable_grad(pose)
+            dr.backward(dr.sum(simulator.levels(pose, ping=number * places + place) * weight))
+            total[number] += float(dr.grad(pose[number])[0]) / places
+    return total / scales(), (time.perf_counter() - begin) / (6 * places)
 
 
 def differences(scene: mi.Scene, draws: int) -> tuple[Array, Array]:
-    """Return central differences per metre, and their standard errors."""
+    """Return differences over the steps per metre, and their standard errors."""
     simulator = mitsonar.DifferentiableSimulator(scene, edge_points=0)
 
-    def slopes() -> Iterator[list[float]]:
-        for draw in range(draws):
-            row = []
-            for number, scale in enumerate(scales()):
-                ends = []
-                for side in (1, -1):
-                    pose = np.array(POSE, dtype=float)
-                    pose[number] += side * STEP_M / scale
-                    levels = np.array(simulator.levels(pose.tolist(), ping=100 + draw), dtype=float)
-                    ends.append(float((levels * weights()).sum()))
-                row.append((ends[0] - ends[1]) / (2 * STEP_M))
-            yield row
+    def total(pose: list[float], ping: int) -> float:
+        return float((np.array(simulator.levels(pose, ping=ping), dtype=float) * weights()).sum())
 
-    table = np.array(list(slopes()))
+    def slope(number: int, ping: int) -> float:
+        return (total(moved_pose(number, STEP_M), ping) - total(moved_pose(number, -STEP_M), ping)) / (2 * STEP_M)
+
+    table = np.array([[slope(number, 100 + draw) for number in range(6)] for draw in range(draws)])
     return table.mean(axis=0), table.std(axis=0, ddof=1) / np.sqrt(draws)
 
 

@@ -129,20 +129,43 @@ class ImagingSonar(mi.Sensor):
 
     # ---------------- Directions of the rays
 
-    def fan(self, column: mi.UInt32, row: mi.UInt32, key: mi.UInt32) -> Fan:
+    def fan(self, column: mi.UInt32, row: mi.UInt32, key: mi.UInt32 | None = None) -> Fan:
         """Return the ray of each cell. If the sonar jitters, ``key`` (see :meth:`key`) draws its position in the cell."""
         sonar = self.sonar
         beam, step = column // sonar.across, column % sonar.across
-        # 1. Position of the ray within its cell, and the angles of the cell's centre and of the ray.
         across, along = self._position_in_cell(row * sonar.columns + column, key)
-        width = sonar.beam_width_rad / sonar.across
-        height = np.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
-        middle = self._axis(beam) + (mi.Float(step) + (0.5 - sonar.across / 2)) * width
-        level = (mi.Float(row) + (0.5 - sonar.rays_per_beam / 2)) * -height
+        return self._fan(self._middle(beam, step), self._level(row), across, along)
+
+    def fan_at(self, beam: mi.UInt32, bearing: DeviceArray, elevation: DeviceArray) -> Fan:
+        """Return the rays at bearings in a beam and elevations [rad], in the cells of :meth:`fan`."""
+        sonar = self.sonar
+        width, height = self._cell()
+        step = dr.floor((bearing - self._axis(beam)) / width + sonar.across / 2)
+        row = dr.floor(sonar.rays_per_beam / 2 - elevation / height)
+        middle, level = self._middle(beam, step), self._level(row)
+        return self._fan(middle, level, (bearing - middle) / width + 0.5, (level - elevation) / height + 0.5)
+
+    def _cell(self) -> tuple[float, float]:
+        """Return width and height of a cell [rad]."""
+        sonar = self.sonar
+        return sonar.beam_width_rad / sonar.across, float(np.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam)
+
+    def _middle(self, beam: mi.UInt32, step: DeviceArray) -> mi.Float:
+        """Return the bearing of the middle of a cell [rad]."""
+        return self._axis(beam) + (mi.Float(step) + (0.5 - self.sonar.across / 2)) * self._cell()[0]
+
+    def _level(self, row: DeviceArray) -> mi.Float:
+        """Return the elevation of the middle of a cell [rad]."""
+        return (mi.Float(row) + (0.5 - self.sonar.rays_per_beam / 2)) * -self._cell()[1]
+
+    def _fan(self, middle: mi.Float, level: mi.Float, across: DeviceArray, along: DeviceArray) -> Fan:
+        """Return rays at positions 0..1 across and down cells, whose middles are given [rad]."""
+        sonar = self.sonar
+        width, height = self._cell()
         sin_b, cos_b = dr.sincos(middle + (across - 0.5) * width)
         elevation = level - (along - 0.5) * height
         sin_e, cos_e = dr.sincos(elevation)
-        # 2. Direction, its derivatives by elevation and bearing, and the exact solid angle of the cell.
+        # 1. Direction, its derivatives by elevation and bearing, and the exact solid angle of the cell.
         if sonar.bearing == "azimuth":
             d = _local(cos_e * sin_b, cos_e * cos_b, sin_e)
             lift = _local(-sin_e * sin_b, -sin_e * cos_b, cos_e)
@@ -153,7 +176,7 @@ class ImagingSonar(mi.Sensor):
             lift = _local(mi.Float(0), -cos_b * sin_e, cos_b * cos_e)
             side = _local(cos_b, -sin_b * cos_e, -sin_b * sin_e)
             solid_angle = dr.cos(middle) * (2 * np.sin(width / 2) * height)
-        # 3. Edges and centre of the cell relative to the ray.
+        # 2. Edges and centre of the cell relative to the ray.
         below, above, aside = (along - 1) * height, along * height, (0.5 - across) * width
         return Fan(d, lift, side, below, above, aside, solid_angle, elevation)
 
@@ -167,9 +190,9 @@ class ImagingSonar(mi.Sensor):
         part = (mi.Float(beam) + (0.5 - self.sonar.beams / 2)) * (2 / self.sonar.beams)  # -1..1 across the fan
         return part * half if self.sonar.beam_layout == "even" else dr.asin(part * np.sin(half))
 
-    def _position_in_cell(self, ray: DeviceArray, key: DeviceArray) -> tuple[mi.Float, mi.Float]:
+    def _position_in_cell(self, ray: DeviceArray, key: DeviceArray | None) -> tuple[mi.Float, mi.Float]:
         """Return the position across and down the cell, 0..1: its centre, or a hash of (seed, ping, ray) with jitter."""
-        if not self.sonar.jittered:
+        if key is None or not self.sonar.jittered:
             return mi.Float(0.5), mi.Float(0.5)
         first, second = mi.sample_tea_32(ray, key, ROUNDS)
         return (mi.Float(first >> 8) + 0.5) * 2.0**-24, (mi.Float(second >> 8) + 0.5) * 2.0**-24

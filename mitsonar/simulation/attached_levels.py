@@ -18,7 +18,7 @@ from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.records.echoes import Echoes
 from mitsonar.simulation.beams import angles_of, beam_at, elevation_gain
 from mitsonar.simulation.device import DeviceArray, clipped
-from mitsonar.simulation.edges import EdgePieces, Edges, crossings, pieces_of, without_derivatives
+from mitsonar.simulation.edges import EdgePieces, Edges, Outline, SonarView, crossings, pieces_of, without_derivatives
 from mitsonar.simulation.models.physical import ExpectedFormer
 from mitsonar.simulation.models.thesis import footprint
 from mitsonar.simulation.tracing import Rays, Tracer
@@ -30,6 +30,18 @@ ASIDE_RAD = 2e-6
 
 NEARER = 1e-3
 """Distance at which a ray beside an edge may hit, relative to that of the edge, without hiding it."""
+
+PLANE_RAD = 4 * ASIDE_RAD
+"""Angle that the edge appears off the tangent plane of such a hit without being hidden, however far away [rad]."""
+
+TURNED = 0.1
+"""Largest cosine of a curved surface close to its outline."""
+
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""Golden ratio less 1: its multiples fill 0..1 evenly."""
+
+CURVED = ("Sphere", "Cylinder")
+"""Shapes of Mitsuba that are curved."""
 
 STEP = 1e-3
 """Relative step of the difference that gives the derivative of beam patterns by their width."""
@@ -57,6 +69,11 @@ class AttachedLevels:
         return None if self.sonar.beam_pattern == "box" else ExpectedFormer(self.sonar)
 
     @cached_property
+    def curved(self) -> list[int]:
+        """Return the numbers of the shapes that are curved."""
+        return [number for number, shape in enumerate(self.scene.shapes()) if shape.class_name() in CURVED]
+
+    @cached_property
     def traced(self) -> Sonar:
         """Return the sonar whose boxes are traced."""
         return self.sonar if self.former is None else self.former.traced
@@ -81,12 +98,17 @@ class AttachedLevels:
         fan = tracer.sensor.fan(rays.column, rays.row, key).carried(lines)
         ray = mi.Ray3f(mi.Point3f(*(line.w for line in lines)), fan.d)
         echoes = Echo.measure(self.scene, tracer.surfaces, ray, fan, edges=True, attached=True)
+        moving = self.edge_points > 0 and dr.grad_enabled(echoes.range_m, echoes.cosine)
+        if moving and self.curved:
+            echoes = self._without_derivatives_on_curved(echoes)
         steps = self._steps(echoes, fan.elevation, rays.beam, given)
-        # 2. Add what edges sweep, which is 0 and has derivatives.
-        if self.edge_points and dr.grad_enabled(echoes.range_m, echoes.cosine):
+        # 2. Add what edges sweep and what curved surfaces change, which is 0 and has derivatives.
+        if moving:
             still = [dr.detach(line) for line in lines]
+            if self.curved:
+                steps += self._on_curved(lines, given)
             pieces = pieces_of(self.edges, self.traced, lines, self.edge_points)
-            for part in pieces + crossings(self.scene, tracer, lines, key):
+            for part in pieces + crossings(self.scene, tracer, lines):
                 steps += self._swept(part, still, given)
         # 3. Each footprint is a step up at its begin and a step down at its end: their running sum is the share of each bin.
         shape = (self.traced.range_bins + 2, self.traced.beams)
@@ -133,14 +155,70 @@ class AttachedLevels:
             with without_derivatives():
                 echoes = Echo.measure(self.scene, self.tracer.surfaces, mi.Ray3f(origin, fan.d), fan, attached=True)
             behind = echoes.range_m - pieces.distance
-            inside &= (echoes.hit == 0) | (behind >= -NEARER * pieces.distance)
-            range_m = dr.select(behind > NEARER * pieces.distance, echoes.range_m, pieces.distance)
-            echoes = replace(echoes, range_m=range_m, near_m=range_m, far_m=range_m)
+            level = -behind * echoes.cosine <= PLANE_RAD * pieces.distance  # of a grazing facet that ends at the edge
+            inside &= (echoes.hit == 0) | (behind >= -NEARER * pieces.distance) | level
+            near = behind <= NEARER * pieces.distance
+            range_m = dr.select(near, pieces.distance, echoes.range_m)
+            dark = near & pieces.smooth & (echoes.cosine < TURNED)
+            echoes = replace(echoes, hit=dr.select(dark, 0, echoes.hit), range_m=range_m, near_m=range_m, far_m=range_m)
             sides.append(replace(echoes, solid_angle_sr=-side * pieces.swept))
         dr.eval(inside, beam, elevation, sides)  # smaller kernels compile faster
         # 3. Their levels, by the solid angle that is swept.
         one, other = (replace(echoes, hit=dr.select(inside, echoes.hit, 0)) for echoes in sides)
         return self._steps(one, elevation, beam, given) + self._steps(other, elevation, beam, given)
+
+    def _without_derivatives_on_curved(self, echoes: Echoes) -> Echoes:
+        """Return echoes of which those of curved surfaces have no derivatives."""
+        table = np.zeros(len(self.scene.shapes()), dtype=np.uint32)
+        table[self.curved] = 1
+        valid = echoes.shape_id >= 0
+        curved = dr.gather(mi.UInt32, mi.UInt32(table), mi.UInt32(dr.select(valid, echoes.shape_id, 0)), valid) > 0
+        parts = {field.name: getattr(echoes, field.name) for field in fields(Echoes)}
+        return Echoes(**{name: dr.select(curved, dr.detach(part), part) for name, part in parts.items()})
+
+    def _on_curved(self, lines: list[mi.Vector4f], given: dict[str, mi.Float]) -> DeviceArray:
+        """Return the steps of rays to points that cover curved surfaces evenly: 0, with derivatives.
+
+        The cosine changes as 1 / cosine towards an outline, where few rays of the fan meet the surface and their mean has
+        no finite variance. Per area instead of per angle, the change is finite.
+        """
+        # 1. Points on the surfaces, and the solid angle that each represents.
+        view = SonarView(self.traced, [dr.detach(line) for line in lines])
+        with without_derivatives():
+            shapes: DeviceArray = self.scene.shapes()
+            weights = [float(Outline(shapes[number]).weights(view)[0]) ** 2 for number in self.curved]
+            parts = []
+            for number, weight in zip(self.curved, weights, strict=True):
+                if size := math.ceil(self.edge_points * weight / (sum(weights) or 1)):
+                    count = np.arange(size) + 0.5
+                    sample = np.stack([count * GOLDEN % 1, count / size]).astype(np.float32)  # a Fibonacci lattice
+                    place = shapes[number].sample_position(0.0, mi.Point2f(sample))
+                    away = place.p - view.origin
+                    met: DeviceArray = dr.zeros(mi.PreliminaryIntersection3f, size)
+                    met.t, met.shape, met.valid = dr.norm(away), mi.ShapePtr(shapes[number]), mi.Bool(True)
+                    ray = mi.Ray3f(view.origin, away / met.t)
+                    facing = dr.dot(met.compute_surface_interaction(ray, mi.RayFlags.Minimal).n, ray.d)
+                    area = 1 / (place.pdf * size * dr.square(met.t))
+                    parts.append([*away, met.t, facing, area, dr.full(mi.Float, number, size)])
+            if not parts:
+                return 0
+            x, y, z, distance, facing, area, number = (dr.concat([mi.Float(part[k]) for part in parts]) for k in range(7))
+            direction = view.to_sonar(mi.Vector3f(x, y, z)) / distance
+            bearing, elevation = angles_of(self.traced, -direction.x, direction.z, direction.y)
+            beam, inside = beam_at(self.traced, bearing)
+            inside &= dr.abs(elevation) <= math.radians(self.traced.elevation_fov_deg) / 2
+            dr.eval(beam, inside, bearing, elevation, distance, facing, area, number)
+        # 2. Echoes of those that are visible: from the same side of the same surface.
+        fan = self.tracer.sensor.fan_at(beam, bearing, elevation).carried(lines)
+        ray = mi.Ray3f(mi.Point3f(*(line.w for line in lines)), fan.d)
+        echoes = Echo.measure(self.scene, self.tracer.surfaces, ray, fan, attached=True)
+        side = dr.dot(mi.Vector3f(echoes.nx, echoes.ny, echoes.nz), fan.d)
+        inside &= (echoes.shape_id == number) & (side * facing > 0)
+        inside &= dr.abs(echoes.range_m - distance) <= NEARER * distance
+        solid_angle = area * dr.detach(echoes.cosine)  # of the hit: where it is 0, its change is infinite
+        echoes = replace(echoes, hit=dr.select(inside, echoes.hit, 0), solid_angle_sr=solid_angle)
+        steps = self._steps(echoes, elevation, beam, {name: dr.detach(value) for name, value in given.items()})
+        return steps - dr.detach(steps)
 
     def _formed(self, boxes: mi.TensorXf, given: dict[str, mi.Float]) -> mi.TensorXf:
         """Apply pattern, pulse, losses and taper to levels in boxes."""

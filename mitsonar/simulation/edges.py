@@ -54,12 +54,14 @@ class EdgePieces(NamedTuple):
         across: unit vector perpendicular to this direction and to the edge.
         distance: distance of the piece [m].
         swept: solid angle that the piece sweeps towards ``across`` [sr]: 0, with derivatives.
+        smooth: whether it belongs to a curved surface that turns away there, so that its cosine is 0.
     """
 
     direction: DeviceArray
     across: DeviceArray
     distance: DeviceArray
     swept: DeviceArray
+    smooth: DeviceArray
 
 
 @dataclass(frozen=True)
@@ -153,8 +155,8 @@ class MeshEdges:
         nearer = dr.select(near < far, near, far)
         return dr.select(view.may_see(one + other, length, nearer), length * share, 0)
 
-    def points(self, share: DeviceArray, view: SonarView) -> tuple[DeviceArray, DeviceArray]:
-        """Return points on the edges, with derivatives, and the piece of the edge that each represents, without [m].
+    def points(self, share: DeviceArray, view: SonarView) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+        """Return points on the edges, with derivatives, the piece of the edge that each represents, without [m], and 0.
 
         Args:
             share: shares of the total weight up to each point, evenly spaced in 0..1.
@@ -171,7 +173,8 @@ class MeshEdges:
         part = mi.Float(1 - clipped((dr.gather(mi.Float64, total, edge) - at) / size, 0, 1))
         # 2. Its place, and the piece that it represents.
         one, other = (self._vertex(dr.gather(mi.UInt32, index, edge)) for index in self.ends)
-        return one * (1 - part) + other * part, dr.detach(other - one) * mi.Float(whole / size / dr.width(share))
+        piece = dr.detach(other - one) * mi.Float(whole / size / dr.width(share))
+        return one * (1 - part) + other * part, piece, mi.Bool(False)
 
     def _vertex(self, index: DeviceArray, active: DeviceArray = True) -> DeviceArray:
         return self.mesh.vertex_position(index, active)
@@ -199,8 +202,8 @@ class Outline:
         distance: DeviceArray = dr.norm(away)
         return dr.select(view.may_see(away, size / distance, distance - size), clipped(size / distance, 0, 1), 0)
 
-    def points(self, share: DeviceArray, view: SonarView) -> tuple[DeviceArray, DeviceArray]:
-        """Return points on the outline, and their pieces; see :meth:`MeshEdges.points`."""
+    def points(self, share: DeviceArray, view: SonarView) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+        """Return points on the outline, their pieces, and which are on no border; see :meth:`MeshEdges.points`."""
         # 1. Part of the outline of each point, and place on it.
         origin = view.origin
         parts, weights = self.shape.precompute_silhouette(mi.ScalarPoint3f(*(float(value[0]) for value in origin)))
@@ -215,7 +218,8 @@ class Outline:
         si = dr.zeros(mi.SurfaceInteraction3f, len(at))
         si.p, si.uv, si.prim_index, si.shape = sample.p, sample.uv, sample.prim_index, mi.ShapePtr(self.shape)
         density = dr.detach(sample.pdf) * mi.Float(share_of_part[part].astype(np.float32)) * len(at)
-        return self.shape.differential_motion(si), dr.detach(sample.silhouette_d) / density
+        smooth = sample.discontinuity_type == int(mi.DiscontinuityFlags.InteriorType)
+        return self.shape.differential_motion(si), dr.detach(sample.silhouette_d) / density, smooth
 
 
 Edges: TypeAlias = MeshEdges | Outline
@@ -259,7 +263,7 @@ def pieces_of(edges: Sequence[Edges], sonar: Sonar, lines: list[mi.Vector4f], co
         size = math.ceil(count * weight / (sum(weights) or 1))
         if not size:
             continue
-        point, piece = one.points((dr.arange(mi.Float, size) + 0.5) / size, view)
+        point, piece, smooth = one.points((dr.arange(mi.Float, size) + 0.5) / size, view)
         away, along = _to_sonar(lines, point - place), view.to_sonar(piece)
         distance = dr.norm(dr.detach(away))
         direction = dr.detach(away) / distance
@@ -267,29 +271,29 @@ def pieces_of(edges: Sequence[Edges], sonar: Sonar, lines: list[mi.Vector4f], co
         length = dr.norm(normal)
         across = dr.select(length > 0, normal / length, 0)
         swept = _change(dr.dot(away, across)) / distance * (length / distance)
-        pieces.append(EdgePieces(direction, across, distance, swept))
+        pieces.append(EdgePieces(direction, across, distance, swept, smooth))
     return pieces
 
 
 # ---------------- Lines along which two shapes cut each other
 
 
-def crossings(scene: mi.Scene, tracer: Tracer, lines: list[mi.Vector4f], key: mi.UInt32) -> list[EdgePieces]:
-    """Return pieces of the lines along which two shapes or objects cut each other, between neighbouring rays.
+def crossings(scene: mi.Scene, tracer: Tracer, lines: list[mi.Vector4f]) -> list[EdgePieces]:
+    """Return pieces of the lines along which two shapes or objects cut each other, between middles of neighbouring cells.
 
+    On an even grid, a line has one piece in each column or row that it crosses; jittered rays would cross it several times.
     Such a line is where the tangent planes at both hits meet. It is visible if each ray meets the nearer plane.
 
     Args:
         scene: scene to trace.
         tracer: tracer of the rays.
         lines: first three rows of ``to_world`` of the sonar, with derivatives or without.
-        key: key of the jitter of the rays.
     """
     sonar, still = tracer.sonar, [dr.detach(line) for line in lines]
     # 1. Which shape and object does each ray meet?
     ray = dr.arange(mi.UInt32, sonar.rays)
     with without_derivatives():
-        hit, _ = _seen(scene, tracer, still, ray, key, attached=False)
+        hit, _ = _seen(scene, tracer, still, ray, attached=False)
     valid, shape, part = hit.valid, mi.Int32(hit.shape_id), mi.Int32(hit.object_id)
     dr.eval(valid, shape, part)
     # 2. Pairs of neighbours that meet different ones, over elevation and across.
@@ -299,7 +303,7 @@ def crossings(scene: mi.Scene, tracer: Tracer, lines: list[mi.Vector4f], key: mi
         differ = (shape != dr.gather(mi.Int32, shape, other)) | (part != dr.gather(mi.Int32, part, other))
         one: DeviceArray = dr.compress(valid & dr.gather(mi.Bool, valid, other) & differ)
         if dr.width(one):
-            pieces.append(_between(scene, tracer, lines, one, one + apart, key, over_elevation=apart > 1))
+            pieces.append(_between(scene, tracer, lines, one, one + apart, over_elevation=apart > 1))
     return pieces
 
 
@@ -309,7 +313,6 @@ def _between(
     lines: list[mi.Vector4f],
     one: DeviceArray,
     other: DeviceArray,
-    key: mi.UInt32,
     *,
     over_elevation: bool,
 ) -> EdgePieces:
@@ -317,7 +320,7 @@ def _between(
     # 1. Planes n . x = h of both hits, as n / h in axes of the sonar.
     planes, fans, hits = [], [], []
     for ray in (one, other):
-        hit, fan = _seen(scene, tracer, lines, ray, key, attached=True)
+        hit, fan = _seen(scene, tracer, lines, ray, attached=True)
         away = hit.t * dr.dot(hit.n, fan.carried(lines).d)
         planes.append(_to_sonar(lines, hit.n) / dr.select(dr.abs(away) > 0, away, dr.inf))
         fans.append(fan)
@@ -351,14 +354,12 @@ def _between(
     length = size * dr.abs(dr.dot(across, dr.normalize(towards)))
     swept = _change(-dr.dot(q, direction)) / dr.norm(still) * length
     distance = 1 / dr.abs(dr.dot(dr.detach(planes[0]), direction))
-    return EdgePieces(direction, across, distance, dr.select(meet, swept, 0))
+    return EdgePieces(direction, across, distance, dr.select(meet, swept, 0), mi.Bool(False))
 
 
-def _seen(
-    scene: mi.Scene, tracer: Tracer, lines: list[mi.Vector4f], ray: mi.UInt32, key: mi.UInt32, *, attached: bool
-) -> tuple[Hit, Fan]:
-    """Return the hits of rays, numbered in film order, and their fan in axes of the sonar."""
-    fan = tracer.sensor.fan(ray % tracer.sonar.columns, ray // tracer.sonar.columns, key)
+def _seen(scene: mi.Scene, tracer: Tracer, lines: list[mi.Vector4f], ray: mi.UInt32, *, attached: bool) -> tuple[Hit, Fan]:
+    """Return the hits of rays through the middles of cells, numbered in film order, and their fan in axes of the sonar."""
+    fan = tracer.sensor.fan(ray % tracer.sonar.columns, ray // tracer.sonar.columns)
     origin = mi.Point3f(*(line.w for line in lines))
     return tracer.surfaces.hit(scene, mi.Ray3f(origin, fan.carried(lines).d), attached=attached), fan
 
