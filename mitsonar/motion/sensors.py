@@ -358,8 +358,8 @@ class VehicleSensors:
             changes["heading"] = replace(compass, values=compass.values + turn(compass.time_s))
         if (side := self.sideways) is not None and (ahead := self.forward) is not None:
             for name, one, other, sign in (("sideways", side, ahead, -1), ("forward", ahead, side, 1)):
-                angle, beside = turn(one.time_s), np.interp(one.time_s, other.time_s, other.values)
-                changes[name] = replace(one, values=one.values * np.cos(angle) + sign * beside * np.sin(angle))
+                angle, crosswise = turn(one.time_s), np.interp(one.time_s, other.time_s, other.values)
+                changes[name] = replace(one, values=one.values * np.cos(angle) + sign * crosswise * np.sin(angle))
         if (reckoning := self.dead_reckoning) is not None:
             poses = reckoning.path.poses.copy()
             poses[:, 5] += turn(reckoning.path.time_s)
