@@ -202,19 +202,22 @@ class AttachedLevels:
                     parts.append([*away, met.t, facing, area, dr.full(mi.Float, number, size)])
             if not parts:
                 return 0
-            x, y, z, distance, facing, area, number = (dr.concat([mi.Float(part[k]) for part in parts]) for k in range(7))
-            direction = view.to_sonar(mi.Vector3f(x, y, z)) / distance
+            columns: list[DeviceArray] = [dr.concat([mi.Float(part[k]) for part in parts]) for k in range(7)]
+            x, y, z, distance, facing, area, owner = columns
+            direction: DeviceArray = view.to_sonar(mi.Vector3f(x, y, z)) / distance
             bearing, elevation = angles_of(self.traced, -direction.x, direction.z, direction.y)
             beam, inside = beam_at(self.traced, bearing)
-            inside &= dr.abs(elevation) <= math.radians(self.traced.elevation_fov_deg) / 2
-            dr.eval(beam, inside, bearing, elevation, distance, facing, area, number)
+            lift: DeviceArray = dr.abs(elevation)
+            inside &= lift <= math.radians(self.traced.elevation_fov_deg) / 2
+            dr.eval(beam, inside, bearing, elevation, distance, facing, area, owner)
         # 2. Echoes of those that are visible: from the same side of the same surface.
         fan = self.tracer.sensor.fan_at(beam, bearing, elevation).carried(lines)
         ray = mi.Ray3f(mi.Point3f(*(line.w for line in lines)), fan.d)
         echoes = Echo.measure(self.scene, self.tracer.surfaces, ray, fan, attached=True)
         side = dr.dot(mi.Vector3f(echoes.nx, echoes.ny, echoes.nz), fan.d)
-        inside &= (echoes.shape_id == number) & (side * facing > 0)
-        inside &= dr.abs(echoes.range_m - distance) <= NEARER * distance
+        inside &= (echoes.shape_id == owner) & (side * facing > 0)
+        off: DeviceArray = dr.abs(echoes.range_m - distance)
+        inside &= off <= NEARER * distance
         solid_angle = area * dr.detach(echoes.cosine)  # of the hit: where it is 0, its change is infinite
         echoes = replace(echoes, hit=dr.select(inside, echoes.hit, 0), solid_angle_sr=solid_angle)
         steps = self._steps(echoes, elevation, beam, {name: dr.detach(value) for name, value in given.items()})
