@@ -246,6 +246,14 @@ class FrameSource:
         Raises:
             MitsonarError: the sensors measure the attitude of the vehicle, and neither frames nor user give a pitch.
         """
+        for name, readings in (("depth", sensors.depth), ("attitude", sensors.pitch)):
+            if readings is not None and readings.smoothed(self.time_s) is None:
+                warnings.warn(
+                    f"{self.name}: the {name} of {sensors.name} is not used, since it does not reach from the first frame to "
+                    f"the last, {self.time_s[0]:.10g}..{self.time_s[-1]:.10g} s: use the frames that it covers",
+                    MitsonarWarning,
+                    stacklevel=3,
+                )
         lean, aided = sensors.attitudes(self.time_s), self
         if self.poses is None and (rise := sensors.rises(self.time_s)) is not None:
             heights = self.height_m

@@ -92,6 +92,11 @@ def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None
     assert aided.height_m is not None
     np.testing.assert_allclose(aided.height_m, sonar.poses[:, 2], atol=2e-3)
     np.testing.assert_allclose(poses[:, 3:5], sonar.poses[:, 3:5], atol=1e-3)
+    later = replace(source, time_s=source.time_s + 5).with_geometry(2.2, np.radians(25))
+    with pytest.warns(MitsonarWarning, match="the (depth|attitude) of simulated sensors is not used") as warned:
+        kept, _ = later.with_sensors(sensors)
+    assert len(warned) == 2
+    assert kept.pitch_rad == later.pitch_rad
     # a depth sensor alone measures the heave, and leaves pitch and roll unknown
     deep = simulated_sensors(vehicle, SensorNoise(depth_m=1e-9, rate_hz=50.0))
     heaving, _ = source.with_geometry(2.2, np.radians(25)).with_sensors(deep)
