@@ -249,7 +249,7 @@ class FrameSource:
         for name, readings in (("depth", sensors.depth), ("attitude", sensors.pitch)):
             if readings is not None and readings.smoothed(self.time_s) is None:
                 warnings.warn(
-                    f"{self.name}: the {name} of {sensors.name} is not used, since it does not reach from the first frame to "
+                    f"{self.name}: the {name} of {sensors.name} is not used, as it does not reach from the first frame to "
                     f"the last, {self.time_s[0]:.10g}..{self.time_s[-1]:.10g} s: use the frames that it covers",
                     MitsonarWarning,
                     stacklevel=3,
