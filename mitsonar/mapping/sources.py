@@ -247,7 +247,7 @@ class FrameSource:
             MitsonarError: the sensors measure the attitude of the vehicle, and neither frames nor user give a pitch.
         """
         for name, readings in (("depth", sensors.depth), ("attitude", sensors.pitch)):
-            if readings is not None and readings.smoothed(self.time_s) is None:
+            if readings is not None and not readings.reaches(self.time_s):
                 warnings.warn(
                     f"{self.name}: the {name} of {sensors.name} is not used, as it does not reach from the first frame to "
                     f"the last, {self.time_s[0]:.10g}..{self.time_s[-1]:.10g} s: use the frames that it covers",

@@ -26,11 +26,13 @@ from mitsonar.motion.trajectory import ALIASES, Trajectory
 __all__ = [
     "COLUMNS",
     "ROOT_HOUR",
+    "SMOOTHED_S",
     "DeadReckoning",
     "Headings",
     "Readings",
     "SensorMotions",
     "VehicleSensors",
+    "leaning_mount",
     "load_sensors",
     "save_sensors",
     "straight_poses",
@@ -49,6 +51,9 @@ MIN_STD = 1e-12
 
 LONGEST_GAP_S = 1.0
 """Longest time between two readings that still cover the time in between, unless readings are slower throughout [s]."""
+
+SMOOTHED_S = 0.15
+"""Time over which depths and attitudes are averaged [s]; a sway with a period of 4 s loses 0.3 % of its amplitude."""
 
 SMOOTHED_MARGIN_S = 10.0
 """Time before the first and after the last frame whose readings enter the smoothing [s]."""
@@ -159,20 +164,28 @@ class Readings:
         value = np.interp(time_s, self.time_s, self.values)
         return np.where(near, value, np.nan), np.where(near, self.std[nearest], np.nan)
 
+    def reaches(self, time_s: Array) -> bool:
+        """Return whether readings lie around all times, from the first to the last."""
+        return bool(time_s[0] >= self.edges_s[0] - 1e-6 and time_s[-1] <= self.edges_s[-1] + 1e-6)
+
     def smoothed(self, time_s: Array) -> Array | None:
         """Return values at times ``(times,)`` from a smoothing spline; None if the readings do not reach all times.
 
-        Noise is smoothed as generalised cross-validation suggests, since height and attitude of a frame must not jump by it.
+        The spline averages over some :data:`SMOOTHED_S`, so that height and attitude of a frame do not jump by the noise of
+        a reading. An oscillation of angular frequency w keeps ``1 / (1 + (SMOOTHED_S * w)**4)`` of its amplitude.
         """
-        if time_s[0] < self.edges_s[0] - 1e-6 or time_s[-1] > self.edges_s[-1] + 1e-6:
+        if not self.reaches(time_s):
             return None
-        chosen = slice(*np.searchsorted(self.time_s, time_s[[0, -1]] + [-SMOOTHED_MARGIN_S, SMOOTHED_MARGIN_S]))
-        seconds, values = self.time_s[chosen] - time_s[0], self.values[chosen]
-        if len(values) < FEWEST_SMOOTHED or np.ptp(values) == 0:
-            return np.asarray(np.interp(time_s, self.time_s, self.values))
-        with np.errstate(divide="ignore", invalid="ignore"):  # readings without noise leave nothing to validate by
-            spline = make_smoothing_spline(seconds, values, 1 / self.std[chosen] ** 2)
-        return np.asarray(spline(np.clip(time_s - time_s[0], seconds[0], seconds[-1])))
+        begin, end = np.searchsorted(self.time_s, time_s[[0, -1]] + [-SMOOTHED_MARGIN_S, SMOOTHED_MARGIN_S])
+        seconds, values = self.time_s[begin:end] - time_s[0], self.values[begin:end]
+        between = np.interp(time_s, self.time_s, self.values)
+        if len(values) < FEWEST_SMOOTHED:
+            return np.asarray(between)
+        spline = make_smoothing_spline(seconds, values, lam=SMOOTHED_S**4 / float(np.median(np.diff(seconds))))
+        smooth = spline(np.clip(time_s - time_s[0], seconds[0], seconds[-1]))
+        # a spline swings far out between readings that lie far apart
+        after = np.clip(np.searchsorted(seconds, time_s - time_s[0]), 1, len(seconds) - 1)
+        return np.where(np.diff(seconds)[after - 1] > LONGEST_GAP_S, between, smooth)
 
 
 def _integrate_between(edges: Array, rate: Array, time_s: Array) -> Array:

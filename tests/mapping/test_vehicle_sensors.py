@@ -19,7 +19,7 @@ from mitsonar.mapping.sensors import SensorNoise, open_sensors, simulated_sensor
 from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose, mounted
-from mitsonar.motion.sensors import ROOT_HOUR, Readings, VehicleSensors, load_sensors, save_sensors
+from mitsonar.motion.sensors import ROOT_HOUR, SMOOTHED_S, Readings, VehicleSensors, load_sensors, save_sensors
 from mitsonar.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -80,13 +80,15 @@ def test_a_sonar_that_looks_down_turns_as_the_vehicle_rolls() -> None:
 
 def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None:
     vehicle, sonar = rolling()
-    frames = replace(over_ground(sway(len(vehicle))), time_s=vehicle.time_s)
-    source = FrameSource.of(replace(frames, poses=None, height_m=None, attitude_rad=None))
     sensors = simulated_sensors(vehicle, SensorNoise(depth_m=1e-9, attitude_deg=1e-9, rate_hz=50.0))
+    deep = simulated_sensors(vehicle, SensorNoise(depth_m=1e-9, rate_hz=50.0))
+    sonar = Trajectory(sonar.poses[1:-1], sonar.time_s[1:-1])  # readings begin before the frames, and end after them
+    frames = replace(over_ground(sway(len(sonar))), time_s=sonar.time_s)
+    source = FrameSource.of(replace(frames, poses=None, height_m=None, attitude_rad=None))
     with pytest.raises(MitsonarError, match="the pitch of the sonar on it is not known"):
         source.with_sensors(sensors)
     aided, _ = source.with_geometry(float(sonar.poses[:, 2].mean()), np.radians(25)).with_sensors(sensors)
-    some = np.arange(len(vehicle))
+    some = np.arange(len(sonar))
     poses = aided.attitudes(some)
     assert poses is not None
     assert aided.height_m is not None
@@ -98,7 +100,6 @@ def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None
     assert len(warned) == 2
     assert kept.pitch_rad == later.pitch_rad
     # a depth sensor alone measures the heave, and leaves pitch and roll unknown
-    deep = simulated_sensors(vehicle, SensorNoise(depth_m=1e-9, rate_hz=50.0))
     heaving, _ = source.with_geometry(2.2, np.radians(25)).with_sensors(deep)
     unsure = attitude_of(heaving.read([3, 4]), "direct", None, None).unsure
     assert unsure.height_m == 0
@@ -106,7 +107,8 @@ def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None
     assert not any(attitude_of(aided.read([3, 4]), "direct", None, None).unsure)
 
 
-def test_smoothing_takes_noise_out_and_leaves_what_is_exact() -> None:
+def test_smoothing_takes_noise_out_and_little_of_a_sway() -> None:
+    """The amplitude follows the closed form of a smoothing spline."""
     time, frames = np.arange(0, 20, 0.05), np.arange(5, 15, 0.2)
     swell = 0.1 * np.sin(2 * np.pi * time / 4)
     true = 0.1 * np.sin(2 * np.pi * frames / 4)
@@ -114,12 +116,18 @@ def test_smoothing_takes_noise_out_and_leaves_what_is_exact() -> None:
     exact, smoothed = (readings(time, values, 0.01).smoothed(frames) for values in (swell, swell + noise))
     assert exact is not None
     assert smoothed is not None
-    np.testing.assert_allclose(exact, true, atol=1e-4)
+    np.testing.assert_allclose(exact, true / (1 + (SMOOTHED_S * 2 * np.pi / 4) ** 4), atol=1e-5)
     assert np.std(smoothed - true) < 0.005
     assert readings(time, swell, 0.01).smoothed(frames + 10) is None
+    # a pause of ten minutes is bridged by a line, though the vehicle rises before and after it
+    pause = np.where(time > 10, time + 600, time)
+    bridged = readings(pause, np.abs(time - 10), 0.01).smoothed(np.arange(5, 615, 0.2))
+    assert bridged is not None
+    assert bridged.min() > -0.05
+    assert bridged.max() < 5.1
     constant = readings(time, np.full(len(time), 3.0), 0.01).smoothed(frames)
     assert constant is not None
-    np.testing.assert_array_equal(constant, 3)
+    np.testing.assert_allclose(constant, 3, rtol=1e-9)
 
 
 def test_a_gyroscope_s_noise_grows_with_the_root_of_time() -> None:
