@@ -99,7 +99,7 @@ def odometry(
         Path | None,
         typer.Option(
             help="CSV file of gyroscope, DVL, depth, attitude, compass or dead reckoning, with named columns of values and "
-            "noise, also beside the poses of a trajectory; or a ROS bag. A pose graph adds them to the frames.",
+            "noise, or the columns of a trajectory; or a ROS bag. A pose graph adds them to the frames.",
         ),
     ] = None,
     local_map: Annotated[

@@ -292,7 +292,10 @@ class VehicleSensors:
 
     def __post_init__(self) -> None:
         if (self.pitch is None) != (self.roll is None):
-            raise MitsonarError(f"{self.name}: pitch and roll of the vehicle need each other: give both, or leave both out")
+            raise MitsonarError(
+                f"{self.name} hold only one of pitch and roll of the vehicle: give both, in a file as vehicle_pitch_deg and "
+                "vehicle_roll_deg, or leave both out"
+            )
         if not self.names:
             raise MitsonarError(
                 f"{self.name} hold no reading: give a gyroscope, velocities, depths, attitudes, headings or poses"

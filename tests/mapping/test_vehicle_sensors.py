@@ -99,6 +99,8 @@ def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None
         kept, _ = later.with_sensors(sensors)
     assert len(warned) == 2
     assert kept.pitch_rad == later.pitch_rad
+    with pytest.raises(MitsonarError, match="only one of pitch and roll of the vehicle: give both, in a file as"):
+        replace(sensors, roll=None)
     # a depth sensor alone measures the heave, and leaves pitch and roll unknown
     heaving, _ = source.with_geometry(2.2, np.radians(25)).with_sensors(deep)
     unsure = attitude_of(heaving.read([3, 4]), "direct", None, None).unsure
