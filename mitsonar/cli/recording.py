@@ -359,7 +359,8 @@ def _along(part: Part, path: Path, name: str) -> Part:
     from mitsonar.motion.trajectory import Trajectory
 
     trajectory = OdometryFolder.open(path).estimated if path.is_dir() else Trajectory.load(path)
-    poses, known = poses_at(trajectory, part.time_s, name, part.attitude_rad)
+    time_s = part.time_s if part.time_s.ndim == 1 else part.time_s.mean(axis=1)
+    poses, known = poses_at(trajectory, time_s, name, part.attitude_rad)
     if not known.all():
         raise MitsonarError(
             f"{path} has no pose for {int((~known).sum()):,} of {count_noun(len(part), 'frame')} of {name}: give a path of "
