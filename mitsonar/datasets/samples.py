@@ -748,6 +748,11 @@ class ImpulsePairs(ImpulseSamples, StoredBatches, Dataset[Batch]):
         """Return the seed of the noise, which changes with the epoch."""
         return self.epoch_seed
 
+    @property
+    def arrays(self) -> dict[str, tuple[str, np.dtype[Any]]]:
+        """Return the arrays of the store of which samples consist, as in `SonarPairs`; none if ``leak`` replaces pings."""
+        return {"response": ("response", np.dtype(np.complex64))} if self.leak == "none" else {}
+
     def raw(self, index: int) -> RawSample:
         """Read a sample as stored: the responses ``(Q, M, taps)``, the numbers of the pings, and the label."""
         here = self.frame_slice(index)

@@ -296,7 +296,7 @@ def batches(
         return DataLoader(RawStream(material.samples, size, start, share), batch_size=size, **options)
     assert material.numbers is not None
     order = Order(material.numbers, recipe.batch, recipe.seed, start, stop, share)
-    if isinstance(material.samples, SonarPairs) and fits_on(device, material.samples):
+    if not isinstance(material.samples, JoinedPairs) and fits_on(device, material.samples):
         return BatchesInMemory(material.samples, order, device)
     return DataLoader(_Stored(material.samples), batch_sampler=order, **options)
 
@@ -333,24 +333,24 @@ MEMORY_SHARE = 0.5
 """A data set is copied to a GPU if it fills at most this fraction of the memory that is free."""
 
 
-def fits_on(device: torch.device, pairs: SonarPairs) -> bool:
-    """Return whether the frames of a data set can be kept in the memory of a GPU; frames with ground geometry cannot."""
-    if device.type != "cuda" or pairs.ground:
+def fits_on(device: torch.device, pairs: SonarPairs | ImpulsePairs) -> bool:
+    """Return whether a data set can be kept in the memory of a GPU; frames with ground geometry cannot."""
+    if device.type != "cuda" or not pairs.arrays or (isinstance(pairs, SonarPairs) and pairs.ground):
         return False
     shapes = [(pairs.store.array(name).shape, kind.itemsize) for name, kind in pairs.arrays.values()]
     return sum(math.prod(shape) * size for shape, size in shapes) <= MEMORY_SHARE * torch.cuda.mem_get_info(device)[0]
 
 
 class BatchesInMemory:
-    """Batches of raw samples from frames in the memory of a device: the same samples that a loader reads from disk.
+    """Batches of raw samples from a data set in the memory of a device: the same samples that a loader reads from disk.
 
     Args:
         pairs: samples without ground geometry.
         order: yields the (epoch, sample) pairs of each batch.
-        device: holds the frames.
+        device: holds the frames or responses.
     """
 
-    def __init__(self, pairs: SonarPairs, order: Order, device: torch.device) -> None:
+    def __init__(self, pairs: SonarPairs | ImpulsePairs, order: Order, device: torch.device) -> None:
         self.pairs, self.order, self.device = pairs, order, device
 
     def __iter__(self) -> Iterator[Batch]:

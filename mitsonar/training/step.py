@@ -183,7 +183,10 @@ class NetworkTraining(lightning.LightningModule):
         optimiser = self.optimizers()
         for group in optimiser.param_groups:  # type: ignore[union-attr]
             group["lr"] = self.rate
-        torch.manual_seed(seed_of(self.recipe.seed, STEP, self.global_step, self.global_rank))
+        seed = seed_of(self.recipe.seed, STEP, self.global_step, self.global_rank)
+        torch.default_generator.manual_seed(seed)  # torch.manual_seed also formats a traceback for each absent device
+        if self.device.type == "cuda":
+            torch.cuda.manual_seed(seed)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Compute the loss of a batch.

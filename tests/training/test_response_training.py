@@ -25,6 +25,7 @@ from mitsonar.networks.blocks import SameAverage  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network  # noqa: E402
 from mitsonar.records.responses import ImpulseResponses  # noqa: E402
+from mitsonar.training.data import BatchesInMemory, Order, _Collation, fits_on  # noqa: E402
 from mitsonar.training.evaluate import evaluate, predictions, samples_for  # noqa: E402
 from mitsonar.training.run import train  # noqa: E402
 
@@ -56,6 +57,18 @@ def run(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("run") / "run"
     train(TrainOptions(recipe_of(FIELDS), made, out, threads=1, workers=0))
     return out
+
+
+def test_batches_in_memory_are_those_of_the_loader(made: Path) -> None:
+    pairs, cpu = ImpulsePairs(made, split={"by": "scene", "train": 0.5, "validation": 0.5}, frames=3), torch.device("cpu")
+    assert not fits_on(cpu, pairs)
+    order = Order(np.arange(len(pairs)), 4, 0, 0, 3, (0, 1))
+    for keys, batch in zip(order, BatchesInMemory(pairs, order, cpu), strict=True):
+        read = _Collation(pairs, finish=False)([{"epoch": epoch, **pairs.raw(number)} for epoch, number in keys])
+        assert batch["epoch"] == read["epoch"]
+        for name, values in read["raw"].items():
+            assert torch.equal(values, batch["raw"][name]), name
+    assert not ImpulsePairs(made, frames=3, leak="one_ping", part="all").arrays
 
 
 # ---------------------------------------------------------------- the network
