@@ -1,6 +1,5 @@
 """The first hour on a machine with a GPU, in steps of at most ten minutes that can be killed and go on.
 
-    python benchmarks/gpu/run.py install LOAD ... [--site FOLDER]      put the loads of pack.py together, install them
     python benchmarks/gpu/run.py STEP --out OUT                        one step
     python benchmarks/gpu/run.py --all --out OUT [--minutes 10]        the open steps, one after the other, for so long
     python benchmarks/gpu/run.py --all --out OUT --scale 0.001 --device cpu
@@ -35,7 +34,6 @@ sys.path.insert(0, str(HERE))
 
 import pack  # noqa: E402
 
-TABLE_32 = ("posenet-normx10", "posenet-quantised")
 TABLE_52 = (
     *("impulse-standard", "impulse-two-receivers", "impulse-40khz", "impulse-60khz", "impulse-100khz", "impulse-160khz"),
     *("impulse-narrow", "impulse-circular-4800", "impulse-wideband-9600", "impulse-wideband-19200"),
@@ -99,19 +97,15 @@ class Failed(Exception):
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("step", nargs="?", choices=["install", *STEPS], help="one step")
-    parser.add_argument("loads", nargs="*", type=Path, help="of install: folders of pack.py")
+    parser.add_argument("step", nargs="?", choices=list(STEPS), help="one step")
     parser.add_argument("--all", action="store_true", help="all steps that are open")
     parser.add_argument("--out", type=Path, default=Path("out/gpu"), help="state, logs, data, weights")
     parser.add_argument("--minutes", type=float, default=10, help="of this call")
     parser.add_argument("--scale", type=float, default=1.0, help="part of the data of the tables, above 0 to 1")
     parser.add_argument("--device", choices=["cuda", "cpu"], default="cuda")
     parser.add_argument("--again", action="store_true", help="steps that failed, too")
-    parser.add_argument("--site", type=Path, default=Path("out/site"), help="of install: where to")
     parser.add_argument("--quick", action="store_true", help="--all --scale 0.001 --device cpu, kept nowhere")
     arguments = parser.parse_args()
-    if arguments.step == "install":
-        return install(arguments.loads, arguments.site)
     if not 0 < arguments.scale <= 1:
         parser.error(f"--scale must be above 0 and at most 1: got {arguments.scale:g}")
     if arguments.quick:
@@ -405,57 +399,54 @@ def rows_of(arguments: Request, name: str) -> dict[str, str]:
     return {f"line {k}": line for k, line in enumerate(line for line in mine if line.strip() and line[0] not in "{-")}
 
 
-def row(table: str, name: str) -> Callable[[Request], Found]:
-    """Return the step of a row of a table, by `mitsonar reproduce`, which resumes where it was stopped."""
+def flagships(arguments: Request) -> Found:
+    """Train PoseNet of tables 3.2 and 3.3 and ours with noise at once; flagships.py says how."""
+    minutes = 5 if arguments.small else max(1.0, (arguments.end - time.monotonic()) / 60 - 0.5)
+    words = [str(HERE / "flagships.py"), str(arguments.out / "flagships"), "--minutes", f"{minutes:.2f}"]
+    words += ["--device", arguments.device, *(["--small"] if arguments.small else [])]
+    if not command(arguments, "flagships", words, goes_on=True):
+        return Found({"so far": last_line(arguments, "flagships")}, done=False)
+    paths = sorted((arguments.out / "flagships").glob("*/rows/*.json"))
+    return Found({path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths})
+
+
+def row(name: str) -> Callable[[Request], Found]:
+    """Return the step of a row of table 5.2, by `mitsonar reproduce`, which resumes where it was stopped."""
 
     def work(arguments: Request) -> Found:
-        out = arguments.out / f"table-{table}"
-        words: list[object] = ["reproduce", table, "--rows", name, "-o", out, *effort(arguments, table)]
+        out = arguments.out / "table-5.2"
+        words: list[object] = ["reproduce", "5.2", "--rows", name, "-o", out, *effort(arguments)]
         words += ["--accelerator", "gpu" if arguments.device == "cuda" else "cpu", "--devices", 1]
         words += ["--workers", 1 if arguments.device == "cuda" or arguments.small else os.cpu_count()]
-        if not command(arguments, f"table-{table}-{name}", mitsonar(*words), goes_on=True):
-            return Found({"so far": last_line(arguments, f"table-{table}-{name}")}, done=False)
+        if not command(arguments, f"table-5.2-{name}", mitsonar(*words), goes_on=True):
+            return Found({"so far": last_line(arguments, f"table-5.2-{name}")}, done=False)
         return Found(json.loads((out / "rows" / f"{name}.json").read_text(encoding="utf-8")))
 
     return work
 
 
-def effort(arguments: Request, table: str) -> list[object]:
-    """Return the effort of a row: all epochs, or at a small scale some seconds on coarse data."""
+def effort(arguments: Request) -> list[object]:
+    """Return the effort of a row of table 5.2: all epochs, or at a small scale some seconds on coarse data."""
     bf16 = ["--set", "precision=bf16-mixed"] if arguments.device == "cuda" else []
     if not arguments.small:
         return ["--scale", arguments.scale, "--minutes", 0, *bf16]
-    rocks = "{family: rocky-field, size_m: 20, a_side: [5, 9]}"
     flat = "{family: flat-objects, size_m: 30, seabed_cells: 200, rectangles: 20, ellipses: 20}"
-    sequences = max(4, round(arguments.scale * (40_000 if table == "3.2" else 3_000) / 4))
-    data = f"scenes: [{{count: 2, sequences: {sequences}}}], world: {rocks if table == '3.2' else flat}"
+    data = f"scenes: [{{count: 2, sequences: {max(4, round(750 * arguments.scale))}}}], world: {flat}"
     changes = ["network.width=0.03", f"data_changes={{{data}}}"]
     return ["--scale", 1, "--minutes", 0.1, *(word for change in changes for word in ("--set", change))]
 
 
 def weights(arguments: Request) -> Found:
-    """Save the networks of finished rows in OUT/weights, in bf16 and files below 16 MiB. `together` reads them."""
+    """Save all networks in OUT/weights, in bf16; `full` makes checkpoints of them again."""
     import torch
 
     output: Plain = {}
-    for path in sorted(arguments.out.glob("table-*/runs/*/network.ckpt")):
-        folder = arguments.out / "weights" / path.parent.name
-        folder.mkdir(parents=True, exist_ok=True)
-        for old in folder.iterdir():
-            old.unlink()
-        whole = folder / "network.bf16"
-        torch.save(halved(torch.load(path, map_location="cpu", weights_only=True)), whole)
-        for name, data in pack.split(whole.name, whole.read_bytes(), 15 * pack.MIB):
-            (folder / name).write_bytes(data)
-        whole.unlink() if len(list(folder.iterdir())) > 1 else None
-        back = together(folder)
-        if {key for key in back} != {key for key in torch.load(path, map_location="cpu", weights_only=True)}:
-            raise Failed(f"{folder} does not hold what {path} holds")
-        output[path.parent.name] = (
-            f"{len(list(folder.iterdir()))} files, {sum(p.stat().st_size for p in folder.iterdir()):,} bytes"
-        )
-    finished = all((arguments.out / "table-3.2" / "rows" / f"{name}.json").exists() for name in TABLE_32[:1])
-    return Found(output or {"networks": "none yet"}, done=finished and bool(output))
+    (arguments.out / "weights").mkdir(exist_ok=True)
+    for path in sorted([*arguments.out.glob("**/runs/*/network.ckpt"), *arguments.out.glob("flagships/*/network.ckpt")]):
+        out = arguments.out / "weights" / f"{path.parent.name}.bf16"
+        torch.save(halved(torch.load(path, map_location="cpu", weights_only=True)), out)
+        output[path.parent.name] = f"{out.stat().st_size:,} bytes"
+    return Found(output or {"networks": "none yet"}, done=bool(output))
 
 
 def halved(value: Saved) -> Saved:
@@ -469,20 +460,15 @@ def halved(value: Saved) -> Saved:
     return [halved(one) for one in value] if isinstance(value, list) else value
 
 
-def together(folder: Path) -> Plain:
-    """Read a checkpoint of `weights` as mitsonar saves it: `torch.save(together(FOLDER), "network.ckpt")`."""
+def full(value: Saved) -> Saved:
+    """Convert all tensors of bf16 to 32-bit numbers."""
     import torch
 
-    def full(value: Saved) -> Saved:
-        if isinstance(value, torch.Tensor):
-            return value.to(torch.float32) if value.dtype == torch.bfloat16 else value
-        if isinstance(value, dict):
-            return {key: full(one) for key, one in value.items()}
-        return [full(one) for one in value] if isinstance(value, list) else value
-
-    with tempfile.TemporaryDirectory() as whole:
-        (path,) = pack.put_together([folder], Path(whole))
-        return dict(full(torch.load(path, map_location="cpu", weights_only=True)))
+    if isinstance(value, torch.Tensor):
+        return value.to(torch.float32) if value.dtype == torch.bfloat16 else value
+    if isinstance(value, dict):
+        return {key: full(one) for key, one in value.items()}
+    return [full(one) for one in value] if isinstance(value, list) else value
 
 
 STEPS: dict[str, Callable[[Request], Found]] = {
@@ -492,28 +478,13 @@ STEPS: dict[str, Callable[[Request], Found]] = {
     "render_speed": render_speed,
     "coherent_speed": coherent_speed,
     "impulse_speed": impulse_speed,
-    **{name: row("3.2", name) for name in TABLE_32},
-    **{name: row("5.2", name) for name in TABLE_52},
+    "flagships": flagships,
+    **{name: row(name) for name in TABLE_52},
     "weights": weights,
 }
 """In the order in which they are done."""
 
-IN_SMALL = {*STEPS} - {*TABLE_32[1:], *TABLE_52[1:]}
-
-
-def install(loads: list[Path], site: Path) -> None:
-    """Put loads together and install their wheels into a folder.
-
-    Raises:
-        SystemExit: nothing to install, a part is missing or damaged.
-    """
-    if not loads:
-        raise SystemExit("nothing to install: give the folders that pack.py made")
-    with tempfile.TemporaryDirectory() as folder:
-        wheels = [str(path) for path in pack.put_together(loads, Path(folder)) if path.suffix == ".whl"]
-        words = ["-q", "--no-index", "--no-deps", "--no-compile", "--upgrade", "--target", str(site)]
-        subprocess.run([sys.executable, "-m", "pip", "install", *words, *wheels], check=True)
-    print(f"{len(wheels)} wheels installed: export PYTHONPATH={site.resolve()}")
+IN_SMALL = {*STEPS} - {*TABLE_52[1:]}
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""The pack for a machine with a GPU: its list of wheels is whole, loads come together again, steps go on and stop nobody."""
+"""The pack for a machine with a GPU: its list is whole, its archive has what is loaded, steps go on and stop nobody."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
 import sys
+import tarfile
 import time
 import tomllib
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks" / "gpu"))
 
+import flagships  # noqa: E402
 import pack  # noqa: E402
 import run  # noqa: E402
 
@@ -80,54 +81,20 @@ def test_the_list_holds_all_that_rendering_and_training_need() -> None:
     assert missing == set()
 
 
-# ---------------------------------------------------------------- wheels and loads
+# ---------------------------------------------------------------- the archive
 
 
-def test_a_slim_wheel_has_no_row_of_what_it_lost(tmp_path: Path) -> None:
-    wheel = tmp_path / "mitsuba-1-py3-none-any.whl"
-    names = (
-        "mitsuba/cuda_ad_mono.so",
-        "mitsuba/cuda_ad_mono_polarized.so",
-        "mitsuba/data/srgb.coeff",
-        "mitsuba/spectral.py",
-    )
-    with zipfile.ZipFile(wheel, "w") as file:
-        for name in names:
-            file.writestr(name, name * 100)
-        file.writestr("m.dist-info/RECORD", "".join(f"{name},sha256=x,1\n" for name in names))
-    pack.slim(wheel, pack.UNUSED)
-    with zipfile.ZipFile(wheel) as file:
-        assert file.namelist() == [names[0], names[3], "m.dist-info/RECORD"]
-        assert file.read("m.dist-info/RECORD").decode() == f"{names[0]},sha256=x,1\n{names[3]},sha256=x,1\n"
-
-
-def test_loads_are_small_and_come_together_again(tmp_path: Path) -> None:
-    wheels, out = tmp_path / "wheels", tmp_path / "out"
-    wheels.mkdir()
-    contents = {"large.whl": bytes(range(256)) * 40, "small.whl": b"x" * 700, "other.whl": b"y" * 1800}
-    for name, data in contents.items():
-        (wheels / name).write_bytes(data)
-    pack.loads(wheels, out, 4000, 2000)
-    folders = sorted(out.iterdir())
-    assert len(folders) >= 4
-    for folder in folders:
-        assert sum(path.stat().st_size for path in folder.iterdir()) <= 4000
-        assert all(path.stat().st_size <= 2000 for path in folder.iterdir())
-    result = pack.put_together(folders, tmp_path / "back")
-    assert {path.name: path.read_bytes() for path in result} == contents
-
-
-def test_a_part_that_is_missing_or_damaged_is_told(tmp_path: Path) -> None:
-    parts = pack.split("a.whl", b"0123456789", 4)
-    assert [len(data) for _, data in parts] == [4, 4, 2]
-    for name, data in parts:
-        (tmp_path / name).write_bytes(data)
-    (tmp_path / parts[1][0]).write_bytes(b"4x67")
-    with pytest.raises(SystemExit, match=r"a\.whl is damaged"):
-        pack.put_together([tmp_path], tmp_path / "back")
-    (tmp_path / parts[1][0]).unlink()
-    with pytest.raises(SystemExit, match=r"a\.whl has 2 of its 3 parts"):
-        pack.put_together([tmp_path], tmp_path / "back")
+def test_the_archive_has_what_is_loaded_and_no_more(tmp_path: Path) -> None:
+    site, out = tmp_path / "site", tmp_path / "deep" / "site.tar.xz"
+    loaded = ["drjit/drjit.py", "mitsuba/cuda_ad_mono.so", "mitsuba/plugins/sphere.so"]
+    unused = ["bin/f2py", "drjit/include/drjit/array.h", "mitsuba/cuda_ad_mono_polarized.so", "mitsuba/data/sunsky/a.bin"]
+    for name in loaded + unused:
+        (site / name).parent.mkdir(parents=True, exist_ok=True)
+        (site / name).write_text(name)
+    pack.slim(site, pack.UNUSED)
+    pack.archive(site, out)
+    with tarfile.open(out) as file:
+        assert sorted(one.name for one in file.getmembers() if one.isfile()) == loaded
 
 
 # ---------------------------------------------------------------- steps
@@ -234,20 +201,17 @@ def test_a_command_that_heeds_no_request_is_killed(tmp_path: Path, monkeypatch: 
     assert time.monotonic() - begun < 30
 
 
-def test_weights_come_back_in_small_files_of_half_the_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_come_back_of_half_the_bytes(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
-    monkeypatch.setattr(pack, "MIB", 2**10)
-    folder = tmp_path / "table-3.2" / "runs" / "posenet-normx10"
+    assert not run.weights(asked_of(tmp_path, 60)).done
+    folder = tmp_path / "flagships" / "posenet-normx10" / "runs" / "posenet-normx10"
     folder.mkdir(parents=True)
     stored: dict[str, Any] = {"weights": {"a": torch.randn(9000), "steps": torch.tensor(7)}, "about": ["x", 1.5]}
     torch.save(stored, folder / "network.ckpt")
-    assert not run.weights(asked_of(tmp_path, 60)).done  # its row is not evaluated yet
-    out = tmp_path / "weights" / "posenet-normx10"
-    sizes = [path.stat().st_size for path in out.iterdir()]
-    assert len(sizes) == 2
-    assert max(sizes) <= 15 * 2**10
-    assert sum(sizes) < 0.6 * (folder / "network.ckpt").stat().st_size
-    back = run.together(out)
+    assert run.weights(asked_of(tmp_path, 60)).done
+    out = tmp_path / "weights" / "posenet-normx10.bf16"
+    assert out.stat().st_size < 0.6 * (folder / "network.ckpt").stat().st_size
+    back = run.full(torch.load(out, weights_only=True))
     assert back["about"] == stored["about"]
     assert int(back["weights"]["steps"]) == 7
     assert torch.allclose(back["weights"]["a"], stored["weights"]["a"], rtol=2**-8)
@@ -281,5 +245,6 @@ def test_rows_are_those_of_the_tables() -> None:
 
     tables = load_tables()
     assert set(run.TABLE_52) == {row.name for row in tables["5.2"].rows}
-    assert set(run.TABLE_32) <= {row.name for row in tables["3.2"].rows}
-    assert {*run.TABLE_32, *run.TABLE_52} <= set(run.STEPS)
+    for name, table in flagships.ROWS.items():
+        assert name in {row.name for row in tables[table].rows}
+    assert set(run.TABLE_52) <= set(run.STEPS)
